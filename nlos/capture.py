@@ -356,9 +356,12 @@ class Capture:
             provenance=record.provenance,
         )
 
-    def save(self, path: str | Path) -> None:
-        """Write the capture to an HDF5 file, whole or not at all."""
-        self.to_record().save(path)
+    def save(self, path: str | Path, compressed: bool = True) -> None:
+        """Write the capture to an HDF5 file, whole or not at all; `compressed` as of `Record.save`.
+
+        What is imaged while it comes is read several times faster where it is not compressed.
+        """
+        self.to_record().save(path, compressed)
 
     @classmethod
     def load(cls, path: str | Path) -> Capture:

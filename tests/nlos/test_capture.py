@@ -88,6 +88,7 @@ def test_unusable_numbers_are_refused(changes: dict[str, object], message: str) 
     confocal=st.booleans(),
     start=st.floats(-10, 10),
     bin_width=st.floats(1e-13, 1e-9),
+    compressed=st.booleans(),
 )
 def test_files_give_back_what_was_saved(
     tmp_path_factory: pytest.TempPathFactory,
@@ -96,6 +97,7 @@ def test_files_give_back_what_was_saved(
     confocal: bool,
     start: float,
     bin_width: float,
+    compressed: bool,
 ) -> None:
     random = np.random.default_rng(0)
     wall = random.normal(size=(*wall_shape, 3))
@@ -104,7 +106,7 @@ def test_files_give_back_what_was_saved(
         signal, wall, wall if confocal else [1, 2, 3], bin_width, start, {"made": "here"}
     )
     path = tmp_path_factory.mktemp("capture") / "wall.h5"
-    saved.save(path)
+    saved.save(path, compressed)
     loaded = Capture.load(path)
     for name in ("signal", "wall", "laser"):
         assert np.array_equal(getattr(loaded, name), getattr(saved, name))
