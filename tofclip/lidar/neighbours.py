@@ -23,7 +23,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.compiling import compile_loop, inlined
+from tofclip.compiling import compile_as_part, compile_loop, inlined
 from tofclip.lidar.detection import find_quantile_value
 from tofclip.threads import run_blocks
 from tofclip.vectors import (
@@ -42,6 +42,8 @@ from tofclip.vectors import (
 FloatArray = NDArray[np.float64]
 
 ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
+
+plane_part = compile_as_part(fastmath=True, _nrt=False)
 
 REACH_PX, STRIDE_PX = 8, 2
 """Neighbours that share a plane, and their distance: errors of adjacent pixels are much alike."""
@@ -437,7 +439,7 @@ def count_used_below(memory, limit):
     return below
 
 
-@inlined
+@plane_part
 def find_residuals_beside(memory, limit):
     """The largest residual of those used that is at most `limit`, and the smallest above it.
 
@@ -461,7 +463,7 @@ def find_residuals_beside(memory, limit):
     return find_highest_lane(last), -find_highest_lane(zero - first)
 
 
-@inlined
+@plane_part
 def fit_plane_around(memory):
     """Least-squares plane ``a * right + b * down + c`` through the neighbours that are used.
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from tofclip.compiling import compile_loop, inlined
+from tofclip.compiling import compile_as_part, compile_loop, inlined
 from tofclip.lidar.detection import PREFIT_THRESHOLD_FACTOR
 from tofclip.vectors import (
     LENGTH,
@@ -30,6 +30,7 @@ SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 """What sums in vectors need; unlike all of ``fastmath`` it leaves infinities and NaN what they are."""
 
 search_step = compile_loop(fastmath=SUMS_IN_ANY_ORDER)
+search_part = compile_as_part(fastmath=SUMS_IN_ANY_ORDER, _nrt=False)
 
 ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
 VECTORS_PER_WORD = 4
@@ -136,7 +137,7 @@ def take_strongest_peaks(
     return background, math.sqrt(variance), number
 
 
-@inlined
+@search_part
 def sum_about(trace, bin_weights):
     """Sums over the bins, and of squares, of what is above a brightness that is usual there.
 
@@ -171,7 +172,7 @@ def sum_about(trace, bin_weights):
     return centre, float(sum_vector(total + totals)), float(sum_vector(square + squares))
 
 
-@inlined
+@search_part
 def apply_filter(trace, sharp, runs, edges, score):
     """Filter a trace where `runs` and `edges` say.
 
@@ -249,7 +250,7 @@ def take_highest(bins, keys, listed, low, high):
     return np.int32(highest & -LENGTH).view(np.float32), entry
 
 
-@inlined
+@search_part
 def claim_bins(trace, centre, free, first, after):
     """Take the bins from `first` to before `after`, as far as they are free.
 
@@ -303,7 +304,7 @@ def sum_weighted(trace, bin_weights):
     return sum_vector(total + others)
 
 
-@inlined
+@search_part
 def list_maxima(score, of_interest, words, level, places):
     """List bin and height of the local maxima of interest, in the order of time; return how many.
 
@@ -344,7 +345,7 @@ def list_maxima(score, of_interest, words, level, places):
     return listed
 
 
-@inlined
+@search_part
 def compute_response(trace, weights, start):
     """Response of a filter whose first weight is for bin `start`.
 
