@@ -55,23 +55,29 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             " b1[::1], i8, f4[::1], i4[:,::1], f4[::1], f4[::1], f8[:,::1], f8[:,::1],"
             " f8[:,::1], f4[:,::1], i8[::1], i8[::1], i8[::1])"
         ),
-        (TABLE, "fit_lone_returns"): (
-            "(f4[:,::1], f8[:,::1], b1[::1], i8, f8[:,::1], f4[:,::1], i8[::1], i8, f4[:,::1],"
-            " f4[:,::1], f8[:,::1])"
+        (EXACT, "fit_returns_exactly"): (
+            "(f4[:,::1], i8[::1], f8[::1], f8[:,::1], f8, i4[:,::1], f8[:,::1], i8,"
+            " Tuple((f8[:,::1], UniTuple(f8, 4))), f8[:,::1], f8[:,::1], f8[:,:,::1], i8[::1])"
         ),
         (TABLE, "fit_crowded_returns"): (
             "(f4[:,::1], f8[:,::1], b1[::1], i8, f8[:,::1], f4[:,::1], i8[::1], i8, f4[:,::1],"
             " f4[:,::1], f4[:,::1], f8[:,::1])"
         ),
+        (TABLE, "fit_lone_returns"): (
+            "(f4[:,::1], f8[:,::1], b1[::1], i8, f8[:,::1], f4[:,::1], i8[::1], i8, f4[:,::1],"
+            " f4[:,::1], f8[:,::1])"
+        ),
         (TABLE, "measure_returns_by_table"): (
             "(f8[:,::1], i8, f4[:,::1], f8, i8[::1], f8[::1], f4[:,::1], f4[:,::1], f8[:,::1],"
             " f8[:,:,::1], i8[::1])"
         ),
-        (EXACT, "fit_returns_exactly"): (
-            "(f4[:,::1], i8[::1], f8[::1], f8[:,::1], f8, i4[:,::1], f8[:,::1], i8,"
-            " Tuple((f8[:,::1], UniTuple(f8, 4))), f8[:,::1], f8[:,::1], f8[:,:,::1], i8[::1])"
-        ),
         (TABLE, "list_returns"): "(f8[:,:,::1], i8[::1], i8[::1], f8[:,::1])",
+        (NEIGHBOURS, "scatter_about_planes"): (
+            "(f8[::1], f8[::1], i8[::1], i8, f4[:,:,:,::1], f8, i8[::1], f4[:,::1], f8[::1])"
+        ),
+        (NEIGHBOURS, "borrow_scatter"): (
+            "(f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), f8, f4[:,::1], f8[::1])"
+        ),
         (JUDGED, "pool_significance"): (
             "(i8[::1], f8[::1], f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), UniTuple(f8, 2),"
             " f8[::1])"
@@ -81,12 +87,6 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
         ),
         (NEIGHBOURS, "count_returns"): "(i8[::1], i8[::1])",
         (NEIGHBOURS, "fill_layers"): "(f8[::1], i8[::1], i8[::1], i8, f4[:,:,:,::1])",
-        (NEIGHBOURS, "scatter_about_planes"): (
-            "(f8[::1], f8[::1], i8[::1], i8, f4[:,:,:,::1], f8, i8[::1], f4[:,::1], f8[::1])"
-        ),
-        (NEIGHBOURS, "borrow_scatter"): (
-            "(f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), f8, f4[:,::1], f8[::1])"
-        ),
         (NEIGHBOURS, "widen_deviations"): "(f8[::1], f8[::1], f4[::1])",
         (SURFACES, "split_over_slit"): "(f8[::1], f8, i8, i4[::1], f4[:,::1])",
         (SURFACES, "add_light"): "(f4[::1], i4[::1], f4[:,::1], i4[::1], f4[:,::1], f4[:,::1])",
@@ -108,9 +108,9 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
         ),
     }
 )
-"""Module and name of the loops that recovery and ranging of a shot call, in the order in which the
-demonstration does, and for which arguments: a letter and bytes for each kind of number, as Numba
-writes them."""
+"""Module and name of the loops that recovery and ranging of a shot call, and for which arguments: a
+letter and bytes for each kind of number, as Numba writes them. What the demonstration needs first
+comes first, and of what it needs together that which takes longest to compile."""
 
 
 @contextlib.contextmanager
