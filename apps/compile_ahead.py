@@ -35,10 +35,9 @@ SOLVERS, SURFACES = "tofclip.solvers.kernels", "tofclip.recovery.surfaces.kernel
 LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
     {
         (CAMERA, "mark_valid"): "(b1[:,::1], f4[:,::1], f4[:,::1], f4, b1[:,::1])",
-        (
-            CAMERA,
-            "sample_rows",
-        ): "(f4[:,::1], f4, f4[:,::1], u8[:,::1], i8[::1], i8[::1], f4[:,::1])",
+        (CAMERA, "sample_rows"): (
+            "(f4[:,::1], f4, f4[:,::1], u8[:,::1], i8[::1], i8[::1], f4[:,::1])"
+        ),
         (SOLVERS, "shrink_nonnegative"): (
             "(f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[:,::1], f8[::1], f8[::1])"
         ),
