@@ -62,6 +62,9 @@ class Hybrid(PhasorMethod):
     `PlanarRSD` does. The image is that of `Backprojection`. Several laser spots add up; confocal
     scans run at doubled wavenumbers.
 
+    Errs by less than `tolerance` at voxels a wavelength and more from the wall, in noise as well;
+    nearer to it, waves that fade within a wavelength are missing.
+
     Voxels between wall and virtual plane are reached backwards, without the waves that left the
     plane's rim. A capture of another library's arrays is imaged in that library; see
     `nlos.portable`.
