@@ -10,6 +10,12 @@ from surface_scene import BIN_M, CAMERA, INSTRUMENT, SCENE, SHAPE, make_model
 
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.basis import SmoothBasis
+from tofclip.recovery.surfaces.derivatives import (
+    CLUSTER_COLUMNS,
+    CLUSTER_ROWS,
+    Derivatives,
+    multiply_derivatives,
+)
 from tofclip.recovery.surfaces.fit import extrapolate_steps, straighten_surfaces
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.ranges import refine_state
@@ -131,3 +137,29 @@ def test_splines_are_left_where_a_quadratic_explains_the_shot(shot, bent: bool):
 def test_what_steps_leave_is_a_geometric_series():
     lengths = np.array([[8.0, 4.0, 1.0], [2.0, 4.0, 0.0]])
     np.testing.assert_allclose(extrapolate_steps(lengths), [2 / 3, 4.0, 0.0])
+
+
+def test_what_steps_take_from_the_misfit_is_given_back():
+    """Seven unknowns and sixteen clusters: their scores after the step say too little."""
+    draw = np.random.default_rng(0)
+    rows, columns = 4 * CLUSTER_ROWS, 4 * CLUSTER_COLUMNS
+    images = draw.standard_normal((7, rows, columns)).astype(np.float32)
+    images *= np.repeat(np.repeat(draw.uniform(0, 1, (7, 4, 4)) ** 2, 12, 1), 48, 2)
+    group = Derivatives([("gains", 0, view) for view in range(7)], 0, 0, images)
+    weights = np.ones((rows, columns), np.float32)
+    flat = images.reshape(7, -1).astype(np.float64)
+    inverse = np.linalg.inv(flat @ flat.T)
+    told, plain = np.zeros((2, 7))
+    draws = 60
+    for _ in range(draws):
+        noise = draw.standard_normal((rows, columns)).astype(np.float32)
+        change = inverse @ (flat @ noise.ravel())
+        left = noise - np.tensordot(change.astype(np.float32), images, 1)
+        found = multiply_derivatives([group], weights, left, left)
+        np.testing.assert_allclose(found.normal, flat @ flat.T, rtol=1e-4, atol=0.1)
+        np.testing.assert_allclose(found.slope, 0, atol=0.1)
+        told += np.diag(inverse @ found.sum_squared_scores(inverse) @ inverse) / draws
+        scores = np.array([score for _, _, score in found.clusters])
+        plain += np.diag(inverse @ (scores.T @ scores) @ inverse) / draws
+    assert np.mean(told / np.diag(inverse)) == pytest.approx(1, abs=0.08)
+    assert np.mean(plain / np.diag(inverse)) < 0.9

@@ -12,8 +12,6 @@ from tofclip.threads import run_blocks
 PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
 NORM_ITERATIONS, FURTHER_NORM_ITERATIONS = 10, 2
 NORM_MARGIN = 1.1
-# Smooth changes of amplitude, which matter, converge first; those of the last step are nearly right.
-ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 6, 2
 TINY = float(np.finfo(np.float32).tiny)
 
 
@@ -181,18 +179,3 @@ def explain_by_amplitude(model: SurfaceModel, image: Image, scale: Image, iterat
         before, energy = energy, float(np.sum(residual**2, dtype=np.float64))
         direction = residual + np.float32(energy / before) * direction
     return change
-
-
-def leave_unexplained(model: SurfaceModel, error: Image, scale: Image) -> Image:
-    """Return what amplitudes cannot explain of a misfit.
-
-    Parameters
-    ----------
-    model : SurfaceModel
-    error : (rows, columns) float32 array
-    scale : (points,) float32 array
-        Of `scale_amplitude`.
-    """
-    change = explain_by_amplitude(model, error, scale, ELIMINATION_ITERATIONS)
-    rest: Image = error - model.render(change)
-    return rest

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofclip.recovery.surfaces.model import FloatArray, Image, SurfaceModel
 from tofclip.recovery.surfaces.places import measure_height
@@ -15,6 +16,7 @@ from tofclip.units import SPEED_OF_LIGHT
 
 WIDTH_STEP = 0.02  # relative; for the derivative by a pulse's width
 CLUSTER_ROWS, CLUSTER_COLUMNS = 12, 48  # measurements whose misfits may depend on each other
+MAX_LEVERAGE = 0.9  # of a cluster: what it alone determines, its misfit says nothing about
 
 
 class Derivatives(NamedTuple):
@@ -123,72 +125,126 @@ def _differentiate_surface(model: SurfaceModel, surface: int, amplitude: Image) 
     return Derivatives(names, first, 0, images)
 
 
-def multiply_groups(groups: list[Derivatives], weights: Image) -> FloatArray:
-    """Return J'WJ, group by group, over the part of the image that two groups share.
+class ClusterProducts(NamedTuple):
+    """What a part of the image says of the unknowns that change it.
+
+    Attributes
+    ----------
+    own : (n,) int array
+        Numbers of these unknowns.
+    normal : (n, n) float32 array
+        J'WJ of the part.
+    score : (n,) float32 array
+        J'W of its misfit.
+    """
+
+    own: NDArray[np.intp]
+    normal: Image
+    score: Image
+
+
+class NormalEquations(NamedTuple):
+    """What a Gauss-Newton step is made of.
+
+    Attributes
+    ----------
+    normal : (unknowns, unknowns) float array
+        J'WJ.
+    slope : (unknowns,) float array
+        J' of what is to be explained.
+    clusters : list of ClusterProducts
+        What each part of the image adds to them.
+    """
+
+    normal: FloatArray
+    slope: FloatArray
+    clusters: list[ClusterProducts]
+
+    def sum_squared_scores(self, inverse: FloatArray) -> FloatArray:
+        """Return the sum of squares of the clusters' scores, as they were before the step.
+
+        A step explains a part of each cluster's misfit, the more the fewer clusters there are, and what
+        is left is too little. With the leverage h of a cluster, ``1 - h`` of its variance is left
+        (R. Bell and D. McCaffrey, Surv. Methodol. 28, 169, 2002).
+
+        Parameters
+        ----------
+        inverse : (unknowns, unknowns) float array
+            Of the normal matrix.
+
+        Returns
+        -------
+        (unknowns, unknowns) float array
+        """
+        scores = np.zeros((len(self.clusters), self.slope.size))
+        for score, (own, normal, pull) in zip(scores, self.clusters, strict=True):
+            factor = np.linalg.cholesky(inverse[np.ix_(own, own)])
+            leverage, directions = np.linalg.eigh(factor.T @ normal @ factor)
+            left = np.sqrt(1 - np.clip(leverage, 0, MAX_LEVERAGE))
+            along = directions.T @ (factor.T @ pull)
+            score[own] = np.linalg.solve(factor.T, directions @ (along / left))
+        return scores.T @ scores
+
+
+def multiply_derivatives(
+    groups: list[Derivatives], weights: Image, rest: Image, error: Image
+) -> NormalEquations:
+    """Return the products of all derivatives with each other and with misfits.
+
+    Cluster by cluster: what is on one stays in cache, and most derivatives are on few.
 
     Parameters
     ----------
     groups : list of Derivatives
     weights : (rows, columns) float32 array
+    rest : (rows, columns) float32 array
+        Misfit that a step is to explain.
+    error : (rows, columns) float32 array
+        Misfit of the clusters' scores.
 
     Returns
     -------
-    (unknowns, unknowns) float array
+    NormalEquations
     """
-    starts = np.cumsum([0] + [len(group.names) for group in groups])
-    normal = np.zeros((starts[-1], starts[-1]))
-    for i, one in enumerate(groups):
-        height, width = one.images.shape[1:]
-        area = np.s_[one.row : one.row + height, one.column : one.column + width]
-        weighted = one.images * weights[area]
-        for j, other in enumerate(groups[: i + 1]):
-            top, left = max(one.row, other.row), max(one.column, other.column)
-            bottom = min(one.row + height, other.row + other.images.shape[1])
-            right = min(one.column + width, other.column + other.images.shape[2])
-            if bottom <= top or right <= left:
+    ends = np.cumsum([0] + [len(group.names) for group in groups])
+    normal, slope = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
+    clusters = []
+    for top in range(0, weights.shape[0], CLUSTER_ROWS):
+        for left in range(0, weights.shape[1], CLUSTER_COLUMNS):
+            area = np.s_[top : top + CLUSTER_ROWS, left : left + CLUSTER_COLUMNS]
+            own, images = _cut_out(groups, ends, area, weights[area].shape)
+            if own.size == 0:
                 continue
-            here, there = (
-                images[
-                    :,
-                    top - group.row : bottom - group.row,
-                    left - group.column : right - group.column,
-                ].reshape(len(group.names), -1)
-                for images, group in ((weighted, one), (other.images, other))
-            )
-            block = (here @ there.T).astype(np.float64)
-            normal[starts[i] : starts[i + 1], starts[j] : starts[j + 1]] = block
-            normal[starts[j] : starts[j + 1], starts[i] : starts[i + 1]] = block.T
-    return normal
+            weighted: Image = images * weights[area].ravel()
+            product: Image = weighted @ images.T
+            score: Image = weighted @ error[area].ravel()
+            normal[np.ix_(own, own)] += product
+            slope[own] += weighted @ rest[area].ravel()
+            clusters.append(ClusterProducts(own, product, score))
+    return NormalEquations(normal, slope, clusters)
 
 
-def sum_scores(groups: list[Derivatives], pull: Image) -> FloatArray:
-    """Return derivatives of the misfit, summed over clusters of measurements.
-
-    Parameters
-    ----------
-    groups : list of Derivatives
-    pull : (rows, columns) float32 array
-        Weighted misfit.
-
-    Returns
-    -------
-    (unknowns, clusters) float array
-    """
-    tall, wide = -(-pull.shape[0] // CLUSTER_ROWS), -(-pull.shape[1] // CLUSTER_COLUMNS)
-    found = []
-    for group in groups:
-        count, height, width = group.images.shape
-        area = np.s_[group.row : group.row + height, group.column : group.column + width]
-        scores = group.images * pull[area]
-        row = (group.row + np.arange(height)) // CLUSTER_ROWS
-        column = (group.column + np.arange(width)) // CLUSTER_COLUMNS
-        first_row, first_column = (
-            np.unique(row, return_index=True),
-            np.unique(column, return_index=True),
-        )
-        scores = np.add.reduceat(scores, first_row[1], axis=1, dtype=np.float64)
-        scores = np.add.reduceat(scores, first_column[1], axis=2)
-        placed = np.zeros((count, tall, wide))
-        placed[:, first_row[0][:, np.newaxis], first_column[0]] = scores
-        found.append(placed.reshape(count, -1))
-    return np.concatenate(found)
+def _cut_out(
+    groups: list[Derivatives],
+    ends: NDArray[np.int64],
+    area: tuple[slice, slice],
+    shape: tuple[int, ...],
+) -> tuple[NDArray[np.intp], Image]:
+    """The unknowns that change a part of the image, and their derivatives there, (n, pixels)."""
+    own, parts = [], []
+    top, left = area[0].start, area[1].start
+    for group, first, last in zip(groups, ends[:-1], ends[1:], strict=True):
+        row, column = group.row - top, group.column - left
+        here = group.images[
+            :, max(-row, 0) : max(shape[0] - row, 0), max(-column, 0) : max(shape[1] - column, 0)
+        ]
+        if not here.any():
+            continue
+        row, column = max(row, 0), max(column, 0)
+        part = np.zeros((here.shape[0], *shape), np.float32)
+        part[:, row : row + here.shape[1], column : column + here.shape[2]] = here
+        own.append(np.arange(first, last))
+        parts.append(part.reshape(here.shape[0], -1))
+    if not own:
+        return np.zeros(0, np.intp), np.zeros((0, shape[0] * shape[1]), np.float32)
+    return np.concatenate(own), np.concatenate(parts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -18,7 +18,7 @@ from tofclip.recovery.surfaces.patches import (
     reach_further,
 )
 from tofclip.recovery.surfaces.pulse import measure_pulse
-from tofclip.recovery.surfaces.ranges import Refinement, compute_objective, refine_state
+from tofclip.recovery.surfaces.ranges import Refinement, refine_state
 from tofclip.recovery.surfaces.refusal import (
     require_explained,
     require_gentle_slopes,
@@ -153,15 +153,15 @@ def straighten_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
     if not bent:
         return solver
     ahead = copy.copy(solver.model)
-    least = compute_objective(ahead, refine_state(ahead, solver.amplitude).amplitude)
+    least = refine_state(ahead, solver.amplitude).objective
     for surface in bent:
         if not (solver.amplitude[solver.model.parts[surface]] > 0).any():
             continue
         trial = solver.model.straighten(surface, solver.amplitude)
-        moved = refine_state(trial, solver.amplitude).amplitude
-        objective = compute_objective(trial, moved)
-        if objective <= least:
-            solver, least = AmplitudeSolver(trial, moved, solver.weight, solver), objective
+        moved = refine_state(trial, solver.amplitude)
+        if moved.objective <= least:
+            solver = AmplitudeSolver(trial, moved.amplitude, solver.weight, solver)
+            least = moved.objective
     return solver
 
 
@@ -185,7 +185,8 @@ def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFi
     model = fit.model.see(streak)
     solver = AmplitudeSolver(model, fit.solver.amplitude, weight, fit.solver)
     solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
-    refinement = refine_state(model, solver.amplitude, fit.refinement)
+    # what explains the last shot best without the prior has that shot's noise
+    refinement = refine_state(model, solver.amplitude, replace(fit.refinement, free=None))
     solver.amplitude = refinement.amplitude
     solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
     unexplained = model.unexplained(solver.amplitude)

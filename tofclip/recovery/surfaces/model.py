@@ -272,9 +272,12 @@ class SurfaceModel:
     def render(self, amplitude: Image) -> Image:
         """Return A a, (rows, columns), of amplitudes (points,)."""
         total = np.zeros(self.image.shape, np.float32)
-        images = self._map_views(lambda view: self.project(view, amplitude, self.kernels[view]))
+        kernels = [
+            kernel * np.float32(gain)
+            for kernel, gain in zip(self.kernels, self.state.gains, strict=True)
+        ]
+        images = self._map_views(lambda view: self.project(view, amplitude, kernels[view]))
         for view, image in enumerate(images):
-            image *= np.float32(self.state.gains[view])
             own, slit = self.overlap(view)
             total[:, slit] += image[:, own]
         return total
@@ -293,8 +296,8 @@ class SurfaceModel:
         total = np.zeros((rows[1] - rows[0], self.image.shape[1]), np.float32)
         for view, kernel in enumerate(self.kernels):
             own, slit = self.overlap(view)
-            image = self.project(view, amplitude, kernel, part, rows)
-            total[:, slit] += np.float32(self.state.gains[view]) * image[:, own]
+            kernel = kernel * np.float32(self.state.gains[view])
+            total[:, slit] += self.project(view, amplitude, kernel, part, rows)[:, own]
         return total
 
     def overlap(self, view: int) -> tuple[slice, slice]:
@@ -314,7 +317,7 @@ class SurfaceModel:
             own, slit = self.overlap(view)
             part = np.zeros((image.shape[0], place.columns), np.float32)
             part[:, own] = image[:, slit]
-            smooth = np.zeros((image.shape[0] + 2 * self._margin, place.columns), np.float32)
+            smooth = np.empty((image.shape[0] + 2 * self._margin, place.columns), np.float32)
             reached = place.reached_rows
             smooth_rows(part, kernel[::-1].copy(), reached, -self._margin, smooth)
             found = np.zeros(self.surface.size, np.float32)

@@ -65,6 +65,24 @@ class Patch:
     basis: SmoothBasis
     coefficients: FloatArray
 
+    def compute_ranges(
+        self, pixels: Pixels, ray_length: FloatArray, coefficients: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the ranges of the surface at some pixels, (n,), m.
+
+        Parameters
+        ----------
+        pixels : (n,) int array
+            Raster numbers.
+        ray_length : (rows, columns) float array
+            Range over depth of each pixel.
+        coefficients : (size,) float array, optional
+            Of another surface over the same basis.
+        """
+        chosen = self.coefficients if coefficients is None else coefficients
+        found: FloatArray = ray_length.ravel()[pixels] / (self.basis.evaluate(pixels) @ chosen)
+        return found
+
 
 def find_patches(
     pixels: Pixels, distance: FloatArray, ray_length: FloatArray, bin_m: float
@@ -132,21 +150,20 @@ def find_dimmer_patches(
     list of Patch
     """
     pixel = returns.y.astype(np.intp) * ray_length.shape[1] + returns.x
-    length = ray_length.ravel()[pixel]
     free = np.ones(pixel.size, bool)
     for patch in patches:
-        fitted = length / (patch.basis.evaluate(pixel) @ patch.coefficients)
+        fitted = patch.compute_ranges(pixel, ray_length)
         free &= np.abs(returns.range - fitted) > DIMMER_REACH_BINS * bin_m
     chosen = np.flatnonzero(free)
     light = float(returns.intensity.sum())
     found = []
     for patch in find_patches(pixel[chosen], returns.range[chosen], ray_length, bin_m):
         on_patch = np.isin(pixel[chosen], patch.pixels)
-        fitted = length[chosen] / (patch.basis.evaluate(pixel[chosen]) @ patch.coefficients)
+        fitted = patch.compute_ranges(pixel[chosen], ray_length)
         on_patch &= np.abs(returns.range[chosen] - fitted) < NEIGHBOUR_BINS * bin_m
         own = float(returns.intensity[chosen[on_patch]].sum())
         dim = patch.pixels.size >= MIN_DIMMER_PX and own > MIN_DIMMER_LIGHT * light
-        error = _compute_median_error(patch, patch.coefficients, ray_length.ravel()[patch.pixels])
+        error = _compute_median_error(patch, ray_length)
         # noise far out of a surface's pulse makes no surface of its own
         dim = dim and error < DIMMER_BINS * bin_m
         if dim and all(_are_apart(patch, one, ray_length, bin_m) for one in patches):
@@ -156,10 +173,7 @@ def find_dimmer_patches(
 
 def _are_apart(patch: Patch, other: Patch, ray_length: FloatArray, bin_m: float) -> bool:
     """Whether two surfaces are apart where the first one is seen."""
-    length = ray_length.ravel()[patch.pixels]
-    here, there = (
-        length / (one.basis.evaluate(patch.pixels) @ one.coefficients) for one in (patch, other)
-    )
+    here, there = (one.compute_ranges(patch.pixels, ray_length) for one in (patch, other))
     return float(np.median(np.abs(here - there))) > DIMMER_REACH_BINS * bin_m
 
 
@@ -187,7 +201,7 @@ def reach_further(
     own = np.zeros(ray_length.shape, bool)
     own.ravel()[patch.pixels] = True
     pixel = returns.y.astype(np.intp) * ray_length.shape[1] + returns.x
-    fitted = ray_length.ravel()[pixel] / (patch.basis.evaluate(pixel) @ patch.coefficients)
+    fitted = patch.compute_ranges(pixel, ray_length)
     near = np.abs(returns.range - fitted) < NEIGHBOUR_BINS * bin_m
     if not (near & own.ravel()[pixel]).any():
         return own
@@ -287,8 +301,7 @@ def _fit_robustly(
 def _bend_where_needed(patch: Patch, ray_length: FloatArray, bin_m: float) -> Patch:
     """Give a patch splines where a quadratic does not follow its returns and they do."""
     shape = (ray_length.shape[0], ray_length.shape[1])
-    length = ray_length.ravel()[patch.pixels]
-    plain = _compute_median_error(patch, patch.coefficients, length)
+    plain = _compute_median_error(patch, ray_length)
     if plain < BEND_BINS * bin_m:
         return patch
     y, x = np.divmod(patch.pixels, shape[1])
@@ -299,7 +312,8 @@ def _bend_where_needed(patch: Patch, ray_length: FloatArray, bin_m: float) -> Pa
         for side in (box[2] - box[0], box[3] - box[1])
     )
     basis = SmoothBasis(shape, box, (down, across))
-    design, inverse = basis.evaluate(patch.pixels), length / patch.distance
+    design = basis.evaluate(patch.pixels)
+    inverse = ray_length.ravel()[patch.pixels] / patch.distance
     differences = make_second_differences(basis.pieces)
     floor = SPLINE_FLOOR * patch.pixels.size * np.eye(design.shape[1])
     penalty = floor + SPLINE_START_PENALTY * patch.pixels.size * differences.T @ differences
@@ -312,31 +326,27 @@ def _bend_where_needed(patch: Patch, ray_length: FloatArray, bin_m: float) -> Pa
     bent = Patch(
         patch.pixels, patch.distance, SmoothBasis(shape, box, basis.pieces, bending), coefficients
     )
-    return (
-        bent if _compute_median_error(bent, coefficients, length) < BENT_FRACTION * plain else patch
-    )
+    return bent if _compute_median_error(bent, ray_length) < BENT_FRACTION * plain else patch
 
 
-def _compute_median_error(patch: Patch, coefficients: FloatArray, length: FloatArray) -> float:
-    """Median distance of a patch's returns from a surface over its basis, m."""
-    fitted = length / (patch.basis.evaluate(patch.pixels) @ coefficients)
+def _compute_median_error(
+    patch: Patch, ray_length: FloatArray, coefficients: FloatArray | None = None
+) -> float:
+    """Median distance of a patch's returns from its surface, or another over its basis, m."""
+    fitted = patch.compute_ranges(patch.pixels, ray_length, coefficients)
     return float(np.median(np.abs(fitted - patch.distance)))
 
 
 def _merge(large: Patch, small: Patch, ray_length: FloatArray, bin_m: float) -> Patch | None:
     """Return both as one patch if one surface fits either as well as a surface of its own."""
-
-    def median_error(patch: Patch, coefficients: FloatArray) -> float:
-        return _compute_median_error(patch, coefficients, ray_length.ravel()[patch.pixels])
-
-    if median_error(small, large.coefficients) > MERGE_REACH_BINS * bin_m:
+    if _compute_median_error(small, ray_length, large.coefficients) > MERGE_REACH_BINS * bin_m:
         return None
     pixels = np.concatenate([large.pixels, small.pixels])
     joint = _fit_quadratic(pixels, np.concatenate([large.distance, small.distance]), ray_length)
     fits = all(
-        median_error(one, joint.coefficients)
+        _compute_median_error(one, ray_length, joint.coefficients)
         # in little light returns scatter by more than that about a surface of their own
-        < max(MERGE_BINS * bin_m, MERGE_EXCESS * median_error(one, one.coefficients))
+        < max(MERGE_BINS * bin_m, MERGE_EXCESS * _compute_median_error(one, ray_length))
         for one in (large, small)
     )
     return joint if fits else None
