@@ -18,6 +18,7 @@ from apps.conventions import (
 )
 from apps.figures.photons import make_range_figure
 from apps.figures.style import save_figure
+from apps.progress import show_progress
 from apps.verbs.cloud import CLOUD_SUFFIXES, DEPTH_SUFFIX
 from devices.photons import find_address
 from devices.photons import read_photons as read_counted_photons
@@ -172,7 +173,7 @@ def photons(
     found = (
         estimate_pixels(image, shape, background=_load_background(background), cycles=cycles)
         if single_pixel
-        else estimate_surface(image, shape, learn=pulse is None, max_returns=returns)
+        else _find_surfaces(image, shape, pulse is None, returns)
     )
     seen_by = choose_camera(
         known, image.image_shape, focal_length_px, field_of_view_deg, found.pulse.fwhm
@@ -204,6 +205,22 @@ def photons(
         point_cloud(found.to_returns(seen_by, past)).save(out)
     seen = np.isfinite(found.range)
     report(_make_figures(found, seen, time.perf_counter() - started, settings), as_json, [out])
+
+
+def _find_surfaces(
+    image: PhotonImage, pulse: Pulse | None, learn: bool, max_returns: int
+) -> SurfaceImage:
+    """Find the surface of every pixel, and show how much of the work is done."""
+    shown = 0
+    with show_progress("finding surfaces", 100) as advance:
+
+        def show(fraction: float) -> None:
+            nonlocal shown
+            percent = round(100 * fraction)
+            advance(percent - shown)
+            shown = percent
+
+        return estimate_surface(image, pulse, learn, max_returns, progress=show)
 
 
 def _list_inputs(file: str, *further: Path | None) -> tuple[Path, ...]:

@@ -141,9 +141,7 @@ class _Sample:
     fraction: float
 
 
-def fit_range_calibration(
-    shots: Sequence[TargetShot], camera: Camera | None = None, walk: bool | None = None
-) -> RangeFit:
+def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None) -> RangeFit:
     """Calibrate ranges by shots of a target at known distances.
 
     Parameters
@@ -151,8 +149,6 @@ def fit_range_calibration(
     shots : sequence of TargetShot
         From three on, of different brightness, they give the range walk; from two on the pixels'
         offsets and response.
-    camera : Camera, optional
-        That is to have the result; by default the first shot's.
     walk : bool, optional
         Whether a range walk must be fitted, or must not; by default where the shots can tell it.
 
@@ -168,7 +164,7 @@ def fit_range_calibration(
     """
     if not shots:
         raise InputError("a range calibration needs a shot of a target")
-    base = shots[0].returns.camera if camera is None else camera
+    base = shots[0].returns.camera
     pulse = SPEED_OF_LIGHT / 2 * base.pulse_fwhm
     _require_reach(shots)
     sample = _gather([_select_target(shot, base, pulse) for shot in shots])
