@@ -23,6 +23,7 @@ from tofclip.arrays import (
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, SparseMatrix
 from tofclip.operators.panels import PanelMatrix
+from tofclip.operators.panels.tiles import TileMatrix, arrange_matrix
 from tofclip.solvers.loops import PortableBatches, make_batches, write_frames
 from tofclip.solvers.method import Mask, Progress, Result, ignore_progress, validate_measurements
 from tofclip.threads import LANES, count_block_threads, limit_blas_threads, run_blocks
@@ -155,7 +156,8 @@ class PreparedInverse:
 
     Notes
     -----
-    Memory: in single precision the matrix is held twice, see `tofclip.operators.panels`.
+    Memory: in single precision the matrix is held twice, or two and a half times on a processor with
+    matrix registers; see `tofclip.operators.panels.tiles`.
     """
 
     operator: LinearOperator
@@ -170,9 +172,9 @@ class PreparedInverse:
         return PerDevice(partial(ComputeDevice.put, values=every))
 
     @cached_property
-    def _panels(self) -> PanelMatrix | None:
+    def _panels(self) -> PanelMatrix | TileMatrix | None:
         """The inverse as compiled products take it, which are for single precision."""
-        return PanelMatrix(self.inverse_gram) if self.operator.dtype == np.float32 else None
+        return arrange_matrix(self.inverse_gram) if self.operator.dtype == np.float32 else None
 
     @cached_property
     def _stretches(self) -> NDArray[np.int64]:
