@@ -81,3 +81,9 @@ def test_no_registers_are_asked_for_where_the_compiler_knows_of_none(monkeypatch
 def test_without_registers_a_matrix_is_multiplied_in_panels(monkeypatch):
     monkeypatch.setattr(tiles, "request_tile_registers", lambda: False)
     assert isinstance(arrange_matrix(np.ones((3, 4), np.float32)), PanelMatrix)
+
+
+def test_without_registers_no_matrix_is_put_into_tiles(monkeypatch):
+    monkeypatch.setattr(tiles, "request_tile_registers", lambda: False)
+    with pytest.raises(RuntimeError, match="registers"):
+        TileMatrix(np.ones((3, 4), np.float32))

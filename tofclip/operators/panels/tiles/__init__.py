@@ -64,6 +64,11 @@ class TileMatrix:
     matrix : (rows, columns) float32 array
         Finite.
 
+    Raises
+    ------
+    RuntimeError
+        The processor's matrix registers may not be used; see `arrange_matrix`.
+
     Notes
     -----
     Memory: one and a half times the matrix, which is held on to as well.
@@ -79,6 +84,8 @@ class TileMatrix:
             split_lanes,
         )
 
+        if not request_tile_registers():  # the first instruction would end the process
+            raise RuntimeError("this process may not use the processor's matrix registers")
         self.shape, self._matrix = matrix.shape, matrix
         rows, columns = matrix.shape
         number, depths = -(-rows // PANEL_ROWS), max(1, -(-columns // TILE_DEPTH))
