@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import os
 import subprocess
 import sys
 import threading
@@ -20,6 +19,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from apps.processes import prepare_module_run
 from tofclip.compile_observers import observers, suppliers
 from tofclip.threads import thread_count
 
@@ -225,15 +225,14 @@ class _Compilation:
 
 
 def _start_process() -> subprocess.Popen[str]:
-    root = str(Path(__file__).resolve().parents[1])
-    paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
+    command, environment = prepare_module_run("apps.compile_ahead")
     return subprocess.Popen(
-        [sys.executable, "-m", "apps.compile_ahead"],
+        command,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        env=environment,
     )
 
 

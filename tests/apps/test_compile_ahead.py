@@ -72,6 +72,18 @@ def test_a_call_waits_for_the_process_that_compiles_the_loop(loop: Any) -> None:
     assert not suppliers
 
 
+def test_processes_compile_the_program_that_runs_not_one_in_the_users_folder(
+    loop: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As where it is installed, and started in a checkout."""
+    for name in ("apps", "tofclip"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise SystemExit")
+    monkeypatch.chdir(tmp_path)
+    with compile_ahead.compile_loops_ahead():
+        assert call(loop) == (1, 0)
+
+
 def test_what_is_called_first_is_compiled_first() -> None:
     first, second = list(compile_ahead.LOOPS)[:2]
     compilation = compile_ahead._Compilation([first, second])
@@ -92,7 +104,7 @@ def test_what_is_called_first_is_compiled_first() -> None:
 def test_a_process_that_fails_leaves_the_loops_to_be_compiled_when_they_are_called(
     program: str, loop: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compile_ahead.sys, "executable", program)
+    monkeypatch.setattr(sys, "executable", program)
     with compile_ahead.compile_loops_ahead():
         assert call(loop) == (0, 1)
 
