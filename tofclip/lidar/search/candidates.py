@@ -120,7 +120,7 @@ def find_candidates(
         See `PhaseTable`.
     score : (1 + bins + WORD_BINS + 1,) float32 array
         Zero where the sharp filter is not applied; overwritten elsewhere. One bin late.
-    places : (3, bins) int32 array
+    places : (4, bins) int32 array
         Overwritten.
     responses : (bins,) float32 array
         Overwritten.

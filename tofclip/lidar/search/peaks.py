@@ -16,6 +16,7 @@ from tofclip.vectors import (
     LENGTH,
     STEP,
     choose,
+    count_set_lanes,
     fill_vector,
     find_first_bit,
     find_highest_lane,
@@ -33,7 +34,7 @@ search_step = compile_loop(fastmath=SUMS_IN_ANY_ORDER)
 search_part = compile_as_part(fastmath=SUMS_IN_ANY_ORDER, _nrt=False)
 
 ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
-VECTORS_PER_WORD = 4
+VECTORS_PER_WORD = 2
 WORD_BINS = VECTORS_PER_WORD * LENGTH
 """Bins whose maxima are listed together, a bit for each."""
 
@@ -73,7 +74,7 @@ def take_strongest_peaks(
         A brightness, number of bins, and sums over the bins of what is above it and of its square.
     listed : int
         Number of maxima.
-    places : (3, bins) int32 array
+    places : (4, bins) int32 array
         Of `list_maxima`; where a peak is taken its zero becomes 1.
     responses : (bins,) float32 array
         Overwritten at these: response of the matched filter.
@@ -214,7 +215,8 @@ def make_key(height, entry):
     -------
     int32
     """
-    return np.int32((np.float32(height).view(np.int32) & -LENGTH) | (entry & (LENGTH - 1)))
+    lane = np.int32(entry) & (LENGTH - 1)
+    return np.int32((np.float32(height).view(np.int32) & -LENGTH) | lane)
 
 
 @inlined
@@ -313,9 +315,9 @@ def list_maxima(score, of_interest, words, level, places):
     score, of_interest, words
         As for `tofclip.lidar.search.candidates.find_candidates`. Of a level top the last bin
         counts.
-    places : (3, bins) int32 array
+    places : (4, bins) int32 array
         Overwritten: bins of the maxima, keys of their scores (`make_key`) with zeros behind the last
-        one, and zeros.
+        one, zeros, and what is only needed meanwhile.
     level : float32
         Score of the background.
 
@@ -323,21 +325,30 @@ def list_maxima(score, of_interest, words, level, places):
     -------
     int
     """
-    zero, background, listed = fill_vector(np.float32(0)), fill_vector(level), 0
-    for number in range(words.size):
-        begin, bits = np.uintp(words[number]), np.uint64(0)
+    zero, background, filled, listed = fill_vector(np.float32(0)), fill_vector(level), 0, 0
+    for word in range(np.uintp(0), np.uintp(words.size)):
+        begin, bits = np.uintp(words[word]), np.uint64(0)
         for vector in range(VECTORS_PER_WORD):
             j = begin + np.uintp(LENGTH * vector)
             here = load_vector(score, j + ONE)
             wanted = (here > load_vector(of_interest, j) + background) & (here > zero)
             highest = (here >= load_vector(score, j)) & (here > load_vector(score, j + ONE + ONE))
-            bits |= list_set_lanes(wanted & highest) << np.uint64(LENGTH * vector)
-        while bits:
-            at = begin + np.uintp(find_first_bit(bits))
-            bits &= bits - np.uint64(1)
-            places[0, listed] = at
-            places[1, listed] = make_key(score[at + ONE], listed)
-            listed += 1
+            found = wanted & highest
+            bits |= list_set_lanes(found) << np.uint64(LENGTH * vector)
+            listed += count_set_lanes(found)
+        places[2, filled] = np.int32(bits)  # all 32 of them
+        places[3, filled] = begin
+        filled += 1 if bits > np.uint64(0) else 0
+    # One loop over the maxima of all words: a processor guesses only once where it ends.
+    word, bits = 0, np.uint64(np.uint32(places[2, 0]))
+    for entry in range(np.uintp(0), np.uintp(listed)):
+        at = np.uintp(places[3, word]) + np.uintp(find_first_bit(bits))
+        places[0, entry] = at
+        places[1, entry] = make_key(score[at + ONE], entry)
+        bits &= bits - np.uint64(1)
+        word += 1 if bits == np.uint64(0) else 0
+        following = np.uint64(np.uint32(places[2, word]))
+        bits = following if bits == np.uint64(0) else bits
     none = fill_vector(np.int32(0))
     store_vector(places[1], np.uintp(listed), none)  # what fills up the last vector
     for k in range(np.uintp(0), np.uintp(listed), STEP):

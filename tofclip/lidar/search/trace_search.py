@@ -46,7 +46,7 @@ class SearchMemory:
     moments : (pixels, 2) array
     peaks : (returns, 2) array
     score, responses, free : float32 arrays
-    places : (3, bins) int32 array
+    places : (4, bins) int32 array
         See `tofclip.lidar.search.candidates.find_candidates`.
     candidates : (pixels * returns, CANDIDATE_COLUMNS) array
     rests : (pixels * returns, width) float32 array
@@ -201,7 +201,7 @@ class TraceSearch:
             moments=np.empty((pixels, 2)),
             peaks=np.empty((most, 2)),
             score=np.zeros(length + WORD_BINS + 2, np.float32),
-            places=np.zeros((3, length), np.int32),
+            places=np.zeros((4, length), np.int32),
             responses=np.empty(length, np.float32),
             free=self._weights.copy(),
             candidates=np.empty((pixels * most, CANDIDATE_COLUMNS)),
