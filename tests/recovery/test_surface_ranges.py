@@ -13,7 +13,9 @@ from tofclip.recovery.surfaces.basis import SmoothBasis
 from tofclip.recovery.surfaces.derivatives import (
     CLUSTER_COLUMNS,
     CLUSTER_ROWS,
+    ClusterProducts,
     Derivatives,
+    NormalEquations,
     multiply_derivatives,
 )
 from tofclip.recovery.surfaces.fit import extrapolate_steps, straighten_surfaces
@@ -163,3 +165,26 @@ def test_what_steps_take_from_the_misfit_is_given_back():
         plain += np.diag(inverse @ (scores.T @ scores) @ inverse) / draws
     assert np.mean(told / np.diag(inverse)) == pytest.approx(1, abs=0.08)
     assert np.mean(plain / np.diag(inverse)) < 0.9
+
+
+def test_what_the_shot_says_nothing_about_leaves_other_scores_alone():
+    """Rounding makes the covariance of two unknowns that nothing tells apart indefinite."""
+    draw = np.random.default_rng(1)
+    images = draw.standard_normal((3, 2 * CLUSTER_ROWS, 2 * CLUSTER_COLUMNS)).astype(np.float32)
+    group = Derivatives([("gains", 0, view) for view in range(3)], 0, 0, images)
+    misfit = draw.standard_normal(images.shape[1:]).astype(np.float32)
+    found = multiply_derivatives([group], np.ones_like(misfit), misfit, misfit)
+    inverse = np.linalg.inv(found.normal)
+    usual = found.sum_squared_scores(inverse)
+    rounded = np.zeros((4, 4))
+    rounded[:3, :3] = inverse
+    rounded[3, 3] = -1e-18  # a fourth unknown, of which there are no derivatives
+    silent = [
+        (np.arange(4), np.pad(product, (0, 1)), np.append(score, np.float32(0)))
+        for _, product, score in found.clusters
+    ]
+    clusters = [ClusterProducts(*cluster) for cluster in silent]
+    wider = NormalEquations(np.pad(found.normal, (0, 1)), np.append(found.slope, 0), clusters)
+    seen = wider.sum_squared_scores(rounded)
+    np.testing.assert_allclose(seen[:3, :3], usual, rtol=1e-9)
+    np.testing.assert_allclose(seen[3], 0, atol=1e-9 * usual.max())

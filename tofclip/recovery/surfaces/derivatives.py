@@ -16,6 +16,7 @@ from tofclip.units import SPEED_OF_LIGHT
 
 WIDTH_STEP = 0.02  # relative; for the derivative by a pulse's width
 CLUSTER_ROWS, CLUSTER_COLUMNS = 12, 48  # measurements whose misfits may depend on each other
+LEAST_VARIANCE = 1e-12  # of the largest one
 MAX_LEVERAGE = 0.9  # of a cluster: what it alone determines, its misfit says nothing about
 
 
@@ -178,12 +179,24 @@ class NormalEquations(NamedTuple):
         """
         scores = np.zeros((len(self.clusters), self.slope.size))
         for score, (own, normal, pull) in zip(scores, self.clusters, strict=True):
-            factor = np.linalg.cholesky(inverse[np.ix_(own, own)])
+            factor, inverse_factor = _take_root(inverse[np.ix_(own, own)])
             leverage, directions = np.linalg.eigh(factor.T @ normal @ factor)
             left = np.sqrt(1 - np.clip(leverage, 0, MAX_LEVERAGE))
             along = directions.T @ (factor.T @ pull)
-            score[own] = np.linalg.solve(factor.T, directions @ (along / left))
+            score[own] = inverse_factor.T @ (directions @ (along / left))
         return scores.T @ scores
+
+
+def _take_root(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return F with ``F F' = C``, and its inverse.
+
+    Products in float32 may leave a covariance with a variance of zero or below along directions that
+    a shot says nothing about, where no Cholesky factor is. There it is taken for very small.
+    """
+    unit = np.sqrt(np.maximum(np.abs(np.diag(covariance)), np.finfo(np.float64).tiny))
+    variances, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
+    deviations = np.sqrt(np.maximum(variances, LEAST_VARIANCE * variances.max()))
+    return unit[:, np.newaxis] * axes * deviations, (axes / deviations).T / unit
 
 
 def multiply_derivatives(

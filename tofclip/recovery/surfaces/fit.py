@@ -28,6 +28,7 @@ from tofclip.recovery.surfaces.refusal import (
 from tofclip.recovery.surfaces.state import SurfaceState
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import Progress, ignore_progress
+from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
 START_ITERATIONS = 25
@@ -66,6 +67,7 @@ class SurfaceFit:
         return START_ITERATIONS + self.refinement.steps * REFINEMENT_ITERATIONS
 
 
+@limit_blas_threads()  # products of a few dozen columns are too small to share
 def fit_surfaces(
     streak: Streak,
     frames: Frames,
@@ -165,6 +167,7 @@ def straighten_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
     return solver
 
 
+@limit_blas_threads()
 def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFit | None:
     """Fit the surfaces of the shot before to the next one of the same camera.
 

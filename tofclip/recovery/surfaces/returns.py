@@ -11,6 +11,7 @@ from tofclip.lidar.range_correction import correct_returns
 from tofclip.recovery.surfaces.fit import SurfaceFit
 from tofclip.recovery.surfaces.model import FloatArray, Image
 from tofclip.shots import Returns
+from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
@@ -20,6 +21,7 @@ EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the squar
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
 
 
+@limit_blas_threads()
 def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float = 0.0) -> Returns:
     """List the points that stand out of the noise and of their neighbourhood, pixel by pixel.
 
