@@ -13,12 +13,19 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
+import numpy as np
 from numba import njit
 from numba.core import event
 from numba.core.caching import FunctionCache
 from numba.extending import register_jitable
 
 from tofclip.compile_observers import observers, suppliers
+
+SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
+"""What sums in vectors need; unlike all of ``fastmath`` it leaves infinities and NaN what they are."""
+
+ONE = np.uintp(1)
+"""For numbers without a sign: beside one with a sign the compiler would make both floats."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 

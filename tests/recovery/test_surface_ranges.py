@@ -151,7 +151,7 @@ def test_what_steps_take_from_the_misfit_is_given_back():
     weights = np.ones((rows, columns), np.float32)
     flat = images.reshape(7, -1).astype(np.float64)
     inverse = np.linalg.inv(flat @ flat.T)
-    told, plain = np.zeros((2, 7))
+    stated, plain = np.zeros((2, 7))
     draws = 60
     for _ in range(draws):
         noise = draw.standard_normal((rows, columns)).astype(np.float32)
@@ -160,10 +160,10 @@ def test_what_steps_take_from_the_misfit_is_given_back():
         found = multiply_derivatives([group], weights, left, left)
         np.testing.assert_allclose(found.normal, flat @ flat.T, rtol=1e-4, atol=0.1)
         np.testing.assert_allclose(found.slope, 0, atol=0.1)
-        told += np.diag(inverse @ found.sum_squared_scores(inverse) @ inverse) / draws
+        stated += np.diag(inverse @ found.sum_squared_scores(inverse) @ inverse) / draws
         scores = np.array([score for _, _, score in found.clusters])
         plain += np.diag(inverse @ (scores.T @ scores) @ inverse) / draws
-    assert np.mean(told / np.diag(inverse)) == pytest.approx(1, abs=0.08)
+    assert np.mean(stated / np.diag(inverse)) == pytest.approx(1, abs=0.08)
     assert np.mean(plain / np.diag(inverse)) < 0.9
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofclip.compiling import compile_loop, inlined
+from tofclip.compiling import ONE, compile_loop, inlined
 from tofclip.vectors import (
     LENGTH,
     STEP,
@@ -19,8 +19,6 @@ from tofclip.vectors import (
     store_vector,
     sum_vector,
 )
-
-ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
 
 fast_loop = compile_loop(fastmath=True)
 

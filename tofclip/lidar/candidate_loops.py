@@ -10,10 +10,8 @@ import math
 
 import numpy as np
 
-from tofclip.compiling import compile_loop, inlined
+from tofclip.compiling import ONE, compile_loop, inlined
 from tofclip.units import SPEED_OF_LIGHT
-
-ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
 
 
 @compile_loop()

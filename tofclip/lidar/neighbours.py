@@ -23,7 +23,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.compiling import compile_as_part, compile_loop, inlined
+from tofclip.compiling import ONE, compile_as_part, compile_loop, inlined
 from tofclip.lidar.detection import find_quantile_value
 from tofclip.threads import run_blocks
 from tofclip.vectors import (
@@ -41,7 +41,6 @@ from tofclip.vectors import (
 
 FloatArray = NDArray[np.float64]
 
-ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
 
 plane_part = compile_as_part(fastmath=True, _nrt=False)
 

@@ -10,10 +10,9 @@ import math
 
 import numpy as np
 
-from tofclip.compiling import inlined
+from tofclip.compiling import ONE, inlined
 from tofclip.lidar.detection import PREFIT_THRESHOLD_FACTOR
 from tofclip.lidar.search.peaks import (
-    ONE,
     apply_filter,
     compute_response,
     list_maxima,

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from tofclip.compiling import compile_as_part, compile_loop, inlined
+from tofclip.compiling import ONE, SUMS_IN_ANY_ORDER, compile_as_part, compile_loop, inlined
 from tofclip.lidar.detection import PREFIT_THRESHOLD_FACTOR
 from tofclip.vectors import (
     LENGTH,
@@ -27,13 +27,9 @@ from tofclip.vectors import (
     sum_vector,
 )
 
-SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
-"""What sums in vectors need; unlike all of ``fastmath`` it leaves infinities and NaN what they are."""
-
 search_step = compile_loop(fastmath=SUMS_IN_ANY_ORDER)
 search_part = compile_as_part(fastmath=SUMS_IN_ANY_ORDER, _nrt=False)
 
-ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
 VECTORS_PER_WORD = 2
 WORD_BINS = VECTORS_PER_WORD * LENGTH
 """Bins whose maxima are listed together, a bit for each."""

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from tofclip.compiling import inlined
+from tofclip.compiling import ONE, inlined
 from tofclip.lidar.detection import CONVERGENCE_STEP_BINS, MAX_FIT_ROUNDS
 from tofclip.lidar.search.candidates import (
     FIRST_OFFSET,
@@ -30,7 +30,7 @@ from tofclip.lidar.search.candidates import (
     cut_out,
     is_near,
 )
-from tofclip.lidar.search.peaks import ONE, search_step
+from tofclip.lidar.search.peaks import search_step
 from tofclip.lidar.search.phase_table import MAX_OFFSET_BINS, PHASES_PER_BIN
 from tofclip.vectors import (
     STEP,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofclip.compiling import compile_loop, inlined
+from tofclip.compiling import ONE, SUMS_IN_ANY_ORDER, compile_loop, inlined
 from tofclip.lidar.signal_rows.windows import FRACTION_SLACK, FRACTIONS
 from tofclip.vectors import (
     LENGTH,
@@ -21,11 +21,9 @@ from tofclip.vectors import (
     store_vector,
 )
 
-FASTMATH = {"contract", "nsz", "arcp", "reassoc"}
-vectorised = compile_loop(fastmath=FASTMATH)
-vectorised_with_room = compile_loop(fastmath=FASTMATH, _nrt=True)
+vectorised = compile_loop(fastmath=SUMS_IN_ANY_ORDER)
+vectorised_with_room = compile_loop(fastmath=SUMS_IN_ANY_ORDER, _nrt=True)
 
-ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
 VECTORS = 4
 WORD_FRAMES = VECTORS * LENGTH
 """Frames whose marks are a bit each of a whole number."""

@@ -19,7 +19,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from tofclip.compiling import compile_loop, inlined
+from tofclip.compiling import ONE, compile_loop, inlined
 from tofclip.vectors import LENGTH
 
 BYTE, INDEX_TYPE = ir.IntType(8), ir.IntType(64)
@@ -38,7 +38,7 @@ PAIRS = ((0, 2), (0, 1), (1, 1), (1, 0), (2, 0), (0, 0))
 """Parts of the matrix and of the operand that are multiplied, in an order that changes one at a
 time and adds the smallest first within a depth."""
 
-ONE, TWO, ROWS = np.uintp(1), np.uintp(2), np.uintp(TILE_ROWS)
+TWO, ROWS = np.uintp(2), np.uintp(TILE_ROWS)
 HALF = np.uint32(16)
 
 SUM_DEPTHS = 20
