@@ -70,8 +70,14 @@ def test_every_occluder_has_a_person_behind_it() -> None:
     assert len(bush.target) == len(make_occlusion_scene("person").target)
 
 
-def test_a_person_walks_while_one_looks() -> None:
+def test_a_person_walks_while_one_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slowly(experiment: Experiment, opens: float) -> Any:
+        time.sleep(0.05)
+        return look_behind(experiment, opens)
+
+    monkeypatch.setattr("apps.occlusion.live.look_behind", slowly)
     settings = ExperimentSettings(side_px=24, sampling_ratio=1.0)
+    began = time.monotonic()
     with contextlib.closing(WalkSource(make_walking_scene("person"), settings)) as source:
         session = Session(source)
         assert session.label == "LIVE"
@@ -85,7 +91,8 @@ def test_a_person_walks_while_one_looks() -> None:
             time.sleep(0.02)
         assert "nothing is promised" in source.describe_frame(len(source) - 1)
         assert not np.allclose(source.pictures(3, session.gate_at(3))[below], first)
-        assert 0 < source.latency < 20
+        # Steps come one after the other, each after its wait.
+        assert 0.05 <= source.latency < time.monotonic() - began - 3 * 0.05
     assert not source.is_live
     assert source.failure_text == ""
 

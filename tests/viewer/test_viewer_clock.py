@@ -34,6 +34,18 @@ def test_the_end_stops_it_or_begins_anew() -> None:
     assert (clock.tick(10.55, 0, 4), clock.playing) == (1, True)
 
 
+def test_a_loop_runs_through_the_frames_that_are_left_at_their_own_pace() -> None:
+    """Of a live source the first ones are forgotten: frame 10 of 4 to 9 is 4, and so on."""
+    clock = PlaybackClock(10.0)
+    clock.loop = True
+    clock.jump(4, 4, 10)
+    clock.play(4, 10)
+    clock.tick(0.0, 4, 10)
+    # In the middle of each frame's tenth of a second.
+    due = [clock.tick(0.05 + number / 10, 4, 10) for number in range(15)]
+    assert due == [4 + number % 6 for number in range(15)]
+
+
 def test_steps_and_jumps_stay_among_the_frames() -> None:
     clock = PlaybackClock(10.0)
     clock.jump(3, 0, 5)
