@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 RANGE_IMAGE_SUFFIX = ".npz"
 DEFAULT_FIELD_OF_VIEW_DEG = 30.0
 
+MAX_RETURNS = 255
+"""Of a pixel: clouds number them in a byte."""
+
 
 def photons(
     file: Annotated[
@@ -142,14 +145,20 @@ def photons(
         ),
     ] = None,
     returns: Annotated[
-        int, typer.Option(metavar="N", help="Surfaces looked for in each pixel.")
+        int,
+        typer.Option(
+            metavar="N",
+            help="Surfaces looked for in each pixel; pictures, .exr among them, show the strongest.",
+        ),
     ] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Find the surface that counted photons show, with the deviation of every range.
 
     Pulse, background and how far neighbours help each other are found from the photons. Hot pixels
-    are left out, counted, and marked in a range image (hot_pixels).
+    are left out, counted, and marked in a range image (hot_pixels). Of several --returns a range
+    image holds the strongest in range_m and all of them in returns_range_m (rows, columns, returns),
+    NaN where there is none; likewise range_sigma_m, intensity and outlier_probability.
 
     Example: tofclip lidar photons cube.npy --bin-width-ps 80 --pulse-ps 400 --out range.npz
     """
@@ -161,8 +170,8 @@ def photons(
     require_writable(out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, *PICTURE_SUFFIXES, inputs=inputs)
     if pulse is not None and pulse_ps is not None:
         raise InputError("give the pulse's width (--pulse-ps) or its shape (--pulse), not both")
-    if returns < 1:
-        raise InputError(f"at least one return is looked for in a pixel, got --returns {returns}")
+    if not 1 <= returns <= MAX_RETURNS:
+        raise InputError(f"--returns: 1 to {MAX_RETURNS} are looked for in a pixel, got {returns}")
     require_view(focal_length_px, field_of_view_deg)
     known = None if camera is None else Camera.load(camera)
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
@@ -171,7 +180,13 @@ def photons(
     if pulse_ps is not None:
         shape = Pulse.gaussian(pulse_ps * PICOSECOND)
     found = (
-        estimate_pixels(image, shape, background=_load_background(background), cycles=cycles)
+        estimate_pixels(
+            image,
+            shape,
+            background=_load_background(background),
+            cycles=cycles,
+            max_returns=returns,
+        )
         if single_pixel
         else _find_surfaces(image, shape, pulse is None, returns)
     )
@@ -196,7 +211,7 @@ def photons(
     past = build_provenance({"verb": "lidar photons", "source": file, **settings}, *inputs)
     # The ending of the name chooses what is written.
     if suffix == RANGE_IMAGE_SUFFIX:
-        save_range_image(found, seen_by, out)
+        save_range_image(found, seen_by, out, returns)
     elif suffix in PICTURE_SUFFIXES:
         save_figure(make_range_figure(found), out)
     elif suffix == DEPTH_SUFFIX:
@@ -319,9 +334,11 @@ def choose_camera(
     return make_pinhole(image_shape, float(focal_length_px or usual), pulse_fwhm)
 
 
-def save_range_image(found: SurfaceImage, camera: Camera, path: Path) -> None:
+def save_range_image(found: SurfaceImage, camera: Camera, path: Path, returns: int = 1) -> None:
     """Write ranges, deviations, photons and outlier probabilities to an NPZ file, whole or not at
-    all; reflectances too, where the camera knows them, and the mask of hot pixels, if any.
+    all; reflectances too, where the camera knows them, and the mask of hot pixels, if any. Where
+    several returns were looked for, the same of all of them, the strongest first, behind the
+    picture's rows and columns: (rows, columns, returns).
     """
     known = camera.range_calibration
     further: dict[str, Any] = {}
@@ -331,12 +348,17 @@ def save_range_image(found: SurfaceImage, camera: Camera, path: Path) -> None:
         further["reflectance_percent"] = known.compute_reflectance(
             found.intensity * found.range**2, *np.indices(found.range.shape)
         )
+    layers: list[dict[str, Any]] = [
+        {
+            "range_m": one.range,
+            "range_sigma_m": one.range_sigma,
+            "intensity": one.intensity,
+            "outlier_probability": one.outlier_probability,
+        }
+        for one in (found, *found.further)
+    ]
+    if returns > 1:
+        for name in layers[0]:
+            further[f"returns_{name}"] = np.stack([one[name] for one in layers], axis=-1)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(
-            file,
-            range_m=found.range,
-            range_sigma_m=found.range_sigma,
-            intensity=found.intensity,
-            outlier_probability=found.outlier_probability,
-            **further,
-        )
+        np.savez_compressed(file, **layers[0], **further)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -320,6 +321,9 @@ def test_a_time_zero_of_the_wrong_sign_is_named(run: Run, files: Path, folder: P
     assert run(*words, "--time-zero-ns", "5").status == 0
     outcome = run("cloud", folder / "frames.h5", "--out", folder / "cloud.ply")
     assert_refused(outcome, "returns have negative ranges (-0.6")
+    highest = re.search(r" to (\S+) m\)", outcome.err)
+    assert highest is not None
+    assert float(highest[1]) < 0
     assert "check the sign of --time-zero-ns" in outcome.err
 
 

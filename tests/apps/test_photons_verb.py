@@ -236,3 +236,50 @@ def test_a_given_background_and_cycles_are_used(run: Run, tmp_path: Path) -> Non
         outcome = run(*words, *option, "--out", tmp_path / "range.npz")
         assert outcome.status == 2
         assert "--single-pixel" in outcome.err
+
+
+def test_all_returns_of_a_pixel_are_in_a_range_image(run: Run, tmp_path: Path) -> None:
+    """A pane before a wall, 40 photons each: both are in the file, with and without neighbours."""
+    noise = np.random.default_rng(5)
+    cube = noise.poisson(0.01, (24, 32, 200))
+    for surface in (50.0, 140.0):
+        pixel = np.repeat(np.arange(24 * 32), noise.poisson(40, 24 * 32))
+        time = np.rint(surface + noise.normal(0, 2.1, pixel.size)).astype(int)
+        np.add.at(cube.reshape(-1, 200), (pixel, time), 1)
+    path, out = tmp_path / "pane.npy", tmp_path / "range.npz"
+    np.save(path, cube.astype(np.uint16))
+    words = ["lidar", "photons", path, "--out", out, "--bin-width-ps", "80", "--pulse-ps", "400"]
+    for further in ([], ["--single-pixel"]):
+        outcome = run(*words, "--returns", "3", *further, "--json")
+        assert (outcome.status, outcome.err) == (0, "")
+        figures = json.loads(outcome.out)
+        with np.load(out) as written:
+            assert set(written) == FIELDS | {f"returns_{name}" for name in FIELDS}
+            found = written["returns_range_m"] / BIN_M
+            for name in FIELDS:
+                every = written[f"returns_{name}"]
+                assert every.shape[:2] == (24, 32)
+                np.testing.assert_array_equal(every[..., 0], written[name])
+        assert np.isfinite(found).sum() == figures["returns"] > 1.98 * 24 * 32
+        for surface in (50, 140):
+            assert np.mean((np.abs(found - surface) < 3).any(axis=-1)) > 0.99
+
+
+def test_what_no_counter_shows_is_refused_in_a_line(run: Run, shot, tmp_path: Path) -> None:
+    """ns given for ps, a pulse longer than the record, and more returns than a cloud numbers."""
+    words = ["lidar", "photons", shot[0], "--out", tmp_path / "range.npz"]
+    for further, needed in (
+        (["--bin-width-ps", "0.08"], "finer than any counter's; check the unit of --bin-width-ps"),
+        (
+            ["--bin-width-ps", "0.16"],
+            "shorter than any counter's; check the unit of --bin-width-ps",
+        ),
+        (["--bin-width-ps", "0.8", "--pulse-ps", "400"], "longer than all 200 bins"),
+        (["--bin-width-ps", "80", "--returns", "1000000000"], "--returns: 1 to 255"),
+    ):
+        for alone in ([], ["--single-pixel"]):
+            outcome = run(*words, *further, *alone)
+            assert outcome.status == 2
+            assert needed in outcome.err
+            assert outcome.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

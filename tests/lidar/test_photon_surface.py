@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.io import loadmat
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Pulse
-from tofclip.lidar.photons import PhotonImage, SurfaceImage, estimate_surface, make_pinhole
-from tofclip.lidar.photons.response import measure_pulse_width
+from tofclip.lidar.photons import (
+    PhotonImage,
+    SurfaceImage,
+    estimate_surface,
+    make_pinhole,
+    matching,
+)
+from tofclip.lidar.photons.response import BinnedResponse, measure_pulse_width
+from tofclip.lidar.photons.scene import Scene
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN = 80e-12
@@ -182,3 +191,49 @@ def test_two_layers_are_both_found_and_none_twice() -> None:
     assert returns.return_number.max() >= 2
     one_pixel = (returns.y == 24) & (returns.x == 30)
     assert np.all(np.diff(returns.range[one_pixel]) > 0)
+
+
+def test_times_in_steps_of_the_counter_are_no_pulse() -> None:
+    """94,000 photons in 200,000 bins of 1 ps, counted in steps of 16 ps.
+
+    Pairs of equal times were taken for a pulse of a bin, of which 0.01 ps were learnt: 3.3 GB, and
+    deviations 9000 times too small.
+    """
+    noise = np.random.default_rng(0)
+    y, x = np.mgrid[:96, :96]
+    surface = 80000 + 20 * x - np.where(np.hypot(y - 50, x - 60) < 30, 15000, 0.0)
+    pixel = noise.integers(0, surface.size, 94000)
+    time = np.where(
+        np.arange(pixel.size) < 55000,
+        surface.ravel()[pixel] + noise.normal(0, 400 / 2.3548, pixel.size),
+        noise.uniform(0, 200000, pixel.size),
+    )
+    steps = 16 * np.rint(time / 16)
+    found = estimate_surface(PhotonImage.from_events(pixel, steps, surface.shape, 1e-12, 200_001))
+    assert found.pulse.fwhm == pytest.approx(400e-12, rel=0.15)
+    error = found.range / (SPEED_OF_LIGHT / 2 * 1e-12) - surface
+    near = np.abs(error) < 400
+    assert near.mean() > 0.99
+    # a learnt response is known to an eighth of its width
+    assert np.sqrt(np.mean(error[near] ** 2)) < 400 / 8
+    assert np.median(found.range_sigma) > SPEED_OF_LIGHT / 2 * 1e-12 * 400 / 10
+    assert error.std() < 2000
+
+
+def test_the_search_keeps_to_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables of tiles on a long axis, and the labels that they leave: a 64th of the usual limit."""
+    limit = matching.MAX_VOLUME_BYTES // 64
+    monkeypatch.setattr(matching, "MAX_VOLUME_BYTES", limit)
+    noise = np.random.default_rng(0)
+    shape, bins = (128, 128), 100_000
+    pixel = noise.integers(0, 128 * 128, 20_000)
+    photons = PhotonImage.from_events(
+        pixel, np.floor(noise.uniform(0, bins, pixel.size)), shape, 1e-12, bins
+    )
+    scene = Scene(BinnedResponse.from_pulse(Pulse.gaussian(4e-12), 1e-12), 1e-6)
+    tracemalloc.start()
+    axis = matching.choose_label_axis(photons, scene)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < limit
+    assert 8 * 128 * 128 * axis.numbers.size <= limit

@@ -140,10 +140,12 @@ def _explain_empty_cloud(frames: Frames) -> str:
     if first < 0:
         # The same search with every time of flight positive shows whether the time zero is wrong.
         later = depth(replace(frames, times=frames.times - first + (last - first)))
-        if len(later):
-            ranges = later.range - SPEED_OF_LIGHT * (last - 2 * first) / 2
+        ranges = later.range - SPEED_OF_LIGHT * (last - 2 * first) / 2
+        early = ranges[ranges < 0]
+        if early.size:
             return (
-                f"all {len(later)} returns have negative ranges ({ranges.min():.3g} to {ranges.max():.3g} m): "
+                f"{early.size} of {ranges.size} returns have negative ranges "
+                f"({early.min():.3g} to {early.max():.3g} m): "
                 "time zero is later than the light; check the sign of `time_zero`"
             )
     return "no return stands out of the background, so there is no point to write"

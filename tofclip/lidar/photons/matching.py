@@ -5,6 +5,7 @@ filter responses as scores.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,12 +20,16 @@ LABELS_PER_WIDTH = 2
 """Coarse bins in the full width of the response."""
 
 MAX_VOLUME_BYTES = 1 << 31
-"""Memory of the two volumes (pixels, labels) of float32; a longer axis gets coarser labels."""
+"""Memory of the two volumes (pixels, labels) of float32, and of the tables of tiles before them; a
+longer axis gets coarser labels."""
 
 JUMP_COST_RATIO = 7.0
 """Any larger change costs this many times as much."""
 
 TILE_PX = 16
+
+TILE_TABLES = 3
+"""Of (tiles, coarse bins) float64 at once: counts, their pooled sums, and a copy that is sorted."""
 
 MIN_TILE_SIGNIFICANCE = 5.0
 """Standard deviations above the background at which a tile of the picture says that some surface
@@ -83,6 +88,9 @@ def choose_label_axis(photons: PhotonImage, scene: Scene) -> LabelAxis:
     coarse = max(1, round(scene.response.width / LABELS_PER_WIDTH))
     while True:
         total = int(np.ceil((photons.bins + 1) / coarse))
+        if TILE_TABLES * 8 * count_tiles(photons.image_shape) * total > MAX_VOLUME_BYTES:
+            coarse *= 2
+            continue
         axis = LabelAxis(coarse, np.arange(total), total)
         numbers = np.flatnonzero(find_occupied_bins(photons, scene, axis))
         if numbers.size == 0:
@@ -91,6 +99,11 @@ def choose_label_axis(photons: PhotonImage, scene: Scene) -> LabelAxis:
             return LabelAxis(coarse, numbers, total)
         # two float32 volumes, the scores and their sums, have to fit
         coarse *= 2
+
+
+def count_tiles(image_shape: tuple[int, int]) -> int:
+    """Number of tiles that cover a picture."""
+    return math.prod(-(-length // TILE_PX) for length in image_shape)
 
 
 def find_occupied_bins(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArray[np.bool_]:
@@ -109,10 +122,10 @@ def find_occupied_bins(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> N
     -------
     (coarse_bins,) bool array
     """
-    rows, columns = photons.image_shape
+    columns = photons.image_shape[1]
     y, x = np.divmod(photons.pixel, columns)
     across = -(-columns // TILE_PX)
-    tiles = -(-rows // TILE_PX) * across
+    tiles = count_tiles(photons.image_shape)
     tile = (y // TILE_PX) * across + x // TILE_PX
     number = tile * axis.coarse_bins + axis.number_events(photons)
     counts = np.bincount(number, photons.count, tiles * axis.coarse_bins)

@@ -10,7 +10,11 @@ from numpy.typing import ArrayLike
 from tofclip.lidar.photons.detector import PhotonDetector
 from tofclip.lidar.photons.hot_pixels import find_hot_pixels, leave_out_pixels
 from tofclip.lidar.photons.photon_image import PhotonImage
-from tofclip.lidar.photons.response import measure_pulse_width
+from tofclip.lidar.photons.response import (
+    find_time_step,
+    measure_pulse_width,
+    require_plausible_pulse,
+)
 from tofclip.lidar.photons.surface_image import SurfaceImage
 from tofclip.lidar.pulse import Pulse
 from tofclip.threads import split_blocks
@@ -27,8 +31,9 @@ def estimate_pixels(
     false_alarm_rate: float = 0.01,
     background: ArrayLike | None = None,
     cycles: int | None = None,
+    max_returns: int = 1,
 ) -> SurfaceImage:
-    """Find the strongest return of every pixel by its own photons alone.
+    """Find the strongest returns of every pixel by its own photons alone.
 
     Parameters
     ----------
@@ -42,6 +47,8 @@ def estimate_pixels(
         in common.
     cycles : int, optional
         Laser cycles of each pixel, of a detector that counts the first photon of a cycle only.
+    max_returns : int
+        Returns looked for in every pixel.
 
     Returns
     -------
@@ -55,9 +62,17 @@ def estimate_pixels(
     """
     hot = find_hot_pixels(photons)
     photons = leave_out_pixels(photons, hot)
+    if background is None:  # which has the photons' own bins
+        photons = photons.join_bins(find_time_step(photons))
     shape = Pulse.gaussian(measure_pulse_width(photons)) if pulse is None else pulse
+    require_plausible_pulse(photons, shape)
     detector = PhotonDetector(
-        shape, photons.bin_width, photons.bins, false_alarm_rate, background=background
+        shape,
+        photons.bin_width,
+        photons.bins,
+        false_alarm_rate,
+        max_returns,
+        background=background,
     )
     pixels = photons.offsets.size - 1
     if background is None:
@@ -65,33 +80,26 @@ def estimate_pixels(
         some = photons.histograms(slice(0, pixels, -(-pixels // SAMPLED_PIXELS)))
         learnt = detector.adapt(some).relative_background
         detector = replace(detector, background=learnt)
-    found = np.full((3, pixels), np.nan)
+    found = np.full((max_returns, 3, pixels), np.nan)
     for piece in split_blocks(pixels, DETECTED_PIXELS_PER_BLOCK):
         arrivals = detector.locate(photons.histograms(piece), piece.start, cycles)
-        found[:, piece] = (
-            arrivals.range[:, 0],
-            arrivals.confidence[:, 0],
-            arrivals.photons[:, 0],
-        )
-    distance, sigma, signal = found.reshape(3, *photons.image_shape)
-    seen = np.isfinite(distance)
-    false_share = min(false_alarm_rate * pixels / max(int(seen.sum()), 1), 1.0)
-    return SurfaceImage(
-        range=distance,
-        range_sigma=sigma,
-        intensity=signal,
-        outlier_probability=np.where(seen, false_share, np.nan),
-        pulse=detector.shape,
-        settings={
-            "response": "learnt" if pulse is None else "given",
-            "pulse_fwhm_ps": detector.shape.fwhm * 1e12,
-            "false_alarm_rate": false_alarm_rate,
-            "background": "given"
-            if background is not None
-            else "learnt"
-            if np.ptp(detector.relative_background)
-            else "even",
-            "hot_pixels": int(hot.sum()),
-        },
-        hot_pixels=hot,
-    )
+        located = np.stack([arrivals.range, arrivals.confidence, arrivals.photons])
+        found[..., piece] = np.moveaxis(located, -1, 0)
+    settings: dict[str, float | str] = {
+        "response": "learnt" if pulse is None else "given",
+        "pulse_fwhm_ps": detector.shape.fwhm * 1e12,
+        "false_alarm_rate": false_alarm_rate,
+        "background": "given"
+        if background is not None
+        else "learnt"
+        if np.ptp(detector.relative_background)
+        else "even",
+        "hot_pixels": int(hot.sum()),
+    }
+    images = []
+    for distance, sigma, signal in found.reshape(max_returns, 3, *photons.image_shape):
+        seen = np.isfinite(distance)
+        false_share = min(false_alarm_rate * pixels / max(int(seen.sum()), 1), 1.0)
+        doubt = np.where(seen, false_share, np.nan)
+        images.append(SurfaceImage(distance, sigma, signal, doubt, detector.shape, settings))
+    return replace(images[0], further=tuple(images[1:]), hot_pixels=hot)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 from tofclip.lidar.photons.photon_image import FloatArray, PhotonImage
 from tofclip.lidar.pulse import Pulse
+from tofclip.units import PICOSECOND
 
 MAX_LAG_FRACTION = 0.25
 """Of the time axis: photons further apart than this are not of one pulse."""
@@ -31,6 +32,13 @@ EXTENT_WIDTHS = (-3.0, 9.0)
 
 BACKGROUND_WIDTHS = (-8.0, -4.0)
 """Full widths before the surface where only background is expected."""
+
+MIN_PULSE_S = 1e-12
+"""Superconducting counters, the quickest there are, spread a pulse over 3 ps."""
+
+STEP_QUANTILE, MIN_STEP_BINS, MIN_PHOTONS_PER_STEP = 0.05, 64, 4.0
+"""Of the gaps between bins with photons, the one that is taken for the counter's step; and how many
+such bins with how many photons each say that the bins between them stay empty for a reason."""
 
 DENSITY_FLOOR = 1e-4
 """Of the peak: no instant is impossible, so that no single photon decides."""
@@ -121,6 +129,30 @@ class BinnedResponse:
         # Shares of a thousandth of the greatest change no decision, but make every sum longer.
         kept = np.flatnonzero(shares > 1e-3 * shares.max())
         return shares[kept[0] : kept[-1] + 1], first + int(kept[0])
+
+
+def find_time_step(photons: PhotonImage) -> int:
+    """Return the bins between the instants that a counter tells apart: photon times in units of
+    1 ps come in steps of its converter, and pairs of equal times are no pulse.
+    """
+    filled = np.flatnonzero(photons.time_profile)
+    if filled.size < MIN_STEP_BINS or photons.photons < MIN_PHOTONS_PER_STEP * filled.size:
+        return 1
+    return int(np.quantile(np.diff(filled), STEP_QUANTILE))
+
+
+def require_plausible_pulse(photons: PhotonImage, pulse: Pulse) -> None:
+    """Refuse a pulse that no counter shows, or that is longer than the record, as of a wrong unit."""
+    if pulse.fwhm < MIN_PULSE_S:
+        fault = "shorter than any counter's"
+    elif pulse.fwhm > photons.bins * photons.bin_width:
+        fault = f"longer than all {photons.bins} bins"
+    else:
+        return
+    raise InputError(
+        f"a pulse of {pulse.fwhm / PICOSECOND:.3g} ps in bins of {photons.bin_width / PICOSECOND:.4g} "
+        f"ps is {fault}; check the unit of `bin_width`"
+    )
 
 
 def measure_pulse_width(photons: PhotonImage) -> float:

@@ -37,7 +37,12 @@ from tofclip.lidar.photons.matching import (
 )
 from tofclip.lidar.photons.photon_image import FloatArray, PhotonImage
 from tofclip.lidar.photons.planes import estimate_bias, fit_surface
-from tofclip.lidar.photons.response import BinnedResponse, measure_pulse_width
+from tofclip.lidar.photons.response import (
+    BinnedResponse,
+    find_time_step,
+    measure_pulse_width,
+    require_plausible_pulse,
+)
 from tofclip.lidar.photons.scene import Scene, estimate_background
 from tofclip.lidar.photons.surface_image import SurfaceImage
 from tofclip.lidar.pulse import Pulse
@@ -98,8 +103,10 @@ def estimate_surface(
     report = (lambda _: None) if progress is None else progress
     hot = find_hot_pixels(photons)
     photons = leave_out_pixels(photons, hot)
+    photons = photons.join_bins(find_time_step(photons))
     width = measure_pulse_width(photons) if pulse is None else 0.0
     start = Pulse.gaussian(width) if pulse is None else pulse
+    require_plausible_pulse(photons, start)
     scene = Scene(BinnedResponse.from_pulse(start, photons.bin_width), estimate_background(photons))
     axis = choose_label_axis(photons, scene)
     train, test = photons.split(HELD_OUT_FRACTION, seed)
@@ -120,9 +127,12 @@ def estimate_surface(
         learnt = learn_scene(train, test, training, surface, required=pulse is None)
     if learnt is not None:
         scene = Scene(learnt, scene.background)
+        require_plausible_pulse(photons, learnt.pulse)
         training = scene.scale(1 - HELD_OUT_FRACTION)
+        del volume  # before there is another one
         volume = compute_scores(train, training, axis)
     labels, margin = match_labels(volume, train.image_shape, slope_cost)
+    del volume
     surface = axis.to_bins(labels)
     report(0.6)
     reach, surface = choose_reach(train, test, training, surface)
@@ -150,7 +160,10 @@ def estimate_surface(
         rest = remove_return(rest, scene, layers[-1])
         if not rest.bin.size:
             break
-        layers.append(keep_significant(rest, scene, plan.locate(rest, scene)))
+        further = keep_significant(rest, scene, plan.locate(rest, scene))
+        if np.isnan(further).all():
+            break
+        layers.append(further)
     found = combine_layers(layers, max_returns, scene, to_range, settings)
     return replace(found, hot_pixels=hot)
 
