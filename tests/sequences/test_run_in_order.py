@@ -99,6 +99,32 @@ def test_a_slow_consumer_gets_the_newest_where_that_is_wanted():
     assert sorted(item.latency for item in items)[len(items) // 2] < 2.5 * STEP
 
 
+def test_results_that_nobody_took_make_room_for_others():
+    """After a consumer was slow, as many things as before are worked on at once."""
+    together, waited = threading.Barrier(3), threading.Event()
+    done: list[int] = []
+
+    def source() -> Iterator[int]:
+        yield from range(6)
+        waited.wait(30)
+        yield from (100, 101, 102)
+
+    def work(value: int) -> int:
+        if value >= 100:
+            together.wait(10)  # passes only where all three are at work
+        done.append(value)
+        return value
+
+    with ThreadPoolExecutor(3) as workers:
+        stream = run_in_order(source(), work, workers, 3, queue_size=9, policy="drop_oldest")
+        next(stream)
+        while len(done) < 4:
+            sleep(STEP / 5)
+        assert next(stream).number >= 3  # the newest of those that were done meanwhile
+        waited.set()
+        assert [item.value for item in stream][-1] == 102
+
+
 def test_few_things_are_alive(worker):
     class Thing:
         pass
@@ -155,7 +181,8 @@ def test_leaving_early_ends_the_threads_and_closes_the_source(worker):
         finally:
             closed.set()
 
-    stream = run_in_order(source(), keep, worker, at_once=2)
+    held = source()  # else letting go of it would close it as well
+    stream = run_in_order(held, keep, worker, at_once=2)
     next(stream)
     stream.close()
     assert closed.wait(5)

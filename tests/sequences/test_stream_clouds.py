@@ -119,6 +119,24 @@ def test_surfaces_follow_those_of_the_last_shot_until_the_scene_changes(
     assert np.median(clouds[3].range) == pytest.approx(1.3, abs=5e-3)
 
 
+@pytest.mark.parametrize("prepared", [False, True])
+def test_leaving_clouds_early_closes_their_source(prepared: bool):
+    made, closed = shots(1), Event()
+
+    def source() -> Iterator[Streak]:
+        try:
+            while True:
+                yield made[0]
+        finally:
+            closed.set()
+
+    held = source()  # else letting go of it would close it as well
+    clouds = stream_clouds(held, RangingPipeline.for_shot(made[0]) if prepared else None)
+    next(clouds)
+    clouds.close()
+    assert closed.wait(5)
+
+
 class CountingExecutor(ThreadPoolExecutor):
     """One worker, which begins when it is told to; counts what it holds at most."""
 
