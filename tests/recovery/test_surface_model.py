@@ -6,10 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surface_scene import BIN, CAMERA, INSTRUMENT, SCENE, make_model
+from surface_scene import BIN, CAMERA, INSTRUMENT, SCENE, SHAPE, make_model
 
+from tofclip.recovery.surfaces.basis import SmoothBasis
 from tofclip.recovery.surfaces.derivatives import iterate_derivatives
+from tofclip.recovery.surfaces.model import SurfaceModel
+from tofclip.recovery.surfaces.places import SUBROWS
 from tofclip.recovery.surfaces.pulse import make_pulse
+from tofclip.recovery.surfaces.state import SurfaceState
 from tofclip.recovery.surfaces.weights import weigh_measurements
 from tofclip.simulate import simulate_shot
 
@@ -48,6 +52,56 @@ def test_squares_of_the_entries_are_those_of_single_points(shot):
         alone[point] = 1
         # what is between rows and columns is exact only on average
         assert np.sum(model.render(alone) ** 2) == pytest.approx(information[point], rel=0.05)
+
+
+def test_squares_of_entries_hold_what_a_view_sees_of_a_hidden_point(shot):
+    model = make_model(shot.streak, overlap=True)
+    model.find_behind(np.full(model.surface.size, 50, np.float32))
+    shaded = model.state.copy()
+    shaded.shading[1] = [-0.7, -0.4, 0.1, 0.6, 0.5, -0.3, 0.2]
+    model.place(shaded)
+    information = model.gather(np.ones_like(model.image), squared=True)
+    hidden = np.flatnonzero(model.behind)
+    for point in hidden[[5, hidden.size // 2, -5]]:
+        alone = np.zeros(model.surface.size, np.float32)
+        alone[point] = 1
+        assert np.sum(model.render(alone) ** 2) == pytest.approx(information[point], rel=0.05)
+
+
+@pytest.mark.parametrize("tangent", [0.0, -0.4, 0.9, -1.1])
+def test_a_pixel_falls_on_the_slit_as_its_square_does(tangent: float):
+    """A square of side 1, projected along lines of the view's slant and summed over each slit
+    pixel; no slant moves its middle.
+    """
+    from tofclip.recovery.surfaces.kernels import split_over_slit
+
+    places = np.linspace(20.0, 21.0, 9)
+    first, shares = np.empty(places.size, np.int32), np.empty((places.size, 4), np.float32)
+    split_over_slit(places, tangent, SUBROWS, first, shares)
+    columns = first[:, np.newaxis] + np.arange(4)
+    np.testing.assert_allclose(shares.sum(axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose((shares * columns).sum(axis=1), places, atol=1e-5)
+    # a square's points by the thousand, each spread over the width of a slit pixel
+    height, width = (np.arange(2000) + 0.5) / 2000 - 0.5, (np.arange(50) + 0.5) / 50 - 0.5
+    for place, start, share in zip(places, first, shares, strict=True):
+        fallen = place + width - tangent * height[:, np.newaxis]
+        exact = np.bincount(np.floor(fallen + 0.5).astype(int).ravel() - start, minlength=4)
+        # three lines stand for the pixel's height: a third of the slant's width apart
+        np.testing.assert_allclose(share, exact / exact.sum(), atol=0.02 + 0.05 * abs(tangent))
+
+
+def test_slopes_of_ranges_are_differences_of_neighbours(shot):
+    """Of a plane, whose inverse depth grows evenly, also where the picture ends."""
+    masks = np.ones((1, *SHAPE), bool)
+    coefficients = np.array([1 / 1.5, 0.08, -0.05, 0, 0, 0])
+    state = SurfaceState.start([coefficients], CAMERA)
+    model = SurfaceModel(shot.streak, CAMERA, masks, [SmoothBasis(SHAPE)], state)
+    distance = model.distance.reshape(SHAPE)
+    right, down = model.compute_slopes().reshape(2, *SHAPE)
+    np.testing.assert_allclose(right[:-1, :-1], np.diff(distance, axis=1)[:-1], atol=1e-12)
+    np.testing.assert_allclose(down[:-1, :-1], np.diff(distance, axis=0)[:, :-1], atol=1e-12)
+    np.testing.assert_allclose(right[:, -1], distance[:, -1] - distance[:, -2], atol=1e-12)
+    np.testing.assert_allclose(down[-1], distance[-1] - distance[-2], atol=1e-12)
 
 
 def test_a_pulse_between_rows_is_the_pulse_over_each_row():

@@ -136,6 +136,42 @@ def test_splines_are_left_where_a_quadratic_explains_the_shot(shot, bent: bool):
         assert np.median(np.abs(error)) < 0.1e-3  # 2.9 mm at the bump before
 
 
+def test_where_the_shot_says_nothing_what_is_known_beforehand_decides(shot):
+    """Of a bend of which nothing is seen: its variance is the inverse of what is known of it, and a
+    step takes it back, as the least of ``c' bending c / 2``.
+    """
+    known, bend = np.array([2.5e5, 1e6, 4e5]), np.array([3e-3, -2e-3, 1e-3])
+    model = make_model(shot.streak)
+    bending = np.diag([0, 0, 0, *known])
+    model.bases = [replace(basis, bending=bending) for basis in model.bases]
+    bent = model.state.copy()
+    for coefficients in bent.coefficients:
+        coefficients[3:] = bend
+    model.place(bent)
+    model.weights = model.weights * np.float32(1e-9)
+    found = refine_state(model, np.full(model.surface.size, 50, np.float32))
+    for covariance, coefficients in zip(found.covariances, model.state.coefficients, strict=True):
+        np.testing.assert_allclose(covariance[3:, 3:] * known, np.eye(3), atol=1e-3)
+        np.testing.assert_allclose(coefficients[3:], 0, atol=1e-3 * np.abs(bend).max())
+    assert found.objective < 1e-3 * np.sum(known * bend**2)  # of both surfaces, half of each
+
+
+def test_the_objective_holds_what_is_known_of_surfaces_beforehand(shot):
+    """Bent surfaces that a shot without noise shows to be so: nothing but the bending is left."""
+    model = make_model(shot.streak)
+    bent = model.state.copy()
+    for coefficients in bent.coefficients:
+        coefficients[3:] = 3e-3, -2e-3, 1e-3
+    model.place(bent)
+    known = np.diag([0, 0, 0, 3e3, 1e3, 2e3])  # far less than the shot says
+    model.bases = [replace(basis, bending=known) for basis in model.bases]
+    amplitude = np.full(model.surface.size, 50, np.float32)
+    model.image = model.render(amplitude)
+    model.weights = 1 / (model.image + 5)
+    expected = sum(float(one @ known @ one) / 2 for one in bent.coefficients)
+    assert refine_state(model, amplitude).objective == pytest.approx(expected, rel=0.01)
+
+
 def test_what_steps_leave_is_a_geometric_series():
     lengths = np.array([[8.0, 4.0, 1.0], [2.0, 4.0, 0.0]])
     np.testing.assert_allclose(extrapolate_steps(lengths), [2 / 3, 4.0, 0.0])
