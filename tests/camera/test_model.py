@@ -28,6 +28,43 @@ def test_defaults():
     assert not made.dead_columns.any()
 
 
+UNEVEN = Camera(
+    centres_px=[41.3, 104.9, 163.2, 228.6, 290.1, 357.7, 418.4],
+    angles=np.deg2rad([-43.3, 22.9, -12.7, 0.6, 48.0, -25.7, 37.5]),
+    image_shape=(15, 19),
+    slit_width_px=460,
+    gains=[0.92, 1.08, 1.02, 0.90, 1.05, 0.96, 1.10],
+    view_positions=[-3.3, -1.8, -1.1, 0.0, 0.7, 2.2, 2.9],
+)
+
+
+@pytest.mark.parametrize("shear", [-2.5, -0.6, 0.0, 1.7])
+@pytest.mark.parametrize("view", range(7))
+def test_a_point_falls_where_the_convention_says(view: int, shear: float):
+    """``x = X - Y tan(angle) + s u`` from the view's centre, of points all over the picture, and as
+    bright as the view's gain.
+    """
+    rows, columns = UNEVEN.image_shape
+    operator = UNEVEN.operator(shear, np.float64)
+    middle = UNEVEN.centres_px[view]
+    own = np.abs(np.arange(UNEVEN.slit_width_px) - middle) < 29  # views lie 58 px apart at least
+    for row, column in ((0, 0), (0, 18), (7, 9), (4, 13), (14, 0), (14, 18)):
+        picture = np.zeros(UNEVEN.image_shape)
+        picture[row, column] = 1
+        light = np.where(own, operator(picture), 0)
+        down, right = row - rows // 2, column - columns // 2
+        expected = (
+            middle
+            + right
+            - down * np.tan(UNEVEN.angles[view])
+            + shear * UNEVEN.view_positions[view]
+        )
+        found = np.average(np.arange(light.size), weights=light)
+        where = f"view {view} at shear {shear}: the point {right} right and {down} down of the axis"
+        assert found == pytest.approx(expected, abs=1e-9), where
+        assert light.sum() == pytest.approx(UNEVEN.gains[view]), where
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

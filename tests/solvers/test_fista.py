@@ -34,6 +34,8 @@ from tofclip.solvers.method import (
 )
 from tofclip.threads import LANES
 
+WEIGHT_RULE = "weights are relative to the largest A'f of all frames"
+
 
 def identity(shape: tuple[int, int], dtype: type = np.float64) -> SparseMatrix:
     size = shape[0] * shape[1]
@@ -52,7 +54,33 @@ def test_sparsity_on_the_identity_is_soft_thresholding():
     result = Sparse(weight=0.3, iterations=40).recover(identity((5, 7)), measurements)
     expected = np.maximum(measurements - weight, 0).T.reshape(5, 5, 7)
     # The step is 2 % below the exact one, so an error shrinks geometrically and fast.
-    np.testing.assert_allclose(result.frames, expected, atol=1e-9)
+    np.testing.assert_allclose(result.frames, expected, atol=1e-9, err_msg=WEIGHT_RULE)
+
+
+def test_total_variation_on_the_identity_moves_two_levels_together():
+    """Of two even parts the edge costs its length times its height, so that each part of n columns
+    gives way by weight / n; of all frames the brightest sets the weight.
+    """
+    levels = np.array([[10.0, 4.0], [2.0, 6.0], [3.0, 3.0]])
+    columns, weight = np.array([4, 6]), 0.05 * levels.max()
+    pictures = np.repeat(levels, columns, axis=1)[:, np.newaxis].repeat(7, axis=1)
+    measurements = pictures.reshape(3, -1).T
+    method = TotalVariation(weight=0.05, iterations=400, gap=0.0)
+    found = method.recover(identity((7, 10)), measurements).frames
+    toward = np.sign(levels[:, ::-1] - levels)
+    expected = np.repeat(levels + toward * weight / columns, columns, axis=1)[:, np.newaxis]
+    np.testing.assert_allclose(
+        found, np.broadcast_to(expected, found.shape), atol=1e-3, err_msg=WEIGHT_RULE
+    )
+
+
+@pytest.mark.parametrize("method", [Sparse(2e-2, 40), TotalVariation(2e-2, 40)], ids=["l1", "tv"])
+def test_a_shot_of_any_brightness_gives_the_same_pictures(method):
+    measurements = np.abs(np.random.default_rng(5).standard_normal((40, 5)))
+    dim, bright = (method.recover(projection(), f * measurements).frames for f in (1, 1000))
+    np.testing.assert_allclose(
+        bright, 1000 * dim, rtol=1e-6, atol=1e-6 * bright.max(), err_msg=WEIGHT_RULE
+    )
 
 
 def test_without_a_weight_it_solves_nonnegative_least_squares():
@@ -134,13 +162,16 @@ def test_what_a_refused_frame_reports_belongs_to_its_picture():
     np.testing.assert_allclose(solver.objective, expected, rtol=1e-12)
 
 
-def test_a_frame_does_not_depend_on_its_neighbours():
+@pytest.mark.parametrize("method", [Sparse(1e-2, 40), TotalVariation(1e-2, 40)], ids=["l1", "tv"])
+def test_a_frame_does_not_depend_on_its_neighbours(method):
     operator = projection()
     measurements = np.abs(np.random.default_rng(5).standard_normal((40, 50)))
     measurements[:, 17] *= 3  # the brightest: it sets the scale of the weight in both runs
-    whole = Sparse(1e-2, 40).recover(operator, measurements)
-    part = Sparse(1e-2, 40).recover(operator, measurements[:, 15:20])
-    np.testing.assert_allclose(part.frames, whole.frames[15:20], rtol=1e-9, atol=1e-12)
+    whole = method.recover(operator, measurements)
+    part = method.recover(operator, measurements[:, 15:20])
+    np.testing.assert_allclose(
+        part.frames, whole.frames[15:20], rtol=1e-9, atol=1e-12, err_msg=WEIGHT_RULE
+    )
 
 
 @pytest.mark.parametrize("method", [Sparse(2e-3, 25), TotalVariation(2e-3, 25)], ids=["l1", "tv"])
