@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import doctest
 import importlib
 import inspect
+import io
 import pkgutil
 import re
 import subprocess
@@ -144,6 +147,34 @@ def public_names() -> dict[str, Any]:
         module, _, one = name.rpartition(".")
         found[name] = getattr(importlib.import_module(module), one)
     return found
+
+
+def list_examples() -> Iterator[doctest.DocTest]:
+    """Of all public names, each once: many are listed in several places."""
+    found: dict[tuple[str | None, int | None], doctest.DocTest] = {}
+    for name, value in public_names().items():
+        if str(getattr(value, "__module__", "")).startswith(ROOTS):
+            for test in doctest.DocTestFinder().find(value, name):
+                found[test.filename, test.lineno] = test
+    yield from (test for test in found.values() if test.examples)
+
+
+def test_examples_do_what_they_say() -> None:
+    """And of those that need a file of one's own, what they import and call is there."""
+    tests = [*list_examples()]
+    assert len(tests) > 10
+    for test in tests:
+        trouble = io.StringIO()
+        doctest.DocTestRunner().run(test, out=trouble.write, clear_globs=False)
+        assert not trouble.getvalue()
+        for example in test.examples:
+            if doctest.SKIP not in example.options:
+                continue
+            for node in ast.walk(ast.parse(example.source)):
+                if isinstance(node, ast.Import | ast.ImportFrom):
+                    exec(ast.unparse(node), test.globs)
+                elif isinstance(node, ast.Call):
+                    assert callable(eval(ast.unparse(node.func), test.globs)), test.name
 
 
 def signatures(name: str, value: Any) -> Iterator[tuple[str, Any]]:

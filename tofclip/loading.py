@@ -51,6 +51,7 @@ def load(path: str | Path) -> Any:
 
     Examples
     --------
+    >>> import tofclip
     >>> frames = tofclip.load("frames.h5")  # doctest: +SKIP
     """
     require_path(path)

@@ -107,8 +107,12 @@ def open_shot(
 
     Examples
     --------
-    >>> from tofclip.simulate.demo import simulate_demo  # doctest: +SKIP
-    >>> shot = open_shot("shot.h5", time_zero=-10.784e-9)  # doctest: +SKIP
+    >>> import numpy as np
+    >>> import tofclip
+    >>> camera = tofclip.Camera([20.0], [0.0], (16, 16), 41)
+    >>> streak = tofclip.Streak(np.eye(40, 41), np.arange(40) * 20e-12)
+    >>> open_shot(streak, camera, time_zero=-10.784e-9).camera.time_zero
+    -1.0784e-08
     """
     if isinstance(source, Streak):
         streak = source if bin_width is None else source.with_bin_width(bin_width)
