@@ -5,14 +5,17 @@ A verb's module is imported when the verb is called, so that the program's own h
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import logging
 import os
 import re
 import signal
 import sys
 import threading
 import traceback
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -30,7 +33,6 @@ from apps.help import (
     make_lazy_group,
 )
 from apps.verb_help import HELP_OPTION, show_verb_help
-from tofclip.compile_observers import observers
 from tofclip.dependencies import describe_missing_package
 from tofclip.errors import InputError, TofclipError
 from tofclip.version import __version__
@@ -52,6 +54,8 @@ OPTIONS_OF_ARGUMENTS = {
     "time_zero": "--time-zero-ns",
 }
 """The command line's option for an argument that the libraries' messages name."""
+
+COMPILING = "tofclip.compiling"  # its logger; the module itself would import the compiler
 
 UNUSABLE_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 """What the operating system says of names that no file can have, whatever is done with them."""
@@ -167,28 +171,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = DEBUG_FLAG in words
     _heed_end_signals()
-    announce = _CompileNotice().announce
-    observers.append(announce)
+    with _keep_to_one_line(debug):
+        status = _run([word for word in words if word != DEBUG_FLAG], debug)
+    if status == EXIT_INTERRUPTED:
+        print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
+    return int(status or 0)
+
+
+def _run(words: Sequence[str], debug: bool) -> Any:
+    """Run a verb and return its exit status."""
     try:
-        words = [word for word in words if word != DEBUG_FLAG]
         _require_no_empty(words)
         shown = words[-1:] == [HELP_OPTION] and show_verb_help(app, words)
-        status: Any = 0 if shown else app(words, prog_name=PROGRAM, standalone_mode=False)
+        status = 0 if shown else app(words, prog_name=PROGRAM, standalone_mode=False)
         sys.stdout.flush()
     except Exception as fault:
         if debug:
             traceback.print_exc()
         return _report_error(fault)
     except KeyboardInterrupt:
-        status = EXIT_INTERRUPTED
+        return EXIT_INTERRUPTED
     except SystemExit as end:  # typer's answer to a broken pipe, and the end of shell completion
         completes = end.code == 0 or COMPLETION_VARIABLE in os.environ
-        status = end.code if completes else EXIT_BROKEN_PIPE
-    finally:
-        observers.remove(announce)
-    if status == EXIT_INTERRUPTED:
-        print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
-    return int(status or 0)
+        return end.code if completes else EXIT_BROKEN_PIPE
+    return status
 
 
 def _require_no_empty(words: Sequence[str]) -> None:
@@ -197,22 +203,48 @@ def _require_no_empty(words: Sequence[str]) -> None:
         raise InputError("an argument is empty; is a variable of the shell not set?")
 
 
-class _CompileNotice:
-    """Says once, on a terminal, why a first run takes longer."""
+@contextlib.contextmanager
+def _keep_to_one_line(debug: bool) -> Iterator[None]:
+    """Say what the compiler has to say, and keep the libraries' warnings and log lines off the
+    screen, where they would stand before the one line about an error; ``--debug`` shows them.
+    """
+    root, compiling, show = logging.getLogger(), logging.getLogger(COMPILING), warnings.showwarning
+    notes, silence, level = _CompileNotes(), logging.NullHandler(), compiling.level
+    compiling.addHandler(notes)
+    compiling.setLevel(logging.INFO)
+    if not debug:
+        root.addHandler(silence)
+        warnings.showwarning = lambda *_, **__: None
+    try:
+        yield
+    finally:
+        warnings.showwarning = show
+        root.removeHandler(silence)
+        compiling.setLevel(level)
+        compiling.removeHandler(notes)
+
+
+class _CompileNotes(logging.Handler):
+    """Says once, on a terminal, why a first run takes longer, and anywhere what keeps compiled
+    loops from being kept.
+    """
 
     def __init__(self) -> None:
-        self.given = False
+        super().__init__()
+        # Not what it is later: `warm-up` sends elsewhere what its steps print.
+        self._stream, self._given = sys.stderr, False
 
-    def announce(self, loop: str) -> None:
-        """Print the line, if it has not been printed; `loop` is what is compiled first."""
-        if self.given or not sys.stderr.isatty():
-            return
-        self.given = True
-        print(
-            f"compiling loops for this processor, once ({loop} and others; "
-            "tofclip warm-up does all beforehand)",
-            file=sys.stderr,
-        )
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if record.levelno >= logging.WARNING:
+            print(f"tofclip: warning: {text}", file=self._stream)
+        elif not self._given and sys.stderr.isatty():
+            self._given = True
+            print(
+                f"compiling loops for this processor, once ({text} and others; "
+                "tofclip warm-up does all beforehand)",
+                file=self._stream,
+            )
 
 
 def _heed_end_signals() -> None:

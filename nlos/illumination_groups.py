@@ -5,7 +5,6 @@ enough for it.
 
 from __future__ import annotations
 
-import inspect
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -283,44 +282,39 @@ def find_leg_bounds(ends: FloatArray, grid: Grid) -> tuple[float, float]:
     return float(np.linalg.norm(outside, axis=1).min()), float(np.linalg.norm(across, axis=1).max())
 
 
-PACKAGE = __name__.partition(".")[0]
-
-
 class AliasingWarning(UserWarning):
     """Wall points lie so far apart that false images of bright things may appear beside them."""
 
 
-def warn_of_aliasing(capture: Capture, band: Band) -> None:
-    """Warn if neighbouring wall points lie more than half the band's shortest wavelength apart.
+def describe_aliasing(capture: Capture, band: Band) -> str | None:
+    """Say why false images may appear; None where none will.
 
-    In a confocal scan the path grows on both legs from point to point, so that a quarter is the
-    limit.
+    They do if neighbouring wall points lie more than half the band's shortest wavelength apart. In
+    a confocal scan the path grows on both legs from point to point, so that a quarter is the limit.
 
     Parameters
     ----------
     capture : Capture
     band : Band
         Wavenumbers of the virtual pulse.
+
+    Returns
+    -------
+    str or None
     """
     shortest = 2 * np.pi / float(band.wavenumbers[-1])
     finest = shortest / 4 if is_confocal(capture) else shortest / 2
     # A wall drawn exactly at the limit must not be warned of for a rounding error.
-    if np.isfinite(capture.spacing) and capture.spacing > finest * (1 + 1e-6):
-        warnings.warn(
-            f"wall points {capture.spacing:.3g} m apart are too coarse for waves of {shortest:.3g} m, the shortest of "
-            f"the virtual pulse: false images may appear; use points at most {finest:.3g} m apart, or a wavelength "
-            f"{capture.spacing / finest:.2g} times longer",
-            AliasingWarning,
-            stacklevel=_count_levels_to_caller(),
-        )
+    if not (np.isfinite(capture.spacing) and capture.spacing > finest * (1 + 1e-6)):
+        return None
+    return (
+        f"wall points {capture.spacing:.3g} m apart are too coarse for waves of {shortest:.3g} m, the shortest of "
+        f"the virtual pulse: false images may appear; use points at most {finest:.3g} m apart, or a wavelength "
+        f"{capture.spacing / finest:.2g} times longer"
+    )
 
 
-def _count_levels_to_caller() -> int:
-    """How far up the first line stands that is not this package's: what the user wrote."""
-    level = 1
-    frame = inspect.currentframe()
-    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
-        frame = frame.f_back
-        level += 1
-    # The first frame here is this function's own, which `warnings` does not see.
-    return max(level - 1, 1)
+def warn_of_aliasing(capture: Capture, band: Band) -> None:
+    """Give what `describe_aliasing` says as an `AliasingWarning`."""
+    if text := describe_aliasing(capture, band):
+        warnings.warn(text, AliasingWarning, stacklevel=2)

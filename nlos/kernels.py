@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from tofclip.compiling import inlined
+from tofclip.compiling import compile_and_keep, inlined
 
 # Only the fusing of multiply and add is let loose: exact zeros at the ends of the waveforms have to
 # stay exact.
-compiled = njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
+compiled = compile_and_keep(fastmath={"contract"}, error_model="numpy")
 
 MIN_DISTANCE_M = 1e-3
 """Distance in m below which the weight 1 / distance stops growing, for voxels that touch the wall."""

@@ -6,20 +6,14 @@ path cannot take the program's place.
 
 from __future__ import annotations
 
-import gc
 import sys
 
 PROGRAM_PACKAGE = "apps"
 EXIT_MISSING, EXIT_INTERRUPTED = 2, 130
 
-OBJECTS_PER_COLLECTION = 100_000
-"""Imports and the compiler make many small objects that stay: looking through them as often as Python
-does by itself, every 700, takes a seventh of a first run."""
-
 
 def main() -> int:
     """Run the program and return its exit status; Ctrl-C ends it in one line even while it starts."""
-    gc.set_threshold(OBJECTS_PER_COLLECTION)
     try:
         # Not above: while modules are loaded there, nothing would catch a Ctrl-C.
         import importlib

@@ -352,7 +352,7 @@ def _library_name(array: Array) -> str:
 
 
 def _find_gpu(library: str, number: int) -> ComputeDevice | None:
-    """CUDA device `scalar_like` through `library`, or None where that cannot be had."""
+    """CUDA device `number` through `library`, or None where that cannot be had."""
     try:
         module = importlib.import_module(library)
         if library == "torch":

@@ -1,4 +1,4 @@
-"""How loops and their parts are compiled, and who hears of it when that takes time.
+"""How loops and their parts are compiled, where they are kept, and who hears of it.
 
 A loop that Python calls is kept on disk. What only such loops call
 needs neither: the caller's machine code holds it. Without entry points for Python and C and without
@@ -9,8 +9,10 @@ Only modules of loops import this one: the compiler takes as long to import as a
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
+from pickle import UnpicklingError
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,7 +21,8 @@ from numba.core import event
 from numba.core.caching import FunctionCache
 from numba.extending import register_jitable
 
-from tofclip.compile_observers import observers, suppliers
+logger = logging.getLogger(__name__)
+"""Says at level INFO which function is being compiled; what comes from disk is not reported."""
 
 SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 """What sums in vectors need; unlike all of ``fastmath`` it leaves infinities and NaN what they are."""
@@ -30,20 +33,36 @@ ONE = np.uintp(1)
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-class _SuppliedCache(FunctionCache):  # type: ignore[misc]
-    """The compiler's cache, to which another process may be about to add the loop."""
+UNUSABLE = (OSError, EOFError, UnpicklingError)
+"""What a full, forbidden or damaged cache raises."""
+
+
+class _DiskCache(FunctionCache):  # type: ignore[misc]
+    """The compiler's cache; a loop that it cannot give or take is compiled for this run alone."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        for supply in tuple(suppliers):
-            supply(self._py_func.__module__, self._py_func.__name__)
-        return super().load_overload(sig, target_context)
+        try:
+            return super().load_overload(sig, target_context)
+        except UNUSABLE:
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except UNUSABLE:
+            _say_not_kept()
 
 
-def compile_loop(**options: Any) -> Callable[[Any], Any]:
-    """Make the decorator of loops that Python calls and that write into arrays they are given.
+@cache
+def _say_not_kept() -> None:
+    logger.warning(
+        "compiled loops cannot be kept, so every run compiles them again: "
+        "name a folder with room, which may be written to, in NUMBA_CACHE_DIR"
+    )
 
-    They make no array, so that nothing counts who holds one, and C does not call them: both would
-    be compiled into each of them.
+
+def compile_and_keep(**options: Any) -> Callable[[Any], Any]:
+    """Make the decorator of loops that are kept on disk, where there is a place for them.
 
     Parameters
     ----------
@@ -54,15 +73,36 @@ def compile_loop(**options: Any) -> Callable[[Any], Any]:
     -------
     callable
     """
-    usual = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
 
     def decorate(function: Any) -> Any:
-        loop: Any = njit(**{**usual, **options})(function)
+        loop: Any = njit(**{"nogil": True, **options})(function)
         if loop is not function:  # as it is where nothing is compiled
-            loop._cache = _SuppliedCache(function)  # what njit's own `cache` sets as well
+            try:
+                loop._cache = _DiskCache(function)  # what njit's own `cache` sets as well
+            except RuntimeError:  # no folder can be written to
+                _say_not_kept()
         return loop
 
     return decorate
+
+
+def compile_loop(**options: Any) -> Callable[[Any], Any]:
+    """Make the decorator of loops that Python calls and that write into arrays they are given.
+
+    They make no array, so that nothing counts who holds one, and C does not call them: both would
+    be compiled into each of them. They are kept as by `compile_and_keep`.
+
+    Parameters
+    ----------
+    **options
+        Of `numba.njit`, such as ``fastmath``.
+
+    Returns
+    -------
+    callable
+    """
+    usual = {"error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
+    return compile_and_keep(**{**usual, **options})
 
 
 compile_as_part: Callable[..., Callable[[F], F]] = partial(
@@ -81,8 +121,7 @@ they are given are constants to the compiler.
 
 class _CompileListener(event.Listener):  # type: ignore[misc]
     def on_start(self, event: Any) -> None:
-        for report in tuple(observers):
-            report(event.data["dispatcher"].py_func.__name__)
+        logger.info(event.data["dispatcher"].py_func.__name__)
 
     def on_end(self, event: Any) -> None:
         pass

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,7 +14,6 @@ from typing import Any
 from apps.benchmarks.case import Case
 from apps.benchmarks.machine import describe_machine
 from apps.benchmarks.peers import PEER_TIMEOUT_S, PEERS_VARIABLE
-from apps.processes import prepare_module_run
 from tofclip.threads import THREADS_VARIABLE, thread_count
 
 CASE_TIMEOUT_S = 120
@@ -106,8 +107,10 @@ def _run_process(
     if clock.remaining_s == 0:
         return {"problem": f"left out: the others took {TOTAL_TIMEOUT_S} s"}
     longest = CASE_TIMEOUT_S + (PEER_TIMEOUT_S if peers else 0)  # what has begun may finish
-    command, environment = prepare_module_run("apps.benchmarks", case.name, str(size))
-    environment |= {THREADS_VARIABLE: str(count), PEERS_VARIABLE: peers or ""}
+    # with this program's own path: another one may lie in the folder that the user is in
+    code = f"import sys; sys.path[:] = {sys.path!r}; import apps.benchmarks.__main__ as one; one.main()"
+    command = [sys.executable, "-c", code, case.name, str(size)]
+    environment = {**os.environ, THREADS_VARIABLE: str(count), PEERS_VARIABLE: peers or ""}
     began = time.monotonic()
     try:
         done = subprocess.run(

@@ -16,14 +16,12 @@ if TYPE_CHECKING:
 
 
 import sys
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Generic
 
 from apps.progress import show_progress
 from nlos import Refinement
-from nlos.illumination_groups import AliasingWarning
+from nlos.band import Band, VirtualPulse
+from nlos.illumination_groups import describe_aliasing
 from nlos.moveout import MidpointImaging
 from nlos.refinement.photons import PhotonRefinement
 from nlos.refinement.refine import build_total_variation
@@ -453,9 +451,6 @@ def prepare_imaging(
     capture = found.prepare(recorded)
     if device is not None:
         capture = capture.on(device)
-    if found.reasons.get("wavelength"):
-        # It was chosen with the wall's sampling in mind.
-        warnings.simplefilter("ignore", AliasingWarning)
     scout = find_scout(capture, found)
     if scout is not None or found.method is None:
         coarse, grid = scout or (found, found.grid())
@@ -464,8 +459,19 @@ def prepare_imaging(
     if scout is not None:
         found = find_bright_box(found, image_capture("looking over", plan, capture))
     found = replace(found, everywhere=True)
+    _warn_of_given_wavelength(capture, found)
     shown = from_library(wanted, found, methods or [found.method or ""])
     return PreparedImaging(capture, found.grid(), found, shown, recorded)
+
+
+def _warn_of_given_wavelength(capture: Capture, found: Settings) -> None:
+    """Warn of false images; a wavelength that was found was so with the wall's sampling in mind."""
+    wavelength, (_, taken) = found.wavelength, METHOD_CLASSES[found.method or METHODS[0]]
+    if wavelength is None or "wavelength" in found.reasons or "wavelength" not in taken:
+        return
+    band = Band(VirtualPulse(wavelength, found.cycles), capture.axis)
+    if text := describe_aliasing(capture, band):
+        print(f"tofclip: warning: {text}", file=sys.stderr)
 
 
 def image_capture(title: str, plan: Plan, capture: Capture) -> Volume:
@@ -484,13 +490,3 @@ def image_capture(title: str, plan: Plan, capture: Capture) -> Volume:
     """
     with show_progress(title, plan.cost) as advance:
         return plan.image(capture, advance)
-
-
-@contextmanager
-def warnings_to_stderr() -> Iterator[None]:
-    """Print what the methods warn of on standard error, each warning once and on one line."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        yield
-    for text in dict.fromkeys(str(one.message) for one in caught):
-        print(f"tofclip: warning: {' '.join(text.split())}", file=sys.stderr)

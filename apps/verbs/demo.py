@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.compile_ahead import compile_loops_ahead
 from apps.conventions import JsonOption, build_provenance, make_folder, report
 from apps.figures.demo import make_demo_figure
 from apps.figures.style import save_figure
@@ -46,14 +45,13 @@ def demo(
 
     Skew, gains and slit centres are found from the shot itself. Surfaces are recovered from the whole shot at
     once; the picture shows them beside total variation of each frame. Writes streak.h5, frames.h5,
-    cloud.ply and preview.png. The first run on a machine compiles the loops it needs meanwhile.
+    cloud.ply and preview.png. The first run on a machine compiles the loops that it needs, once.
 
     Example: tofclip demo --out demo-output
     """
     started = time.perf_counter()
     make_folder(out)
-    with compile_loops_ahead():
-        run = _run_demo(seed)
+    run = _run_demo(seed)
     written = [out / name for name in ("streak.h5", "frames.h5", "cloud.ply", "preview.png")]
     run.streak.save(written[0])
     run.frames.save(written[1])

@@ -20,7 +20,9 @@ import math
 import numpy as np
 from numba import njit
 
-compiled = njit(nogil=True, cache=True, error_model="numpy")
+from tofclip.compiling import compile_and_keep
+
+compiled = compile_and_keep(error_model="numpy")
 inlined = njit(inline="always", error_model="numpy")
 
 

@@ -5,7 +5,6 @@ bits mean.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from devices.linospad2.words import (
     ADDRESSES,
@@ -18,8 +17,9 @@ from devices.linospad2.words import (
     PIXEL_CONVERTERS,
     VALID_BIT,
 )
+from tofclip.compiling import compile_and_keep
 
-compiled = njit(nogil=True, cache=True, error_model="numpy")
+compiled = compile_and_keep(error_model="numpy")
 
 
 @compiled

@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from devices.timetag.words import (
     DELTA,
@@ -18,8 +17,9 @@ from devices.timetag.words import (
     TIME_MASK,
     WRAP,
 )
+from tofclip.compiling import compile_and_keep
 
-compiled = njit(nogil=True, cache=True, error_model="numpy")
+compiled = compile_and_keep(error_model="numpy")
 
 # The 53 upper bits of a word fill the mantissa of a double.
 _DOUBLE_STEP = 2.0**-53

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from nlos.kernels import cosine_of_turns, sine_of_turns
 from nlos.rsd.kernels import TAPS
+from tofclip.compiling import SUMS_IN_ANY_ORDER, compile_and_keep
 
-compiled = njit(
-    nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy"
-)
+compiled = compile_and_keep(fastmath=SUMS_IN_ANY_ORDER, error_model="numpy")
 
 UINT64_ONE = np.uint64(1)
 

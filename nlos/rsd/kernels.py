@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from tofclip.compiling import compile_as_part, inlined
+from tofclip.compiling import SUMS_IN_ANY_ORDER, compile_and_keep, compile_as_part, inlined
 from tofclip.vectors import LENGTH, STEP, fill_vector, load_vector, store_vector
 
-compiled = njit(
-    nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy"
-)
+compiled = compile_and_keep(fastmath=SUMS_IN_ANY_ORDER, error_model="numpy")
 
 part_of_loop = compile_as_part(_nrt=False)
 

@@ -12,7 +12,7 @@ from small_instrument import Run
 
 from nlos.method import Plan
 
-MAX_FILES = 40
+MAX_FILES = 41
 
 COUNT_FILES = """
 import inspect, sys, threading

@@ -145,6 +145,28 @@ def test_a_help_with_a_number_of_its_verbs_work_imports_that(
     assert "Take 16 frames." in capsys.readouterr().out
 
 
+def test_libraries_say_nothing_before_the_one_line_about_an_error() -> None:
+    code = """
+import logging, sys, warnings
+from apps import cli
+def work(words, **options):
+    warnings.warn("invalid value encountered in divide", RuntimeWarning)
+    logging.getLogger("ptufile").warning("read of 5 bytes")
+    raise cli.InputError("photon counts must be finite")
+cli.app = work
+sys.exit(cli.main(sys.argv[1:]))
+"""
+    command = [sys.executable, "-c", code]
+    plain = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (plain.returncode, plain.stdout) == (2, "")
+    assert plain.stderr == "tofclip: error: photon counts must be finite\n"
+    whole = subprocess.run(
+        [*command, "--debug"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert "RuntimeWarning: invalid value" in whole.stderr
+    assert "read of 5 bytes" in whole.stderr
+
+
 def test_statuses_of_the_process(files: Path) -> None:
     good, bad = ran("info", files / "camera.h5", "--json"), ran("info", files / "absent.h5")
     assert (good.returncode, good.stderr, json.loads(good.stdout)["kind"]) == (0, "", "camera")

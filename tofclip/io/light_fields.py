@@ -9,7 +9,6 @@ run from -4 to 3.
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 from collections.abc import Callable
@@ -30,7 +29,7 @@ from tofclip.files import (
 )
 from tofclip.io.archive import NPY_SUFFIX, Archive
 from tofclip.io.exr import Channels, read_exr_parts
-from tofclip.io.tiff import MAX_PIXELS, NULL_LOG_HANDLER, require_bounded_page
+from tofclip.io.tiff import MAX_PIXELS, require_bounded_page
 from tofclip.light_field import LightField
 from tofclip.storage import Record, collect_provenance
 
@@ -206,7 +205,6 @@ def _read_picture(path: Path) -> NDArray[Any]:
 def _decode_tiff(path: Path) -> NDArray[Any]:
     import tifffile
 
-    logging.getLogger("tifffile").addHandler(NULL_LOG_HANDLER)
     with BoundedFile(path) as file, tifffile.TiffFile(file) as tiff:
         if len(tiff.pages) != 1:
             raise FileFormatError(path, f"holds {len(tiff.pages)} pictures, expected one view")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
 
 MAX_PIXELS = 1 << 28
 """A damaged header may claim any size; no streak camera has a sensor larger than this."""
-
-NULL_LOG_HANDLER = logging.NullHandler()
 
 
 def read_tiff(path: str | Path) -> Streak:
@@ -75,8 +72,6 @@ def _open_page(path: str | Path) -> Iterator[tifffile.TiffPage]:
     """Open the only picture in the file."""
     import tifffile
 
-    # Without a handler its complaints go to standard error, ahead of the one line that we raise.
-    logging.getLogger("tifffile").addHandler(NULL_LOG_HANDLER)
     with translate_read_errors(path), BoundedFile(path) as file:
         try:
             with tifffile.TiffFile(file) as tiff:

@@ -109,12 +109,11 @@ def _open_tables(path: Path) -> Iterator[tuple[Any, list[tuple[Any, Any]]]]:
     """Open the scan's points and the extension's columns, each with the file that it is in."""
     pye57 = _import_pye57()
     try:
-        file = pye57.E57(str(path))
-        tables = [(file.image_file, file.data3d[0]["points"])]
-        if file.root.isDefined(EXTRA_COLUMNS):
-            tables.append((file.image_file, file.root[EXTRA_COLUMNS]))
-        yield pye57.libe57, tables
-        file.close()
+        with contextlib.closing(pye57.E57(str(path))) as file:
+            tables = [(file.image_file, file.data3d[0]["points"])]
+            if file.root.isDefined(EXTRA_COLUMNS):
+                tables.append((file.image_file, file.root[EXTRA_COLUMNS]))
+            yield pye57.libe57, tables
     except (TofclipError, MemoryError):
         raise
     except Exception as fault:  # the library raises whatever the damage happens to cause

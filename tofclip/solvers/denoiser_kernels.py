@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-fast_njit = njit(
-    nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy"
-)
+from tofclip.compiling import SUMS_IN_ANY_ORDER, compile_and_keep
+
+fast_njit = compile_and_keep(fastmath=SUMS_IN_ANY_ORDER, error_model="numpy")
 
 
 @fast_njit

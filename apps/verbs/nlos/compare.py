@@ -27,7 +27,6 @@ from apps.nlos.imaging import (
     parse_method_names,
     prepare_imaging,
     require_valid_settings,
-    warnings_to_stderr,
 )
 from apps.nlos.measure import compare_with_truth, measure_imaging, measure_sharpness
 from apps.nlos.truth import HiddenTruth
@@ -97,9 +96,8 @@ def compare(
     # Everything that can be refused is refused before the capture is read.
     _check_settings(wanted)
     capture, truth = read_capture(source), HiddenTruth.load(source)
-    with warnings_to_stderr():
-        prepared, left_out = _choose_methods(wanted, capture)
-        runs = _measure_methods(prepared)
+    prepared, left_out = _choose_methods(wanted, capture)
+    runs = _measure_methods(prepared)
     found, grid = prepared.shown, prepared.grid
     figures = _collect_metrics(runs, truth)
     save_figure(

@@ -17,7 +17,6 @@ from apps.nlos.imaging import (
     parse_method_names,
     prepare_imaging,
     require_valid_settings,
-    warnings_to_stderr,
 )
 from apps.progress import show_progress
 from apps.settings import (
@@ -107,8 +106,7 @@ def film(
     capture = read_capture(source)
     # Reading the file does not count as imaging.
     started = time.perf_counter()
-    with warnings_to_stderr():
-        found, video = _make_video(capture, wanted)
+    found, video = _make_video(capture, wanted)
     seconds = time.perf_counter() - started
     _write_video(replace(video, provenance=_build_video_provenance(video, source, found)), out)
     save_settings(found, beside, SETTINGS_HEADING)

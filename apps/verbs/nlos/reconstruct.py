@@ -44,7 +44,6 @@ from apps.nlos.imaging import (
     prepare_imaging,
     require_valid_refinement,
     require_valid_settings,
-    warnings_to_stderr,
 )
 from apps.sequences import resolve_device, run_with_progress
 from apps.settings import (
@@ -214,9 +213,8 @@ def _reconstruct_single(
     if wanted.refine and wanted.refine != PHOTONS:
         wanted = replace(wanted, method=REFINED_METHOD)
     started = time.perf_counter()
-    with warnings_to_stderr():
-        prepared = prepare_imaging(capture, wanted, device=device)
-        found, volume = _image(prepared)
+    prepared = prepare_imaging(capture, wanted, device=device)
+    found, volume = _image(prepared)
     chosen = prepared.settings
     on_wall = is_brightest_on_wall(volume, capture, chosen.wavelength or 0.0)
     if on_wall:

@@ -27,7 +27,6 @@ from apps.nlos.imaging import (
     parse_method_names,
     prepare_imaging,
     require_valid_settings,
-    warnings_to_stderr,
 )
 from apps.settings import (
     SettingsOption,
@@ -126,20 +125,19 @@ def stream(
     first = next((one for one in coming if one.capture is not None), None)
     if first is None or first.capture is None:
         raise InputError(f"{source}: the source ended before it gave a capture that can be read")
-    with warnings_to_stderr():
-        started = time.perf_counter()
-        prepared = prepare_imaging(first.capture, wanted)
-        plan = prepared.settings.make_method().plan(prepared.capture, prepared.grid)
-        planned = time.perf_counter() - started
-        make_folder(out)  # only now: captures that cannot be imaged leave no empty folder
-        save_settings(
-            replace(prepared.shown, method=prepared.settings.method),
-            out / SETTINGS_NAME,
-            SETTINGS_HEADING,
-        )
-        imaging = _choose_imaging(plan, prepared, wanted.average)
-        made = _VolumeStream(chain([first], coming), prepared, imaging, out, follow_s > 0)
-        figures = _run_with_page(made, source) if view else made.run()
+    started = time.perf_counter()
+    prepared = prepare_imaging(first.capture, wanted)
+    plan = prepared.settings.make_method().plan(prepared.capture, prepared.grid)
+    planned = time.perf_counter() - started
+    make_folder(out)  # only now: captures that cannot be imaged leave no empty folder
+    save_settings(
+        replace(prepared.shown, method=prepared.settings.method),
+        out / SETTINGS_NAME,
+        SETTINGS_HEADING,
+    )
+    imaging = _choose_imaging(plan, prepared, wanted.average)
+    made = _VolumeStream(chain([first], coming), prepared, imaging, out, follow_s > 0)
+    figures = _run_with_page(made, source) if view else made.run()
     figures = {
         "method": prepared.settings.method,
         "voxels": prepared.grid.shape,

@@ -7,7 +7,6 @@ memory: a size is believed only if the file can hold it and if it stays below a 
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ from tofclip.io.archive import list_npz_entries, read_npy_header
 from tofclip.io.becker_hickl import read_sdt_blocks
 from tofclip.io.mat import list_mat_variables
 from tofclip.io.picoquant import TCSPC, PtuEvents, get_scan_shape, read_scan
-from tofclip.io.tiff import NULL_LOG_HANDLER, require_finite_chain
+from tofclip.io.tiff import require_finite_chain
 from tofclip.lidar.photons.photon_image import PhotonImage
 from tofclip.storage import HDF5_SIGNATURE
 
@@ -420,7 +419,6 @@ def _make_hdf5_loader(path: Path, name: str, matlab: bool) -> Callable[[], NDArr
 def _open_tiff(path: Path) -> PhotonFile:
     import tifffile
 
-    logging.getLogger("tifffile").addHandler(NULL_LOG_HANDLER)  # damage is one line, ours
     with BoundedFile(path) as file, tifffile.TiffFile(file) as tiff:
         require_finite_chain(tiff, path)
         series = tiff.series[0]

@@ -7,8 +7,8 @@ Positions below a bin and overlapping returns are treated by the steps of
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from tofclip.compiling import compile_and_keep
 from tofclip.lidar.pulse_fit import (
     find_pulse_window,
     get_variance,
@@ -23,7 +23,7 @@ MAX_ITERATIONS = (
 MIN_PHOTONS = 0.5  # lets an empty histogram have a background
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def find_best_score(counts, weights, shade, first):
     """Largest log-matched filter response over all bins, and its bin.
 
@@ -58,7 +58,7 @@ def find_best_score(counts, weights, shade, first):
     return score[best], best
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def find_best_scores(histograms, weights, shade, first, best):
     """Fill `best` with the largest response of each histogram.
 
@@ -77,7 +77,7 @@ def find_best_scores(histograms, weights, shade, first, best):
         best[row] = compute_best_score(histograms[row], table, first, score)
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def spread_filter(weights, shade):
     """Weights that each bin has in the filter, (width, bins): as `compute_best_score` takes them.
 
@@ -93,7 +93,7 @@ def spread_filter(weights, shade):
     return table
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def compute_best_score(counts, table, first, score):
     """What `find_best_score` says of histograms in which most bins hold photons, to the bit.
 
@@ -133,7 +133,7 @@ def compute_best_score(counts, table, first, score):
     return best
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def simulate_best_scores(photons, arrived, noise, weights, shade, first, best):
     """Fill `best` with the best scores of histograms over which `photons` are thrown by a random
     generator as the background is distributed.
@@ -165,7 +165,7 @@ def simulate_best_scores(photons, arrived, noise, weights, shade, first, best):
         best[trial] = compute_best_score(counts, table, first, score)
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def extract_strongest_returns(
     rest, free, dither, level, table, background, first, scale, times, peaks, numbers
 ):
@@ -207,7 +207,7 @@ def extract_strongest_returns(
         free[row] -= relative[begin:end].sum()
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def fit_histograms(
     histograms, arrived, live, cycles, peaks, numbers, relative, curve, scale, times, found
 ):
@@ -268,7 +268,7 @@ def fit_histograms(
             )
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def estimate_background(trace, relative, times, peaks, scale):
     """Background photons of a usual bin, from the bins that no return reaches.
 
@@ -303,7 +303,7 @@ def estimate_background(trace, relative, times, peaks, scale):
     return (photons + MIN_PHOTONS) / max(bins, 1.0)
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def estimate_height(trace, times, background, curve, scale, peak):
     """Height of a return from the photons around its bin; never less than half a photon's.
 
@@ -336,7 +336,7 @@ def estimate_height(trace, times, background, curve, scale, peak):
     return max(excess, MIN_PHOTONS) / max(area, 1e-3)
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def summarise_return(trace, times, background, curve, scale, estimate, k, variance, found):
     """Write arrival, photons and the arrival's Cramer-Rao deviation at the estimate to `found`.
 
@@ -383,7 +383,7 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, varian
         found[2] = np.sqrt(pp / determinant) / height
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def compute_scores(histograms, weights, first, score):
     """Fill `score` with the log-matched filter's response of each histogram at each bin.
 
@@ -408,7 +408,7 @@ def compute_scores(histograms, weights, first, score):
                         score[row, j] += histograms[row, i] * weights[w]
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def add_path_scores(score, slope_cost, jump_cost, total):
     """Add to `total` the best score of all paths that reach each entry along the first axis.
 
@@ -442,7 +442,7 @@ def add_path_scores(score, slope_cost, jump_cost, total):
             before[:] = path
 
 
-@njit(nogil=True, cache=True)
+@compile_and_keep()
 def pool_neighbours(counts, label, reach, apart, pooled, contributors):
     """Sum each pixel's histogram with those of neighbours on the same surface, moved to the pixel's
     own bin.

@@ -7,10 +7,11 @@ function is serial and holds no interpreter lock.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-compiled = njit(nogil=True, cache=True, error_model="numpy")
-vectorised = njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
+from tofclip.compiling import compile_and_keep
+
+compiled = compile_and_keep(error_model="numpy")
+vectorised = compile_and_keep(error_model="numpy", fastmath=True)
 
 MIN_PLANE_PIXELS = 6
 """A plane through fewer pixels is taken as level."""
