@@ -134,7 +134,7 @@ def calibrate_range(
     two give what each pixel measures too long and how bright it is, three of different brightness
     (other distances, or grey filters) how ranges depend on intensity. All of it goes into the camera
     file, with standard deviations, and is used wherever that camera is: recover, cloud, stream, view,
-    lidar sequence and lidar photons.
+    lidar sequence and lidar photons. A shot of anything but a plate is refused.
 
     Example: tofclip calibrate range --target-m 1.5 plate.h5 --out camera.h5
 
@@ -186,8 +186,7 @@ def _cut(shot: TargetShot, region: tuple[int, int, int, int]) -> TargetShot:
     if not (0 <= top < bottom <= rows and 0 <= left < right <= columns):
         raise InputError(f"--region: the picture has rows 0..{rows} and columns 0..{columns}")
     y, x = shot.returns.y, shot.returns.x
-    inside = (y >= top) & (y < bottom) & (x >= left) & (x < right)
-    return replace(shot, returns=shot.returns[inside])
+    return shot.cut((y >= top) & (y < bottom) & (x >= left) & (x < right))
 
 
 @dataclass(frozen=True)

@@ -118,8 +118,12 @@ def test_refusals_are_one_line(run: Run, tmp_path: Path) -> None:
     shot = save_plate(tmp_path / "plate.npy", 0.5, 100, 0)
     dark = tmp_path / "dark.npy"
     np.save(dark, np.random.default_rng(0).poisson(0.02, (*PIXELS, BINS)).astype(np.uint8))
+    steps = np.random.default_rng(0).poisson(0.02, (*PIXELS, BINS))
+    steps[*np.indices(PIXELS), 20 + np.arange(30).reshape(PIXELS)] += 50
+    np.save(tmp_path / "steps.npy", steps.astype(np.uint8))
     out = tmp_path / "camera.h5"
     for words, needed in (
+        (["--target-m", "0.5", tmp_path / "steps.npy"], "cut the picture to it (--region)"),
         (["--target-m", "0.5", "--target-m", "0.6", shot], "one for each"),
         (["--target-m", "-1", shot], "positive length"),
         (["--target-m", "0.5", "--walk", shot], "3 shots"),
@@ -133,3 +137,32 @@ def test_refusals_are_one_line(run: Run, tmp_path: Path) -> None:
         assert needed in outcome.err
         assert outcome.err.count("\n") == 1
     assert not out.exists()
+
+
+@pytest.mark.nightly
+def test_a_recorded_scene_is_no_plate(run: Run, shared_data: Path, tmp_path: Path) -> None:
+    """Its corners hold traces of bright letters: a time zero of -11.6, -1.2 or +12.5 ns was stated
+    to picoseconds."""
+    folder, camera = shared_data / "clip", tmp_path / "camera.h5"
+    if not folder.is_dir():
+        pytest.skip("no recorded shot")
+    pictures = {
+        "line": "LinePattern",
+        "line-background": "LinePattern_bkg",
+        "dot": "DotPattern",
+        "dot-background": "DotPattern_bkg",
+    }
+    words = [
+        word for name, stem in pictures.items() for word in (f"--{name}", folder / f"{stem}.tif")
+    ]
+    assert run("calibrate", *words, "--out", camera).status == 0
+    for method in ("tv", "linear"):
+        frames = tmp_path / f"{method}.h5"
+        words = ["recover", folder / "scene5.tif", "--camera", camera, "--method", method]
+        assert run(*words, "--out", frames).status == 0
+        for region in ([], [5, 15, 5, 15], [12, 23, 9, 21]):
+            words = ["--target-m", 2, frames, "--out", tmp_path / "calibrated.h5"]
+            cut = ["--region", *region] if region else []
+            outcome = run("calibrate", "range", *words, *cut)
+            assert (outcome.status, outcome.err.count("\n")) == (2, 1)
+    assert not (tmp_path / "calibrated.h5").exists()

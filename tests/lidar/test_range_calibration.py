@@ -218,6 +218,113 @@ def test_what_cannot_be_told_is_refused() -> None:
         replace(one, reflectance_percent=0.0)
 
 
+ROOM = (40, 48)
+ROOM_CAMERA = Camera(
+    np.array([24.0]), np.zeros(1), ROOM, 48, pulse_fwhm=400e-12, focal_length_px=40.0
+)
+
+
+def draw_scene(kind: str, random: np.random.Generator) -> np.ndarray:
+    """Depths of a scene without a plate, m; NaN where nothing comes back."""
+    y, x = (place.ravel() for place in np.indices(ROOM))
+    ray = compute_ray_directions(ROOM_CAMERA, y, x)
+    ray = ray / ray[:, 2:]
+    if kind == "room":
+        ends = np.array([random.uniform(0.8, 1.1), random.uniform(0.6, 0.9), 3.0])
+        depth_m = np.min(ends / np.maximum(np.abs(ray), 1e-9), axis=1)
+        for _ in range(3):
+            middle = np.array([*random.uniform(-0.5, 0.5, 2), random.uniform(1.5, 2.5)])
+            along = ray @ middle / np.sum(ray**2, axis=1)
+            miss = np.sum((along[:, np.newaxis] * ray - middle) ** 2, axis=1)
+            half = np.sqrt(np.maximum(random.uniform(0.2, 0.5) ** 2 - miss, 0))
+            front = along - half / np.linalg.norm(ray, axis=1)
+            depth_m = np.where(half > 0, np.minimum(front, depth_m), depth_m)
+    elif kind == "slanted":
+        slope = np.tan(np.deg2rad(random.uniform(10, 60)))
+        turn = random.uniform(0, 2 * np.pi)
+        depth_m = 2 / (
+            1 - slope * (np.cos(turn) * ray[:, 0] + np.sin(turn) * ray[:, 1]).clip(-9, 0.4)
+        )
+    elif kind == "bush":
+        depth_m = 2 + random.uniform(-0.3, 0.3, y.size)
+    elif kind == "relief":
+        shape = np.hypot(y - 20, x - 24) / 30
+        depth_m = 2 + random.uniform(0.055, 0.08) * shape**2 / np.max(shape**2)
+    elif kind == "walls":
+        edges = np.cumsum([0, random.integers(18, 22), random.integers(12, 15)])
+        depth_m = np.array([1.5, 2.1, 2.8])[np.searchsorted(edges, x, side="right") - 1]
+    else:
+        depth_m = np.where(random.random(y.size) < 0.01, random.uniform(0, 6, y.size), np.nan)
+    return depth_m
+
+
+def see_depths(depth_m: np.ndarray, photons: float, random: np.random.Generator) -> TargetShot:
+    """A shot of these depths, said to be of a target at 2 m."""
+    y, x = (place.ravel() for place in np.indices(ROOM))
+    y, x, depth_m = (part[np.isfinite(depth_m)] for part in (y, x, depth_m))
+    true = depth_m / compute_ray_directions(ROOM_CAMERA, y, x)[:, 2]
+    signal = random.poisson(photons * (2 / true) ** 2).clip(1).astype(float)
+    sigma = NOISE_M / np.sqrt(signal)
+    measured = true + LATE_S * SPEED_OF_LIGHT / 2 + random.normal(0, sigma)
+    returns = Returns(
+        y=y.astype(np.int32),
+        x=x.astype(np.int32),
+        range=measured,
+        intensity=(signal * measured**2).astype(np.float32),
+        confidence=sigma.astype(np.float32),
+        return_number=np.ones(y.size, np.uint8),
+        time=2 * measured / SPEED_OF_LIGHT,
+        camera=ROOM_CAMERA,
+    )
+    return TargetShot(returns, 2.0, RECORD)
+
+
+@pytest.mark.parametrize("kind", ["room", "slanted", "bush", "relief", "walls", "empty"])
+def test_a_scene_without_a_plate_is_refused(kind: str) -> None:
+    """Twelve seeds, bright and dim; a picosecond was stated for ranges wrong by metres."""
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        shot = see_depths(draw_scene(kind, random), (1000, 30)[seed % 2], random)
+        with pytest.raises(CalibrationError, match=r"plate|no return|two surfaces|cut off") as seen:
+            fit_range_calibration([shot])
+        assert "\n" not in str(seen.value)
+
+
+@pytest.mark.parametrize("kind", ["near", "dim", "tilted", "small", "before a wall"])
+def test_a_plate_is_one(kind: str) -> None:
+    """Seven seeds: time zero is within four of its deviations, which are what photons make them."""
+    for seed in range(7):
+        random = np.random.default_rng(seed)
+        y, x = (place.ravel() for place in np.indices(ROOM))
+        depth_m = np.full(y.size, 2.0)
+        if kind == "tilted":  # 30 mm, half of a pulse's length, from edge to edge
+            depth_m += 0.03 * (x - 23.5) / 47
+        if kind == "small":
+            depth_m[(np.abs(y - 20) > 5) | (np.abs(x - 24) > 5)] = np.nan
+        if kind == "before a wall":
+            depth_m[x > 28] = 2.6
+        shot = see_depths(depth_m, {"near": 5000, "dim": 5}.get(kind, 500), random)
+        fit = fit_range_calibration([shot])
+        late = (fit.camera.time_zero - LATE_S) / fit.calibration.time_zero_sigma
+        # A tilt is an error that neighbours share, and the deviation holds it.
+        assert abs(late) < 4
+        if kind == "near":
+            ideal = NOISE_M / np.sqrt(5000 * y.size) * 2 / SPEED_OF_LIGHT
+            assert fit.calibration.time_zero_sigma == pytest.approx(ideal, rel=0.15)
+
+
+def test_traces_of_something_bright_are_no_plate() -> None:
+    """Flat, but with a hundredth of the counts that the picture shows elsewhere."""
+    random = np.random.default_rng(0)
+    shot = see_depths(np.full(ROOM[0] * ROOM[1], 2.0), 20, random)
+    corner = (shot.returns.y < 20) & (shot.returns.x < 20)
+    bright = shot.returns.intensity * np.where(corner, 1, 100)
+    shot = replace(shot, returns=replace(shot.returns, intensity=bright.astype(np.float32)))
+    assert fit_range_calibration([shot]).target_fraction == 1
+    with pytest.raises(CalibrationError, match="a trace of these; show a flat plate"):
+        fit_range_calibration([shot.cut(corner)])
+
+
 def test_a_camera_file_carries_it(tmp_path: Path) -> None:
     camera = fit_range_calibration(World(5).see_all()).camera
     camera.save(tmp_path / "camera.h5")

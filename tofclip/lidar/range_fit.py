@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.mixed_model import Effects, Measurements, fit_effects
 from tofclip.lidar.range_correction import square_range
 from tofclip.shots import Returns
-from tofclip.units import SPEED_OF_LIGHT
+from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]
 
@@ -42,6 +43,27 @@ WINDOW_PULSES = 0.5
 MIN_TARGET_PIXELS = 3
 """With the target's return. In the dark a detector announces one in a pixel of a hundred, at any
 range: the camera of such a shot would be wrong by the length of the record."""
+
+MIN_TARGET_FRACTION = 0.005
+"""Of the picture's pixels: rays and false alarms agree by chance in patches of a few pixels across."""
+
+MIN_TARGET_BRIGHTNESS = 0.02
+"""Of the whole picture's brightest returns. What is dimmer may be a trace that a recovery leaves of
+them elsewhere: in the dark corners of a recorded scene these had 0.2 to 0.5 % (method tv)."""
+
+BRIGHTEST_PERCENTILE = 99.0
+SHOW_A_PLATE = "show a flat plate that faces the camera, or cut the picture to it (`region`)"
+
+MIN_TARGET_SHARE = 0.5
+"""Of the returns that are not that dim: a plate is most of what is seen. Cluttered scenes have 0.05 to 0.5."""
+
+MAX_FLANK_RATIO = 0.25
+"""Returns up to a window's width before and behind the target, over the target's: none beside a plate,
+as many as within on a surface that goes on in depth."""
+
+MAX_ROUGHNESS = 0.2
+"""Median distance from the target's plane in half widths of the window. A plate's noise makes 0.11 of
+it at most (the window holds six deviations), depths that fill the window evenly make 0.5."""
 
 MAX_RIVAL_FRACTION = 0.7
 """Of the target's returns, that another surface may have."""
@@ -69,6 +91,9 @@ class TargetShot:
         For messages.
     reflectance_percent : float
         Of the target; NaN where it is not known.
+    brightest : float
+        Counts of the brightest returns of the whole picture, where `returns` are those of a part of
+        it; by default of `returns`.
     """
 
     returns: Returns
@@ -76,6 +101,7 @@ class TargetShot:
     record: tuple[float, float]
     name: str = "the shot"
     reflectance_percent: float = np.nan
+    brightest: float = np.nan
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.distance) and self.distance > 0):
@@ -84,6 +110,22 @@ class TargetShot:
             raise InputError(
                 f"a reflectance must be a positive percentage, got {self.reflectance_percent}"
             )
+
+    def cut(self, inside: NDArray[np.bool_]) -> TargetShot:
+        """Return the shot with a part of its returns, and what is known of the others.
+
+        Parameters
+        ----------
+        inside : (returns,) bool array
+        """
+        brightest = self.measure_brightest() if np.isnan(self.brightest) else self.brightest
+        return replace(self, returns=self.returns[inside], brightest=brightest)
+
+    def measure_brightest(self) -> float:
+        """Counts of the brightest returns."""
+        if not len(self.returns):
+            return 0.0
+        return float(np.percentile(_count_signal(self.returns), BRIGHTEST_PERCENTILE))
 
 
 @dataclass(frozen=True)
@@ -159,7 +201,7 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
     Raises
     ------
     CalibrationError
-        A shot has no return, shows two surfaces, or disagrees with the others; the targets lie
+        A shot has no return, shows two surfaces or no flat plate, or disagrees with the others; the targets lie
         further apart than the record is long; or a walk is asked for that the shots cannot tell.
     """
     if not shots:
@@ -256,13 +298,22 @@ def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
             f"{camera.image_shape}"
         )
     found = shot.returns.select("strongest")
-    needed = min(MIN_TARGET_PIXELS, camera.image_shape[0] * camera.image_shape[1])
+    pixels = camera.image_shape[0] * camera.image_shape[1]
+    needed = min(max(MIN_TARGET_PIXELS, round(MIN_TARGET_FRACTION * pixels)), pixels)
     missing = CalibrationError(
         f"{shot.name}: no return stands out in {needed} or more pixels: is the target in the record "
-        "and in the picture?"
+        "and in the picture, and large enough?"
     )
     if len(found) == 0:
         raise missing
+    brightest = shot.measure_brightest() if np.isnan(shot.brightest) else shot.brightest
+    clear = _count_signal(found) >= MIN_TARGET_BRIGHTNESS * brightest
+    if not clear.any():
+        raise CalibrationError(
+            f"{shot.name}: no plate: its returns have {np.median(_count_signal(found)):.3g} counts at "
+            f"most places, the picture's brightest {brightest:.3g}: a trace of these; {SHOW_A_PLATE}"
+        )
+    found = found[clear]
     # A plate across the axis is farther along slanted lines of sight: its distance is over the
     # cosine.
     cosine = compute_ray_directions(camera, found.y, found.x)[:, 2]
@@ -273,6 +324,7 @@ def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
     target = _find_cluster(excess, width, shot.name)
     if target.sum() < needed:
         raise missing
+    _require_plate(excess, sigma, target, width, (found.y, found.x), shot.name)
     arrival = 2 / SPEED_OF_LIGHT * float(np.median(found.range[target]))
     margin = camera.pulse_fwhm / 2
     if not shot.record[0] + margin <= arrival <= shot.record[1] - margin:
@@ -282,7 +334,6 @@ def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
         )
     # Whatever time zero the shot was recovered with is put back: it is what is to be found.
     zero = SPEED_OF_LIGHT / 2 * shot.returns.camera.time_zero
-    square = square_range(found.range)
     y, x = found.y[target].astype(np.int64), found.x[target].astype(np.int64)
     return _Sample(
         y,
@@ -291,9 +342,48 @@ def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
         y * camera.image_shape[1] + x,
         excess[target] + zero,
         sigma[target],
-        np.maximum(found.intensity / square, np.finfo(np.float32).tiny)[target],
+        _count_signal(found)[target],
         cosine[target],
         float(target.mean()),
+    )
+
+
+def _count_signal(returns: Returns) -> FloatArray:
+    """Counts of returns, which list what they would have at 1 m."""
+    signal = returns.intensity / square_range(returns.range)
+    return np.asarray(np.maximum(signal, np.finfo(np.float32).tiny), dtype=np.float64)
+
+
+def _require_plate(
+    excess: FloatArray,
+    sigma: FloatArray,
+    target: NDArray[np.bool_],
+    width: float,
+    place: tuple[NDArray[Any], NDArray[Any]],
+    name: str,
+) -> None:
+    """Refuse returns that agree by chance, or as those of a slanted or uneven surface do."""
+    share = float(target.mean())
+    middle = float(np.median(excess[target]))
+    flank = np.count_nonzero(~target & (np.abs(excess - middle) <= 3 * width)) / target.sum()
+    y, x = (np.asarray(axis[target], dtype=np.float64) for axis in place)
+    plane = np.stack([np.ones(y.size), y - y.mean(), x - x.mean()], axis=1)
+    slope, *_ = np.linalg.lstsq(plane, excess[target], rcond=None)
+    left = excess[target] - plane @ slope
+    rough = float(np.median(np.abs(left - np.median(left))))
+    if share < MIN_TARGET_SHARE:
+        fault = "clutter"
+    elif flank > MAX_FLANK_RATIO:
+        fault = "a surface that goes on in depth"
+    elif rough > MAX_ROUGHNESS * width:
+        fault = "an uneven surface"
+    else:
+        return
+    raise CalibrationError(
+        f"{name}: no plate but {fault}: {target.sum()} of {target.size} returns ({share:.0%}) agree to "
+        f"{width / MILLIMETRE:.2g} mm, {flank:.0%} as many lie just before and behind, and they scatter by "
+        f"{1.4826 * rough / MILLIMETRE:.2g} mm about a plane where "
+        f"{np.median(sigma[target]) / MILLIMETRE:.2g} mm is stated; {SHOW_A_PLATE}"
     )
 
 
