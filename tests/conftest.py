@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import faulthandler
 import os
+import re
 import signal
 import sys
 import threading
+from collections.abc import Generator
 from pathlib import Path
 from types import ModuleType
+from typing import TypeVar
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Workers share the cores: products on threads of their own would only wait for each other.
@@ -68,6 +71,45 @@ def pytest_sessionfinish() -> None:
     """
     if "PYTEST_XDIST_WORKER" in os.environ:
         faulthandler.dump_traceback_later(SECONDS_TO_END, exit=True, file=sys.__stderr__)
+
+
+Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
+STRICT = "TOFCLIP_KNOWN_SKIPS_ONLY" in os.environ
+
+KNOWN_SKIPS = {
+    "": r"^no (recorded|clip pictures|/)|Aravis|Swabian|iverilog|kiss_icp|bm3d|matrix registers|"
+    "there is a graphics processor",
+    "torch": "torch|PyTorch|another device than NumPy's",
+    "browser": "chromium",
+}
+"""What a machine may lack, and, by its name in TOFCLIP_WITHOUT, what .ci/run may be told to do without."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    return refuse_unknown_skip(report)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    report = yield
+    return refuse_unknown_skip(report)
+
+
+def refuse_unknown_skip(report: Report) -> Report:
+    """Let a skip fail in .ci/run if no reason that is known says why: what is not tested is said."""
+    if not report.skipped or hasattr(report, "wasxfail") or not STRICT:
+        return report
+    assert isinstance(report.longrepr, tuple)
+    reason = report.longrepr[2].removeprefix("Skipped: ")
+    allowed = ["", *os.environ.get("TOFCLIP_WITHOUT", "").split()]
+    if not any(re.search(KNOWN_SKIPS[name], reason) for name in allowed):
+        report.outcome, report.longrepr = (
+            "failed",
+            f"skipped for a reason that is not known: {reason}",
+        )
+    return report
 
 
 @pytest.fixture(scope="session")
