@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tofclip.errors import InputError, StorageError
+from tofclip.files import require_suffix
 
 if TYPE_CHECKING:
     from tofclip.shots import Frames
@@ -97,8 +98,8 @@ def require_writable(out: Path, *suffixes: str, inputs: tuple[Path, ...] = ()) -
     """
     if out.is_dir():
         raise StorageError(f"{out}: cannot be written: it is a folder; name a file")
-    if suffixes and out.suffix.lower() not in suffixes:
-        raise InputError(f"{out}: the name must end in {' or '.join(suffixes)}")
+    if suffixes:
+        require_suffix(out, *suffixes)
     if out.parent.exists() and not out.parent.is_dir():
         raise StorageError(f"{out}: cannot be written: its folder is a file")
     if not out.parent.is_dir():

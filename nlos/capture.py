@@ -15,7 +15,7 @@ from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, require_nu
 from tofclip.errors import InputError, ShapeError
 from tofclip.notebook import render_html
 from tofclip.storage import Field, Record
-from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
+from tofclip.units import PICOSECOND, SPEED_OF_LIGHT, require_credible_bin_width
 
 if TYPE_CHECKING:
     from tofclip.shots import Frames
@@ -71,9 +71,6 @@ class TimeAxis:
 
 
 FloatArray = NDArray[np.float64]
-
-BIN_WIDTH_LIMITS_S = (1e-15, 1e-7)
-"""Shortest and longest credible time bin, s: from 0.3 um to 30 m of path."""
 
 MAX_WALL_EXTENT_M = 1e3
 """m; a wider one was not measured in metres."""
@@ -174,10 +171,7 @@ class Capture:
             )
 
     def _validate_units(self) -> None:
-        if not BIN_WIDTH_LIMITS_S[0] <= self.bin_width <= BIN_WIDTH_LIMITS_S[1]:
-            raise InputError(
-                f"a bin width of {self.bin_width:g} s is not credible; give seconds (16 ps are 16e-12)"
-            )
+        require_credible_bin_width(self.bin_width)
         if not np.any(self.valid):
             return
         low, high = self.points.min(axis=0), self.points.max(axis=0)

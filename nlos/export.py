@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from nlos.plane import axis_step, is_evenly_spaced
 from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
-from tofclip.files import atomic_path
+from tofclip.files import atomic_path, require_suffix
 
 if TYPE_CHECKING:
     from nlos.geometry import FloatArray
@@ -42,8 +42,7 @@ class Mesh:
 
     def save(self, path: str | Path) -> None:
         """Write the mesh as binary PLY, whole or not at all."""
-        if Path(path).suffix.lower() != ".ply":
-            raise InputError(f"{path}: a mesh is written as .ply")
+        require_suffix(path, ".ply")
         header = [
             "ply",
             "format binary_little_endian 1.0",
@@ -140,9 +139,7 @@ def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
     if suffix in POINT_SUFFIXES:
         _write_points(volume, path, fraction)
         return
-    if suffix not in WRITERS:
-        known = ", ".join((*WRITERS, *POINT_SUFFIXES))
-        raise InputError(f"{path}: no format of volumes is called '{suffix}'; use one of {known}")
+    require_suffix(path, *WRITERS, *POINT_SUFFIXES)
     with atomic_path(path) as temporary:
         WRITERS[suffix](volume, temporary)
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from nlos.picture import COLOUR_MAP, compute_extent
 from nlos.video import TransientVideo
-from tofclip.errors import InputError
-from tofclip.files import atomic_path
+from tofclip.files import atomic_path, require_suffix
 
 FIGURE_SIZE_INCHES = (5.6, 5.0)
 DOTS_PER_INCH = 80
@@ -40,8 +39,7 @@ def save_film(video: TransientVideo, path: str | Path) -> None:
     from PIL import Image
 
     target = Path(path)
-    if target.suffix.lower() != ".gif":
-        raise InputError(f"{target}: a film's name must end in .gif")
+    require_suffix(target, ".gif")
     first, *others = (
         Image.fromarray(picture).quantize(dither=Image.Dither.NONE)
         for picture in render_frames(video)

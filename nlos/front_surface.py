@@ -13,7 +13,7 @@ from nlos.geometry import FloatArray
 from nlos.plane import axis_step
 from nlos.volume import Volume
 from tofclip.errors import InputError
-from tofclip.files import atomic_path
+from tofclip.files import atomic_path, require_suffix
 
 GRADIENT_VOXELS = 2.0
 """Standard deviation of the neighbourhood whose gradients give a normal, voxels."""
@@ -87,8 +87,7 @@ class FrontSurface:
         InputError
             Another suffix.
         """
-        if Path(path).suffix.lower() != ".ply":
-            raise InputError(f"{path}: a surface with normals is written as .ply")
+        require_suffix(path, ".ply")
         points, faces = self.points, self.faces if min(self.depth.shape) > 1 else np.empty((0, 3))
         names = ("x", "y", "z", "nx", "ny", "nz", "brightness")
         header = [

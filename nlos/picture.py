@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.volume import Volume
-from tofclip.errors import InputError
-from tofclip.files import atomic_path
+from tofclip.files import atomic_path, require_suffix
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,8 +52,7 @@ def save_picture(volume: Volume, path: str | Path) -> None:
         The name has an ending of another format.
     """
     target = Path(path)
-    if target.suffix.lower() not in PICTURE_SUFFIXES:
-        raise InputError(f"{target}: a picture's name must end in {', '.join(PICTURE_SUFFIXES)}")
+    require_suffix(target, *PICTURE_SUFFIXES)
     figure = _draw_figure(volume)
     with atomic_path(target) as temporary:
         figure.savefig(temporary, format=target.suffix[1:].lower())

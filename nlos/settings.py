@@ -31,6 +31,7 @@ from nlos.signal_analysis import (
     find_lit_end,
     find_longest_wavelength,
     require_plausible,
+    require_usable_cycles,
     require_usable_wavelength,
 )
 from nlos.volume import Volume
@@ -305,6 +306,7 @@ def complete_settings(capture: Capture, **given: Any) -> Settings:
         raise InputError(
             f"a gate of {found.gate or 0.0:.4g} m blanks the whole record; blank less (`gate`)"
         )
+    require_usable_cycles(capture, found.cycles)
     if found.wavelength is None:
         wavelength, reason = choose_wavelength(gated, found.cycles)
         found = _add(found, "wavelength", wavelength, reason)

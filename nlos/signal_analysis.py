@@ -338,6 +338,18 @@ def require_usable_wavelength(capture: Capture, wavelength: float, cycles: float
         )
 
 
+def require_usable_cycles(capture: Capture, cycles: float) -> None:
+    """Refuse a virtual pulse that even at the shortest wavelength of the time bins is longer than
+    the record: its band would be computed over that length.
+    """
+    record, shortest = float(np.ptp(capture.axis.paths)), 2 * capture.axis.spacing
+    if cycles * shortest > record:
+        raise InputError(
+            f"a pulse of {cycles:.4g} cycles is longer than the record of {record:.3g} m: use at most "
+            f"{record / shortest:.2g} cycles; about 3 are usual"
+        )
+
+
 def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str]:
     """Choose the carrier of a virtual pulse for a capture without the wall's own light.
 

@@ -15,17 +15,27 @@ import math
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tofclip.errors import FileFormatError, StorageError, TofclipError
+from tofclip.errors import FileFormatError, InputError, StorageError, TofclipError
 
 if TYPE_CHECKING:
     import h5py
 
-MAX_ARRAY_BYTES = 1 << 35
-"""Largest array that is read from a file, 32 GiB; of a computer with less memory, its memory."""
+MAX_UNPACKED_BYTES = 1 << 31
+"""Largest array that a file may make of much less, 2 GiB: what deflate packs a thousandfold is zeros."""
+
+USUAL_COMPRESSION = 8
+"""Arrays that take at least one byte of so many in their file may be larger: the file is large, too."""
+
+MEMORY_FRACTION = 0.5
+"""Of the computer's memory, the most that one array of a file may take."""
+
+ARRAY_LIMIT_VARIABLE = "TOFCLIP_MAX_ARRAY_GIB"
+"""Environment variable that states the largest array, GiB, in place of these limits."""
 
 MAX_COMPRESSION = 1032
 """Deflate makes at most this number of bytes of one; other compressions are not believed to do better."""
@@ -66,13 +76,34 @@ class BoundedFile(io.BufferedReader):
         return super().read(left if size is None or size < 0 else min(size, left))
 
 
-def find_array_limit() -> int:
-    """Return the size, bytes, above which no array of a file is read on this computer."""
-    try:
+def find_array_limit(stored: int = 0) -> int:
+    """Return the size, bytes, above which an array that takes `stored` bytes of its file is not read.
+
+    Raises
+    ------
+    InputError
+        The environment's ``TOFCLIP_MAX_ARRAY_GIB`` is not a positive number.
+    """
+    wanted = os.environ.get(ARRAY_LIMIT_VARIABLE)
+    if wanted:
+        with contextlib.suppress(ValueError, OverflowError):
+            if (limit := int(float(wanted) * (1 << 30))) > 0:
+                return limit
+        raise InputError(f"{ARRAY_LIMIT_VARIABLE} must be a positive number, got '{wanted}'")
+    limit = max(MAX_UNPACKED_BYTES, USUAL_COMPRESSION * stored)
+    with contextlib.suppress(ValueError, OSError, AttributeError):  # a system that does not say
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (ValueError, OSError, AttributeError):  # a system that does not say
-        memory = MAX_ARRAY_BYTES
-    return min(MAX_ARRAY_BYTES, memory)
+        limit = min(limit, int(MEMORY_FRACTION * memory))
+    return limit
+
+
+def _require_array_limit(path: str | Path, name: str, claimed: int, stored: int) -> None:
+    if claimed > (limit := find_array_limit(min(stored, os.path.getsize(path)))):
+        raise FileFormatError(
+            path,
+            f"'{name}' claims {claimed} bytes, more than the {limit} that are read; if you trust the "
+            f"file, set {ARRAY_LIMIT_VARIABLE}={-(-claimed >> 30)}",
+        )
 
 
 def require_bounded_size(
@@ -98,11 +129,7 @@ def require_bounded_size(
     ------
     FileFormatError
     """
-    limit = find_array_limit()
-    if claimed > limit:
-        raise FileFormatError(
-            path, f"'{name}' claims {claimed} bytes, more than the {limit} that are read"
-        )
+    _require_array_limit(path, name, claimed, stored)
     if claimed > min(stored, os.path.getsize(path)) * (MAX_COMPRESSION if compressed else 1):
         raise FileFormatError(
             path,
@@ -130,6 +157,28 @@ def require_own_member(group: h5py.Group, name: str, origin: str | Path) -> None
         raise FileFormatError(origin, f"'{name}' cannot be read: links are not followed")
 
 
+def iterate_members(
+    group: h5py.Group, visited: set[int]
+) -> Iterator[tuple[str, h5py.Dataset | h5py.Group | None]]:
+    """Yield names and members of an HDF5 group; None for a link to elsewhere, and for an object
+    whose address is among those `visited`.
+
+    A file of a few kilobytes may hold a group that holds itself many times over: whoever walks
+    through groups in groups hands on one set of visited addresses.
+    """
+    import h5py
+
+    visited.add(h5py.h5o.get_info(group.id).addr)
+    for name in group:
+        item = None
+        if isinstance(group.get(name, getlink=True), h5py.HardLink):
+            item = group[name]
+            address = h5py.h5o.get_info(item.id).addr
+            item = None if address in visited else item
+            visited.add(address)
+        yield name, item
+
+
 def require_bounded_dataset(
     dataset: h5py.Dataset, origin: str | Path, at_once: int | None = None
 ) -> None:
@@ -155,16 +204,26 @@ def require_bounded_dataset(
     claimed = math.prod(dataset.shape) * dtype.itemsize
     wanted = claimed if at_once is None else at_once * dtype.itemsize
     chunk = math.prod(dataset.chunks or ()) * dtype.itemsize
-    stored, limit = dataset.id.get_storage_size(), find_array_limit()
-    if wanted > limit or chunk > max(claimed, MAX_CHUNK_BYTES):
-        raise FileFormatError(
-            origin,
-            f"'{name}' claims {max(wanted, chunk)} bytes, more than the {limit} that are read",
-        )
+    stored = dataset.id.get_storage_size()
+    _require_array_limit(origin, name, wanted, stored)
+    if chunk > max(claimed, MAX_CHUNK_BYTES):
+        raise FileFormatError(origin, f"is damaged: a chunk of '{name}' claims {chunk} bytes")
     if stored > os.path.getsize(origin) or claimed > MAX_COMPRESSION * stored:
         raise FileFormatError(
             origin, f"is damaged: '{name}' claims {claimed} bytes, which the file cannot hold"
         )
+
+
+def require_suffix(path: str | Path, *suffixes: str) -> None:
+    """Refuse to write to a name that says another format than the file will have.
+
+    Raises
+    ------
+    InputError
+        The name ends in none of `suffixes`.
+    """
+    if Path(path).suffix.lower() not in suffixes:
+        raise InputError(f"{path}: the name must end in {' or '.join(suffixes)}")
 
 
 def compute_sha256(path: str | Path) -> str:
@@ -247,8 +306,12 @@ def remove_temporary_files(targets: Iterable[Path]) -> None:
 
 @contextlib.contextmanager
 def translate_read_errors(path: str | Path) -> Iterator[None]:
-    """Turn the operating system's refusals to read `path` into `StorageError`."""
+    """Turn the operating system's refusals to read `path` into `StorageError`; refuse a pipe or a
+    device before it is opened, which may wait for ever or never end.
+    """
     try:
+        if _is_endless(path):
+            raise StorageError(f"{path}: is a pipe or a device; save what it gives to a file first")
         yield
     except FileNotFoundError as fault:
         raise StorageError(f"{path}: no such file") from fault
@@ -256,6 +319,13 @@ def translate_read_errors(path: str | Path) -> Iterator[None]:
         raise StorageError(f"{path}: is a folder, a file is needed") from fault
     except PermissionError as fault:
         raise StorageError(f"{path}: reading is not permitted") from fault
+
+
+def _is_endless(path: str | Path) -> bool:
+    with contextlib.suppress(OSError):  # opening it will say
+        mode = os.stat(path).st_mode
+        return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+    return False
 
 
 def _create_temporary_file(target: Path) -> Path:

@@ -29,14 +29,14 @@ from tofclip.records import (
     stored_texts,
 )
 from tofclip.storage import Field, Record, Scalar, make_stand_in
-from tofclip.units import SPEED_OF_LIGHT
+from tofclip.units import SPEED_OF_LIGHT, require_credible_bin_width
 
 __all__ = ["Frames", "Returns", "Streak"]
 
 RETURN_CHOICES = ("first", "strongest", "last", "all")
 """Which return of a pixel counts."""
 
-MAX_BIN_WIDTH_S = 1e-3
+MAX_ROW_S = 1e-3
 """s; the slowest sweeps of streak cameras last milliseconds in all."""
 
 
@@ -160,6 +160,8 @@ class Streak(Storable):
             )
         if not np.all(np.isfinite(checked)) or np.any(np.diff(checked) <= 0):
             raise InputError(f"{self.source}: the time axis must be finite and increase row by row")
+        if checked.size > 1:
+            require_credible_bin_width(float(np.diff(checked).mean()), longest=MAX_ROW_S)
         return checked
 
     @property
@@ -179,10 +181,7 @@ class Streak(Storable):
         """Return the same picture with evenly spaced rows of `bin_width` seconds, the first at 0."""
         if not (np.isfinite(bin_width) and bin_width > 0):
             raise InputError(f"bin width must be a positive number of seconds, got {bin_width}")
-        if bin_width > MAX_BIN_WIDTH_S:
-            raise InputError(
-                f"a row of {bin_width:.3g} s is longer than any sweep; check the unit of `bin_width`"
-            )
+        require_credible_bin_width(bin_width, longest=MAX_ROW_S)
         return replace(
             self, row_times=np.arange(self.counts.shape[0], dtype=np.float64) * float(bin_width)
         )
@@ -424,6 +423,8 @@ class Frames(Storable):
             raise ShapeError("frames", f"(time, y, x) = {expected}", tuple(self.values.shape))
         if times.size == 0 or not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
             raise InputError("frame times must be finite and increase")
+        if times.size > 1:
+            require_credible_bin_width(self.bin_width)
         shears = np.asarray(self.shears, dtype=np.float64)
         object.__setattr__(self, "shears", shears if shears.size else np.zeros(times.size))
         if self.shears.shape != times.shape or not np.all(np.isfinite(self.shears)):
@@ -439,7 +440,7 @@ class Frames(Storable):
         return np.asarray(to_numpy(self.values), dtype=dtype)
 
     def __getitem__(self, frames: slice) -> Frames:
-        """Return some of the frames, such as ``frames[100:200]``."""
+        """Return some of the frames, such as ``frames[100:200]``, with the returns of their time."""
         if not isinstance(frames, slice):
             raise InputError(
                 "frames are selected by a slice, such as frames[100:101] for one of them"
@@ -448,11 +449,18 @@ class Frames(Storable):
             raise InputError(f"no frame is selected of {len(self)}")
         if (frames.step or 1) < 0:
             raise InputError("frames stay in the order of time; a step cannot be negative")
+        returns = self.returns
+        if returns is not None:
+            # A return belongs to the frame nearest in time.
+            nearest = np.searchsorted((self.times[1:] + self.times[:-1]) / 2, returns.time)
+            taken = np.arange(len(self))[frames]
+            returns = returns[(taken[0] <= nearest) & (nearest <= taken[-1])]
         return replace(
             self,
             values=self.values[frames],
             times=self.times[frames],
             shears=self.shears[frames],
+            returns=returns,
         )
 
     def sel(

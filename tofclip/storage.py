@@ -23,13 +23,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from tofclip.errors import FileFormatError, InputError, StorageError, require_path
+from tofclip.errors import FileFormatError, StorageError, require_path
 from tofclip.files import (
     atomic_path,
     compute_sha256,
     format_error_line,
+    iterate_members,
     require_bounded_dataset,
-    require_own_member,
+    require_suffix,
     translate_read_errors,
 )
 from tofclip.version import __version__
@@ -39,29 +40,8 @@ if TYPE_CHECKING:
 
 Scalar = str | int | float | bool
 
-FOREIGN_SUFFIXES = frozenset(
-    [
-        ".csv",
-        ".exr",
-        ".jpg",
-        ".json",
-        ".las",
-        ".laz",
-        ".mat",
-        ".mp4",
-        ".npy",
-        ".npz",
-        ".obj",
-        ".pcd",
-        ".pdf",
-        ".ply",
-        ".png",
-        ".tif",
-        ".tiff",
-        ".txt",
-    ]
-)
-"""Of formats that a record is not written in: a file is not called what it is not."""
+RECORD_SUFFIXES = (".h5", ".hdf5")
+"""Of names under which a record is written: a file is not called what it is not."""
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """The first bytes of every HDF5 file."""
@@ -272,15 +252,14 @@ def write_record(record: Record, path: str | Path, compressed: bool = True) -> N
     Raises
     ------
     InputError
-        The name ends in the suffix of another format.
+        The name ends in another suffix than .h5 or .hdf5.
     StorageError
         The file cannot be written.
     """
     import h5py
 
-    suffix = Path(path).suffix.lower()
-    if suffix in FOREIGN_SUFFIXES:
-        raise InputError(f"{path}: '{record.kind}' is saved as HDF5 (.h5), not as '{suffix}'")
+    if Path(path).suffix:
+        require_suffix(path, *RECORD_SUFFIXES)
     with atomic_path(path) as temporary:
         # HDF5 crashes the process when the disk fills up under it: it writes to memory, and Python
         # to the disk.
@@ -434,6 +413,7 @@ def _read_group(
     group: h5py.Group,
     origin: str,
     read_dataset: Callable[[h5py.Dataset, str], Any],
+    visited: set[int] | None = None,
     depth: int = 0,
 ) -> Record:
     import h5py
@@ -442,9 +422,10 @@ def _read_group(
         raise FileFormatError(origin, f"has records in each other, more than {MAX_DEPTH} deep")
     fields: dict[str, Field] = {}
     children: dict[str, Record] = {}
-    for name in group:
-        require_own_member(group, name, origin)
-        item = group[name]
+    visited = set() if visited is None else visited
+    for name, item in iterate_members(group, visited):
+        if item is None:
+            raise FileFormatError(origin, f"'{name}' cannot be read: links are not followed")
         if isinstance(item, h5py.Dataset):
             axes = _read_text(item, "axes")
             fields[name] = Field(
@@ -453,7 +434,7 @@ def _read_group(
                 tuple(axes.split(",")) if axes else (),
             )
         elif isinstance(item, h5py.Group):
-            children[name] = _read_group(item, origin, read_dataset, depth + 1)
+            children[name] = _read_group(item, origin, read_dataset, visited, depth + 1)
         else:
             raise FileFormatError(origin, f"is damaged: '{name}' cannot be read")
     _require_bounded_attributes(group, origin)

@@ -99,7 +99,7 @@ class RecordingWriter:
         # for a day that did not pass.
         self._clock_offset_ns = time_ns() - monotonic_ns()
         self._checked_at = monotonic()
-        self._head = _render_head(head, path)
+        self._head = _render_head(head)
         with contextlib.ExitStack() as stack:
             self._file, temporary = _create_file(path, overwrite, stack)
             self._append(BlockKind.HEAD, self._head)
@@ -202,10 +202,10 @@ class RecordingWriter:
         return StorageError(f"{self._path}: cannot be written: {fault.strerror}{safe}")
 
 
-def _render_head(head: Record, path: Path) -> bytes:
+def _render_head(head: Record) -> bytes:
     """Return a record as the bytes of an HDF5 file."""
     with tempfile.TemporaryDirectory() as folder:
-        image = Path(folder, path.name)
+        image = Path(folder, "head.h5")
         head.save(image)
         content = image.read_bytes()
     # Filled up to whole sectors, so that a lost one never costs two copies. HDF5 reads on as far as

@@ -26,6 +26,7 @@ def refused(outcome: Outcome, complaint: str) -> None:
         ),
         (["--point-fraction", "2"], "point_fraction is a share"),
         (["--cycles", "0"], "cycles"),
+        (["--cycles", "1e8"], "is longer than the record"),
         (["--voxel-mm", "-1"], "voxel"),
         (["--bins-together", "0"], "cannot be put together by 0"),
         (["--gate-m", "-1"], "margin"),

@@ -269,7 +269,7 @@ def test_what_no_counter_shows_is_refused_in_a_line(run: Run, shot, tmp_path: Pa
     """ns given for ps, a pulse longer than the record, and more returns than a cloud numbers."""
     words = ["lidar", "photons", shot[0], "--out", tmp_path / "range.npz"]
     for further, needed in (
-        (["--bin-width-ps", "0.08"], "finer than any counter's; check the unit of --bin-width-ps"),
+        (["--bin-width-ps", "0.08"], "is not credible; check the unit of --bin-width-ps"),
         (
             ["--bin-width-ps", "0.16"],
             "shorter than any counter's; check the unit of --bin-width-ps",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import struct
 import tracemalloc
 import zipfile
@@ -25,11 +26,12 @@ from PIL import Image
 
 from nlos.io import read_capture
 from tofclip import PointCloud, load
-from tofclip.errors import FileFormatError
-from tofclip.files import MAX_ARRAY_BYTES, find_array_limit, require_bounded_size
+from tofclip.errors import FileFormatError, InputError, StorageError, TofclipError
+from tofclip.files import MAX_UNPACKED_BYTES, find_array_limit, require_bounded_size
 from tofclip.io import read_streak
 from tofclip.io.light_fields import read_light_field
 from tofclip.io.streaks import StreakStack, outline_streak_file
+from tofclip.lidar.photons.files import read_photons
 
 HUGE = 1 << 29
 ROOM_BYTES = 16 << 20
@@ -231,9 +233,26 @@ def test_a_file_that_claims_more_than_it_can_hold_is_refused(
 def test_no_array_is_larger_than_the_memory(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.touch()
-    assert find_array_limit() <= MAX_ARRAY_BYTES
-    with pytest.raises(FileFormatError, match=f"more than the {find_array_limit()} that are read"):
-        require_bounded_size(path, "a", find_array_limit() + 1, 1 << 60)
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    assert find_array_limit(1 << 60) < memory
+    with pytest.raises(FileFormatError, match=r"more than the [0-9]+ that are read"):
+        require_bounded_size(path, "a", memory, 1 << 60)
+
+
+def test_a_bomb_of_zeros_is_refused_unless_the_user_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a"
+    path.touch()
+    os.truncate(path, 1 << 23)  # takes no room on the disk
+    assert find_array_limit() <= MAX_UNPACKED_BYTES
+    with pytest.raises(FileFormatError, match=r"set TOFCLIP_MAX_ARRAY_GIB=4$"):
+        require_bounded_size(path, "a", 1 << 32, 1 << 23, compressed=True)
+    monkeypatch.setenv("TOFCLIP_MAX_ARRAY_GIB", "4")
+    require_bounded_size(path, "a", 1 << 32, 1 << 23, compressed=True)
+    monkeypatch.setenv("TOFCLIP_MAX_ARRAY_GIB", "all")
+    with pytest.raises(InputError, match="must be a positive number"):
+        require_bounded_size(path, "a", 1 << 32, 1 << 23, compressed=True)
 
 
 def test_what_deflate_can_pack_is_believed(tmp_path: Path) -> None:
@@ -242,3 +261,28 @@ def test_what_deflate_can_pack_is_believed(tmp_path: Path) -> None:
         assert stored["lf"].nbytes > 500 * (tmp_path / "field.npz").stat().st_size
     with pytest.raises(FileFormatError, match="no field 'scale'"):
         read_light_field(tmp_path / "field.npz")
+
+
+@pytest.mark.parametrize("read", [load, outline_streak_file, read_photons, read_capture])
+def test_a_file_whose_root_holds_itself_is_read_once(
+    read: Callable[[Path], Any], tmp_path: Path
+) -> None:
+    for own in (False, True):
+        with h5py.File(tmp_path / "cycle.h5", "w") as file:
+            if own:
+                file.attrs["format"], file.attrs["format_version"] = "tofclip", 1
+                file.attrs["provenance"], file.attrs["kind"] = "{}", "frames"
+            for number in range(24):
+                file[f"again{number}"] = file["/"]
+        with pytest.raises(TofclipError):
+            read(tmp_path / "cycle.h5")
+
+
+@pytest.mark.parametrize("read", [load, read_photons, read_capture, read_streak, PointCloud.load])
+def test_a_pipe_is_refused_before_it_is_waited_for(
+    read: Callable[[Path], Any], tmp_path: Path
+) -> None:
+    for name in ("shot.tif", "shot.npy", "shot.ply", "shot.exr", "shot.npz", "shot.csv"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises((StorageError, InputError), match=r"is a pipe or a device|must end in"):
+            read(tmp_path / name)

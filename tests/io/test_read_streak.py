@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -264,3 +265,26 @@ def test_recorded_focus_pictures_have_no_time_axis(shared_data: Path, name: str)
     assert streak.counts.shape == (1016, 1344)
     assert streak.row_times is None
     assert streak.metadata["Streak camera/Mode"] == "Focus"
+
+
+def test_a_row_of_pictures_that_is_broken_off_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "stack.tif"
+    with tifffile.TiffWriter(path) as writer:
+        for _ in range(64):
+            writer.write(np.ones((20, 30), np.uint16), metadata=None, contiguous=False)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(FileFormatError, match="is truncated: its picture 32 is missing"):
+        read_streak(path)
+
+
+def test_a_picture_that_follows_itself_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "loop.tif"
+    tifffile.imwrite(path, np.ones((20, 30), np.uint16))
+    with tifffile.TiffFile(path) as tiff:
+        page, layout = tiff.pages.first, tiff.tiff
+        next_at = page.offset + layout.tagnosize + len(page.tags) * layout.tagsize
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<I", content, next_at, page.offset)
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match="circle"):
+        read_streak(path)

@@ -70,7 +70,7 @@ def test_a_surface_is_written_with_normals(tmp_path: Path) -> None:
     corners = found.points[found.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert np.all(across[:, 2] < 0)
-    with pytest.raises(InputError, match=r"written as \.ply"):
+    with pytest.raises(InputError, match=r"must end in \.ply"):
         found.save(tmp_path / "surface.vti")
 
 

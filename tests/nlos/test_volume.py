@@ -27,6 +27,13 @@ def test_magnitude_and_brightest_voxel() -> None:
     assert volume.find_brightest() == pytest.approx((0.3, -0.2, 0.6))
 
 
+@pytest.mark.parametrize("suffix", [".nii", ".ply", ".h5x"])
+def test_a_volume_is_not_called_what_it_is_not(suffix: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"must end in \.h5 or \.hdf5"):
+        volume_with().save(tmp_path / f"volume{suffix}")
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_maximum_projection_keeps_the_depth() -> None:
     projection = volume_with().maximum_projection()
     assert projection.brightness.shape == projection.depth.shape == (3, 4)

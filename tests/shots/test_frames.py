@@ -10,7 +10,7 @@ import pytest
 
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import FileFormatError, InputError, ShapeError
-from tofclip.shots import Frames
+from tofclip.shots import Frames, Returns
 from tofclip.storage import Field, Record
 
 CAMERA = Camera(
@@ -69,6 +69,7 @@ def test_the_mean_bin_width() -> None:
         ({"times": TIMES[:3]}, ShapeError, r"= \(3, 5, 6\)"),
         ({"times": TIMES[::-1]}, InputError, "finite and increase"),
         ({"times": np.array([0, 1, np.inf, 3])}, InputError, "finite and increase"),
+        ({"times": 1e12 * TIMES}, InputError, "not credible"),  # ps in place of s
         ({"times": np.empty(0), "values": VALUES[:0]}, InputError, "finite and increase"),
         ({"values": np.where(VALUES > 1, np.nan, VALUES)}, InputError, "NaN or infinity"),
     ],
@@ -85,3 +86,21 @@ def test_a_file_without_a_camera_is_refused(tmp_path: Path) -> None:
     Record("frames", record.fields).save(tmp_path / "frames.h5")
     with pytest.raises(FileFormatError, match=r"frames\.h5: frames record carries no camera"):
         Frames.load(tmp_path / "frames.h5")
+
+
+def test_frames_take_their_returns_along() -> None:
+    times = np.array([5.0, 10.4, 11.9, 12.1, 15.0, 30.0]) * 1e-12
+    numbers = np.zeros(times.size, np.int32)
+    returns = Returns(
+        numbers, numbers, 1.5e8 * times, *([numbers + np.float32(1)] * 3), times, CAMERA
+    )
+    frames = Frames(VALUES, TIMES, CAMERA, returns=returns)
+
+    def left(part: Frames) -> list[float]:
+        assert part.returns is not None
+        return list(np.round(part.returns.time * 1e12, 3))
+
+    assert left(frames[1:3]) == [11.9, 12.1]
+    assert left(frames.sel(time=(10.5e-12, 11.5e-12))) == [11.9]
+    # Every return is in one part of a whole.
+    assert left(frames[:2]) + left(frames[2:]) == left(frames[:]) == left(frames)

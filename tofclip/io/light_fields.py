@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.errors import FileFormatError, StorageError
 from tofclip.files import (
     BoundedFile,
     atomic_path,
     format_error_line,
     require_bounded_size,
+    require_suffix,
     translate_read_errors,
 )
 from tofclip.io.archive import NPY_SUFFIX, Archive
@@ -273,10 +274,8 @@ def write_light_field(light_field: LightField, path: str | Path) -> None:
         The file cannot be written.
     """
     target = Path(path)
-    writer = _WRITERS.get(target.suffix.lower())
-    if writer is None:
-        raise InputError(f"{target}: the name of a light field must end in {' or '.join(_WRITERS)}")
-    writer(light_field, target)
+    require_suffix(target, *_WRITERS)
+    _WRITERS[target.suffix.lower()](light_field, target)
 
 
 def read_depth_map(path: str | Path) -> NDArray[np.float64]:

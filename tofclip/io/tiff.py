@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -89,6 +90,7 @@ def _open_page(path: str | Path) -> Iterator[tifffile.TiffPage]:
 def _check_only_page(tiff: tifffile.TiffFile, path: str | Path) -> tifffile.TiffPage:
     """Hold what the header claims against the file before any memory is taken for it."""
     page = tiff.pages.first
+    require_whole_chain(tiff, path)
     if len(tiff.pages) != 1:
         raise FileFormatError(path, f"holds {len(tiff.pages)} pictures, expected one streak image")
     if page.ndim != 2 or page.dtype is None or page.dtype.kind not in "uif":
@@ -99,8 +101,9 @@ def _check_only_page(tiff: tifffile.TiffFile, path: str | Path) -> tifffile.Tiff
     return page
 
 
-def require_finite_chain(tiff: tifffile.TiffFile, path: str | Path) -> None:
-    """Refuse a file whose pictures follow each other in a circle: going through them has no end.
+def require_whole_chain(tiff: tifffile.TiffFile, path: str | Path) -> None:
+    """Refuse a file whose pictures follow each other in a circle, or on beyond its end; tifffile
+    takes either for the end of the row.
 
     Parameters
     ----------
@@ -112,11 +115,23 @@ def require_finite_chain(tiff: tifffile.TiffFile, path: str | Path) -> None:
     ------
     FileFormatError
     """
+    file, layout = tiff.filehandle, tiff.tiff
     seen: set[int] = set()
-    for page in tiff.pages:
-        if page.offset in seen:
+
+    def read_number(at: int, form: str) -> int:
+        file.seek(at)
+        content = file.read(struct.calcsize(form))
+        if len(content) < struct.calcsize(form):
+            raise FileFormatError(path, f"is truncated: its picture {len(seen)} is missing")
+        return int(struct.unpack(form, content)[0])
+
+    offset = tiff.pages.first.offset
+    while offset:
+        if offset in seen:
             raise FileFormatError(path, "is damaged: its pictures follow each other in a circle")
-        seen.add(page.offset)
+        tags = read_number(offset, layout.tagnoformat)
+        seen.add(offset)
+        offset = read_number(offset + layout.tagnosize + tags * layout.tagsize, layout.offsetformat)
 
 
 def require_bounded_page(page: tifffile.TiffPage, path: str | Path) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tofclip.dependencies import import_open3d
 from tofclip.errors import FileFormatError, InputError, ShapeError, require_type
+from tofclip.files import require_suffix
 from tofclip.io.archive import ArchiveEntry
 from tofclip.lidar import export
 from tofclip.lidar.column import Column
@@ -234,6 +235,7 @@ class PointCloud(Storable):
         StorageError
             The file could not be written; what was there before is left as it was.
         """
+        require_suffix(path, *export.FORMATS, ".h5")
         if Path(path).suffix.lower() == ".h5":
             super().save(path)
         else:

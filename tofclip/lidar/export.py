@@ -14,8 +14,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import FileFormatError, InputError
-from tofclip.files import atomic_path, translate_read_errors
+from tofclip.errors import FileFormatError
+from tofclip.files import atomic_path, require_suffix, translate_read_errors
 from tofclip.io.archive import Archive, ArchiveEntry
 from tofclip.lidar.column import Columns, Table
 from tofclip.lidar.e57 import list_e57_columns, write_e57
@@ -71,11 +71,8 @@ def read_table(path: str | Path) -> Table:
 
 
 def _look_up_format(path: str | Path) -> tuple[ColumnWriter, ColumnLister]:
-    suffix = Path(path).suffix.lower()
-    if suffix not in FORMATS:
-        known = ", ".join([*FORMATS, ".h5"])
-        raise InputError(f"{path}: no point cloud format is called '{suffix}'; use one of {known}")
-    return FORMATS[suffix]
+    require_suffix(path, *FORMATS)
+    return FORMATS[Path(path).suffix.lower()]
 
 
 def _write_ply(path: Path, columns: Columns) -> None:

@@ -22,6 +22,7 @@ from tofclip.errors import FileFormatError, InputError, TofclipError
 from tofclip.files import (
     BoundedFile,
     format_error_line,
+    iterate_members,
     require_bounded_size,
     translate_read_errors,
 )
@@ -29,7 +30,7 @@ from tofclip.io.archive import list_npz_entries, read_npy_header
 from tofclip.io.becker_hickl import read_sdt_blocks
 from tofclip.io.mat import list_mat_variables
 from tofclip.io.picoquant import TCSPC, PtuEvents, get_scan_shape, read_scan
-from tofclip.io.tiff import require_finite_chain
+from tofclip.io.tiff import require_whole_chain
 from tofclip.lidar.photons.photon_image import PhotonImage
 from tofclip.storage import HDF5_SIGNATURE
 
@@ -363,7 +364,7 @@ def _open_hdf5(path: Path) -> PhotonFile:
     arrays, scalars = [], {}
     with h5py.File(path, "r") as file:
         scalars.update(file.attrs)
-        for name, dataset in _iterate_datasets(file):
+        for name, dataset in _iterate_datasets(file, set()):
             scalars.update(dataset.attrs)
             is_cell = dataset.dtype.kind == "O" and dataset.attrs.get("MATLAB_class") == b"cell"
             if dataset.size == 1 and dataset.dtype.kind in "uif":
@@ -380,19 +381,18 @@ def _open_hdf5(path: Path) -> PhotonFile:
     return PhotonFile(arrays, _find_bin_width(scalars))
 
 
-def _iterate_datasets(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the datasets of a file that lie in it: links to elsewhere are not followed."""
+def _iterate_datasets(group: Any, visited: set[int], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the datasets of a file that lie in it, each once: links to elsewhere are not followed."""
     import h5py
 
-    for name in group:
-        if name == "#refs#" or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+    for name, item in iterate_members(group, visited):
+        if name == "#refs#":
             continue
-        item = group[name]
         if isinstance(item, h5py.Dataset):
             if not (item.external or item.is_virtual):
                 yield prefix + name, item
         elif isinstance(item, h5py.Group) and prefix.count("/") < 8:
-            yield from _iterate_datasets(item, f"{prefix}{name}/")
+            yield from _iterate_datasets(item, visited, f"{prefix}{name}/")
 
 
 def _make_hdf5_loader(path: Path, name: str, matlab: bool) -> Callable[[], NDArray[Any]]:
@@ -420,7 +420,7 @@ def _open_tiff(path: Path) -> PhotonFile:
     import tifffile
 
     with BoundedFile(path) as file, tifffile.TiffFile(file) as tiff:
-        require_finite_chain(tiff, path)
+        require_whole_chain(tiff, path)
         series = tiff.series[0]
         if len(series.shape) != 3 or series.dtype is None:
             raise FileFormatError(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.errors import InputError, ShapeError
-from tofclip.shots import MAX_BIN_WIDTH_S
+from tofclip.units import require_credible_bin_width
 
 FloatArray = NDArray[np.float64]
 
@@ -60,14 +60,7 @@ class PhotonImage:
             raise ShapeError("the counts of photon events", self.bin.shape, self.count.shape)
         if not (np.isfinite(self.bin_width) and self.bin_width > 0):
             raise InputError(f"the width of a bin must be a positive time, got {self.bin_width}")
-        if self.bin_width > MAX_BIN_WIDTH_S:
-            raise InputError(
-                f"a bin of {self.bin_width:.3g} s is longer than any range takes; check the unit of `bin_width`"
-            )
-        if self.bin_width < MIN_BIN_WIDTH_S:
-            raise InputError(
-                f"a bin of {self.bin_width:.3g} s is finer than any counter's; check the unit of `bin_width`"
-            )
+        require_credible_bin_width(self.bin_width, shortest=MIN_BIN_WIDTH_S)
         if not self.bin.size:
             raise InputError("no pixel counted a photon")
 
