@@ -22,7 +22,7 @@ from devices.ledger import Stats
 from devices.recorder import record_source
 from devices.recording.blocks import HEADER_BYTES, BlockHeader, BlockKind
 from devices.recording.check import repair, verify
-from devices.recording.reader import Block, Recording
+from devices.recording.reader import SEARCH_BYTES, Block, Recording
 from devices.recording.writer import RecordingWriter, make_head
 from devices.replay import ReplaySource
 from devices.ring import Gap, Piece
@@ -491,6 +491,37 @@ def test_a_truncated_recording_is_good_up_to_its_end_and_says_that_it_is_cut(
         repair(path, tmp_path / "out.h5")
         again = verify(tmp_path / "out.h5")
         assert (again.is_sound, again.complete, again.records) == (True, False, found.records)
+
+
+@pytest.mark.parametrize("before_border", range(1, 9))
+def test_a_block_is_found_wherever_the_search_before_it_stops(
+    tmp_path: Path, before_border: int
+) -> None:
+    """Of its first eight bytes so many lie before the border of what is searched at once."""
+    path = tmp_path / "run.h5"
+    writer = RecordingWriter(path, make_head(CODEC, Info("x"), None, {}))
+    damaged_at = path.stat().st_size
+    long = SEARCH_BYTES + 1 - before_border
+    writer.add(Piece(bytes(long - HEADER_BYTES), 0))
+    writer.add(Piece(CODEC.encode(np.array([(5, 1, 0)], RECORD_DTYPE)), 1))
+    writer.close()
+    content = bytearray(path.read_bytes())
+    content[damaged_at] ^= 1
+    path.write_bytes(content)
+    found = verify(path)
+    assert (found.records, found.damaged_blocks, found.damaged_bytes) == (1, 1, long)
+
+
+def test_blocks_say_when_they_were_recorded(tmp_path: Path) -> None:
+    """By this computer's clock, ns since 1970."""
+    before = time.time_ns()
+    written(tmp_path / "run.h5")
+    after = time.time_ns()
+    with Recording(tmp_path / "run.h5") as recording:
+        times = [one.header.time_ns for one in recording.blocks if isinstance(one, Block)]
+    # Both clocks are read one after the other, and the system may set one meanwhile.
+    assert before - 10**9 < times[0] <= times[-1] < after + 10**9
+    assert times == sorted(times)
 
 
 def test_a_second_recorder_is_refused(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ Each fails `OldTagger`, which is how the first driver was, and passes the driver
 
 from __future__ import annotations
 
+import errno
 import time
 from typing import Any
 
@@ -13,19 +14,29 @@ import pytest
 
 from devices.codec import Records
 from devices.emulation.faults import Fault
-from devices.emulation.usb import VirtualUsb
+from devices.emulation.usb import VirtualUsb, make_usb_error
 from devices.source import Source
 from devices.timetag import feed
 from devices.timetag.emulator import (
     BOARD_MEMORY_BYTES,
     CLOCK_HZ,
+    COMMAND,
+    MAGIC,
     EmulatedTimeTagger,
     EmulatorSettings,
 )
 from devices.timetag.light import PoissonStream
-from devices.timetag.registers import Capture, Register, TimeTagger
+from devices.timetag.registers import (
+    COMMAND_ENDPOINT,
+    DATA_ENDPOINT,
+    USB_IDENTITY,
+    Capture,
+    Register,
+    TimeTagger,
+)
 from devices.timetag.source import open_on_backend
 from devices.uri import Uri
+from devices.usb import UsbLink
 from tofclip.errors import DeviceError, DeviceTimeoutError, ProtocolError
 
 KIND: dict[str, Any] = {
@@ -37,6 +48,7 @@ KIND: dict[str, Any] = {
     "packet_bytes": 512,
 }
 RECORDS = 2000
+OLD: dict[str, Any] = {"old_records": 400, "holds_packets": True, "flush_discards": False}
 
 
 class OldTagger(TimeTagger):
@@ -110,7 +122,7 @@ def true_ticks() -> Any:
         {"stale_replies": 1},
         {"stale_replies": 2, "jammed_bytes": 5},
         {"old_records": 40, "holds_packets": True},
-        {"old_records": 400, "holds_packets": True, "flush_discards": False},
+        OLD,
         {"holds_packets": True, "packet_bytes": 510},
         {"holds_packets": True, "packet_bytes": 510, "flush_discards": False},
     ],
@@ -188,6 +200,44 @@ def test_a_clock_that_cannot_be_is_refused() -> None:
     instrument._registers[Register.CLOCK] = 42
     with pytest.raises(ProtocolError, match="42 Hz, which cannot be"):
         open_source(instrument)
+
+
+@pytest.mark.parametrize("stale", [1, 2])
+def test_a_late_reply_does_not_answer_the_next_request(stale: int) -> None:
+    """What another program asked, and never fetched, comes while this one works."""
+    instrument = make_instrument()
+    tagger = TimeTagger(UsbLink(USB_IDENTITY, "", VirtualUsb(instrument)))
+
+    def reply_late() -> None:
+        for _ in range(stale):
+            instrument.receive(COMMAND_ENDPOINT, COMMAND.pack(MAGIC, 0, Register.CLOCK, 0))
+
+    tagger.write(Register.STROBE, 5)
+    reply_late()
+    assert tagger.read(Register.STROBE) == 5
+    reply_late()
+    tagger.write(Register.STROBE, 9)
+    assert tagger.read(Register.STROBE) == 9
+    assert tagger.version == 6
+
+
+@pytest.mark.parametrize("silent", [0, 1, 2])
+def test_records_of_the_last_session_are_thrown_away_though_they_come_slowly(silent: int) -> None:
+    """One request for them is not answered in time."""
+
+    class Slow(EmulatedTimeTagger):
+        requests = 0
+
+        def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
+            if endpoint == DATA_ENDPOINT:
+                self.requests += 1
+                if self.requests == silent + 1:
+                    raise make_usb_error(errno.ETIMEDOUT)
+            return super().fill(endpoint, buffer, timeout)
+
+    setting = EmulatorSettings(**{**KIND, "records": RECORDS, **OLD})
+    instrument = Slow(lambda _: PoissonStream(1e6, CLOCK_HZ, 1), "", setting)
+    np.testing.assert_array_equal(read_all(instrument)["time_ticks"], true_ticks())
 
 
 @pytest.mark.parametrize("number", range(12))

@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import array_shapes
 
 from nlos import Capture
 from tofclip.errors import FileFormatError, InputError, ShapeError
+from tofclip.units import SPEED_OF_LIGHT
 
 WALL = np.random.default_rng(1).normal(size=(3, 4, 3))
 SIGNAL = np.random.default_rng(2).normal(size=(5, 3, 4))
@@ -28,6 +29,13 @@ def test_points_and_traces_agree_and_leave_masked_points_out() -> None:
     assert np.array_equal(capture.traces(slice(6, 8)), capture.traces()[6:8])
     assert capture.traces().dtype == np.float32
     assert capture.traces().flags.c_contiguous
+
+
+@pytest.mark.parametrize("start", [0.0, 0.2, -1.3])
+def test_the_first_bin_is_at_the_start_of_the_record(start: float) -> None:
+    capture = Capture(SIGNAL, WALL, [0, 0, 0], 1e-10, start)
+    assert capture.axis.paths[0] == start
+    assert np.diff(capture.axis.paths) == pytest.approx(SPEED_OF_LIGHT * 1e-10)
 
 
 def test_lasers_follow_the_points() -> None:

@@ -10,6 +10,7 @@ import pytest
 from relay_walls import planar_wall
 
 from nlos import Capture, Grid, PlanarRSD, Volume, settings_for
+from nlos.band import VirtualPulse
 from nlos.capture import TimeAxis
 from nlos.io import read_capture
 from nlos.moveout import join_near_lasers
@@ -19,7 +20,7 @@ from nlos.preparation import (
     remove_first_bounce,
 )
 from nlos.settings import complete_settings, is_brightest_on_wall
-from nlos.signal_analysis import find_first_bounce
+from nlos.signal_analysis import choose_wavelength, find_brightest_path, find_first_bounce
 from nlos.simulate import PointScene, add_poisson_noise
 from tofclip.errors import InputError
 
@@ -46,14 +47,68 @@ def with_glare(capture: Capture, peak: float, fades: float = 0.05) -> Capture:
 def test_the_walls_own_light_is_recognised_and_gated(confocal: bool, peak: float) -> None:
     bounce = find_first_bounce(with_glare(clean(confocal), peak))
     assert bounce is not None
-    # It has faded, and the hidden point's light (from 1.5 m on) is not cut away.
-    assert 0.05 < bounce.end < 1.2
     settings = settings_for(with_glare(clean(confocal), peak))
     assert settings.gate_found
     assert "wall's own light" in settings.reasons["gate"]
     prepared = settings.prepare(with_glare(clean(confocal), peak))
     volume = settings.make_method().reconstruct(prepared, settings.grid(0.05))
     assert volume.find_brightest() == pytest.approx(HIDDEN[0], abs=0.06)
+
+
+def lit_late(hidden: float, confocal: bool, peak: float = 0.0, fades: float = 1.0) -> Capture:
+    """Every wall point sees light of brightness 1 that much path (m) after the wall's own."""
+    axis, laser = TimeAxis(1700, 3e-12), WALL if confocal else np.zeros(3)
+    late = axis.paths[:, None, None] - np.linalg.norm(WALL - laser, axis=-1)
+    glare = np.where(late >= 0, peak * np.exp(-np.maximum(late, 0) / fades), 0)
+    signal = glare + np.exp(-(((late - hidden) / 0.05) ** 2) / 2)
+    return Capture(signal, WALL, laser, axis.bin_width)
+
+
+PROFILE_STEP, ROUNDING = 0.72 / 50, 1e-3
+"""m of path by which the mean signal is looked at, of the wall's width; and a bin, to which steps
+begin.
+"""
+
+
+@pytest.mark.parametrize("confocal", [True, False])
+@pytest.mark.parametrize("peak", [10.0, 1000.0])
+def test_the_gate_ends_where_the_walls_light_is_a_tenth_of_what_follows(
+    confocal: bool, peak: float
+) -> None:
+    for fades in np.linspace(0.04, 0.06, 5):
+        bounce = find_first_bounce(lit_late(1.2, confocal, peak, fades))
+        assert bounce is not None
+        faded = fades * np.log(10 * peak)
+        # In the middle of the first step of the profile at which it has.
+        assert faded - ROUNDING < bounce.end < faded + PROFILE_STEP + ROUNDING
+
+
+@pytest.mark.parametrize("confocal", [True, False])
+def test_the_brightest_path_is_found_to_half_a_step(confocal: bool) -> None:
+    for hidden in 1.2 + PROFILE_STEP * np.arange(0, 1, 0.2):
+        found = find_brightest_path(lit_late(hidden, confocal))
+        assert found == pytest.approx(hidden, abs=PROFILE_STEP / 2 + ROUNDING)
+
+
+@pytest.mark.parametrize("depth", [0.5, 0.8, 1.3])
+def test_the_wavelength_is_the_shortest_that_the_wall_samples_at_the_hidden_depth(
+    depth: float,
+) -> None:
+    """A flash, of all waves alike: 20 % of the pulse's may be finer than the wall samples."""
+    wall = planar_wall(32, 32) * 0.6
+    # 0.6 mm of path, and light of 1 mm, that all waves of centimetres are alike in.
+    axis = TimeAxis(900, 2e-12, 2 * depth - 0.05)
+    flash = PointScene([[0.0, 0.0, depth]]).simulate_capture(wall, wall, axis, 3.5e-12)
+    counts = add_poisson_noise(flash, 1000.0, 1.0, seed=1)
+    sine = 0.72 / np.hypot(0.72, depth)
+    sampled = 4 * flash.spacing * sine
+    # The pulse's waves are normally distributed; the wavenumber above which a fifth of them lies:
+    pulse = VirtualPulse(1.0, 3.0)
+    expected = sampled * (1 + 0.8416 / (np.sqrt(2) * pulse.sigma * pulse.wavenumber))
+    found, reason = choose_wavelength(counts, 3.0)
+    assert "wall points" in reason
+    # Steps of 5 %, rounded up to a millimetre; the brightest wall points lie aside of the depth.
+    assert 0.95 * expected < found < 1.05 * expected + 1e-3
 
 
 def test_nothing_is_gated_where_the_wall_is_dark() -> None:
@@ -121,11 +176,26 @@ def test_a_picture_is_mirrored_along_an_axis() -> None:
 
 
 def test_a_bright_wall_is_noticed() -> None:
-    grid = Grid([0.0, 0.2], [0.0], [0.01, 0.5])
-    for index, on_wall in ((0, True), (1, False)):
+    """Nearer than half a wavelength to a wall point."""
+    x, y, _ = clean().points[100]
+    grid = Grid([x, x + 0.2], [y], [0.01, 0.045, 0.055, 0.07, 0.09, 0.5])
+    for index, on_wall in enumerate((True, True, False, False, False, False)):
         values = np.zeros(grid.shape)
         values[index, 0, 0] = 1
         assert is_brightest_on_wall(Volume(values, grid), clean(), 0.1) == on_wall
+
+
+def test_the_box_before_a_wall_with_relief_begins_by_its_middle() -> None:
+    """Of 30 cm of relief, the hindmost points see things that the foremost ones' gate blanks."""
+    wall = WALL.copy()
+    wall[..., 2] = 0.3 * (wall[..., 0] > 0)
+    hidden = [-0.15, -0.05, 0.5]
+    capture = PointScene([hidden], [400.0]).simulate_capture(wall, wall, AXIS, 40e-12)
+    settings = complete_settings(with_glare(capture, 1000.0, 0.045))
+    assert settings.gate_found
+    gate, near = settings.gate or 0.0, settings.near or 0.0
+    # Two fifths of the gate from the middle of the relief.
+    assert near == pytest.approx(0.15 + 0.4 * gate, abs=settings.voxel)
 
 
 @pytest.mark.parametrize(("apart", "error"), [(1e-7, 0.02), (1e-3, 0.05), (15e-3, 0.1)])
