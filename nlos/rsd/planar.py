@@ -42,8 +42,11 @@ class PlanarRSD(PhasorMethod):
     the band. For a confocal scan the wavenumber is doubled and the laser's wave drops out; several
     laser spots add up.
 
-    Errs by less than `tolerance` at depths of a wavelength and more; nearer to the wall, waves that
-    fade within a wavelength are missing. Holds the wall's spectrum, 8 bytes per plane wave and
+    Errs by less than `tolerance` at depths of a wavelength and more where the record holds every
+    path by way of the voxels, in noise as well; nearer to the wall, waves that fade within a
+    wavelength are missing. Light or background that the record's end cuts off adds an error that no
+    tolerance makes smaller: 0.3 % for points on a background, 1.2 % for an even background alone.
+    Holds the wall's spectrum, 8 bytes per plane wave and
     frequency (60 MB for 128 x 128 points and 120 frequencies), the volume, and per thread the waves
     of all terms of two depths (30 MB). A capture of another library's arrays is imaged in that
     library; see `nlos.portable`.
