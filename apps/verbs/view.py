@@ -19,7 +19,7 @@ from apps.viewer.desktop import open_window
 from apps.viewer.page import Page, WaitingPage
 from apps.viewer.render import choose_renderer
 from apps.viewer.scene_figure import choose_frames, save_film, save_picture
-from apps.viewer.server import parse_loopback
+from apps.viewer.server import is_local, parse_host
 from apps.viewer.session import Session
 from apps.viewer.source_factory import (
     LOOK_METHODS,
@@ -69,7 +69,8 @@ def view(
     host: Annotated[
         str,
         typer.Option(
-            metavar="ADDRESS", help="Where the page is served: a loopback address of this computer."
+            metavar="ADDRESS",
+            help="Where the page is served: an IP address of this computer; 0.0.0.0 for all of them.",
         ),
     ] = "127.0.0.1",
     no_browser: Annotated[
@@ -90,9 +91,9 @@ def view(
 ) -> None:
     """Look at a source: on a page of the browser, in a window, as a picture or as a film.
 
-    The page is served to this computer only. Through ssh: ssh -L 8080:localhost:8080 HOST, then
-    tofclip view SOURCE --port 8080 --no-browser there, and http://localhost:8080 here. On the page,
-    K shows the keys.
+    The page is for this computer, and for whoever has its address with the token. Through ssh:
+    ssh -L 8080:localhost:8080 HOST, then tofclip view SOURCE --port 8080 --no-browser there, and
+    the address that it prints here. On the page, K shows the keys.
 
     Example: tofclip view frames.h5 --png scene.png
     """
@@ -165,7 +166,7 @@ class PageDoor:
     Parameters
     ----------
     host : str
-        A loopback address, or ``"localhost"``.
+        An IP address of this computer, or ``"localhost"``.
     port : int, optional
         A free one by default.
     no_browser : bool
@@ -191,7 +192,7 @@ class PageDoor:
             What is being done.
         """
         title = source if "://" in source else Path(source).name
-        self._waiting = WaitingPage(title, words, self.port, parse_loopback(self.host))
+        self._waiting = WaitingPage(title, words, self.port, parse_host(self.host))
         self._show_address(self._waiting.address)
 
     def serve(self, session: Session) -> None:
@@ -206,7 +207,7 @@ class PageDoor:
         InputError, MissingDependencyError
             It cannot be served.
         """
-        page = Page(session, self.port, parse_loopback(self.host), self._waiting)
+        page = Page(session, self.port, parse_host(self.host), self._waiting)
         was_waiting, self._waiting = self._waiting is not None, None
         with contextlib.closing(page):
             if not was_waiting:
@@ -221,5 +222,11 @@ class PageDoor:
     def _show_address(self, address: str) -> None:
         report({"address": address}, self.as_json)
         sys.stdout.flush()  # a program that reads the address waits for it
+        if not is_local(parse_host(self.host)):
+            print(
+                "tofclip: other computers can reach this page, unencrypted: whoever has its address, "
+                "with the token, can see and control it",
+                file=sys.stderr,
+            )
         if not self.no_browser:
             webbrowser.open(address)

@@ -16,7 +16,7 @@ from apps.viewer.export_panel import ExportPanel
 from apps.viewer.furniture import draw_furniture
 from apps.viewer.page_text import Status, format_page_title, render_page_html, render_waiting_html
 from apps.viewer.selection_panel import NO_SHADOWS, SelectionPanel
-from apps.viewer.server import LOOPBACK, get_address, start_server, stop_server
+from apps.viewer.server import LOOPBACK, start_server, stop_server
 from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.side_pictures import render_pictures
 from apps.viewer.viewpoint import Box, Viewpoint, make_presets, move_camera, place_viewpoint
@@ -58,7 +58,7 @@ class WaitingPage:
         What is being done.
     port : int, optional
     host : str
-        A loopback address.
+        An IP address of this computer.
 
     Raises
     ------
@@ -69,15 +69,14 @@ class WaitingPage:
     def __init__(
         self, title: str, words: str, port: int | None = None, host: str = LOOPBACK
     ) -> None:
-        self.server = start_server(port, host)
-        self.address = get_address(self.server, host)
+        self.server, self.address = start_server(port, host)
         _set_up_panel(self.server, title)
         self._words = self.server.gui.add_html(render_waiting_html(words))
 
-    def hand_over(self) -> viser.ViserServer:
-        """Return the server, its page empty again."""
+    def hand_over(self) -> tuple[viser.ViserServer, str]:
+        """Return the server, its page empty again, and its address."""
         self._words.remove()
-        return self.server
+        return self.server, self.address
 
     def close(self) -> None:
         """Stop serving."""
@@ -93,7 +92,7 @@ class Page:
     session : Session
     port : int, optional
     host : str
-        A loopback address.
+        An IP address of this computer.
     waiting : WaitingPage, optional
         Served already, where this page is to be; instead of port and host.
 
@@ -116,8 +115,9 @@ class Page:
         first = session.frame_at(time.monotonic())
         self._framed_cloud = first.cloud.xyz
         self.viewpoint = place_viewpoint(first.cloud.xyz, SCENE_ASPECT)
-        self.server = start_server(port, host) if waiting is None else waiting.hand_over()
-        self.address = get_address(self.server, host) if waiting is None else waiting.address
+        self.server, self.address = (
+            start_server(port, host) if waiting is None else waiting.hand_over()
+        )
         self._pace, self._frames = FramePacer(), RateCounter()
         self.points = Points(self.server, self.post)
         self._set_up_scene()

@@ -28,7 +28,7 @@ div[style*="pointer-events: none"] .tofclip-lost {
 """
 LOST_TEXT = (
     "Connection lost: tofclip view has ended, or cannot be reached. What you see is the last "
-    "picture; this page goes on by itself when the program is back at this address."
+    "picture. This page goes on by itself when it is reached again; a new tofclip view has a new address."
 )
 SHARED_TEXT = (
     "Every browser at this address shows the same frame, colours, filters and picked points; where "

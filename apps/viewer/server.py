@@ -1,13 +1,16 @@
-"""The server of the page, for browsers of this computer only."""
+"""The server of the page, for whoever has its address with the token."""
 
 from __future__ import annotations
 
 import contextlib
+import http.client
 import io
 import ipaddress
 import socket
+from http import HTTPStatus
 from typing import TYPE_CHECKING
 
+from apps.viewer.guard import install_guard
 from tofclip.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
@@ -17,26 +20,28 @@ LOOPBACK = "127.0.0.1"
 FIRST_PORT = 8080
 
 
-def start_server(port: int | None = None, host: str = LOOPBACK) -> viser.ViserServer:
-    """Start a server that only this computer can reach.
+def start_server(port: int | None = None, host: str = LOOPBACK) -> tuple[viser.ViserServer, str]:
+    """Start a server that lets in whoever knows the token in its address.
 
     Parameters
     ----------
     port : int, optional
         By default the first free one from 8080 on.
     host : str
-        A loopback address.
+        An IP address of this computer; 0.0.0.0 or :: for all of them.
 
     Returns
     -------
-    ViserServer
+    server : ViserServer
+    address : str
+        To open in a browser.
 
     Raises
     ------
     InputError
-        The port is taken.
+        The port is taken, or the address is another computer's.
     MissingDependencyError
-        viser is not installed.
+        viser is not installed, or one that cannot be guarded.
     """
     try:
         import viser
@@ -55,7 +60,16 @@ def start_server(port: int | None = None, host: str = LOOPBACK) -> viser.ViserSe
     _require_free_port(host, port or 0)
     # viser greets on standard output, which belongs to --json.
     with contextlib.redirect_stdout(io.StringIO()):
-        return LocalServer(host=host, port=FIRST_PORT if port is None else port, verbose=False)
+        server = LocalServer(host=host, port=FIRST_PORT if port is None else port, verbose=False)
+    token = install_guard(server.get_port(), is_local(host))
+    if token is None or not _refuses_strangers(host, server.get_port()):
+        stop_server(server)
+        raise MissingDependencyError(
+            f"viser {viser.__version__} would show the page to everybody: pip install viser==1.1.1"
+        )
+    named = socket.gethostname() if _is_everywhere(host) else host
+    name = f"[{named}]" if ":" in named else named
+    return server, f"http://{name}:{server.get_port()}/?token={token}"
 
 
 def stop_server(server: viser.ViserServer) -> None:
@@ -64,40 +78,40 @@ def stop_server(server: viser.ViserServer) -> None:
         server.stop()
 
 
-def get_address(server: viser.ViserServer, host: str = LOOPBACK) -> str:
-    """Return the address to open in a browser.
-
-    Parameters
-    ----------
-    server : ViserServer
-    host : str
-        That it listens at.
-
-    Returns
-    -------
-    str
-    """
-    name = f"[{host}]" if ":" in host else host
-    return f"http://{name}:{server.get_port()}/"
-
-
-def parse_loopback(host: str) -> str:
-    """Return the address to listen at for what ``--host`` was given.
+def parse_host(host: str) -> str:
+    """Return the IP address to listen at for what ``--host`` was given.
 
     Raises
     ------
     InputError
-        Other computers could reach it. viser lets in everyone who reaches it, so ssh has to decide.
+        It is none.
     """
     if host == "localhost":
         return LOOPBACK
-    with contextlib.suppress(ValueError):
-        if ipaddress.ip_address(host).is_loopback:
-            return host
-    raise InputError(
-        f"the page is served to this computer only, not at '{host}'; from another one: "
-        f"ssh -L {FIRST_PORT}:localhost:{FIRST_PORT} THIS_COMPUTER, then http://localhost:{FIRST_PORT}"
-    )
+    try:
+        return str(ipaddress.ip_address(host))
+    except ValueError as fault:
+        raise InputError(
+            f"--host takes an IP address of this computer, 0.0.0.0 for all of them, not '{host}'"
+        ) from fault
+
+
+def is_local(host: str) -> bool:
+    """Say whether only this computer reaches what listens at an IP address."""
+    return ipaddress.ip_address(host).is_loopback
+
+
+def _is_everywhere(host: str) -> bool:
+    return ipaddress.ip_address(host).is_unspecified
+
+
+def _refuses_strangers(host: str, port: int) -> bool:
+    """Ask for the page without the token: another version of a library may not ask the guard."""
+    if _is_everywhere(host):
+        host = "::1" if ":" in host else LOOPBACK
+    with contextlib.closing(http.client.HTTPConnection(host, port, timeout=10)) as connection:
+        connection.request("GET", "/")
+        return connection.getresponse().status == HTTPStatus.FORBIDDEN
 
 
 def _require_free_port(host: str, port: int) -> None:

@@ -106,6 +106,18 @@ def test_the_page_of_a_raw_shot_opens_before_it_is_recovered(
         urllib.request.urlopen(json.loads(capsys.readouterr().out)["address"])
 
 
+def test_a_page_that_other_computers_reach_is_said_to_be_one(
+    cloud: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Page, "run", lambda page: None)
+    for host, lines in (("127.0.0.1", 0), ("0.0.0.0", 1)):
+        assert main(["view", str(cloud), "--no-browser", "--json", "--host", host]) == 0
+        said = capsys.readouterr()
+        assert "?token=" in json.loads(said.out)["address"]
+        assert said.err.count("other computers can reach this page") == lines
+        assert said.err.count("\n") == lines
+
+
 def raise_input_error() -> None:
     raise InputError("no light")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.server
 import io
 import shutil
 import threading
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import viser
 from matplotlib.image import imread
 from viewer_scenes import PlaneSource, frames, volume
 
@@ -35,6 +37,13 @@ FLAGS = (
 LOADING_MS = 120_000  # a page and its first picture, while all cores compute something else
 PATIENCE_MS = 30_000  # a software renderer on a busy machine draws twice a second
 SCENE = "canvas[data-engine]"
+OPEN_SOCKET = """place => new Promise(decide => {
+    const socket = new WebSocket(place, ["viser-v" + "VERSION"]);
+    socket.onmessage = () => decide(true);
+    socket.onclose = () => decide(false);
+})""".replace("VERSION", viser.__version__)
+"""Says whether a page may open a WebSocket and receives something."""
+
 HARMLESS = ("THREE.Clock", "GPU stall", "GroupMarkerNotSet", "Automatic fallback to software WebGL")
 
 
@@ -417,6 +426,48 @@ def test_a_lost_connection_is_said_in_words(browser: Any) -> None:
     until(words.is_visible, "the page says that no answer came")
     assert words.inner_text().startswith("Connection lost: tofclip view has ended")
     seen.close()
+
+
+def test_the_pages_of_other_servers_see_nothing(browser: Any) -> None:
+    """Not even in the browser that has the cookie, which it sends along to every port."""
+    page, second = Page(Session(PlaneSource())), Page(Session(PlaneSource()))
+    other = http.server.HTTPServer(("127.0.0.1", 0), EmptyPage)
+    threading.Thread(target=other.serve_forever, daemon=True).start()
+    context = browser.new_context()
+    tab, elsewhere = context.new_page(), f"http://127.0.0.1:{other.server_port}/"
+    bare = page.address.partition("?")[0]
+    socket_address = bare.replace("http:", "ws:")
+    try:
+        assert tab.goto(bare, timeout=LOADING_MS).status == 403
+        assert tab.goto(f"{page.address}x", timeout=LOADING_MS).status == 403
+        for one in (page, second):
+            assert tab.goto(one.address, timeout=LOADING_MS).status == 200
+        assert tab.goto(bare, timeout=LOADING_MS).status == 200  # the second's cookie is another
+        until(lambda: len(page.server.get_clients()) == 1, "the page has its WebSocket", LOADING_MS)
+        assert tab.evaluate(OPEN_SOCKET, socket_address)
+        assert tab.evaluate("document.cookie") == ""
+        tab.goto(elsewhere, timeout=LOADING_MS)
+        assert len(context.cookies(elsewhere)) == 2
+        assert not tab.evaluate(OPEN_SOCKET, socket_address)
+        tab.set_content(f"<iframe src='{bare}'></iframe>")
+        until(lambda: tab.frames[1].url == "chrome-error://chromewebdata/", "no frame shows it")
+    finally:
+        context.close()
+        other.shutdown()
+        other.server_close()
+        page.close()
+        second.close()
+
+
+class EmptyPage(http.server.BaseHTTPRequestHandler):
+    """A page of another server of this computer."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, *_: Any) -> None:
+        """Say nothing."""
 
 
 def test_a_volume_as_a_surface(browser: Any) -> None:
