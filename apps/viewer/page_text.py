@@ -28,7 +28,8 @@ div[style*="pointer-events: none"] .tofclip-lost {
 """
 LOST_TEXT = (
     "Connection lost: tofclip view has ended, or cannot be reached. What you see is the last "
-    "picture. This page goes on by itself when it is reached again; a new tofclip view has a new address."
+    "picture. This page goes on by itself once it reaches the program again; a new tofclip view has "
+    "a new address."
 )
 SHARED_TEXT = (
     "Every browser at this address shows the same frame, colours, filters and picked points; where "
