@@ -200,6 +200,7 @@ def photons(
         "bin_width_ps": image.bin_width / PICOSECOND,
         "bins": image.bins,
         "image_shape": list(image.image_shape),
+        **({"axes": image.axes} if image.axes else {}),
         "focal_length_px": seen_by.focal_length_px,
         "time_zero_ns": seen_by.time_zero / NANOSECOND,
         **({} if camera is None else {"camera": str(camera)}),

@@ -49,6 +49,7 @@ def test_a_range_image_with_deviations(run: Run, shot, tmp_path: Path) -> None:
     figures = json.loads(outcome.out)
     assert list(figures) == KEYS
     assert (figures["pixels"], figures["coverage"], figures["returns"]) == (2240, 1.0, 2240)
+    assert figures["settings"]["axes"].startswith("yxt, ahead of the next axis by a factor of ")
     with np.load(out) as written:
         assert set(written) == FIELDS
         assert all(written[name].shape == (40, 56) for name in FIELDS)

@@ -106,6 +106,50 @@ def test_every_layout_gives_the_same_photons(name, counts, tmp_path) -> None:
     assert described["layout"] in ("cube", "cells", "events")
 
 
+def draw_ball(shape: tuple[int, int, int], seed: int) -> np.ndarray:
+    """A ball before a slanted wall, 5 signal photons a pixel and 0.02 of background a bin."""
+    rows, columns, bins = shape
+    noise = np.random.default_rng(seed)
+    y, x = np.mgrid[:rows, :columns]
+    near = np.hypot(y - 0.5 * rows, x - 0.4 * columns) < 0.3 * min(rows, columns)
+    surface = np.where(near, 0.3 * bins, 0.6 * bins + 0.2 * bins * x / columns)
+    cube = noise.poisson(0.02, shape)
+    pixel = np.repeat(np.arange(surface.size), noise.poisson(5, surface.size))
+    time = np.rint(surface.ravel()[pixel] + noise.normal(0, 1.3, pixel.size)).astype(int)
+    np.add.at(cube.reshape(-1, bins), (pixel, time.clip(0, bins - 1)), 1)
+    return cube
+
+
+@pytest.mark.parametrize("shape", [(80, 80, 512), (64, 64, 64)])
+@pytest.mark.parametrize("hot", [0.0, 0.5, 5.0, 50.0])
+def test_hot_pixels_do_not_say_which_axis_is_time(shape, hot: float, tmp_path: Path) -> None:
+    """2 % of the pixels are hot in all bins; a picture axis was taken from 5 counts a bin on."""
+    cube = draw_ball(shape, 1)
+    noise = np.random.default_rng(2)
+    pixels = noise.random(shape[:2]) < 0.02
+    cube[pixels] += noise.poisson(hot, cube[pixels].shape)
+    for order in ("yxt", "tyx", "ytx"):
+        path = tmp_path / f"{order}.npy"
+        np.save(path, cube.transpose(["yxt".index(axis) for axis in order]).astype(np.uint16))
+        image = read_photons(path, BIN)
+        assert (*image.image_shape, image.bins) == shape
+        assert image.axes.startswith(f"{order}, ahead of the next axis by a factor of ")
+        # asked for where it is less than 2
+        assert float(image.axes.split()[-1]) > 4
+
+
+def test_axes_that_light_and_length_disagree_on_are_asked_for(tmp_path: Path) -> None:
+    """A wide picture of few bins is read rightly or not at all; a flat cube is not."""
+    noise = np.random.default_rng(3)
+    flat = noise.poisson(0.2, (64, 64, 64))
+    wide = draw_ball((20, 1000, 100), 4) + noise.poisson(0.2, (20, 1000, 100))
+    for cube in (flat, wide):
+        np.save(tmp_path / "a.npy", cube.astype(np.uint8))
+        with pytest.raises(InputError, match=r"which axis is time .* by a factor of .*give `axes`"):
+            read_photons(tmp_path / "a.npy", BIN)
+        assert read_photons(tmp_path / "a.npy", BIN, "yxt").axes == ""
+
+
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "events.npz"])
 def test_the_files_own_bin_width_is_recognised(name, counts, tmp_path) -> None:
     WRITERS[name](tmp_path / name, counts)

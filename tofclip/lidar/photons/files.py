@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,8 +40,22 @@ MAX_IMAGE_BYTES = 1 << 32
 MAX_BINS = MAX_PIXELS = 1 << 26
 """Events may claim any bin and any pixel; pictures and histograms are not larger than this."""
 
-MIN_CONCENTRATION_RATIO = 1.3
-MIN_LENGTH_RATIO = 1.25
+MIN_AXES_CERTAINTY = 2.0
+"""Factor by which the time axis has to be ahead: the square of that by which it is longer, or light
+more uneven along it, than another axis."""
+
+MAX_LENGTH_RATIO = 3.0
+"""A line of pixels may be longer than time by any factor: length alone does not decide."""
+
+MIN_UNEVENNESS = 0.03
+"""Variance of light along an axis over its mean squared; what is less says nothing."""
+
+BRIGHT_PIXEL_QUANTILE, BRIGHT_PIXEL_RATIO = 0.9, 2.0
+"""Pixels brighter than this many times the quantile of all weigh no more: up to a tenth may be hot."""
+
+MAX_LOOKED_AT = 1 << 25
+"""Values, evenly chosen, that say which axis is time."""
+
 MAX_SECONDS = 1e-3
 """s; photon times that are all shorter and not whole are seconds, others are numbers of bins."""
 
@@ -121,8 +135,8 @@ def read_photons(
     bin_width : float, optional
         Duration of a bin, or unit of the photon times, s; overrides the file's own.
     axes : str, optional
-        Order of a cube's axes, such as ``"yxt"`` or ``"txy"``; by default the axis along which
-        light is most concentrated, or the longest, is time.
+        Order of a cube's axes, such as ``"yxt"`` or ``"txy"``; by default that is time along which
+        light is most concentrated and which is longest; `PhotonImage.axes` says how surely.
 
     Returns
     -------
@@ -243,10 +257,14 @@ def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | N
             cube = np.squeeze(cube)
         if cube.dtype.kind not in "uifb":
             raise FileFormatError(path, f"its cube holds {cube.dtype}, not counts; {SUITABLE}")
-        order = axes or opened.axes or recognise_axes(cube, path)
-        return PhotonImage.from_cube(
+        order, how = axes or opened.axes, ""
+        if not order:
+            order, certainty = recognise_axes(cube, path)
+            how = f"{order}, ahead of the next axis by a factor of {certainty:.2g}"
+        image = PhotonImage.from_cube(
             np.transpose(cube, [order.index(axis) for axis in "yxt"]), bin_width
         )
+        return replace(image, axes=how)
     if layout == "cells":
         cells = arrays[0].load()
         lists = [np.asarray(cell).ravel() for cell in cells.ravel()]
@@ -273,9 +291,8 @@ def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | N
     return PhotonImage.from_events(pixel, number, (rows, columns), bin_width)
 
 
-def recognise_axes(cube: NDArray[Any], path: Path) -> str:
-    """Say which axis of a cube is time: the one along which light is most concentrated, else the
-    longest.
+def recognise_axes(cube: NDArray[Any], path: Path) -> tuple[str, float]:
+    """Say which axis of a cube is time: light is concentrated along it, and it is long.
 
     Parameters
     ----------
@@ -285,34 +302,50 @@ def recognise_axes(cube: NDArray[Any], path: Path) -> str:
 
     Returns
     -------
-    str
-        ``tyx``, ``ytx`` or ``yxt``.
+    str, float
+        ``tyx``, ``ytx`` or ``yxt``, and by what factor it is ahead of the next axis.
 
     Raises
     ------
     InputError
-        Neither says so.
+        Neither says so, or one says otherwise than the other.
     """
-    concentration = []
+    step = math.ceil((cube.size / MAX_LOOKED_AT) ** (1 / 3))
+    score = np.empty(3)
     for axis in range(3):
-        others = tuple(other for other in range(3) if other != axis)
-        profile = cube.sum(axis=others, dtype=np.float64)
-        total = profile.sum()
-        concentration.append(float(profile.size * (profile**2).sum() / max(total**2, 1e-300)))
-    by_light, by_length = np.argsort(concentration)[::-1], np.argsort(cube.shape)[::-1]
-    excess = [concentration[n] - 1 for n in by_light]
-    if (
-        concentration[by_light[0]] > MIN_CONCENTRATION_RATIO
-        and excess[0] > MIN_CONCENTRATION_RATIO * excess[1]
-    ):
-        time = int(by_light[0])
-    elif cube.shape[by_length[0]] > MIN_LENGTH_RATIO * cube.shape[by_length[1]]:
-        time = int(by_length[0])
-    else:
+        others = [cube.shape[other] for other in range(3) if other != axis]
+        length = np.clip(cube.shape[axis] / max(others), 1 / MAX_LENGTH_RATIO, MAX_LENGTH_RATIO)
+        score[axis] = length * _compare_concentration(cube[::step, ::step, ::step], axis)
+    second, first = np.argsort(score)[-2:]
+    certainty = float(score[first] / score[second])
+    order = {0: "tyx", 1: "ytx", 2: "yxt"}
+    if certainty < MIN_AXES_CERTAINTY:
         raise InputError(
-            f"{path}: its shape {cube.shape} does not say which axis is time; give `axes`, e.g. yxt"
+            f"{path}: neither its shape {cube.shape} nor its light says which axis is time ({order[int(first)]} "
+            f"is ahead of {order[int(second)]} by a factor of {certainty:.2g}); give `axes`, e.g. yxt"
         )
-    return {0: "tyx", 1: "ytx", 2: "yxt"}[time]
+    return order[int(first)], certainty
+
+
+def _compare_concentration(cube: NDArray[Any], time: int) -> float:
+    """Unevenness of light along an axis over that along the other two, were it the time axis: hot
+    pixels, which rule every sum, then weigh no more than bright ones.
+    """
+    picture = cube.sum(axis=time, dtype=np.float64)
+    bright = BRIGHT_PIXEL_RATIO * max(float(np.quantile(picture, BRIGHT_PIXEL_QUANTILE)), 1.0)
+    weight = np.minimum(1.0, bright / np.maximum(picture, bright))
+    axes = "yxt".replace("yxt"[time], "")
+    along = np.einsum(f"yxt,{axes}->{'yxt'[time]}", cube, weight)
+    weighted = picture * weight
+    own, *others = (
+        # photons alone make a profile uneven by one over their number in an entry
+        max(
+            (profile.var() / max(profile.mean(), 1e-9) - 1) / max(profile.mean(), 1e-9),
+            MIN_UNEVENNESS,
+        )
+        for profile in (along, weighted.sum(axis=0), weighted.sum(axis=1))
+    )
+    return float(own / max(others))
 
 
 def _open_npy(path: Path) -> PhotonFile:

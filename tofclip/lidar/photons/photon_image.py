@@ -38,6 +38,9 @@ class PhotonImage:
         Bins of the time axis.
     bin_width : float
         Duration of a bin, s.
+    axes : str
+        Order of the axes of the cube that they were read from and how surely it was recognised;
+        empty where it was known.
 
     Raises
     ------
@@ -51,6 +54,7 @@ class PhotonImage:
     image_shape: tuple[int, int]
     bins: int
     bin_width: float
+    axes: str = ""
 
     def __post_init__(self) -> None:
         pixels = self.image_shape[0] * self.image_shape[1]
