@@ -35,7 +35,8 @@ def test_demo(run: Run, tmp_path: Path) -> None:
     assert found["median_depth_error_m"] < 0.2e-3
     assert found["share_within_one_bin"] > 0.985
     assert found["false_return_share"] < 0.01
-    assert 0.7 < found["range_z"] < 1.6  # about 1 if the stated deviations are true
+    # About 1 if the stated deviations are true: eight seeds reach 0.80 to 1.17, this one 0.96.
+    assert 0.75 < found["range_z"] < 1.25
     assert found["points"] == len(PointCloud.load(folder / "cloud.ply"))
     frames = Frames.load(folder / "frames.h5")
     assert frames.provenance["settings"] == {"verb": "demo", "seed": 1}

@@ -1,0 +1,172 @@
+"""Every default of a method, a detector and a search, and the place that measures or explains it.
+
+Who changes one says here where the new one was measured.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import nlos
+from nlos.backprojection import Weighting
+from nlos.refinement.photons import PhotonRefinement
+from nlos.refinement.refine import build_total_variation
+from tofclip.lidar import Detection
+from tofclip.lidar.photons import PhotonDetector, Smoothness
+from tofclip.recovery import DepthLockedFocus, FixedFocus, SurfaceRecovery
+from tofclip.simulate import StreakDetector
+from tofclip.solvers import (
+    LeastSquares,
+    LinearInverse,
+    PlugAndPlay,
+    RegularisationByDenoising,
+    Sparse,
+    TotalVariation,
+    Wavelets,
+)
+from tofclip.solvers.denoisers import CollaborativeWiener, NonlocalMeans
+from tofclip.solvers.light_field_variation import LightFieldVariation
+
+FISTA = "docs/recovery_algorithm.md: ## 4. Frames from f, with a prior: FISTA"
+LINEAR = "docs/recovery_algorithm.md: ## 5. Frames from f, without: the linear inverse"
+RANGES = "docs/recovery_algorithm.md: ## 6. From frames to ranges"
+SURFACES = "docs/recovery_algorithm.md: ## 7. Surfaces instead of frames"
+SHEARS = "docs/recovery_algorithm.md: ## 3. Which shear each frame has"
+REFOCUS = (
+    "docs/reproduction.md: ## Refocusing a recovered light field beside direct recovery, SR = 1"
+)
+HIDDEN = "docs/nlos.md: ## Which method for which capture"
+REFINED = "docs/nlos.md: ## Refined"
+FEW_PHOTONS = "docs/nlos.md: ## Few photons"
+BUYS = "docs/nlos_algorithm.md: ## What each step buys"
+ROOT = Path(__file__).parents[1]
+CHOSEN = "chosen: no study compares it with others"
+
+PROXIMAL = {"tolerance": 0.0, "data_term": LeastSquares, "gap": 1e-3, "further": 0}
+PROXIMAL |= {"noise_fall": 0.0}
+DEFAULTS: list[tuple[Any, str, dict[str, Any]]] = [
+    # recovery of frames and surfaces
+    (LinearInverse, LINEAR, {"damping": 1e-2}),
+    (Sparse, FISTA, {"weight": 2e-3, "iterations": 40, **PROXIMAL}),
+    (TotalVariation, FISTA, {"weight": 1e-3, "iterations": 60, **PROXIMAL}),
+    (Wavelets, CHOSEN, {"weight": 2e-3, "iterations": 60, **PROXIMAL}),
+    (
+        LightFieldVariation,
+        REFOCUS,
+        {"weight": 1e-2, "iterations": 200, "grid": (1, 1), "angular": 0.5, **PROXIMAL},
+    ),
+    (
+        PlugAndPlay,
+        "its docstring",
+        {"denoiser": CollaborativeWiener(), "calls": 8, "strength": 0.12, "coupling": 0.1},
+    ),
+    (
+        RegularisationByDenoising,
+        CHOSEN,
+        {"denoiser": CollaborativeWiener(), "calls": 8, "strength": 0.08, "coupling": 0.3},
+    ),
+    (NonlocalMeans, CHOSEN, {"patch_px": 5, "reach_px": 10, "filtering": 0.6}),
+    (CollaborativeWiener, CHOSEN, {"patch_px": 6, "stride_px": 3, "reach_px": 10, "group": 40}),
+    (
+        SurfaceRecovery,
+        SURFACES,
+        {"weight": 2.0, "iterations": 60, "start": Sparse(), "detection": Detection()},
+    ),
+    (DepthLockedFocus, SHEARS, {"tolerance_px": 0.25}),
+    (FixedFocus, SHEARS, {"shear": 0.0}),
+    # what counts as a return
+    (
+        Detection,
+        RANGES,
+        {
+            "signal_to_noise": 5.0,
+            "min_scene_fraction": 0.05,
+            "min_time_bin_fraction": 0.12,
+            "min_pixel_fraction": 0.2,
+            "max_returns": 4,
+        },
+    ),
+    # counted photons
+    (
+        PhotonDetector,
+        CHOSEN,
+        {"false_alarm_rate": 0.01, "max_returns": 1, "min_photons": 20.0, "background": None},
+    ),
+    (Smoothness, CHOSEN, {"slope_cost": 1.0, "jump_cost": 6.0, "reach_px": 1}),
+    (
+        StreakDetector,
+        CHOSEN,
+        {
+            "rows": 576,
+            "bin_width": 2e-11,
+            "peak_photons": 2000.0,
+            "background_photons": 2.0,
+            "full_scale_photons": 65535.0,
+        },
+    ),
+    # hidden scenes
+    (nlos.Backprojection, HIDDEN, {"cycles": 3.0, "weighting": Weighting(1.0, 0.0)}),
+    (nlos.FilteredBackprojection, HIDDEN, {"sigma": 0.02, "weighting": Weighting(0.0, 0.0)}),
+    (nlos.LightCone, HIDDEN, {"signal_to_noise": 0.8, "falloff": 4.0}),
+    (nlos.FKMigration, HIDDEN, {"falloff": 4.0}),
+    (nlos.PlanarRSD, BUYS, {"cycles": 3.0, "tolerance": 1e-2}),
+    (
+        nlos.Hybrid,
+        BUYS,
+        {"cycles": 3.0, "propagation": "spectral", "tolerance": 1e-2, "plane_z": None},
+    ),
+    (nlos.Refinement, REFINED, {"prior": Sparse(weight=2e-2, iterations=60)}),
+    (build_total_variation, REFINED, {"weight": 2e-2, "iterations": 60}),
+    (
+        PhotonRefinement,
+        FEW_PHOTONS,
+        {
+            "iterations": 12,
+            "prior_weight": 1.0,
+            "blank": 0.0,
+            "ramp": 0.0,
+            "response_sigma": None,
+        },
+    ),
+]
+
+
+def find_defaults(made: Any) -> dict[str, Any]:
+    """Return the defaults of what a class or function is given, by name."""
+    if not dataclasses.is_dataclass(made):
+        given = inspect.signature(made).parameters.values()
+        return {one.name: one.default for one in given if one.default is not one.empty}
+    defaults = {}
+    for field in dataclasses.fields(made):
+        if field.init and field.default is not dataclasses.MISSING:
+            defaults[field.name] = field.default
+        elif field.init and field.default_factory is not dataclasses.MISSING:
+            defaults[field.name] = field.default_factory()
+    return defaults
+
+
+@pytest.mark.parametrize(
+    ("made", "where", "expected"), DEFAULTS, ids=[made.__name__ for made, _, _ in DEFAULTS]
+)
+def test_a_default_is_what_was_measured(made: Any, where: str, expected: dict[str, Any]) -> None:
+    found = find_defaults(made)
+    for name in sorted(expected.keys() | found.keys()):
+        before, now = expected.get(name, "nothing"), found.get(name, "nothing")
+        assert before == now, (
+            f"{made.__name__}'s default {name} was {before} ({where}) and is {now} now: "
+            "measure it anew, and say here and there what was found"
+        )
+
+
+def test_the_places_where_defaults_were_measured_exist() -> None:
+    for place in {where for _, where, _ in DEFAULTS if where.startswith("docs/")}:
+        page, heading = place.split(": ", 1)
+        lines = (ROOT / page).read_text(encoding="utf-8").splitlines()
+        assert any(line.startswith(heading) for line in lines), place
+    for made in {made for made, where, _ in DEFAULTS if where == "its docstring"}:
+        assert "strength" in str(inspect.getdoc(made)), made.__name__
