@@ -7,14 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from devices.linospad2.source import LinoSpad2File
 from devices.photons import STAMPS_SUFFIX
-from devices.recording.reader import read_head_if_recording
 from tofclip.errors import FileFormatError
-from tofclip.files import translate_read_errors
-from tofclip.io.streaks import outline_streak_file
-from tofclip.lidar import PointCloud
 from tofclip.lidar.photons.files import describe_photons
-from tofclip.loading import CLOUD_SUFFIXES, HDF5_SIGNATURE
-from tofclip.storage import Record, is_own_file, is_stand_in, read_outline
+from tofclip.loading import outline
+from tofclip.storage import Record, is_own_file, is_stand_in
 
 if TYPE_CHECKING:
     from tofclip.storage import Field
@@ -42,26 +38,11 @@ def describe_file(file: Path) -> dict[str, Any]:
 
 def _read_outline(file: Path) -> Record:
     """Read what a file says about its arrays, not their values, which may not fit into memory."""
-    recording = read_head_if_recording(file)
-    if recording is not None:
-        return recording
     if file.suffix.lower() == STAMPS_SUFFIX:
         with LinoSpad2File(file) as source:
             known = {"instrument": source.info.instrument, **source.info.details}
             return Record("photon stamps", attributes=known | {"stamps": source.stats.acquired})
-    with translate_read_errors(file), open(file, "rb") as opened:
-        start = opened.read(len(HDF5_SIGNATURE))
-    # Decided by content, because suffixes get lost.
-    if start == HDF5_SIGNATURE:
-        return read_outline(file)
-    if file.suffix.lower() not in CLOUD_SUFFIXES:
-        return outline_streak_file(file)
-    try:
-        return PointCloud.read_outline(file)
-    except FileFormatError:
-        if file.suffix.lower() != ".npz":
-            raise
-    return outline_streak_file(file)  # an archive that is not a point cloud may be a LIFT shot
+    return outline(file)
 
 
 def _describe_record(record: Record) -> dict[str, Any]:

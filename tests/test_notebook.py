@@ -181,7 +181,7 @@ def test_a_missing_library_is_named_in_a_line(
 def test_wrong_types_and_names_are_refused_by_our_own_errors(
     frames: tofclip.Frames, cloud: tofclip.PointCloud, tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match=r"saved as HDF5 \(\.h5\), not as '\.npz'"):
+    with pytest.raises(InputError, match=r"must end in \.h5 or \.hdf5"):
         frames.save(tmp_path / "frames.npz")
     with pytest.raises(InputError, match=r"\.xyz"):
         cloud.save(tmp_path / "cloud.xyz")

@@ -6,13 +6,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from tofclip.errors import FileFormatError, require_path
+from tofclip.errors import require_path
 from tofclip.files import translate_read_errors
 from tofclip.io import read_streak
+from tofclip.io.archive import Archive
+from tofclip.io.exr import read_exr_parts
+from tofclip.io.streaks import outline_streak_file
 from tofclip.lidar import PointCloud
-from tofclip.storage import Record
-
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+from tofclip.storage import HDF5_SIGNATURE, Field, Record, make_stand_in, read_outline
 
 HOMES = {
     "camera": ("tofclip.camera", "Camera"),
@@ -23,10 +24,15 @@ HOMES = {
     "volume": ("nlos", "Volume"),
 }
 """Where the object of each kind of record is made. `nlos` is named, not imported: it builds on this
-package.
+package, as do recordings' readers.
 """
 
 CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57")
+
+EXR_SIGNATURE = b"\x76\x2f\x31\x01"
+NPZ_SIGNATURE = b"PK\x03\x04"
+UNITS_OF_NAMES = {"_m": "m", "_percent": "percent"}
+"""Of the arrays of a range image, by the ends of their names."""
 
 
 def load(path: str | Path) -> Any:
@@ -35,12 +41,14 @@ def load(path: str | Path) -> Any:
     Parameters
     ----------
     path : path-like
-        HDF5, a point cloud in any format that `PointCloud.save` writes, or what `read_streak` reads.
+        HDF5, a point cloud in any format that `PointCloud.save` writes, a range image of
+        ``tofclip lidar photons``, a depth picture (OpenEXR), a recording, or what `read_streak` reads.
 
     Returns
     -------
     Frames, PointCloud, Streak, Camera, nlos.Volume or nlos.Capture
-        For another kind of record, a `tofclip.storage.Record`.
+        For another kind of record, such as a recording's head, a range image or a depth picture, a
+        `tofclip.storage.Record`.
 
     Raises
     ------
@@ -54,21 +62,64 @@ def load(path: str | Path) -> Any:
     >>> import tofclip
     >>> frames = tofclip.load("frames.h5")  # doctest: +SKIP
     """
-    require_path(path)
-    file = Path(path)
-    with translate_read_errors(file), open(file, "rb") as opened:
-        start = opened.read(len(HDF5_SIGNATURE))
-    if start != HDF5_SIGNATURE:
-        if file.suffix.lower() not in CLOUD_SUFFIXES:
-            return read_streak(file)
-        try:
-            return PointCloud.load(file)
-        except FileFormatError:
-            if file.suffix.lower() != ".npz":
-                raise
-            return read_streak(file)  # an archive that is not a point cloud may be a LIFT shot
-    record = Record.load(file)
+    record, found = _open(path, values=True)
+    if found is not None:
+        return found
     if record.kind not in HOMES:
         return record
     module, name = HOMES[record.kind]
     return getattr(import_module(module), name).from_record(record)
+
+
+def outline(path: str | Path) -> Record:
+    """Describe what `load` would open, without reading values that may not fit into memory."""
+    return _open(path, values=False)[0]
+
+
+def _open(path: str | Path, values: bool) -> tuple[Record, Any]:
+    """Return a file's record; and where `values` of other formats are asked for, what they make,
+    the record being empty then.
+
+    The first line that fits says what a file is: by its content, because suffixes get lost.
+    """
+    require_path(path)
+    file = Path(path)
+    with translate_read_errors(file), open(file, "rb") as opened:
+        start = opened.read(len(HDF5_SIGNATURE))
+    head = import_module("devices.recording.reader").read_head_if_recording(file)
+    if head is not None:
+        return head, None
+    if start == HDF5_SIGNATURE:
+        return (Record.load if values else read_outline)(file), None
+    if start.startswith(EXR_SIGNATURE):
+        return _open_depth_picture(file), None
+    is_cloud = file.suffix.lower() in CLOUD_SUFFIXES
+    if start.startswith(NPZ_SIGNATURE):
+        archive = Archive(file)
+        is_cloud = is_cloud and not archive.names.isdisjoint(("x", "x_m"))  # else maybe a LIFT shot
+        if not is_cloud and "range_m" in archive:
+            return _open_range_image(archive, values), None
+    if values:
+        return Record(""), PointCloud.load(file) if is_cloud else read_streak(file)
+    return PointCloud.read_outline(file) if is_cloud else outline_streak_file(file), None
+
+
+def _open_range_image(archive: Archive, values: bool) -> Record:
+    """What `tofclip lidar photons` writes to .npz."""
+    fields = {}
+    for name in sorted(archive.names):
+        known = archive.describe(name)
+        units = next((unit for end, unit in UNITS_OF_NAMES.items() if name.endswith(end)), "")
+        content = archive.read(name) if values else make_stand_in(known.shape, known.dtype)
+        fields[name] = Field(content, units, ("y", "x", "return")[: len(known.shape)])
+    return Record("range image", fields, origin=str(archive.path))
+
+
+def _open_depth_picture(file: Path) -> Record:
+    """Channels of an OpenEXR picture, such as depth (Z) and intensity (Y) of the returns."""
+    (_, channels), *_ = read_exr_parts(file)
+    units = {"Z": "m", "Y": "count"}
+    fields = {
+        name: Field(pixels, units.get(name, ""), ("y", "x")) for name, pixels in channels.items()
+    }
+    return Record("depth picture", fields, origin=str(file))

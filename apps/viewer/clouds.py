@@ -10,12 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.verbs.photons import DEFAULT_FIELD_OF_VIEW_DEG
 from apps.viewer.shot_recovery import find_min_intensity
 from apps.viewer.source import Source, View
 from tofclip.errors import FileFormatError, InputError
 from tofclip.lidar import PointCloud
 from tofclip.lidar.cloud import OPTIONAL_COLUMNS
 from tofclip.lidar.export import read_table
+from tofclip.lidar.geometry import compute_ray_directions
+from tofclip.lidar.photons import make_pinhole
+from tofclip.loading import load, outline
+from tofclip.storage import Record
 from tofclip.units import SPEED_OF_LIGHT
 
 CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57")
@@ -85,11 +90,33 @@ def read_cloud(path: Path) -> PointCloud:
     """
     if path.suffix.lower() == ".h5":
         return PointCloud.load(path)
+    record = None if path.suffix.lower() not in (".npz", ".exr") else outline(path)
+    if record is not None and record.kind in ("range image", "depth picture"):
+        return _place_pixels(load(path))
     table = read_table(path)
     if missing := [axis for axis in "xyz" if axis not in table]:
         raise FileFormatError(path, f"has no column '{missing[0]}', so it is not a point cloud")
     xyz = np.stack([table[axis] for axis in "xyz"], axis=-1)
     return make_cloud(xyz[np.all(np.isfinite(xyz), axis=1)] if len(table) == 3 else xyz, table)
+
+
+def _place_pixels(picture: Record) -> PointCloud:
+    """Points of a picture that does not say its camera, seen by a pinhole of the field of view that
+    `tofclip lidar photons` takes where none is given: ranges are the file's, widths are not.
+    """
+    fields = {name: one.values for name, one in picture.fields.items()}
+    distance = fields["range_m"] if "range_m" in fields else fields.get("Z")
+    if distance is None or distance.ndim != 2:
+        raise FileFormatError(picture.origin, "has no picture of ranges or depths to show")
+    rows, columns = np.nonzero(np.isfinite(distance) & (distance > 0))
+    focal_length_px = distance.shape[1] / 2 / np.tan(np.deg2rad(DEFAULT_FIELD_OF_VIEW_DEG) / 2)
+    camera = make_pinhole(distance.shape, float(focal_length_px), 1e-10)
+    rays = compute_ray_directions(camera, rows, columns)
+    rays /= rays[:, 2:] if "range_m" not in fields else 1
+    brightness = fields.get("intensity", fields.get("Y", np.ones_like(distance)))
+    return make_cloud(
+        distance[rows, columns, np.newaxis] * rays, {"intensity": brightness[rows, columns]}
+    )
 
 
 def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) -> PointCloud:

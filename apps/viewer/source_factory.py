@@ -17,6 +17,7 @@ from apps.viewer.shot_recovery import ShotRecovery
 from apps.viewer.shots import StoredShotSource
 from apps.viewer.source import Gate
 from apps.viewer.transient import TransientSource
+from devices.recording.reader import read_head_if_recording
 from devices.shot_stream import TrackedShots, read_transients
 from devices.transients import read_transient
 from tofclip.camera import Camera, measure
@@ -95,7 +96,7 @@ def open_source(
     ----------
     name : str
         Frames, cloud, volume, shot or stack of shots (HDF5); a cloud of another format; a raw
-        streak image; a folder of clouds or of streak images; or an address such as
+        streak image; a range image or depth picture; a folder of clouds or of streak images; or an address such as
         ``sim+linospad2://?seed=1``.
     options : ShotOptions, optional
     announce : callable
@@ -120,7 +121,9 @@ def open_source(
         start = file.read(len(HDF5_SIGNATURE))
     if start == HDF5_SIGNATURE:
         return _open_hdf5(path, options, announce)
-    if path.suffix.lower() in CLOUD_SUFFIXES and not (
+    if read_head_if_recording(path) is not None:
+        return _open_instrument(f"file://{path}", options, announce)
+    if path.suffix.lower() in (*CLOUD_SUFFIXES, ".exr") and not (
         path.suffix.lower() == ".npz" and _is_lift_archive(path)
     ):
         return CloudSource(path.name, [path])
@@ -258,6 +261,6 @@ def _is_lift_archive(path: Path) -> bool:
     """Whether an archive is a shot rather than a cloud."""
     try:
         with zipfile.ZipFile(path) as archive:
-            return not {"x_m.npy", "x.npy"} & set(archive.namelist())
+            return not {"x_m.npy", "x.npy", "range_m.npy"} & set(archive.namelist())
     except zipfile.BadZipFile as fault:
         raise FileFormatError(path, "is not a NumPy archive, or is damaged") from fault
