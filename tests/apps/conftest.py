@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,3 +97,30 @@ def curved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def confocal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same point before a planar wall, scanned confocally."""
     return confocal_capture(tmp_path_factory.mktemp("confocal") / "capture.h5")
+
+
+def run_demo(verb: str, out: Path) -> dict[str, Any]:
+    printed, said = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
+        status = main([*verb.split(), "--out", str(out), "--seed", "1", "--json"])
+    assert (status, said.getvalue()) == (0, "")
+    figures: dict[str, Any] = json.loads(printed.getvalue())
+    return figures
+
+
+@pytest.fixture(scope="session")
+def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the demonstration puts its files."""
+    return tmp_path_factory.mktemp("demo") / "new" / "demo"
+
+
+@pytest.fixture(scope="session")
+def demonstration(demo_folder: Path) -> dict[str, Any]:
+    """Figures of `tofclip demo`; who asks for it is in the group ``golden``."""
+    return run_demo("demo", demo_folder)
+
+
+@pytest.fixture(scope="session")
+def hidden_letters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Figures of `tofclip nlos demo`; who asks for it is in the group ``golden``."""
+    return run_demo("nlos demo", tmp_path_factory.mktemp("hidden-letters"))

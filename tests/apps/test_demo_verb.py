@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from small_instrument import Run
+import pytest
 
 from tofclip import Camera, Frames, PointCloud
 
+pytestmark = pytest.mark.xdist_group("golden")  # who else asks for the demonstration
 
-def test_demo(run: Run, tmp_path: Path) -> None:
-    outcome = run("demo", "--out", tmp_path / "new" / "demo", "--seed", "1", "--json")
-    assert (outcome.status, outcome.err) == (0, "")
-    found = json.loads(outcome.out)
-    folder = tmp_path / "new" / "demo"
+
+def test_demo(demonstration: dict[str, Any], demo_folder: Path) -> None:
+    found, folder = demonstration, demo_folder
     assert {path.name for path in folder.iterdir()} == {
         "streak.h5",
         "frames.h5",
