@@ -7,7 +7,7 @@ the sum over k of ``S_k(r) * exp(1j * k * |r_L - r|)``, at every depth.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from nlos.backends import Backend, Diffraction
@@ -95,7 +95,7 @@ class WavePlan(PhasorPlan):
             + MAGNITUDE_BYTES * capture.axis.bins * capture.valid.size
             + SPECTRUM_COPIES * groups[0].memory_bytes
         )
-        self._diffractions = _build_diffractions(groups, band, backend)
+        self._held: tuple[DiffractionPlan | None, dict[int, Diffraction]] = None, {}
         self._warned = False
 
     @property
@@ -165,24 +165,27 @@ class WavePlan(PhasorPlan):
             Called with the rest of the number of voxels.
         """
         work = self.grid.size - self._wall_work(number)
-        self._diffractions[number].add(on_plane, total, SubProgress(progress, self.grid.size, work))
+        diffraction = self._hold_diffraction(number)
+        diffraction.add(on_plane, total, SubProgress(progress, self.grid.size, work))
+
+    def _hold_diffraction(self, number: int) -> Diffraction:
+        """Return what carries a group's field to the voxels.
+
+        Tables and threads' memory are those of one plane at a time, which its groups share: a scan
+        may have hundreds of planes.
+        """
+        group = self.groups[number]
+        plane, made = self._held
+        if plane is not group.plane_to_depths:
+            plane, made = self._held = group.plane_to_depths, {}
+        if not made:
+            # a copy, whose tables end with it
+            source = build_source(group.group, self.band)
+            made[number] = self._backend.plane_to_depths(replace(plane), source)
+        elif number not in made:
+            made[number] = next(iter(made.values())).for_laser(group.group.laser)
+        return made[number]
 
     def _wall_work(self, number: int) -> int:
         """How many voxels the way from the wall to the plane counts for."""
         return int(self.groups[number].wall_fraction * self.grid.size)
-
-
-def _build_diffractions(
-    groups: Sequence[GroupPlan], band: Band, backend: Backend
-) -> list[Diffraction]:
-    """Return what carries every group's field to the voxels; groups of one plane share it."""
-    by_plane: dict[int, Diffraction] = {}
-    found = []
-    for one in groups:
-        plan = one.plane_to_depths
-        if id(plan) not in by_plane:
-            by_plane[id(plan)] = backend.plane_to_depths(plan, build_source(one.group, band))
-            found.append(by_plane[id(plan)])
-        else:
-            found.append(by_plane[id(plan)].for_laser(one.group.laser))
-    return found

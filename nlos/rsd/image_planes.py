@@ -125,11 +125,11 @@ class LaserSource:
 
     def _split_range(self, half: float, tolerance: float) -> Illumination:
         key = half, tolerance
-        if key not in self.splits:
-            self.splits[key] = split_illumination(
-                self.wavenumbers - self.centre_wavenumber, self.strength, half, tolerance
-            )
-        return self.splits[key]
+        if found := self.splits.get(key):
+            return found
+        offsets = self.wavenumbers - self.centre_wavenumber
+        made = split_illumination(offsets, self.strength, half, tolerance)
+        return self.splits.setdefault(key, made)  # one step, as threads share the dictionary
 
 
 class CompiledDiffraction:

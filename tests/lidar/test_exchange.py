@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -50,6 +52,11 @@ def test_pye57_reads_e57(cloud, tmp_path) -> None:
         path.write_bytes(damaged)
         with pytest.raises(FileFormatError, match=r"scene\.e57"):
             PointCloud.load(path)
+    pye57.E57(str(path), mode="w").close()
+    with pytest.raises(FileFormatError) as kept:  # with all that the failed frames hold
+        PointCloud.load(path)
+    assert str(path) not in {os.path.realpath(one) for one in Path("/proc/self/fd").iterdir()}
+    assert "scene.e57" in str(kept.value)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".csv", ".npz", ".h5", ".las", ".laz", ".e57"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from functools import cache
 
@@ -82,6 +83,26 @@ def test_spots_that_light_the_same_wall_share_one_plan() -> None:
     # Two for each of two detectors, not one for each of 256 spots.
     assert scanned.images == 4
     assert choose_roles(exhaustive("planar")) is exhaustive("planar")
+
+
+@pytest.mark.parametrize("spots", [1, 2, 4])
+def test_a_plan_keeps_no_more_than_it_announces_however_many_spots(spots: int) -> None:
+    """Each spot is seen by a part of the wall of its own, and so has a plane of its own."""
+    wall = lattice(20, curved=True).reshape(-1, 3)
+    lasers = np.outer(np.arange(len(wall)) * spots // len(wall), [0.05, 0.02, 0.0])
+    signal = np.random.default_rng(0).random((AXIS.bins, len(wall)))
+    capture = Capture(signal, wall, lasers, AXIS.bin_width)
+    Hybrid(WAVELENGTH).reconstruct(capture, GRID)  # what is imported stays as well
+    tracemalloc.start()
+    try:
+        plan = Hybrid(WAVELENGTH).plan(capture, GRID)
+        plan.image(capture)
+        kept, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert plan.images == spots
+    assert kept < plan.memory_bytes
+    assert most < 2 * plan.memory_bytes
 
 
 def test_a_scan_by_the_laser_is_imaged_by_default() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -40,6 +41,9 @@ MAX_SHARED_THRESHOLDS = 32
 MIN_LIVE_CYCLES = (
     0.5  # a bin that hardly any cycle reaches says nothing, but not with infinite surety
 )
+
+_thresholds_lock = threading.Lock()
+"""Held while a threshold is sought or found: detectors on several threads share them."""
 
 
 @lru_cache(maxsize=MAX_SHARED_THRESHOLDS)
@@ -210,7 +214,9 @@ class PhotonDetector:
         """
         from tofclip.lidar.photons.kernels import find_best_scores, simulate_best_scores
 
-        if photons not in self._threshold_cache:
+        with _thresholds_lock:
+            if photons in self._threshold_cache:
+                return self._threshold_cache[photons]
             best = np.empty(CALIBRATION_HISTOGRAMS)
             noise = np.random.default_rng(CALIBRATION_SEED + photons)
             share = self.relative_background / self.bins
@@ -228,8 +234,9 @@ class PhotonDetector:
                     thrown = noise.multinomial(photons, share, best[piece].size)
                     find_best_scores(thrown.astype(np.float64), *filtering, best[piece])
             best += noise.uniform(0, DITHER, best.size)
-            self._threshold_cache[photons] = float(np.quantile(best, 1 - self.false_alarm_rate))
-        return self._threshold_cache[photons]
+            found = float(np.quantile(best, 1 - self.false_alarm_rate))
+            self._threshold_cache[photons] = found
+            return found
 
     def adapt(self, histograms: FloatArray) -> PhotonDetector:
         """Return a detector for the background that these histograms have in common.
