@@ -407,9 +407,9 @@ def test_neighbours_help_starved_pixels_and_borders_stay_sharp(detector):
     )  # most pixels alone know too little
     assert np.mean(error < 2 * bin_m) > 0.98
     assert np.median(error) < 0.6 * bin_m
-    # Gaussian errors have their median at 0.67; pooled over a slope in whole bins they are somewhat
-    # larger
-    assert 0.5 < np.median(error / smooth.confidence.reshape(32, 32)) < 1.5
+    # Gaussian errors have their median at 0.67; pooled over a slope in whole bins they are larger:
+    # 1.00 over 12 seeds, with a deviation of 0.065
+    assert 0.8 < np.median(error / smooth.confidence.reshape(32, 32)) < 1.2
     assert np.mean(smooth.photons) == pytest.approx(2.0, rel=0.15)
 
 
@@ -445,3 +445,16 @@ def test_many_trials_are_simulated_in_batches(detector, monkeypatch):
     assert (done, max(largest)) == ([128, 128, 44], 128)
     assert pieces.rms_m == pytest.approx(whole.rms_m, rel=0.3)
     assert pieces.detection_rate == pytest.approx(whole.detection_rate, abs=0.05)
+
+
+@pytest.mark.parametrize(("photons", "background"), [(500, 20.0), (800, 50.0)])
+def test_ranges_are_true_in_a_bright_background(detector, photons, background):
+    """2000 returns: bias within four deviations of a mean, deviations within four of theirs."""
+    arrival = np.random.default_rng(12).uniform(40, 80, 2000) * BIN
+    found = detector.locate(histograms(arrival, photons, background, seed=13))
+    error = found.range[:, 0] - metres(arrival)
+    scores = (error / found.confidence[:, 0])[found.detected[:, 0]]
+    assert scores.size > 1990
+    assert abs(scores.mean()) < 4 / np.sqrt(scores.size)
+    # A normal number's square has a variance of two.
+    assert np.mean(scores**2) == pytest.approx(1, abs=4 * np.sqrt(2 / scores.size))

@@ -17,6 +17,8 @@ from tofclip.lidar.photons import (
     make_pinhole,
     matching,
 )
+from tofclip.lidar.photons.layers import keep_significant
+from tofclip.lidar.photons.planes import estimate_bias
 from tofclip.lidar.photons.response import BinnedResponse, measure_pulse_width
 from tofclip.lidar.photons.scene import Scene
 from tofclip.units import SPEED_OF_LIGHT
@@ -237,3 +239,27 @@ def test_the_search_keeps_to_its_memory(monkeypatch: pytest.MonkeyPatch) -> None
     tracemalloc.stop()
     assert peak < limit
     assert 8 * 128 * 128 * axis.numbers.size <= limit
+
+
+def test_a_further_surface_is_kept_where_chance_is_below_one_in_fifty() -> None:
+    """Of a mean of one photon, four or more come with 1.90 %, three or more with 8.03 %."""
+    response = BinnedResponse.from_pulse(Pulse.gaussian(FWHM), BIN)
+    bins_seen = 2 * (0.5 * response.width + 1) + 1
+    scene = Scene(response, 1 / bins_seen)
+    counts = np.zeros((7, 7, 60))
+    counts[..., 30] = 4
+    counts[3, 3, 30] = 3
+    layer = np.ones((7, 7, 4)) * [30.0, 0.5, 4.0, 0.1]
+    kept = np.isfinite(keep_significant(PhotonImage.from_cube(counts, BIN), scene, layer)[..., 0])
+    np.testing.assert_array_equal(np.argwhere(~kept), [[3, 3]])
+
+
+def test_what_planes_miss_on_a_known_bend() -> None:
+    """A bend pulls a plane by half a bin, one of half the reach by a quarter of that."""
+    wide, narrow, pulled = 0.05, 0.1, 0.5
+    # The mean square of their difference: of bias, and of the photons that only one of them used.
+    apart = np.sqrt((0.75 * pulled) ** 2 + narrow**2 - wide**2)
+    ones = np.ones((20, 20))
+    fitted = np.stack([ones * apart, ones * wide, ones], axis=-1)
+    nested = np.stack([0 * ones, ones * narrow, ones], axis=-1)
+    np.testing.assert_allclose(estimate_bias(fitted, nested, 4, 5.0), pulled**2, rtol=1e-9)
