@@ -143,7 +143,9 @@ def test_axes_that_light_and_length_disagree_on_are_asked_for(tmp_path: Path) ->
     noise = np.random.default_rng(3)
     flat = noise.poisson(0.2, (64, 64, 64))
     wide = draw_ball((20, 1000, 100), 4) + noise.poisson(0.2, (20, 1000, 100))
-    for cube in (flat, wide):
+    hot = draw_ball((20, 1000, 100), 0)
+    hot[noise.random(hot.shape[:2]) < 0.02] += 50
+    for cube in (flat, wide, hot):
         np.save(tmp_path / "a.npy", cube.astype(np.uint8))
         with pytest.raises(InputError, match=r"which axis is time .* by a factor of .*give `axes`"):
             read_photons(tmp_path / "a.npy", BIN)

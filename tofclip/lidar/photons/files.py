@@ -311,13 +311,16 @@ def recognise_axes(cube: NDArray[Any], path: Path) -> tuple[str, float]:
         Neither says so, or one says otherwise than the other.
     """
     step = math.ceil((cube.size / MAX_LOOKED_AT) ** (1 / 3))
-    score = np.empty(3)
+    light, score = np.empty(3), np.empty(3)
     for axis in range(3):
         others = [cube.shape[other] for other in range(3) if other != axis]
         length = np.clip(cube.shape[axis] / max(others), 1 / MAX_LENGTH_RATIO, MAX_LENGTH_RATIO)
-        score[axis] = length * _compare_concentration(cube[::step, ::step, ::step], axis)
+        light[axis] = _compare_concentration(cube[::step, ::step, ::step], axis)
+        score[axis] = length * light[axis]
     second, first = np.argsort(score)[-2:]
-    certainty = float(score[first] / score[second])
+    # Hot pixels in a short picture make light uneven along its long axis: then two are in question.
+    rival = max(light[axis] for axis in range(3) if axis != first)
+    certainty = float(score[first] / score[second] / max(rival, 1.0))
     order = {0: "tyx", 1: "ytx", 2: "yxt"}
     if certainty < MIN_AXES_CERTAINTY:
         raise InputError(
