@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tofclip.errors import InputError, StorageError
-from tofclip.files import require_suffix
+from tofclip.files import require_apart, require_suffix
 
 if TYPE_CHECKING:
     from tofclip.shots import Frames
@@ -78,7 +78,7 @@ RECORD_SUFFIXES = (".h5", ".hdf5")
 PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
-def require_writable(out: Path, *suffixes: str, inputs: tuple[Path, ...] = ()) -> None:
+def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | None] = ()) -> None:
     """Refuse an output that cannot be written, or that would overwrite an input.
 
     Finding out after minutes of work would be too late. The writing itself is all or nothing in any
@@ -89,8 +89,8 @@ def require_writable(out: Path, *suffixes: str, inputs: tuple[Path, ...] = ()) -
     out : Path
     *suffixes : str
         Endings that the name may have; none given: any.
-    inputs : tuple of Path
-        Files that must survive.
+    inputs : iterable of path-like or None
+        What must survive, see `tofclip.files.require_apart`.
 
     Raises
     ------
@@ -106,11 +106,7 @@ def require_writable(out: Path, *suffixes: str, inputs: tuple[Path, ...] = ()) -
         raise StorageError(f"{out}: cannot be written: the folder does not exist; create it first")
     if not os.access(out.parent, os.W_OK):
         raise StorageError(f"{out}: cannot be written: writing is not permitted there")
-    for path in inputs:
-        if out.exists() and path.exists() and out.samefile(path):
-            raise InputError(
-                f"{out}: is an input too; choose another name, so that it is not overwritten"
-            )
+    require_apart([out], inputs)
 
 
 def name_beside(out: Path, suffix: str) -> Path:
@@ -136,7 +132,7 @@ def name_beside(out: Path, suffix: str) -> Path:
     return out.with_suffix(suffix)
 
 
-def choose_preview(out: Path, preview: Path | None, inputs: tuple[Path, ...]) -> Path:
+def choose_preview(out: Path, preview: Path | None, inputs: Iterable[str | Path | None]) -> Path:
     """Return where the picture of a result goes, and refuse either where it cannot be written.
 
     Parameters
@@ -145,8 +141,8 @@ def choose_preview(out: Path, preview: Path | None, inputs: tuple[Path, ...]) ->
         File of our own.
     preview : Path, optional
         The picture, beside the result by default.
-    inputs : tuple of Path
-        Files that must survive.
+    inputs : iterable of path-like or None
+        What must survive, see `tofclip.files.require_apart`.
 
     Returns
     -------
@@ -157,7 +153,7 @@ def choose_preview(out: Path, preview: Path | None, inputs: tuple[Path, ...]) ->
     InputError, StorageError
         See `require_writable`.
     """
-    preview = preview or name_beside(out, ".png")
+    preview, inputs = preview or name_beside(out, ".png"), list(inputs)
     require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
     require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
     return preview
@@ -198,6 +194,8 @@ def _to_plain_value(value: Any) -> Any:
 
 def make_folder(folder: Path) -> None:
     """Make a folder for results, with its parents."""
+    if folder.exists() and not folder.is_dir():
+        raise StorageError(f"{folder}: cannot be made: it is a file; name a folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as fault:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import glob
 import hashlib
 import io
 import math
@@ -19,6 +20,7 @@ import stat
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import unquote
 
 from tofclip.errors import FileFormatError, InputError, StorageError, TofclipError
 
@@ -285,6 +287,60 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise StorageError(f"{target}: cannot be written: {reason}") from fault
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def require_apart(outputs: Iterable[str | Path], inputs: Iterable[str | Path | None]) -> None:
+    """Refuse outputs that are inputs too: they would be overwritten, or taken for results.
+
+    They are compared as the file system knows them, so that a link or another spelling of a name
+    makes no difference. What does not exist yet is no input.
+
+    Parameters
+    ----------
+    outputs : iterable of path-like
+        Files that may be written, and folders for results.
+    inputs : iterable of path-like or None
+        Files, folders with the files in them, patterns of `glob`, and addresses, of which only
+        those that begin with ``file://`` name a file. None stands for an option that was not given.
+
+    Raises
+    ------
+    InputError
+    """
+    existing = {_identify_entry(Path(one)): Path(one) for one in outputs}
+    existing.pop(None, None)
+    if not existing:
+        return
+    for path in _iterate_inputs(inputs):
+        out = existing.get(_identify_entry(path))
+        if out is not None:
+            what = "folder" if out.is_dir() else "name"
+            raise InputError(
+                f"{out}: is an input too; choose another {what}, so that it is not overwritten"
+            )
+
+
+def _iterate_inputs(inputs: Iterable[str | Path | None]) -> Iterator[Path]:
+    """Yield the files and folders that inputs name, and the files of these folders."""
+    for one in inputs:
+        scheme, is_address, place = str(one or "").partition("://")
+        if one is None or (is_address and scheme.lower() != "file"):
+            continue
+        name = unquote(place.partition("?")[0]) if is_address else str(one)
+        is_pattern = glob.has_magic(name) and not os.path.lexists(name)
+        for path in map(Path, glob.iglob(name, recursive=True) if is_pattern else [name]):
+            yield path
+            with contextlib.suppress(OSError):  # no folder, or one that cannot be read
+                yield from (inner for inner in path.iterdir() if not inner.is_dir())
+
+
+def _identify_entry(path: Path) -> tuple[int, int] | None:
+    """Return by what the file system knows a file or a folder; None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def remove_temporary_files(targets: Iterable[Path]) -> None:

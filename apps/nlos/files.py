@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from apps.conventions import PICTURE_SUFFIXES, RECORD_SUFFIXES, build_provenance, require_writable
 from nlos.export import POINT_SUFFIXES, WRITERS
-from tofclip.errors import InputError, StorageError
+from tofclip.errors import InputError
 from tofclip.files import identify_file
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class ResultFiles:
         others = [one for one in (self.picture, self.surface) if one is not None]
         return [*self.volumes, *others, self.settings]
 
-    def require_writable(self, *inputs: Path) -> None:
+    def require_writable(self, *inputs: Path | None) -> None:
         """Refuse names that cannot be written, or that would overwrite an input."""
         for volume in self.volumes:
             require_writable(volume, *list_volume_suffixes(), inputs=inputs)
@@ -161,25 +161,3 @@ def add_provenance(volume: Volume, source: Path, settings: dict[str, object]) ->
     Volume
     """
     return replace(volume, provenance=build_provenance(settings, source, earlier=volume.provenance))
-
-
-def require_separate_folder(source: Path, out: Path) -> None:
-    """Refuse to write results of a folder into that folder, where they would be taken for captures.
-
-    Parameters
-    ----------
-    source, out : Path
-
-    Raises
-    ------
-    StorageError
-        `out` is a file.
-    InputError
-        `out` is the folder of the captures.
-    """
-    if out.exists() and not out.is_dir():
-        raise StorageError(f"{out}: is a file; a folder of captures needs a folder for its results")
-    if out.resolve() == source.resolve():
-        raise InputError(
-            f"{out}: is the folder of the captures; choose another one for the results"
-        )

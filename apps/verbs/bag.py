@@ -46,8 +46,6 @@ def bag(
     """
     if not (rate_hz > 0 and start_s >= 0):
         raise InputError("the rate must be positive and the start not negative")
-    if out.suffix.lower() == MCAP_SUFFIX:
-        require_writable(out)
     files = [
         file
         for file in list_files(clouds).values()
@@ -55,6 +53,8 @@ def bag(
     ]
     if not files:
         raise InputError(f"{clouds}: there is no cloud; names end in {', '.join(CLOUD_SUFFIXES)}")
+    if out.suffix.lower() == MCAP_SUFFIX:
+        require_writable(out, inputs=files)
     points = 0
 
     def read() -> Iterator[StampedCloud]:

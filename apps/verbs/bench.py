@@ -55,7 +55,7 @@ def bench(
     cases = find_cases(name)
     if page is not None:
         # Before the measurements, which take minutes.
-        require_writable(page, ".md")
+        require_writable(page, ".md", inputs=(peers,))
     with show_progress("measuring", count_processes(cases)) as advance:
         figures = run_cases(cases, None if peers is None else str(peers), advance)
     if page is not None:

@@ -141,9 +141,7 @@ def calibrate_range(
     Example: tofclip calibrate range --target-m 1 --target-m 2 --target-m 3 near.npy middle.npy far.npy
     --bin-width-ps 80 --reflectance-percent 50 --out camera.h5
     """
-    files = tuple(Path(shot) for shot in shots if "://" not in shot)
-    inputs = files if camera is None else (*files, camera)
-    preview = choose_preview(out, preview, inputs)
+    preview = choose_preview(out, preview, (*shots, camera))
     require_view(focal_length_px, field_of_view_deg)
     distances = _one_each(target_m, len(shots), "--target-m")
     # NaN stands for a target of unknown reflectance; given, it is a mistake.

@@ -190,7 +190,7 @@ def recover(
     Example: tofclip clip recover measurements.h5 --shear -0.3 --preset quality --out picture.png
     """
     # No output may replace a file that is read.
-    inputs = tuple(path for path in (measurement, truth, depth_map) if path is not None)
+    inputs = (measurement, truth, depth_map)
     outputs = [path for path in (out, all_in_focus) if path is not None]
     # A wrong ending is refused before the recovery, not after it.
     for path in outputs:

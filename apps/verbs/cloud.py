@@ -19,6 +19,7 @@ from apps.conventions import (
 )
 from apps.sequences import report_summary, resolve_device, run_with_progress
 from tofclip.errors import InputError
+from tofclip.files import require_apart
 from tofclip.lidar.organised import ORGANISED_SUFFIXES
 from tofclip.sequences import CloudSettings, is_sequence, list_files
 from tofclip.sequences.clouds import save_cloud
@@ -135,6 +136,7 @@ def _convert_sequence(
     clouds: CloudSettings, frames: Path, out: Path, suffix: str, how: tuple[str | None, str, bool]
 ) -> None:
     require_format(suffix, DEPTH_SUFFIX)
+    require_apart([out], [frames])
     cluster, device, as_json = how
     jobs = clouds.jobs(list_files(frames), out, suffix)
     points: list[int] = []

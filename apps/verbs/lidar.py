@@ -29,6 +29,7 @@ from apps.verbs.bag import bag
 from apps.verbs.cloud import require_format
 from apps.verbs.photons import photons
 from tofclip.errors import InputError
+from tofclip.files import require_apart
 from tofclip.lidar import Detection, Pulse, depth, point_cloud
 from tofclip.lidar.detection import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.lidar.objects import find_objects
@@ -133,9 +134,7 @@ def parallax(
 
     Example: tofclip lidar parallax shot.tif --camera camera.h5 --out camera_locked.h5
     """
-    require_writable(
-        out, *RECORD_SUFFIXES, inputs=(streak,) if camera is None else (streak, camera)
-    )
+    require_writable(out, *RECORD_SUFFIXES, inputs=(streak, camera))
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
     shot = open_shot(streak, camera, zero)
     with show_progress("focusing", count_parallax_work(shot, shears)) as advance:
@@ -246,6 +245,7 @@ def sequence(
     """
     # Before the jobs claim the folder.
     require_format(suffix)
+    require_apart([out], [shots, camera])
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
     jobs = RangingSettings(camera, zero, focus, average, not keep_jitter).jobs(

@@ -167,7 +167,13 @@ def photons(
     inputs = _list_inputs(file, pulse, background, camera)
     if not single_pixel and (background is not None or cycles is not None):
         raise InputError("--background and --cycles go with --single-pixel")
-    require_writable(out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, *PICTURE_SUFFIXES, inputs=inputs)
+    require_writable(
+        out,
+        *CLOUD_SUFFIXES,
+        DEPTH_SUFFIX,
+        *PICTURE_SUFFIXES,
+        inputs=(file, pulse, background, camera),
+    )
     if pulse is not None and pulse_ps is not None:
         raise InputError("give the pulse's width (--pulse-ps) or its shape (--pulse), not both")
     if not 1 <= returns <= MAX_RETURNS:

@@ -45,9 +45,7 @@ def record(
     """
     if seconds is not None and not seconds > 0:
         raise InputError(f"--seconds must be positive, got {seconds:g}")
-    require_writable(
-        out, *RECORD_SUFFIXES, inputs=(Path(uri.removeprefix("file://").partition("?")[0]),)
-    )
+    require_writable(out, *RECORD_SUFFIXES, inputs=(uri,))
     past = build_provenance({"verb": "record", "uri": uri, "seconds": seconds})
     with show_time_progress("recording", seconds) as watch:
         done = recorded(

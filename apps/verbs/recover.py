@@ -25,6 +25,7 @@ from apps.progress import show_progress
 from apps.sequences import report_summary, resolve_device, run_with_progress
 from apps.verbs.cloud import CLOUD_SUFFIXES as CLOUD_SUFFIXES
 from tofclip.errors import InputError
+from tofclip.files import require_apart
 from tofclip.recovery import (
     compute_view_delays_bins,
     make_method,
@@ -126,19 +127,20 @@ def recover(
         _check_sequence_options(cloud, preview)
         recovery = RecoverySettings(method, iterations, None, focus, camera, zero, device)
         used = resolve_device(device, cluster)
+        require_apart([out], [streak, camera])
         _recover_sequence(recovery, (streak, width), out, sweep or [], (cluster, used, as_json))
         return
     _check_single_options(streak, cluster, sweep)
-    # An instrument's address is not a file that an output could replace.
-    inputs = tuple(Path(name) for name in (streak, camera) if name and not _is_address(name))
-    preview = choose_preview(out, preview, inputs)
+    preview = choose_preview(out, preview, (streak, camera))
     if cloud is not None:
-        require_writable(cloud, *CLOUD_SUFFIXES, inputs=inputs)
+        require_writable(cloud, *CLOUD_SUFFIXES, inputs=(streak, camera))
     solver, chosen_focus = make_method(method, iterations=iterations), parse_focus(focus)
     started = time.perf_counter()
     # Outputs and settings have been checked by now: an instrument is not started for nothing.
     shot = _open_source(streak, camera, zero, width)
     plan = plan_recovery(shot, solver, chosen_focus, device)
+    # An instrument's address is no file with a checksum.
+    inputs = tuple(Path(name) for name in (streak, camera) if name and not _is_address(name))
     with show_progress("recovering", plan.work) as advance:
         frames = plan.add_provenance(plan.run(advance), *inputs)
     frames.save(out)

@@ -27,7 +27,7 @@ from apps.studies.cases import Library
 from apps.studies.registry import STUDIES, find_studies
 from tofclip import __version__
 from tofclip.errors import InputError
-from tofclip.files import atomic_path
+from tofclip.files import atomic_path, require_apart
 from tofclip.sequences.jobs import Job
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ def reproduce(
     studies = find_studies(name)
     _require_folder(data)
     folder = out / STUDY_FOLDER
+    require_apart([out, folder], [data])
     make_folder(folder)
     library = Library(data)
     # A single study that was named is tried even without its recording, so that the reason is an

@@ -18,6 +18,7 @@ from apps.conventions import JsonOption, TimeZeroOption, make_folder, report
 from apps.verbs.cloud import require_format
 from devices.shot_stream import TrackedShots, read_transients
 from tofclip.errors import InputError
+from tofclip.files import require_apart
 from tofclip.recovery import SharpestFocus, SurfaceRecovery, parse_focus
 from tofclip.sequences import list_shots
 from tofclip.sequences.ranger import CloudPipeline, RangingPipeline, build_cloud_path
@@ -108,6 +109,8 @@ def stream(
     require_format(suffix)
     if shots is not None and shots < 1:
         raise InputError(f"--shots must be positive, got {shots}")
+    if out is not None:
+        require_apart([out, *out.glob(f"cloud_*{suffix}")], [source, camera])
     coming = TrackedShots(
         _read_shots(source, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
     )

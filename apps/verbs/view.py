@@ -129,10 +129,9 @@ def _check_outputs(
     # Truth values add up: more than one was asked for.
     if desktop + (png is not None) + (mp4 is not None) > 1:
         raise InputError("choose one of --desktop, --png and --mp4")
-    files = tuple(Path(name) for name in inputs if name is not None and "://" not in str(name))
     for out, suffix in ((png, ".png"), (mp4, ".mp4")):
         if out is not None:
-            require_writable(out, suffix, inputs=files)
+            require_writable(out, suffix, inputs=inputs)
 
 
 def _draw_picture(session: Session, out: Path, started: float, as_json: bool) -> None:

@@ -90,14 +90,14 @@ def test_names_that_cannot_be_written(run: Run, curved: Path, tmp_path: Path) ->
     refused(run("nlos", "info", tmp_path / "mine.toml"), "is not a capture of a known format")
     (tmp_path / "captures").mkdir()
     folder = ["nlos", "reconstruct", tmp_path / "captures"]
-    refused(run(*folder, "--out", tmp_path / "captures"), "choose another one for the results")
     refused(run(*folder, "--out", tmp_path / "results"), "no capture is in there")
-    refused(run(*folder, "--out", source), "is a file; a folder of captures needs a folder")
     refused(
         run(*folder, "--out", tmp_path / "results", "--suffix", ".stl"),
         "no format of volumes is called '.stl'",
     )
     (tmp_path / "captures" / "a.h5").touch()
+    refused(run(*folder, "--out", tmp_path / "captures"), "is an input too; choose another folder")
+    refused(run(*folder, "--out", source), "it is a file; name a folder")
     (tmp_path / "captures" / "a.npz").touch()
     refused(
         run(*folder, "--out", tmp_path / "results"), "a.h5 and a.npz would have results of one name"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tofclip.arrays import parse_device
 from tofclip.errors import InputError
+from tofclip.files import require_apart
 from tofclip.lidar import PointCloud, Returns, depth, point_cloud
 from tofclip.lidar.organised import save_organised
 from tofclip.sequences.inputs import make_result_paths
@@ -125,6 +126,7 @@ class CloudSettings:
             "suffix": suffix,
             "device": normalise_device(self.device),
         }
+        require_apart([folder / f"{name}{suffix}" for name in frames], frames.values())
         # Before the paths are made: a folder of other settings stays untouched.
         lock_output_folder(folder, settings, frames)
         paths = make_result_paths(frames, folder, suffix)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera
 from tofclip.errors import InputError
-from tofclip.files import compute_sha256
+from tofclip.files import compute_sha256, require_apart
 from tofclip.records import Storable, stored_array, stored_child, stored_value
 from tofclip.recovery import SharpestFocus, open_shot, parse_focus
 from tofclip.sequences.inputs import Shot
@@ -106,6 +106,13 @@ class RangingSettings:
         """
         plan, readers = folder.resolve() / PLAN_NAME, list(shots.values())
         names = list(shots)
+        # Rounded up: what is left over at the end makes one more cloud.
+        parts = [
+            slice(number * self.average, (number + 1) * self.average)
+            for number in range(-(-len(readers) // self.average))
+        ]
+        results = [folder.resolve() / f"{name_cloud(names[part])}{suffix}" for part in parts]
+        require_apart([plan, *results], {self.camera, *(shot.path for shot in readers)})
         # Made before the folder is claimed, and saved after: a first shot that cannot be used
         # leaves no folder behind, and a folder of other settings gets no plan.
         made = None if plan.exists() else self.plan(readers[0]())
@@ -116,16 +123,15 @@ class RangingSettings:
         if made is not None:
             made.save(plan)
         # a worker that holds an older plan notices by the hash
-        version, jobs = compute_sha256(plan), []
-        # Rounded up: what is left over at the end makes one more cloud.
-        for number in range(-(-len(readers) // self.average)):
-            part = slice(number * self.average, (number + 1) * self.average)
-            some = tuple(readers[part])
-            result = folder.resolve() / f"{name_cloud(names[part])}{suffix}"
-            jobs.append(
-                Job(result.stem, result, partial(write_average_cloud, plan, version, some, result))
+        version = compute_sha256(plan)
+        return [
+            Job(
+                result.stem,
+                result,
+                partial(write_average_cloud, plan, version, tuple(readers[part]), result),
             )
-        return jobs
+            for part, result in zip(parts, results, strict=True)
+        ]
 
     def plan(self, first: Streak) -> RangingPlan:
         """Return what all shots share with the first one."""

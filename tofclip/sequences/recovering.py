@@ -11,7 +11,7 @@ from typing import Any
 
 from tofclip.arrays import CPU
 from tofclip.errors import InputError
-from tofclip.files import compute_sha256
+from tofclip.files import compute_sha256, require_apart
 from tofclip.recovery import (
     RecoveryPlan,
     SurfaceRecovery,
@@ -91,7 +91,14 @@ class RecoverySettings:
         Returns
         -------
         list of Job
+
+        Raises
+        ------
+        InputError
+            A shot bears the name of a result, or the folder belongs to other settings.
         """
+        results = [folder / f"{name}{FRAMES_SUFFIX}" for name in shots]
+        require_apart(results, {self.camera, *(shot.path for shot in shots.values())})
         lock_output_folder(
             folder,
             self.settings() | {"bin_width": next(iter(shots.values())).bin_width},

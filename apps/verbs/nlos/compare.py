@@ -41,6 +41,7 @@ from apps.settings import (
 from apps.studies.hidden_scene_adjoint import correlate_views
 from nlos.io import read_capture
 from tofclip.errors import InputError
+from tofclip.files import require_apart
 
 if TYPE_CHECKING:
     from apps.nlos.imaging import PreparedImaging
@@ -92,9 +93,13 @@ def compare(
     """
     wanted = load_settings(CompareSettings, settings, flags)
     written = [out, name_beside(out, ".toml")]
-    _require_writable(written, volumes, (source,) if settings is None else (source, settings))
+    require_writable(out, *PICTURE_SUFFIXES, inputs=(source, settings))
+    require_writable(written[1], inputs=(source, settings))
     # Everything that can be refused is refused before the capture is read.
     _check_settings(wanted)
+    if volumes is not None:
+        require_apart([volumes, *(volumes / f"{name}.h5" for name in METHODS)], [source, settings])
+        make_folder(volumes)
     capture, truth = read_capture(source), HiddenTruth.load(source)
     prepared, left_out = _choose_methods(wanted, capture)
     runs = _measure_methods(prepared)
@@ -108,16 +113,6 @@ def compare(
         written += _save_volumes(runs, volumes, source, found)
     save_settings(found, written[1], SETTINGS_HEADING)
     _report_comparison(grid, figures, left_out, as_json, written)
-
-
-def _require_writable(
-    pictures: Sequence[Path], volumes: Path | None, inputs: tuple[Path, ...]
-) -> None:
-    picture, settings = pictures
-    require_writable(picture, *PICTURE_SUFFIXES, inputs=inputs)
-    require_writable(settings, inputs=inputs)
-    if volumes is not None:
-        make_folder(volumes)
 
 
 def _check_settings(settings: CompareSettings) -> None:

@@ -101,7 +101,8 @@ def film(
     """
     wanted = load_settings(FilmSettings, settings, flags)
     beside = name_beside(out, ".toml")
-    _require_writable(out, beside, (source,) if settings is None else (source, settings))
+    require_writable(out, *FILM_SUFFIXES, inputs=(source, settings))
+    require_writable(beside, inputs=(source, settings))
     _check_settings(wanted, out)
     capture = read_capture(source)
     # Reading the file does not count as imaging.
@@ -121,11 +122,6 @@ def film(
         "seconds": seconds,
     }
     report(figures, as_json, [out, beside])
-
-
-def _require_writable(out: Path, beside: Path, inputs: tuple[Path, ...]) -> None:
-    require_writable(out, *FILM_SUFFIXES, inputs=inputs)
-    require_writable(beside, inputs=inputs)
 
 
 def _check_settings(settings: FilmSettings, out: Path) -> None:

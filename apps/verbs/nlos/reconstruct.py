@@ -28,7 +28,6 @@ from apps.nlos.files import (
     list_captures,
     list_volume_suffixes,
     note_content,
-    require_separate_folder,
     write_volume,
 )
 from apps.nlos.imaging import (
@@ -59,6 +58,7 @@ from nlos.io import read_capture
 from nlos.settings import is_brightest_on_wall
 from tofclip.arrays import ComputeDevice
 from tofclip.errors import InputError
+from tofclip.files import require_apart
 from tofclip.sequences.jobs import Job, run_jobs
 
 if TYPE_CHECKING:
@@ -178,12 +178,12 @@ def reconstruct(
     if is_capture_folder(source):
         if surface is not None:
             raise InputError(f"{source}: --surface is for a single capture, and this is a folder")
-        _reconstruct_folder(source, out, order, suffix or [".h5"], (cluster, as_json))
+        _reconstruct_folder((source, settings), out, order, suffix or [".h5"], (cluster, as_json))
         return
     if cluster is not None:
         raise InputError(f"{source}: --cluster is for a folder of captures")
     results = ResultFiles([out], png, name_beside(out, SETTINGS_SUFFIX), surface)
-    results.require_writable(source, *([] if settings is None else [settings]))
+    results.require_writable(source, settings)
     report(_reconstruct_single(source, results, order), as_json, results.paths)
 
 
@@ -281,7 +281,7 @@ def _image(
 
 
 def _reconstruct_folder(
-    source: Path,
+    inputs: tuple[Path, Path | None],
     out: Path,
     order: _ImagingRequest,
     suffixes: Sequence[str],
@@ -290,8 +290,9 @@ def _reconstruct_folder(
     """Image every capture of a folder whose results are not there yet."""
     cluster, as_json = how
     _require_formats(suffixes)
-    require_separate_folder(source, out)
-    sources = list_captures(source)
+    sources = list_captures(inputs[0])
+    results = [path for one in sources for path in _name_results(out, one.stem, suffixes).paths]
+    require_apart([out, *results], [*inputs, *sources])
     make_folder(out)
     # Results of other settings in the same folder would be taken for finished.
     _check_folder_settings(out / FOLDER_SETTINGS_NAME, order.settings)

@@ -44,10 +44,10 @@ def simulate(
     Example: tofclip nlos simulate --letters T --wall cylinder --wall-points 32 --out capture.h5
     """
     chosen = load_settings(SceneSettings, settings, flags)
-    inputs = [path for path in (settings, chosen.mesh and Path(chosen.mesh)) if path]
+    inputs = [Path(path) for path in (settings, chosen.mesh) if path]
     beside = name_beside(out, ".toml")
-    require_writable(out, *RECORD_SUFFIXES, inputs=tuple(inputs))
-    require_writable(beside, inputs=tuple(inputs))
+    require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
+    require_writable(beside, inputs=inputs)
     started = time.perf_counter()
     capture, truth = simulate_scene(chosen)
     past = build_provenance(

@@ -19,7 +19,7 @@ import numpy as np
 import typer
 
 from apps.conventions import JsonOption, make_folder, report
-from apps.nlos.files import CAPTURE_SUFFIXES, is_capture_folder, list_captures
+from apps.nlos.files import CAPTURE_SUFFIXES, GEOMETRY_FILE, is_capture_folder, list_captures
 from apps.nlos.imaging import (
     METHODS,
     PORTABLE_METHODS,
@@ -40,6 +40,7 @@ from nlos.io import read_capture
 from nlos.method import PhasorPlan
 from nlos.moveout import MidpointJoin
 from tofclip.errors import InputError, TofclipError
+from tofclip.files import require_apart
 from tofclip.sequences.streaming import run_in_order
 
 if TYPE_CHECKING:
@@ -121,6 +122,8 @@ def stream(
     """
     wanted = replace(load_settings(StreamSettings, settings, flags), everywhere=True)
     _check_settings(wanted, follow_s, captures)
+    renderings = (path.parent for path in source.glob(f"*/{GEOMETRY_FILE}"))
+    require_apart([out, out / SETTINGS_NAME, *out.glob("*.h5")], [source, settings, *renderings])
     coming = islice(_read_captures(source, follow_s), captures)
     first = next((one for one in coming if one.capture is not None), None)
     if first is None or first.capture is None:
