@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -30,6 +31,7 @@ from devices.transients import (
     strip_options,
 )
 from devices.uri import Uri
+from tofclip.errors import TofclipError
 from tofclip.shots import Streak
 
 MAX_STAMPS = 10_000
@@ -77,16 +79,19 @@ class ShotAccounts:
     dropped_host : int
         Came and were dropped for newer ones, by the driver's buffer or between the stages, or
         waited still when the stream was ended.
+    failed : int
+        Could not be read, or no cloud could be made of them.
     """
 
     acquired: int
     delivered: int
     dropped_device: int
     dropped_host: int
+    failed: int = 0
 
     @property
     def dropped(self) -> int:
-        """All that were taken and not delivered."""
+        """All that were taken and lost or left out, without those that failed."""
         return self.dropped_device + self.dropped_host
 
 
@@ -203,22 +208,22 @@ class TransientStream(Iterator[Streak]):
             yield batch
 
 
-class TrackedShots(Iterator[Streak]):
+class TrackedShots(Iterator[Streak | TofclipError]):
     """Shots on their way into stages, each with its stamp, so that the consumer behind the stages
     can say how old a shot is and where the others went.
 
     Parameters
     ----------
     shots : iterator of Streak
-        A `TransientStream`, or shots from files.
+        A `TransientStream`, or shots from files: in the place of one that cannot be read its error.
     """
 
-    def __init__(self, shots: Iterator[Streak]) -> None:
+    def __init__(self, shots: Iterator[Streak] | Iterator[Streak | TofclipError]) -> None:
         self._shots = shots
         self._stream = shots if isinstance(shots, TransientStream) else None
         self._stamps: dict[int, ShotStamp] = {}
         self._count = self._first_number = 0
-        self._peeked: Streak | None = None
+        self._peeked: deque[Streak | TofclipError] = deque()
 
     @property
     def is_live(self) -> bool:
@@ -226,15 +231,20 @@ class TrackedShots(Iterator[Streak]):
         return self._stream is not None and self._stream.is_live
 
     def peek(self) -> Streak | None:
-        """Return the next shot, which stays the next one; None at the end."""
-        if self._peeked is None:
-            self._peeked = next(self, None)
-        return self._peeked
+        """Return the next shot that can be read; it and those before it are still to come. None at
+        the end.
+        """
+        while not self._peeked or isinstance(self._peeked[-1], TofclipError):
+            try:
+                self._peeked.append(self._take())
+            except StopIteration:
+                return None
+        return self._peeked[-1]
 
-    def __next__(self) -> Streak:
-        if self._peeked is not None:
-            shot, self._peeked = self._peeked, None
-            return shot
+    def __next__(self) -> Streak | TofclipError:
+        return self._peeked.popleft() if self._peeked else self._take()
+
+    def _take(self) -> Streak | TofclipError:
         shot = next(self._shots)
         stamp = None if self._stream is None else self._stream.stamp
         stamp = stamp or ShotStamp(self._count)
@@ -273,16 +283,17 @@ class TrackedShots(Iterator[Streak]):
             missing += self._stream.shots_lost
         return missing
 
-    def count_shots(self, delivered: int) -> ShotAccounts:
-        """Return what became of every shot, given how many were delivered; final once the stream
-        has been closed.
+    def count_shots(self, delivered: int, failed: int = 0) -> ShotAccounts:
+        """Return what became of every shot, given how many were delivered and how many failed;
+        final once the stream has been closed.
         """
         acquired, lost = self._count, 0
         if self._stream is not None and self._stream.is_live:
             # The instrument knows of shots that never reached this program.
             acquired = max(self._stream.shots_acquired, self._count)
             lost = self._stream.shots_lost
-        return ShotAccounts(acquired, delivered, lost, acquired - lost - delivered)
+        dropped = acquired - lost - delivered - failed
+        return ShotAccounts(acquired, delivered, lost, dropped, failed)
 
     def close(self) -> None:
         """Close the source; not while another thread waits for a shot."""

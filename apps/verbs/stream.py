@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
@@ -15,9 +16,10 @@ import numpy as np
 import typer
 
 from apps.conventions import JsonOption, TimeZeroOption, make_folder, report
+from apps.sequences import EXIT_SOME_FAILED
 from apps.verbs.cloud import require_format
 from devices.shot_stream import TrackedShots, read_transients
-from tofclip.errors import InputError
+from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
 from tofclip.recovery import SharpestFocus, SurfaceRecovery, parse_focus
 from tofclip.sequences import list_shots
@@ -28,6 +30,7 @@ from tofclip.solvers import LinearInverse, ProximalMethod, Sparse, TotalVariatio
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
+    from tofclip.sequences.inputs import Shot
     from tofclip.sequences.streaming import StreamedCloud
     from tofclip.shots import Streak
 
@@ -100,7 +103,8 @@ def stream(
 
     Photons become a shot in batches, pictures one by one: see records= and frames=
     of an address. Of an instrument the newest shot is taken. acquired = delivered + dropped_device
-    + dropped_host counts every shot that it took, and clouds bear its numbers. latency_median_s is
+    + dropped_host + failed counts every shot that it took, and clouds bear its numbers. Shots of
+    which no cloud can be made are listed as they come, and the exit status is 1. latency_median_s is
     the time from the instrument's own stamp until the cloud is there (latency_from says so;
     "arrival" where it sends no time), with the least delay of its messages taken for none.
 
@@ -117,6 +121,9 @@ def stream(
     # The first shot brings the camera and the time axis of all.
     first = coming.peek()
     if first is None:
+        fault = next(coming, None)
+        if isinstance(fault, TofclipError):
+            raise fault
         raise InputError(f"{source}: the source ended before it gave a shot")
     pipeline = _make_pipeline(
         first, camera, None if time_zero_ns is None else time_zero_ns * NANOSECOND, focus, method
@@ -125,19 +132,38 @@ def stream(
         make_folder(out)
     # Instruments do not wait: the newest shot counts. Files do, and lose nothing.
     policy: Literal["drop_oldest", "block"] = "drop_oldest" if drop or coming.is_live else "block"
-    with closing(stream_clouds(coming, pipeline, held, policy)) as made:
+    failed = 0
+
+    def note_failure(number: int, fault: TofclipError) -> None:
+        nonlocal failed
+        failed += 1
+        print(f"tofclip: failed: shot {number}: {fault}", file=sys.stderr)
+
+    with closing(stream_clouds(coming, pipeline, held, policy, on_failure=note_failure)) as made:
         figures = _consume_clouds(islice(made, shots), out, suffix, coming)
     # Counted last: only when the instrument has been stopped are its accounts final.
-    accounts = coming.count_shots(figures["clouds"])
+    accounts = coming.count_shots(figures["clouds"], failed)
     figures |= {"method": method, "dropped": accounts.dropped, **asdict(accounts)}
     report(figures, as_json, [] if out is None else [out])
+    if failed:
+        raise typer.Exit(EXIT_SOME_FAILED)
 
 
-def _read_shots(source: str, bin_width: float | None) -> Iterator[Streak]:
+def _read_shots(
+    source: str, bin_width: float | None
+) -> Iterator[Streak] | Iterator[Streak | TofclipError]:
     """Shots of an instrument, a folder or a stack."""
     if "://" in source:
         return read_transients(source, bin_width)
-    return (shot() for shot in list_shots(source, bin_width).values())
+    return map(_read_or_fail, list_shots(source, bin_width).values())
+
+
+def _read_or_fail(shot: Shot) -> Streak | TofclipError:
+    """Return the error of a shot that cannot be read, which lets those behind it go on."""
+    try:
+        return shot()
+    except TofclipError as fault:
+        return fault
 
 
 def _make_pipeline(

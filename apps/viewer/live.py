@@ -14,7 +14,7 @@ from apps.viewer.shots import ShotSource
 from apps.viewer.source import View
 from devices.shot_stream import TrackedShots
 from tofclip.camera import Camera
-from tofclip.errors import InputError
+from tofclip.errors import InputError, TofclipError
 from tofclip.files import format_error_line
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
@@ -60,12 +60,18 @@ class LiveShotSource(ShotSource):
     """
 
     def __init__(
-        self, title: str, shots: Iterator[Streak], camera: Camera, method: Method | None = None
+        self,
+        title: str,
+        shots: Iterator[Streak] | TrackedShots,
+        camera: Camera,
+        method: Method | None = None,
     ) -> None:
         self._shots = shots if isinstance(shots, TrackedShots) else TrackedShots(shots)
         first = next(self._shots, None)
         if first is None:
             raise InputError(f"{title}: the source ended before it gave anything")
+        if isinstance(first, TofclipError):
+            raise first
         super().__init__(title, camera, first.times, method)
         self._cache: deque[tuple[Readings, View]] = deque(maxlen=MAX_CACHED_SHOTS)
         self._arrivals: deque[float] = deque(maxlen=RATE_WINDOW_SHOTS + 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -117,6 +118,44 @@ def test_a_folder_is_followed_and_its_accounts_balance(run: Run, tmp_path: Path)
     assert found["acquired"] == 8
     assert found["delivered"] + found["dropped"] + found["failed"] == 8
     assert found["delivered"] == len(list((tmp_path / "out").glob("?.h5"))) >= 1
+
+
+def test_a_half_written_capture_is_tried_again(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    moving(0).save(folder / "0.h5")
+    moving(1).save(tmp_path / "whole.h5")
+    whole = (tmp_path / "whole.h5").read_bytes()
+    (folder / "1.h5").write_bytes(whole[: len(whole) // 2])
+    (folder / "2.h5").write_bytes(b"never whole")
+    (folder / "3.h5").write_bytes(b"a name for the time of writing")
+
+    def finish() -> None:
+        time.sleep(0.3)  # it has been tried meanwhile; if not, this test shows nothing
+        with open(folder / "1.h5", "ab") as file:
+            file.write(whole[len(whole) // 2 :])
+        (folder / "3.h5").unlink()
+
+    writer = threading.Thread(target=finish)
+    writer.start()
+    words = ["--out", tmp_path / "out", *WORDS, "--follow-s", 1.5, "--json"]
+    outcome = run("nlos", "stream", folder, *words)
+    writer.join()
+    assert outcome.status == 1
+    assert '"acquired": 3, "delivered": 2, "dropped": 0, "failed": 1' in outcome.out
+    assert outcome.err.startswith("tofclip: failed: 2: ")
+    assert outcome.err.count("\n") == 1
+    x, y, z = Volume.load(tmp_path / "out" / "1.h5").find_brightest()
+    assert (x, y, z) == pytest.approx((-0.1, 0.05, 0.7), abs=0.06)
+
+
+def test_an_unreadable_first_capture_is_counted(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "0.h5").write_bytes(b"nothing")
+    moving(1).save(tmp_path / "in" / "1.h5")
+    outcome = run("nlos", "stream", tmp_path / "in", "--out", tmp_path / "out", *WORDS, "--json")
+    assert outcome.status == 1
+    assert '"acquired": 2, "delivered": 1, "dropped": 0, "failed": 1' in outcome.out
 
 
 @pytest.mark.parametrize(

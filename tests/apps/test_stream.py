@@ -208,6 +208,59 @@ def test_files_are_streamed_too(kind: str, tmp_path: Path, capsys: pytest.Captur
     assert read_report(capsys)["clouds"] == 3
 
 
+@pytest.mark.parametrize("bad", [0, 1, 3])
+def test_a_shot_that_cannot_be_used_is_listed_and_the_others_become_clouds(
+    bad: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, clouds = tmp_path / "shots", tmp_path / "clouds"
+    source.mkdir()
+    made = shots(4)
+    made[0].camera.save(tmp_path / "camera.h5")
+    for number, shot in enumerate(made):
+        replace(shot, camera=None).save(source / f"{number}.h5")
+    whole = (source / f"{bad}.h5").read_bytes()
+    (source / f"{bad}.h5").write_bytes(whole[: len(whole) // 2])
+    words = ["stream", str(source), "--camera", str(tmp_path / "camera.h5"), "--out", str(clouds)]
+    assert main([*words, "--json"]) == 1
+    said = capsys.readouterr()
+    figures = json.loads(said.out)
+    counts = ("acquired", "delivered", "dropped_device", "dropped_host", "failed")
+    assert [figures[name] for name in counts] == [4, 3, 0, 0, 1]
+    assert said.err.count("\n") == 1
+    assert said.err.startswith(f"tofclip: failed: shot {bad}: {source / str(bad)}.h5: ")
+    names = {f"cloud_{number:06d}.ply" for number in range(4) if number != bad}
+    assert {path.name for path in clouds.iterdir()} == names
+
+
+def test_a_shot_of_another_size_is_listed_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second, third = shots(3)
+    source = tmp_path / "shots"
+    source.mkdir()
+    first.save(source / "0.h5")
+    replace(second, counts=second.counts[:-20], row_times=second.row_times[:-20]).save(
+        source / "1.h5"
+    )
+    third.save(source / "2.h5")
+    assert main(["stream", str(source), "--json"]) == 1
+    said = capsys.readouterr()
+    figures = json.loads(said.out)
+    assert [figures[name] for name in ("acquired", "delivered", "failed")] == [3, 2, 1]
+    assert said.err.startswith("tofclip: failed: shot 1: ")
+
+
+def test_a_folder_without_a_shot_that_can_be_read_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.tif", "b.tif"):
+        (tmp_path / name).write_bytes(b"II*\0")
+    assert main(["stream", str(tmp_path), "--json"]) == 2
+    said = capsys.readouterr()
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    assert "a.tif" in said.err
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

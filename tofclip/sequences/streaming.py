@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.camera import Rectifier
-from tofclip.errors import InputError
+from tofclip.errors import InputError, TofclipError
 from tofclip.lidar import PointCloud, point_cloud
 from tofclip.sequences.ranger import CloudPipeline, RangingPipeline
 from tofclip.shots import Returns, Streak
@@ -271,7 +271,10 @@ def _dispatch(
 
 
 def _has_result(future: Future[Any]) -> bool:
-    return future.done() and future.exception() is None
+    """Whether work is done and went well: what failed is not newer than what did not."""
+    if not future.done() or future.exception() is not None:
+        return False
+    return not isinstance(future.result(), TofclipError)
 
 
 def _read_source(source: Iterable[Any], target: Channel[_Arrival]) -> None:
@@ -330,12 +333,13 @@ class StreamedCloud:
 
 
 def stream_clouds(
-    shots: Iterable[Streak],
+    shots: Iterable[Streak | TofclipError],
     pipeline: CloudPipeline | None = None,
     queue_size: int = 1,
     policy: Policy = "block",
     executor: Executor | None = None,
     at_once: int | None = None,
+    on_failure: Callable[[int, TofclipError], object] | None = None,
 ) -> Generator[StreamedCloud, None, None]:
     """Yield the cloud of every shot, as soon as it is made.
 
@@ -345,7 +349,8 @@ def stream_clouds(
     Parameters
     ----------
     shots : iterable of Streak
-        A file's, a folder's or an instrument's; it is read on a thread of its own.
+        A file's, a folder's or an instrument's; it is read on a thread of its own. In the place of a
+        shot that cannot be read may come its error.
     pipeline : RangingPipeline or SurfacePipeline, optional
         By default a `RangingPipeline` for the camera that the first shot carries.
     queue_size : int
@@ -359,6 +364,9 @@ def stream_clouds(
     at_once : int, optional
         Shots that the executor has at a time; by default as many as there are cores, and one more
         where all shots are worth waiting for.
+    on_failure : callable, optional
+        Called with the number of a shot of which no cloud can be made, and its error; the stream
+        goes on. By default the error ends it.
 
     Yields
     ------
@@ -378,6 +386,8 @@ def stream_clouds(
         first = next(coming, None)
         if first is None:
             return
+        if isinstance(first, TofclipError):
+            raise first
         pipeline, coming = RangingPipeline.for_shot(first), _prepend_shot(first, coming)
     # A core for each shot: shared out among all, a shot would be done sooner, but cores would wait
     # for each other.
@@ -392,9 +402,14 @@ def stream_clouds(
         # turn has the next one at hand. It grows old there, where the channel would have a newer.
         cores = 1 if pipeline.in_order else thread_count()
         room = cores + (policy == "block") if at_once is None else at_once
-        work = partial(_make_cloud, pipeline)
+        work = partial(_make_cloud_or_fail, pipeline)
         with closing(run_in_order(coming, work, workers, room, queue_size, policy)) as items:
             for item in items:
+                if isinstance(item.value, TofclipError):
+                    if on_failure is None:
+                        raise item.value
+                    on_failure(item.number, item.value)
+                    continue
                 streak, returns, cloud, seconds = item.value
                 waited = item.latency - sum(seconds.values())
                 steps = {READ: item.read_seconds, WAIT: waited, **seconds}
@@ -403,9 +418,20 @@ def stream_clouds(
                 )
 
 
-def _make_cloud(
-    pipeline: CloudPipeline, shot: Streak
-) -> tuple[Streak, Returns, PointCloud, dict[str, float]]:
+_Made = tuple[Streak, Returns, PointCloud, dict[str, float]]
+
+
+def _make_cloud_or_fail(
+    pipeline: CloudPipeline, shot: Streak | TofclipError
+) -> _Made | TofclipError:
+    """Return the error of a shot as a result, which lets those behind it go on."""
+    try:
+        return shot if isinstance(shot, TofclipError) else _make_cloud(pipeline, shot)
+    except TofclipError as fault:
+        return fault
+
+
+def _make_cloud(pipeline: CloudPipeline, shot: Streak) -> _Made:
     """Return a shot with its returns and cloud, and what each step took, s."""
     ends = [perf_counter()]
     rectified = pipeline.rectify(shot)
@@ -420,7 +446,9 @@ def _make_cloud(
     return shot, returns, cloud, dict(zip(STEPS, seconds, strict=True))
 
 
-def _prepend_shot(first: Streak, others: Iterator[Streak]) -> Iterator[Streak]:
+def _prepend_shot(
+    first: Streak, others: Iterator[Streak | TofclipError]
+) -> Iterator[Streak | TofclipError]:
     """Put a shot back before the others; closing this closes them."""
     yield first
     yield from others

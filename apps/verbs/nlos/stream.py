@@ -113,7 +113,8 @@ def stream(
 
     The settings are found from the first capture and hold for all, which have its wall, laser and
     time axis; what it has not is counted as failed. All of the box is imaged, since things move.
-    Every capture is accounted for: acquired = delivered + dropped + failed.
+    Every capture is accounted for: acquired = delivered + dropped + failed. With --follow-s, one that
+    cannot be read is tried again whenever its file changes: it may be half written.
 
     --average takes the noise off what is far without smearing what moves near by: the number of
     captures grows in proportion to the distance from the wall, as does what is resolved.
@@ -185,24 +186,42 @@ def _read_captures(source: Path, follow_s: float) -> Iterator[_NamedCapture]:
     if not is_capture_folder(source):
         yield _NamedCapture(source.stem, read_capture(source))
         return
-    seen: set[Path] = set()
+    done: set[Path] = set()
+    unreadable: dict[Path, tuple[tuple[int, int], str]] = {}
     last = time.monotonic()
     waiting = follow_s > 0
     while True:
         # A folder that is waited for may be empty yet.
         found = _list_present(source) if waiting else list_captures(source)
         for path in found:
-            if path in seen:
+            state = _read_state(path)
+            if path in done or state is None or state == unreadable.get(path, (None,))[0]:
                 continue
-            seen.add(path)
             try:
-                yield _NamedCapture(path.stem, read_capture(path))
+                capture = read_capture(path)
             except TofclipError as fault:
-                yield _NamedCapture(path.stem, None, str(fault))
+                # Perhaps it is still being written: tried again when it has changed.
+                unreadable[path] = state, str(fault)
+            else:
+                done.add(path)
+                unreadable.pop(path, None)
+                yield _NamedCapture(path.stem, capture)
             last = time.monotonic()
         if time.monotonic() - last >= follow_s:
-            return
+            break
         time.sleep(POLL_INTERVAL_S)
+    for path, (_, problem) in unreadable.items():
+        if path.exists():  # it may have been a name for the time of writing
+            yield _NamedCapture(path.stem, None, problem)
+
+
+def _read_state(path: Path) -> tuple[int, int] | None:
+    """Return what changes when a file is written to; None if it is gone since it was listed."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_size, found.st_mtime_ns
 
 
 def _list_present(folder: Path) -> list[Path]:
