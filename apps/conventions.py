@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tofclip.errors import InputError, StorageError
+from tofclip.errors import StorageError
 from tofclip.files import require_apart, require_suffix
 
 if TYPE_CHECKING:
