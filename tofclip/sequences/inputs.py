@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tofclip.errors import InputError, StorageError
+from tofclip.files import translate_read_errors
 from tofclip.io import read_streak
 from tofclip.io.streaks import StreakStack
 from tofclip.sequences.jobs.output_folder import SETTINGS_NAME
@@ -160,7 +161,7 @@ def make_result_paths(names: Mapping[str, object], folder: Path, suffix: str) ->
 def _is_stack(path: Path) -> bool:
     """Say a stack from a single streak image: it has one more dimension."""
     try:
-        with open(path, "rb") as file:
+        with translate_read_errors(path), open(path, "rb") as file:
             return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE and StreakStack.is_one(path)
     except OSError:
         return False
