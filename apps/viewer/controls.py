@@ -214,7 +214,9 @@ def bind_user_input(handle: Any, post: Post, act: Callable[[Any], None]) -> None
         Called with the new value.
     """
 
-    def changed(event: Any) -> None:
+    # A coroutine, which viser runs at once and functions later: by then a frame that is just being
+    # shown may have set the control to its own number.
+    async def changed(event: Any) -> None:
         # events without a client come from this program's own changes
         if event.client is not None:
             value = event.target.value
