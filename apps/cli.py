@@ -163,10 +163,7 @@ def _show_overview(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program and return its exit status.
 
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Defaults to the command line's.
+    `arguments`: defaults to the command line's.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = DEBUG_FLAG in words
@@ -289,14 +286,6 @@ def _describe_unusable_input(fault: Exception) -> str | None:
 def name_options(message: str) -> str:
     """Put the options of the command line in the place of arguments that a message of the libraries
     names as in Python.
-
-    Parameters
-    ----------
-    message : str
-
-    Returns
-    -------
-    str
 
     Examples
     --------

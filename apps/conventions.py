@@ -84,17 +84,8 @@ def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | No
     Finding out after minutes of work would be too late. The writing itself is all or nothing in any
     case.
 
-    Parameters
-    ----------
-    out : Path
-    *suffixes : str
-        Endings that the name may have; none given: any.
-    inputs : iterable of path-like or None
-        What must survive, see `tofclip.files.require_apart`.
-
-    Raises
-    ------
-    InputError, StorageError
+    `*suffixes`: endings that the name may have; none given: any; `inputs`: what must survive, see
+    `tofclip.files.require_apart`.
     """
     if out.is_dir():
         raise StorageError(f"{out}: cannot be written: it is a folder; name a file")
@@ -112,20 +103,7 @@ def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | No
 def name_beside(out: Path, suffix: str) -> Path:
     """Name what is written beside an output: as the output, with another ending.
 
-    Parameters
-    ----------
-    out : Path
-    suffix : str
-        With its dot.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    StorageError
-        The output is a folder, such as ``.`` or ``/``, which has no name.
+    `suffix`: with its dot.
     """
     if not out.name:
         raise StorageError(f"{out}: cannot be written: it is a folder; name a file")
@@ -135,23 +113,8 @@ def name_beside(out: Path, suffix: str) -> Path:
 def choose_preview(out: Path, preview: Path | None, inputs: Iterable[str | Path | None]) -> Path:
     """Return where the picture of a result goes, and refuse either where it cannot be written.
 
-    Parameters
-    ----------
-    out : Path
-        File of our own.
-    preview : Path, optional
-        The picture, beside the result by default.
-    inputs : iterable of path-like or None
-        What must survive, see `tofclip.files.require_apart`.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    InputError, StorageError
-        See `require_writable`.
+    `out`: file of our own; `preview`: the picture, beside the result by default; `inputs`: what
+    must survive, see `tofclip.files.require_apart`.
     """
     preview, inputs = preview or name_beside(out, ".png"), list(inputs)
     require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
@@ -164,19 +127,8 @@ def build_provenance(
 ) -> dict[str, Any]:
     """Describe how a result came about, with what is known about its input's own past.
 
-    Parameters
-    ----------
-    settings : mapping
-        Options by name.
-    *inputs : Path
-        Files whose checksums are recorded.
-    earlier : mapping, optional
-        Provenance of the input.
-
-    Returns
-    -------
-    dict
-        Plain values only, for JSON.
+    `settings`: options by name; `*inputs`: files whose checksums are recorded; `earlier`:
+    provenance of the input. Returns plain values only, for JSON.
     """
     from tofclip.storage import collect_provenance
 
@@ -213,17 +165,10 @@ def report(
 ) -> None:
     """Print the figures of a run.
 
-    Parameters
-    ----------
-    figures : mapping
-        Names to numbers, strings, and lists or mappings of these. NumPy's numbers and arrays are
-        understood.
-    as_json : bool
-        One JSON object on one line (NaN becomes null) instead of a table.
-    written : sequence of Path
-        Files to name in the table.
-    note : str
-        What has to be known about the figures of the table.
+    `figures`: names to numbers, strings, and lists or mappings of these. NumPy's numbers and arrays
+    are understood; `as_json`: one JSON object on one line (NaN becomes null) instead of a table;
+    `written`: files to name in the table; `note`: what has to be known about the figures of the
+    table.
     """
     plain = to_json_value(figures)
     if as_json:
@@ -354,10 +299,7 @@ def to_json_value(value: Any) -> Any:
 def summarise_list(values: Sequence[Any]) -> str:
     """Return how many values there are, the first and the last, as a person reads a long list.
 
-    Parameters
-    ----------
-    values : sequence
-        Not empty.
+    `values`: not empty.
 
     Examples
     --------

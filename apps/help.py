@@ -54,23 +54,11 @@ def make_lazy_group(
 ) -> type[TyperGroup]:
     """Return the class of a group whose verbs are modules of a package.
 
-    Parameters
-    ----------
-    package : str
-        Where the modules are. A module holds a function named like the verb, or a group of verbs
-        called ``app``.
-    verbs : VerbTable
-        In the order of the help. A verb of two words, such as ``"calibrate range"``, stands beside
-        one that is called by the first word alone.
-    readers : collection of str, optional
-        Verbs, of one word or two, whose first argument is a file, a folder, a pattern or an address.
-        A file that is not there is refused before anything else is looked at or imported, which
-        takes longer than all else.
-
-    Returns
-    -------
-    type of TyperGroup
-        For the ``cls`` of a ``typer.Typer``.
+    `package`: where the modules are. A module holds a function named like the verb, or a group of
+    verbs called ``app``; `verbs`: in the order of the help. A verb of two words, such as
+    ``"calibrate range"``, stands beside one that is called by the first word alone; `readers`:
+    verbs, of one word or two, whose first argument is a file, a folder, a pattern or an address.
+    Returns for the ``cls`` of a ``typer.Typer``.
     """
 
     class LazyGroup(TyperGroup):
@@ -130,17 +118,8 @@ def _require_source(words: Sequence[str], readers: Collection[str]) -> None:
 def load_command(module: str, name: str) -> Command:
     """Import a verb's module and return its command, which is a group if the module has an ``app``.
 
-    Parameters
-    ----------
-    module : str
-        Such as ``apps.verbs.recover``.
-    name : str
-        Of the verb.
-
-    Returns
-    -------
-    TyperCommand or TyperGroup
-        With its help set from its docstring.
+    `module`: such as ``apps.verbs.recover``; `name`: of the verb. Returns with its help set from
+    its docstring.
     """
     home = import_module(module)
     is_group = hasattr(home, "app")
@@ -207,17 +186,8 @@ def _hide_types_of_flags(params: Sequence[Any]) -> None:
 def walk_verbs(group: TyperGroup, words: tuple[str, ...] = ()) -> dict[str, TyperCommand]:
     """Import every verb of a group and return the commands by the words that call them.
 
-    Parameters
-    ----------
-    group : TyperGroup
-        Lazy or not.
-    words : tuple of str
-        That call the group.
-
-    Returns
-    -------
-    dict
-        Such as ``{"lidar scene": command}``, in the order of the help.
+    `group`: lazy or not; `words`: that call the group. Returns such as ``{"lidar scene":
+    command}``, in the order of the help.
     """
     found: dict[str, TyperCommand] = {}
     for name, listed in group.commands.items():

@@ -34,11 +34,7 @@ BOX_HEADER, LONG_LENGTH = Struct(">I4s"), Struct(">Q")
 class FilmWriter:
     """A film that is being written.
 
-    Parameters
-    ----------
-    path : Path
-    rate : float
-        Pictures per second.
+    `rate`: pictures per second.
     """
 
     def __init__(self, path: Path, rate: float) -> None:
@@ -68,15 +64,7 @@ class FilmWriter:
 def open_film(out: Path, rate: float) -> Iterator[FilmWriter]:
     """Yield a film to add pictures to; the file appears whole or not at all.
 
-    Parameters
-    ----------
-    out : Path
-    rate : float
-        Pictures per second.
-
-    Yields
-    ------
-    FilmWriter
+    `rate`: pictures per second.
     """
     with atomic_path(out) as temporary:
         film = FilmWriter(temporary, rate)
@@ -89,16 +77,7 @@ def open_film(out: Path, rate: float) -> Iterator[FilmWriter]:
 
 
 def is_whole_film(path: Path) -> bool:
-    """Whether an MP4 file has all that it says: its index, which is written last, and every box.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    bool
-    """
+    """Whether an MP4 file has all that it says: its index, which is written last, and every box."""
     size, place, kinds = path.stat().st_size, 0, set()
     with open(path, "rb") as file:
         while place + BOX_HEADER.size <= size:

@@ -22,21 +22,7 @@ def show_progress(title: str, total: int) -> Iterator[Advance]:
     thread as on a cluster's worker, there is none. After Ctrl-C the function raises in every thread
     that calls it, so that none goes on computing for nothing.
 
-    Parameters
-    ----------
-    title : str
-    total : int
-        Amount of work at which the bar is full.
-
-    Yields
-    ------
-    callable
-        Takes the amount of work just done.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        The callable raises it after Ctrl-C.
+    `total`: amount of work at which the bar is full. Yields takes the amount of work just done.
     """
     with _watch_interrupt() as interrupted, _open_bar(title, total) as draw:
 
@@ -52,10 +38,6 @@ def show_progress(title: str, total: int) -> Iterator[Advance]:
 def show_activity(title: str) -> Iterator[None]:
     """Show that work whose amount is not known goes on, and for how long; as `show_progress`, on a
     terminal only.
-
-    Parameters
-    ----------
-    title : str
     """
     with _open_bar(title, None):
         yield

@@ -45,19 +45,7 @@ def make_result(
 ) -> Result:
     """Return what is kept of a finished study; plain values only.
 
-    Parameters
-    ----------
-    study : Study
-    outcome : Outcome
-    settings : mapping
-    command : str
-        That makes the study again.
-    seconds : float
-        That it took.
-
-    Returns
-    -------
-    dict
+    `command`: that makes the study again; `seconds`: that it took.
     """
     rows = [asdict(row) | {"mean": row.mean, "spread": row.spread} for row in outcome.rows]
     return {
@@ -76,17 +64,7 @@ def make_result(
 
 
 def load_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
-    """Return the result in `path` if it is whole and was made with the same settings.
-
-    Parameters
-    ----------
-    path : Path
-    settings : mapping
-
-    Returns
-    -------
-    dict or None
-    """
+    """Return the result in `path` if it is whole and was made with the same settings."""
     try:
         found = json.loads(path.read_text("utf-8"))
         return found if found["settings"] == settings else None
@@ -97,18 +75,8 @@ def load_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
 def add_best(result: Result, figures: Mapping[str, BestFigure], seconds: float | None) -> Result:
     """Return a study's result with what the settings of choice reach in its rows.
 
-    Parameters
-    ----------
-    result : dict
-    figures : mapping of str to BestFigure
-        By the rows' labels, as `apps.studies.best.solve_best` returns them; rows that are missing
-        are marked as not tried.
-    seconds : float or None
-        Of processor time, that they took; None: not known.
-
-    Returns
-    -------
-    dict
+    `figures`: by the rows' labels, as `apps.studies.best.solve_best` returns them; rows that are
+    missing are marked as not tried; `seconds`: of processor time, that they took; None: not known.
     """
     rows = []
     for row in result["rows"]:
@@ -140,16 +108,7 @@ def _choose_better(own: float, found: BestFigure | None) -> dict[str, Any]:
 
 
 def count_below(results: Sequence[Result]) -> tuple[int, int]:
-    """Return how many rows the best of ours is below the paper's figure in, and of how many.
-
-    Parameters
-    ----------
-    results : sequence of dict
-
-    Returns
-    -------
-    (int, int)
-    """
+    """Return how many rows the best of ours is below the paper's figure in, and of how many."""
     compared = [row for result in results for row in result["rows"] if _is_compared(row)]
     return sum(row["best"]["percent"] < row["paper"] for row in compared), len(compared)
 
@@ -159,17 +118,7 @@ def _is_compared(row: Mapping[str, Any]) -> bool:
 
 
 def write_result(result: Result, folder: Path) -> list[Path]:
-    """Write NAME.md, NAME.csv and, last, NAME.json, which marks the study as finished.
-
-    Parameters
-    ----------
-    result : dict
-    folder : Path
-
-    Returns
-    -------
-    list of Path
-    """
+    """Write NAME.md, NAME.csv and, last, NAME.json, which marks the study as finished."""
     name = result["name"]
     texts = {
         f"{name}.md": f"{render_section(result)}\n",
@@ -182,17 +131,7 @@ def write_result(result: Result, folder: Path) -> list[Path]:
 
 
 def write_page(results: Sequence[Result], folder: Path) -> Path:
-    """Write the page with the table and the picture of every study.
-
-    Parameters
-    ----------
-    results : sequence of dict
-    folder : Path
-
-    Returns
-    -------
-    Path
-    """
+    """Write the page with the table and the picture of every study."""
     head = (
         "# Tables and figures of the paper, made again\n\n"
         "Made by `tofclip reproduce`; do not edit. Ours is the mean over the seeds and its standard deviation; the "
@@ -221,15 +160,7 @@ def render_section(result: Result, beside: str = "") -> str:
     """Return a study's heading, command, table and picture in Markdown; pictures lie in the folder
     `beside`.
 
-    Parameters
-    ----------
-    result : dict
-    beside : str
-        Ends in a slash, or is empty.
-
-    Returns
-    -------
-    str
+    `beside`: ends in a slash, or is empty.
     """
     names = ", ".join([result["name"], *result["also"]])
     has_best = "best_seconds" in result

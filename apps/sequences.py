@@ -32,19 +32,8 @@ def run_with_progress(
 ) -> Summary:
     """Run the jobs that are not done yet, with a bar that shows the time left.
 
-    Parameters
-    ----------
-    title : str
-        Of the bar.
-    jobs : sequence of Job
-    cluster : str, optional
-        Where; one after the other in this process by default.
-    watch : callable, optional
-        Called with each report.
-
-    Returns
-    -------
-    Summary
+    `title`: of the bar; `cluster`: where; one after the other in this process by default; `watch`:
+    called with each report.
     """
     missing = select_unfinished(jobs)
     with show_progress(title, len(missing)) as advance:
@@ -59,20 +48,7 @@ def run_with_progress(
 def resolve_device(device: str, cluster: str | None) -> str:
     """Return which device a name stands for here; workers on other machines look for it themselves.
 
-    Parameters
-    ----------
-    device : str
-    cluster : str, optional
-        Address of the cluster's scheduler.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    InputError, MissingDependencyError
-        It is not the name of a device, or, without a cluster, the device is not on this computer.
+    `cluster`: address of the cluster's scheduler.
     """
     try:
         found = str(parse_device(device))
@@ -88,21 +64,8 @@ def report_summary(
 ) -> None:
     """Print the figures of a sequence and its failures.
 
-    Parameters
-    ----------
-    summary : Summary
-    total : int
-        Jobs of the sequence, those included that were done by an earlier run.
-    as_json : bool
-    out : Path
-        Where the results are.
-    figures : mapping, optional
-        Further ones.
-
-    Raises
-    ------
-    typer.Exit
-        With status 1: there were failures.
+    `total`: jobs of the sequence, those included that were done by an earlier run; `out`: where the
+    results are; `figures`: further ones.
     """
     attempted = summary.done + len(summary.failures)
     figures = {

@@ -51,20 +51,9 @@ def setting_field(
 ) -> Any:
     """Declare a setting.
 
-    Parameters
-    ----------
-    metavar, meaning : str
-        For the help.
-    default : object
-        Its value if neither file nor flag sets it; None if it has to be found, or may be absent.
-    shown : str, optional
-        The default in words, for the help.
-    choices : iterable of str
-        Names that shells offer to complete.
-
-    Returns
-    -------
-    dataclass field
+    `metavar, meaning`: for the help; `default`: its value if neither file nor flag sets it; None if
+    it has to be found, or may be absent; `shown`: the default in words, for the help; `choices`:
+    names that shells offer to complete.
     """
     option = {
         "metavar": metavar,
@@ -90,25 +79,8 @@ def add_setting_flags(kind: type[DataclassInstance]) -> Callable[[Verb], Verb]:
 def load_settings(kind: type[Settings], file: Path | None, flags: Mapping[str, Any]) -> Settings:
     """Return the settings of a file and of flags; flags win.
 
-    Parameters
-    ----------
-    kind : type
-        The verb's settings.
-    file : Path or None
-        TOML.
-    flags : mapping
-        By the names of the settings; None where a flag was not given.
-
-    Returns
-    -------
-    An instance of `kind`.
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        The file cannot be read, or is not TOML.
-    InputError
-        It holds an unknown key, or a value of another type.
+    `kind`: the verb's settings; `file`: TOML; `flags`: by the names of the settings; None where a
+    flag was not given.
     """
     by_file = {} if file is None else _read_file(kind, file)
     return kind(
@@ -127,13 +99,7 @@ def save_settings(settings: DataclassInstance, path: Path, heading: str) -> None
     """Write the settings that have a value, whole or not at all; read back, they are the same to
     the last bit.
 
-    Parameters
-    ----------
-    settings : dataclass instance
-    path : Path
-        TOML.
-    heading : str
-        A comment in the first line.
+    `path`: TOML; `heading`: A comment in the first line.
     """
     text = f"# {heading}\n{tomli_w.dumps(settings_to_dict(settings))}"
     with atomic_path(path) as temporary:

@@ -120,17 +120,8 @@ def _drop_placeholders(module: ModuleType) -> None:
 def show_verb_help(app: typer.Typer, words: Sequence[str]) -> bool:
     """Print a verb's help and say so, if that is what a command line asks for and nothing else.
 
-    Parameters
-    ----------
-    app : typer.Typer
-        With all verbs.
-    words : sequence of str
-        Of the command line: those that call a verb, and ``--help``.
-
-    Returns
-    -------
-    bool
-        False: nothing was printed.
+    `app`: with all verbs; `words`: of the command line: those that call a verb, and ``--help``.
+    Returns false: nothing was printed.
     """
     *names, last = words or ("",)
     if last != HELP_OPTION or not names or any(name.startswith("-") for name in names):

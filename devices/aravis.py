@@ -79,37 +79,24 @@ NANOSECOND_S, PICOSECOND_S = 1e-9, 1e-12
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """How to acquire; None leaves the camera's own setting.
-
-    Parameters
-    ----------
-    exposure_us : float or None
-    gain : float or None
-        In the camera's own unit, dB for most.
-    frame_rate : float or None
-        1/s.
-    pixel_format : str
-        As GenICam calls it, e.g. ``Mono16``; empty leaves the camera's.
-    row_ps : float or None
-        Duration of a row, ps, where the camera looks at a streak tube's screen.
-    gate : GateScan or None
-        Where a gated intensifier stands before it, stepped by each frame.
-    buffers : int or None
-        Frames that Aravis holds while this program must wait; None: as many as fit into
-        `HELD_BYTES`, within `HELD_FRAMES`.
-    timeout, reconnect : float
-        s without any frame after which the camera is asked whether it is there, and for it to come
-        back.
-    """
+    """How to acquire; None leaves the camera's own setting."""
 
     exposure_us: float | None = None
-    gain: float | None = None
-    frame_rate: float | None = None
-    pixel_format: str = ""
+    gain: float | None = None  # in the camera's own unit, dB for most
+    frame_rate: float | None = None  # 1/s
+    pixel_format: str = ""  # as GenICam calls it, e.g. ``Mono16``; empty leaves the camera's
+    # duration of a row, ps, where the camera looks at a streak tube's screen
     row_ps: float | None = None
+    # where a gated intensifier stands before it, stepped by each frame
     gate: GateScan | None = None
+    # frames that Aravis holds while this program must wait; None: as many as fit into `HELD_BYTES`,
+    # within `HELD_FRAMES`
     buffers: int | None = None
+    # s without any frame after which the camera is asked whether it is there, and for it to come
+    # back
     timeout: float = 5.0
+    # s without any frame after which the camera is asked whether it is there, and for it to come
+    # back
     reconnect: float = 5.0
 
     def __post_init__(self) -> None:
@@ -153,14 +140,7 @@ class AravisFeed:
     for malformed ones whose first packet is missing: that is the one that brings the identifier, and
     so they are counted with the next frame that has one.
 
-    Parameters
-    ----------
-    library : module
-        Aravis.
-    place : str
-        Name or address of the camera; empty for the first one found.
-    ledger : Ledger
-    settings : CameraSettings
+    `library`: aravis; `place`: name or address of the camera; empty for the first one found.
     """
 
     def __init__(self, library: Any, place: str, ledger: Ledger, settings: CameraSettings) -> None:
@@ -402,13 +382,7 @@ class AravisFeed:
 
 @lru_cache(maxsize=1)
 def load_aravis() -> Any:
-    """Import Aravis.
-
-    Raises
-    ------
-    MissingDependencyError
-        Aravis or the binding is not there, or the binding is for another version of Python.
-    """
+    """Import Aravis."""
     try:
         if importlib.util.find_spec("gi") is None:
             _import_system_module("gi")

@@ -33,12 +33,7 @@ class InstrumentClock:
 
         A stamp that goes back means that the instrument's clock began anew.
 
-        Parameters
-        ----------
-        stamp : float
-            s of the instrument's clock.
-        arrived_at : float
-            s of `time.monotonic`.
+        `stamp`: s of the instrument's clock; `arrived_at`: s of `time.monotonic`.
         """
         if self._last_stamp is not None and stamp < self._last_stamp:
             self.reset()

@@ -29,25 +29,12 @@ class FrameCodec:
 
     A frame is malformed if its number is not above that of the one before. Decoding allocates what
     the pixels take, 8 bits for each of those that came as single bits.
-
-    Parameters
-    ----------
-    rows, columns : int
-    bits : int
-        1 (eight pixels in a byte, the leftmost highest), 8, 16 or 32 (little-endian).
-    quarter_turns : int
-        Counter-clockwise ones that put upright what came; 0 to 3, for square pictures only.
-
-    Raises
-    ------
-    InputError
-        There is no such depth, or a picture would be empty, larger than 64 MiB, not made of whole
-        bytes, or turned without being square.
     """
 
     rows: int
     columns: int
-    bits: int = 16
+    bits: int = 16  # 1 (eight pixels in a byte, the leftmost highest), 8, 16 or 32 (little-endian)
+    # counter-clockwise ones that put upright what came; 0 to 3, for square pictures only
     quarter_turns: int = 0
 
     name: ClassVar[str] = "frames"
@@ -109,22 +96,7 @@ class FrameCodec:
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
         """Decode whole frames; `state` is the last one's number.
 
-        Parameters
-        ----------
-        data : bytes-like
-            Whole frames.
-        state : int
-        after_loss : bool
-            Not needed: every frame carries its number.
-
-        Returns
-        -------
-        DecodeResult
-
-        Raises
-        ------
-        InputError
-            The bytes are not whole frames.
+        `data`: whole frames; `after_loss`: not needed: every frame carries its number.
         """
         words = as_bytes(data)
         if words.size % self.frame_bytes:
@@ -143,13 +115,7 @@ class FrameCodec:
         return DecodeResult(records, len(numbers) - len(records), int(before[-1]))
 
     def encode(self, records: Records) -> bytes:
-        """Return numbers and pixels as the camera sends them.
-
-        Raises
-        ------
-        InputError
-            They are of another kind, their numbers do not rise, or a single bit is neither 0 nor 1.
-        """
+        """Return numbers and pixels as the camera sends them."""
         if records.dtype != self.dtype or records.ndim != 1:
             raise InputError(f"frames must be a one-dimensional array of {self.dtype}")
         if np.any(np.diff(records["number"], prepend=-1) <= 0):
@@ -165,17 +131,7 @@ class FrameCodec:
         return frames.tobytes()
 
     def pack_frame(self, number: int, pixels: bytes) -> bytes:
-        """Return a frame's bytes from those of its pixels.
-
-        Parameters
-        ----------
-        number : int
-        pixels : bytes
-
-        Returns
-        -------
-        bytes
-        """
+        """Return a frame's bytes from those of its pixels."""
         return number.to_bytes(_NUMBER_DTYPE.itemsize, "little") + pixels
 
     def _unpack_pixels(self, data: ByteView) -> Any:

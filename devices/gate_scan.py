@@ -18,29 +18,12 @@ GATE_OPTIONS = ("gate_steps", "gate_step_ps", "gate_width_ns", "gate_offset_ps")
 
 @dataclass(frozen=True)
 class GateScan:
-    """A scan; a picture's number modulo `steps` is its step.
+    """A scan; a picture's number modulo `steps` is its step."""
 
-    Parameters
-    ----------
-    steps : int
-        Pictures of one scan.
-    step_ps : float
-        How much later the gate opens from one to the next, ps.
-    width_ns : float
-        How long it is open, ns.
-    offset_ps : float
-        When it opens in the first one, ps after the laser's pulse.
-
-    Raises
-    ------
-    InputError
-        No gate does that.
-    """
-
-    steps: int = 72
-    step_ps: float = 252.0
-    width_ns: float = 5.0
-    offset_ps: float = 5000.0
+    steps: int = 72  # pictures of one scan
+    step_ps: float = 252.0  # how much later the gate opens from one to the next, ps
+    width_ns: float = 5.0  # how long it is open, ns
+    offset_ps: float = 5000.0  # when it opens in the first one, ps after the laser's pulse
 
     def __post_init__(self) -> None:
         if not (

@@ -77,12 +77,7 @@ class Ledger:
     def deliver(self, delivered: int, malformed: int) -> None:
         """Move records that waited to those that were read.
 
-        Parameters
-        ----------
-        delivered : int
-            Records that were sound.
-        malformed : int
-            Records that were not.
+        `delivered`: records that were sound; `malformed`: records that were not.
         """
         self._add(unread=-delivered - malformed, delivered=delivered, malformed=malformed)
 

@@ -79,10 +79,7 @@ class Connection:
 class LoopbackServer:
     """Listens on a free port of 127.0.0.1 and serves each client on a thread of its own.
 
-    Parameters
-    ----------
-    serve : callable
-        Called with each new `Connection`; when it returns the connection is closed.
+    `serve`: called with each new `Connection`; when it returns the connection is closed.
     """
 
     def __init__(self, serve: Callable[[Connection], None]) -> None:

@@ -48,19 +48,11 @@ EDGE_S = 1e-10
 
 @dataclass(frozen=True)
 class CountedPhotons:
-    """Photons of a picture, as an instrument counted them.
+    """Photons of a picture, as an instrument counted them."""
 
-    Parameters
-    ----------
-    counts : (bins, rows, columns) float32 array
-    times : (bins,) float64 array
-        Of each bin, s after the laser's pulse; evenly spaced.
-    pulse : Pulse or None
-        How a return at one instant shows in successive bins, where the instrument knows.
-    """
-
-    counts: NDArray[np.float32]
-    times: NDArray[np.float64]
+    counts: NDArray[np.float32]  # (bins, rows, columns)
+    times: NDArray[np.float64]  # (bins,), of each bin, s after the laser's pulse; evenly spaced
+    # how a return at one instant shows in successive bins, where the instrument knows
     pulse: Pulse | None = None
 
     @property
@@ -76,10 +68,7 @@ class CountedPhotons:
 def find_address(file: str) -> str | None:
     """Return the address of a file that holds an instrument's records, None of any other file.
 
-    Parameters
-    ----------
-    file : str
-        A recording of this program, or a LinoSPAD2's (``.dat``).
+    `file`: A recording of this program, or a LinoSPAD2's (``.dat``).
     """
     path = Path(file)
     is_stamps = path.suffix.lower() == STAMPS_SUFFIX
@@ -91,24 +80,9 @@ def read_photons(address: str, bin_width: float | None = None) -> CountedPhotons
 
     Memory: the counts, and one batch of the source.
 
-    Parameters
-    ----------
-    address : str
-        As `devices.open` takes it, with `GATHERING_OPTIONS` where wanted.
-    bin_width : float, optional
-        Duration of a bin, s, in which photons with a time stamp each are counted, 20 ps by default;
-        other instruments know their own.
-
-    Returns
-    -------
-    CountedPhotons
-
-    Raises
-    ------
-    InputError
-        The source counts no photons in time, knows its own bins, or ended before a whole scan.
-    DeviceError
-        The instrument failed before that.
+    `address`: as `devices.open` takes it, with `GATHERING_OPTIONS` where wanted; `bin_width`:
+    duration of a bin, s, in which photons with a time stamp each are counted, 20 ps by default;
+    other instruments know their own.
     """
     uri = Uri.parse(address)
     scans, binning = uri.value("scans", int, 1), uri.value("binning", int, 1)

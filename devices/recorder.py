@@ -27,18 +27,10 @@ ProgressCallback = Callable[[float], None]
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """What a recording came to.
-
-    Parameters
-    ----------
-    seconds : float
-    bytes : int
-        Of the instrument, without the file's own.
-    stats : Stats
-    """
+    """What a recording came to."""
 
     seconds: float
-    bytes: int
+    bytes: int  # of the instrument, without the file's own
     stats: Stats
 
 
@@ -57,35 +49,9 @@ def record_source(
     and the buffer still hold is recorded before `KeyboardInterrupt` is raised; a second signal
     gives that up. The source is closed. Memory: the source's.
 
-    Parameters
-    ----------
-    source : Source
-        One that has bytes to tap: a live instrument, or another recording.
-    path : Path
-        Locked meanwhile; a second recorder is refused.
-    seconds : float
-    provenance : mapping
-        How it came about.
-    watch : callable
-        Called with the seconds that have passed, now and then.
-    overwrite : bool
-        Replace `path` if it exists.
-
-    Returns
-    -------
-    RecordingSummary
-
-    Raises
-    ------
-    InputError
-        The source has no bytes to tap, or `path` exists.
-    StorageError
-        The disk is full, or the file was removed; what was recorded before is safe. Or another
-        recorder writes it.
-    DeviceError
-        The instrument failed; what came before is in the file.
-    KeyboardInterrupt
-        After a signal, once the recording has been ended in order.
+    `source`: one that has bytes to tap: a live instrument, or another recording; `path`: locked
+    meanwhile; a second recorder is refused; `provenance`: how it came about; `watch`: called with
+    the seconds that have passed, now and then; `overwrite`: replace `path` if it exists.
     """
     with source:
         if not isinstance(source, DecodedSource):

@@ -138,22 +138,7 @@ def discover() -> list[DiscoveredInstrument]:
 
 
 def build_codec(name: str, settings: Mapping[str, Scalar]) -> Codec:
-    """Build the codec called `name` from the settings that it once gave.
-
-    Parameters
-    ----------
-    name : str
-    settings : mapping
-
-    Returns
-    -------
-    Codec
-
-    Raises
-    ------
-    InputError
-        There is no such codec, or it does not take these settings.
-    """
+    """Build the codec called `name` from the settings that it once gave."""
     if name not in CODECS:
         raise InputError(f"no codec is called '{name}'; known are {', '.join(sorted(CODECS))}")
     try:

@@ -40,17 +40,8 @@ class ReplaySource(DecodedSource):
 
     Memory: one piece and its records; 100 bytes for each piece of the recording.
 
-    Parameters
-    ----------
-    path : Path
-    is_paced : bool
-        Let as much time pass between two pieces as there was when they were recorded, but at most
-        `MAX_PAUSE_S`.
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        FileFormatError where the file is not a recording, or is a damaged one.
+    `is_paced`: let as much time pass between two pieces as there was when they were recorded, but
+    at most `MAX_PAUSE_S`.
     """
 
     def __init__(self, path: Path, is_paced: bool = False) -> None:

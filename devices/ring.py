@@ -27,25 +27,14 @@ class Gap(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Piece:
-    """Whole records as they came, not decoded yet.
-
-    Parameters
-    ----------
-    data : bytes
-    records : int
-        How many, by the codec's count.
-    gap : Gap
-    received_at : float
-        When it came, s of `time.monotonic`; 0 where that is not known.
-    taken_at : float
-        When the instrument took the last of it by its own clock, s of `time.monotonic` (see
-        `devices.clock.InstrumentClock`); 0 where the instrument does not say.
-    """
+    """Whole records as they came, not decoded yet."""
 
     data: bytes
-    records: int
+    records: int  # how many, by the codec's count
     gap: Gap = Gap.NONE
-    received_at: float = 0.0
+    received_at: float = 0.0  # when it came, s of `time.monotonic`; 0 where that is not known
+    # when the instrument took the last of it by its own clock, s of `time.monotonic` (see
+    # `devices.clock.InstrumentClock`); 0 where the instrument does not say
     taken_at: float = 0.0
 
 
@@ -53,16 +42,10 @@ class RingBuffer:
     """A queue of pieces that never holds more than `capacity` bytes (but always at least one
     piece).
 
-    Parameters
-    ----------
-    capacity : int
-        Bytes.
-    policy : {"block", "drop_oldest", "fail"}
-        What happens when it is full: the writer waits (and the instrument's own memory fills up),
-        the oldest piece goes, or measurement ends with `BufferOverflowError` after what is in the
-        queue.
-    ledger : Ledger
-        Where arrivals and drops are entered.
+    `capacity`: bytes; `policy`: what happens when it is full: the writer waits (and the
+    instrument's own memory fills up), the oldest piece goes, or measurement ends with
+    `BufferOverflowError` after what is in the queue; `ledger`: where arrivals and drops are
+    entered.
     """
 
     def __init__(self, capacity: int, policy: OverflowPolicy, ledger: Ledger) -> None:
@@ -98,15 +81,7 @@ class RingBuffer:
             self._changed.notify_all()
 
     def get(self, timeout: float) -> Piece | None:
-        """Take the oldest piece; None at the end of the stream.
-
-        Raises
-        ------
-        DeviceTimeoutError
-            None came within `timeout` seconds.
-        Exception
-            What `fail` was given, once everything before it has been taken.
-        """
+        """Take the oldest piece; None at the end of the stream."""
         with self._changed:
             if not self._changed.wait_for(
                 lambda: self._pieces or self._ended or self._fault, timeout

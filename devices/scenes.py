@@ -39,44 +39,22 @@ IMAGE_SIZE_PX = 32
 
 @dataclass(frozen=True)
 class LineLight:
-    """What falls on a line of pixels after each pulse of the laser, in one exposure.
+    """What falls on a line of pixels after each pulse of the laser, in one exposure."""
 
-    Parameters
-    ----------
-    photons : (rows, columns) array
-        Expected photons, background included; row = instant, column = pixel.
-    row_times : (rows,) array
-        Middle of each row, s after the pulse.
-    camera : Camera
-        What a calibration would know of the camera.
-    truth : GroundTruth
-        What stands in front of it.
-    """
-
+    # (rows, columns), expected photons, background included; row = instant, column = pixel
     photons: NDArray[np.float64]
-    row_times: NDArray[np.float64]
-    camera: Camera
-    truth: GroundTruth
+    row_times: NDArray[np.float64]  # (rows,), middle of each row, s after the pulse
+    camera: Camera  # what a calibration would know of the camera
+    truth: GroundTruth  # what stands in front of it
 
 
 @dataclass(frozen=True)
 class EmulatedLight:
-    """What falls on the screen, and how it is swept.
+    """What falls on the screen, and how it is swept."""
 
-    Parameters
-    ----------
-    photons : (rows, columns) array
-        Expected photons of each pixel in one exposure.
-    row_times : (rows,) array
-        s.
-    full_scale : int
-        Reading at which a pixel saturates.
-    seed : int
-    """
-
-    photons: NDArray[np.float64]
-    row_times: NDArray[np.float64]
-    full_scale: int = 65535
+    photons: NDArray[np.float64]  # (rows, columns), expected photons of each pixel in one exposure
+    row_times: NDArray[np.float64]  # (rows,), s
+    full_scale: int = 65535  # reading at which a pixel saturates
     seed: int = 0
 
     def draw_frame(self, number: int) -> NDArray[np.uint16]:
@@ -88,15 +66,7 @@ class EmulatedLight:
     def of(cls, light: LineLight, seed: int) -> EmulatedLight:
         """Let a scene's light fall on the screen.
 
-        Parameters
-        ----------
-        light : LineLight
-        seed : int
-            Of the photons.
-
-        Returns
-        -------
-        EmulatedLight
+        `seed`: of the photons.
         """
         return cls(light.photons, light.row_times, seed=seed)
 
@@ -173,15 +143,7 @@ def render_array_delays() -> NDArray[np.float64]:
 def draw_exposure(light: LineLight, seed: int) -> Streak:
     """Draw one exposure, without any instrument in between.
 
-    Parameters
-    ----------
-    light : LineLight
-        Expected photons.
-    seed : int
-
-    Returns
-    -------
-    Streak
+    `light`: expected photons.
     """
     counts = np.random.default_rng(seed).poisson(light.photons).astype(np.float32)
     return Streak(counts, light.row_times, camera=light.camera)

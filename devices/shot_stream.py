@@ -40,21 +40,14 @@ MAX_STAMPS = 10_000
 
 @dataclass(frozen=True)
 class ShotStamp:
-    """As which shot, and when, a streak image was taken.
+    """As which shot, and when, a streak image was taken."""
 
-    Parameters
-    ----------
-    number : int
-        Its number at the instrument, from 0: those that were lost on the way have been counted.
-    taken_at : float
-        When the instrument took the last of it by its own clock, s of `time.monotonic`; 0 where it
-        does not say.
-    received_at : float
-        When the last of it came, s of `time.monotonic`; 0 where it comes from a file.
-    """
-
+    # its number at the instrument, from 0: those that were lost on the way have been counted
     number: int
+    # when the instrument took the last of it by its own clock, s of `time.monotonic`; 0 where it
+    # does not say
     taken_at: float = 0.0
+    # when the last of it came, s of `time.monotonic`; 0 where it comes from a file
     received_at: float = 0.0
 
     def compute_age(self) -> float | None:
@@ -67,27 +60,15 @@ class ShotStamp:
 
 @dataclass(frozen=True)
 class ShotAccounts:
-    """What became of every shot.
+    """What became of every shot."""
 
-    Parameters
-    ----------
-    acquired : int
-        Shots that the instrument took, or that were read from a file.
-    delivered : int
-    dropped_device : int
-        Lost by the instrument or on the wire, or damaged when they came.
-    dropped_host : int
-        Came and were dropped for newer ones, by the driver's buffer or between the stages, or
-        waited still when the stream was ended.
-    failed : int
-        Could not be read, or no cloud could be made of them.
-    """
-
-    acquired: int
+    acquired: int  # shots that the instrument took, or that were read from a file
     delivered: int
-    dropped_device: int
+    dropped_device: int  # lost by the instrument or on the wire, or damaged when they came
+    # came and were dropped for newer ones, by the driver's buffer or between the stages, or waited
+    # still when the stream was ended
     dropped_host: int
-    failed: int = 0
+    failed: int = 0  # could not be read, or no cloud could be made of them
 
     @property
     def dropped(self) -> int:
@@ -102,20 +83,8 @@ def read_transients(address: str, bin_width: float | None = None) -> TransientSt
     the last one may have fewer. The source is opened with the first image, and closed with the
     stream. Memory: a batch of the source, and a streak image.
 
-    Parameters
-    ----------
-    address, bin_width
-        As for `devices.read_transient`. Reading ends after ``seconds`` only where the address gives
-        them.
-
-    Returns
-    -------
-    TransientStream
-
-    Raises
-    ------
-    InputError, DeviceError
-        As for `devices.read_transient`, with the first image.
+    `address, bin_width`: as for `devices.read_transient`. Reading ends after ``seconds`` only where
+    the address gives them.
     """
     return TransientStream(address, bin_width)
 
@@ -127,11 +96,7 @@ class TransientStream(Iterator[Streak]):
     chooses a ``policy``: what is shown or ranged late would be of no use. What is dropped for that
     is in `stats`.
 
-    Parameters
-    ----------
-    address : str
-    bin_width : float or None
-        s.
+    `bin_width`: s.
     """
 
     def __init__(self, address: str, bin_width: float | None = None) -> None:
@@ -212,10 +177,8 @@ class TrackedShots(Iterator[Streak | TofclipError]):
     """Shots on their way into stages, each with its stamp, so that the consumer behind the stages
     can say how old a shot is and where the others went.
 
-    Parameters
-    ----------
-    shots : iterator of Streak
-        A `TransientStream`, or shots from files: in the place of one that cannot be read its error.
+    `shots`: A `TransientStream`, or shots from files: in the place of one that cannot be read its
+    error.
     """
 
     def __init__(self, shots: Iterator[Streak] | Iterator[Streak | TofclipError]) -> None:
@@ -267,16 +230,7 @@ class TrackedShots(Iterator[Streak | TofclipError]):
         """Return how many shots up to a delivered one were lost, wherever that was. Those behind
         it are not known yet.
 
-        Parameters
-        ----------
-        stamp : ShotStamp
-            The newest delivered one's.
-        delivered : int
-            Shots delivered so far, this one included.
-
-        Returns
-        -------
-        int
+        `stamp`: the newest delivered one's; `delivered`: shots delivered so far, this one included.
         """
         missing = stamp.number - self._first_number + 1 - delivered
         if self._stream is not None and not self._stream.is_numbered:

@@ -175,11 +175,7 @@ class Source(abc.ABC):
 class DecodedSource(Source):
     """What live and recorded streams have in common, so that both decode alike.
 
-    Parameters
-    ----------
-    codec : Codec
-    ledger : Ledger
-        Where the pieces have been entered as unread.
+    `ledger`: where the pieces have been entered as unread.
     """
 
     def __init__(self, codec: Codec, ledger: Ledger) -> None:

@@ -16,12 +16,7 @@ from tofclip.storage import Field, Record
 
 
 class StreakFile(Source):
-    """One frame, and the time axis that its file brings.
-
-    Parameters
-    ----------
-    streak : Streak
-    """
+    """One frame, and the time axis that its file brings."""
 
     def __init__(self, streak: Streak) -> None:
         self._streak = streak

@@ -53,21 +53,13 @@ _Connected = TypeVar("_Connected")
 
 @dataclass(frozen=True)
 class Transfer:
-    """What one transfer brought.
+    """What one transfer brought."""
 
-    Parameters
-    ----------
-    data : bytes-like
-        Valid until the next `Feed.pull`.
-    gap : Gap
-        What is missing before it. After a gap the data begins with a whole record.
-    taken_at : float
-        When the instrument took the last of it by its own clock, s of `time.monotonic`; 0 where it
-        does not say.
-    """
-
-    data: memoryview
+    data: memoryview  # valid until the next `Feed.pull`
+    # what is missing before it. After a gap the data begins with a whole record
     gap: Gap = Gap.NONE
+    # when the instrument took the last of it by its own clock, s of `time.monotonic`; 0 where it
+    # does not say
     taken_at: float = 0.0
 
 
@@ -110,13 +102,7 @@ class StreamSource(DecodedSource):
 
     Memory: the buffer's capacity, plus one transfer and one decoded piece.
 
-    Parameters
-    ----------
-    feed : Feed
-    codec : Codec
-    ledger : Ledger
-        The one that the feed enters losses into.
-    buffering : BufferSettings
+    `ledger`: the one that the feed enters losses into.
     """
 
     def __init__(
@@ -267,21 +253,7 @@ def parse_buffer_settings(uri: Uri) -> BufferSettings:
 def parse_seconds(uri: Uri, name: str, default: float) -> float:
     """Read a time to wait, within 0 and 600 s.
 
-    Parameters
-    ----------
-    uri : Uri
-    name : str
-    default : float
-        Seconds.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    InputError
-        It is not a number, or outside 0 to 600 s.
+    `default`: seconds.
     """
     found = uri.value(name, float, default)
     if not 0 < found <= 600:
@@ -290,22 +262,7 @@ def parse_seconds(uri: Uri, name: str, default: float) -> float:
 
 
 def retry_connect(connect: Callable[[], _Connected], seconds: float) -> _Connected:
-    """Return what `connect` returns, which is called again while the instrument does not answer.
-
-    Parameters
-    ----------
-    connect : callable
-    seconds : float
-
-    Returns
-    -------
-    object
-
-    Raises
-    ------
-    DeviceDisconnectedError
-        The instrument did not answer for `seconds`.
-    """
+    """Return what `connect` returns, which is called again while the instrument does not answer."""
     deadline = monotonic() + seconds
     while True:
         try:

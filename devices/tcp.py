@@ -26,19 +26,7 @@ RECEIVE_BYTES = 1 << 18
 class TcpLink:
     """A connection to a server. Not for two threads at once.
 
-    Parameters
-    ----------
-    host : str
-    port : int
-    timeout : float
-        Seconds to wait for the connection.
-
-    Raises
-    ------
-    DeviceNotFoundError
-        Nothing answers there.
-    DeviceTimeoutError
-        Nothing answers in time.
+    `timeout`: seconds to wait for the connection.
     """
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
@@ -60,15 +48,7 @@ class TcpLink:
     def send(self, data: bytes, timeout: float) -> None:
         """Send all of `data`.
 
-        Parameters
-        ----------
-        data : bytes
-        timeout : float
-            Seconds.
-
-        Raises
-        ------
-        DeviceTimeoutError, DeviceDisconnectedError
+        `timeout`: seconds.
         """
         with self._translate_errors():
             self._socket.settimeout(timeout)
@@ -77,20 +57,7 @@ class TcpLink:
     def read_available(self, limit: int, timeout: float) -> bytes:
         """Return what came, at least 1 and at most `limit` bytes.
 
-        Parameters
-        ----------
-        limit : int
-            Bytes.
-        timeout : float
-            Seconds.
-
-        Returns
-        -------
-        bytes
-
-        Raises
-        ------
-        DeviceTimeoutError, DeviceDisconnectedError
+        `limit`: bytes; `timeout`: seconds.
         """
         if not self._buffer:
             self._fill_buffer(monotonic() + timeout, timeout)
@@ -100,23 +67,7 @@ class TcpLink:
         """Return `length` bytes, a length that came from the wire and is bounded before anything is
         held for it.
 
-        Parameters
-        ----------
-        length, limit : int
-            Bytes.
-        timeout : float
-            Seconds for all of it.
-
-        Returns
-        -------
-        bytes
-
-        Raises
-        ------
-        ProtocolError
-            `length` is negative or beyond `limit`.
-        DeviceTimeoutError, DeviceDisconnectedError
-            What came in time stays for the next call.
+        `length, limit`: bytes; `timeout`: seconds for all of it.
         """
         if not 0 <= length <= limit:
             raise ProtocolError(
@@ -130,24 +81,7 @@ class TcpLink:
     def read_until(self, end: bytes, limit: int, timeout: float) -> bytes:
         """Return everything up to `end`, which is taken off.
 
-        Parameters
-        ----------
-        end : bytes
-        limit : int
-            Bytes.
-        timeout : float
-            Seconds for all of it.
-
-        Returns
-        -------
-        bytes
-
-        Raises
-        ------
-        ProtocolError
-            `end` is not among the next `limit` bytes.
-        DeviceTimeoutError, DeviceDisconnectedError
-            What came in time stays for the next call.
+        `limit`: bytes; `timeout`: seconds for all of it.
         """
         deadline = monotonic() + timeout
         searched = 0

@@ -76,18 +76,7 @@ class TcspcFile(Source):
     The calibration has ``resolution_s``, the width of a bin, and ``channels``; of photons also
     ``laser_period_s``, of images ``rows`` and ``columns``.
 
-    Parameters
-    ----------
-    path : path-like
-    open_file : callable
-        Makes the file's reader.
-
-    Raises
-    ------
-    StorageError
-        The file is absent or may not be read.
-    FileFormatError
-        It is damaged, or has no pulses to count from.
+    `open_file`: makes the file's reader.
     """
 
     def __init__(self, path: str | Path, open_file: Callable[[Path], Reader]) -> None:
@@ -173,11 +162,8 @@ class PtuPhotons:
     """Photons of a PTU file; see `Reader`. Opening reads the file once, to know its channels and
     where each piece begins. Markers are passed over; pictures are read by `tofclip.lidar.photons`.
 
-    Parameters
-    ----------
-    path : Path
-    sync : int, optional
-        Channel of the laser's pulses in T2 mode; by default the electronics' own input for them.
+    `sync`: channel of the laser's pulses in T2 mode; by default the electronics' own input for
+    them.
     """
 
     lost = 0
@@ -208,12 +194,8 @@ class SwabianPhotons:
     """Photons of Swabian Instruments' files; see `Reader`. Their library reads forwards only, so
     that stepping back begins anew.
 
-    Parameters
-    ----------
-    path : Path
-    sync : int
-        Channel of the laser's pulses, as the instrument numbers it: negative for falling edges. All
-        others become channels from 0, in the order of their numbers.
+    `sync`: channel of the laser's pulses, as the instrument numbers it: negative for falling edges.
+    All others become channels from 0, in the order of their numbers.
     """
 
     def __init__(self, path: Path, sync: int) -> None:
@@ -318,16 +300,7 @@ def open_sdt(uri: Uri) -> TcspcFile:
 def compute_photon_times(photons: Records, calibration: Record) -> NDArray[np.float64]:
     """Return when each photon came, s after the laser's pulse: the beginning of its bin.
 
-    Parameters
-    ----------
-    photons : (n,) record array
-        With a field ``bin``.
-    calibration : Record
-        Gives the resolution, s.
-
-    Returns
-    -------
-    (n,) float64 array
+    `photons` (n,): with a field ``bin``; `calibration`: gives the resolution, s. Returns (n,).
     """
     times: NDArray[np.float64] = photons["bin"] * calibration.number("resolution_s")
     return times

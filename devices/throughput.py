@@ -19,22 +19,13 @@ POLL_INTERVAL_S = 0.25
 
 @dataclass(frozen=True)
 class Throughput:
-    """What came of reading a source for a while.
+    """What came of reading a source for a while."""
 
-    Parameters
-    ----------
-    seconds : float
-        Until the source was stopped, or at its end.
-    bytes : int
-        That were decoded in this time: as they came from the instrument, or the records' where a
-        source has no bytes.
-    stats : Stats
-        After everything that was left had been read and the source was closed.
-    """
-
-    seconds: float
+    seconds: float  # until the source was stopped, or at its end
+    # that were decoded in this time: as they came from the instrument, or the records' where a
+    # source has no bytes
     bytes: int
-    stats: Stats
+    stats: Stats  # after everything that was left had been read and the source was closed
 
     @property
     def figures(self) -> dict[str, float]:
@@ -50,23 +41,7 @@ def measure_throughput(
 ) -> Throughput:
     """Read a source for some seconds or to its end, decode everything, and close it.
 
-    Parameters
-    ----------
-    source : Source
-    seconds : float
-    watch : callable
-        Called with the seconds that have passed, now and then.
-
-    Returns
-    -------
-    Throughput
-
-    Raises
-    ------
-    InputError
-        The time is not positive.
-    DeviceError
-        The instrument failed.
+    `watch`: called with the seconds that have passed, now and then.
     """
     if not 0 < seconds < math.inf:
         raise InputError(f"a trial takes a positive, finite number of seconds, got {seconds:g}")
@@ -102,15 +77,7 @@ class _ByteMeter:
     def read(self, source: Source, timeout: float) -> Batch | None:
         """Read a batch and count its bytes.
 
-        Parameters
-        ----------
-        source : Source
-        timeout : float
-            Seconds.
-
-        Returns
-        -------
-        Batch or None
+        `timeout`: seconds.
         """
         batch = source.read(timeout)
         if batch is not None and not self._is_tapped:

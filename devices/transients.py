@@ -54,32 +54,16 @@ PICOSECOND_S = 1e-12
 
 @dataclass(frozen=True)
 class AccumulationSettings:
-    """How records become a streak image; see the module's text.
-
-    Parameters
-    ----------
-    seconds : float
-    frames : int
-    bins : int or None
-        None: as many as fit into the laser's period.
-    start : float
-        s.
-    period : float or None
-        s. None: as the source says.
-    sync : int
-    pixels : tuple of int
-    bin_width : float or None
-        s. None: `BIN_WIDTH_S` for photons, and the camera's own time axis for frames.
-    records : int
-    """
+    """How records become a streak image; see the module's text."""
 
     seconds: float = 10.0
     frames: int = 1
-    bins: int | None = None
-    start: float = 0.0
-    period: float | None = None
+    bins: int | None = None  # none: as many as fit into the laser's period
+    start: float = 0.0  # s
+    period: float | None = None  # s. None: as the source says
     sync: int = 0
     pixels: tuple[int, ...] = (1, 2, 3)
+    # s. None: `BIN_WIDTH_S` for photons, and the camera's own time axis for frames
     bin_width: float | None = None
     records: int = 100_000
 
@@ -87,20 +71,7 @@ class AccumulationSettings:
     def from_uri(cls, uri: Uri, bin_width: float | None) -> AccumulationSettings:
         """Read the values of an address that say how to gather.
 
-        Parameters
-        ----------
-        uri : Uri
-        bin_width : float, optional
-            Seconds.
-
-        Returns
-        -------
-        AccumulationSettings
-
-        Raises
-        ------
-        InputError
-            A value is not a number, or not positive.
+        `bin_width`: seconds.
         """
         standard = cls()
         pixels = uri.value("pixels", _parse_integers, standard.pixels)
@@ -122,14 +93,7 @@ class AccumulationSettings:
         return found
 
     def axis(self, known_period: float | None) -> BinAxis:
-        """Return the bins of a histogram of photons.
-
-        Raises
-        ------
-        InputError
-            Neither the address nor the source says how many bins there are, or how long the laser's
-            period is.
-        """
+        """Return the bins of a histogram of photons."""
         width = BIN_WIDTH_S if self.bin_width is None else self.bin_width
         period = self.period or known_period
         if self.bins is not None:
@@ -194,21 +158,7 @@ def accumulate_streak(
 ) -> Streak:
     """Make one streak image of everything that comes.
 
-    Parameters
-    ----------
-    batches : iterator of Batch
-    calibration : Record, optional
-        The source's.
-    gathering : AccumulationSettings
-
-    Returns
-    -------
-    Streak
-
-    Raises
-    ------
-    InputError
-        Nothing came, or these records make no streak image.
+    `calibration`: the source's.
     """
     first = next(batches, None)
     if first is None:
@@ -234,22 +184,7 @@ def accumulate_streak(
 
 
 def read_batches(source: Source, seconds: float) -> Iterator[Batch]:
-    """Read until the end, or for some seconds of a live source.
-
-    Parameters
-    ----------
-    source : Source
-    seconds : float
-
-    Yields
-    ------
-    Batch
-
-    Raises
-    ------
-    DeviceError
-        The instrument failed, or nothing came at all.
-    """
+    """Read until the end, or for some seconds of a live source."""
     deadline = monotonic() + seconds
     while not source.is_live or monotonic() < deadline:
         try:
@@ -329,15 +264,7 @@ def read_camera(calibration: Record | None) -> Camera | None:
 def strip_options(uri: Uri, names: Collection[str] = ACCUMULATION_OPTIONS) -> str:
     """Return the address without what says how to gather.
 
-    Parameters
-    ----------
-    uri : Uri
-    names : collection of str
-        Options to leave out.
-
-    Returns
-    -------
-    str
+    `names`: options to leave out.
     """
     # Files of photon counters need the channel of the laser's pulses themselves.
     own = {"sync"} if Path(uri.location).suffix.lower() in (".ptu", ".ttbin") else set()

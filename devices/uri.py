@@ -16,34 +16,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Uri:
-    """A parsed address.
+    """A parsed address."""
 
-    Parameters
-    ----------
-    text : str
-        The address as it was given, for messages.
-    scheme : str
-        Lower case, e.g. ``"sim+timetag"``.
-    location : str
-        All between ``://`` and ``?``: a serial number, ``HOST:PORT`` or a path.
-    values : mapping of str to str
-        The query.
-    """
-
-    text: str
-    scheme: str
-    location: str
-    values: Mapping[str, str] = field(default_factory=dict)
+    text: str  # the address as it was given, for messages
+    scheme: str  # lower case, e.g. ``"sim+timetag"``
+    location: str  # all between ``://`` and ``?``: a serial number, ``HOST:PORT`` or a path
+    values: Mapping[str, str] = field(default_factory=dict)  # the query
 
     @classmethod
     def parse(cls, text: str) -> Uri:
-        """Take an address apart.
-
-        Raises
-        ------
-        InputError
-            It has no scheme, or its query is not made of ``name=value``, each name once.
-        """
+        """Take an address apart."""
         if not text.isprintable():
             raise InputError(f"{text!r} holds control characters, which no address has")
         scheme, separator, rest = text.partition("://")
@@ -71,21 +53,7 @@ class Uri:
         """Return value `name` turned into a `kind` (``int``, ``float``, ``str``), `default` where
         it is not given.
 
-        Parameters
-        ----------
-        name : str
-        kind : callable
-            From a text to a value.
-        default : object
-
-        Returns
-        -------
-        object
-
-        Raises
-        ------
-        InputError
-            The value cannot be turned into a `kind`.
+        `kind`: from a text to a value.
         """
         if name not in self.values:
             return default
@@ -102,13 +70,7 @@ class Uri:
         return found
 
     def host_and_port(self, default_port: int) -> tuple[str, int]:
-        """Return the place as ``HOST[:PORT]``.
-
-        Raises
-        ------
-        InputError
-            There is no host, or the port is not within 1..65535.
-        """
+        """Return the place as ``HOST[:PORT]``."""
         try:
             parts = urlsplit(f"//{self.location}")
             host, port = parts.hostname, parts.port

@@ -53,13 +53,7 @@ class UsbIdentity(NamedTuple):
 
 
 def system_backend() -> Any:
-    """Return pyusb's backend for this machine's USB, on the libusb that `libusb-package` brings.
-
-    Raises
-    ------
-    UsbBackendError
-        There is none.
-    """
+    """Return pyusb's backend for this machine's USB, on the libusb that `libusb-package` brings."""
     try:
         import libusb_package
         import usb.backend.libusb1
@@ -79,15 +73,7 @@ def system_backend() -> Any:
 def find_devices(identity: UsbIdentity, backend: Any) -> Iterator[usb.core.Device]:
     """Yield every connected instrument of that kind.
 
-    Parameters
-    ----------
-    identity : UsbIdentity
-    backend : object
-        Of pyusb.
-
-    Yields
-    ------
-    usb.core.Device
+    `backend`: of pyusb.
     """
     import usb.core
 
@@ -100,20 +86,7 @@ def find_devices(identity: UsbIdentity, backend: Any) -> Iterator[usb.core.Devic
 def read_serial(device: usb.core.Device, identity: UsbIdentity) -> str:
     """Return the serial number, empty where there is none.
 
-    Parameters
-    ----------
-    device : usb.core.Device
-    identity : UsbIdentity
-        For the message.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    DevicePermissionError
-        It may not be read.
+    `identity`: for the message.
     """
     with translate_errors(identity):
         return str(device.serial_number or "")
@@ -177,18 +150,8 @@ class UsbLink:
 
     Not for two threads at once. Reading and writing clear a stalled endpoint and try once more.
 
-    Parameters
-    ----------
-    identity : UsbIdentity
-    serial : str
-        Empty: the only one that is connected.
-    backend : object
-        pyusb's backend; `system_backend`, or an emulator's.
-
-    Raises
-    ------
-    DeviceNotFoundError, DevicePermissionError, DeviceBusyError
-        DeviceNotFoundError also where several are connected and no serial number was given.
+    `serial`: empty: the only one that is connected; `backend`: pyusb's backend; `system_backend`,
+    or an emulator's.
     """
 
     def __init__(self, identity: UsbIdentity, serial: str, backend: Any) -> None:
@@ -200,22 +163,7 @@ class UsbLink:
         """Fill `buffer` from a bulk endpoint and return how many bytes came; fewer than fit are no
         fault.
 
-        Parameters
-        ----------
-        endpoint : int
-            Address.
-        buffer : array of bytes
-            Overwritten.
-        timeout : float
-            Seconds.
-
-        Returns
-        -------
-        int
-
-        Raises
-        ------
-        DeviceTimeoutError, DeviceStalledError, DeviceDisconnectedError, TransferOverflowError
+        `endpoint`: address; `buffer`: overwritten; `timeout`: seconds.
         """
         return self._retry_after_halt(
             endpoint, lambda: int(self._device.read(endpoint, buffer, _to_milliseconds(timeout)))
@@ -224,18 +172,7 @@ class UsbLink:
     def write(self, endpoint: int, data: bytes, timeout: float) -> None:
         """Send all of `data` to a bulk endpoint.
 
-        Parameters
-        ----------
-        endpoint : int
-            Address.
-        data : bytes
-        timeout : float
-            Seconds.
-
-        Raises
-        ------
-        DeviceTimeoutError, DeviceStalledError, DeviceDisconnectedError
-            DeviceTimeoutError also where only a part was taken.
+        `endpoint`: address; `timeout`: seconds.
         """
         sent = self._retry_after_halt(
             endpoint, lambda: int(self._device.write(endpoint, data, _to_milliseconds(timeout)))
@@ -248,18 +185,7 @@ class UsbLink:
     def request(self, number: int, value: int, timeout: float) -> None:
         """Send a vendor request without data to the instrument's firmware.
 
-        Parameters
-        ----------
-        number, value : int
-            The request (``bRequest``) and its ``wValue``.
-        timeout : float
-            Seconds.
-
-        Raises
-        ------
-        DeviceStalledError
-            The firmware does not know the request.
-        DeviceTimeoutError, DeviceDisconnectedError
+        `number, value`: the request (``bRequest``) and its ``wValue``; `timeout`: seconds.
         """
         with translate_errors(self.identity):
             self._device.ctrl_transfer(
@@ -267,13 +193,7 @@ class UsbLink:
             )
 
     def reconnect(self, patience: float) -> None:
-        """Wait until the instrument with this serial number is back, and claim it.
-
-        Raises
-        ------
-        DeviceDisconnectedError
-            It did not come back within `patience` seconds.
-        """
+        """Wait until the instrument with this serial number is back, and claim it."""
         deadline = monotonic() + patience
         self.close()
         while monotonic() < deadline:

@@ -28,36 +28,15 @@ from tofclip.solvers import Method as Recovery
 
 @dataclass(frozen=True, eq=False)
 class CompressedCapture:
-    """Measurements ``f = F h`` of a wall's transient pictures h, one column per time bin.
+    """Measurements ``f = F h`` of a wall's transient pictures h, one column per time bin."""
 
-    Parameters
-    ----------
-    measurements : (measurements, t) array
-        Kept as float32.
-    operator : LinearOperator
-        F, from pictures (rows, columns) to (measurements,).
-    wall : (rows, columns, 3) array
-        The wall point of every pixel, m; NaN where unknown.
-    laser : (3,) or (rows, columns, 3) array
-        Laser spot, or one per wall point, m.
-    bin_width, start : float
-        As of `Capture`: the ways to and from the devices are taken off.
-    provenance : mapping
-        How it came about.
-
-    Raises
-    ------
-    ShapeError, InputError
-        Measurements, operator and wall disagree, or a measurement is not finite.
-    """
-
-    measurements: NDArray[np.float32]
-    operator: LinearOperator
-    wall: FloatArray
-    laser: FloatArray
-    bin_width: float
-    start: float = 0.0
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    measurements: NDArray[np.float32]  # (measurements, t), kept as float32
+    operator: LinearOperator  # f, from pictures (rows, columns) to (measurements,)
+    wall: FloatArray  # (rows, columns, 3), the wall point of every pixel, m; NaN where unknown
+    laser: FloatArray  # (3,), laser spot, or one per wall point, m
+    bin_width: float  # as of `Capture`: the ways to and from the devices are taken off
+    start: float = 0.0  # as of `Capture`: the ways to and from the devices are taken off
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # how it came about
 
     def __post_init__(self) -> None:
         require_numpy("imaging straight from compressed measurements", self.measurements)
@@ -79,23 +58,8 @@ class CompressedCapture:
         """Read a capture (t, rows, columns) through an operator, as a CLIP camera does; masked wall
         points are dark.
 
-        Parameters
-        ----------
-        capture : Capture
-            Signal (t, rows, columns).
-        operator : LinearOperator
-            (rows, columns) pictures to (measurements,) vectors.
-
-        Returns
-        -------
-        CompressedCapture
-
-        Raises
-        ------
-        ShapeError
-            The signal's pictures do not fit the operator.
-        InputError
-            The signal is not a NumPy array.
+        `capture`: signal (t, rows, columns); `operator`: (rows, columns) pictures to
+        (measurements,) vectors.
         """
         if capture.signal.shape[1:] != operator.shape_in:
             raise ShapeError("signal", ("t", *operator.shape_in), capture.signal.shape)
@@ -108,11 +72,8 @@ class CompressedCapture:
     def recover_transients(self, method: Recovery | None = None) -> Capture:
         """Recover the wall's transients.
 
-        Parameters
-        ----------
-        method : Method, optional
-            Of `tofclip.solvers`; defaults to the adjoint. `LinearInverse` costs as much and is
-            sharper.
+        `method`: of `tofclip.solvers`; defaults to the adjoint. `LinearInverse` costs as much and
+        is sharper.
         """
         method = method or Backprojection()
         frames = method.recover(self.operator, self.measurements).frames
@@ -131,19 +92,12 @@ class AdjointImaging:
     Memory for the recovered transients, besides what the solver needs.
 
     X. Feng, Y. Ma, L. Gao, Nat. Commun. 13, 3333 (2022), supplement Note 13, Eq. 22.
-
-    Parameters
-    ----------
-    solver : Method
-        Any method of this package.
-    recovery : Method
-        The adjoint, or another of `tofclip.solvers`.
-    threshold : float
-        Voxels weaker than this fraction of the brightest become 0; 0 keeps all.
     """
 
-    solver: Method
+    solver: Method  # any method of this package
+    # the adjoint, or another of `tofclip.solvers`
     recovery: Recovery = field(default_factory=Backprojection)
+    # voxels weaker than this fraction of the brightest become 0; 0 keeps all
     threshold: float = 0.3
 
     def __post_init__(self) -> None:
@@ -151,22 +105,7 @@ class AdjointImaging:
             raise InputError(f"a threshold is a fraction between 0 and 1, got {self.threshold}")
 
     def plan(self, capture: CompressedCapture, grid: Grid) -> Plan:
-        """Make the solver ready for transients recovered from such measurements.
-
-        Parameters
-        ----------
-        capture : CompressedCapture
-        grid : Grid
-
-        Returns
-        -------
-        Plan
-
-        Raises
-        ------
-        InputError
-            The solver cannot image such a capture on the grid.
-        """
+        """Make the solver ready for transients recovered from such measurements."""
         blank = np.zeros((capture.measurements.shape[1], *capture.wall.shape[:-1]), np.float32)
         return self.solver.plan(
             Capture(blank, capture.wall, capture.laser, capture.bin_width, capture.start), grid
@@ -175,20 +114,7 @@ class AdjointImaging:
     def reconstruct(self, capture: CompressedCapture, grid: Grid) -> Volume:
         """Image the hidden scene.
 
-        Parameters
-        ----------
-        capture : CompressedCapture
-        grid : Grid
-
-        Returns
-        -------
-        Volume
-            Weak voxels are zero.
-
-        Raises
-        ------
-        InputError
-            The solver cannot image such a capture on the grid.
+        Returns weak voxels are zero.
         """
         plan = self.plan(capture, grid)
         volume = plan.image(capture.recover_transients(self.recovery))

@@ -22,19 +22,8 @@ class DepthAverage:
     "Low-latency time-of-flight non-line-of-sight imaging at 5 frames per second", Nat. Commun. 12,
     6526 (2021).
 
-    Parameters
-    ----------
-    grid : Grid
-        Of the fields.
-    wall : float
-        z from which depths count, m.
-    captures : int
-        How many are averaged at the last depth; nearer by at least the newest alone.
-
-    Raises
-    ------
-    InputError
-        The number is not positive.
+    `grid`: of the fields; `wall`: z from which depths count, m; `captures`: how many are averaged
+    at the last depth; nearer by at least the newest alone.
     """
 
     def __init__(self, grid: Grid, wall: float, captures: int) -> None:
@@ -53,16 +42,8 @@ class DepthAverage:
     def add(self, field: Volume) -> Volume:
         """Take the field of a new capture, and return the image of the average.
 
-        Parameters
-        ----------
-        field : Volume
-            Complex, as of `PhasorPlan.field`.
-
-        Returns
-        -------
-        Volume
-            Brightness, real and not negative, float32. Of a stream's first captures it holds those
-            that there are.
+        `field`: complex, as of `PhasorPlan.field`. Returns brightness, real and not negative,
+        float32. Of a stream's first captures it holds those that there are.
         """
         self._latest.append(field.values)
         newest_first = list(self._latest)[::-1]

@@ -31,15 +31,8 @@ class PhasorPropagation(Protocol):
     def field(self, phasors: Array, progress: Progress = ignore_progress) -> Array:
         """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64.
 
-        Parameters
-        ----------
-        phasors : (n, frequencies) complex64 array
-        progress : callable
-            Called with the number of plane points times frequencies just done.
-
-        Returns
-        -------
-        (y, x, frequencies) complex64 array
+        `phasors` (n, frequencies); `progress`: called with the number of plane points times
+        frequencies just done. Returns (y, x, frequencies).
         """
         ...
 
@@ -50,13 +43,8 @@ class Diffraction(Protocol):
     def add(self, values: Array, total: Array, progress: Progress) -> None:
         """Add the image of a field (y, x, frequencies) to a volume (z, y, x).
 
-        Parameters
-        ----------
-        values : (y, x, frequencies) complex64 array
-        total : (z, y, x) complex64 array
-            Added to, in place.
-        progress : callable
-            Called with the number of voxels just done.
+        `values` (y, x, frequencies); `total` (z, y, x): added to, in place; `progress`: called with
+        the number of voxels just done.
         """
         ...
 
@@ -134,12 +122,7 @@ class Backend(Protocol):
 
 
 class CompiledBackend:
-    """Compiled loops on NumPy's arrays.
-
-    Parameters
-    ----------
-    band : Band
-    """
+    """Compiled loops on NumPy's arrays."""
 
     def __init__(self, band: Band) -> None:
         self.band = band
@@ -170,11 +153,7 @@ class CompiledBackend:
 class PortableBackend:
     """Matrix products on the arrays of any library, where these live.
 
-    Parameters
-    ----------
-    band : Band
-    capture : Capture
-        For the device and the number of bins of its signal.
+    `capture`: for the device and the number of bins of its signal.
     """
 
     def __init__(self, band: Band, capture: Capture) -> None:
@@ -220,14 +199,6 @@ class PortableBackend:
 def choose_backend(capture: Capture, band: Band) -> Backend:
     """Return the backend of a capture's arrays, for the frequencies of a band.
 
-    Parameters
-    ----------
-    capture : Capture
-    band : Band
-        Wavenumbers, rad/m.
-
-    Returns
-    -------
-    Backend
+    `band`: wavenumbers, rad/m.
     """
     return CompiledBackend(band) if is_numpy(capture.signal) else PortableBackend(band, capture)

@@ -190,21 +190,9 @@ def backproject_signals(
     """Smear every wall point's filtered signal over the voxels that it may come from, and add all
     up.
 
-    Parameters
-    ----------
-    capture : Capture
-    grid : Grid
-    apply_filter : callable
-        Filters the signals of some wall points.
-    points_at_a_time : int
-        How many are filtered at once; bounds the memory.
-    weighting : Weighting
-    progress : callable
-        Called with the number of look-ups just done.
-
-    Returns
-    -------
-    (z, y, x) complex64 array
+    `apply_filter`: filters the signals of some wall points; `points_at_a_time`: how many are
+    filtered at once; bounds the memory; `progress`: called with the number of look-ups just done.
+    Returns (z, y, x).
     """
     total = np.zeros(grid.shape, np.complex64)
     for some in split_blocks(len(capture.points), points_at_a_time):
@@ -231,12 +219,7 @@ class _Batch:
     ) -> None:
         """Add what these wall points contribute to a brick of voxels.
 
-        Parameters
-        ----------
-        field : (z, y, x) complex64 array
-            Added to, in place.
-        x, y, z : float64 array
-            Axes of the brick, m.
+        `field` (z, y, x): added to, in place; `x, y, z`: axes of the brick, m.
         """
         values = self.waveforms.values.view(np.float32)
         start, spacing = np.float32(self.waveforms.start), np.float32(self.waveforms.spacing)

@@ -93,21 +93,13 @@ class VirtualPulse:
 
 @dataclass(frozen=True, eq=False)
 class Waveforms:
-    """Band-limited complex signals, finely sampled over path length.
+    """Band-limited complex signals, finely sampled over path length."""
 
-    Parameters
-    ----------
-    values : (points, samples) complex array
-        The first and the last two samples are 0, so that holding them means silence outside.
-    start : float
-        Path length of sample 0, m.
-    spacing : float
-        Path between samples, m.
-    """
-
+    # (points, samples), the first and the last two samples are 0, so that holding them means
+    # silence outside
     values: NDArray[Any]
-    start: float
-    spacing: float
+    start: float  # path length of sample 0, m
+    spacing: float  # path between samples, m
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,15 +28,10 @@ class DepthPropagator:
 
     Memory: some 20 bytes per plane wave and frequency in single precision, as much again for every
     spectrum.
-
-    Parameters
-    ----------
-    plan : DiffractionPlan
-    dtype : dtype
-        complex64 or complex128; the transfer functions are those of single precision in either.
     """
 
     plan: DiffractionPlan
+    # complex64 or complex128; the transfer functions are those of single precision in either
     dtype: DTypeLike = np.complex64
 
     def to_waves(self, values: Array) -> Array:
@@ -59,16 +54,8 @@ class DepthPropagator:
         """Return what every wave (waves, frequencies) is multiplied by on its way to a depth; see
         `Transfer.evaluate`.
 
-        Parameters
-        ----------
-        depth : float
-            z, m.
-        delay : (2,) float64 array
-            Path in m and the wavenumber k_0 in rad/m.
-
-        Returns
-        -------
-        (waves, frequencies) complex array
+        `depth`: z, m; `delay` (2,): path in m and the wavenumber k_0 in rad/m. Returns (waves,
+        frequencies).
         """
         nodes = self.plan.transfer.evaluate(depth - self.plan.plane.z, delay)
         matrix, turn = self._node_interpolation

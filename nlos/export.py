@@ -65,20 +65,7 @@ def extract_surface(volume: Volume, fraction: float) -> Mesh:
     """Draw the surface on which the magnitude is `fraction` (0..1) of the largest, by marching
     cubes.
 
-    Parameters
-    ----------
-    volume : Volume
-    fraction : float
-
-    Returns
-    -------
-    Mesh
-        Vertices in m, float32, and faces, int32.
-
-    Raises
-    ------
-    InputError
-        The fraction is not between 0 and 1, an axis has a single voxel, or the volume is dark.
+    Returns vertices in m, float32, and faces, int32.
     """
     import pyvista
 
@@ -102,15 +89,7 @@ def extract_points(
     """Positions (n, 3) in m, and magnitudes (n,), of the voxels with at least `fraction` (0..1) of
     the brightest.
 
-    Parameters
-    ----------
-    volume : Volume
-    fraction : float
-
-    Returns
-    -------
-    xyz : (n, 3) float32 array
-    magnitude : (n,) float32 array
+    Returns `xyz` (n, 3); `magnitude` (n,).
     """
     z, y, x = np.nonzero(volume.threshold(fraction).magnitude)
     xyz = np.stack([volume.grid.x[x], volume.grid.y[y], volume.grid.z[z]], axis=-1).astype(
@@ -122,18 +101,8 @@ def extract_points(
 def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
     """Do what `Volume.export_volume` describes.
 
-    Parameters
-    ----------
-    volume : Volume
-    path : str or Path
-        Its suffix names the format.
-    fraction : float
-        Which voxels become points: those with at least this fraction of the brightest.
-
-    Raises
-    ------
-    InputError
-        There is no format of that suffix.
+    `path`: its suffix names the format; `fraction`: which voxels become points: those with at least
+    this fraction of the brightest.
     """
     suffix = Path(path).suffix.lower()
     if suffix in POINT_SUFFIXES:

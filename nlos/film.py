@@ -24,17 +24,7 @@ def save_film(video: TransientVideo, path: str | Path) -> None:
 
     Memory for all pictures of the film, 0.2 MB each.
 
-    Parameters
-    ----------
-    video : TransientVideo
-        With depth or without.
-    path : path-like
-        Ends in .gif.
-
-    Raises
-    ------
-    InputError
-        Another suffix.
+    `video`: with depth or without; `path`: ends in .gif.
     """
     from PIL import Image
 

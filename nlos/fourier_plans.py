@@ -54,25 +54,15 @@ class FourierPlan(Protocol):
         ...
 
     def update_arrays(self, source: ComplexArray, target: ComplexArray) -> None:
-        """Go on with other buffers of the same shapes and strides.
-
-        Parameters
-        ----------
-        source, target : complex64 array
-        """
+        """Go on with other buffers of the same shapes and strides."""
         ...
 
 
 class ScipyPlan:
     """The same by scipy.fft, for one or both of the directions that FFTW has.
 
-    Parameters
-    ----------
-    source, target : complex64 array
-        Buffers of one shape.
-    axis : int
-    inverse : bool
-        ``exp(+1j ...)`` instead of ``exp(-1j ...)``; unscaled as well.
+    `source, target`: buffers of one shape; `inverse`: ``exp(+1j ...)`` instead of ``exp(-1j ...)``;
+    unscaled as well.
     """
 
     def __init__(
@@ -88,12 +78,7 @@ class ScipyPlan:
             self._target[...] = fft.fft(self._source, axis=self._axis)
 
     def update_arrays(self, source: ComplexArray, target: ComplexArray) -> None:
-        """Go on with other buffers.
-
-        Parameters
-        ----------
-        source, target : complex64 array
-        """
+        """Go on with other buffers."""
         self._source, self._target = source, target
 
 
@@ -108,17 +93,8 @@ def plan_transform(
 ) -> FourierPlan:
     """Plan a transform along one axis on one thread.
 
-    Parameters
-    ----------
-    source, target : complex64 array
-        Buffers of one shape.
-    axis : int
-    inverse : bool
-        ``exp(+1j ...)`` instead of ``exp(-1j ...)``; neither is scaled.
-
-    Returns
-    -------
-    FourierPlan
+    `source, target`: buffers of one shape; `inverse`: ``exp(+1j ...)`` instead of ``exp(-1j ...)``;
+    neither is scaled.
     """
     if pyfftw is None:
         return ScipyPlan(source, target, axis, inverse)

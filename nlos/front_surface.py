@@ -24,28 +24,15 @@ MAX_STEP_VOXELS = 3.0
 
 @dataclass(frozen=True, eq=False)
 class FrontSurface:
-    """The hidden surface that is seen from the wall, one point per pixel of the front view.
+    """The hidden surface that is seen from the wall, one point per pixel of the front view."""
 
-    Parameters
-    ----------
-    x, y : (n,) array
-        Pixels, m.
-    depth : (y, x) float32 array
-        m; NaN where nothing is seen.
-    albedo : (y, x) float32 array
-        Brightness, 0 where nothing is seen.
-    normals : (y, x, 3) float32 array
-        Unit vectors that point to the wall's side (z < 0); NaN where nothing is seen.
-    source : str
-        What depth and normals were found from.
-    """
-
-    x: FloatArray
-    y: FloatArray
-    depth: NDArray[np.float32]
-    albedo: NDArray[np.float32]
+    x: FloatArray  # (n,), pixels, m
+    y: FloatArray  # (n,), pixels, m
+    depth: NDArray[np.float32]  # (y, x), m; NaN where nothing is seen
+    albedo: NDArray[np.float32]  # (y, x), brightness, 0 where nothing is seen
+    # (y, x, 3), unit vectors that point to the wall's side (z < 0); NaN where nothing is seen
     normals: NDArray[np.float32]
-    source: str = "gradient of the volume"
+    source: str = "gradient of the volume"  # what depth and normals were found from
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -77,15 +64,7 @@ class FrontSurface:
     def save(self, path: str | Path) -> None:
         """Write an oriented cloud that is a mesh as well, as binary PLY, whole or not at all.
 
-        Parameters
-        ----------
-        path : path-like
-            Ends in .ply.
-
-        Raises
-        ------
-        InputError
-            Another suffix.
+        `path`: ends in .ply.
         """
         require_suffix(path, ".ply")
         points, faces = self.points, self.faces if min(self.depth.shape) > 1 else np.empty((0, 3))
@@ -114,22 +93,8 @@ def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
     """Find the front surface of a volume; its normals are the directions in which brightness
     changes most.
 
-    Parameters
-    ----------
-    volume : Volume
-        At least 3 voxels along every axis.
-    fraction : float
-        A line of sight shows a surface where its brightest voxel has this fraction of the
-        brightest of all.
-
-    Returns
-    -------
-    FrontSurface
-
-    Raises
-    ------
-    InputError
-        The volume is too small or dark, or the fraction is not between 0 and 1.
+    `volume`: at least 3 voxels along every axis; `fraction`: A line of sight shows a surface where
+    its brightest voxel has this fraction of the brightest of all.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -151,17 +116,8 @@ def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
 def build_front_surface(volume: Volume, normals: NDArray[Any], fraction: float) -> FrontSurface:
     """Put together the surface of the brightest voxel on every line of sight.
 
-    Parameters
-    ----------
-    volume : Volume
-    normals : (y, x, 3) array
-        Of that voxel, of any length and on either side.
-    fraction : float
-        As of `find_front_surface`.
-
-    Returns
-    -------
-    FrontSurface
+    `normals` (y, x, 3): of that voxel, of any length and on either side; `fraction`: as of
+    `find_front_surface`.
     """
     grid, magnitude = volume.grid, volume.magnitude
     albedo = magnitude.max(axis=0)
@@ -180,15 +136,7 @@ def build_front_surface(volume: Volume, normals: NDArray[Any], fraction: float) 
 def require_surface(magnitude: NDArray[np.floating], fraction: float) -> None:
     """Refuse volumes that hold no surface, and fractions that are none.
 
-    Parameters
-    ----------
-    magnitude : (z, y, x) array
-    fraction : float
-
-    Raises
-    ------
-    InputError
-        One of these is the case.
+    `magnitude` (z, y, x).
     """
     if not 0 < fraction < 1:
         raise InputError(

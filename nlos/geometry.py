@@ -240,21 +240,13 @@ class StraightWays:
 
     What the plane carries to a voxel comes from about their crossings: elsewhere the phases of both
     parts of the way turn, and their sum cancels.
-
-    Parameters
-    ----------
-    wall_to_plane, plane_to_voxels : float
-        Along the plane, at most, m; with room about the crossings.
-    rim : (float, float)
-        Width along y and x of the plane's rim, where little of the field is left, m.
-    first_depth : float
-        z of the nearest voxels, m.
     """
 
-    wall_to_plane: float
-    plane_to_voxels: float
+    wall_to_plane: float  # along the plane, at most, m; with room about the crossings
+    plane_to_voxels: float  # along the plane, at most, m; with room about the crossings
+    # width along y and x of the plane's rim, where little of the field is left, m
     rim: tuple[float, float]
-    first_depth: float
+    first_depth: float  # z of the nearest voxels, m
 
     @classmethod
     def find(
@@ -262,20 +254,9 @@ class StraightWays:
     ) -> StraightWays | None:
         """Find the straight ways between wall points and voxels through a plane.
 
-        Parameters
-        ----------
-        points : (n, 3) float64 array
-            Of the wall, m.
-        plane : VirtualPlane
-            In front of them.
-        grid : Grid
-        tolerance : float
-            Relative error allowed.
-
-        Returns
-        -------
-        StraightWays or None
-            None where voxels lie before the plane: no straight way to these crosses it.
+        `points` (n, 3): of the wall, m; `plane`: in front of them; `tolerance`: relative error
+        allowed. Returns none where voxels lie before the plane: no straight way to these crosses
+        it.
         """
         first, last = float(grid.z[0]), float(grid.z[-1])
         if first <= plane.z:

@@ -30,18 +30,11 @@ MIN_POINTS_PER_SPOT = 4
 
 @dataclass(frozen=True, eq=False)
 class IlluminationGroup:
-    """Wall points whose light started at one laser spot, or at each point itself.
+    """Wall points whose light started at one laser spot, or at each point itself."""
 
-    Parameters
-    ----------
-    laser : (3,) array or None
-        m; None for a confocal scan, in which the way out is the way back.
-    indices : (n,) int array
-        Which of the capture's valid points.
-    """
-
+    # (3,), m; None for a confocal scan, in which the way out is the way back
     laser: FloatArray | None
-    indices: NDArray[np.intp]
+    indices: NDArray[np.intp]  # (n,), which of the capture's valid points
 
     @property
     def legs(self) -> int:
@@ -51,15 +44,7 @@ class IlluminationGroup:
     def compute_phasors(self, capture: Capture, band: Band) -> NDArray[np.complex64]:
         """Return the phasors of the group's wall points.
 
-        Parameters
-        ----------
-        capture : Capture
-        band : Band
-            Frequencies of the virtual pulse.
-
-        Returns
-        -------
-        (n, frequencies) complex64 array
+        `band`: frequencies of the virtual pulse. Returns (n, frequencies).
         """
         traces = capture.traces()
         return np.asarray(
@@ -80,16 +65,7 @@ def is_confocal(capture: Capture) -> bool:
 
 
 def swap_roles(capture: Capture) -> Capture:
-    """Take laser spots for wall points and wall points for laser spots.
-
-    Parameters
-    ----------
-    capture : Capture
-
-    Returns
-    -------
-    Capture
-    """
+    """Take laser spots for wall points and wall points for laser spots."""
     lasers = np.broadcast_to(capture.laser, capture.wall.shape)
     return replace(capture, wall=lasers, laser=capture.wall)
 
@@ -100,14 +76,7 @@ def choose_roles(capture: Capture) -> Capture:
     A wave has to be imaged for every laser spot, whatever the number of wall points: a scan by a
     laser in front of few detectors is quicker the other way round.
 
-    Parameters
-    ----------
-    capture : Capture
-
-    Returns
-    -------
-    Capture
-        The same one unless swapping helps.
+    Returns the same one unless swapping helps.
     """
     if len(capture.lasers) == 1 or is_confocal(capture):
         return capture
@@ -140,17 +109,7 @@ def group_by_illumination(capture: Capture) -> list[IlluminationGroup]:
 def gather_by_points(
     capture: Capture, groups: Sequence[IlluminationGroup]
 ) -> list[list[IlluminationGroup]]:
-    """Gather the groups that share their wall points: one plan serves them all.
-
-    Parameters
-    ----------
-    capture : Capture
-    groups : sequence of IlluminationGroup
-
-    Returns
-    -------
-    list of lists of IlluminationGroup
-    """
+    """Gather the groups that share their wall points: one plan serves them all."""
     found: dict[bytes, list[IlluminationGroup]] = {}
     for group in groups:
         found.setdefault(capture.points[group.indices].tobytes(), []).append(group)
@@ -158,18 +117,7 @@ def gather_by_points(
 
 
 def require_few_spots(capture: Capture, groups: Sequence[IlluminationGroup]) -> None:
-    """Refuse a capture whose laser spots each lit too few points for a field of their own.
-
-    Parameters
-    ----------
-    capture : Capture
-    groups : sequence of IlluminationGroup
-
-    Raises
-    ------
-    InputError
-        There are too many.
-    """
+    """Refuse a capture whose laser spots each lit too few points for a field of their own."""
     if len(groups) * MIN_POINTS_PER_SPOT > len(capture.points):
         raise InputError(
             f"{len(groups)} laser spots for {len(capture.points)} wall points: a field per spot needs at least "
@@ -180,16 +128,7 @@ def require_few_spots(capture: Capture, groups: Sequence[IlluminationGroup]) -> 
 def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> SphericalWaves:
     """Return the waves between wall and voxels in one illumination group.
 
-    Parameters
-    ----------
-    group : IlluminationGroup
-    band : Band
-    continued : bool
-        Whether they go on from a plane, or start at points; see `SphericalWaves`.
-
-    Returns
-    -------
-    SphericalWaves
+    `continued`: whether they go on from a plane, or start at points; see `SphericalWaves`.
     """
     k = group.legs * band.wavenumbers
     step = float(k[1] - k[0]) if k.size > 1 else 1.0
@@ -199,16 +138,7 @@ def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> Spheri
 def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
     """Return what shines on the scene in one illumination group.
 
-    Parameters
-    ----------
-    group : IlluminationGroup
-        Its laser spot, m.
-    band : Band
-        Wavenumbers and weights of the virtual pulse.
-
-    Returns
-    -------
-    LaserSource
+    `group`: its laser spot, m; `band`: wavenumbers and weights of the virtual pulse.
     """
     return LaserSource(group.laser, band.wavenumbers, band.strength)
 
@@ -219,16 +149,6 @@ def choose_unaliased_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> 
 
     Evenly spaced frequencies repeat a signal with their period; where the paths of the grid go
     beyond the record, the record is continued with silence.
-
-    Parameters
-    ----------
-    capture : Capture
-    grid : Grid
-    pulse : VirtualPulse
-
-    Returns
-    -------
-    Band
     """
     outward, back = find_leg_bounds(capture.lasers, grid), find_leg_bounds(capture.points, grid)
     return choose_band_for_paths(capture.axis, pulse, outward[0] + back[0], outward[1] + back[1])
@@ -240,17 +160,7 @@ def choose_band_for_paths(
     """Return the pulse's band over a period in which paths from `shortest` to `longest` (m) meet
     the record once.
 
-    Parameters
-    ----------
-    axis : TimeAxis
-        Of the record.
-    pulse : VirtualPulse
-    shortest, longest : float
-        Metres.
-
-    Returns
-    -------
-    Band
+    `axis`: of the record; `shortest, longest`: metres.
     """
     tail = Band(pulse, axis).tail_bins * axis.spacing
     # no image of the record, a period earlier or later, may be reached by a path of the grid
@@ -262,16 +172,7 @@ def choose_band_for_paths(
 def find_leg_bounds(ends: FloatArray, grid: Grid) -> tuple[float, float]:
     """Bounds of the distance between any of some points and any voxel.
 
-    Parameters
-    ----------
-    ends : (n, 3) float64 array
-        Metres.
-    grid : Grid
-
-    Returns
-    -------
-    (float, float)
-        Shortest and longest, m.
+    `ends` (n, 3): metres. Returns shortest and longest, m.
     """
     axes = (grid.x, grid.y, grid.z)
     low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
@@ -292,15 +193,7 @@ def describe_aliasing(capture: Capture, band: Band) -> str | None:
     They do if neighbouring wall points lie more than half the band's shortest wavelength apart. In
     a confocal scan the path grows on both legs from point to point, so that a quarter is the limit.
 
-    Parameters
-    ----------
-    capture : Capture
-    band : Band
-        Wavenumbers of the virtual pulse.
-
-    Returns
-    -------
-    str or None
+    `band`: wavenumbers of the virtual pulse.
     """
     shortest = 2 * np.pi / float(band.wavenumbers[-1])
     finest = shortest / 4 if is_confocal(capture) else shortest / 2

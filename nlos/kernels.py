@@ -62,15 +62,7 @@ def shift_signals(signal, delay_bins):
     """Read column p of `signal` (t, points) `delay_bins[p]` bins later, linearly interpolated, 0
     outside the record.
 
-    Parameters
-    ----------
-    signal : (t, points) float32 array
-    delay_bins : (points,) array
-        Bins, fractions included.
-
-    Returns
-    -------
-    (t, points) float32 array
+    `signal` (t, points); `delay_bins` (points,): bins, fractions included. Returns (t, points).
     """
     bins, points = signal.shape
     result = np.zeros_like(signal)
@@ -95,20 +87,11 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers,
     Meant for a brick of voxels so small that their paths to a wall point span a short piece of its
     waveform, which then stays in the first cache level while the voxels' sums stay in the second.
 
-    Parameters
-    ----------
-    waveforms : (points, 2 * samples) float32 array
-        Real and imaginary parts in turns; the first and the last two samples are 0.
-    start, spacing : float32
-        Path length of the first sample and path between samples, m.
-    wall : (points, 3) float32 array
-    lasers : (1, 3) or (points, 3) float32 array
-        One laser spot for all wall points or one for each.
-    x, y, z : float32 array
-        Axes of the brick.
-    powers : (2,) float32 array
-        Further weights: powers of the last leg's length and of the cosine of its angle with z.
-    field : (z, y, x) complex64 array
+    `waveforms` (points, 2 * samples): real and imaginary parts in turns; the first and the last two
+    samples are 0; `start, spacing`: path length of the first sample and path between samples, m;
+    `wall` (points, 3); `lasers` (1, 3): one laser spot for all wall points or one for each; `x, y,
+    z`: axes of the brick; `powers` (2,): further weights: powers of the last leg's length and of
+    the cosine of its angle with z; `field` (z, y, x).
     """
     per_metre = np.float32(1) / spacing
     # Of every voxel: real and imaginary part of the sample before its path, then of the one after.
@@ -228,24 +211,10 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
     """Add ``sum_m terms[m] * f_m(R) * exp(1j * wavenumber * R)``, R the distance from the laser
     spot, to a plane.
 
-    Parameters
-    ----------
-    terms : (m, y, x) complex64 array
-        May be larger than the plane along y and x.
-    odd : int
-        Terms from this one on are multiplied by 1j.
-    x, y : (n,) float64 array
-    depth : float
-    laser : (3,) float64 array
-    wavenumber : float
-        rad/m; carrier of the illumination.
-    table : (m, samples) float32 array
-        The functions f_m, evenly spaced over the distances from ``span[0]`` to ``span[1]``.
-    span : (2,) float64 array
-    carrier : (x,) complex64 array
-        Multiplies every column.
-    field : (y, x) complex64 array
-        Added to.
+    `terms` (m, y, x): may be larger than the plane along y and x; `odd`: terms from this one on are
+    multiplied by 1j; `x, y` (n,); `laser` (3,); `wavenumber`: rad/m; carrier of the illumination;
+    `table` (m, samples): the functions f_m, evenly spaced over the distances from ``span[0]`` to
+    ``span[1]``; `span` (2,); `carrier` (x,): multiplies every column; `field` (y, x): added to.
     """
     before, weight, sums = (
         np.empty(x.size, np.uint32),
@@ -279,15 +248,8 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
 def add_with_carrier(values, x, y, z, laser, wavenumber, field):
     """Add ``values * exp(1j * wavenumber * R)``, R the distance from the laser spot, to some planes.
 
-    Parameters
-    ----------
-    values : (z, y, x) complex64 array
-    x, y, z : (n,) float64 array
-    laser : (3,) float64 array
-    wavenumber : float
-        rad/m.
-    field : (z, y, x) complex64 array
-        Added to.
+    `values` (z, y, x); `x, y, z` (n,); `laser` (3,); `wavenumber`: rad/m; `field` (z, y, x): added
+    to.
     """
     waves = np.empty((2, x.size), np.float32)
     turns_per_metre = wavenumber / (2 * math.pi)

@@ -39,14 +39,8 @@ class SubProgress:
     """Progress of one step of several, reported as a portion of all work; may be called from
     several threads.
 
-    Parameters
-    ----------
-    progress : callable
-        Of the whole.
-    work : int
-        What the step counts up to.
-    portion : int
-        What that is of the whole.
+    `progress`: of the whole; `work`: what the step counts up to; `portion`: what that is of the
+    whole.
     """
 
     def __init__(self, progress: Progress, work: int, portion: int) -> None:
@@ -62,12 +56,7 @@ class SubProgress:
 
 
 class PlannedGeometry:
-    """Wall, laser, time axis and device that something is made ready for.
-
-    Parameters
-    ----------
-    capture : Capture
-    """
+    """Wall, laser, time axis and device that something is made ready for."""
 
     def __init__(self, capture: Capture) -> None:
         self.wall, self.laser = capture.wall, capture.laser
@@ -235,22 +224,7 @@ class PhasorMethod(Method):
 
     @abstractmethod
     def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
-        """Make the method ready for captures like `capture` on `grid`; see `Method.plan`.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        PhasorPlan
-
-        Raises
-        ------
-        InputError
-            The method cannot image the capture on the grid.
-        """
+        """Make the method ready for captures like `capture` on `grid`; see `Method.plan`."""
 
     def phasor_field(
         self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
@@ -258,22 +232,7 @@ class PhasorMethod(Method):
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear in the
         signal within the method's tolerance.
 
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        progress : callable
-            Called with the amount of work just done.
-
-        Returns
-        -------
-        Volume
-            (z, y, x) complex64.
-
-        Raises
-        ------
-        InputError
-            The method cannot image the capture on the grid.
+        `progress`: called with the amount of work just done. Returns (z, y, x) complex64.
         """
         return self.plan(capture, grid).field(capture, progress)
 
@@ -281,16 +240,6 @@ class PhasorMethod(Method):
 def require_imageable(capture: Capture, grid: Grid) -> None:
     """Refuse what no method can image: a single wall point, a grid behind the wall, or a volume
     larger than `MEMORY_LIMIT_BYTES`.
-
-    Parameters
-    ----------
-    capture : Capture
-    grid : Grid
-
-    Raises
-    ------
-    InputError
-        One of these is the case.
     """
     if len(capture.points) == 1:
         raise InputError("one wall point cannot locate anything: a capture needs several")
@@ -308,18 +257,7 @@ def require_imageable(capture: Capture, grid: Grid) -> None:
 
 
 def require_numpy_signal(what: str, capture: Capture) -> None:
-    """Refuse a signal on another device for a method of compiled loops, `what` in the message.
-
-    Parameters
-    ----------
-    what : str
-    capture : Capture
-
-    Raises
-    ------
-    InputError
-        The signal is not a NumPy array.
-    """
+    """Refuse a signal on another device for a method of compiled loops, `what` in the message."""
     if not is_numpy(capture.signal):
         raise InputError(
             f"{what} works on NumPy arrays only, and this capture's signal is on {capture.device}: "

@@ -61,15 +61,8 @@ def join_near_lasers(capture: Capture) -> Capture:
     the two: 0.1 mm for 15 mm and half a metre. Where pairs are farther apart, signals are read at
     the path that leads by way of the same points; see the module.
 
-    Parameters
-    ----------
-    capture : Capture
-
-    Returns
-    -------
-    Capture
-        The same one where pairs are so far apart that the path would err too much, or all are
-        confocal already.
+    Returns the same one where pairs are so far apart that the path would err too much, or all are
+    confocal already.
     """
     return MidpointJoin(capture).join(capture)
 
@@ -77,10 +70,7 @@ def join_near_lasers(capture: Capture) -> Capture:
 class MidpointJoin:
     """What `join_near_lasers` does, made ready for captures of one geometry.
 
-    Parameters
-    ----------
-    capture : Capture
-        One of them.
+    `capture`: one of them.
     """
 
     def __init__(self, capture: Capture) -> None:
@@ -101,21 +91,7 @@ class MidpointJoin:
                 self._middle, self._moveout = middle, _Moveout(capture)
 
     def join(self, capture: Capture) -> Capture:
-        """Return a capture with its pairs at their midpoints, or itself; see `join_near_lasers`.
-
-        Parameters
-        ----------
-        capture : Capture
-
-        Returns
-        -------
-        Capture
-
-        Raises
-        ------
-        InputError
-            Wall, laser, time axis or device differ from those that were planned for.
-        """
+        """Return a capture with its pairs at their midpoints, or itself; see `join_near_lasers`."""
         self._geometry.require_same(capture)
         if self._middle is None:
             return capture
@@ -126,32 +102,13 @@ class MidpointJoin:
 class MidpointImaging(PhasorMethod):
     """A method that images captures whose pairs are joined by `join_near_lasers`, for captures as
     they come.
-
-    Parameters
-    ----------
-    method : PhasorMethod
     """
 
     def __init__(self, method: PhasorMethod) -> None:
         self.method = method
 
     def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
-        """Make the method ready for captures like `capture` on `grid`; see `Method.plan`.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        PhasorPlan
-
-        Raises
-        ------
-        InputError
-            The method cannot image such a capture on the grid.
-        """
+        """Make the method ready for captures like `capture` on `grid`; see `Method.plan`."""
         join = MidpointJoin(capture)
         joined = join.join(capture)
         plan = self.method.plan(joined, grid)
@@ -232,10 +189,7 @@ def _path_of(confocal: FloatArray, squared: Any, along: Any) -> FloatArray:
 class _Moveout:
     """Where between the bins every valid signal is read: at the path of its pair.
 
-    Parameters
-    ----------
-    capture : Capture
-        For its geometry; NumPy's arrays.
+    `capture`: for its geometry; NumPy's arrays.
     """
 
     def __init__(self, capture: Capture) -> None:
@@ -252,13 +206,7 @@ class _Moveout:
     def read(self, signal: NDArray[Any]) -> NDArray[np.float32]:
         """Return signals (t, ...) read at their pairs' paths, linear between bins; 0 outside.
 
-        Parameters
-        ----------
-        signal : (t, ...) array
-
-        Returns
-        -------
-        (t, ...) float32 array
+        `signal` (t, ...). Returns (t, ...).
         """
         read = np.zeros(signal.shape, np.float32)
         flat, recorded = (one.reshape(self._axis.bins, -1) for one in (read, signal))

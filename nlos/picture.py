@@ -40,16 +40,7 @@ def save_picture(volume: Volume, path: str | Path) -> None:
     it, the side view shares y and has the wall at its left edge; below it, the top view shares x
     and has the wall at its upper edge.
 
-    Parameters
-    ----------
-    volume : Volume
-    path : path-like
-        Ends in .png, .pdf or .svg.
-
-    Raises
-    ------
-    InputError
-        The name has an ending of another format.
+    `path`: ends in .png, .pdf or .svg.
     """
     target = Path(path)
     require_suffix(target, *PICTURE_SUFFIXES)
@@ -150,14 +141,7 @@ def compute_extent(
     """Left, right, lower and upper edge of a picture with axes to the right and downwards, m, as
     matplotlib has it.
 
-    Parameters
-    ----------
-    right, down : (n,) float64 array
-        Centres of the pixels, m.
-
-    Returns
-    -------
-    (float, float, float, float)
+    `right, down` (n,): centres of the pixels, m.
     """
     return (*_find_edges(right), *_find_edges(down)[::-1])
 

@@ -133,17 +133,10 @@ class VirtualPlane(Plane):
     root of the rim's distance only. Faded out as a raised cosine, whose second derivative jumps,
     they weaken with the third power of the fade's width.
 
-    Parameters
-    ----------
-    x, y : (n,) array
-        Evenly spaced and increasing, m; at least 2 of each.
-    z : float
-        m.
-    fade : (float, float)
-        Width of the fade along y and x, m.
+    `x, y` (n,): evenly spaced and increasing, m; at least 2 of each; `z`: m.
     """
 
-    fade: tuple[float, float] = (0.0, 0.0)
+    fade: tuple[float, float] = (0.0, 0.0)  # width of the fade along y and x, m
 
     @property
     def weights(self) -> NDArray[np.float32]:
@@ -180,23 +173,9 @@ def choose_virtual_plane(
     shortest wavelength apart. Where the wall's points stand above a lattice, their spacing is a
     multiple or a fraction of its step, so that Fourier transforms lead from one to the other.
 
-    Parameters
-    ----------
-    points : (n, 3) array
-        Wall points, m.
-    grid : Grid
-    waves : SphericalWaves
-    zones : float
-        Room beside the straight ways, in radii of the first Fresnel zone.
-    z : float, optional
-        Where, m. Defaults to the shortest wavelength, but 5 to 10 cm, in front of the foremost wall
-        point.
-    wall : WallLattice, optional
-        That the points stand above.
-
-    Returns
-    -------
-    VirtualPlane
+    `points` (n, 3): wall points, m; `zones`: room beside the straight ways, in radii of the first
+    Fresnel zone; `z`: where, m. Defaults to the shortest wavelength, but 5 to 10 cm, in front of
+    the foremost wall point; `wall`: that the points stand above.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     shortest, middle = (
@@ -244,40 +223,20 @@ SAME_COORDINATE_FRACTION = 0.02
 class WallLattice:
     """Wall points above the places of an even lattice, at whatever depth; some places may stay
     empty.
-
-    Parameters
-    ----------
-    x, y : (n,) array
-        Coordinates of the places, m.
-    row, column : (points,) int array
-        Place of every wall point.
     """
 
-    x: FloatArray
-    y: FloatArray
-    row: NDArray[np.intp]
-    column: NDArray[np.intp]
+    x: FloatArray  # (n,), coordinates of the places, m
+    y: FloatArray  # (n,), coordinates of the places, m
+    row: NDArray[np.intp]  # (points,), place of every wall point
+    column: NDArray[np.intp]  # (points,), place of every wall point
 
     @classmethod
     def of(cls, points: FloatArray, evenness: float = EVENNESS_TOLERANCE) -> WallLattice:
         """Find the lattice that wall points (n, 3) stand above; they may be off it by a fraction of
         its step.
 
-        Parameters
-        ----------
-        points : (n, 3) float64 array
-            Metres.
-        evenness : float
-            How far off its place a point may be, in steps of the lattice.
-
-        Returns
-        -------
-        WallLattice
-
-        Raises
-        ------
-        InputError
-            There is none, or two points stand in one place.
+        `points` (n, 3): metres; `evenness`: how far off its place a point may be, in steps of the
+        lattice.
         """
         x, column = _fit_lattice_axis(points[:, 0], "x", evenness)
         y, row = _fit_lattice_axis(points[:, 1], "y", evenness)
@@ -328,13 +287,7 @@ class WallLattice:
 
 @dataclass(frozen=True, eq=False)
 class PlanarWall:
-    """Wall points as a lattice of a plane; places where no point is known stay dark.
-
-    Parameters
-    ----------
-    plane : Plane
-    lattice : WallLattice
-    """
+    """Wall points as a lattice of a plane; places where no point is known stay dark."""
 
     plane: Plane
     lattice: WallLattice
@@ -344,21 +297,8 @@ class PlanarWall:
         """Find the lattice that wall points (n, 3) stand on; they may be off it by a fraction of
         its step.
 
-        Parameters
-        ----------
-        points : (n, 3) float64 array
-            Metres.
-        evenness : float
-            How far off its place a point may be, in steps of the lattice.
-
-        Returns
-        -------
-        PlanarWall
-
-        Raises
-        ------
-        InputError
-            They stand on none, or not on a plane z = const.
+        `points` (n, 3): metres; `evenness`: how far off its place a point may be, in steps of the
+        lattice.
         """
         lattice = WallLattice.of(points, evenness)
         plane = Plane(lattice.x, lattice.y, float(points[:, 2].mean()))

@@ -16,20 +16,7 @@ from tofclip.errors import InputError
 def crop_capture(capture: Capture, nearest: float, farthest: float) -> Capture:
     """Keep the bins that hold paths from `nearest` to `farthest`.
 
-    Parameters
-    ----------
-    capture : Capture
-    nearest, farthest : float
-        Lengths of path, m.
-
-    Returns
-    -------
-    Capture
-
-    Raises
-    ------
-    InputError
-        Fewer than two bins are left.
+    `nearest, farthest`: lengths of path, m.
     """
     paths = capture.axis.paths
     kept = np.flatnonzero((paths >= nearest) & (paths <= farthest))
@@ -47,20 +34,7 @@ def rebin_capture(capture: Capture, factor: int) -> Capture:
     Counts stay counts. Bins much finer than the wall's sampling carry noise and cost time: path per
     bin of about the distance of neighbouring wall points loses nothing.
 
-    Parameters
-    ----------
-    capture : Capture
-    factor : int
-
-    Returns
-    -------
-    Capture
-        Its bins are `factor` times wider.
-
-    Raises
-    ------
-    InputError
-        Fewer than two bins are left.
+    Returns its bins are `factor` times wider.
     """
     bins = capture.axis.bins // factor if factor >= 1 else 0
     if bins < 2:
@@ -85,23 +59,8 @@ def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> C
     That light reaches wall point r_p after the path ``|r_L - r_p|``; everything up to `margin`
     later goes with it: the instrument's response and what the wall sends on.
 
-    Parameters
-    ----------
-    capture : Capture
-    margin : float
-        m of path, 0 or more.
-    ramp : float
-        m of path over which signals then rise to their whole strength, as a raised cosine; a sharp
-        edge would show as a plane at half the margin.
-
-    Returns
-    -------
-    Capture
-
-    Raises
-    ------
-    InputError
-        A length is negative or not finite.
+    `margin`: m of path, 0 or more; `ramp`: m of path over which signals then rise to their whole
+    strength, as a raised cosine; a sharp edge would show as a plane at half the margin.
     """
     for name, value in (("margin after the first bounce", margin), ("ramp after it", ramp)):
         if not (np.isfinite(value) and value >= 0):
@@ -122,20 +81,7 @@ def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> C
 def flip_capture(capture: Capture, axis: str) -> Capture:
     """Mirror a capture's coordinates, and with them the picture.
 
-    Parameters
-    ----------
-    capture : Capture
-    axis : {"x", "y"}
-        Its coordinates change sign.
-
-    Returns
-    -------
-    Capture
-
-    Raises
-    ------
-    InputError
-        Another axis.
+    `axis`: its coordinates change sign.
     """
     if axis not in ("x", "y"):
         raise InputError(f"a capture is mirrored along x or y, not along '{axis}'")
@@ -156,20 +102,7 @@ def fade_record_end(capture: Capture, length: float) -> Capture:
 
     Where light still comes when the record ends, its end would show as a plane.
 
-    Parameters
-    ----------
-    capture : Capture
-    length : float
-        m of path before the end.
-
-    Returns
-    -------
-    Capture
-
-    Raises
-    ------
-    InputError
-        The length is not positive.
+    `length`: m of path before the end.
     """
     if not (np.isfinite(length) and length > 0):
         raise InputError(f"the record's end must fade over more than 0 m, got {length}")

@@ -24,13 +24,7 @@ class ReciprocalPlan(PhasorPlan):
     path, less those waves times ``|r - r_p|``, fall with neither distance; divided by ``|r - r_p|``
     they are those of the capture as it came.
 
-    Parameters
-    ----------
-    capture : Capture
-        As it comes.
-    grid : Grid
-    swapped : WavePlan
-        For the capture whose roles are swapped.
+    `capture`: as it comes; `swapped`: for the capture whose roles are swapped.
     """
 
     def __init__(self, capture: Capture, grid: Grid, swapped: WavePlan) -> None:

@@ -27,17 +27,11 @@ MAX_WALL_POINTS = 4096
 
 @dataclass(frozen=True)
 class PeakWidths:
-    """Full widths at half maximum of a point's magnitude, m.
+    """Full widths at half maximum of a point's magnitude, m."""
 
-    Parameters
-    ----------
-    x, y, z : float
-        NaN where the magnitude does not fall to half on both sides.
-    """
-
-    x: float
-    y: float
-    z: float
+    x: float  # naN where the magnitude does not fall to half on both sides
+    y: float  # naN where the magnitude does not fall to half on both sides
+    z: float  # naN where the magnitude does not fall to half on both sides
 
 
 def compute_diffraction_limit(capture: Capture, point: Any, pulse: VirtualPulse) -> PeakWidths:
@@ -49,23 +43,8 @@ def compute_diffraction_limit(capture: Capture, point: Any, pulse: VirtualPulse)
     distance z and one laser this is 1.2 * wavelength * z / W across, half of it for a confocal
     scan, and half the envelope's width in depth.
 
-    Parameters
-    ----------
-    capture : Capture
-        For its wall and laser.
-    point : (3,) array
-        m.
-    pulse : VirtualPulse
-
-    Returns
-    -------
-    PeakWidths
-        Full widths at half maximum along x, y and z, m.
-
-    Raises
-    ------
-    InputError
-        The point has not three finite coordinates.
+    `capture`: for its wall and laser; `point` (3,): m. Returns full widths at half maximum along x,
+    y and z, m.
     """
     point = np.asarray(point, dtype=np.float64)
     if point.shape != (3,) or not np.all(np.isfinite(point)):
@@ -76,17 +55,9 @@ def compute_diffraction_limit(capture: Capture, point: Any, pulse: VirtualPulse)
 def measure_point_spread(volume: Volume, point: Any | None = None) -> PeakWidths:
     """Widths of a volume's peak, along the lines x, y and z through it.
 
-    Parameters
-    ----------
-    volume : Volume
-        A quarter of the width per voxel, or finer.
-    point : (3,) array, optional
-        The voxel nearest to it is taken for the peak; defaults to the brightest.
-
-    Returns
-    -------
-    PeakWidths
-        Full widths at half maximum along x, y and z, m.
+    `volume`: A quarter of the width per voxel, or finer; `point` (3,): the voxel nearest to it is
+    taken for the peak; defaults to the brightest. Returns full widths at half maximum along x, y
+    and z, m.
     """
     z, y, x = volume.grid.find_nearest(volume.find_brightest() if point is None else point)
     magnitude = volume.magnitude
@@ -102,18 +73,7 @@ def measure_fwhm(axis: FloatArray, values: NDArray[Any], peak: int) -> float:
     """Full width at half of ``values[peak]``, by linear interpolation; NaN if one side does not
     fall so far.
 
-    Parameters
-    ----------
-    axis : (n,) float64 array
-        Metres, ascending.
-    values : (n,) array
-    peak : int
-        Place of the maximum.
-
-    Returns
-    -------
-    float
-        Metres.
+    `axis` (n,): metres, ascending; `values` (n,); `peak`: place of the maximum. Returns metres.
     """
     level = HALF_MAXIMUM * float(values[peak])
     below = np.flatnonzero(values < level)

@@ -18,20 +18,14 @@ SCORE_RADIUS_M = 0.04
 
 @dataclass(frozen=True)
 class PointScore:
-    """Energy fraction and contrast of what lies near hidden points.
+    """Energy fraction and contrast of what lies near hidden points."""
 
-    Parameters
-    ----------
-    energy : float
-        Sum of ``|u|^2`` over the voxels near a point, over that of all voxels, u the volume's
-        values. It depends on the space imaged, and on how far the virtual pulse reaches: most of
-        what is not near is its sidelobes along the line of sight.
-    contrast : float
-        Mean magnitude of the voxels near a point, over that of all others. It grows with the empty
-        space imaged.
-    """
-
+    # sum of ``|u|^2`` over the voxels near a point, over that of all voxels, u the volume's values.
+    # It depends on the space imaged, and on how far the virtual pulse reaches: most of what is not
+    # near is its sidelobes along the line of sight
     energy: float
+    # mean magnitude of the voxels near a point, over that of all others. It grows with the empty
+    # space imaged
     contrast: float
 
 
@@ -40,24 +34,7 @@ def score_points(volume: Volume, points: Any, radius: float = SCORE_RADIUS_M) ->
 
     Unlike peak over mean it is not fooled by a bright spot in the wrong place.
 
-    Parameters
-    ----------
-    volume : Volume
-    points : (n, 3) array_like
-        Metres.
-    radius : float
-        What counts as near, m.
-
-    Returns
-    -------
-    PointScore
-
-    Raises
-    ------
-    ShapeError
-        The points are not (n, 3).
-    InputError
-        No voxel, or every one, lies near a point; or the volume is dark away from them.
+    `points` (n, 3): metres; `radius`: what counts as near, m.
     """
     near = find_near_voxels(volume.grid, points, radius)
     if not near.any() or near.all():
@@ -77,22 +54,7 @@ def score_points(volume: Volume, points: Any, radius: float = SCORE_RADIUS_M) ->
 def find_near_voxels(grid: Grid, points: Any, radius: float = SCORE_RADIUS_M) -> NDArray[np.bool_]:
     """Find the voxels whose centres lie near hidden points.
 
-    Parameters
-    ----------
-    grid : Grid
-    points : (n, 3) array_like
-        Metres.
-    radius : float
-        What counts as near, m.
-
-    Returns
-    -------
-    (z, y, x) bool array
-
-    Raises
-    ------
-    ShapeError
-        The points are not (n, 3).
+    `points` (n, 3): metres; `radius`: what counts as near, m. Returns (z, y, x).
     """
     from scipy.spatial import cKDTree
 
@@ -109,21 +71,7 @@ def score_brightest(volume: Volume, occupied: NDArray[np.bool_]) -> float:
 
     Unlike a share of energy it does not depend on the scale of brightness.
 
-    Parameters
-    ----------
-    volume : Volume
-    occupied : (z, y, x) bool array
-        Voxels that hold something hidden, or lie near it.
-
-    Returns
-    -------
-    float
-        0 to 1.
-
-    Raises
-    ------
-    InputError
-        No voxel is occupied.
+    `occupied` (z, y, x): voxels that hold something hidden, or lie near it. Returns 0 to 1.
     """
     count = int(np.count_nonzero(occupied))
     if count == 0:

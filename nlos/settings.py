@@ -321,16 +321,8 @@ def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | 
     Waves twice as long have an eighth of the work, on voxels of their half; small boxes are looked
     over with the waves themselves.
 
-    Parameters
-    ----------
-    capture : Capture
-    settings : Settings
-        Complete but for the method.
-
-    Returns
-    -------
-    (Settings, Grid) or None
-        None where the voxels asked for are no finer, or all of the box is wanted.
+    `settings`: complete but for the method. Returns (Settings, Grid): none where the voxels asked
+    for are no finer, or all of the box is wanted.
     """
     wavelength = settings.wavelength or 0.0
     if settings.everywhere or (settings.voxel or 0.0) >= wavelength / 2:
@@ -348,17 +340,7 @@ def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | 
 def find_bright_box(settings: Settings, scouted: Volume) -> Settings:
     """Return the settings with the box that holds everything bright in a coarse volume.
 
-    Parameters
-    ----------
-    settings : Settings
-    scouted : Volume
-        By `find_scout`. An image through a virtual pulse, whichever method images later: lct and fk
-        make up for the loss of light with distance, and would take the noise of the farthest depths
-        for the brightest things.
-
-    Returns
-    -------
-    Settings
+    `scouted`: by `find_scout`.
     """
     part = Grid.around(scouted, _voxel_size(settings))
     x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (part.x, part.y, part.z))
@@ -368,16 +350,7 @@ def find_bright_box(settings: Settings, scouted: Volume) -> Settings:
 def is_brightest_on_wall(volume: Volume, capture: Capture, wavelength: float) -> bool:
     """Whether the brightest voxel lies on the wall, so that the picture shows the wall's own light.
 
-    Parameters
-    ----------
-    volume : Volume
-    capture : Capture
-    wavelength : float
-        Nearer to a wall point than half of it, m, is on the wall.
-
-    Returns
-    -------
-    bool
+    `wavelength`: nearer to a wall point than half of it, m, is on the wall.
     """
     away = np.linalg.norm(capture.points - np.array(volume.find_brightest()), axis=1)
     return bool(away.min() < BRIGHTEST_ON_WALL_WAVELENGTHS * wavelength)

@@ -84,18 +84,10 @@ MAX_SIGNAL = 1e30
 
 @dataclass(frozen=True)
 class FirstBounce:
-    """Light that came straight from the laser spot, by way of no hidden thing.
+    """Light that came straight from the laser spot, by way of no hidden thing."""
 
-    Parameters
-    ----------
-    end : float
-        m of path after its arrival by which it has faded.
-    ratio : float
-        Its peak, relative to the brightest light that follows.
-    """
-
-    end: float
-    ratio: float
+    end: float  # m of path after its arrival by which it has faded
+    ratio: float  # its peak, relative to the brightest light that follows
 
 
 def find_first_bounce(capture: Capture) -> FirstBounce | None:
@@ -104,14 +96,7 @@ def find_first_bounce(capture: Capture) -> FirstBounce | None:
     It arrives at every wall point after the path from the laser spot, and falls from there on until
     hidden things' light rises.
 
-    Parameters
-    ----------
-    capture : Capture
-
-    Returns
-    -------
-    FirstBounce or None
-        None where no such light is in the record.
+    Returns none where no such light is in the record.
     """
     late, level = _compute_profile(capture)
     extent = float(np.ptp(capture.points, axis=0).max())
@@ -145,43 +130,21 @@ class SignalSpectrum:
 
     Photons' noise is white: what the highest frequencies hold, all frequencies hold. Other noise is
     known where the record begins before light can have come.
-
-    Parameters
-    ----------
-    power : (frequencies,) array
-        Mean over the wall points.
-    floor : float
-        Of the noise.
-    wavenumbers : (frequencies,) array
-        rad/m of path.
-    spectrum : (n, frequencies) complex array
-        Of some wall points.
-    early : (n, t) bool array
-        Samples before any light can have come; none where there are too few.
-    points : int
-        All wall points.
     """
 
-    power: FloatArray
-    floor: float
-    wavenumbers: FloatArray
-    spectrum: NDArray[np.complex128]
+    power: FloatArray  # (frequencies,), mean over the wall points
+    floor: float  # of the noise
+    wavenumbers: FloatArray  # (frequencies,), rad/m of path
+    spectrum: NDArray[np.complex128]  # (n, frequencies), of some wall points
+    # (n, t), samples before any light can have come; none where there are too few
     early: NDArray[np.bool_]
-    points: int
+    points: int  # all wall points
 
     @classmethod
     def of(cls, capture: Capture, margin: float) -> SignalSpectrum:
         """Analyse a capture without the wall's own light.
 
-        Parameters
-        ----------
-        capture : Capture
-        margin : float
-            m of path before light may come that a wave reaches ahead.
-
-        Returns
-        -------
-        SignalSpectrum
+        `margin`: m of path before light may come that a wave reaches ahead.
         """
         traces, direct = _select_traces(capture)
         # Waves would see an edge where the record ends while light still comes.
@@ -218,16 +181,7 @@ class SignalSpectrum:
     def fraction_shorter(self, pulse: VirtualPulse, wavelength: float) -> float:
         """Fraction of a pulse's signal, noise taken off, in waves shorter than `wavelength` m.
 
-        Parameters
-        ----------
-        pulse : VirtualPulse
-        wavelength : float
-            Metres.
-
-        Returns
-        -------
-        float
-            0 to 1.
+        `wavelength`: metres. Returns 0 to 1.
         """
         signal = pulse.spectrum(self.wavenumbers) ** 2 * np.maximum(self.power - self.floor, 0)
         shorter = self.wavenumbers > 2 * np.pi / wavelength
@@ -263,18 +217,7 @@ def find_lit_end(capture: Capture) -> bool:
 
 
 def require_plausible(capture: Capture) -> None:
-    """Refuse what no picture can come of, before any work is done.
-
-    Parameters
-    ----------
-    capture : Capture
-
-    Raises
-    ------
-    InputError
-        The wall has no extent, the laser spot is not near the wall, the record begins after all
-        light, or the signals are dark, constant, saturated or overflow.
-    """
+    """Refuse what no picture can come of, before any work is done."""
     low, high = capture.points.min(axis=0), capture.points.max(axis=0)
     extent = float((high - low).max())
     if len(capture.points) > 1 and extent == 0 and capture.laser.ndim == 1:
@@ -315,18 +258,8 @@ def require_plausible(capture: Capture) -> None:
 def require_usable_wavelength(capture: Capture, wavelength: float, cycles: float) -> None:
     """Refuse a given wavelength that shows nothing.
 
-    Parameters
-    ----------
-    capture : Capture
-    wavelength : float
-        Carrier of the virtual pulse, m of path.
-    cycles : float
-        Length of the pulse in wavelengths.
-
-    Raises
-    ------
-    InputError
-        The wavelength is longer than the wall is wide, or its pulse longer than the record.
+    `wavelength`: carrier of the virtual pulse, m of path; `cycles`: length of the pulse in
+    wavelengths.
     """
     extent = float(np.ptp(capture.points, axis=0).max())
     record = float(np.ptp(capture.axis.paths))
@@ -357,15 +290,7 @@ def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str]:
     noise. In a noisy record only waves that stand out of the noise can make false images: the wall
     has to sample these, at the steepest angle at which they arrive.
 
-    Parameters
-    ----------
-    capture : Capture
-    cycles : float
-
-    Returns
-    -------
-    float, str
-        m of path, and the reason.
+    Returns m of path, and the reason.
     """
     sampled = find_shortest_wavelength(capture, cycles)
     reason = "the shortest that wall points and time bins carry"
@@ -407,16 +332,7 @@ def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
     The band's shortest wave is sampled twice along the wall (four times in a confocal scan, where
     the path grows on both legs) and twice along the record.
 
-    Parameters
-    ----------
-    capture : Capture
-    cycles : float
-        Length of the pulse in wavelengths.
-
-    Returns
-    -------
-    float
-        Metres.
+    `cycles`: length of the pulse in wavelengths. Returns metres.
     """
     return _band_reach(cycles) * max(_sampling_limit(capture), 2 * capture.axis.spacing)
 

@@ -57,27 +57,10 @@ def unwarp_signal(
     all wall points. Between bins the signal is interpolated linearly; before the first and after
     the last bin it is 0.
 
-    Parameters
-    ----------
-    signal : (t, ...) array
-        As the camera saw it; fetched from wherever it is.
-    wall : (..., 3) array
-        Wall points, m; the signal of a point with NaN becomes 0.
-    camera, laser : (3,) array
-        Position of the camera and of the laser spot on the wall, m.
-    bin_width : float
-        Duration of a time bin, s.
-
-    Returns
-    -------
-    (t, ...) float32 array
-
-    Raises
-    ------
-    ShapeError
-        The wall does not fit the signal.
-    InputError
-        A position is not three finite numbers.
+    `signal` (t, ...): as the camera saw it; fetched from wherever it is; `wall` (..., 3): wall
+    points, m; the signal of a point with NaN becomes 0; `camera, laser` (3,): position of the
+    camera and of the laser spot on the wall, m; `bin_width`: duration of a time bin, s. Returns (t,
+    ...).
     """
     signal, wall = (
         np.asarray(to_numpy(signal), dtype=np.float32),
@@ -105,22 +88,8 @@ def remove_device_legs(capture: Capture, source: Any, camera: Any) -> Capture:
     Every wall point's signal is moved earlier by ``(|r_L - source| + |r_p - camera|) / c``, by
     linear interpolation; the part that is common to all goes into the start.
 
-    Parameters
-    ----------
-    capture : Capture
-        Its bins stand for the whole way source -> laser spot -> hidden point -> wall point ->
-        camera.
-    source, camera : (3,) array
-        Position of the laser device and of the camera, m.
-
-    Returns
-    -------
-    Capture
-
-    Raises
-    ------
-    InputError
-        A position is not three finite numbers.
+    `capture`: its bins stand for the whole way source -> laser spot -> hidden point -> wall point
+    -> camera; `source, camera` (3,): position of the laser device and of the camera, m.
     """
     source, camera = np.asarray(source, dtype=np.float64), np.asarray(camera, dtype=np.float64)
     for name, place in (("source", source), ("camera", camera)):

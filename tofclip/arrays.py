@@ -46,15 +46,7 @@ def empty_aligned(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     """Return an array whose first element begins a cache line: NumPy's begin anywhere, and then every
     vector of 512 bits lies in two lines.
 
-    Parameters
-    ----------
-    shape : tuple of int
-    dtype : dtype
-
-    Returns
-    -------
-    array
-        Contiguous; its elements are not set.
+    Returns contiguous; its elements are not set.
     """
     kind = np.dtype(dtype)
     size = math.prod(shape) * kind.itemsize
@@ -64,13 +56,7 @@ def empty_aligned(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
 
 
 def namespace(*arrays: Array) -> Any:
-    """Return the functions of the array API standard for the library that all `arrays` are of.
-
-    Raises
-    ------
-    InputError
-        The arrays are of different libraries, or of one that does not follow the standard.
-    """
+    """Return the functions of the array API standard for the library that all `arrays` are of."""
     kinds = {type(array) for array in arrays}
     if len(kinds) == 1:  # asked in every step of a solver: a dictionary answers ten times as fast
         (kind,) = kinds
@@ -95,16 +81,7 @@ def _resolve_namespace(arrays: tuple[Array, ...]) -> Any:
 def clip_values(values: Array, lowest: float | None = None, highest: float | None = None) -> Array:
     """Return an array's values with those below or above a limit replaced by it.
 
-    Parameters
-    ----------
-    values : array
-    lowest, highest : float, optional
-        No limit by default.
-
-    Returns
-    -------
-    array
-        Of the same shape and dtype.
+    `lowest, highest`: no limit by default. Returns of the same shape and dtype.
     """
     if not is_numpy(values):
         return namespace(values).clip(values, min=lowest, max=highest)
@@ -143,17 +120,7 @@ def as_type(array: Array, dtype: DTypeLike) -> Array:
 
     NumPy's come back contiguous, as compiled loops need them.
 
-    Parameters
-    ----------
-    array : array
-        Of any library.
-    dtype : dtype
-        A NumPy type, or what names one.
-
-    Returns
-    -------
-    array
-        Of the same shape.
+    `array`: of any library; `dtype`: A NumPy type, or what names one. Returns of the same shape.
     """
     if is_numpy(array):
         return np.ascontiguousarray(array, dtype)
@@ -171,15 +138,7 @@ def native_device(array: Array) -> Any:
 def zeros(shape: tuple[int, ...], like: Array) -> Array:
     """Return zeros of the type of `like`, where `like` is.
 
-    Parameters
-    ----------
-    shape : tuple of int
-    like : array
-        Gives dtype, library and device.
-
-    Returns
-    -------
-    array of `shape`
+    `like`: gives dtype, library and device.
     """
     if is_numpy(like):
         return np.zeros(shape, like.dtype)
@@ -190,15 +149,7 @@ def scalar_like(value: float, like: Array) -> Array:
     """Return a number of the type of `like`, where `like` is: for functions that not every library
     has for Python's.
 
-    Parameters
-    ----------
-    value : float
-    like : array
-        Gives dtype, library and device.
-
-    Returns
-    -------
-    () array
+    `like`: gives dtype, library and device.
     """
     return like.dtype.type(value) if is_numpy(like) else zeros((), like) + value
 
@@ -206,16 +157,7 @@ def scalar_like(value: float, like: Array) -> Array:
 def require_numpy(what: str, *arrays: Array) -> None:
     """Refuse arrays of other libraries.
 
-    Parameters
-    ----------
-    what : str
-        What works on NumPy arrays only, as the message's subject.
-    *arrays : array
-
-    Raises
-    ------
-    InputError
-        One of `arrays` is not NumPy's.
+    `what`: what works on NumPy arrays only, as the message's subject.
     """
     for array in arrays:
         if not is_numpy(array):
@@ -289,10 +231,7 @@ CPU = ComputeDevice()
 class PerDevice(Generic[T]):
     """What is set up once in each place where it is needed, such as the copy of an array.
 
-    Parameters
-    ----------
-    make : callable
-        Sets it up in the `ComputeDevice` that it is given.
+    `make`: sets it up in the `ComputeDevice` that it is given.
     """
 
     def __init__(self, make: Callable[[ComputeDevice], T]) -> None:
@@ -311,20 +250,9 @@ class PerDevice(Generic[T]):
 def parse_device(name: str) -> ComputeDevice:
     """Return the place that a user asks for.
 
-    Parameters
-    ----------
-    name : str
-        ``cpu`` for NumPy and the compiled loops; ``cuda`` or ``cuda:1`` for a GPU,
-        through CuPy or else PyTorch; ``auto`` for a GPU where there is one, and
-        ``cpu`` where there is none; or a library with its own name of a device, such as
-        ``torch:cpu`` or ``torch:xpu``.
-
-    Raises
-    ------
-    InputError
-        Nothing is called that.
-    MissingDependencyError
-        The library is not installed, or finds no such device.
+    `name`: ``cpu`` for NumPy and the compiled loops; ``cuda`` or ``cuda:1`` for a GPU, through CuPy
+    or else PyTorch; ``auto`` for a GPU where there is one, and ``cpu`` where there is none; or a
+    library with its own name of a device, such as ``torch:cpu`` or ``torch:xpu``.
     """
     if name == "cpu":
         return ComputeDevice()
@@ -385,16 +313,7 @@ def _find_torch_device(name: str) -> ComputeDevice:
 def gather_entries(table: Array, numbers: Array) -> Array:
     """Return ``table[numbers]`` for a one-dimensional table and numbers of any shape.
 
-    Parameters
-    ----------
-    table : (n,) array
-    numbers : int array
-        Any shape.
-
-    Returns
-    -------
-    array
-        Of the numbers' shape.
+    `table` (n,); `numbers`: any shape. Returns of the numbers' shape.
     """
     xp = namespace(table, numbers)
     return xp.reshape(xp.take(table, xp.reshape(numbers, (-1,)), axis=0), numbers.shape)
@@ -403,15 +322,7 @@ def gather_entries(table: Array, numbers: Array) -> Array:
 def gather_rows(columns: Array, rows: Array) -> Array:
     """Return ``columns[rows[i, n], n]``; `rows` is (i, n), or (n,) for one entry of each column.
 
-    Parameters
-    ----------
-    columns : (rows, n) array
-    rows : (i, n) or (n,) int array
-
-    Returns
-    -------
-    array
-        Of the shape of `rows`.
+    `columns` (rows, n); `rows` (i, n). Returns of the shape of `rows`.
     """
     xp = namespace(columns, rows)
     if rows.ndim == 1:
@@ -423,17 +334,7 @@ def build_index_window(first: Array, width: int, last: Array, end: int) -> tuple
     """Return the numbers from `first` on, (width, n), none beyond ``end - 1``, and which of them
     are below `last`.
 
-    Parameters
-    ----------
-    first : (n,) int array
-    width : int
-    last : (n,) int array
-    end : int
-
-    Returns
-    -------
-    numbers : (width, n) int array
-    inside : (width, n) bool array
+    `first` (n,); `last` (n,). Returns `numbers` (width, n); `inside` (width, n).
     """
     xp = namespace(first, last)
     numbers = first + xp.arange(width, dtype=first.dtype, device=native_device(first))[:, None]

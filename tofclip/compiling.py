@@ -64,14 +64,7 @@ def _say_not_kept() -> None:
 def compile_and_keep(**options: Any) -> Callable[[Any], Any]:
     """Make the decorator of loops that are kept on disk, where there is a place for them.
 
-    Parameters
-    ----------
-    **options
-        Of `numba.njit`, such as ``fastmath``.
-
-    Returns
-    -------
-    callable
+    `**options`: of `numba.njit`, such as ``fastmath``.
     """
 
     def decorate(function: Any) -> Any:
@@ -92,14 +85,7 @@ def compile_loop(**options: Any) -> Callable[[Any], Any]:
     They make no array, so that nothing counts who holds one, and C does not call them: both would
     be compiled into each of them. They are kept as by `compile_and_keep`.
 
-    Parameters
-    ----------
-    **options
-        Of `numba.njit`, such as ``fastmath``.
-
-    Returns
-    -------
-    callable
+    `**options`: of `numba.njit`, such as ``fastmath``.
     """
     usual = {"error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
     return compile_and_keep(**{**usual, **options})

@@ -35,14 +35,7 @@ DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
 def describe_missing_package(fault: ImportError) -> str | None:
     """Return which package is missing and what to install, None where a module of ours is missing.
 
-    Parameters
-    ----------
-    fault : ImportError
-        As it was raised by an import.
-
-    Returns
-    -------
-    str or None
+    `fault`: as it was raised by an import.
 
     Examples
     --------
@@ -61,21 +54,7 @@ def describe_missing_package(fault: ImportError) -> str | None:
 def import_file_reader(name: str, install: str) -> Any:
     """Import a package that reads a kind of file.
 
-    Parameters
-    ----------
-    name : str
-        Of the module.
-    install : str
-        What pip is asked for.
-
-    Returns
-    -------
-    module
-
-    Raises
-    ------
-    MissingDependencyError
-        It is not installed, or does not load here.
+    `name`: of the module; `install`: what pip is asked for.
     """
     try:
         return importlib.import_module(name)
@@ -88,15 +67,6 @@ def import_file_reader(name: str, install: str) -> Any:
 def import_open3d() -> Any:
     """Import Open3D with the libusb of libusb-package: Open3D is linked against one, which bare
     machines lack and its wheel does not bring.
-
-    Returns
-    -------
-    module
-
-    Raises
-    ------
-    MissingDependencyError
-        It is not installed, or does not load here.
     """
     try:
         libusb = importlib.import_module("libusb_package").get_library_path()

@@ -87,12 +87,7 @@ class MissingTimeAxisError(InputError):
 class FileFormatError(TofclipError, ValueError):
     """A file is damaged, incomplete or of another format than expected.
 
-    Parameters
-    ----------
-    path : path-like
-        The offending file.
-    problem : str
-        What was found and what was expected, as one clause.
+    `path`: the offending file; `problem`: what was found and what was expected, as one clause.
     """
 
     def __init__(self, path: str | Path, problem: str) -> None:
@@ -156,17 +151,8 @@ class ProtocolError(DeviceError):
 def require_type(value: object, wanted: type | tuple[type, ...], use: str) -> None:
     """Refuse an argument of another type than the one that is needed.
 
-    Parameters
-    ----------
-    value : object
-    wanted : type or tuple of types
-    use : str
-        What needs it and how one comes by it, such as ``"recover takes a Streak, see read_streak"``.
-
-    Raises
-    ------
-    InputError
-        It is of another type.
+    `use`: what needs it and how one comes by it, such as ``"recover takes a Streak, see
+    read_streak"``.
 
     Examples
     --------
@@ -179,15 +165,5 @@ def require_type(value: object, wanted: type | tuple[type, ...], use: str) -> No
 
 
 def require_path(path: object) -> None:
-    """Refuse what is not the name of a file: Python would take a number for a file that is open.
-
-    Parameters
-    ----------
-    path : object
-
-    Raises
-    ------
-    InputError
-        It is neither text nor a path.
-    """
+    """Refuse what is not the name of a file: Python would take a number for a file that is open."""
     require_type(path, (str, PathLike), "a file is given by its name")

@@ -62,10 +62,6 @@ class BoundedFile(io.BufferedReader):
 
     Python takes the memory for all bytes that are asked for before it reads them, and decoders ask
     for as many as a damaged header says.
-
-    Parameters
-    ----------
-    path : path-like
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -79,13 +75,7 @@ class BoundedFile(io.BufferedReader):
 
 
 def find_array_limit(stored: int = 0) -> int:
-    """Return the size, bytes, above which an array that takes `stored` bytes of its file is not read.
-
-    Raises
-    ------
-    InputError
-        The environment's ``TOFCLIP_MAX_ARRAY_GIB`` is not a positive number.
-    """
+    """Return the size, bytes, above which an array that takes `stored` bytes of its file is not read."""
     wanted = os.environ.get(ARRAY_LIMIT_VARIABLE)
     if wanted:
         with contextlib.suppress(ValueError, OverflowError):
@@ -113,23 +103,9 @@ def require_bounded_size(
 ) -> None:
     """Refuse an array that claims more than its file can hold, or more than is read at all.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    name : str
-        Of the array, for the message.
-    claimed : int
-        Bytes that its values would take in memory.
-    stored : int
-        Bytes that it takes in the file; where the file itself says so, at most the file's size is
-        believed.
-    compressed : bool
-        Whether these are compressed bytes.
-
-    Raises
-    ------
-    FileFormatError
+    `path`: the file; `name`: of the array, for the message; `claimed`: bytes that its values would
+    take in memory; `stored`: bytes that it takes in the file; where the file itself says so, at
+    most the file's size is believed; `compressed`: whether these are compressed bytes.
     """
     _require_array_limit(path, name, claimed, stored)
     if claimed > min(stored, os.path.getsize(path)) * (MAX_COMPRESSION if compressed else 1):
@@ -142,16 +118,7 @@ def require_bounded_size(
 def require_own_member(group: h5py.Group, name: str, origin: str | Path) -> None:
     """Refuse a member of an HDF5 group that is a link, be it within the file or out of it.
 
-    Parameters
-    ----------
-    group : h5py.Group
-    name : str
-    origin : path-like
-        The file that it is in.
-
-    Raises
-    ------
-    FileFormatError
+    `origin`: the file that it is in.
     """
     import h5py
 
@@ -186,17 +153,8 @@ def require_bounded_dataset(
 ) -> None:
     """Refuse a dataset whose values are not in its own file, or claim more than the file can hold.
 
-    Parameters
-    ----------
-    dataset : h5py.Dataset
-    origin : path-like
-        The file that it is in.
-    at_once : int, optional
-        How many of its values are read at once; by default all.
-
-    Raises
-    ------
-    FileFormatError
+    `origin`: the file that it is in; `at_once`: how many of its values are read at once; by default
+    all.
     """
     name, dtype = dataset.name.lstrip("/"), dataset.dtype
     if dataset.is_virtual or dataset.external:
@@ -217,13 +175,7 @@ def require_bounded_dataset(
 
 
 def require_suffix(path: str | Path, *suffixes: str) -> None:
-    """Refuse to write to a name that says another format than the file will have.
-
-    Raises
-    ------
-    InputError
-        The name ends in none of `suffixes`.
-    """
+    """Refuse to write to a name that says another format than the file will have."""
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"{path}: the name must end in {' or '.join(suffixes)}")
 
@@ -237,11 +189,6 @@ def compute_sha256(path: str | Path) -> str:
 def identify_file(file: Path) -> str:
     """Say by what a file's content is known again: its hash, or for a large one what
     `MAX_HASHED_BYTES` says.
-
-    Raises
-    ------
-    StorageError
-        It cannot be read.
     """
     with translate_read_errors(file):
         state = file.stat()
@@ -295,17 +242,9 @@ def require_apart(outputs: Iterable[str | Path], inputs: Iterable[str | Path | N
     They are compared as the file system knows them, so that a link or another spelling of a name
     makes no difference. What does not exist yet is no input.
 
-    Parameters
-    ----------
-    outputs : iterable of path-like
-        Files that may be written, and folders for results.
-    inputs : iterable of path-like or None
-        Files, folders with the files in them, patterns of `glob`, and addresses, of which only
-        those that begin with ``file://`` name a file. None stands for an option that was not given.
-
-    Raises
-    ------
-    InputError
+    `outputs`: files that may be written, and folders for results; `inputs`: files, folders with the
+    files in them, patterns of `glob`, and addresses, of which only those that begin with
+    ``file://`` name a file.
     """
     existing = {_identify_entry(Path(one)): Path(one) for one in outputs}
     existing.pop(None, None)

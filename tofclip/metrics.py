@@ -48,22 +48,7 @@ def nmse_energy(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> fl
     """Squared error relative to the energy of the truth: ``sum (h - g)^2 / sum g^2``; arguments as
     in `nmse`.
 
-    Parameters
-    ----------
-    estimate, truth : (rows, columns) array_like
-    border_px : int
-        Pixels left out on all sides.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    ShapeError
-        The shapes differ.
-    InputError
-        The border leaves nothing, or the truth is zero everywhere.
+    `estimate, truth` (rows, columns); `border_px`: pixels left out on all sides.
     """
     h, g = _crop_borders(estimate, truth, border_px)
     energy = float(np.sum(g**2))
@@ -78,21 +63,7 @@ def correlation_coefficient(estimate: ArrayLike, truth: ArrayLike, border_px: in
 
     Arguments as in `nmse`.
 
-    Parameters
-    ----------
-    estimate, truth : (rows, columns) array_like
-    border_px : int
-        Pixels left out on all sides.
-
-    Returns
-    -------
-    float
-        -1 to 1.
-
-    Raises
-    ------
-    ShapeError, InputError
-        The shapes differ, the border leaves nothing, or the truth is constant.
+    `estimate, truth` (rows, columns); `border_px`: pixels left out on all sides. Returns -1 to 1.
     """
     h, g = _crop_borders(estimate, truth, border_px)
     h, g = h - h.mean(), g - g.mean()

@@ -26,17 +26,7 @@ MAX_PLOTTED_POINTS = 20_000
 
 
 def require_package(name: str) -> Any:
-    """Return another library's module.
-
-    Parameters
-    ----------
-    name : str
-
-    Raises
-    ------
-    MissingDependencyError
-        It is not installed, or does not load.
-    """
+    """Return another library's module."""
     try:
         return import_module(name)
     except ImportError as fault:
@@ -46,17 +36,7 @@ def require_package(name: str) -> Any:
 def render_html(title: str, rows: Mapping[str, str], picture: NDArray[np.floating] | None) -> str:
     """Return a table beside a picture, in HTML.
 
-    Parameters
-    ----------
-    title : str
-    rows : mapping of str to str
-        Names and values.
-    picture : (y, x) array or None
-        Brightness; NaN is drawn black.
-
-    Returns
-    -------
-    str
+    `rows`: names and values; `picture` (y, x): brightness; NaN is drawn black.
     """
     cells = "".join(
         f"<tr><th style='text-align:left'>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>"
@@ -78,20 +58,8 @@ def plot_picture(
 ) -> Axes:
     """Draw a picture with a scale of its brightness.
 
-    Parameters
-    ----------
-    picture : (y, x) array
-    title : str
-    ax : matplotlib Axes, optional
-        Where to draw; by default the current figure's.
-    unit : str
-        Of the brightness.
-    sides : (x, y) of arrays, optional
-        Places of columns and rows, m; by default they are numbered.
-
-    Returns
-    -------
-    matplotlib Axes
+    `picture` (y, x); `ax`: where to draw; by default the current figure's; `unit`: of the
+    brightness; `sides` (x, y): places of columns and rows, m; by default they are numbered.
     """
     pyplot = require_package("matplotlib.pyplot")
     ax = ax or pyplot.gca()
@@ -108,17 +76,7 @@ def plot_points(
 ) -> Axes:
     """Draw points as the camera sees them, coloured by their range.
 
-    Parameters
-    ----------
-    xyz : (n, 3) array
-        m: x right, y down, z forward.
-    distance : (n,) array
-        m.
-    ax : matplotlib Axes, optional
-
-    Returns
-    -------
-    matplotlib Axes
+    `xyz` (n, 3): m: x right, y down, z forward; `distance` (n,): m.
     """
     pyplot = require_package("matplotlib.pyplot")
     ax = ax or pyplot.gca()
@@ -138,18 +96,7 @@ def make_data_array(
 ) -> Any:
     """Return an `xarray.DataArray` whose coordinates carry their units.
 
-    Parameters
-    ----------
-    values : array
-    axes : mapping of str to (array, str)
-        Coordinates and unit of each axis, in order.
-    name, unit : str
-        Of the values.
-
-    Raises
-    ------
-    MissingDependencyError
-        xarray is not installed.
+    `axes`: coordinates and unit of each axis, in order; `name, unit`: of the values.
     """
     xarray = require_package("xarray")
     places = {axis: (axis, place, {"units": units}) for axis, (place, units) in axes.items()}

@@ -59,13 +59,7 @@ class Storable:
 
     @classmethod
     def from_record(cls: type[StorableType], record: Record) -> StorableType:
-        """Rebuild an object from what was stored.
-
-        Raises
-        ------
-        FileFormatError
-            A field is absent, or has another number of dimensions, unit or type than declared.
-        """
+        """Rebuild an object from what was stored."""
         made: StorableType = _read_fields(cls, record)
         return made
 
@@ -91,30 +85,13 @@ def stored_array(
 ) -> Metadata:
     """Declare an array.
 
-    Parameters
-    ----------
-    units : str
-        See `tofclip.storage.Field`.
-    *axes : str
-        Name of each axis.
-    dtype : dtype or tuple of dtype
-        That of the array in memory. Of several, that of the file if it is one of them, else the
-        first. Boolean arrays are stored as 0 and 1, uint8.
-    name : str
-        In the file; by default the dataclass field's.
-    dimensions : int, optional
-        Number of axes, where they have no names.
-    name_axes : callable, optional
-        Where the number of axes is free: from that number to their names.
-    optional : bool
-        Whether None is a value, and whether files without the array get the field's default.
-    skip_empty : bool
-        Whether an array without elements is left out of the file.
-
-    Returns
-    -------
-    dict
-        Metadata for `dataclasses.field`.
+    `units`: see `tofclip.storage.Field`; `*axes`: name of each axis; `dtype`: that of the array in
+    memory. Of several, that of the file if it is one of them, else the first. Boolean arrays are
+    stored as 0 and 1, uint8; `name`: in the file; by default the dataclass field's; `dimensions`:
+    number of axes, where they have no names; `name_axes`: where the number of axes is free: from
+    that number to their names; `optional`: whether None is a value, and whether files without the
+    array get the field's default; `skip_empty`: whether an array without elements is left out of
+    the file. Returns metadata for `dataclasses.field`.
     """
     kinds = dtype if isinstance(dtype, tuple) else (dtype,)
     return {
@@ -127,19 +104,9 @@ def stored_value(
 ) -> Metadata:
     """Declare a number or a text, stored as an attribute; several names declare a tuple of them.
 
-    Parameters
-    ----------
-    *names : str
-        In the file; by convention they end in the unit (``time_zero_s``).
-    dtype : callable
-        ``float``, ``int``, ``str`` or ``bool``.
-    optional : bool
-        Whether files without the attribute get the field's default.
-
-    Returns
-    -------
-    dict
-        Metadata for `dataclasses.field`.
+    `*names`: in the file; by convention they end in the unit (``time_zero_s``); `dtype`: ``float``,
+    ``int``, ``str`` or ``bool``; `optional`: whether files without the attribute get the field's
+    default. Returns metadata for `dataclasses.field`.
     """
     return {_KEY: _StoredValue(names, dtype, optional)}
 
@@ -154,21 +121,9 @@ def stored_child(
 ) -> Metadata:
     """Declare a `Storable` object that has a record of its own within this one.
 
-    Parameters
-    ----------
-    read : callable
-        Makes the object from its record.
-    kind : str
-        Of that record; empty: `read` looks at it itself.
-    optional : bool
-        Whether None is a value.
-    name : str
-        In the file; by default the dataclass field's.
-
-    Returns
-    -------
-    dict
-        Metadata for `dataclasses.field`.
+    `read`: makes the object from its record; `kind`: of that record; empty: `read` looks at it
+    itself; `optional`: whether None is a value; `name`: in the file; by default the dataclass
+    field's. Returns metadata for `dataclasses.field`.
     """
     return {_KEY: _StoredChild(read, kind, optional, name)}
 
@@ -214,30 +169,14 @@ class _Declaration(Protocol):
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
         """Put `value` of dataclass field `own_name` into the record.
 
-        Parameters
-        ----------
-        own_name : str
-            Name of the dataclass field.
-        value : object
-        contents : _Contents
-            Added to, in place.
+        `own_name`: name of the dataclass field; `contents`: added to, in place.
         """
         ...
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
         """Return the value that the record of a `kind` holds, or `MISSING` for the default.
 
-        Parameters
-        ----------
-        own_name : str
-            Name of the dataclass field.
-        record : Record
-        kind : type
-            The class that is read.
-
-        Returns
-        -------
-        object
+        `own_name`: name of the dataclass field; `kind`: the class that is read.
         """
         ...
 
@@ -314,23 +253,7 @@ class _StoredValue:
         contents.attributes.update(zip(names, values, strict=True))
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
-        """Return the scalar, or several as a tuple, in the declared type.
-
-        Parameters
-        ----------
-        own_name : str
-        record : Record
-        kind : type
-
-        Returns
-        -------
-        scalar, tuple or `MISSING`
-
-        Raises
-        ------
-        FileFormatError
-            An attribute is absent or of another type.
-        """
+        """Return the scalar, or several as a tuple, in the declared type."""
         names = self.names or (own_name,)
         if self.optional and names[0] not in record.attributes:
             return MISSING

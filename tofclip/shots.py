@@ -197,20 +197,8 @@ def outline_streak(
 ) -> Record:
     """Describe a streak image whose pixels are not read; see `tofclip.storage.read_outline`.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    has_times, has_limit : bool
-        Whether the instants of its rows, and the limit of its pixels, are known.
-    metadata : mapping of str to str
-    camera : Camera, optional
-    attachments : mapping of str to Record, optional
-
-    Returns
-    -------
-    Record
-        With the fields and children of a `Streak`'s.
+    `shape`: rows and columns; `has_times, has_limit`: whether the instants of its rows, and the
+    limit of its pixels, are known. Returns with the fields and children of a `Streak`'s.
     """
     axes = ("time", "column")
     fields = {"counts": Field(make_stand_in(shape, np.float32), "count", axes)}

@@ -62,20 +62,12 @@ MAX_OUTLINE_VALUES = 9
 
 @dataclass(frozen=True)
 class Field:
-    """An array with its unit and the names of its axes.
-
-    Parameters
-    ----------
-    values : ndarray
-    units : str
-        SI unit (``"s"``, ``"m"``, ``"rad"``), ``"px"``, ``"count"``, or ``""`` for a pure number.
-    axes : tuple of str
-        One name per dimension, e.g. ``("time", "y", "x")``.
-    """
+    """An array with its unit and the names of its axes."""
 
     values: NDArray[Any]
+    # SI unit (``"s"``, ``"m"``, ``"rad"``), ``"px"``, ``"count"``, or ``""`` for a pure number
     units: str = ""
-    axes: tuple[str, ...] = ()
+    axes: tuple[str, ...] = ()  # one name per dimension, e.g. ``("time", "y", "x")``
 
 
 @dataclass(frozen=True)
@@ -241,21 +233,7 @@ class Record:
 
 
 def write_record(record: Record, path: str | Path, compressed: bool = True) -> None:
-    """Write a record to `path`, whole or not at all; see `Record.save`.
-
-    Parameters
-    ----------
-    record : Record
-    path : str or Path
-    compressed : bool
-
-    Raises
-    ------
-    InputError
-        The name ends in another suffix than .h5 or .hdf5.
-    StorageError
-        The file cannot be written.
-    """
+    """Write a record to `path`, whole or not at all; see `Record.save`."""
     import h5py
 
     if Path(path).suffix:
@@ -283,15 +261,8 @@ def read_outline(path: str | Path) -> Record:
     """Read what kind of record `path` holds, its attributes, and shape, type, unit and axes of its
     arrays.
 
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    Record
-        Arrays of more than `MAX_OUTLINE_VALUES` values are stand-ins (`make_stand_in`): no file is
-        too large for this.
+    Returns arrays of more than `MAX_OUTLINE_VALUES` values are stand-ins (`make_stand_in`): no file
+    is too large for this.
     """
     return _read_file(path, _read_few_values)
 
@@ -459,13 +430,7 @@ def _read_text(item: h5py.Group | h5py.Dataset, name: str) -> str:
 
 
 def _to_scalar(value: Any) -> Scalar:
-    """Turn an HDF5 attribute into a Python scalar.
-
-    Raises
-    ------
-    TypeError
-        It is an array, complex, or empty.
-    """
+    """Turn an HDF5 attribute into a Python scalar."""
     plain = value.item() if isinstance(value, np.generic) else value
     found = plain.decode() if isinstance(plain, bytes) else plain
     if not isinstance(found, str | int | float | bool):

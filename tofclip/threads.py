@@ -36,11 +36,6 @@ THREADS_VARIABLE = "TOFCLIP_THREADS"
 def thread_count() -> int:
     """Return how many threads to use: the environment's ``TOFCLIP_THREADS``, else one for each core
     that this process may run on.
-
-    Raises
-    ------
-    InputError
-        The variable is not a positive whole number.
     """
     wanted = os.environ.get(THREADS_VARIABLE, "")
     if not wanted:
@@ -81,10 +76,7 @@ def open_worker_pool(threads: int | None = None) -> Iterator[Executor]:
     At the end of the block, jobs that have not begun are cancelled and those under way waited for.
     BLAS has one thread meanwhile.
 
-    Parameters
-    ----------
-    threads : int, optional
-        `thread_count` by default.
+    `threads`: `thread_count` by default.
     """
     pool = ThreadPoolExecutor(threads or thread_count(), "tofclip", _limit_worker)
     with limit_blas_threads():
@@ -109,20 +101,9 @@ def map_parallel(
     progress between them. The first exception is raised in its result's place, and no further job
     is started.
 
-    Parameters
-    ----------
-    work : callable
-        Must not depend on the order in which jobs are done.
-    jobs : iterable
-        Taken one by one, as they are needed.
-    lookahead : int, optional
-        Jobs that may be under way or done before their turn; it bounds the results in memory. By
-        default one per thread.
-
-    Yields
-    ------
-    object
-        Result of each job.
+    `work`: must not depend on the order in which jobs are done; `jobs`: taken one by one, as they
+    are needed; `lookahead`: jobs that may be under way or done before their turn; it bounds the
+    results in memory. By default one per thread. Yields result of each job.
 
     Examples
     --------
@@ -144,17 +125,7 @@ def map_parallel(
 
 
 def split_blocks(total: int, size: int = LANES) -> Iterator[slice]:
-    """Cut ``range(total)`` into slices of at most `size`.
-
-    Parameters
-    ----------
-    total : int
-    size : int
-
-    Yields
-    ------
-    slice
-    """
+    """Cut ``range(total)`` into slices of at most `size`."""
     for start in range(0, total, size):
         yield slice(start, min(start + size, total))
 
@@ -164,14 +135,8 @@ def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> 
 
     An interruption (Ctrl-C) waits for the blocks under way and starts no further ones.
 
-    Parameters
-    ----------
-    work : callable
-        Called with the slice of a block. Blocks must not write to the same memory.
-    total : int
-        Length of the axis that is cut.
-    size : int
-        Length of a block, at most.
+    `work`: called with the slice of a block. Blocks must not write to the same memory; `total`:
+    length of the axis that is cut; `size`: length of a block, at most.
     """
     blocks = list(split_blocks(total, size))
     if len(blocks) == 1:  # on the calling thread, with all threads that BLAS has

@@ -26,13 +26,7 @@ MAX_BIN_WIDTH_S = 1e-7
 def require_credible_bin_width(
     bin_width: float, shortest: float = MIN_BIN_WIDTH_S, longest: float = MAX_BIN_WIDTH_S
 ) -> None:
-    """Refuse a time bin, s, that was not given in seconds.
-
-    Raises
-    ------
-    InputError
-        It is not positive, or shorter or longer than any instrument's.
-    """
+    """Refuse a time bin, s, that was not given in seconds."""
     if not shortest <= bin_width <= longest:
         raise InputError(
             f"a bin width of {bin_width:g} s is not credible; check the unit of `bin_width` "

@@ -34,10 +34,7 @@ ANY_ORDER = ("contract", "reassoc", "nsz")
 class Vector(types.Type):  # type: ignore[misc]
     """Type of sixteen float32, int32 or bool.
 
-    Parameters
-    ----------
-    dtype : numba type
-        Of one of them.
+    `dtype`: of one of them.
     """
 
     def __init__(self, dtype: Any) -> None:

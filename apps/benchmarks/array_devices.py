@@ -76,18 +76,8 @@ def compare_devices(
 ) -> PreparedCase:
     """The work on the device against the same work by the compiled loops.
 
-    Parameters
-    ----------
-    work : callable
-        From the input to an array.
-    given, moved : object
-        The input for the compiled loops, and on the device.
-    amount : float
-        Of work, in the unit of the figures.
-
-    Returns
-    -------
-    PreparedCase
+    `work`: from the input to an array; `given, moved`: the input for the compiled loops, and on the
+    device; `amount`: of work, in the unit of the figures.
     """
 
     def judge() -> dict[str, float]:
@@ -105,16 +95,7 @@ def compare_devices(
 def prepare_recovery(method: str, side: int) -> PreparedCase:
     """Frames from a shot's measurements.
 
-    Parameters
-    ----------
-    method : str
-        ``l1``, ``tv`` or ``linear``.
-    side : int
-        Pixels of the picture.
-
-    Returns
-    -------
-    PreparedCase
+    `method`: ``l1``, ``tv`` or ``linear``; `side`: pixels of the picture.
     """
     camera, measurements = make_shot(side)
     operator = camera.operator()
@@ -145,19 +126,8 @@ def prepare_imaging(
 ) -> PreparedCase:
     """A hidden volume from a simulated capture.
 
-    Parameters
-    ----------
-    make_method : callable
-        From a wavelength in m to a method.
-    shape : str
-        A wall of `build_relay_wall`.
-    confocal : bool
-    side : int
-        Wall points along a side.
-
-    Returns
-    -------
-    PreparedCase
+    `make_method`: from a wavelength in m to a method; `shape`: A wall of `build_relay_wall`;
+    `side`: wall points along a side.
     """
     warnings.simplefilter("ignore", AliasingWarning)
     wavelength = WALL_POINTS_PER_WAVELENGTH * WALL_WIDTH_M / (side - 1)

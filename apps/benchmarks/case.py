@@ -18,63 +18,33 @@ class PeerUnavailableError(Exception):
 
 @dataclass(frozen=True)
 class PreparedCase:
-    """A case at one size, ready to run.
+    """A case at one size, ready to run."""
 
-    Parameters
-    ----------
-    action : callable
-        What is measured.
-    floor : callable
-        What it cannot do without, on the same data and threads.
-    amount : float
-        How much one action does, in the case's unit.
-    peers : mapping of str to callable
-        The same by other programs, by their names.
-    floor_fraction : float
-        Part of the floor that `floor` does, where all of it would take too long; above 1 where it
-        does more.
-    figures : callable
-        What else is to be said of this size, by names that end in their unit: errors, latencies.
-        Called once, after the times were taken.
-    """
-
-    action: Action
-    floor: Action
-    amount: float
+    action: Action  # what is measured
+    floor: Action  # what it cannot do without, on the same data and threads
+    amount: float  # how much one action does, in the case's unit
+    # the same by other programs, by their names
     peers: Mapping[str, Peer] = field(default_factory=dict)
+    # part of the floor that `floor` does, where all of it would take too long; above 1 where it
+    # does more
     floor_fraction: float = 1.0
+    # what else is to be said of this size, by names that end in their unit: errors, latencies.
+    # Called once, after the times were taken
     figures: Callable[[], Mapping[str, float]] = dict
 
 
 @dataclass(frozen=True)
 class Case:
-    """Something that is measured at several sizes.
+    """Something that is measured at several sizes."""
 
-    Parameters
-    ----------
-    name : str
-        ``group-what``, what a user types; the group alone names all of its cases.
-    title : str
-        What it does, as a row of a table says it.
-    size : str
-        What its sizes count.
-    sizes : tuple of int
-        Rising. Growth is from each to the next; threads and floor are reported for the last.
-    unit : str
-        What `PreparedCase.amount` counts.
-    floor : str
-        What it is held against, in words.
-    prepare : callable
-        Makes the inputs of a size.
-    """
-
-    name: str
-    title: str
-    size: str
+    name: str  # ``group-what``, what a user types; the group alone names all of its cases
+    title: str  # what it does, as a row of a table says it
+    size: str  # what its sizes count
+    # rising. Growth is from each to the next; threads and floor are reported for the last
     sizes: tuple[int, ...]
-    unit: str
-    floor: str
-    prepare: Callable[[int], PreparedCase]
+    unit: str  # what `PreparedCase.amount` counts
+    floor: str  # what it is held against, in words
+    prepare: Callable[[int], PreparedCase]  # makes the inputs of a size
 
     @property
     def group(self) -> str:

@@ -26,11 +26,7 @@ RATE_HZ = 1.28e7
 def read_records(source: Source, size_mb: int) -> None:
     """Read and decode a source until `size_mb` megabytes have come.
 
-    Parameters
-    ----------
-    source : Source
-        Closed at the end.
-    size_mb : int
+    `source`: closed at the end.
     """
     wanted, records = size_mb * MEGA // RECORD_BYTES, 0
     with source:

@@ -24,14 +24,7 @@ def prepare_lensless(side: int) -> PreparedCase:
     """A lensless camera's picture by nonnegative least squares: the same measurements, point-spread
     function and number of iterations as the peer's.
 
-    Parameters
-    ----------
-    side : int
-        Pixels of the sensor and of the picture, which is dark in its outer half.
-
-    Returns
-    -------
-    PreparedCase
+    `side`: pixels of the sensor and of the picture, which is dark in its outer half.
     """
     random = np.random.default_rng(0)
     speckle = np.maximum(gaussian_filter(random.standard_normal((side, side)), 1.0), 0) ** 3

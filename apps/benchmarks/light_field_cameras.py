@@ -56,16 +56,7 @@ FLOORS = {
 def prepare_camera(name: str, side: int) -> PreparedCase:
     """A weighted model and its adjoint on one picture; its set-up is timed beside.
 
-    Parameters
-    ----------
-    name : str
-        A key of `CAMERAS`.
-    side : int
-        Pixels of the picture.
-
-    Returns
-    -------
-    PreparedCase
+    `name`: A key of `CAMERAS`; `side`: pixels of the picture.
     """
 
     def make_model() -> object:

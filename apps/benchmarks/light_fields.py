@@ -43,18 +43,8 @@ def render_scene(side: int) -> LightField:
 def prepare_recovery(encoder: str, weight: float | None, side: int) -> PreparedCase:
     """One picture by total variation; the floor takes as many products as its last recovery needed.
 
-    Parameters
-    ----------
-    encoder : str
-        A key of `CAMERAS`.
-    weight : float or None
-        Of the prior; None: chosen by cross-validation, as part of the work.
-    side : int
-        Pixels of the picture.
-
-    Returns
-    -------
-    PreparedCase
+    `encoder`: A key of `CAMERAS`; `weight`: of the prior; None: chosen by cross-validation, as part
+    of the work; `side`: pixels of the picture.
     """
     light_field = render_scene(side)
     measurement = measure(light_field, CameraSetup(encoder, 0.5, 0))

@@ -23,18 +23,10 @@ BYTES_PER_MIB = 1 << 20
 def measure_case(case: Case, size: int) -> dict[str, Any]:
     """Return the figures of a case at one size.
 
-    Parameters
-    ----------
-    case : Case
-    size : int
-
-    Returns
-    -------
-    dict
-        ``seconds`` (median, least and greatest of the repeats after one that warms up),
-        ``per_second``, ``peak_mib`` of the process with its libraries and inputs, ``own_mib`` of
-        that only while the action ran, ``floor_seconds``, ``times_floor``, ``peers``: seconds, or
-        why there are none, and ``figures``, where the case has more to say.
+    Returns ``seconds`` (median, least and greatest of the repeats after one that warms up),
+    ``per_second``, ``peak_mib`` of the process with its libraries and inputs, ``own_mib`` of that
+    only while the action ran, ``floor_seconds``, ``times_floor``, ``peers``: seconds, or why there
+    are none, and ``figures``, where the case has more to say.
     """
     ready = case.prepare(size)
     before = measure_peak_memory_bytes()
@@ -65,16 +57,8 @@ def measure_case(case: Case, size: int) -> dict[str, Any]:
 def time_repeats(action: Action, seconds: float) -> list[float]:
     """Time an action again and again.
 
-    Parameters
-    ----------
-    action : callable
-    seconds : float
-        Stop when the repeats took this long; from `MIN_REPEATS` to `MAX_REPEATS` of them.
-
-    Returns
-    -------
-    list of float
-        Seconds.
+    `seconds`: stop when the repeats took this long; from `MIN_REPEATS` to `MAX_REPEATS` of them.
+    Returns seconds.
     """
     found: list[float] = []
     while len(found) < MAX_REPEATS:

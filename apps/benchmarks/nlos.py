@@ -36,19 +36,8 @@ def make_scene(count: int, relief: float) -> tuple[Capture, Grid, float]:
     """A capture of ``count ** 2`` points, a grid of ``count ** 3`` voxels, and a wavelength of four
     wall points.
 
-    Parameters
-    ----------
-    count : int
-        Points along a side.
-    relief : float
-        Depth of the wall's shape, m; 0: a plane.
-
-    Returns
-    -------
-    capture : Capture
-    grid : Grid
-    wavelength : float
-        Metres.
+    `count`: points along a side; `relief`: depth of the wall's shape, m; 0: a plane. Returns
+    `wavelength`: metres.
     """
     axis = np.linspace(-1, 1, count)
     x, y = np.meshgrid(axis, axis)
@@ -63,17 +52,7 @@ def make_transforms(side: int, number: int) -> tuple[Action, float]:
     """Inverse transforms of the doubled plane, a hundredth of `number` or more, and which fraction
     of it that is.
 
-    Parameters
-    ----------
-    side : int
-        Points along a side of the plane.
-    number : int
-        Transforms that the method needs.
-
-    Returns
-    -------
-    action : callable
-    fraction : float
+    `side`: points along a side of the plane; `number`: transforms that the method needs.
     """
     threads = thread_count()
     each = max(1, number // (100 * threads))
@@ -127,15 +106,7 @@ def prepare_confocal(method: Method, count: int) -> PreparedCase:
     """A confocal scan of a planar wall; the floor is a transform of its doubled box, there and
     back.
 
-    Parameters
-    ----------
-    method : Method
-    count : int
-        Points along a side.
-
-    Returns
-    -------
-    PreparedCase
+    `count`: points along a side.
     """
     wall = build_relay_wall("planar", count)
     capture = Capture(
@@ -167,15 +138,7 @@ def make_exhaustive_capture(count: int) -> Capture:
 def prepare_backprojection(capture_of: Callable[[int], Capture], count: int) -> PreparedCase:
     """Point by point; the floor copies a complex number for each look-up.
 
-    Parameters
-    ----------
-    capture_of : callable
-        From the number of points along a side to a capture.
-    count : int
-
-    Returns
-    -------
-    PreparedCase
+    `capture_of`: from the number of points along a side to a capture.
     """
     capture, axis = capture_of(count), np.linspace(-1, 1, count)
     grid = Grid(axis, axis, np.linspace(0.6, 1.6, count // 4))

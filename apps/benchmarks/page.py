@@ -45,16 +45,7 @@ TABLE_COLUMNS = ("", "size", "threads", "time", "rate", "memory", "floor", "x fl
 def render_page(figures: Mapping[str, Any], command: str) -> str:
     """Return the page of the figures that a run of `command` gave.
 
-    Parameters
-    ----------
-    figures : mapping
-        ``machine`` and ``entries``.
-    command : str
-
-    Returns
-    -------
-    str
-        Markdown.
+    `figures`: ``machine`` and ``entries``. Returns markdown.
     """
     parts = [
         PAGE_HEADER.format(command=command, machine=_format_machine(figures["machine"])).rstrip()

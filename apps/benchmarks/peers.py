@@ -77,23 +77,12 @@ print("seconds", seconds)
 
 @dataclass
 class LenslessPeer:
-    """LenslessPiCam's FISTA on a sensor's picture of a known point-spread function.
+    """LenslessPiCam's FISTA on a sensor's picture of a known point-spread function."""
 
-    Parameters
-    ----------
-    spread, readings : (rows, columns) float32 array
-    iterations : int
-
-    Attributes
-    ----------
-    picture : (rows, columns) array, optional
-        What it made, once it was timed.
-    """
-
-    spread: NDArray[np.float32]
-    readings: NDArray[np.float32]
+    spread: NDArray[np.float32]  # (rows, columns)
+    readings: NDArray[np.float32]  # (rows, columns)
     iterations: int
-    picture: NDArray[Any] | None = None
+    picture: NDArray[Any] | None = None  # (rows, columns), what it made, once it was timed
     _seconds: float = 0.0
 
     def __call__(self) -> float:
@@ -111,16 +100,7 @@ class LenslessPeer:
 def time_astra(picture: NDArray[np.float32], angles: NDArray[np.float64]) -> float:
     """Seconds of ASTRA's parallel projections of a picture, linear interpolation, processor.
 
-    Parameters
-    ----------
-    picture : (rows, columns) float32 array
-    angles : (angles,) float64 array
-        rad.
-
-    Returns
-    -------
-    float
-        Seconds.
+    `picture` (rows, columns); `angles` (angles,): rad. Returns seconds.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "picture.npz"
@@ -131,18 +111,7 @@ def time_astra(picture: NDArray[np.float32], angles: NDArray[np.float64]) -> flo
 def time_ytal(capture: Capture, grid: Grid, wavelength: float, cycles: float) -> float:
     """Seconds of y-tal's phasor fields on the same arrays, its solve call alone.
 
-    Parameters
-    ----------
-    capture : Capture
-    grid : Grid
-    wavelength : float
-        Metres.
-    cycles : float
-
-    Returns
-    -------
-    float
-        Seconds.
+    `wavelength`: metres. Returns seconds.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "capture.npz"
@@ -160,23 +129,7 @@ def time_ytal(capture: Capture, grid: Grid, wavelength: float, cycles: float) ->
 def run_peer(script: str, name: str, *words: str) -> float:
     """Run a script in the peers' Python and return the seconds that its last lines report.
 
-    Parameters
-    ----------
-    script : str
-    name : str
-        Of the peer, for the message.
-    *words : str
-        The script's arguments.
-
-    Returns
-    -------
-    float
-        Seconds.
-
-    Raises
-    ------
-    PeerUnavailableError
-        No such Python was named, or the peer is not installed there or does not run.
+    `name`: of the peer, for the message; `*words`: the script's arguments. Returns seconds.
     """
     python = os.environ.get(PEERS_VARIABLE)
     if not python:

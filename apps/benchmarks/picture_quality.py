@@ -27,26 +27,15 @@ SEEDS = 5
 
 @dataclass(frozen=True)
 class QualityCase:
-    """What is recovered, and how good it has to be.
+    """What is recovered, and how good it has to be."""
 
-    Parameters
-    ----------
-    light_field : str
-        Name of the NPZ file, without its ending.
-    shear : float
-    encoder, preset : str
-    limits : dict of int to float
-        NMSE in per cent that must not be exceeded, by the sampling ratio in per cent.
-    corrupted : float
-        Fraction of the measurements that are wildly wrong.
-    """
-
-    light_field: str
+    light_field: str  # name of the NPZ file, without its ending
     shear: float
     encoder: str
     preset: str
+    # NMSE in per cent that must not be exceeded, by the sampling ratio in per cent
     limits: dict[int, float]
-    corrupted: float = 0.0
+    corrupted: float = 0.0  # fraction of the measurements that are wildly wrong
 
     @property
     def name(self) -> str:
@@ -75,20 +64,7 @@ QUALITY_CASES = (
 def prepare_quality(wanted: QualityCase, ratio_percent: int) -> PreparedCase:
     """A recovery with the weight that the search found, against the products it needs.
 
-    Parameters
-    ----------
-    wanted : QualityCase
-    ratio_percent : int
-        Sampling ratio.
-
-    Returns
-    -------
-    PreparedCase
-
-    Raises
-    ------
-    InputError
-        `TOFCLIP_DATA` names no folder with the light field.
+    `ratio_percent`: sampling ratio.
     """
     path = Path(os.environ.get("TOFCLIP_DATA", ""), "lightfields", f"{wanted.light_field}.npz")
     if not path.is_file():

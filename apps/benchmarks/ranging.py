@@ -58,16 +58,7 @@ def simulate_shots(rows: int) -> list[Streak]:
 def bring_shots(streaks: list[Streak], shots: int, period_s: float) -> Iterator[Streak]:
     """Bring a shot every `period_s` seconds.
 
-    Parameters
-    ----------
-    streaks : list of Streak
-        Used in turn.
-    shots : int
-    period_s : float
-
-    Yields
-    ------
-    Streak
+    `streaks`: used in turn.
     """
     began = time.perf_counter()
     for number in range(shots):
@@ -78,15 +69,8 @@ def bring_shots(streaks: list[Streak], shots: int, period_s: float) -> Iterator[
 def prepare_streaming(rows: int, method: LinearInverse | ProximalMethod) -> PreparedCase:
     """Shots that were read already, one after the other: sweep, recovery, returns, clouds.
 
-    Parameters
-    ----------
-    rows : int
-    method : LinearInverse or ProximalMethod
-        One with a prior begins each shot at the last one's pictures; its first shot is not counted.
-
-    Returns
-    -------
-    PreparedCase
+    `method`: one with a prior begins each shot at the last one's pictures; its first shot is not
+    counted.
     """
     made = make_instrument(rows)
     streaks = simulate_shots(rows)

@@ -39,14 +39,7 @@ def measurements(frames: int) -> NDArray[np.float32]:
 
 
 def run_products(projection: LineProjection, frames: int, iterations: int) -> None:
-    """Multiply `iterations` times each way on every frame, in blocks on all threads, nothing else.
-
-    Parameters
-    ----------
-    projection : LineProjection
-    frames : int
-    iterations : int
-    """
+    """Multiply `iterations` times each way on every frame, in blocks on all threads, nothing else."""
 
     def work(piece: slice) -> None:
         block = np.ones((*projection.shape_in, LANES), np.float32)
@@ -61,10 +54,7 @@ def run_products(projection: LineProjection, frames: int, iterations: int) -> No
 def run_adjoints(projection: LineProjection, data: NDArray[np.float32]) -> None:
     """One product with the transpose for every frame.
 
-    Parameters
-    ----------
-    projection : LineProjection
-    data : (measurements, frames) float32 array
+    `data` (measurements, frames).
     """
     block = np.ascontiguousarray(data[:, :LANES])
 
@@ -77,10 +67,7 @@ def run_adjoints(projection: LineProjection, data: NDArray[np.float32]) -> None:
 def run_dense_products(projection: LineProjection, data: NDArray[np.float32]) -> None:
     """A product with a dense matrix and one with the sparse transpose for every frame.
 
-    Parameters
-    ----------
-    projection : LineProjection
-    data : (measurements, frames) float32 array
+    `data` (measurements, frames).
     """
     matrix = np.eye(SLIT_WIDTH_PX, dtype=np.float32)
     weights = np.empty_like(data)
@@ -97,17 +84,7 @@ def run_dense_products(projection: LineProjection, data: NDArray[np.float32]) ->
 
 
 def prepare_iterative(method: Method, frames: int) -> PreparedCase:
-    """A method that multiplies again and again.
-
-    Parameters
-    ----------
-    method : Method
-    frames : int
-
-    Returns
-    -------
-    PreparedCase
-    """
+    """A method that multiplies again and again."""
     projection, data = make_operator(), measurements(frames)
     return PreparedCase(
         lambda: method.recover(projection, data),

@@ -32,13 +32,7 @@ STUDIES = {
 
 
 def find_cases(name: str) -> tuple[Case, ...]:
-    """Return the case of a name, those of a group, or the page's for ``all``.
-
-    Raises
-    ------
-    InputError
-        Nothing has that name, or a study needs a library that is not installed.
-    """
+    """Return the case of a name, those of a group, or the page's for ``all``."""
     group = name.partition("-")[0]
     cases = load_study(group) if group in STUDIES else CASES
     found = tuple(case for case in cases if name in ("all", case.name, case.group))
@@ -51,13 +45,7 @@ def find_cases(name: str) -> tuple[Case, ...]:
 
 
 def load_study(group: str) -> tuple[Case, ...]:
-    """Return the cases of a study.
-
-    Raises
-    ------
-    InputError
-        It needs a library that is not installed.
-    """
+    """Return the cases of a study."""
     try:
         module = importlib.import_module(f"apps.benchmarks.{STUDIES[group]}")
     except ImportError as absence:

@@ -40,18 +40,9 @@ def run_cases(
 ) -> dict[str, Any]:
     """Measure cases one after the other.
 
-    Parameters
-    ----------
-    cases : sequence of Case
-    peers : str, optional
-        Python in which other programs are installed.
-    advance : callable
-        Called with 1 after each process; there are `count_processes` of them.
-
-    Returns
-    -------
-    dict
-        ``describe_machine`` and ``entries``, one for each case.
+    `peers`: python in which other programs are installed; `advance`: called with 1 after each
+    process; there are `count_processes` of them. Returns ``describe_machine`` and ``entries``, one
+    for each case.
     """
     machine = describe_machine()  # before anything is measured: its load is that of others
     clock = TimeBudget()

@@ -46,14 +46,7 @@ def make_streaks(rows: int) -> list[Streak]:
 def prepare_stream(rows: int, shots: int) -> PreparedCase:
     """Shots as fast as they are taken, then at three quarters of that rate.
 
-    Parameters
-    ----------
-    rows, shots : int
-        Rows of a streak image, and number of shots.
-
-    Returns
-    -------
-    PreparedCase
+    `rows, shots`: rows of a streak image, and number of shots.
     """
     streaks = make_streaks(rows)
     pipeline = RangingPipeline.for_shot(streaks[0])
@@ -95,17 +88,7 @@ def start_workers(number: int) -> Iterator[str]:
 
 
 def record_shots(folder: Path, number: int) -> Path:
-    """Simulate some shots, and link to them under as many names as asked for.
-
-    Parameters
-    ----------
-    folder : Path
-    number : int
-
-    Returns
-    -------
-    Path
-    """
+    """Simulate some shots, and link to them under as many names as asked for."""
     instrument, scene = make_instrument(CLUSTER_ROWS), make_default_scene()
     shots = folder / "shots"
     shots.mkdir()
@@ -122,16 +105,7 @@ def record_shots(folder: Path, number: int) -> Path:
 def make_clouds(shots: Path, out: Path, cluster: str | None) -> Summary:
     """Make the clouds of all shots.
 
-    Parameters
-    ----------
-    shots, out : Path
-        Folders.
-    cluster : str, optional
-        See `tofclip.sequences.jobs.run_jobs`.
-
-    Returns
-    -------
-    Summary
+    `shots, out`: folders; `cluster`: see `tofclip.sequences.jobs.run_jobs`.
     """
     jobs = RangingSettings(shots.parent / "camera.h5").jobs(list_shots(shots), out, SUFFIX)
     return run_jobs(jobs, cluster)

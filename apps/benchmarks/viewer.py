@@ -77,15 +77,7 @@ def make_echo_request(server: Any, answered: Callable[[], None]) -> Callable[[],
 
     It reaches into viser's inner messages, which only a measurement may do.
 
-    Parameters
-    ----------
-    server : viser server
-    answered : callable
-        Called when the page has answered.
-
-    Returns
-    -------
-    callable
+    `answered`: called when the page has answered.
     """
     names = (f"tofclip-drawn-{number % 4}" for number in itertools.count())
 

@@ -43,20 +43,8 @@ def make_demo_figure(
     """Draw streak image, brightness and range as seen by the camera; top and side view in metres;
     range errors.
 
-    Parameters
-    ----------
-    streak : Streak
-    frames : Frames
-    returns : Returns
-    cloud : PointCloud
-    truth : GroundTruth
-        Of the simulated scene, for the range errors.
-    compared : Frames
-        Of the same shot, each frame recovered alone.
-
-    Returns
-    -------
-    Figure
+    `truth`: of the simulated scene, for the range errors; `compared`: of the same shot, each frame
+    recovered alone.
     """
     figure = make_figure(15.5, 7.6)
     panels = figure.subplots(2, 4)

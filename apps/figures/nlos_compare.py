@@ -55,18 +55,9 @@ def make_comparison_figure(
     """Draw the brightest voxel along z (upper row) and along y (lower row), a column for each
     method.
 
-    Parameters
-    ----------
-    volumes : mapping
-        By method, on one grid; each is drawn relative to its own brightest voxel.
-    figures : mapping
-        What is written below each column: ``seconds``, ``peak_mib``, ``correlation`` and so on.
-    truth : HiddenTruth or None
-        Outlined where it is known.
-
-    Returns
-    -------
-    Figure
+    `volumes`: by method, on one grid; each is drawn relative to its own brightest voxel; `figures`:
+    what is written below each column: ``seconds``, ``peak_mib``, ``correlation`` and so on;
+    `truth`: outlined where it is known.
     """
     grid = next(iter(volumes.values())).grid
     across = float(np.subtract(*outer_edges(grid.x)[::-1]))
@@ -99,18 +90,8 @@ def make_comparison_figure(
 def draw_view(axes: Axes, volume: Volume, plane: PlaneAxes, truth: HiddenTruth | None) -> AxesImage:
     """Draw the brightest voxel along the third axis, and the outline of what is hidden.
 
-    Parameters
-    ----------
-    axes : Axes
-    volume : Volume
-    plane : (str, str)
-        Names of the axes to the right and downwards.
-    truth : HiddenTruth, optional
-
-    Returns
-    -------
-    AxesImage
-        Brightness relative to the view's largest, 0 to 1.
+    `plane`: names of the axes to the right and downwards. Returns brightness relative to the view's
+    largest, 0 to 1.
     """
     along = "zyx".index(next(name for name in "zyx" if name not in plane))
     picture = volume.magnitude.max(axis=along)
@@ -127,13 +108,7 @@ def draw_view(axes: Axes, volume: Volume, plane: PlaneAxes, truth: HiddenTruth |
 def draw_outline(axes: Axes, truth: HiddenTruth, plane: PlaneAxes) -> None:
     """Draw the border of everything hidden, seen along the third axis.
 
-    Parameters
-    ----------
-    axes : Axes
-    truth : HiddenTruth
-        Positions, m.
-    plane : (str, str)
-        Names of the axes to the right and downwards.
+    `truth`: positions, m; `plane`: names of the axes to the right and downwards.
     """
     places = truth.positions[:, ["xyz".index(name) for name in plane]]
     radius = truth.spacing / 2 if truth.spacing else POINT_RADIUS_M

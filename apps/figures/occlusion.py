@@ -39,15 +39,7 @@ def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult])
     """Draw the geometry, the returns in time, and what three cameras make of the target, beside the
     truth.
 
-    Parameters
-    ----------
-    experiment : Experiment
-    probes : sequence of ProbeResult
-        Small targets on the axis, drawn with a tick or a cross.
-
-    Returns
-    -------
-    Figure
+    `probes`: small targets on the axis, drawn with a tick or a cross.
     """
     figure = make_figure(13, 7)
     figure.suptitle(_format_headline(experiment), fontsize=SMALL_FONT_PT + 5)
@@ -126,13 +118,7 @@ def _draw_plan(axes: Axes, experiment: Experiment, probes: Sequence[ProbeResult]
 
 
 def draw_history(axes: Axes, experiment: Experiment) -> None:
-    """Draw all light over time on a logarithmic scale, with the gates of the returns.
-
-    Parameters
-    ----------
-    axes : Axes
-    experiment : Experiment
-    """
+    """Draw all light over time on a logarithmic scale, with the gates of the returns."""
     measurements = experiment.measurements
     times = measurements.time_axis.times / PICOSECOND
     history = np.maximum(measurements.history / measurements.history.max(), MIN_RELATIVE_LIGHT)

@@ -30,19 +30,11 @@ PANEL_LAYOUT = {"left": 0.02, "right": 0.98, "bottom": 0.16, "top": 0.8}
 
 
 class FlashFrame(NamedTuple):
-    """An instant of the flash.
+    """An instant of the flash."""
 
-    Attributes
-    ----------
-    time : float
-        ps after the flash.
-    title : str
-    pictures : two (rows, columns) arrays
-        Of the middle view and of the recovery, from 0 to 1.
-    """
-
-    time: float
+    time: float  # ps after the flash
     title: str
+    # of the middle view and of the recovery, from 0 to 1
     pictures: tuple[NDArray[Any], NDArray[Any]]
 
 
@@ -52,11 +44,7 @@ def save_flash_film(experiment: Experiment, path: Path) -> None:
     Each return is shown at its own brightness; the recovered pictures light up as the measurements
     of their gates do.
 
-    Parameters
-    ----------
-    experiment : Experiment
-    path : Path
-        Of the GIF.
+    `path`: of the GIF.
     """
     figure, frames = _make_canvas(8, 3.2), _make_flash_frames(experiment)
     left, right, time = figure.subplots(1, 3, gridspec_kw=PANEL_LAYOUT)
@@ -81,12 +69,7 @@ def save_walk_film(experiment: Experiment, path: Path, advance: Callable[[int], 
 
     Calls ``advance(1)`` after each of `WALK_STEPS`.
 
-    Parameters
-    ----------
-    experiment : Experiment
-    path : Path
-        Of the GIF.
-    advance : callable
+    `path`: of the GIF.
     """
     figure = _make_canvas(9.4, 2.9)
     names = ("one view, all its light", "one view, the second return", "ToF-CLIP", "truth")

@@ -40,12 +40,7 @@ def make_region_figure(region: InactiveRegion) -> Figure:
 def draw_region(axes: Axes, region: InactiveRegion, least_reach: float = 0.0) -> None:
     """Draw the region from above with seven views; z to the right, x upwards.
 
-    Parameters
-    ----------
-    axes : Axes
-    region : InactiveRegion
-    least_reach : float
-        Draw at least so far behind the occluder, m.
+    `least_reach`: draw at least so far behind the occluder, m.
     """
     places = np.linspace(-0.5, 0.5, VIEW_COUNT) * region.baseline
     usual = (

@@ -17,12 +17,7 @@ SHOWN_PERCENTILES = (1.0, 99.0)  # percent of the pixels that span the colours
 
 
 def make_range_figure(found: SurfaceImage) -> Figure:
-    """Draw a range image with what it is worth.
-
-    Parameters
-    ----------
-    found : SurfaceImage
-    """
+    """Draw a range image with what it is worth."""
     figure = make_figure(12, 9)
     axes = figure.subplots(2, 2)
     panels: tuple[tuple[Any, str, dict[str, Any]], ...] = (

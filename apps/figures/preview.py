@@ -60,15 +60,6 @@ def make_preview_figure(streak: Streak, frames: Frames) -> Figure:
 
     Where times are ranges, brightness is multiplied by range squared, so that near and far
     surfaces of one kind look alike.
-
-    Parameters
-    ----------
-    streak : Streak
-    frames : Frames
-
-    Returns
-    -------
-    Figure
     """
     moments = choose_moments(frames)
     lines = math.ceil(len(moments) / PANEL_COLUMNS)

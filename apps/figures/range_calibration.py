@@ -19,16 +19,7 @@ SHOWN_PERCENTILES = (1.0, 99.0)
 
 
 def make_range_calibration_figure(found: RangeFit) -> Figure:
-    """Draw the fitted walk over what was measured, and the pictures of the pixels' own numbers.
-
-    Parameters
-    ----------
-    found : RangeFit
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw the fitted walk over what was measured, and the pictures of the pixels' own numbers."""
     known = found.calibration
     pictures = [
         (known.offsets / MILLIMETRE, "offset (mm)"),

@@ -20,15 +20,7 @@ MIN_SHEAR, MAX_SHEAR = -1.4, 0.8  # shears
 def make_reproduction_figure(title: str, outcome: Outcome) -> Figure:
     """Draw the panels of an outcome, one line below the other.
 
-    Parameters
-    ----------
-    title : str
-    outcome : Outcome
-        Its panels, line by line.
-
-    Returns
-    -------
-    Figure
+    `outcome`: its panels, line by line.
     """
     lines = outcome.panels
     columns = max(map(len, lines))

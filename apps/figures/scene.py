@@ -39,17 +39,8 @@ def make_scene_figure(
 ) -> Figure:
     """Draw a scene in the manner of the paper's Supplementary Figure 21.
 
-    Parameters
-    ----------
-    frames : Frames
-    cloud : PointCloud
-        Of these frames.
-    objects : sequence of DetectedObject
-        Numbered in the top view; the four with most points are shown at their ranges.
-
-    Returns
-    -------
-    Figure
+    `cloud`: of these frames; `objects`: numbered in the top view; the four with most points are
+    shown at their ranges.
     """
     figure = make_figure(13, 7.5)
     if frames.time_zero_note:

@@ -39,14 +39,7 @@ def make_figure(width: float, height: float) -> Figure:
     """Make an empty figure, in inches. It draws with Agg: no display is needed and pyplot is left
     alone.
 
-    Parameters
-    ----------
-    width, height : float
-        Inches.
-
-    Returns
-    -------
-    Figure
+    `width, height`: inches.
     """
     from matplotlib.figure import Figure  # a third of a second that only a verb's pictures need
 
@@ -66,20 +59,9 @@ def add_panels(
     To search for places that fit around the labels takes longer than to draw a figure of many
     panels; with this the figure's own search is off.
 
-    Parameters
-    ----------
-    figure : Figure
-    rows, columns : int
-    band : (float, float)
-        Where the grid begins and ends, inches from the top of the figure.
-    room : (left, right, bottom, top)
-        Inches that ticks and labels take around each panel.
-    widths : sequence of float, optional
-        Of the columns, relative to each other; equal by default.
-
-    Returns
-    -------
-    (rows, columns) array of Axes
+    `band`: where the grid begins and ends, inches from the top of the figure; `room` (left, right,
+    bottom, top): inches that ticks and labels take around each panel; `widths`: of the columns,
+    relative to each other; equal by default. Returns (rows, columns).
     """
     figure.set_layout_engine(None)
     width, height = figure.get_size_inches()
@@ -103,11 +85,7 @@ def add_panels(
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure in the format that the name's ending says, whole or not at all.
 
-    Parameters
-    ----------
-    figure : Figure
-    path : Path
-        Its suffix names the format.
+    `path`: its suffix names the format.
     """
     engine, panels = figure.get_layout_engine(), figure.get_axes()
     if engine is not None and panels:
@@ -124,12 +102,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 def store_picture(picture: Path, place: Path) -> None:
     """Store a picture; a large PNG in `FEWER_COLOURS`.
 
-    Parameters
-    ----------
-    picture : Path
-        As it was drawn.
-    place : Path
-        Where it goes; may be the same.
+    `picture`: as it was drawn; `place`: where it goes; may be the same.
     """
     from PIL import Image
 
@@ -156,18 +129,8 @@ def draw_image(
 ) -> AxesImage:
     """Draw a picture without smoothing over its pixels.
 
-    Parameters
-    ----------
-    axes : Axes
-    picture : (rows, columns) or (rows, columns, 3) array
-    extent : (left, right, bottom, top), optional
-        Outer edges in the axes' units; pixel numbers where absent.
-    **look
-        Further settings of ``imshow``.
-
-    Returns
-    -------
-    AxesImage
+    `picture` (rows, columns); `extent` (left, right, bottom, top): outer edges in the axes' units;
+    pixel numbers where absent; `**look`: further settings of ``imshow``.
     """
     axes.set_facecolor(EMPTY_COLOUR)
     return axes.imshow(
@@ -178,11 +141,7 @@ def draw_image(
 def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
     """Set the title of a picture and the labels of its axes.
 
-    Parameters
-    ----------
-    axes : Axes
-    title, x, y : str
-        With units.
+    `title, x, y`: with units.
     """
     # A place of its own, or matplotlib looks for free space above the ticks at every drawing.
     axes.set_title(title, fontsize=SMALL_FONT_PT + 2, y=1.0)
@@ -194,13 +153,7 @@ def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
 def add_colour_bar(axes: Axes, mapped: Any, meaning: str) -> None:
     """Put a labelled colour scale beside a picture.
 
-    Parameters
-    ----------
-    axes : Axes
-    mapped : ScalarMappable
-        What the picture was drawn with.
-    meaning : str
-        Label, with its unit.
+    `mapped`: what the picture was drawn with; `meaning`: label, with its unit.
     """
     bar = axes.figure.colorbar(mapped, ax=axes, shrink=0.9)
     bar.set_label(meaning, fontsize=SMALL_FONT_PT)

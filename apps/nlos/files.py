@@ -34,11 +34,6 @@ def list_volume_suffixes() -> tuple[str, ...]:
 def note_content(source: Path) -> str:
     """Return a comment for a TOML file by which a capture, or a folder of renderings, is known
     again, whatever it is called and however old it is.
-
-    Raises
-    ------
-    StorageError
-        It cannot be read.
     """
     if not source.is_dir():
         return CONTENT_MARK + identify_file(source)
@@ -49,23 +44,12 @@ def note_content(source: Path) -> str:
 
 @dataclass(frozen=True)
 class ResultFiles:
-    """Names of what is written of one capture.
+    """Names of what is written of one capture."""
 
-    Parameters
-    ----------
-    volumes : sequence of Path
-        The volume, in the format that each suffix names.
-    picture : Path or None
-    settings : Path
-        Written last: where it stands, the others are whole.
-    surface : Path or None
-        The front surface with normals.
-    """
-
-    volumes: Sequence[Path]
+    volumes: Sequence[Path]  # the volume, in the format that each suffix names
     picture: Path | None
-    settings: Path
-    surface: Path | None = None
+    settings: Path  # written last: where it stands, the others are whole
+    surface: Path | None = None  # the front surface with normals
 
     @property
     def paths(self) -> list[Path]:
@@ -104,13 +88,7 @@ def is_capture_folder(source: Path) -> bool:
 
 
 def list_captures(folder: Path) -> list[Path]:
-    """List the captures of a folder: files that may hold one, and folders of renderings.
-
-    Raises
-    ------
-    InputError
-        There is none, or two would have results of the same name.
-    """
+    """List the captures of a folder: files that may hold one, and folders of renderings."""
     found = sorted(
         path
         for path in folder.iterdir()
@@ -134,12 +112,7 @@ def list_captures(folder: Path) -> list[Path]:
 def write_volume(volume: Volume, path: Path, fraction: float) -> None:
     """Write a volume in the format that the suffix names.
 
-    Parameters
-    ----------
-    volume : Volume
-    path : Path
-    fraction : float
-        Which voxels become points: those with at least this fraction of the brightest.
+    `fraction`: which voxels become points: those with at least this fraction of the brightest.
     """
     if path.suffix.lower() in RECORD_SUFFIXES:
         volume.save(path)
@@ -148,16 +121,5 @@ def write_volume(volume: Volume, path: Path, fraction: float) -> None:
 
 
 def add_provenance(volume: Volume, source: Path, settings: dict[str, object]) -> Volume:
-    """Record in a volume's provenance which file it was made of, and how.
-
-    Parameters
-    ----------
-    volume : Volume
-    source : Path
-    settings : dict
-
-    Returns
-    -------
-    Volume
-    """
+    """Record in a volume's provenance which file it was made of, and how."""
     return replace(volume, provenance=build_provenance(settings, source, earlier=volume.provenance))

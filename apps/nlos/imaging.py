@@ -127,18 +127,7 @@ def parse_method_names(text: str) -> tuple[str, ...]:
 
 
 def require_used_settings(settings: ImagingSettings, methods: Sequence[str]) -> None:
-    """Refuse a setting that none of the methods takes, since it would change nothing.
-
-    Parameters
-    ----------
-    settings : ImagingSettings
-    methods : sequence of str
-
-    Raises
-    ------
-    InputError
-        There is such a setting.
-    """
+    """Refuse a setting that none of the methods takes, since it would change nothing."""
     by_method = {name: _list_settings(name) for name in METHODS}
     taken = {name for method in methods for name in by_method[method]}
     for name in sorted(
@@ -152,18 +141,7 @@ def require_used_settings(settings: ImagingSettings, methods: Sequence[str]) -> 
 
 
 def require_valid_settings(settings: ImagingSettings, methods: Sequence[str]) -> None:
-    """Refuse settings that no capture could make sense of, before any is read.
-
-    Parameters
-    ----------
-    settings : ImagingSettings
-    methods : sequence of str
-
-    Raises
-    ------
-    InputError
-        There is such a setting.
-    """
+    """Refuse settings that no capture could make sense of, before any is read."""
     require_used_settings(settings, methods)
     if settings.flip not in (None, "x", "y"):
         raise InputError(f"flip is x or y, got '{settings.flip}'")
@@ -201,18 +179,8 @@ def from_library(settings: Imaging, found: Settings, methods: Sequence[str]) -> 
     """Return the command line's settings with what was found, and what the methods' classes take
     where nothing is given; what none of the methods takes is left out.
 
-    Parameters
-    ----------
-    settings : ImagingSettings
-        As given on the command line.
-    found : Settings
-        What the library chose for the rest, in m.
-    methods : sequence of str
-
-    Returns
-    -------
-    ImagingSettings
-        In mm where names end so.
+    `settings`: as given on the command line; `found`: what the library chose for the rest, in m.
+    Returns in mm where names end so.
     """
     kept: dict[str, Any] = {
         name: None
@@ -251,15 +219,7 @@ def choose_device(device: str, settings: ImagingSettings) -> ComputeDevice:
     """Return the device that a name asks for; ``auto`` stays with the compiled loops where a method
     has nothing else.
 
-    Parameters
-    ----------
-    device : str
-        See `tofclip.arrays.parse_device`.
-    settings : ImagingSettings
-
-    Returns
-    -------
-    ComputeDevice
+    `device`: see `tofclip.arrays.parse_device`.
     """
     named, refine = (getattr(settings, name, None) for name in ("method", "refine"))
     portable = named in (None, *PORTABLE_METHODS) and refine is None
@@ -317,18 +277,7 @@ _NAMED_REFINEMENTS = f"{', '.join(REFINEMENTS[:-1])} or {REFINEMENTS[-1]}"
 
 
 def require_valid_refinement(settings: RefinementSettings, method: str | None) -> None:
-    """Refuse a refinement that makes no sense, and settings of one that is not asked for.
-
-    Parameters
-    ----------
-    settings : RefinementSettings
-    method : str, optional
-
-    Raises
-    ------
-    InputError
-        One of these is the case.
-    """
+    """Refuse a refinement that makes no sense, and settings of one that is not asked for."""
     if settings.refine is None:
         for name in ("iterations", "prior_weight"):
             if getattr(settings, name) is not None:
@@ -358,17 +307,8 @@ def require_valid_refinement(settings: RefinementSettings, method: str | None) -
 def build_refinement(settings: Refining, imaging: Settings, grid: Grid) -> tuple[Refining, Method]:
     """Build the refinement that settings ask for.
 
-    Parameters
-    ----------
-    settings : RefinementSettings
-    imaging : Settings
-        Of the method that is iterated.
-    grid : Grid
-
-    Returns
-    -------
-    RefinementSettings, Method
-        The settings come back with what was not given.
+    `imaging`: of the method that is iterated. Returns the settings come back with what was not
+    given.
     """
     if settings.refine == PHOTONS:
         found = replace(
@@ -399,26 +339,13 @@ def build_refinement(settings: Refining, imaging: Settings, grid: Grid) -> tuple
 
 @dataclass(frozen=True, eq=False)
 class PreparedImaging(Generic[Imaging]):
-    """A capture ready to be imaged, with every setting known.
+    """A capture ready to be imaged, with every setting known."""
 
-    Parameters
-    ----------
-    capture : Capture
-        Gated, its bins put together.
-    grid : Grid
-    settings : Settings
-        As the library has them.
-    shown : ImagingSettings
-        As the command line has them; given back, they lead here again.
-    recorded : Capture
-        As it came.
-    """
-
-    capture: Capture
+    capture: Capture  # gated, its bins put together
     grid: Grid
-    settings: Settings
-    shown: Imaging
-    recorded: Capture
+    settings: Settings  # as the library has them
+    shown: Imaging  # as the command line has them; given back, they lead here again
+    recorded: Capture  # as it came
 
 
 def prepare_imaging(
@@ -430,18 +357,8 @@ def prepare_imaging(
     """Find every setting that is not given, and the voxels: all that the box holds, or the part
     that coarse voxels show to be bright.
 
-    Parameters
-    ----------
-    recorded : Capture
-    wanted : ImagingSettings
-    methods : sequence of str, optional
-        That will image; by default the one in the settings, or the quickest.
-    device : ComputeDevice, optional
-        Where to compute; where the capture is by default.
-
-    Returns
-    -------
-    PreparedImaging
+    `methods`: that will image; by default the one in the settings, or the quickest; `device`: where
+    to compute; where the capture is by default.
     """
     given = to_library(wanted).to_dict()
     if methods:
@@ -477,16 +394,6 @@ def _warn_of_given_wavelength(capture: Capture, found: Settings) -> None:
 def image_capture(title: str, plan: Plan, capture: Capture) -> Volume:
     """Image the hidden scene under a progress bar that counts look-ups or voxels, whichever the
     plan does.
-
-    Parameters
-    ----------
-    title : str
-    plan : Plan
-    capture : Capture
-
-    Returns
-    -------
-    Volume
     """
     with show_progress(title, plan.cost) as advance:
         return plan.image(capture, advance)

@@ -26,20 +26,12 @@ TRUTH_RADIUS_M = 0.04
 
 @dataclass(frozen=True, eq=False)
 class MeasuredVolume:
-    """A volume and what it cost.
-
-    Parameters
-    ----------
-    volume : Volume
-    seconds : float
-        Wall-clock time of the imaging, without compiling.
-    peak_bytes : int or None
-        Most memory that the program took at a time beyond what it had before; None where the system
-        does not show.
-    """
+    """A volume and what it cost."""
 
     volume: Volume
-    seconds: float
+    seconds: float  # wall-clock time of the imaging, without compiling
+    # most memory that the program took at a time beyond what it had before; None where the system
+    # does not show
     peak_bytes: int | None
 
     @property
@@ -56,17 +48,7 @@ def measure_imaging(name: str, imaging: Method, capture: Capture, grid: Grid) ->
 
     A few voxels are imaged first, so that loading the compiled loops is not counted.
 
-    Parameters
-    ----------
-    name : str
-    imaging : Method
-    capture : Capture
-    grid : Grid
-
-    Returns
-    -------
-    MeasuredVolume
-        Seconds, and bytes where the system reports them.
+    Returns seconds, and bytes where the system reports them.
     """
     few = slice(WARM_UP_VOXELS)
     with show_activity(f"{name}: loading its loops"):
@@ -123,16 +105,8 @@ def compare_with_truth(volume: Volume, truth: HiddenTruth) -> dict[str, Any]:
     """Fraction of the energy near hidden things, and how much brighter voxels are there than
     elsewhere.
 
-    Parameters
-    ----------
-    volume : Volume
-    truth : HiddenTruth
-
-    Returns
-    -------
-    dict
-        ``energy_near_truth``, ``contrast_to_truth`` and ``truth_reach_m``, the distance that counts
-        as near.
+    Returns ``energy_near_truth``, ``contrast_to_truth`` and ``truth_reach_m``, the distance that
+    counts as near.
     """
     axes = (volume.grid.x, volume.grid.y, volume.grid.z)
     # coarse voxels may have no centre within the radius

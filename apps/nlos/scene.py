@@ -90,13 +90,7 @@ class SceneSettings:
 
 
 def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:
-    """Simulate the capture that settings describe.
-
-    Raises
-    ------
-    InputError
-        Several kinds of things are hidden, a name is unknown, or a number makes no sense.
-    """
+    """Simulate the capture that settings describe."""
     if settings.scan not in SCANS:
         raise InputError(f"no scan is called '{settings.scan}'; choose {' or '.join(SCANS)}")
     if settings.background and settings.peak_counts is None:
@@ -134,16 +128,7 @@ def build_hidden_scene(settings: SceneSettings) -> tuple[HiddenScene | PointScen
 def find_nearest_wall_point(wall: FloatArray, place: tuple[float, float]) -> FloatArray:
     """Return the wall point whose x and y are nearest to a place, m.
 
-    Parameters
-    ----------
-    wall : (..., 3) float64 array
-        Metres; NaN where there is no wall.
-    place : (float, float)
-        x and y, m.
-
-    Returns
-    -------
-    (3,) float64 array
+    `wall` (..., 3): metres; NaN where there is no wall; `place`: x and y, m. Returns (3,).
     """
     known = wall[np.isfinite(wall).all(axis=-1)]
     spot: FloatArray = known[np.argmin(np.linalg.norm(known[:, :2] - place, axis=1))]
@@ -158,25 +143,8 @@ def choose_time_axis(
 
     A sum of distances is largest at a corner of the box about what is hidden.
 
-    Parameters
-    ----------
-    wall : (..., 3) float64 array
-        Metres; NaN where there is no wall.
-    laser : (..., 3) float64 array
-        Metres.
-    hidden : (n, 3) float64 array
-        Metres.
-    bin_width, jitter : float
-        Seconds; the jitter is the response's standard deviation.
-
-    Returns
-    -------
-    TimeAxis
-
-    Raises
-    ------
-    InputError
-        The bin width is not positive.
+    `wall` (..., 3): metres; NaN where there is no wall; `laser` (..., 3): metres; `hidden` (n, 3):
+    metres; `bin_width, jitter`: seconds; the jitter is the response's standard deviation.
     """
     if not (math.isfinite(bin_width) and bin_width > 0):
         raise InputError(

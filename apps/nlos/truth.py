@@ -24,18 +24,10 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class HiddenTruth:
-    """Where hidden things scatter light.
+    """Where hidden things scatter light."""
 
-    Parameters
-    ----------
-    positions : (n, 3) array
-        Points, or the centres of facets, m.
-    spacing : float
-        Distance of neighbouring facets, m; 0 for points.
-    """
-
-    positions: FloatArray
-    spacing: float
+    positions: FloatArray  # (n, 3), points, or the centres of facets, m
+    spacing: float  # distance of neighbouring facets, m; 0 for points
 
     def attach_to_record(self, capture: Capture) -> Record:
         """Put the truth into the record of its capture."""
@@ -68,20 +60,7 @@ class HiddenTruth:
     def mask_near(self, grid: Grid, reach: float) -> NDArray[np.bool_]:
         """Voxels (z, y, x) whose centres lie within `reach` m of something hidden.
 
-        Parameters
-        ----------
-        grid : Grid
-        reach : float
-            Metres.
-
-        Returns
-        -------
-        (z, y, x) bool array
-
-        Raises
-        ------
-        InputError
-            The reach is not positive.
+        `reach`: metres. Returns (z, y, x).
         """
         if reach <= 0:
             raise InputError(f"the reach about hidden things must be positive, got {reach} m")

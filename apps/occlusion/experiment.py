@@ -50,38 +50,17 @@ learns little of it.
 
 @dataclass(frozen=True)
 class ExperimentSettings:
-    """How the scene is lit and measured.
+    """How the scene is lit and measured."""
 
-    Parameters
-    ----------
-    side_px : int
-        Rows and columns of the picture.
-    encoder : str
-        A name of `tofclip.operators.light_field_camera.CAMERAS`.
-    sampling_ratio : float
-        Measurements over pixels of one picture.
-    illumination : str
-        ``diodes``: one beside each view; ``oblique``: one far to the side; ``co-located``: one
-        beside the middle view, whose light the occluder keeps from everything that view cannot see.
-    photons : float
-        Of the brightest measurement at its brightest instant.
-    seed : int
-    samples : int
-        Rays on a side of each pixel.
-
-    Raises
-    ------
-    InputError
-        An unknown illumination, a picture too small to show anything, or no photons.
-    """
-
-    side_px: int = 128
-    encoder: str = "line"
-    sampling_ratio: float = 0.5
+    side_px: int = 128  # rows and columns of the picture
+    encoder: str = "line"  # A name of `tofclip.operators.light_field_camera.CAMERAS`
+    sampling_ratio: float = 0.5  # measurements over pixels of one picture
+    # ``diodes``: one beside each view; ``oblique``: one far to the side; ``co-located``: one beside
+    # the middle view, whose light the occluder keeps from everything that view cannot see
     illumination: str = "diodes"
-    photons: float = 2000.0
+    photons: float = 2000.0  # of the brightest measurement at its brightest instant
     seed: int = 0
-    samples: int = 2
+    samples: int = 2  # rays on a side of each pixel
 
     def __post_init__(self) -> None:
         if self.illumination not in ILLUMINATIONS:
@@ -96,13 +75,7 @@ class ExperimentSettings:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A scene, as it is measured.
-
-    Parameters
-    ----------
-    scene : OcclusionScene
-    settings : Settings
-    """
+    """A scene, as it is measured."""
 
     scene: OcclusionScene
     settings: ExperimentSettings

@@ -50,35 +50,19 @@ SHOWN_SIDE_PX, GAP_PX = 192, 6
 
 @dataclass(frozen=True)
 class WalkFrame:
-    """A step of the walk, as it was seen.
+    """A step of the walk, as it was seen."""
 
-    Parameters
-    ----------
-    view : View
-        Occluder and person, each at its own distance.
-    pictures : mapping of str to (rows, columns) array
-        By what each of them shows.
-    description : str
-        What the formula promises.
-    """
-
-    view: View
-    pictures: Mapping[str, Picture]
-    description: str
+    view: View  # occluder and person, each at its own distance
+    pictures: Mapping[str, Picture]  # by what each of them shows
+    description: str  # what the formula promises
 
 
 class WalkSource(Source):
     """A person walks to and fro behind an occluder. Each step is flashed, measured and recovered as
     fast as the machine can, at the occluder's width and the gate that the sliders say.
 
-    Parameters
-    ----------
-    scene : OcclusionScene
-    settings : ExperimentSettings
-        Of the camera.
+    `settings`: of the camera.
 
-    Notes
-    -----
     Memory: the last 32 steps.
     """
 
@@ -146,16 +130,7 @@ class WalkSource(Source):
     def pictures(self, number: int, gate: Gate) -> Mapping[str, Picture]:
         """Return what one camera sees beside what CLIP sees; see `Source`.
 
-        Parameters
-        ----------
-        number : int
-        gate : Gate
-            Not used: the gate is one of the settings.
-
-        Returns
-        -------
-        mapping of str to (rows, columns) array
-            Two beside each other in each.
+        `gate`: not used: the gate is one of the settings. Returns two beside each other in each.
         """
         pictures = self._find_frame(number).pictures
         return {
@@ -196,15 +171,7 @@ class WalkSource(Source):
 def look_behind(experiment: Experiment, opens: float) -> WalkFrame:
     """Measure a scene and recover what stands before and behind a gate.
 
-    Parameters
-    ----------
-    experiment : Experiment
-    opens : float
-        Distance from which on light passes the gate, m.
-
-    Returns
-    -------
-    WalkFrame
+    `opens`: distance from which on light passes the gate, m.
     """
     measurements = experiment.measurements
     front, behind, distances = separate_at(measurements, opens)
@@ -231,18 +198,8 @@ def separate_at(
 ) -> tuple[Picture, Picture, tuple[float, float]]:
     """Recover what sends light back before a gate opens, and after.
 
-    Parameters
-    ----------
-    measurements : TimedMeasurements
-    opens : float
-        Distance from which on light passes the gate, m.
-
-    Returns
-    -------
-    front, behind : (rows, columns) arrays
-        Dark where no light came.
-    distances : (float, float)
-        Of both, m; `opens` for one that is dark.
+    `opens`: distance from which on light passes the gate, m. Returns `front, behind` (rows,
+    columns): dark where no light came; `distances`: of both, m; `opens` for one that is dark.
     """
     returns = measurements.split_returns(opens)
     found = separate_occluder(measurements, returns=returns)
@@ -257,14 +214,7 @@ def separate_at(
 def pair_pictures(left: Picture, right: Picture) -> Picture:
     """Put two pictures of one shape beside each other, each at its own brightness.
 
-    Parameters
-    ----------
-    left, right : (rows, columns) arrays
-
-    Returns
-    -------
-    (n, m) array
-        Enlarged, so that they can be looked at.
+    `left, right` (rows, columns). Returns (n, m): enlarged, so that they can be looked at.
     """
     times = max(1, SHOWN_SIDE_PX // max(left.shape))
     parts = [
@@ -305,15 +255,6 @@ def _place_pictures(
 class GatedSource(Source):
     """Recorded or live shots behind a time gate: what comes back from nearer than a slider says is
     kept out of the cloud and of the picture.
-
-    Parameters
-    ----------
-    shots : TransientSource or ShotSource
-
-    Raises
-    ------
-    InputError
-        The source is neither.
     """
 
     def __init__(self, shots: Source) -> None:
@@ -381,16 +322,7 @@ class GatedSource(Source):
     def pictures(self, number: int, gate: Gate) -> Mapping[str, Picture]:
         """Return all light, as a camera without time of flight has it, and what passes the gate.
 
-        Parameters
-        ----------
-        number : int
-        gate : Gate
-            Not used: the gate is one of the settings.
-
-        Returns
-        -------
-        mapping of str to (rows, columns) array
-            Both beside each other.
+        `gate`: not used: the gate is one of the settings. Returns both beside each other.
         """
         frames = self._recover(number)
         distance: Any = SPEED_OF_LIGHT * frames.times / 2

@@ -67,27 +67,15 @@ RANGE_MARGIN_M = 20e-3  # of the sweep, before the occluder and behind the targe
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """One target and what became of it.
+    """One target and what became of it."""
 
-    Parameters
-    ----------
-    distance : float
-        From the views, m.
-    factor : float
-        Distance from the occluder in lengths of the inactive region.
-    correlation : float
-        Of the recovered picture with what the reference view would see without an occluder.
-    views : int
-        How many views got light from it.
-    picture, truth : (rows, columns) float32 arrays
-    """
-
-    distance: float
-    factor: float
+    distance: float  # from the views, m
+    factor: float  # distance from the occluder in lengths of the inactive region
+    # of the recovered picture with what the reference view would see without an occluder
     correlation: float
-    views: int
-    picture: Array
-    truth: Array
+    views: int  # how many views got light from it
+    picture: Array  # (rows, columns)
+    truth: Array  # (rows, columns)
 
     @property
     def expected_visible(self) -> bool:
@@ -105,19 +93,9 @@ def probe_target(
 ) -> ProbeResult:
     """Put a target behind an occluder and try to recover it.
 
-    Parameters
-    ----------
-    occluder : tuple of Body
-    region : InactiveRegion
-        Of the occluder's solid part on the axis; it must have an end.
-    factor : float
-        Where the target stands, in lengths of the region behind the occluder.
-    seed : int
-        Of the line angles and the photons.
-
-    Returns
-    -------
-    ProbeResult
+    `region`: of the occluder's solid part on the axis; it must have an end; `factor`: where the
+    target stands, in lengths of the region behind the occluder; `seed`: of the line angles and the
+    photons.
     """
     distance = region.distance + factor * region.length
     width = TARGET_WIDTH_FRACTION * region.width
@@ -155,21 +133,9 @@ def probe_with_fixed_camera(
     the board fills the picture; what is judged is a strip of it, as wide as the target of
     `probe_target`, whose pattern has nothing to do with that beside it.
 
-    Parameters
-    ----------
-    occluder : tuple of Body
-        Upright, and so tall that no view sees its ends.
-    region : InactiveRegion
-    factor : float
-        As of `probe_target`.
-    seeds : int
-        Shots of one scene, with line angles and photons of their own.
-
-    Returns
-    -------
-    list of ProbeResult
-        One for each seed, its pictures those of the strip; a correlation of 0 where no second
-        return was found.
+    `occluder`: upright, and so tall that no view sees its ends; `factor`: as of `probe_target`;
+    `seeds`: shots of one scene, with line angles and photons of their own. Returns one for each
+    seed, its pictures those of the strip; a correlation of 0 where no second return was found.
     """
     distance = region.distance + factor * region.length
     width = TARGET_WIDTH_FRACTION * region.width

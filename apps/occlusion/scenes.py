@@ -42,24 +42,14 @@ formula holds there.
 
 @dataclass(frozen=True)
 class OcclusionScene:
-    """What stands where.
-
-    Parameters
-    ----------
-    name, title : str
-    occluder, target : tuple of Body
-    region : InactiveRegion
-        Of the occluder's solid part on the axis.
-    behind : float
-        From the occluder to the target, m.
-    """
+    """What stands where."""
 
     name: str
     title: str
     occluder: tuple[Body, ...]
     target: tuple[Body, ...]
-    region: InactiveRegion
-    behind: float = TARGET_DEPTH_M
+    region: InactiveRegion  # of the occluder's solid part on the axis
+    behind: float = TARGET_DEPTH_M  # from the occluder to the target, m
 
     @property
     def distance(self) -> float:
@@ -81,26 +71,14 @@ class OcclusionScene:
 
 
 def make_walking_scene(name: str) -> OcclusionScene:
-    """Return a scene of `SCENES` with a person behind its occluder, instead of what stands there.
-
-    Raises
-    ------
-    InputError
-        No scene has that name.
-    """
+    """Return a scene of `SCENES` with a person behind its occluder, instead of what stands there."""
     scene = make_occlusion_scene(name)
     behind = scene.title.partition(" behind ")[2]
     return replace(scene, title=f"a person behind {behind}", target=_make_figure())
 
 
 def make_occlusion_scene(name: str) -> OcclusionScene:
-    """Return a scene of `SCENES`.
-
-    Raises
-    ------
-    InputError
-        No scene has that name.
-    """
+    """Return a scene of `SCENES`."""
     if name not in SCENES:
         raise InputError(f"unknown scene '{name}'; take one of {', '.join(SCENES)}")
     return SCENES[name]()
@@ -109,16 +87,7 @@ def make_occlusion_scene(name: str) -> OcclusionScene:
 def make_upright_bar(width: float, distance: float = OCCLUDER_DISTANCE_M) -> Body:
     """Return a bar on the axis, so long that no view sees its ends.
 
-    Parameters
-    ----------
-    width : float
-        Metres.
-    distance : float
-        From the views, m.
-
-    Returns
-    -------
-    Body
+    `width`: metres; `distance`: from the views, m.
     """
     return _make_plate(width, 40 * width, make_plain_pattern(OCCLUDER_REFLECTANCE), z=distance)
 

@@ -28,20 +28,11 @@ SEED = 0
 
 @dataclass(frozen=True)
 class BestCase:
-    """A row of a table, and what is measured and scored for it.
+    """A row of a table, and what is measured and scored for it."""
 
-    Parameters
-    ----------
-    labels : tuple of str
-        Of the row.
-    case : Case
-        With the settings of choice.
-    is_light_field : bool
-        All views are scored instead of the picture refocused at the case's shear.
-    """
-
-    labels: tuple[str, ...]
-    case: Case
+    labels: tuple[str, ...]  # of the row
+    case: Case  # with the settings of choice
+    # all views are scored instead of the picture refocused at the case's shear
     is_light_field: bool = False
 
     @property
@@ -52,18 +43,10 @@ class BestCase:
 
 @dataclass(frozen=True)
 class BestFigure:
-    """What came out for a row.
+    """What came out for a row."""
 
-    Parameters
-    ----------
-    percent : float
-        NMSE.
-    setting : str
-        That gave it.
-    """
-
-    percent: float
-    setting: str
+    percent: float  # NMSE
+    setting: str  # that gave it
 
 
 def choose_settings(case: Case, is_light_field: bool = False) -> BestCase:
@@ -83,23 +66,9 @@ def solve_best(
 ) -> dict[str, BestFigure]:
     """Solve the rows that are not known yet, measurements on all cores.
 
-    Parameters
-    ----------
-    cases : sequence of BestCase
-    library : Library
-        Light fields by name.
-    known : mapping of str to BestFigure
-        By `BestCase.key`, of an earlier run.
-    keep : callable
-        Called with all figures so far after each measurement, so that a run that is stopped can go
-        on.
-    advance : callable
-        Called with the number of rows just done.
-
-    Returns
-    -------
-    dict of str to BestFigure
-        By `BestCase.key`, of all rows.
+    `library`: light fields by name; `known`: by `BestCase.key`, of an earlier run; `keep`: called
+    with all figures so far after each measurement, so that a run that is stopped can go on;
+    `advance`: called with the number of rows just done. Returns by `BestCase.key`, of all rows.
     """
     found = {one.key: known[one.key] for one in cases if one.key in known}
     advance(len(found))

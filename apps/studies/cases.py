@@ -32,12 +32,8 @@ from tofclip.threads import map_parallel
 class Library:
     """Light fields by name, each rendered or read once.
 
-    Parameters
-    ----------
-    data : Path, optional
-        Folder of recorded data, whose ``lightfields`` holds NPZ light fields.
-    array : CameraArray, optional
-        Cameras of the rendered ones; the paper's 8 x 8 views of 128 x 128 pixels unless given.
+    `data`: folder of recorded data, whose ``lightfields`` holds NPZ light fields; `array`: cameras
+    of the rendered ones; the paper's 8 x 8 views of 128 x 128 pixels unless given.
     """
 
     def __init__(self, data: Path | None = None, array: CameraArray | None = None) -> None:
@@ -47,12 +43,9 @@ class Library:
     def light_field(self, name: str) -> LightField:
         """Return the light field of a scene.
 
-        Parameters
-        ----------
-        name : str
-            A name of `tofclip.simulate.light_fields.SCENES`, ``NAME:EDIT`` with an edit of the flip
-            test, ``NAME:4x4`` for its middle sixteen views, ``NAME:flat`` for its reference view as
-            a poster at s = 0, or ``data:NAME`` for a recorded one.
+        `name`: A name of `tofclip.simulate.light_fields.SCENES`, ``NAME:EDIT`` with an edit of the
+        flip test, ``NAME:4x4`` for its middle sixteen views, ``NAME:flat`` for its reference view
+        as a poster at s = 0, or ``data:NAME`` for a recorded one.
         """
         if name not in self._cache:
             self._cache[name] = self._make_light_field(name)
@@ -67,13 +60,7 @@ class Library:
         return self.data is not None and (self.data / name).is_file()
 
     def recording(self, name: str) -> Path:
-        """Return the path of a file of the folder of recorded data.
-
-        Raises
-        ------
-        InputError
-            No folder was given.
-        """
+        """Return the path of a file of the folder of recorded data."""
         if self.data is None:
             raise InputError(f"{name} is recorded data; name the folder that holds it by --data")
         return self.data / name
@@ -110,58 +97,29 @@ CAMERA_NAMES = {
 
 @dataclass(frozen=True)
 class Case:
-    """One figure of a table.
+    """One figure of a table."""
 
-    Parameters
-    ----------
-    labels : tuple of str
-        Of its row.
-    scene : str
-        As the library knows it.
-    encoder : str
-    sampling_ratio, shear : float
-    paper : float or None
-        NMSE in the paper, per cent.
-    bad_fraction : float
-    photons : float or None
-    white_noise : float
-        Standard deviation relative to that of the measurements.
-    data_term : str
-        Of the recovery.
-    """
-
-    labels: tuple[str, ...]
-    scene: str
+    labels: tuple[str, ...]  # of its row
+    scene: str  # as the library knows it
     encoder: str
     sampling_ratio: float
     shear: float
-    paper: float | None = None
+    paper: float | None = None  # NMSE in the paper, per cent
     bad_fraction: float = 0.0
     photons: float | None = None
-    white_noise: float = 0.0
-    data_term: str = "squares"
+    white_noise: float = 0.0  # standard deviation relative to that of the measurements
+    data_term: str = "squares"  # of the recovery
 
 
 @dataclass(frozen=True)
 class SolvedCase:
-    """A case with what came out.
-
-    Parameters
-    ----------
-    case : Case
-    percent : tuple of float
-        NMSE of each seed.
-    picture, truth : (rows, columns) arrays
-        The first seed's, and shift-and-add of the true views.
-    weight : float
-        Of the first seed's prior.
-    """
+    """A case with what came out."""
 
     case: Case
-    percent: tuple[float, ...]
-    picture: NDArray[Any]
-    truth: NDArray[Any]
-    weight: float
+    percent: tuple[float, ...]  # NMSE of each seed
+    picture: NDArray[Any]  # (rows, columns), the first seed's, and shift-and-add of the true views
+    truth: NDArray[Any]  # (rows, columns), the first seed's, and shift-and-add of the true views
+    weight: float  # of the first seed's prior
 
     def row(self) -> Row:
         """Return the row of the table."""
@@ -179,20 +137,8 @@ def solve_cases(
 
     The prior's weight is chosen by cross-validation with the first seed, and kept for the others.
 
-    Parameters
-    ----------
-    cases : sequence of Case
-    library : Library
-        Light fields by name.
-    seeds : int
-        Repeats with other cameras and noise.
-    advance : callable
-        Called with 1 after each case and seed.
-
-    Returns
-    -------
-    list of SolvedCase
-        In the order of the cases.
+    `library`: light fields by name; `seeds`: repeats with other cameras and noise; `advance`:
+    called with 1 after each case and seed. Returns in the order of the cases.
     """
     # Made once, before the threads start: many cases share a truth, and the library keeps a plain
     # dictionary.
@@ -218,16 +164,7 @@ def solve_cases(
 def measure_case(case: Case, library: Library, seed: int) -> ClipMeasurement:
     """Measure the true views as a case asks for.
 
-    Parameters
-    ----------
-    case : Case
-    library : Library
-    seed : int
-        Of camera and noise.
-
-    Returns
-    -------
-    ClipMeasurement
+    `seed`: of camera and noise.
     """
     setup = CameraSetup(case.encoder, case.sampling_ratio, seed)
     clean = measure(library.light_field(case.scene), setup)

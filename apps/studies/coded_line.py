@@ -34,22 +34,9 @@ def make_coded_line_sensors(
 ) -> list[SliceConvolution]:
     """Build 1D sensors behind coded lines, each with a code of its own.
 
-    Parameters
-    ----------
-    image_shape : (int, int)
-    lines : int
-        M.
-    width_px : int
-        N_p.
-    steepest : float
-        Angles run evenly from minus this to this, rad; 0 keeps all lines upright.
-    seed : int
-
-    Returns
-    -------
-    list of SliceConvolution
-        One for each line, long enough for lines of 45 degrees from all of the picture, whatever
-        `steepest` is.
+    `lines`: m; `width_px`: n_p; `steepest`: angles run evenly from minus this to this, rad; 0 keeps
+    all lines upright. Returns one for each line, long enough for lines of 45 degrees from all of
+    the picture, whatever `steepest` is.
     """
     random = np.random.default_rng(seed)
     spreads = [
@@ -66,9 +53,7 @@ def compute_column_ranks(sensors: Sequence[SliceConvolution]) -> NDArray[np.int6
     A column of the picture's spectrum has as many unknowns as the picture has rows, and only
     rank(G_k) equations: one for a lone slice, whatever its PSF; at most M for M of them.
 
-    Returns
-    -------
-    (frequencies,) array
+    Returns (frequencies,).
     """
     spectra = np.concatenate([one.spectra for one in sensors], axis=1)
     ranks: NDArray[np.int64] = np.linalg.matrix_rank(spectra.astype(np.complex128), rtol=1e-5)
@@ -84,24 +69,11 @@ def recover_from_lines(
     """Measure each view of a light field by a coded line of its own, and recover the picture that
     is in focus at one depth (supplement Eq. 21).
 
-    Parameters
-    ----------
-    light_field : LightField
-        As many views as there are sensors. Each view's own picture is measured, so that surfaces
-        out of focus enter the measurements as they would in an instrument.
-    shear : float
-        Depth of the picture, pixels per view step.
-    sensors : sequence of SliceConvolution
-        One 1D sensor for each view.
-    weight : float, optional
-        Of total variation, relative to the largest value of A'f. By default it is chosen by
-        cross-validation: no true picture is looked at.
-
-    Returns
-    -------
-    picture : (rows, columns) float32 array
-    weight : float
-        The one that was used.
+    `light_field`: as many views as there are sensors. Each view's own picture is measured, so that
+    surfaces out of focus enter the measurements as they would in an instrument; `shear`: depth of
+    the picture, pixels per view step; `sensors`: one 1D sensor for each view; `weight`: of total
+    variation, relative to the largest value of A'f. By default it is chosen by cross-validation: no
+    true picture is looked at. Returns `picture` (rows, columns); `weight`: the one that was used.
     """
     measured = [
         one(picture).ravel() for one, picture in zip(sensors, light_field.pictures, strict=True)
@@ -138,20 +110,11 @@ def _tabulate_model(
 
 @dataclass(frozen=True)
 class LineArm:
-    """One arm of the comparison: ten lines of one width, upright or rotated.
-
-    Parameters
-    ----------
-    name : str
-    width_px : int
-        N_p.
-    max_angle : float
-        Angles run evenly from minus this to this, rad.
-    """
+    """One arm of the comparison: ten lines of one width, upright or rotated."""
 
     name: str
-    width_px: int
-    max_angle: float
+    width_px: int  # n_p
+    max_angle: float  # angles run evenly from minus this to this, rad
 
 
 @dataclass(frozen=True)
@@ -165,19 +128,8 @@ class ArmResult:
 def measure_arm(light_field: LightField, shear: float, seeds: int, arm: LineArm) -> ArmResult:
     """Recover a light field's picture through an arm's lines, once for each seed of their codes.
 
-    Parameters
-    ----------
-    light_field : LightField
-        A view for each line.
-    shear : float
-        Depth of the picture; the truth is shift-and-add of the views.
-    seeds : int
-        The prior's weight is chosen with the first one and kept for the others.
-    arm : LineArm
-
-    Returns
-    -------
-    ArmResult
+    `light_field`: A view for each line; `shear`: depth of the picture; the truth is shift-and-add
+    of the views; `seeds`: the prior's weight is chosen with the first one and kept for the others.
     """
     truth = light_field.refocus(shear)
     shape = (truth.shape[0], truth.shape[1])
@@ -193,19 +145,7 @@ def measure_arm(light_field: LightField, shear: float, seeds: int, arm: LineArm)
 def compute_psnr_db(estimate: NDArray[Any], truth: NDArray[Any]) -> float:
     """Peak signal-to-noise ratio in dB, relative to the brightest pixel of the truth.
 
-    Parameters
-    ----------
-    estimate, truth : (rows, columns) array
-
-    Returns
-    -------
-    float
-        dB.
-
-    Raises
-    ------
-    InputError
-        The estimate equals the truth.
+    `estimate, truth` (rows, columns). Returns dB.
     """
     error = float(np.mean((estimate.astype(np.float64) - truth) ** 2))
     if error == 0:
@@ -222,18 +162,8 @@ MAX_ANGLES_RAD = {"upright": 0.0, "rotated": MAX_ANGLE_RAD}
 def run_line_rotation(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover letters through ten coded lines of several widths, with and without rotation.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
+    `library`: light fields by name; `seeds`: repeats with other random numbers; `advance`: called
+    with the number of steps just done.
     """
     light_field = halve_pictures(select_views(library.light_field(SCENE), LINES))
     shear = SHEAR / 2  # a pixel is twice as wide
@@ -260,17 +190,7 @@ def run_line_rotation(library: Library, seeds: int, advance: Advance) -> Outcome
 
 
 def select_views(light_field: LightField, count: int) -> LightField:
-    """Return the `count` views nearest to the middle of the aperture.
-
-    Parameters
-    ----------
-    light_field : LightField
-    count : int
-
-    Returns
-    -------
-    LightField
-    """
+    """Return the `count` views nearest to the middle of the aperture."""
     nearest = np.argsort((light_field.views**2).sum(axis=1), kind="stable")[:count]
     return LightField(light_field.pictures[nearest], light_field.views[nearest])
 

@@ -40,19 +40,9 @@ POSTER_CASES = [
 def run_area_sensors(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover scenes of three complexities from every n-th sensor pixel on either axis.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     solved = solve_cases(POSTER_CASES, library, seeds, advance)
     panels = []
@@ -82,23 +72,10 @@ ITERATIONS = 200
 
 @dataclass(frozen=True)
 class DiffuserRecording:
-    """What a diffuser put on an area sensor, and what it does to a point source.
+    """What a diffuser put on an area sensor, and what it does to a point source."""
 
-    Parameters
-    ----------
-    point_spread : (rows, columns) array
-        Background taken off.
-    measurements : (rows, columns) array
-        Background taken off; any scale.
-
-    Raises
-    ------
-    ShapeError, InputError
-        PSF and measurements are not of one shape, or nothing was recorded.
-    """
-
-    point_spread: NDArray[np.float64]
-    measurements: NDArray[np.float64]
+    point_spread: NDArray[np.float64]  # (rows, columns), background taken off
+    measurements: NDArray[np.float64]  # (rows, columns), background taken off; any scale
 
     def __post_init__(self) -> None:
         if self.point_spread.ndim != 2 or self.measurements.shape != self.point_spread.shape:
@@ -115,23 +92,13 @@ class DiffuserRecording:
 
 @dataclass(frozen=True)
 class DiffuserRecovery:
-    """The scene behind a recording.
+    """The scene behind a recording."""
 
-    Parameters
-    ----------
-    scene : (2 rows, 2 columns) float32 array
-        Twice as high and wide as the sensor: a PSF as large as the sensor brings light from there.
-    pitch_px : int
-        Every so manieth pixel of either axis was used.
-    relative_residual : float
-        ``|A h - f| / |f|`` over the measurements that were used.
-    iterations : int
-    seconds : float
-    """
-
+    # (2 rows, 2 columns), twice as high and wide as the sensor: a PSF as large as the sensor brings
+    # light from there
     scene: NDArray[Any]
-    pitch_px: int
-    relative_residual: float
+    pitch_px: int  # every so manieth pixel of either axis was used
+    relative_residual: float  # ``|A h - f| / |f|`` over the measurements that were used
     iterations: int
     seconds: float
 
@@ -139,12 +106,6 @@ class DiffuserRecovery:
 def read_diffuser_recording(path: str | Path) -> DiffuserRecording:
     """Read an ``.npz`` with `psf` and `raw`, both (rows, columns) in counts, and one number
     `background`.
-
-    Raises
-    ------
-    StorageError, FileFormatError, InputError
-        The file cannot be read, an entry is absent or of another shape, or nothing is above the
-        background.
     """
     archive = Archive(path)
     background = float(archive.finite_array("background"))
@@ -160,17 +121,8 @@ def build_diffuser_model(recording: DiffuserRecording, pitch_px: int) -> LinearO
     """Return the map from the scene, twice as high and wide as the sensor, to every n-th pixel's
     measurements.
 
-    Parameters
-    ----------
-    recording : DiffuserRecording
-        Sensor image and measured point-spread function.
-    pitch_px : int
-        Sensor pixels from one used pixel to the next.
-
-    Returns
-    -------
-    LinearOperator
-        (2 rows, 2 columns) pictures to (measurements,) vectors.
+    `recording`: sensor image and measured point-spread function; `pitch_px`: sensor pixels from one
+    used pixel to the next. Returns (2 rows, 2 columns) pictures to (measurements,) vectors.
     """
     rows, columns = recording.measurements.shape
     measured = MeasuredPointSpreads(recording.point_spread[np.newaxis], [0.0])
@@ -184,17 +136,8 @@ def recover_diffuser_scene(
 ) -> DiffuserRecovery:
     """Recover the scene with nonnegative total variation from every n-th pixel of either axis.
 
-    Parameters
-    ----------
-    recording : DiffuserRecording
-    pitch_px : int
-        1 for the full measurement.
-    iterations : int
-        About 16 ms each for a sensor of 300 x 400 pixels on one core.
-
-    Returns
-    -------
-    DiffuserRecovery
+    `pitch_px`: 1 for the full measurement; `iterations`: about 16 ms each for a sensor of 300 x 400
+    pixels on one core.
     """
     model = build_diffuser_model(recording, pitch_px)
     every_nth = recording.measurements[::pitch_px, ::pitch_px]
@@ -215,19 +158,9 @@ def run_lensless_hand(library: Library, seeds: int, advance: Advance) -> Outcome
     """Recover the scene from every pixel, every second and every third on either axis; nothing here
     is random.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     recording = read_diffuser_recording(library.recording(RECORDING))
     recoveries = []

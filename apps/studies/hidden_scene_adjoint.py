@@ -40,28 +40,24 @@ DOCUMENT_MARK = "<!-- adjoint study -->"
 
 @dataclass(frozen=True)
 class StudyRow:
-    """What one exposure and sampling ratio give.
-
-    Parameters
-    ----------
-    exposure : str
-    largest_count : float
-    sampling_ratio : float
-    adjoint, cut, linear : float
-        Correlation of the front view with that of all wall points at the same exposure: for
-        recovery by the adjoint, the same with both volumes cut off at the threshold, and for
-        recovery by the linear inverse.
-    full : float
-        Correlation of that reference itself with the noiseless one.
-    """
+    """What one exposure and sampling ratio give."""
 
     exposure: str
     largest_count: float
     sampling_ratio: float
+    # correlation of the front view with that of all wall points at the same exposure: for recovery
+    # by the adjoint, the same with both volumes cut off at the threshold, and for recovery by the
+    # linear inverse
     adjoint: float
+    # correlation of the front view with that of all wall points at the same exposure: for recovery
+    # by the adjoint, the same with both volumes cut off at the threshold, and for recovery by the
+    # linear inverse
     cut: float
+    # correlation of the front view with that of all wall points at the same exposure: for recovery
+    # by the adjoint, the same with both volumes cut off at the threshold, and for recovery by the
+    # linear inverse
     linear: float
-    full: float
+    full: float  # correlation of that reference itself with the noiseless one
 
 
 def build_office(spacing: float = 0.06) -> HiddenScene:
@@ -99,22 +95,8 @@ def build_office_grid() -> Grid:
 def build_tomography(points: int, sampling_ratio: float) -> RadonProjection:
     """Line projections of a picture at ``sampling_ratio * points`` angles, evenly over half a turn.
 
-    Parameters
-    ----------
-    points : int
-        Wall points along a side.
-    sampling_ratio : float
-        Measurements over wall points.
-
-    Returns
-    -------
-    RadonProjection
-        (points, points) pictures to (angles * points,) vectors.
-
-    Raises
-    ------
-    InputError
-        The ratio is too small for a single angle.
+    `points`: wall points along a side; `sampling_ratio`: measurements over wall points. Returns
+    (points, points) pictures to (angles * points,) vectors.
     """
     angles = round(sampling_ratio * points)
     if angles < 1:
@@ -133,19 +115,8 @@ def find_expected_peak(capture: Capture, largest_count: float, seed: int) -> flo
     With millions of measurements the largest count lies far above the largest expected one: 6 where
     that is about 1.
 
-    Parameters
-    ----------
-    capture : Capture
-        Expected signal, of any scale.
-    largest_count : float
-        Counts.
-    seed : int
-        Of the Poisson noise.
-
-    Returns
-    -------
-    float
-        Counts, by bisection.
+    `capture`: expected signal, of any scale; `largest_count`: counts; `seed`: of the Poisson noise.
+    Returns counts, by bisection.
     """
     relative = (
         capture.signal[capture.signal > PEAK_FRACTION * capture.signal.max()] / capture.signal.max()
@@ -161,15 +132,7 @@ def find_expected_peak(capture: Capture, largest_count: float, seed: int) -> flo
 def correlate_views(one: Volume, other: Volume) -> float:
     """Pearson correlation of two volumes' front views.
 
-    Parameters
-    ----------
-    one, other : Volume
-        On grids of the same lateral shape.
-
-    Returns
-    -------
-    float
-        -1 to 1.
+    `one, other`: on grids of the same lateral shape. Returns -1 to 1.
     """
     first, second = (volume.maximum_projection().brightness.ravel() for volume in (one, other))
     return float(np.corrcoef(first, second)[0, 1])
@@ -178,18 +141,8 @@ def correlate_views(one: Volume, other: Volume) -> float:
 def run_study(capture: Capture, grid: Grid, solver: Method, seed: int = 0) -> list[StudyRow]:
     """Image a noiseless capture at every exposure and sampling ratio.
 
-    Parameters
-    ----------
-    capture : Capture
-        Of rows and as many columns.
-    grid : Grid
-    solver : Method
-    seed : int
-        Of the photons; those of the reference and of the compressed measurements are independent.
-
-    Returns
-    -------
-    list of StudyRow
+    `capture`: of rows and as many columns; `seed`: of the photons; those of the reference and of
+    the compressed measurements are independent.
     """
     # Without noise: what more light could reach at best.
     clean = solver.reconstruct(capture, grid)
@@ -238,16 +191,7 @@ def format_table(rows: Sequence[StudyRow]) -> str:
 def replace_between_marks(text: str, document: Path) -> None:
     """Replace what stands between the two marks of a document.
 
-    Parameters
-    ----------
-    text : str
-    document : Path
-        Rewritten whole.
-
-    Raises
-    ------
-    InputError
-        The document does not hold the mark twice.
+    `document`: rewritten whole.
     """
     from tofclip.files import atomic_path, translate_read_errors
 

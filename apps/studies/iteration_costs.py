@@ -25,30 +25,18 @@ NORM_ITERATIONS = 10
 
 @dataclass(frozen=True)
 class IterationCost:
-    """One row of Table 1, with what was measured.
-
-    Parameters
-    ----------
-    method : str
-    recovers : str
-        ``"light field"`` or ``"refocused picture"``.
-    measurements, unknowns : int
-    complexity : str
-        Of one iteration as the paper has it: N pixels on a side, n_a views on a side, m measurements, r
-        exposures, k operations of the prior for each unknown.
-    seconds : float
-        Of one whole iteration: model, prior and bookkeeping; the median of the repeats.
-    model_seconds : float
-        Of the model and its adjoint alone, the median of the repeats.
-    """
+    """One row of Table 1, with what was measured."""
 
     method: str
-    recovers: str
+    recovers: str  # ``"light field"`` or ``"refocused picture"``
     measurements: int
     unknowns: int
+    # of one iteration as the paper has it: N pixels on a side, n_a views on a side, m measurements,
+    # r exposures, k operations of the prior for each unknown
     complexity: str
+    # of one whole iteration: model, prior and bookkeeping; the median of the repeats
     seconds: float
-    model_seconds: float
+    model_seconds: float  # of the model and its adjoint alone, the median of the repeats
 
 
 @dataclass(frozen=True)
@@ -71,24 +59,10 @@ def measure_iteration_costs(
     """Time one iteration of every method of Table 1: FISTA with total variation for all of them
     alike.
 
-    Parameters
-    ----------
-    light_field : LightField
-    shear : float
-        Depth that CLIP refocuses on.
-    exposures : int
-        r, of Ashok's and Babacan's methods; the others take one.
-    sampling_ratio : float
-        Of CLIP.
-    repeats : int
-        Iterations timed, after a first one that is not.
+    `shear`: depth that CLIP refocuses on; `exposures`: r, of Ashok's and Babacan's methods; the
+    others take one; `sampling_ratio`: of CLIP; `repeats`: iterations timed, after a first one that
+    is not.
 
-    Returns
-    -------
-    list of IterationCost
-
-    Notes
-    -----
     Memory is about ten light fields in float32.
     """
     views = [(v, u) for v, u in light_field.views.tolist()]
@@ -181,19 +155,9 @@ SCENE, SHEAR = "letters", -0.4
 def run_iteration_table(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Time every method; the repeats stand in for seeds.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     costs = measure_iteration_costs(library.light_field(SCENE), SHEAR, repeats=2 * seeds)
     advance(1)

@@ -34,14 +34,10 @@ POWER_ITERATIONS = 15
 
 @dataclass(frozen=True)
 class LightFieldDictionary:
-    """Atoms that patches of light fields are made of.
+    """Atoms that patches of light fields are made of."""
 
-    Parameters
-    ----------
-    atoms : (atoms, views, rows, columns) float32 array
-        Of unit norm. The first is constant: brightness costs nothing in a recovery.
-    """
-
+    # (atoms, views, rows, columns), of unit norm. The first is constant: brightness costs nothing
+    # in a recovery
     atoms: Array
 
     @property
@@ -56,25 +52,8 @@ def learn_dictionary(
     """Learn atoms from patches of light fields with the same views (scikit-learn's online
     dictionary learning).
 
-    Parameters
-    ----------
-    light_fields : sequence of LightField
-    patch_px : int
-        Rows and columns of a patch; it has all views.
-    atoms : int
-    seed : int
-        Of the patches that are looked at and of the learning.
-
-    Returns
-    -------
-    LightFieldDictionary
-
-    Raises
-    ------
-    MissingDependencyError
-        scikit-learn is not installed.
-    ShapeError
-        The light fields have different numbers of views or are smaller than a patch.
+    `patch_px`: rows and columns of a patch; it has all views; `seed`: of the patches that are
+    looked at and of the learning.
     """
     try:
         from sklearn.decomposition import PCA, MiniBatchDictionaryLearning
@@ -118,28 +97,10 @@ def recover_with_dictionary(
     For each patch ``1/2 |y - sum_k C_k (D a)_k|^2 + w |a|_1`` is minimised by FISTA; the constant
     atom is free.
 
-    Parameters
-    ----------
-    exposure : (rows, columns) array
-    codes : (views, rows, columns) array
-        The mask as each view sees it, `MarwahCamera.codes`.
-    dictionary : LightFieldDictionary
-    weight : float
-        Sparsity, relative to each patch's largest correlation with an atom.
-    iterations : int
+    `exposure` (rows, columns); `codes` (views, rows, columns): the mask as each view sees it,
+    `MarwahCamera.codes`; `weight`: sparsity, relative to each patch's largest correlation with an
+    atom. Returns (views, rows, columns).
 
-    Returns
-    -------
-    (views, rows, columns) float32 array
-
-    Raises
-    ------
-    ShapeError
-        Mask codes, dictionary and exposure do not fit each other, or the exposure is smaller than a
-        patch.
-
-    Notes
-    -----
     Memory beyond the result is that of 64 patches' coded dictionaries, 4 MB with the default sizes.
     """
     if (

@@ -49,20 +49,9 @@ def compute_depth_accuracy(
     At an object's border the shear of either side counts, two pixels wide: what is in focus there
     is both.
 
-    Parameters
-    ----------
-    found, true : (rows, columns) arrays
-        Shears.
-    picture : (rows, columns) array
-        Textured pixels have a slope of a fifth of its steepest or more; six pixels at the border do
-        not count.
-    step : float
-        Between the shears of the focal stack.
-
-    Returns
-    -------
-    float
-        0 to 1.
+    `found, true` (rows, columns): shears; `picture` (rows, columns): textured pixels have a slope
+    of a fifth of its steepest or more; six pixels at the border do not count; `step`: between the
+    shears of the focal stack. Returns 0 to 1.
     """
     slope = np.hypot(*np.gradient(picture))
     textured = slope > TEXTURE_THRESHOLD * np.quantile(slope, 0.99)
@@ -79,19 +68,9 @@ def run_light_field_processing(library: Library, seeds: int, advance: Advance) -
     """Score depth from focus against the exact shears and a viewpoint against a camera rendered
     there.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     rows, panels = [], []
     for name in FOCUS_SCENES:
@@ -159,19 +138,9 @@ def run_glossy_plate(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover a plate of either kind from CLIP-1D at SR = 1; say how even its light is, and the
     errors.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     rows, panels = [], []
     pattern = make_text_pattern("TOF\nCLIP", 0.05, 0.35)

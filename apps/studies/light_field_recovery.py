@@ -73,17 +73,7 @@ REFOCUSING_CASES = [
 def recover_light_field(case: Case, library: Library, seed: int) -> LightField:
     """Recover all views that got measurements, with total variation over pixels and views.
 
-    Parameters
-    ----------
-    case : Case
-    library : Library
-    seed : int
-        Of camera and noise.
-
-    Returns
-    -------
-    LightField
-        Pictures (views, rows, columns).
+    `seed`: of camera and noise. Returns pictures (views, rows, columns).
     """
     measurement = measure_case(case, library, seed)
     camera, views = measurement.camera(), measurement.views
@@ -105,19 +95,9 @@ def run_table3(library: Library, seeds: int, advance: Advance) -> Outcome:
     """CLIP-0D of printed letters with 4 x 4 views: the whole light field, and pictures at four
     depths.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     solved = solve_cases(PICTURE_CASES, library, seeds, advance)
     found = _recover_light_fields(LIGHT_FIELD_CASES, library, seeds, advance)
@@ -140,19 +120,9 @@ def run_table3(library: Library, seeds: int, advance: Advance) -> Outcome:
 def run_table4(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Pictures refocused from a recovered light field beside those recovered directly, at SR = 1.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     direct = [case for case in REFOCUSING_CASES if case.labels[-1] == DIRECT_LABEL]
     wholes = [

@@ -48,19 +48,9 @@ def run_black_occluders(library: Library, seeds: int, advance: Advance) -> Outco
     """Recover what stands behind the occluder; shift-and-add is the truth, the bare target stands
     beside it.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     solved = solve_cases(BLACK_CASES, library, seeds, advance)
     rows, panels = [one.row() for one in solved], []
@@ -111,19 +101,9 @@ def run_flash_occlusion(library: Library, seeds: int, advance: Advance) -> Outco
     """Flash scenes behind occluders, gate, and recover with and without the model of what the
     occluder hides.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     side = min(library.array.image_shape)
     cases = [
@@ -207,19 +187,9 @@ def run_inactive_region(library: Library, seeds: int, advance: Advance) -> Outco
     """Put small targets behind bars of several widths and at several distances, inside the region
     and beyond.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     places = [
         TargetPosition(width, distance, factor)

@@ -23,21 +23,11 @@ CROSS_VALIDATED = "chosen by cross-validation with the first seed, without the t
 
 @dataclass(frozen=True)
 class Row:
-    """One figure of a table.
+    """One figure of a table."""
 
-    Parameters
-    ----------
-    labels : tuple of str
-        One for each of the table's columns.
-    ours : tuple of float
-        One for each seed.
-    paper : float or None
-        None: the paper has no such figure.
-    """
-
-    labels: tuple[str, ...]
-    ours: tuple[float, ...]
-    paper: float | None = None
+    labels: tuple[str, ...]  # one for each of the table's columns
+    ours: tuple[float, ...]  # one for each seed
+    paper: float | None = None  # none: the paper has no such figure
 
     @property
     def mean(self) -> float:
@@ -61,63 +51,30 @@ class Panel:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Rows and pictures of a study.
+    """Rows and pictures of a study."""
 
-    Parameters
-    ----------
-    columns : tuple of str
-        What the rows' labels say.
-    figure : str
-        What the rows' figures are, with the unit.
-    rows : tuple of Row
-    panels : tuple of tuple of Panel
-        Pictures as they are laid out: one tuple for each line.
-    """
-
-    columns: tuple[str, ...]
-    figure: str
+    columns: tuple[str, ...]  # what the rows' labels say
+    figure: str  # what the rows' figures are, with the unit
     rows: tuple[Row, ...]
-    panels: tuple[tuple[Panel, ...], ...]
+    panels: tuple[tuple[Panel, ...], ...]  # pictures as they are laid out: one tuple for each line
 
 
 @dataclass(frozen=True)
 class Study:
-    """A table or figure of the paper that can be made again.
+    """A table or figure of the paper that can be made again."""
 
-    Parameters
-    ----------
-    name : str
-        What the user types.
-    aliases : tuple of str
-        Other names: the figures that show the table's pictures.
-    title : str
-    note : str
-        What differs from the paper.
-    weight : str
-        How the weight of the prior was chosen: the end of a sentence.
-    seconds : float
-        About what a seed costs on two cores.
-    seeded : bool
-        False: it has no random choices, more seeds change nothing.
-    work : callable
-        (library, seeds, advance) to the outcome; calls `advance` with shares that add up to `steps`
-        per seed.
-    steps : int
-        Advances for each seed.
-    recording : str or None
-        What it needs of the folder of recorded data; without that it cannot be made.
-    best : tuple of BestCase
-        Rows of the paper that are also solved with the settings of choice.
-    """
-
-    name: str
-    aliases: tuple[str, ...]
+    name: str  # what the user types
+    aliases: tuple[str, ...]  # other names: the figures that show the table's pictures
     title: str
-    note: str
-    weight: str
-    seconds: float
-    steps: int
+    note: str  # what differs from the paper
+    weight: str  # how the weight of the prior was chosen: the end of a sentence
+    seconds: float  # about what a seed costs on two cores
+    steps: int  # advances for each seed
+    # (library, seeds, advance) to the outcome; calls `advance` with shares that add up to `steps`
+    # per seed
     work: Callable[[Library, int, Advance], Outcome]
-    seeded: bool = True
+    seeded: bool = True  # false: it has no random choices, more seeds change nothing
+    # what it needs of the folder of recorded data; without that it cannot be made
     recording: str | None = None
+    # rows of the paper that are also solved with the settings of choice
     best: tuple[BestCase, ...] = ()

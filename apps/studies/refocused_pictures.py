@@ -43,19 +43,9 @@ FLIP_CASES = [
 def run_flip_test(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover every edit of both scenes at three depths with both cameras.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     solved = solve_cases(FLIP_CASES, library, seeds, advance)
     panels = []
@@ -138,19 +128,9 @@ def run_invalid_measurements(library: Library, seeds: int, advance: Advance) -> 
     """Set a fraction of the measurements to 0 or to the largest; recover with squares, and with
     Huber's term.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     return _make_outcome(
         ("camera", "scene", "bad measurements", "data term"),
@@ -161,19 +141,9 @@ def run_invalid_measurements(library: Library, seeds: int, advance: Advance) -> 
 def run_few_photons(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Count photons; the largest measurement has the number given.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     return _make_outcome(
         ("camera", "scene", "photons"), solve_cases(PHOTON_CASES, library, seeds, advance)
@@ -229,19 +199,9 @@ def run_angle_assignment(library: Library, seeds: int, advance: Advance) -> Outc
     """Recover with both ways of dealing; others' light fields too where they are at hand, as
     figures only.
 
-    Parameters
-    ----------
-    library : Library
-        Light fields and recordings by name.
-    seeds : int
-        Repeats with other random numbers.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
-        A row of figures for each case, and the pictures to show.
+    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+    `advance`: called with the number of steps just done. Returns A row of figures for each case,
+    and the pictures to show.
     """
     scenes = ASSIGNMENT_SCENES | {
         f"data:{name}": shear

@@ -33,13 +33,7 @@ STUDIES: tuple[Study, ...] = (
 
 
 def find_studies(name: str) -> tuple[Study, ...]:
-    """Return the study of a name, of a figure that shows its pictures, or every one for ``all``.
-
-    Raises
-    ------
-    InputError
-        Nothing has that name.
-    """
+    """Return the study of a name, of a figure that shows its pictures, or every one for ``all``."""
     found = tuple(study for study in STUDIES if name in ("all", study.name, *study.aliases))
     if not found:
         known = ", ".join(word for study in STUDIES for word in (study.name, *study.aliases))

@@ -30,15 +30,10 @@ STACK_SHEARS = np.arange(-1.3, 0.61, 0.3)
 class RepresentationTable:
     """A scene and the paper's figures: NMSE in per cent by camera and shear over the sampling
     ratios.
-
-    Parameters
-    ----------
-    scene : str
-    figures : dict
-        (encoder, shear) to the figures at SR = 2, 1, 0.5 and 0.25; None where the paper has none.
     """
 
     scene: str
+    # (encoder, shear) to the figures at SR = 2, 1, 0.5 and 0.25; None where the paper has none
     figures: dict[tuple[str, float], tuple[float | None, ...]]
 
     @property
@@ -61,19 +56,9 @@ class RepresentationTable:
         """Recover at every depth and sampling ratio with both cameras; depth maps for the first
         seed.
 
-        Parameters
-        ----------
-        library : Library
-            Light fields and recordings by name.
-        seeds : int
-            Repeats with other random numbers.
-        advance : callable
-            Called with the number of steps just done.
-
-        Returns
-        -------
-        Outcome
-            A row of figures for each case, and the pictures to show.
+        `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
+        `advance`: called with the number of steps just done. Returns A row of figures for each
+        case, and the pictures to show.
         """
         solved = solve_cases(self.cases, library, seeds, advance)
         panels = [self._make_truth_panels(library, solved)]

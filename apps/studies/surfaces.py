@@ -63,30 +63,19 @@ FIGURES = {  # what a row says: key, unit's factor
 
 
 class Scored(NamedTuple):
-    """One shot by one method.
+    """One shot by one method."""
 
-    Attributes
-    ----------
-    figures : dict of str to float
-        Those of `tofclip.simulate.score_returns`, ``image_nmse``, ``image_nmse_inner`` and ``seconds``
-        of processor time.
-    picture : (rows, columns) float32 array
-        Light of all instants.
-    """
-
+    # those of `tofclip.simulate.score_returns`, ``image_nmse``, ``image_nmse_inner`` and
+    # ``seconds`` of processor time
     figures: dict[str, float]
-    picture: NDArray[np.float32]
+    picture: NDArray[np.float32]  # (rows, columns), light of all instants
 
 
 def make_small_instrument(photons: float, rays_per_pixel_side: int = 4) -> Instrument:
     """Return an instrument like the demonstration's with pictures of half its side.
 
-    Parameters
-    ----------
-    photons : float
-        Expected signal of the brightest streak pixel.
-    rays_per_pixel_side : int
-        Rays of the simulation; they have to be closer than the finest pattern.
+    `photons`: expected signal of the brightest streak pixel; `rays_per_pixel_side`: rays of the
+    simulation; they have to be closer than the finest pattern.
     """
     centres = np.arange(60.0, 600.0, 86.0)
     camera = Camera(
@@ -183,11 +172,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 def make_scene_instrument(name: str, photons: float) -> Instrument:
     """Return the instrument before which a scene of `SCENES` stands.
 
-    Parameters
-    ----------
-    name : str
-    photons : float
-        Expected signal of the brightest streak pixel.
+    `photons`: expected signal of the brightest streak pixel.
     """
     if name == "gauze":
         return make_small_instrument(photons, GAUZE_RAYS_PER_PIXEL_SIDE)
@@ -197,18 +182,8 @@ def make_scene_instrument(name: str, photons: float) -> Instrument:
 def score_methods(scene: Scene, instrument: Instrument, seed: int, fit: bool) -> dict[str, Scored]:
     """Recover one shot by every method, with the same camera.
 
-    Parameters
-    ----------
-    scene : Scene
-    instrument : Instrument
-    seed : int
-        Of the photon noise.
-    fit : bool
-        Whether sweep, gains and centres are found from the shot; else the true ones are known.
-
-    Returns
-    -------
-    dict of str to Scored
+    `seed`: of the photon noise; `fit`: whether sweep, gains and centres are found from the shot;
+    else the true ones are known.
     """
     shot = simulate_shot(scene, instrument, seed)
     streak = shot.streak
@@ -263,18 +238,8 @@ def _make_panels(
 def run_demo(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover the demonstration's shot by every method.
 
-    Parameters
-    ----------
-    library : Library
-        Not needed.
-    seeds : int
-        Of the photon noise.
-    advance : callable
-        Called with the number of steps just done.
-
-    Returns
-    -------
-    Outcome
+    `library`: not needed; `seeds`: of the photon noise; `advance`: called with the number of steps
+    just done.
     """
     scene, instrument = make_default_scene(), make_default_instrument()
     scored = []
@@ -294,20 +259,8 @@ def run_scenes(
 ) -> Outcome:
     """Recover every scene at every amount of light by every method; the camera is known.
 
-    Parameters
-    ----------
-    library : Library
-        Not needed.
-    seeds : int
-        Of the photon noise.
-    advance : callable
-        Called with the number of steps just done.
-    photons : tuple of int
-        Of the brightest streak pixel.
-
-    Returns
-    -------
-    Outcome
+    `library`: not needed; `seeds`: of the photon noise; `advance`: called with the number of steps
+    just done; `photons`: of the brightest streak pixel.
     """
     rows, panels = [], []
     for name, make_scene in SCENES.items():

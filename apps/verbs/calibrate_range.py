@@ -189,40 +189,20 @@ def _cut(shot: TargetShot, region: tuple[int, int, int, int]) -> TargetShot:
 
 @dataclass(frozen=True)
 class _ShotReader:
-    """How shots of the target are read.
-
-    Parameters
-    ----------
-    camera : Camera or None
-    method : str
-    bin_width : float or None
-        s.
-    pulse : Pulse or None
-    axes : str or None
-    view : (float or None, float)
-        Focal length, px, and field of view, degrees, of a pinhole.
-    """
+    """How shots of the target are read."""
 
     camera: Camera | None
     method: str
-    bin_width: float | None
+    bin_width: float | None  # s
     pulse: Pulse | None
     axes: str | None
+    # (float or None, float), focal length, px, and field of view, degrees, of a pinhole
     view: tuple[float | None, float]
 
     def read(self, shot: str, distance: float) -> TargetShot:
         """Find the returns of a shot, as they were measured.
 
-        Parameters
-        ----------
-        shot : str
-            File or address.
-        distance : float
-            Of the target, m.
-
-        Returns
-        -------
-        TargetShot
+        `shot`: file or address; `distance`: of the target, m.
         """
         if not (np.isfinite(distance) and distance > 0):
             raise InputError(f"--target-m: a distance must be a positive length, got {distance}")

@@ -318,21 +318,9 @@ def choose_camera(
 ) -> Camera:
     """Return a known camera, or a pinhole.
 
-    Parameters
-    ----------
-    known : Camera or None
-    image_shape : (int, int)
-        Rows and columns of the pinhole.
-    focal_length_px : float or None
-        In place of the camera's, or of that of the field of view.
-    field_of_view_deg : float
-        Width of a pinhole's picture.
-    pulse_fwhm : float
-        Of a return, s.
-
-    Returns
-    -------
-    Camera
+    `image_shape`: rows and columns of the pinhole; `focal_length_px`: in place of the camera's, or
+    of that of the field of view; `field_of_view_deg`: width of a pinhole's picture; `pulse_fwhm`:
+    of a return, s.
     """
     if known is not None:
         return known if focal_length_px is None else known.replace(focal_length_px=focal_length_px)

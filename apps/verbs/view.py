@@ -161,51 +161,25 @@ def _open_window(session: Session) -> None:
 class PageDoor:
     """Where the page is served, and how a browser comes there: at once where a source takes seconds,
     so that the page is loaded by then.
-
-    Parameters
-    ----------
-    host : str
-        An IP address of this computer, or ``"localhost"``.
-    port : int, optional
-        A free one by default.
-    no_browser : bool
-        Whether the page is not opened here.
-    as_json : bool
-        Whether its address is reported as JSON.
     """
 
-    host: str
-    port: int | None = None
-    no_browser: bool = False
-    as_json: bool = False
+    host: str  # an IP address of this computer, or ``"localhost"``
+    port: int | None = None  # A free one by default
+    no_browser: bool = False  # whether the page is not opened here
+    as_json: bool = False  # whether its address is reported as JSON
     _waiting: WaitingPage | None = None
 
     def open_waiting(self, source: str, words: str) -> None:
         """Serve a page that says what is being done.
 
-        Parameters
-        ----------
-        source : str
-            As the user named it.
-        words : str
-            What is being done.
+        `source`: as the user named it; `words`: what is being done.
         """
         title = source if "://" in source else Path(source).name
         self._waiting = WaitingPage(title, words, self.port, parse_host(self.host))
         self._show_address(self._waiting.address)
 
     def serve(self, session: Session) -> None:
-        """Serve a session until Ctrl-C.
-
-        Parameters
-        ----------
-        session : Session
-
-        Raises
-        ------
-        InputError, MissingDependencyError
-            It cannot be served.
-        """
+        """Serve a session until Ctrl-C."""
         page = Page(session, self.port, parse_host(self.host), self._waiting)
         was_waiting, self._waiting = self._waiting is not None, None
         with contextlib.closing(page):

@@ -116,13 +116,7 @@ def _save_shots(folder: Path) -> None:
 
 
 def _run_quietly(words: Sequence[str]) -> None:
-    """Run a command without its output.
-
-    Raises
-    ------
-    InputError
-        It failed, for instance because a package is missing.
-    """
+    """Run a command without its output."""
     messages = io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(messages):
         status = main(words)

@@ -13,23 +13,13 @@ MIN_SPEED, MAX_SPEED = 1 / 16, 16.0
 class PlaybackClock:
     """Counts frames while it runs; the caller gives the time, in seconds of any steady
     clock.
-
-    Parameters
-    ----------
-    rate : float
-        Frames per second at speed 1.
-    speed : float
-        Times faster than that.
-    loop : bool
-        Whether the last frame is followed by the first; otherwise the clock stops there.
-    position : float
-        Frame, and how far it has run.
     """
 
-    rate: float
-    speed: float = 1.0
+    rate: float  # frames per second at speed 1
+    speed: float = 1.0  # times faster than that
+    # whether the last frame is followed by the first; otherwise the clock stops there
     loop: bool = True
-    position: float = 0.0
+    position: float = 0.0  # frame, and how far it has run
     playing: bool = field(default=False, init=False)
     _last_tick_s: float | None = field(default=None, init=False, repr=False)
 
@@ -45,12 +35,7 @@ class PlaybackClock:
     def play(self, oldest: int, count: int) -> None:
         """Run; from the oldest frame on where the last one is reached.
 
-        Parameters
-        ----------
-        oldest : int
-            First frame that still exists.
-        count : int
-            Number after the last frame.
+        `oldest`: first frame that still exists; `count`: number after the last frame.
         """
         if self.frame >= count - 1:
             self.position = float(oldest)
@@ -63,13 +48,7 @@ class PlaybackClock:
     def jump(self, frame: int, oldest: int, count: int) -> None:
         """Go to a frame, or to the nearest that exists.
 
-        Parameters
-        ----------
-        frame : int
-        oldest : int
-            First frame that still exists.
-        count : int
-            Number after the last frame.
+        `oldest`: first frame that still exists; `count`: number after the last frame.
         """
         self.position = float(min(max(frame, oldest), max(count - 1, oldest)))
         self._last_tick_s = None
@@ -77,13 +56,7 @@ class PlaybackClock:
     def step(self, frames: int, oldest: int, count: int) -> None:
         """Pause, and move by a number of frames, back where it is negative.
 
-        Parameters
-        ----------
-        frames : int
-        oldest : int
-            First frame that still exists.
-        count : int
-            Number after the last frame.
+        `oldest`: first frame that still exists; `count`: number after the last frame.
         """
         self.pause()
         self.jump(self.frame + frames, oldest, count)
@@ -95,18 +68,8 @@ class PlaybackClock:
     def tick(self, now: float, oldest: int, count: int) -> int:
         """Let time pass and return the frame that is due.
 
-        Parameters
-        ----------
-        now : float
-            Seconds of a steady clock.
-        oldest : int
-            First frame that still exists.
-        count : int
-            Number after the last frame.
-
-        Returns
-        -------
-        int
+        `now`: seconds of a steady clock; `oldest`: first frame that still exists; `count`: number
+        after the last frame.
         """
         # a clock of the machine may be set back
         passed = 0.0 if self._last_tick_s is None else max(0.0, now - self._last_tick_s)

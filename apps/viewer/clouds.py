@@ -31,14 +31,8 @@ MAX_CACHED_CLOUDS = 32
 class CloudSource(Source):
     """Clouds in files, shown one after the other.
 
-    Parameters
-    ----------
-    title : str
-    paths : sequence of Path
-        In order.
+    `paths`: in order.
 
-    Notes
-    -----
     Memory: the last 32 clouds looked at.
     """
 
@@ -82,11 +76,6 @@ def find_clouds(folder: Path) -> list[Path]:
 def read_cloud(path: Path) -> PointCloud:
     """Read a cloud of this program, or another's table of points with at least x, y and z in
     metres.
-
-    Raises
-    ------
-    InputError, StorageError, FileFormatError
-        The file cannot be read, or holds no positions.
     """
     if path.suffix.lower() == ".h5":
         return PointCloud.load(path)
@@ -122,16 +111,7 @@ def _place_pixels(picture: Record) -> PointCloud:
 def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) -> PointCloud:
     """Make a cloud of positions; what is not known follows from them, or is 0.
 
-    Parameters
-    ----------
-    xyz : (n, 3) array
-        m.
-    known : mapping of str to (n,) array, optional
-        Columns by their names; ``"brightness"`` counts as intensity.
-
-    Returns
-    -------
-    PointCloud
+    `xyz` (n, 3): m; `known`: columns by their names; ``"brightness"`` counts as intensity.
     """
     known = known or {}
     distance = np.linalg.norm(xyz, axis=1)

@@ -43,18 +43,10 @@ TURBO_ENDS = 0.09, 0.93
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something that every point has.
+    """Something that every point has."""
 
-    Parameters
-    ----------
-    unit : str
-        Of what `extract` returns.
-    extract : callable
-        Takes a cloud, returns (n,) numbers.
-    """
-
-    unit: str
-    extract: Callable[[PointCloud], NDArray[Any]]
+    unit: str  # of what `extract` returns
+    extract: Callable[[PointCloud], NDArray[Any]]  # takes a cloud, returns (n,) numbers
 
 
 QUANTITIES: Mapping[str, Quantity] = {
@@ -70,33 +62,17 @@ QUANTITIES: Mapping[str, Quantity] = {
 
 @dataclass(frozen=True)
 class Colouring:
-    """How points are coloured.
+    """How points are coloured."""
 
-    Parameters
-    ----------
-    quantity : str
-        One of `QUANTITIES`.
-    palette : str
-        One of `PALETTES`.
-    limits : (float, float), optional
-        Values of the first and the last colour, in the quantity's unit; `LIMIT_PERCENTILES`
-        percentiles by default.
-    equalised : bool
-        Whether every colour is given to equally many points, instead of to an equal span of values.
-    shaded : bool
-        Whether dim points are drawn darker, so that what is written on a surface can be read in
-        colours of range.
-
-    Raises
-    ------
-    InputError
-        No such quantity or palette, or limits that do not rise.
-    """
-
-    quantity: str = "range"
-    palette: str = "turbo"
+    quantity: str = "range"  # one of `QUANTITIES`
+    palette: str = "turbo"  # one of `PALETTES`
+    # values of the first and the last colour, in the quantity's unit; `LIMIT_PERCENTILES`
+    # percentiles by default
     limits: tuple[float, float] | None = None
+    # whether every colour is given to equally many points, instead of to an equal span of values
     equalised: bool = False
+    # whether dim points are drawn darker, so that what is written on a surface can be read in
+    # colours of range
     shaded: bool = True
 
     def __post_init__(self) -> None:
@@ -118,21 +94,12 @@ class Colouring:
 
 @dataclass(frozen=True)
 class Scale:
-    """What the colours mean.
-
-    Parameters
-    ----------
-    quantity : str
-    unit : str
-    palette : str
-    values : (256,) array
-        Value of each colour, rising.
-    """
+    """What the colours mean."""
 
     quantity: str
     unit: str
     palette: str
-    values: NDArray[np.float64]
+    values: NDArray[np.float64]  # (256,), value of each colour, rising
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -168,17 +135,8 @@ def format_length(length: float) -> str:
 def choose_ticks(scale: Scale, count: int = 6) -> tuple[list[tuple[float, str]], str]:
     """Return round values of a scale and its title, in a unit in which the numbers are short.
 
-    Parameters
-    ----------
-    scale : Scale
-    count : int
-        About how many there should be.
-
-    Returns
-    -------
-    list of (float, str), str
-        Where each one lies, 0 for the first colour to 1 for the last, and its number; then the
-        quantity with its unit.
+    `count`: about how many there should be. Returns where each one lies, 0 for the first colour to
+    1 for the last, and its number; then the quantity with its unit.
     """
     low, high = scale.limits
     factor, unit = 1.0, scale.unit
@@ -199,15 +157,7 @@ def choose_ticks(scale: Scale, count: int = 6) -> tuple[list[tuple[float, str]],
 def choose_round_values(low: float, high: float, count: int) -> NDArray[np.float64]:
     """Return at most about `count` round values, evenly apart, between two limits.
 
-    Parameters
-    ----------
-    low, high : float
-        Rising, or equal.
-    count : int
-
-    Returns
-    -------
-    (n,) array
+    `low, high`: rising, or equal. Returns (n,).
     """
     if not high > low:
         return np.array([low])
@@ -218,17 +168,7 @@ def choose_round_values(low: float, high: float, count: int) -> NDArray[np.float
 
 
 def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
-    """Return the scale of a cloud's colours.
-
-    Parameters
-    ----------
-    cloud : PointCloud
-    colouring : Colouring
-
-    Returns
-    -------
-    Scale
-    """
+    """Return the scale of a cloud's colours."""
     quantity = QUANTITIES[colouring.quantity]
     values = quantity.extract(cloud)
     low, high = colouring.limits or _find_limits(values)
@@ -244,16 +184,8 @@ def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
 def colour_points(cloud: PointCloud, scale: Scale, brightest: float = 0.0) -> NDArray[np.uint8]:
     """Return each point's red, green and blue, (n, 3).
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    scale : Scale
-    brightest : float
-        Intensity that is drawn in full light, less of it darker; 0 for no shading.
-
-    Returns
-    -------
-    (n, 3) uint8 array
+    `brightest`: intensity that is drawn in full light, less of it darker; 0 for no shading. Returns
+    (n, 3).
     """
     colours = scale.colours(QUANTITIES[scale.quantity].extract(cloud))
     # Intensity is in the colour already.

@@ -35,15 +35,8 @@ MAX_TIME_MARKS = 4
 class Controls:
     """Playback, time gate, refocus and ways of showing; how points look is in `AppearancePanel`.
 
-    Parameters
-    ----------
-    server : ViserServer
-    session : Session
-    post : callable
-        Takes what is to be done by the thread that owns the session.
-    first : DisplayedFrame
-    resize : callable
-        Called when points are to have another size.
+    `post`: takes what is to be done by the thread that owns the session; `resize`: called when
+    points are to have another size.
     """
 
     def __init__(
@@ -77,11 +70,7 @@ class Controls:
     def show(self, shown: DisplayedFrame, status: Status) -> None:
         """Bring texts and controls up to date with what is shown.
 
-        Parameters
-        ----------
-        shown : DisplayedFrame
-        status : Status
-            Its text as HTML.
+        `status`: its text as HTML.
         """
         if self._status.content != status.html:
             self._status.content = status.html
@@ -187,14 +176,7 @@ class Controls:
 def mark_times(times: NDArray[np.float64]) -> tuple[tuple[int, str], ...]:
     """Return the frames at round times of flight, with their times in ns, for a time line.
 
-    Parameters
-    ----------
-    times : (frames,) array
-        Time of flight, s; rising.
-
-    Returns
-    -------
-    tuple of (int, str)
+    `times` (frames,): time of flight, s; rising.
     """
     in_ns = times / NANOSECOND
     places = choose_round_values(in_ns[0], in_ns[-1], MAX_TIME_MARKS)
@@ -205,13 +187,7 @@ def mark_times(times: NDArray[np.float64]) -> tuple[tuple[int, str], ...]:
 def bind_user_input(handle: Any, post: Post, act: Callable[[Any], None]) -> None:
     """Have `act` called with a control's new value when a user, not this program, has changed it.
 
-    Parameters
-    ----------
-    handle : viser input handle
-    post : callable
-        Takes what is to be done by the viewer's own thread.
-    act : callable
-        Called with the new value.
+    `post`: takes what is to be done by the viewer's own thread; `act`: called with the new value.
     """
 
     # A coroutine, which viser runs at once and functions later: by then a frame that is just being
@@ -234,15 +210,8 @@ FILTER_NAMES = ("range", "intensity", "x", "y", "z")
 class AppearancePanel:
     """Colours, scale, point size and filters.
 
-    Parameters
-    ----------
-    server : ViserServer
-    session : Session
-    post : callable
-    first : DisplayedFrame
-        Its extent is that of the filters until they are narrowed.
-    resize : callable
-        Called when points are to have another size.
+    `first`: its extent is that of the filters until they are narrowed; `resize`: called when points
+    are to have another size.
     """
 
     def __init__(

@@ -22,13 +22,7 @@ KEY_HELP = "space: play or pause    left, right: step    home, end: first, last 
 
 
 class DesktopWindow:
-    """A plotter that follows a session.
-
-    Parameters
-    ----------
-    session : Session
-    plotter : pyvista.Plotter
-    """
+    """A plotter that follows a session."""
 
     def __init__(self, session: Session, plotter: Any) -> None:
         self.session, self.plotter = session, plotter
@@ -74,13 +68,7 @@ class DesktopWindow:
 
 
 def open_window(session: Session) -> None:
-    """Show a session in a window until it is closed.
-
-    Raises
-    ------
-    MissingDependencyError
-        There is no display, or no working graphics library.
-    """
+    """Show a session in a window until it is closed."""
     require_display()
     import pyvista
 

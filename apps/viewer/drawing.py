@@ -76,12 +76,7 @@ class FramePacer:
     def record_sent(self, now: float, points: int) -> None:
         """Note that a frame was sent.
 
-        Parameters
-        ----------
-        now : float
-            Time in s.
-        points : int
-            Of the frame.
+        `now`: time in s; `points`: of the frame.
         """
         self._next = now + max(1 / MAX_FRAMES_PER_S, points / MAX_POINTS_PER_S)
 
@@ -101,13 +96,7 @@ class DetailChooser:
     def record(self, browser: int, points: int, seconds: float) -> None:
         """Note how long a browser took for a frame.
 
-        Parameters
-        ----------
-        browser : int
-            Its number.
-        points : int
-            That were drawn.
-        seconds : float
+        `browser`: its number; `points`: that were drawn.
         """
         self._points_per_s[browser] = points / max(seconds, 1e-3)
 
@@ -122,16 +111,8 @@ class DetailChooser:
     def count(self, points: int, moving: bool) -> int:
         """Return how many points of a cloud are drawn.
 
-        Parameters
-        ----------
-        points : int
-            Of the cloud.
-        moving : bool
-            Whether the view or the cloud moves, so that the next frame has to come soon.
-
-        Returns
-        -------
-        int
+        `points`: of the cloud; `moving`: whether the view or the cloud moves, so that the next
+        frame has to come soon.
         """
         known = self._points_per_s.values()
         longest = MOVING_FRAME_S if moving else STILL_FRAME_S
@@ -141,14 +122,7 @@ class DetailChooser:
     def is_worthwhile(self, drawn: int, points: int) -> bool:
         """Whether clearly more points of a cloud than are drawn now could be, or have to be fewer.
 
-        Parameters
-        ----------
-        drawn, points : int
-            Now, and of the whole cloud.
-
-        Returns
-        -------
-        bool
+        `drawn, points`: now, and of the whole cloud.
         """
         wanted = self.count(points, moving=False)
         return wanted != drawn and not (
@@ -159,19 +133,7 @@ class DetailChooser:
 def time_frame(client: viser.ClientHandle) -> float:
     """Return how long a browser takes to draw what it shows, s.
 
-    Parameters
-    ----------
-    client : ClientHandle
-        Asked for something that it does not have: it answers once in each frame.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    RuntimeError, TimeoutError
-        The browser has gone, or does not answer.
+    `client`: asked for something that it does not have: it answers once in each frame.
     """
     for _ in range(WARM_UP_FRAMES):
         client.local_storage.get_item("tofclip-drawn", ANSWER_TIMEOUT_S)
@@ -185,11 +147,7 @@ class Points:
     """The points in the scene. Of a large cloud a part is drawn, larger, so that surfaces stay closed:
     fewer while it moves, as many as the slowest browser can draw while it stands still.
 
-    Parameters
-    ----------
-    server : ViserServer
-    post : callable
-        Takes what is to be done by the thread that owns the page.
+    `post`: takes what is to be done by the thread that owns the page.
     """
 
     def __init__(self, server: viser.ViserServer, post: Post) -> None:
@@ -219,13 +177,7 @@ class Points:
     def draw(self, xyz: NDArray[np.float32], colours: NDArray[np.uint8], size_m: float) -> None:
         """Draw points.
 
-        Parameters
-        ----------
-        xyz : (n, 3) array
-            m.
-        colours : (n, 3) array
-        size_m : float
-            Side of a point, where all are drawn.
+        `xyz` (n, 3): m; `colours` (n, 3); `size_m`: side of a point, where all are drawn.
         """
         self._xyz, self._size_m = xyz, size_m
         self._colours = colours if len(xyz) else (0, 0, 0)
@@ -250,10 +202,7 @@ class Points:
     def update(self, now: float) -> None:
         """Draw what suits movement or rest, and measure browsers of which nothing is known.
 
-        Parameters
-        ----------
-        now : float
-            Seconds of the monotonic clock.
+        `now`: seconds of the monotonic clock.
         """
         if self._order is None or self._is_held:
             return

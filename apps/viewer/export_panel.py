@@ -32,16 +32,9 @@ LEGEND_PX = 70  # below the picture
 class ExportPanel:
     """Screenshot, export, bookmarks and keys.
 
-    Parameters
-    ----------
-    server : ViserServer
-    session : Session
-    post : callable
-    list_views : callable
-        Takes a window's width over its height, returns where one can look from, by name; the first
-        is where one looks from at first.
-    drawn_whole : callable
-        Returns what a screenshot is taken within, so that all points of a large cloud are on it.
+    `list_views`: takes a window's width over its height, returns where one can look from, by name;
+    the first is where one looks from at first; `drawn_whole`: returns what a screenshot is taken
+    within, so that all points of a large cloud are on it.
     """
 
     def __init__(
@@ -164,10 +157,7 @@ class ExportPanel:
 def format_box(xyz: NDArray[np.float32]) -> str:
     """Return the lengths of the box around a cloud in words; empty for an empty cloud.
 
-    Parameters
-    ----------
-    xyz : (n, 3) array
-        m.
+    `xyz` (n, 3): m.
     """
     if len(xyz) == 0:
         return ""

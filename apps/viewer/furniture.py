@@ -32,16 +32,7 @@ AXIS_COLOURS = ((229, 72, 77), (70, 167, 88), (62, 142, 208))
 def draw_furniture(scene: viser.SceneApi, box: Box) -> list[Any]:
     """Draw box, scale bar and axes around a cloud.
 
-    Parameters
-    ----------
-    scene : SceneApi
-    box : Box
-        Of the cloud.
-
-    Returns
-    -------
-    list of scene nodes
-        To be shown and hidden together.
+    `box`: of the cloud. Returns to be shown and hidden together.
     """
     drawn: list[Any] = [_add_lines(scene, "/box", box.corners[np.array(box.edges)], BOX_COLOUR)]
     for name, length_m, place in zip("xyz", box.high - box.low, box.length_marks, strict=True):
@@ -71,11 +62,7 @@ def _draw_axes(scene: viser.SceneApi, box: Box) -> list[Any]:
 class ClipBox:
     """A box in the scene whose two opposite corners can be dragged; points outside are not shown.
 
-    Parameters
-    ----------
-    scene : SceneApi
-    changed : callable
-        Called with the box after a corner was dragged.
+    `changed`: called with the box after a corner was dragged.
     """
 
     def __init__(self, scene: viser.SceneApi, changed: Callable[[Box], None]) -> None:
@@ -88,12 +75,7 @@ class ClipBox:
         return bool(self._handles)
 
     def show(self, box: Box) -> None:
-        """Draw the box with its handles.
-
-        Parameters
-        ----------
-        box : Box
-        """
+        """Draw the box with its handles."""
         self._draw_edges(box)
         corners = {"low": box.low, "high": box.high}
         turns = {"low": (1.0, 0.0, 0.0, 0.0), "high": POINTING_INWARDS}

@@ -31,12 +31,8 @@ class Guard:
     hence Origin has to be the page's own. The name in Host has to be this computer's, for anybody's
     DNS can point another one here.
 
-    Parameters
-    ----------
-    serve : callable
-        Answers what is passed on; websockets' ``process_request``.
-    is_local : bool
-        Whether only this computer reaches the server.
+    `serve`: answers what is passed on; websockets' ``process_request``; `is_local`: whether only
+    this computer reaches the server.
     """
 
     def __init__(self, serve: Any, is_local: bool) -> None:
@@ -97,16 +93,8 @@ def install_guard(port: int, is_local: bool) -> str | None:
     viser has no parameter for ``process_request`` and keeps its server of websockets to itself.
     Behind a proxy its own port would stay open to every page, hence that server is looked for.
 
-    Parameters
-    ----------
-    port : int
-    is_local : bool
-        Whether only this computer reaches the server.
-
-    Returns
-    -------
-    str or None
-        The token; None where there is no such server.
+    `is_local`: whether only this computer reaches the server. Returns the token; None where there
+    is no such server.
     """
     from websockets.asyncio.server import Server
 

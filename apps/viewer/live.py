@@ -38,24 +38,10 @@ class LiveShotSource(ShotSource):
     one sees is never late; `lost` counts the others wherever it happened, in the instrument, its
     driver or here.
 
-    Parameters
-    ----------
-    title : str
-    shots : iterator of Streak
-        Its end, or a fault of an instrument, ends the source; what came can still be looked at. A
-        generator lets go of its instrument when it is dropped then. The first one is shown at once.
-    camera : Camera
-        With its sweep.
-    method : Method, optional
-        The linear inverse by default: others take seconds for a shot.
+    `shots`: its end, or a fault of an instrument, ends the source; what came can still be looked
+    at; `camera`: with its sweep; `method`: the linear inverse by default: others take seconds for a
+    shot.
 
-    Raises
-    ------
-    InputError
-        There is no shot.
-
-    Notes
-    -----
     Memory: the measurements and clouds of 32 shots.
     """
 

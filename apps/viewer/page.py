@@ -50,20 +50,7 @@ SURFACE_COLOUR = (216, 210, 196)
 class WaitingPage:
     """A page that says what is being done, until `Page` takes its place: browsers load it meanwhile.
 
-    Parameters
-    ----------
-    title : str
-        Of the source.
-    words : str
-        What is being done.
-    port : int, optional
-    host : str
-        An IP address of this computer.
-
-    Raises
-    ------
-    InputError, MissingDependencyError
-        As `start_server`.
+    `title`: of the source; `words`: what is being done; `host`: an IP address of this computer.
     """
 
     def __init__(
@@ -87,19 +74,8 @@ class Page:
     """Serves a session. One thread, in `run`, owns the session; whatever the browsers ask for waits
     in a queue.
 
-    Parameters
-    ----------
-    session : Session
-    port : int, optional
-    host : str
-        An IP address of this computer.
-    waiting : WaitingPage, optional
-        Served already, where this page is to be; instead of port and host.
-
-    Raises
-    ------
-    InputError, MissingDependencyError
-        As `start_server`.
+    `host`: an IP address of this computer; `waiting`: served already, where this page is to be;
+    instead of port and host.
     """
 
     def __init__(

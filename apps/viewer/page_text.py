@@ -40,49 +40,26 @@ BLANK_PIXEL = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAA
 
 @dataclass(frozen=True)
 class Status:
-    """What the line at the top says.
+    """What the line at the top says."""
 
-    Parameters
-    ----------
-    label : str
-        ``"LIVE"`` or ``"REPLAY"``.
-    frame, frames : int
-    points : int
-    data_rate, frame_rate : float
-        Frames per second that come in, and that are sent to the page.
-    cloud_latency : float
-        From when a shot was taken until its cloud was there, s; NaN where none comes in.
-    lost : int
-        Shots that were taken and are not shown, wherever they were lost.
-    failure_text : str
-    time : float
-        Time of flight of the frame, s; NaN where frames have none.
-    frame_name : str
-        What a frame is: frame, slice, shot or cloud.
-    depth_text : str
-        Where a slice lies; empty where frames are not slices.
-    notes : tuple of str
-        What has to be known about the picture, such as that its ranges have no time zero.
-    whole_name : str
-        What is shown where it is not one frame but all of them, instead of the frame's number.
-    drawn_points : int, optional
-        Of a large cloud, by a browser that would be slow with all of them.
-    """
-
-    label: str
+    label: str  # ``"LIVE"`` or ``"REPLAY"``
     frame: int
     frames: int
     points: int
-    data_rate: float
-    frame_rate: float
+    data_rate: float  # frames per second that come in, and that are sent to the page
+    frame_rate: float  # frames per second that come in, and that are sent to the page
+    # from when a shot was taken until its cloud was there, s; NaN where none comes in
     cloud_latency: float = float("nan")
-    lost: int = 0
+    lost: int = 0  # shots that were taken and are not shown, wherever they were lost
     failure_text: str = ""
-    time: float = float("nan")
-    frame_name: str = "frame"
-    depth_text: str = ""
+    time: float = float("nan")  # time of flight of the frame, s; NaN where frames have none
+    frame_name: str = "frame"  # what a frame is: frame, slice, shot or cloud
+    depth_text: str = ""  # where a slice lies; empty where frames are not slices
+    # what has to be known about the picture, such as that its ranges have no time zero
     notes: tuple[str, ...] = ()
+    # what is shown where it is not one frame but all of them, instead of the frame's number
     whole_name: str = ""
+    # of a large cloud, by a browser that would be slow with all of them
     drawn_points: int | None = None
 
     @property
@@ -160,10 +137,7 @@ def _find_label_shift(place: float) -> int:
 def render_page_html(title: str) -> str:
     """Return what is said at the foot of the controls, and what names the browser's tab.
 
-    Parameters
-    ----------
-    title : str
-        Of the source.
+    `title`: of the source.
     """
     name = html.escape(format_page_title(title), quote=True)
     # a picture's event is the one script that runs in a text put into a page
@@ -177,10 +151,7 @@ def render_page_html(title: str) -> str:
 def render_waiting_html(words: str) -> str:
     """Return what is said while there is nothing to look at yet.
 
-    Parameters
-    ----------
-    words : str
-        What is being done.
+    `words`: what is being done.
     """
     return f"<div id='waiting' style='{HTML_STYLE}'>{html.escape(words)} ...</div>"
 

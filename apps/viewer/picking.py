@@ -21,35 +21,17 @@ CLOSE_MISS_RAD = 0.004
 
 @dataclass(frozen=True)
 class Pick:
-    """A point that was chosen.
+    """A point that was chosen."""
 
-    Parameters
-    ----------
-    position : (float, float, float)
-        x, y, z in m.
-    range, confidence : float
-        m; the confidence is one standard deviation of the range.
-    intensity : float
-        Counts, referred to 1 m.
-    return_number : int
-    time : float
-        Time of flight, s.
-    pixel : (int, int), optional
-        Row and column that saw it.
-    waveform : Waveform, optional
-        That pixel's signal over time.
-    return_times : tuple of float
-        Time of flight of every return that was found in that pixel and is shown, s.
-    """
-
-    position: tuple[float, float, float]
-    range: float
-    confidence: float
-    intensity: float
+    position: tuple[float, float, float]  # x, y, z in m
+    range: float  # m; the confidence is one standard deviation of the range
+    confidence: float  # m; the confidence is one standard deviation of the range
+    intensity: float  # counts, referred to 1 m
     return_number: int
-    time: float
-    pixel: tuple[int, int] | None = None
-    waveform: Waveform | None = None
+    time: float  # time of flight, s
+    pixel: tuple[int, int] | None = None  # row and column that saw it
+    waveform: Waveform | None = None  # that pixel's signal over time
+    # time of flight of every return that was found in that pixel and is shown, s
     return_times: tuple[float, ...] = ()
 
     @property
@@ -74,16 +56,7 @@ def find_point_on_ray(
     Of the points that the ray misses closely the one nearest to the eye is meant; with none so
     close, the one missed by the smallest angle.
 
-    Parameters
-    ----------
-    xyz : (n, 3) array
-        m.
-    origin, direction : (3,) array
-        Of the ray, in the same frame.
-
-    Returns
-    -------
-    int or None
+    `xyz` (n, 3): m; `origin, direction` (3,): of the ray, in the same frame.
     """
     along = np.asarray(direction, dtype=np.float64)
     away = xyz - np.asarray(origin, dtype=np.float64)
@@ -110,21 +83,8 @@ def make_pick(
 ) -> Pick:
     """Return what is known about point `number` of a cloud.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    number : int
-        Of the point.
-    pixel : (int, int), optional
-        Row and column that the point comes from.
-    waveform : Waveform, optional
-        Of that pixel.
-    return_times : tuple of float
-        Time of flight of that pixel's returns, s.
-
-    Returns
-    -------
-    Pick
+    `number`: of the point; `pixel`: row and column that the point comes from; `waveform`: of that
+    pixel; `return_times`: time of flight of that pixel's returns, s.
     """
     x, y, z = (float(value) for value in cloud.xyz[number])
     return Pick(
@@ -143,13 +103,6 @@ def make_pick(
 def measure_distance(first: Pick, second: Pick) -> float:
     """Distance of two points, m.
 
-    Parameters
-    ----------
-    first, second : Pick
-
-    Returns
-    -------
-    float
-        Metres.
+    Returns metres.
     """
     return float(np.linalg.norm(np.subtract(first.position, second.position)))

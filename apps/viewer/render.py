@@ -28,20 +28,8 @@ def rasterise_points(
 ) -> NDArray[np.uint8]:
     """Draw points as squares, near ones over far ones.
 
-    Parameters
-    ----------
-    xyz : (n, 3) array
-        m.
-    colours : (n, 3) array
-    viewpoint : Viewpoint
-    shape : (int, int)
-        Rows and columns of the picture.
-    size_px : int
-        Side of a square.
-
-    Returns
-    -------
-    (rows, columns, 3) uint8 array
+    `xyz` (n, 3): m; `colours` (n, 3); `shape`: rows and columns of the picture; `size_px`: side of
+    a square. Returns (rows, columns, 3).
     """
     picture = np.empty((*shape, 3), np.uint8)
     picture[:] = BACKGROUND
@@ -94,18 +82,7 @@ class Renderer(Protocol):
         """Return a picture of `shape` rows and columns, (rows, columns, 3); points are `point_px`
         wide.
 
-        Parameters
-        ----------
-        shown : DisplayedFrame
-        viewpoint : Viewpoint
-        shape : (int, int)
-            Rows and columns.
-        point_px : int
-            Pixels.
-
-        Returns
-        -------
-        (rows, columns, 3) uint8 array
+        `shape`: rows and columns; `point_px`: pixels. Returns (rows, columns, 3).
         """
         ...
 
@@ -165,13 +142,7 @@ class RasterRenderer:
 def add_to_plotter(plotter: Any, shown: DisplayedFrame, point_px: int) -> None:
     """Put points, or the surface, into a pyvista plotter.
 
-    Parameters
-    ----------
-    plotter : pyvista.Plotter
-        What was shown before is removed.
-    shown : DisplayedFrame
-    point_px : int
-        Width of a point, pixels.
+    `plotter`: what was shown before is removed; `point_px`: width of a point, pixels.
     """
     import pyvista
 

@@ -38,12 +38,7 @@ Image = NDArray[np.uint8]
 class SceneFigure:
     """A figure around a rendered scene: box, colours, words. Pictures of a film share one.
 
-    Parameters
-    ----------
-    title : str
-    first : DisplayedFrame
-        Says from where one looks.
-    renderer : Renderer
+    `first`: says from where one looks.
     """
 
     def __init__(self, title: str, first: DisplayedFrame, renderer: Renderer) -> None:
@@ -124,13 +119,7 @@ class SceneFigure:
 def save_picture(title: str, shown: DisplayedFrame, renderer: Renderer, out: Path) -> None:
     """Write a picture of what is shown, whole or not at all.
 
-    Parameters
-    ----------
-    title : str
-    shown : DisplayedFrame
-    renderer : Renderer
-    out : Path
-        Its suffix names the format.
+    `out`: its suffix names the format.
     """
     from apps.figures.style import save_figure
 
@@ -201,23 +190,8 @@ def save_film(
 ) -> int:
     """Write a film, whole or not at all.
 
-    Parameters
-    ----------
-    session : Session
-    renderer : Renderer
-    out : Path
-        Ends in ``.mp4``.
-    advance : callable
-        Called with 1 after every picture.
-
-    Returns
-    -------
-    int
-        The largest number of points in a picture.
-
-    Raises
-    ------
-    InputError, MissingDependencyError, StorageError
+    `out`: ends in ``.mp4``; `advance`: called with 1 after every picture. Returns the largest
+    number of points in a picture.
     """
     whole = session.frame_at(0.0)  # a transient begins at its end: with all of its points
     still, most, frames = (

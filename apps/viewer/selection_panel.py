@@ -31,13 +31,7 @@ NO_SHADOWS: Any = {"cast_shadow": False, "receive_shadow": False}
 class SelectionPanel:
     """Listens to clicks on points.
 
-    Parameters
-    ----------
-    server : ViserServer
-    session : Session
-    post : callable
-    above : PanelHandle
-        The docked panel below which this one stays in sight.
+    `above`: the docked panel below which this one stays in sight.
     """
 
     def __init__(

@@ -23,25 +23,8 @@ FIRST_PORT = 8080
 def start_server(port: int | None = None, host: str = LOOPBACK) -> tuple[viser.ViserServer, str]:
     """Start a server that lets in whoever knows the token in its address.
 
-    Parameters
-    ----------
-    port : int, optional
-        By default the first free one from 8080 on.
-    host : str
-        An IP address of this computer; 0.0.0.0 or :: for all of them.
-
-    Returns
-    -------
-    server : ViserServer
-    address : str
-        To open in a browser.
-
-    Raises
-    ------
-    InputError
-        The port is taken, or the address is another computer's.
-    MissingDependencyError
-        viser is not installed, or one that cannot be guarded.
+    `port`: by default the first free one from 8080 on; `host`: an IP address of this computer;
+    0.0.0.0 or :: for all of them. Returns `address`: to open in a browser.
     """
     try:
         import viser
@@ -79,13 +62,7 @@ def stop_server(server: viser.ViserServer) -> None:
 
 
 def parse_host(host: str) -> str:
-    """Return the IP address to listen at for what ``--host`` was given.
-
-    Raises
-    ------
-    InputError
-        It is none.
-    """
+    """Return the IP address to listen at for what ``--host`` was given."""
     if host == "localhost":
         return LOOPBACK
     try:

@@ -26,31 +26,14 @@ NO_LIMITS: Limits = (-np.inf, np.inf)
 
 @dataclass(frozen=True)
 class Filters:
-    """Limits, all of them inclusive; a point must keep every one.
+    """Limits, all of them inclusive; a point must keep every one."""
 
-    Parameters
-    ----------
-    range : (float, float)
-        m.
-    intensity : (float, float)
-        Counts, referred to 1 m.
-    time : (float, float)
-        Time of flight, s.
-    x, y, z : (float, float)
-        Sides of the box, m.
-
-    Raises
-    ------
-    InputError
-        A lower limit above its upper one.
-    """
-
-    range: Limits = NO_LIMITS
-    intensity: Limits = NO_LIMITS
-    time: Limits = NO_LIMITS
-    x: Limits = NO_LIMITS
-    y: Limits = NO_LIMITS
-    z: Limits = NO_LIMITS
+    range: Limits = NO_LIMITS  # m
+    intensity: Limits = NO_LIMITS  # counts, referred to 1 m
+    time: Limits = NO_LIMITS  # time of flight, s
+    x: Limits = NO_LIMITS  # sides of the box, m
+    y: Limits = NO_LIMITS  # sides of the box, m
+    z: Limits = NO_LIMITS  # sides of the box, m
 
     def __post_init__(self) -> None:
         for name, (low, high) in vars(self).items():
@@ -90,31 +73,16 @@ HALF_GATE_FRAMES = 12
 
 @dataclass(frozen=True)
 class DisplayedFrame:
-    """Everything that is drawn of one frame.
-
-    Parameters
-    ----------
-    frame : int
-    cloud : PointCloud
-        What the filters left.
-    colours : (n, 3) uint8 array
-    scale : Scale
-    pixels : (n, 2) int array, optional
-    surface : TriangleMesh, optional
-        Drawn instead of the points.
-    caption : str
-        Of which frames the points are; empty where there is one only.
-    thinned_from : int
-        Points of which these were drawn by lot while frames pass; 0 where all are here.
-    """
+    """Everything that is drawn of one frame."""
 
     frame: int
-    cloud: PointCloud
-    colours: NDArray[np.uint8]
+    cloud: PointCloud  # what the filters left
+    colours: NDArray[np.uint8]  # (n, 3)
     scale: Scale
-    pixels: NDArray[np.int32] | None = None
-    surface: TriangleMesh | None = None
-    caption: str = ""
+    pixels: NDArray[np.int32] | None = None  # (n, 2)
+    surface: TriangleMesh | None = None  # drawn instead of the points
+    caption: str = ""  # of which frames the points are; empty where there is one only
+    # points of which these were drawn by lot while frames pass; 0 where all are here
     thinned_from: int = 0
 
     @property
@@ -128,10 +96,6 @@ class Session:
 
     Not to be used by two threads at once. Public attributes may be set at any time; `frame_at` then
     draws accordingly.
-
-    Parameters
-    ----------
-    source : Source
     """
 
     def __init__(self, source: Source) -> None:
@@ -228,15 +192,7 @@ class Session:
         """Choose the point that a ray hits, m; the last two choices are kept, and a miss forgets
         them.
 
-        Parameters
-        ----------
-        origin : (3,) array_like
-            Of the ray, m.
-        direction : (3,) array_like
-
-        Returns
-        -------
-        Pick or None
+        `origin` (3,): of the ray, m; `direction` (3,).
         """
         if self._displayed is None:
             return None

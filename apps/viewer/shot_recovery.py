@@ -31,16 +31,9 @@ MIN_FRAMES = 3
 class ShotRecovery:
     """Turns the measurements of one camera into frames, at any shear.
 
-    Parameters
-    ----------
-    camera : Camera
-    times : (frames,) array
-        Time of flight of each column of measurements, s.
-    method : Method, optional
-        The linear inverse by default.
+    `times` (frames,): time of flight of each column of measurements, s; `method`: the linear
+    inverse by default.
 
-    Notes
-    -----
     Memory of the linear inverse: one operator and one matrix (columns, columns) for each of the last
     16 shears, which every recovery of this process shares (`tofclip.sequences.cache`). Safe to share
     by threads.
@@ -59,17 +52,8 @@ class ShotRecovery:
     def frames(self, measurements: Readings, shear: float, gate: Gate) -> Frames:
         """Recover the frames of a gate.
 
-        Parameters
-        ----------
-        measurements : (columns, frames) array
-            Rectified, of the whole shot.
-        shear : float
-            Pixels per view step.
-        gate : Gate
-
-        Returns
-        -------
-        Frames
+        `measurements` (columns, frames): rectified, of the whole shot; `shear`: pixels per view
+        step.
         """
         part = np.ascontiguousarray(measurements[:, gate.frames])
         if self.is_linear:
@@ -87,17 +71,9 @@ class ShotRecovery:
     ) -> View:
         """Recover the frames of a gate and locate their returns.
 
-        Parameters
-        ----------
-        measurements, shear, gate
-            As for `frames`.
-        least_intensity : float
-            Weaker returns are left out: a threshold relative to the gate would find noise in a dark one.
-            Counts, referred to 1 m.
-
-        Returns
-        -------
-        View
+        `measurements, shear, gate`: as for `frames`; `least_intensity`: weaker returns are left
+        out: a threshold relative to the gate would find noise in a dark one. Counts, referred to 1
+        m.
         """
         found = make_view(depth(self.frames(measurements, shear, self._widen_gate(gate))))
         return found if least_intensity <= 0 else select_brighter(found, least_intensity)
@@ -121,15 +97,7 @@ def list_recovery_notes(recovery: ShotRecovery) -> tuple[str, ...]:
 def make_view(returns: Returns, cloud: PointCloud | None = None) -> View:
     """Return the points of returns and which pixel saw them.
 
-    Parameters
-    ----------
-    returns : Returns
-    cloud : PointCloud, optional
-        Of these returns, where they have been placed in space already.
-
-    Returns
-    -------
-    View
+    `cloud`: of these returns, where they have been placed in space already.
     """
     points = point_cloud(returns) if cloud is None else cloud
     return View(points, np.stack([returns.y, returns.x], axis=-1))
@@ -139,10 +107,7 @@ def find_min_intensity(whole: PointCloud) -> float:
     """Return the intensity below which a return of a shot does not count, as `Detection` has it for
     all of its frames.
 
-    Parameters
-    ----------
-    whole : PointCloud
-        Of all frames.
+    `whole`: of all frames.
     """
     light = whole.intensity
     return (
@@ -155,15 +120,7 @@ def find_min_intensity(whole: PointCloud) -> float:
 def select_brighter(view: View, intensity: float) -> View:
     """Return the points with a minimum number of counts.
 
-    Parameters
-    ----------
-    view : View
-    intensity : float
-        Counts.
-
-    Returns
-    -------
-    View
+    `intensity`: counts.
     """
     return _select(view, view.cloud.intensity >= intensity)
 
@@ -171,14 +128,7 @@ def select_brighter(view: View, intensity: float) -> View:
 def leave_out_rays(view: View) -> View:
     """Return a view without dim points: of the whole scene, and beside a brighter one of their pixel.
 
-    Parameters
-    ----------
-    view : View
-        Of all frames, with pixels.
-
-    Returns
-    -------
-    View
+    `view`: of all frames, with pixels.
     """
     found = select_brighter(view, find_min_intensity(view.cloud))
     if found.pixels is None or len(found.cloud) == 0:

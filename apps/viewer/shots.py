@@ -24,15 +24,8 @@ MAX_CACHED_VIEWS = 16
 class ShotSource(Source):
     """Shots of one camera, wherever they come from; frame `n` is the cloud of shot `n`.
 
-    Parameters
-    ----------
-    title : str
-    camera : Camera
-        With its sweep.
-    row_times : (rows,) array
-        Instant of each row, s.
-    method : Method, optional
-        The linear inverse by default.
+    `camera`: with its sweep; `row_times` (rows,): instant of each row, s; `method`: the linear
+    inverse by default.
     """
 
     def __init__(
@@ -81,16 +74,7 @@ class ShotSource(Source):
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
         """Return streak image, intensity and depth of shot `number`; see `Source`.
 
-        Parameters
-        ----------
-        number : int
-        gate : Gate
-            Not used: a shot is shown as a whole.
-
-        Returns
-        -------
-        dict of (rows, columns) float32 arrays
-            Depth in m.
+        `gate`: not used: a shot is shown as a whole. Returns depth in m.
         """
         measurements = self.measurements(number)
         bright = self.recovery.frames(measurements, 0.0, self._find_bright_gate(measurements))
@@ -103,15 +87,7 @@ class ShotSource(Source):
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
         """Return the signal of a pixel over the whole shot; see `Source`.
 
-        Parameters
-        ----------
-        number : int
-        pixel : (int, int)
-            Row and column.
-
-        Returns
-        -------
-        Waveform
+        `pixel`: row and column.
         """
         frames = self.recover_frames(number)
         return Waveform(frames.times, frames.values[:, pixel[0], pixel[1]].copy())
@@ -119,17 +95,7 @@ class ShotSource(Source):
     def refocus(self, number: int, shear: float, gate: Gate) -> View:
         """Recover shot `number` at another shear; see `Source`.
 
-        Parameters
-        ----------
-        number : int
-        shear : float
-            Pixels per view step.
-        gate : Gate
-            Not used: the whole shot is recovered.
-
-        Returns
-        -------
-        View
+        `shear`: pixels per view step; `gate`: not used: the whole shot is recovered.
         """
         return self.recovery.view(self.measurements(number), shear, self._full_gate)
 
@@ -146,18 +112,8 @@ class ShotSource(Source):
 class StoredShotSource(ShotSource):
     """Shots in files, read when they are looked at.
 
-    Parameters
-    ----------
-    title : str
-    shots : sequence of callables
-        Each reads its shot.
-    camera : Camera
-        With its sweep.
-    method : Method, optional
-        The linear inverse by default.
+    `shots`: each reads its shot; `camera`: with its sweep; `method`: the linear inverse by default.
 
-    Notes
-    -----
     Memory: the measurements of the last shot, and the last 16 clouds.
     """
 

@@ -24,18 +24,8 @@ Image = NDArray[np.uint8]
 def render_pictures(pictures: Mapping[str, Picture], scale: Scale) -> dict[str, Image]:
     """Turn pictures into images of a handy size.
 
-    Parameters
-    ----------
-    pictures : mapping of str to (rows, columns) array
-        ``"depth"`` is in m, NaN where there is nothing; all others are brightness.
-    scale : Scale
-        The scene's colours. The depth has the very same where these show range, and otherwise its
-        own limits; brightness has the scene's palette where that shows intensity, and otherwise is
-        grey, so that no second meaning of a colour is beside the scene.
-
-    Returns
-    -------
-    dict of str to (rows, columns, 3) uint8 array
+    `pictures`: ``"depth"`` is in m, NaN where there is nothing; all others are brightness; `scale`:
+    the scene's colours.
     """
     return {
         name: resize_image(
@@ -86,14 +76,7 @@ def _close_seams(depth: Picture, light: Picture) -> None:
 def colour_brightness(picture: Picture, palette: str) -> Image:
     """Colour a picture by its brightness, negative values as dark.
 
-    Parameters
-    ----------
-    picture : (rows, columns) float array
-    palette : str
-
-    Returns
-    -------
-    (rows, columns, 3) uint8 array
+    `picture` (rows, columns). Returns (rows, columns, 3).
     """
     light = np.maximum(np.nan_to_num(picture), 0)
     top = float(np.percentile(light, WHITE_PERCENTILE)) or float(light.max()) or 1.0
@@ -104,16 +87,8 @@ def colour_brightness(picture: Picture, palette: str) -> Image:
 def colour_depth(picture: Picture, scale: Scale) -> Image:
     """Colour a picture of distances; NaN becomes a dark grey.
 
-    Parameters
-    ----------
-    picture : (rows, columns) float array
-        Metres.
-    scale : Scale
-        Taken where it is one of ranges; else the colours run from the 1st to the 99th percentile.
-
-    Returns
-    -------
-    (rows, columns, 3) uint8 array
+    `picture` (rows, columns): metres; `scale`: taken where it is one of ranges; else the colours
+    run from the 1st to the 99th percentile. Returns (rows, columns, 3).
     """
     image = np.empty((*picture.shape, 3), np.uint8)
     image[:] = EMPTY_COLOUR

@@ -19,32 +19,19 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class View:
-    """What a source shows in one frame.
-
-    Parameters
-    ----------
-    cloud : PointCloud
-    pixels : (n, 2) int array, optional
-        Row and column of the pixel that saw each point.
-    """
+    """What a source shows in one frame."""
 
     cloud: PointCloud
+    # (n, 2), row and column of the pixel that saw each point
     pixels: NDArray[np.int32] | None = None
 
 
 @dataclass(frozen=True)
 class Waveform:
-    """A pixel's signal over time.
+    """A pixel's signal over time."""
 
-    Parameters
-    ----------
-    times : (n,) array
-        Time of flight, s.
-    counts : (n,) array
-    """
-
-    times: FloatArray
-    counts: NDArray[np.float32]
+    times: FloatArray  # (n,), time of flight, s
+    counts: NDArray[np.float32]  # (n,)
 
 
 @dataclass(frozen=True)
@@ -70,36 +57,18 @@ class Gate:
 
 @dataclass
 class DisplayModes:
-    """How a source shows itself, where it can be shown in several ways.
+    """How a source shows itself, where it can be shown in several ways."""
 
-    Parameters
-    ----------
-    names : tuple of str
-        The ways there are; empty where there is one only.
-    current : str
-    threshold : float
-        Share of the brightest voxel below which nothing is shown.
-    """
-
-    names: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()  # the ways there are; empty where there is one only
     current: str = ""
-    threshold: float = 0.3
+    threshold: float = 0.3  # share of the brightest voxel below which nothing is shown
 
 
 @dataclass
 class Setting:
-    """A number that is set by a slider while one looks.
+    """A number that is set by a slider while one looks."""
 
-    Parameters
-    ----------
-    name : str
-        With its unit.
-    low, high, step : float
-    value : float
-    hint : str
-    """
-
-    name: str
+    name: str  # with its unit
     low: float
     high: float
     step: float
@@ -109,50 +78,28 @@ class Setting:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a source can do beyond showing its frames.
+    """What a source can do beyond showing its frames."""
 
-    Parameters
-    ----------
-    times : (frames,) array, optional
-        Time of flight of each frame, s, of a source whose frames are the instants of one transient.
-    shears : (float, float), optional
-        Least and largest shear of a refocus, pixels per view step; None where it cannot be
-        refocused.
-    """
-
+    # (frames,), time of flight of each frame, s, of a source whose frames are the instants of one
+    # transient
     times: FloatArray | None = None
+    # least and largest shear of a refocus, pixels per view step; None where it cannot be refocused
     shears: tuple[float, float] | None = None
 
 
 @dataclass
 class Source(abc.ABC):
-    """A row of frames, numbered from 0.
+    """A row of frames, numbered from 0."""
 
-    Parameters
-    ----------
-    title : str
-        What the page calls it.
-    rate : float
-        Frames per second at natural speed.
-    capabilities : Capabilities
-    display_modes : DisplayModes
-    frame_name : str
-        What a frame is: an instant's frame, a slice, a shot or a cloud.
-    notes : tuple of str
-        What has to be known about everything that is shown, such as that ranges have no time zero.
-    settings : tuple of Setting
-        What is set by sliders, beyond what all sources have.
-    min_intensity : float
-        Counts; dimmer points are left out until the filters are reset. 0 for none.
-    """
-
-    title: str
-    rate: float
+    title: str  # what the page calls it
+    rate: float  # frames per second at natural speed
     capabilities: Capabilities = field(default_factory=Capabilities)
     display_modes: DisplayModes = field(default_factory=DisplayModes)
-    frame_name: str = "frame"
+    frame_name: str = "frame"  # what a frame is: an instant's frame, a slice, a shot or a cloud
+    # what has to be known about everything that is shown, such as that ranges have no time zero
     notes: tuple[str, ...] = ()
-    settings: tuple[Setting, ...] = ()
+    settings: tuple[Setting, ...] = ()  # what is set by sliders, beyond what all sources have
+    # counts; dimmer points are left out until the filters are reset. 0 for none
     min_intensity: float = 0.0
 
     @abc.abstractmethod
@@ -216,50 +163,15 @@ class Source(abc.ABC):
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
         """Return pictures of frame `number`, or of a transient's gate, by name: "streak",
         "intensity", "depth" (m).
-
-        Parameters
-        ----------
-        number : int
-        gate : Gate
-
-        Returns
-        -------
-        dict of (rows, columns) float32 arrays
         """
         return {}
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform | None:
-        """Return the signal of a pixel (row, column) in frame `number`, None where it is not known.
-
-        Parameters
-        ----------
-        number : int
-        pixel : (int, int)
-
-        Returns
-        -------
-        Waveform or None
-        """
+        """Return the signal of a pixel (row, column) in frame `number`, None where it is not known."""
         return None
 
     def refocus(self, number: int, shear: float, gate: Gate) -> View:
-        """Recover the frames of a gate once more, at another shear, pixels per view step.
-
-        Parameters
-        ----------
-        number : int
-        shear : float
-        gate : Gate
-
-        Returns
-        -------
-        View
-
-        Raises
-        ------
-        InputError
-            The source holds no measurements.
-        """
+        """Recover the frames of a gate once more, at another shear, pixels per view step."""
         raise InputError(f"{self.title} holds no measurements, so it cannot be refocused")
 
     def surface(self) -> TriangleMesh | None:

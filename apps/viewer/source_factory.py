@@ -57,25 +57,16 @@ FIRST_LOOK_NOTE = (
 
 @dataclass(frozen=True)
 class ShotOptions:
-    """What has to be known about raw shots.
+    """What has to be known about raw shots."""
 
-    Parameters
-    ----------
-    camera : Path, optional
-        The camera's file; by default the camera that travels with the shot.
-    bin_width : float, optional
-        Duration of a row, s; by default the shot's own time axis.
-    time_zero : float, optional
-        Reading of the time axis at which light of range 0 would arrive, s; by default the camera's.
-    method : str, optional
-        How shots are recovered: a name of `tofclip.recovery.plan.METHODS`, ``"surfaces"`` for a single
-        one. By default a single one by some iterations of ``"l1"``, and one after the other by
-        ``"linear"``.
-    """
-
+    # the camera's file; by default the camera that travels with the shot
     camera: Path | None = None
-    bin_width: float | None = None
+    bin_width: float | None = None  # duration of a row, s; by default the shot's own time axis
+    # reading of the time axis at which light of range 0 would arrive, s; by default the camera's
     time_zero: float | None = None
+    # how shots are recovered: a name of `tofclip.recovery.plan.METHODS`, ``"surfaces"`` for a
+    # single one. By default a single one by some iterations of ``"l1"``, and one after the other by
+    # ``"linear"``
     method: str | None = None
 
 
@@ -92,24 +83,10 @@ def open_source(
 ) -> Source:
     """Open a file, a folder of files, or the address of an instrument.
 
-    Parameters
-    ----------
-    name : str
-        Frames, cloud, volume, shot or stack of shots (HDF5); a cloud of another format; a raw
-        streak image; a range image or depth picture; a folder of clouds or of streak images; or an address such as
-        ``sim+linospad2://?seed=1``.
-    options : ShotOptions, optional
-    announce : callable
-        Called with what is done where it takes seconds, as soon as the inputs are known to be good.
-
-    Returns
-    -------
-    Source
-
-    Raises
-    ------
-    InputError, StorageError, FileFormatError, DeviceError
-        It cannot be opened, or is nothing to look at.
+    `name`: frames, cloud, volume, shot or stack of shots (HDF5); a cloud of another format; a raw
+    streak image; a range image or depth picture; a folder of clouds or of streak images; or an
+    address such as ``sim+linospad2://?seed=1``; `announce`: called with what is done where it takes
+    seconds, as soon as the inputs are known to be good.
     """
     options = options or ShotOptions()
     if "://" in name:

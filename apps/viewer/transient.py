@@ -44,17 +44,9 @@ class TransientSource(Source):
     the camera predicts them from the frames, which explain the measured ones but for the recovery's
     residual.
 
-    Parameters
-    ----------
-    title : str
-    frames : Frames
-    measurements : (columns, frames) array, optional
-        Rectified measurements from which the frames were recovered.
-    method : Method, optional
-        Of a refocus; the linear inverse by default.
+    `measurements` (columns, frames): rectified measurements from which the frames were recovered;
+    `method`: of a refocus; the linear inverse by default.
 
-    Notes
-    -----
     Memory: the frames, and on the first refocus their measurements (columns, frames).
     """
 
@@ -90,16 +82,7 @@ class TransientSource(Source):
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
         """Return streak image, intensity in a gate and depth; see `Source`.
 
-        Parameters
-        ----------
-        number : int
-            Not used: the gate says which frames are shown.
-        gate : Gate
-
-        Returns
-        -------
-        dict of (rows, columns) float32 arrays
-            Depth in m.
+        `number`: not used: the gate says which frames are shown. Returns depth in m.
         """
         distance = np.maximum(self.frames.times[gate.frames], 0) * SPEED_OF_LIGHT / 2
         # As the intensity of a point, referred to 1 m: far objects would be lost beside near ones.
@@ -118,16 +101,7 @@ class TransientSource(Source):
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
         """Return the signal of a pixel; see `Source`.
 
-        Parameters
-        ----------
-        number : int
-            Not used: the signal runs through all frames.
-        pixel : (int, int)
-            Row and column.
-
-        Returns
-        -------
-        Waveform
+        `number`: not used: the signal runs through all frames; `pixel`: row and column.
         """
         row, column = pixel
         return Waveform(self.frames.times, self.frames.values[:, row, column])
@@ -135,17 +109,7 @@ class TransientSource(Source):
     def refocus(self, number: int, shear: float, gate: Gate) -> View:
         """Recover the frames of a gate at another shear; see `Source`.
 
-        Parameters
-        ----------
-        number : int
-            Not used.
-        shear : float
-            Pixels per view step.
-        gate : Gate
-
-        Returns
-        -------
-        View
+        `number`: not used; `shear`: pixels per view step.
         """
         return self._recovery.view(
             self._measurements, shear, gate, find_min_intensity(self._full_view.cloud)
@@ -180,15 +144,7 @@ class TransientSource(Source):
 def render_depth(view: View, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Return the range of each pixel's most intense return, m; NaN where nothing came back.
 
-    Parameters
-    ----------
-    view : View
-    shape : (int, int)
-        Rows and columns of the camera's picture.
-
-    Returns
-    -------
-    (rows, columns) float32 array
+    `shape`: rows and columns of the camera's picture. Returns (rows, columns).
     """
     picture = np.full(shape, np.nan, np.float32)
     if view.pixels is not None:

@@ -30,19 +30,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """An eye that looks at a point; y is down.
+    """An eye that looks at a point; y is down."""
 
-    Parameters
-    ----------
-    eye, target : (3,) array
-        m.
-    field_of_view : float
-        From the lower to the upper edge of the picture, rad.
-    """
-
-    eye: FloatArray
-    target: FloatArray
-    field_of_view: float = FIELD_OF_VIEW_RAD
+    eye: FloatArray  # (3,), m
+    target: FloatArray  # (3,), m
+    field_of_view: float = FIELD_OF_VIEW_RAD  # from the lower to the upper edge of the picture, rad
 
     def is_close_to(self, other: Viewpoint) -> bool:
         """Whether another viewpoint shows the same, as far as one can see."""
@@ -70,17 +62,8 @@ class Viewpoint:
         """Return row, column and depth (m) of points in a picture of `shape` pixels; NaN behind the
         eye.
 
-        Parameters
-        ----------
-        xyz : (n, 3) array
-            Metres.
-        shape : (int, int)
-            Rows and columns.
-
-        Returns
-        -------
-        row, column, depth : (n,) float64 array
-            Pixels, pixels and metres.
+        `xyz` (n, 3): metres; `shape`: rows and columns. Returns `row, column, depth` (n,): pixels,
+        pixels and metres.
         """
         right, down, depth = self.axes @ (np.asarray(xyz, dtype=np.float64) - self.eye).T
         depth = np.where(depth > 0, depth, np.nan)
@@ -103,16 +86,10 @@ front would need much of the window, and neither hides the other's words from an
 
 @dataclass(frozen=True)
 class Box:
-    """The box around nearly all points of a cloud.
+    """The box around nearly all points of a cloud."""
 
-    Parameters
-    ----------
-    low, high : (3,) array
-        Opposite corners, m.
-    """
-
-    low: FloatArray
-    high: FloatArray
+    low: FloatArray  # (3,), opposite corners, m
+    high: FloatArray  # (3,), opposite corners, m
 
     @classmethod
     def around(cls, xyz: NDArray[np.float32]) -> Box:
@@ -179,18 +156,9 @@ def round_length_down(length: float) -> float:
 def make_presets(xyz: NDArray[np.float32], aspect: float = 1.5) -> dict[str, Viewpoint]:
     """Return places to look at a cloud from, by name.
 
-    Parameters
-    ----------
-    xyz : (n, 3) array
-        m; not empty.
-    aspect : float
-        Width of the picture over its height.
-
-    Returns
-    -------
-    dict of str to Viewpoint
-        ``"start"`` is `place_viewpoint`'s; ``"front"``, ``"top"`` and ``"side"`` see the whole cloud;
-        ``"camera"`` is where it was taken from.
+    `xyz` (n, 3): m; not empty; `aspect`: width of the picture over its height. Returns ``"start"``
+    is `place_viewpoint`'s; ``"front"``, ``"top"`` and ``"side"`` see the whole cloud; ``"camera"``
+    is where it was taken from.
     """
     box = Box.around(xyz)
     middle = (box.low + box.high) / 2
@@ -215,16 +183,7 @@ def make_presets(xyz: NDArray[np.float32], aspect: float = 1.5) -> dict[str, Vie
 def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
     """Return a viewpoint close to the camera's own, the origin, from which a cloud is seen whole.
 
-    Parameters
-    ----------
-    xyz : (n, 3) array
-        m.
-    aspect : float
-        Width of the picture over its height.
-
-    Returns
-    -------
-    Viewpoint
+    `xyz` (n, 3): m; `aspect`: width of the picture over its height.
     """
     if len(xyz) == 0:
         return Viewpoint(np.array([0.0, 0.0, -1.0]), np.zeros(3))
@@ -253,13 +212,7 @@ def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
 
 
 def move_camera(camera: Any, viewpoint: Viewpoint) -> None:
-    """Move a camera of the page, or the one that pages start with, to a viewpoint.
-
-    Parameters
-    ----------
-    camera : viser camera handle
-    viewpoint : Viewpoint
-    """
+    """Move a camera of the page, or the one that pages start with, to a viewpoint."""
     camera.position, camera.look_at = viewpoint.eye, viewpoint.target
     camera.fov = max(viewpoint.field_of_view, float(np.deg2rad(5.0)))
 

@@ -31,13 +31,6 @@ PLAY_TIME_S = 8.0
 class VolumeSource(Source):
     """A volume; frame `n` is slice `n` in z, which matters where slices are shown.
 
-    Parameters
-    ----------
-    title : str
-    volume : Volume
-
-    Notes
-    -----
     Memory: the magnitude of the volume.
     """
 
@@ -77,17 +70,7 @@ class VolumeSource(Source):
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
         """Return brightness and depth of the front view, or of slice `number`; see `Source`.
 
-        Parameters
-        ----------
-        number : int
-            Slice in z.
-        gate : Gate
-            Not used.
-
-        Returns
-        -------
-        dict of (rows, columns) float32 arrays
-            Depth in m, NaN where it is too dark.
+        `number`: slice in z; `gate`: not used. Returns depth in m, NaN where it is too dark.
         """
         projection = self.volume.maximum_projection()
         bright = projection.brightness >= self.display_modes.threshold * self._magnitude.max()
@@ -161,11 +144,7 @@ class VolumeFeed(Protocol):
 class VolumeStreamSource(Source):
     """The newest volume of a stream; every volume is a frame, and only the last one is kept.
 
-    Parameters
-    ----------
-    title : str
-    feed : VolumeFeed
-        With a volume.
+    `feed`: with a volume.
     """
 
     def __init__(self, title: str, feed: VolumeFeed) -> None:

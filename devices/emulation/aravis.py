@@ -29,17 +29,9 @@ FillPattern = ctypes.CFUNCTYPE(
 class EmulatedFeed(AravisFeed):
     """Frames of Aravis' own emulated camera.
 
-    Parameters
-    ----------
-    library, ledger, settings
-        As for `AravisFeed`.
-    serial : str
-    lost_per_thousand : int
-        Packets of a thousand that are lost on the wire.
-    light : EmulatedLight or None
-        What it sees; None for Aravis' moving stripes.
-    seen_by : Camera or None
-        What a calibration would know of the lenslets before it.
+    `library, ledger, settings`: as for `AravisFeed`; `lost_per_thousand`: packets of a thousand
+    that are lost on the wire; `light`: what it sees; None for Aravis' moving stripes; `seen_by`:
+    what a calibration would know of the lenslets before it.
     """
 
     def __init__(
@@ -98,16 +90,6 @@ class ShownLight:
 
     The binding drops Python's function after the call that sets it, so that the library itself is
     asked.
-
-    Parameters
-    ----------
-    camera_process : GvFakeCamera
-    light : EmulatedLight
-
-    Raises
-    ------
-    MissingDependencyError
-        The library is not found under its name.
     """
 
     def __init__(self, camera_process: Any, light: EmulatedLight) -> None:

@@ -31,36 +31,24 @@ PERMANENT_ENUMERATIONS = 1_000_000
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """One fault."""
 
-    Parameters
-    ----------
-    transfer : int
-        Number of the data transfer in which it happens, from 0 since the instrument was first
-        started, without those by which old data is thrown away; or of the reply, from 0 since it
-        was switched on.
-    kind : str
-        ``timeout``: nothing comes. ``stall``: the endpoint halts, `amount` times in a row.
-        ``unplug``: gone for `amount` enumerations, keeping its power; ``powerloss``: without.
-        ``short``: only `amount` bytes come now. ``overflow``: the transfer is lost on the wire.
-        ``corrupt``: `amount` records cannot be. ``lost``: `amount` records find the instrument's
-        memory full. ``reply_late``: a reply comes only after the host has given up. ``reply_lost``:
-        it never comes. ``reply_stall``: its endpoint halts once.
-    amount : int
-    """
-
+    # number of the data transfer in which it happens, from 0 since the instrument was first
+    # started, without those by which old data is thrown away; or of the reply, from 0 since it was
+    # switched on
     transfer: int
+    # ``timeout``: nothing comes. ``stall``: the endpoint halts, `amount` times in a row.
+    # ``unplug``: gone for `amount` enumerations, keeping its power; ``powerloss``: without.
+    # ``short``: only `amount` bytes come now. ``overflow``: the transfer is lost on the wire.
+    # ``corrupt``: `amount` records cannot be. ``lost``: `amount` records find the instrument's
+    # memory full. ``reply_late``: a reply comes only after the host has given up. ``reply_lost``:
+    # it never comes. ``reply_stall``: its endpoint halts once
     kind: FaultKind
     amount: int = 1
 
     @classmethod
     def parse(cls, text: str) -> tuple[Fault, ...]:
-        """Read ``kind@transfer`` or ``kind@transfer:amount``, joined by commas.
-
-        Raises
-        ------
-        InputError
-        """
+        """Read ``kind@transfer`` or ``kind@transfer:amount``, joined by commas."""
         return tuple(cls._parse_one(word) for word in text.split(",") if word)
 
     @classmethod
@@ -78,15 +66,7 @@ class Fault:
 def draw_fault_script(seed: int, transfers: int) -> tuple[Fault, ...]:
     """Draw up to six faults of any kind, at most one per transfer, within the first `transfers`.
 
-    Parameters
-    ----------
-    seed : int
-    transfers : int
-
-    Returns
-    -------
-    tuple of Fault
-        In the order of the transfers.
+    Returns in the order of the transfers.
     """
     rng = np.random.default_rng(seed)
     # without repeats: one fault for a transfer

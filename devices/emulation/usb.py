@@ -32,13 +32,8 @@ def make_usb_error(number: int) -> usb.core.USBError:
 class VirtualDevice(abc.ABC):
     """An instrument on the virtual USB.
 
-    Parameters
-    ----------
-    identity : UsbIdentity
-    strings : tuple of str
-        Manufacturer, product and serial number.
-    endpoints : tuple of int
-        Addresses of its bulk endpoints.
+    `strings`: manufacturer, product and serial number; `endpoints`: addresses of its bulk
+    endpoints.
     """
 
     def __init__(
@@ -67,15 +62,7 @@ class VirtualDevice(abc.ABC):
     def control(self, request: int, value: int) -> None:
         """Do what a vendor request asks for; without an override it knows none, and stalls.
 
-        Parameters
-        ----------
-        request, value : int
-            Of the setup packet.
-
-        Raises
-        ------
-        usb.core.USBError
-            Always, without an override.
+        `request, value`: of the setup packet.
         """
         raise make_usb_error(errno.EPIPE)
 
@@ -83,11 +70,7 @@ class VirtualDevice(abc.ABC):
     def receive(self, endpoint: int, data: bytes) -> None:
         """Take what the host sends.
 
-        Parameters
-        ----------
-        endpoint : int
-            Address.
-        data : bytes
+        `endpoint`: address.
         """
 
     @abc.abstractmethod
@@ -95,28 +78,12 @@ class VirtualDevice(abc.ABC):
         """Write what the host asks for into `buffer` and return how many bytes; raise
         `make_usb_error` for faults.
 
-        Parameters
-        ----------
-        endpoint : int
-            Address.
-        buffer : memoryview
-            Overwritten.
-        timeout : float
-            Seconds.
-
-        Returns
-        -------
-        int
+        `endpoint`: address; `buffer`: overwritten; `timeout`: seconds.
         """
 
 
 class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no types
-    """A backend for pyusb (`usb.backend.IBackend`) over virtual devices.
-
-    Parameters
-    ----------
-    *devices : VirtualDevice
-    """
+    """A backend for pyusb (`usb.backend.IBackend`) over virtual devices."""
 
     def __init__(self, *devices: VirtualDevice) -> None:
         self._devices = devices
@@ -140,16 +107,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def get_configuration_descriptor(self, dev: VirtualDevice, config: int) -> SimpleNamespace:
         """Describe the one configuration of a device, as pyusb reads it.
 
-        Parameters
-        ----------
-        dev : VirtualDevice
-        config : int
-            0.
-
-        Returns
-        -------
-        SimpleNamespace
-            Fields of the USB 2.0 configuration descriptor.
+        `config`: 0. Returns fields of the USB 2.0 configuration descriptor.
         """
         _require_descriptor(config == 0)
         return SimpleNamespace(
@@ -163,16 +121,8 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     ) -> SimpleNamespace:
         """Describe the one interface of a device, as pyusb reads it.
 
-        Parameters
-        ----------
-        dev : VirtualDevice
-        intf, alt, config : int
-            Numbers of interface, alternate setting and configuration.
-
-        Returns
-        -------
-        SimpleNamespace
-            Fields of the USB 2.0 interface descriptor.
+        `intf, alt, config`: numbers of interface, alternate setting and configuration. Returns
+        fields of the USB 2.0 interface descriptor.
         """
         _require_descriptor((intf, alt, config) == (INTERFACE_NUMBER, 0, 0))
         return SimpleNamespace(
@@ -187,16 +137,8 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     ) -> SimpleNamespace:
         """Describe an endpoint of a device, as pyusb reads it.
 
-        Parameters
-        ----------
-        dev : VirtualDevice
-        ep, intf, alt, config : int
-            Numbers of endpoint, interface, alternate setting and configuration.
-
-        Returns
-        -------
-        SimpleNamespace
-            Fields of the USB 2.0 endpoint descriptor.
+        `ep, intf, alt, config`: numbers of endpoint, interface, alternate setting and
+        configuration. Returns fields of the USB 2.0 endpoint descriptor.
         """
         _require_descriptor(
             ep < len(dev.endpoints) and (intf, alt, config) == (INTERFACE_NUMBER, 0, 0)
@@ -221,55 +163,24 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         return 1
 
     def is_kernel_driver_active(self, dev_handle: VirtualDevice, intf: int) -> bool:
-        """Say that no kernel driver holds the interface.
-
-        Parameters
-        ----------
-        dev_handle : VirtualDevice
-        intf : int
-
-        Returns
-        -------
-        bool
-        """
+        """Say that no kernel driver holds the interface."""
         _require_plugged(dev_handle)
         return False
 
     def claim_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
-        """Claim the interface, which fails while another process has it.
-
-        Parameters
-        ----------
-        dev_handle : VirtualDevice
-        intf : int
-
-        Raises
-        ------
-        usb.core.USBError
-            Another process has it.
-        """
+        """Claim the interface, which fails while another process has it."""
         _require_plugged(dev_handle)
         if dev_handle.is_claimed_elsewhere:
             raise make_usb_error(errno.EBUSY)
 
     def release_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
-        """Give the interface back.
-
-        Parameters
-        ----------
-        dev_handle : VirtualDevice
-        intf : int
-        """
+        """Give the interface back."""
         _require_plugged(dev_handle)
 
     def clear_halt(self, dev_handle: VirtualDevice, ep: int) -> None:
         """Let a stalled endpoint go on.
 
-        Parameters
-        ----------
-        dev_handle : VirtualDevice
-        ep : int
-            Address.
+        `ep`: address.
         """
         _require_plugged(dev_handle)
         dev_handle.clear_halt(ep)
@@ -280,25 +191,8 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     ) -> int:  # fmt: skip
         """Answer requests for string descriptors and those of the maker's own.
 
-        Parameters
-        ----------
-        dev_handle : VirtualDevice
-        bmRequestType, bRequest, wValue, wIndex : int
-            The setup packet, USB 2.0, section 9.3.
-        data : array of bytes
-            Overwritten with the answer.
-        timeout : int
-            Milliseconds.
-
-        Returns
-        -------
-        int
-            Bytes of the answer.
-
-        Raises
-        ------
-        usb.core.USBError
-            It is another request, or there is no such string.
+        `bmRequestType, bRequest, wValue, wIndex`: the setup packet, USB 2.0, section 9.3; `data`:
+        overwritten with the answer; `timeout`: milliseconds. Returns bytes of the answer.
         """
         _require_plugged(dev_handle)
         if bmRequestType == VENDOR_REQUEST:
@@ -324,19 +218,8 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     ) -> int:
         """Hand what the host sends to the device.
 
-        Parameters
-        ----------
-        dev_handle : VirtualDevice
-        ep, intf : int
-            Address of the endpoint, number of the interface.
-        data : array of bytes
-        timeout : int
-            Milliseconds.
-
-        Returns
-        -------
-        int
-            Bytes.
+        `ep, intf`: address of the endpoint, number of the interface; `timeout`: milliseconds.
+        Returns bytes.
         """
         self._require_ready(dev_handle, ep)
         dev_handle.receive(ep, data.tobytes())
@@ -347,20 +230,8 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     ) -> int:
         """Have the device fill the host's buffer.
 
-        Parameters
-        ----------
-        dev_handle : VirtualDevice
-        ep, intf : int
-            Address of the endpoint, number of the interface.
-        buff : array of bytes
-            Overwritten.
-        timeout : int
-            Milliseconds.
-
-        Returns
-        -------
-        int
-            Bytes.
+        `ep, intf`: address of the endpoint, number of the interface; `buff`: overwritten;
+        `timeout`: milliseconds. Returns bytes.
         """
         self._require_ready(dev_handle, ep)
         return dev_handle.fill(ep, memoryview(buff), timeout / 1000)

@@ -58,23 +58,11 @@ def _add_photon(row, position, width, density, period, per_period):
 def add_stamps(stamps, clock_bins, codes, period, steps):
     """Add LinoSPAD2's time stamps.
 
-    Parameters
-    ----------
-    stamps : (n, columns) uint32 array
-        The last two columns are code and pixel.
-    clock_bins : float
-        Period of the board's clock.
-    codes : (pixels, codes, 2) float32 array
-        Where a code begins within the first period of the clock, offset and start of the axis
-        included; its length.
-    period : float
-        Time between two laser pulses, 0 for none.
-    steps : (pixels, bins + 2) float64 array
-
-    Returns
-    -------
-    int
-        Stamps left out because there is no such pixel.
+    `stamps` (n, columns): the last two columns are code and pixel; `clock_bins`: period of the
+    board's clock; `codes` (pixels, codes, 2): where a code begins within the first period of the
+    clock, offset and start of the axis included; its length; `period`: time between two laser
+    pulses, 0 for none; `steps` (pixels, bins + 2). Returns stamps left out because there is no such
+    pixel.
     """
     number = np.uint32(codes.shape[1])
     last = stamps.shape[1] - 1
@@ -99,18 +87,9 @@ def add_stamps(stamps, clock_bins, codes, period, steps):
 def add_times(pixels, times, scale, shift, width, period, steps):
     """Add photons of which pixel and time are known; ``position = times * scale + shift``.
 
-    Parameters
-    ----------
-    pixels : (photons,) int array
-    times : (photons,) array
-    scale, shift : float
-        Bins per unit of time, and bins.
-    width : float
-        Bins over which a photon is spread.
-    period : float
-        Bins of the laser's period.
-    steps : (pixels, bins + 2) float64 array
-        Added to, in place; the density's differences.
+    `pixels` (photons,); `times` (photons,); `scale, shift`: bins per unit of time, and bins;
+    `width`: bins over which a photon is spread; `period`: bins of the laser's period; `steps`
+    (pixels, bins + 2): added to, in place; the density's differences.
     """
     density, per_period = 1.0 / width, 1.0 / period
     for photon in range(times.size):
@@ -125,22 +104,8 @@ def find_last_sync(ticks, channels, flags, ignored, sync, before, known):
 
     A record with one of the `ignored` flags reports levels, not edges.
 
-    Parameters
-    ----------
-    ticks, channels, flags : (records,) int array
-    ignored : int
-        Bits of flags.
-    sync : int
-        Bit of the laser's channel.
-    before : int
-        Record.
-    known : int
-        Ticks.
-
-    Returns
-    -------
-    int
-        Ticks.
+    `ticks, channels, flags` (records,); `ignored`: bits of flags; `sync`: bit of the laser's
+    channel; `before`: record; `known`: ticks. Returns ticks.
     """
     for record in range(before - 1, -1, -1):
         if channels[record] & sync and not flags[record] & ignored:
@@ -152,23 +117,11 @@ def find_last_sync(ticks, channels, flags, ignored, sync, before, known):
 def add_tags(ticks, channels, flags, ignored, sync, known, pixel_of, scale, shift, period, steps):
     """Add time tags, each by how long it came after the last sync pulse.
 
-    Parameters
-    ----------
-    ticks, channels, flags : (n,) array
-        One bit of `channels` for each channel that saw an edge.
-    ignored : int
-        Flags of records that report no edges.
-    sync : int
-        The sync's bit.
-    known : int
-        Ticks at the last sync before the first record, -1 where there was none: photons before the
-        first one are left out.
-    pixel_of : (channels,) int64 array
-        Negative: not a pixel.
-    scale, shift : float
-        ``position = ticks since sync * scale + shift``; a tick is `scale` bins long.
-    period : float
-    steps : (pixels, bins + 2) float64 array
+    `ticks, channels, flags` (n,): one bit of `channels` for each channel that saw an edge;
+    `ignored`: flags of records that report no edges; `sync`: the sync's bit; `known`: ticks at the
+    last sync before the first record, -1 where there was none: photons before the first one are
+    left out; `pixel_of` (channels,): negative: not a pixel; `scale, shift`: ``position = ticks
+    since sync * scale + shift``; a tick is `scale` bins long; `steps` (pixels, bins + 2).
     """
     density, per_period = 1.0 / scale, 1.0 / period
     for record in range(ticks.size):

@@ -51,19 +51,9 @@ def compute_zone_ranges(zones: int) -> NDArray[np.float64]:
 class EmulatedKit:
     """A kit that sends frames once it has been asked to, or at once where it needs no asking.
 
-    Parameters
-    ----------
-    settings : KitSettings
-        Of the driver, but for the port.
-    parser : Parser
-        The driver's, for the histograms' shape.
-    format_lines : callable
-        From counts, the frame's number and its tick to lines.
-    seed : int
-    rate : float
-        Frames per second.
-    torn, lost : int
-        Of this number of frames one has a line cut, or is not sent; 0 for none.
+    `settings`: of the driver, but for the port; `parser`: the driver's, for the histograms' shape;
+    `format_lines`: from counts, the frame's number and its tick to lines; `rate`: frames per
+    second; `torn, lost`: of this number of frames one has a line cut, or is not sent; 0 for none.
     """
 
     def __init__(

@@ -41,21 +41,11 @@ VL53_SCALE = 10
 
 @dataclass(frozen=True)
 class KitFrame:
-    """What was sent for one frame.
+    """What was sent for one frame."""
 
-    Parameters
-    ----------
-    counts : (bins, zones) uint32 array or None
-        None where lines of it are missing.
-    missing : int
-        Frames that the kit took before it and never sent.
-    stamp : float or None
-        s of the kit's clock.
-    """
-
-    counts: NDArray[np.uint32] | None
-    missing: int = 0
-    stamp: float | None = None
+    counts: NDArray[np.uint32] | None  # (bins, zones), none where lines of it are missing
+    missing: int = 0  # frames that the kit took before it and never sent
+    stamp: float | None = None  # s of the kit's clock
 
 
 class Parser(Protocol):
@@ -77,14 +67,9 @@ class Parser(Protocol):
 class Tmf8828Parser:
     """See the module's text. Zones are in the order in which they come: captures, then halves, then
     channels; where each of them looks is the optics' matter.
-
-    Parameters
-    ----------
-    zones : int
-        64, or 9 for the 3 x 3 mode.
     """
 
-    zones: int = 64
+    zones: int = 64  # 64, or 9 for the 3 x 3 mode
     scale: float = field(default=1.0, init=False)
 
     def __post_init__(self) -> None:
@@ -156,16 +141,10 @@ class Tmf8828Parser:
 
 @dataclass
 class Vl53l8Parser:
-    """See the module's text.
+    """See the module's text."""
 
-    Parameters
-    ----------
-    zones, bins : int
-        As the kit's program was set.
-    """
-
-    zones: int = 16
-    bins: int = 24
+    zones: int = 16  # as the kit's program was set
+    bins: int = 24  # as the kit's program was set
     scale: float = field(default=1 / VL53_SCALE, init=False)
 
     def __post_init__(self) -> None:
@@ -224,18 +203,7 @@ def _parse_floats(words: list[bytes]) -> NDArray[np.float64] | None:
 def format_tmf8828(counts: NDArray[Any], number: int, tick: int) -> list[bytes]:
     """Return the lines that a TMF8828's program sends for a frame; the inverse of `Tmf8828Parser`.
 
-    Parameters
-    ----------
-    counts : (128, zones) array
-    number : int
-        Of the frame.
-    tick : int
-        0.2 us.
-
-    Returns
-    -------
-    list of bytes
-        With their ends.
+    `counts` (128, zones); `number`: of the frame; `tick`: 0.2 us. Returns with their ends.
     """
     captures, halves = (TMF_CAPTURES, 2) if counts.shape[1] == 64 else (1, 1)
     width = counts.shape[1] // captures

@@ -54,31 +54,18 @@ PICOSECOND_S = 1e-12
 
 @dataclass(frozen=True)
 class KitSettings:
-    """How to talk to a kit.
+    """How to talk to a kit."""
 
-    Parameters
-    ----------
-    instrument : str
-        What it is, in words.
-    port : str
-        Of the operating system, e.g. ``/dev/ttyACM0``.
-    baud : int
-    start, stop : bytes
-        Commands that begin and end measuring; empty for programs that measure by themselves.
-    bin_width, first_bin : float
-        Duration of a bin and middle of the first one, s.
-    reconnect : float
-        s to wait for a kit that went away.
-    """
-
-    instrument: str
-    port: str
+    instrument: str  # what it is, in words
+    port: str  # of the operating system, e.g. ``/dev/ttyACM0``
     baud: int
+    # commands that begin and end measuring; empty for programs that measure by themselves
     start: bytes
+    # commands that begin and end measuring; empty for programs that measure by themselves
     stop: bytes
-    bin_width: float
-    first_bin: float
-    reconnect: float
+    bin_width: float  # duration of a bin and middle of the first one, s
+    first_bin: float  # duration of a bin and middle of the first one, s
+    reconnect: float  # s to wait for a kit that went away
 
 
 class KitFeed:
@@ -87,12 +74,8 @@ class KitFeed:
     Frames of which lines are missing or torn are malformed; those that the kit's numbers show to be
     missing are lost by the instrument.
 
-    Parameters
-    ----------
-    settings : KitSettings
-    make_parser : callable
-        Returns a new parser: nothing of what came before a broken connection is of use behind it.
-    ledger : Ledger
+    `make_parser`: returns a new parser: nothing of what came before a broken connection is of use
+    behind it.
     """
 
     def __init__(

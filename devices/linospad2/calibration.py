@@ -108,25 +108,9 @@ def load_calibration(
 ) -> BoardCalibration:
     """Read tables as the board's makers and daplis write them.
 
-    Parameters
-    ----------
-    code_table : path-like
-        CSV, ps: a line of code numbers, then for each pixel its number and 140 ends of codes.
-    offset_table : path-like
-        NPY with 256 numbers, ps.
-    hot_pixels : path-like, optional
-        Text with one pixel number in each line.
-
-    Returns
-    -------
-    BoardCalibration
-
-    Raises
-    ------
-    StorageError
-        A file is absent or may not be read.
-    FileFormatError
-        A file holds something else.
+    `code_table`: CSV, ps: a line of code numbers, then for each pixel its number and 140 ends of
+    codes; `offset_table`: NPY with 256 numbers, ps; `hot_pixels`: text with one pixel number in
+    each line.
     """
     picosecond = 1e-12
     table = _read_numbers(
@@ -162,3 +146,17 @@ def _read_numbers(path: str | Path, reader: Callable[[Path], Any]) -> NDArray[np
             raise FileFormatError(
                 path, f"holds no table of numbers ({format_error_line(fault)})"
             ) from fault
+
+
+def make_calibration_record(
+    board: BoardCalibration, laser_period: float | None, camera: Record | None
+) -> Record:
+    """Return what turns time stamps into a scene: the board's tables, the laser's period, the
+    camera.
+
+    `laser_period`: seconds.
+    """
+    record = board.to_record()
+    attributes = {} if laser_period is None else {"laser_period_s": laser_period}
+    children = {} if camera is None else {"camera": camera}
+    return Record(record.kind, record.fields, attributes, children)

@@ -66,26 +66,13 @@ class LinoSpad2Codec:
 
     A valid word of the converter that serves no pixels is malformed. Decoding allocates at most 5
     bytes for each byte of the stream: rows for the valid words only.
-
-    Parameters
-    ----------
-    firmware : str
-        ``"2212b"`` (blocks: pixel = 4 * converter + address) or ``"2212s"`` (skipping: converter +
-        64 * address).
-    timestamps : int
-        Words per converter and cycle.
-    counter : bool
-        Whether every cycle begins with the absolute counter.
-
-    Raises
-    ------
-    InputError
-        There is no such firmware, or the number is not within 1..16384.
     """
 
+    # ``"2212b"`` (blocks: pixel = 4 * converter + address) or ``"2212s"`` (skipping: converter + 64
+    # * address)
     firmware: str = "2212b"
-    timestamps: int = 512
-    counter: bool = False
+    timestamps: int = 512  # words per converter and cycle
+    counter: bool = False  # whether every cycle begins with the absolute counter
 
     name: ClassVar[str] = "linospad2"
     start: ClassVar[int] = 0
@@ -158,17 +145,7 @@ class LinoSpad2Codec:
         """Decode whole cycles; `state` is how many came before. Cycles that were lost are not
         counted.
 
-        Parameters
-        ----------
-        data : bytes-like
-            Whole cycles.
-        state : int
-        after_loss : bool
-            Not needed: cycles do not depend on each other.
-
-        Returns
-        -------
-        DecodeResult
+        `data`: whole cycles; `after_loss`: not needed: cycles do not depend on each other.
         """
         from devices.linospad2.kernels import decode_stamps
 
@@ -195,13 +172,7 @@ class LinoSpad2Codec:
         return DecodeResult(records, malformed, state + len(cycles))
 
     def encode(self, records: Records) -> bytes:
-        """Return the bytes of all cycles from 0 up to that of the last time stamp.
-
-        Raises
-        ------
-        InputError
-            The stream cannot hold these time stamps, or they are not in its order.
-        """
+        """Return the bytes of all cycles from 0 up to that of the last time stamp."""
         from devices.linospad2.kernels import encode_stamps
 
         self._require_valid(records)

@@ -26,18 +26,9 @@ compiled = compile_and_keep(error_model="numpy")
 def count_stamps(cycles, header, kept_of_cycle):
     """Count the valid words of each cycle.
 
-    Parameters
-    ----------
-    cycles : (cycles, words) uint32 array
-    header : int
-        Words before the first converter's.
-    kept_of_cycle : (cycles,) int64 array
-        Gets the number of valid words of the converters that have pixels.
-
-    Returns
-    -------
-    int
-        Valid words of the converter that has none.
+    `cycles` (cycles, words); `header`: words before the first converter's; `kept_of_cycle`
+    (cycles,): gets the number of valid words of the converters that have pixels. Returns valid
+    words of the converter that has none.
     """
     words = cycles.shape[1]
     # the last converter serves no pixels
@@ -62,16 +53,9 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
     no branch that the processor could guess wrong. It ends with the last row, behind which there
     are not valid words.
 
-    Parameters
-    ----------
-    cycles : (cycles, words) uint32 array
-    header : int
-        Words before the first converter's; they are repeated at the front of each row.
-    first_cycle : int
-        Number of the first cycle.
-    pixel_of : (converters, addresses) uint32 array
-    records : (rows, header + 3) uint32 array
-        One row for each valid word; gets header, cycle, code and pixel.
+    `cycles` (cycles, words); `header`: words before the first converter's; they are repeated at the
+    front of each row; `first_cycle`: number of the first cycle; `pixel_of` (converters, addresses);
+    `records` (rows, header + 3): one row for each valid word; gets header, cycle, code and pixel.
     """
     depth = (cycles.shape[1] - header) // CONVERTERS
     row = 0
@@ -99,20 +83,9 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
 def encode_stamps(records, header, address_of, cycles):
     """Put records into the words of empty cycles.
 
-    Parameters
-    ----------
-    records : (rows, header + 3) uint32 array
-        As `decode_stamps` writes them, in order of cycle and converter.
-    header : int
-    address_of : (pixels,) uint32 array
-        Converter * 4 + address.
-    cycles : (cycles, words) uint32 array
-        Zeros; gets the words.
-
-    Returns
-    -------
-    int
-        `ENCODED_OK`, or what keeps the records from being encoded.
+    `records` (rows, header + 3): as `decode_stamps` writes them, in order of cycle and converter;
+    `address_of` (pixels,): converter * 4 + address; `cycles` (cycles, words): zeros; gets the
+    words. Returns `ENCODED_OK`, or what keeps the records from being encoded.
     """
     depth = (cycles.shape[1] - header) // CONVERTERS
     previous, slot = np.int64(-1), 0

@@ -29,26 +29,15 @@ _REQUIRED_KEYS = ("firmware", "timestamps_per_cycle", "absolute_counter")
 
 @dataclass(frozen=True)
 class Sidecar:
-    """How to read a recording.
-
-    Parameters
-    ----------
-    codec : LinoSpad2Codec
-    calibration : BoardCalibration
-        The board's tables; `BoardCalibration.ideal` where none are named.
-    board : str
-        Which board it was; may be empty.
-    laser_period : float or None
-        Time between two laser pulses, s, where pulses were locked to the board's clock.
-    camera : Path or None
-        File of the camera in front of the line.
-    """
+    """How to read a recording."""
 
     codec: LinoSpad2Codec
+    # the board's tables; `BoardCalibration.ideal` where none are named
     calibration: BoardCalibration
-    board: str = ""
+    board: str = ""  # which board it was; may be empty
+    # time between two laser pulses, s, where pulses were locked to the board's clock
     laser_period: float | None = None
-    camera: Path | None = None
+    camera: Path | None = None  # file of the camera in front of the line
 
 
 def read_sidecar(recording: str | Path) -> Sidecar:
@@ -58,13 +47,6 @@ def read_sidecar(recording: str | Path) -> Sidecar:
     ``absolute_counter`` (true or false), and optionally ``board``, ``code_table`` with
     ``offset_table``, ``hot_pixels``, ``laser_period_ps`` and ``camera``. Names of files are
     relative to the TOML file.
-
-    Raises
-    ------
-    StorageError
-        There is no such file.
-    FileFormatError
-        It is not TOML, lacks a key, has one too many, or a value of another kind.
     """
     path = Path(recording).with_suffix(".toml")
     values = _check_keys(_parse_toml(path, recording), path)

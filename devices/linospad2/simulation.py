@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 
 from devices.codec import Records
 from devices.ledger import Ledger
-from devices.linospad2.calibration import CLOCK_PERIOD_S, CODES_PER_PERIOD, BoardCalibration
+from devices.linospad2.calibration import (
+    CLOCK_PERIOD_S,
+    CODES_PER_PERIOD,
+    BoardCalibration,
+    make_calibration_record,
+)
 from devices.linospad2.codec import FIRMWARES, PIXELS, LinoSpad2Codec
 from devices.linospad2.words import ADDRESSES
 from devices.scenes import LineLight, simulate_line_light
@@ -46,23 +51,12 @@ OPTIONS = (
 
 @dataclass(frozen=True)
 class SimulatedBoard:
-    """A board before which a scene is lit by a pulsed laser.
+    """A board before which a scene is lit by a pulsed laser."""
 
-    Parameters
-    ----------
-    light : LineLight
-        Of 256 pixels, and shorter than the laser's period.
-    calibration : BoardCalibration
-    codec : LinoSpad2Codec
-    photons_per_cycle : float
-        Expected photons on all pixels together.
-    seed : int
-    """
-
-    light: LineLight
+    light: LineLight  # of 256 pixels, and shorter than the laser's period
     calibration: BoardCalibration
     codec: LinoSpad2Codec
-    photons_per_cycle: float
+    photons_per_cycle: float  # expected photons on all pixels together
     seed: int
 
     def __post_init__(self) -> None:
@@ -160,13 +154,8 @@ def draw_uneven_calibration(seed: int) -> BoardCalibration:
 class SimulatedFeed:
     """A board's cycles, one after the other; see `devices.stream.Feed`.
 
-    Parameters
-    ----------
-    board : SimulatedBoard
-    cycles : int
-        Until the stream ends.
-    cycle_time : float
-        Seconds that a cycle takes at least; 0: as fast as they are read.
+    `cycles`: until the stream ends; `cycle_time`: seconds that a cycle takes at least; 0: as fast
+    as they are read.
     """
 
     def __init__(self, board: SimulatedBoard, cycles: int, cycle_time: float) -> None:
@@ -202,29 +191,6 @@ class SimulatedFeed:
 
     def close(self) -> None:
         """Do nothing: nothing is held."""
-
-
-def make_calibration_record(
-    board: BoardCalibration, laser_period: float | None, camera: Record | None
-) -> Record:
-    """Return what turns time stamps into a scene: the board's tables, the laser's period, the
-    camera.
-
-    Parameters
-    ----------
-    board : BoardCalibration
-    laser_period : float, optional
-        Seconds.
-    camera : Record, optional
-
-    Returns
-    -------
-    Record
-    """
-    record = board.to_record()
-    attributes = {} if laser_period is None else {"laser_period_s": laser_period}
-    children = {} if camera is None else {"camera": camera}
-    return Record(record.kind, record.fields, attributes, children)
 
 
 def open_simulated(uri: Uri) -> StreamSource:

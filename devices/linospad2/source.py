@@ -8,9 +8,9 @@ from pathlib import Path
 
 from devices.codec import as_bytes
 from devices.ledger import Ledger
+from devices.linospad2.calibration import make_calibration_record
 from devices.linospad2.codec import LinoSpad2Codec
 from devices.linospad2.sidecar import read_sidecar
-from devices.linospad2.simulation import make_calibration_record
 from devices.ring import Piece
 from devices.source import READ_TIMEOUT_S, Batch, DecodedSource, Info
 from devices.uri import Uri
@@ -32,17 +32,6 @@ class LinoSpad2File(DecodedSource):
 
     Memory: one piece of 1 MiB, or one cycle, and what it decodes to; 16 bytes for each piece of the
     recording.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Raises
-    ------
-    StorageError
-        The recording or its TOML file is absent or may not be read.
-    FileFormatError
-        The TOML file is damaged, or there is not one whole cycle.
     """
 
     codec: LinoSpad2Codec

@@ -46,34 +46,17 @@ class BlockKind(enum.IntEnum):
 
 @dataclass(frozen=True)
 class BlockHeader:
-    """What stands before a payload.
-
-    Parameters
-    ----------
-    kind : BlockKind
-    gap : Gap
-        What is missing before it.
-    time_ns : int
-        When it was recorded, in ns since 1970, by this computer's clock.
-    records : int
-    length : int
-        Bytes of the payload.
-    checksum : int
-        CRC-32 of the payload.
-    number : int
-        Number of the block in its recording, from 0; -1 in recordings of version 0.1.0.
-    recording : int
-        The random number that the blocks of a recording share.
-    """
+    """What stands before a payload."""
 
     kind: BlockKind
-    gap: Gap
-    time_ns: int
+    gap: Gap  # what is missing before it
+    time_ns: int  # when it was recorded, in ns since 1970, by this computer's clock
     records: int
-    length: int
-    checksum: int
+    length: int  # bytes of the payload
+    checksum: int  # CRC-32 of the payload
+    # number of the block in its recording, from 0; -1 in recordings of version 0.1.0
     number: int = 0
-    recording: int = 0
+    recording: int = 0  # the random number that the blocks of a recording share
 
     @classmethod
     def of(
@@ -88,22 +71,8 @@ class BlockHeader:
     ) -> BlockHeader:
         """Describe a payload; the parameters are those of the class.
 
-        Parameters
-        ----------
-        kind : BlockKind
-        payload : bytes
-        time_ns : int
-            ns since 1970.
-        records : int
-        gap : Gap
-        number : int
-            Of the block.
-        recording : int
-            Of the recording, a random number.
-
-        Returns
-        -------
-        BlockHeader
+        `time_ns`: ns since 1970; `number`: of the block; `recording`: of the recording, a random
+        number.
         """
         checksum = zlib.crc32(payload)
         return cls(kind, gap, time_ns, records, len(payload), checksum, number, recording)

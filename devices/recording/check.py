@@ -16,41 +16,35 @@ from tofclip.errors import FileFormatError
 
 @dataclass
 class Findings:
-    """What is in a recording.
+    """What is in a recording."""
 
-    Parameters
-    ----------
-    bytes : int
-        Of the instrument, as they came.
-    blocks, records, malformed, gaps : int
-        Sound blocks; records that decode, and records that do not; places where the recording says
-        that something is missing.
-    damaged_blocks, damaged_bytes : int
-        What is not what was written. Bytes behind the last block count as well.
-    cut_bytes : int
-        Of these, a last block that was never finished, because the program was killed or the file
-        truncated: no damage to what is before it.
-    complete : bool
-        The recording was ended in order, and nothing of it is missing. False for that of a program
-        that was killed, although it is good up to its end, and for a repaired copy of a damaged or
-        truncated recording, however often it is copied.
-    stats : mapping
-        The accounts at the end, empty where it was not ended in order.
-    fault : str
-        What ended it if it was not meant to end.
-    """
-
-    bytes: int = 0
+    bytes: int = 0  # of the instrument, as they came
+    # sound blocks; records that decode, and records that do not; places where the recording says
+    # that something is missing
     blocks: int = 0
+    # sound blocks; records that decode, and records that do not; places where the recording says
+    # that something is missing
     records: int = 0
+    # sound blocks; records that decode, and records that do not; places where the recording says
+    # that something is missing
     malformed: int = 0
+    # sound blocks; records that decode, and records that do not; places where the recording says
+    # that something is missing
     gaps: int = 0
+    # what is not what was written. Bytes behind the last block count as well
     damaged_blocks: int = 0
+    # what is not what was written. Bytes behind the last block count as well
     damaged_bytes: int = 0
+    # of these, a last block that was never finished, because the program was killed or the file
+    # truncated: no damage to what is before it
     cut_bytes: int = 0
+    # the recording was ended in order, and nothing of it is missing. False for that of a program
+    # that was killed, although it is good up to its end, and for a repaired copy of a damaged or
+    # truncated recording, however often it is copied
     complete: bool = False
+    # the accounts at the end, empty where it was not ended in order
     stats: dict[str, int] = field(default_factory=dict)
-    fault: str = ""
+    fault: str = ""  # what ended it if it was not meant to end
 
     @property
     def is_sound(self) -> bool:
@@ -77,11 +71,6 @@ def verify(path: Path) -> Findings:
     accounts.
 
     Memory: one block and its records.
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        FileFormatError where the file cannot be opened as a recording at all.
     """
     with Recording(path) as recording:
         inspector = _Inspector(recording.codec)
@@ -94,22 +83,7 @@ def repair(path: Path, out: Path) -> Findings:
     """Copy every sound block of a recording into a new one; gaps are marked where something had to
     be left out, and the copy of a damaged or truncated recording never claims to be complete.
 
-    Parameters
-    ----------
-    path : Path
-        Also a recording of version 0.1.0.
-    out : Path
-        Replaced if it exists.
-
-    Returns
-    -------
-    Findings
-        Of `path`.
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        FileFormatError where not even a block that describes the instrument is left.
+    `path`: also a recording of version 0.1.0; `out`: replaced if it exists. Returns of `path`.
     """
     with Recording(path) as recording:
         inspector = _Inspector(recording.codec)
@@ -145,17 +119,7 @@ class _Inspector:
         return Stats(found.records + found.malformed, found.records, malformed=found.malformed)
 
     def inspect(self, blocks: BlockReader, entry: Block | Damage) -> Piece | None:
-        """Enter a block into the findings; return its piece if it is a sound one.
-
-        Parameters
-        ----------
-        blocks : BlockReader
-        entry : Block or Damage
-
-        Returns
-        -------
-        Piece or None
-        """
+        """Enter a block into the findings; return its piece if it is a sound one."""
         if isinstance(entry, Damage):
             self._holes += 1
             self._count_damage(entry.length)

@@ -31,34 +31,20 @@ SEARCH_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Damage:
-    """A stretch of a recording that is not what was written.
+    """A stretch of a recording that is not what was written."""
 
-    Parameters
-    ----------
-    position, length : int
-        Bytes of the file.
-    is_cut : bool
-        It is the beginning of a last block that was never finished: a program was killed in the
-        middle of writing it, or the file was truncated.
-    """
-
-    position: int
-    length: int
+    position: int  # bytes of the file
+    length: int  # bytes of the file
+    # it is the beginning of a last block that was never finished: a program was killed in the
+    # middle of writing it, or the file was truncated
     is_cut: bool = False
 
 
 @dataclass(frozen=True)
 class Block:
-    """A block with a sound header.
+    """A block with a sound header."""
 
-    Parameters
-    ----------
-    position : int
-        Of its header, in the file.
-    header : BlockHeader
-    """
-
-    position: int
+    position: int  # of its header, in the file
     header: BlockHeader
 
     @property
@@ -78,14 +64,8 @@ class BlockReader:
     The first sound header decides which recording, and which version of the format, this is;
     blocks of any other are not looked at. Memory: one block.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    fetch : callable
-        Takes position and length, returns these bytes, fewer at the end.
-    length : int
-        Bytes there are.
+    `path`: for messages; `fetch`: takes position and length, returns these bytes, fewer at the end;
+    `length`: bytes there are.
     """
 
     def __init__(self, path: Path, fetch: Callable[[int, int], bytes], length: int) -> None:
@@ -114,13 +94,7 @@ class BlockReader:
                 position = block.end
 
     def read_payload(self, block: Block) -> bytes:
-        """Return a block's payload.
-
-        Raises
-        ------
-        FileFormatError
-            It is not what was written.
-        """
+        """Return a block's payload."""
         data = self._fetch(block.payload_position, block.header.length)
         if not block.header.matches(data):
             raise FileFormatError(
@@ -199,21 +173,12 @@ class BlockReader:
 
 @dataclass(frozen=True)
 class Ending:
-    """What a recording says at its end.
+    """What a recording says at its end."""
 
-    Parameters
-    ----------
-    stats : mapping
-        The accounts, by name.
-    fault : str
-        What ended it if it was not meant to end.
-    is_complete : bool
-        Nothing of what was recorded is missing. False for ever in a copy of a damaged or
-        truncated recording.
-    """
-
-    stats: dict[str, int]
-    fault: str
+    stats: dict[str, int]  # the accounts, by name
+    fault: str  # what ended it if it was not meant to end
+    # nothing of what was recorded is missing. False for ever in a copy of a damaged or truncated
+    # recording
     is_complete: bool
 
     def to_json(self) -> bytes:
@@ -225,20 +190,7 @@ class Ending:
     def from_json(cls, payload: bytes, path: Path) -> Ending:
         """Read the payload of an END block.
 
-        Parameters
-        ----------
-        payload : bytes
-        path : Path
-            For the message.
-
-        Returns
-        -------
-        Ending
-
-        Raises
-        ------
-        FileFormatError
-            It is something else.
+        `path`: for the message.
         """
         try:
             known = json.loads(payload)
@@ -251,15 +203,6 @@ class Ending:
 class Recording:
     """A recording, open for reading; also one that is still being written, or whose program was
     killed.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        FileFormatError where the file is not a recording, or all copies of its head are damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -313,23 +256,7 @@ class Recording:
 def read_at(file: int, position: int, length: int, path: Path) -> bytes:
     """Read `length` bytes from `position` on, fewer at the end of the file.
 
-    Parameters
-    ----------
-    file : int
-        Descriptor.
-    position, length : int
-        Bytes.
-    path : Path
-        For the message.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    StorageError
-        The disk fails.
+    `file`: descriptor; `position, length`: bytes; `path`: for the message.
     """
     pieces: list[bytes] = []
     while length > 0:
@@ -367,15 +294,7 @@ def read_head_if_recording(path: Path) -> Record | None:
 def parse_head(image: bytes, path: Path) -> Record:
     """Read the record that the payload of a HEAD block, an HDF5 file, holds.
 
-    Parameters
-    ----------
-    image : bytes
-    path : Path
-        Of the recording.
-
-    Returns
-    -------
-    Record
+    `path`: of the recording.
     """
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, path.name)
@@ -388,20 +307,7 @@ def parse_head(image: bytes, path: Path) -> Record:
 def build_codec_from_head(head: Record, path: Path) -> Codec:
     """Build the codec that a recording's head names.
 
-    Parameters
-    ----------
-    head : Record
-    path : Path
-        For the message.
-
-    Returns
-    -------
-    Codec
-
-    Raises
-    ------
-    FileFormatError
-        The codec is unknown, or does not take its settings.
+    `path`: for the message.
     """
     try:
         settings = json.loads(str(head.attribute("codec_settings")))

@@ -40,19 +40,8 @@ def make_head(
 ) -> Record:
     """Describe an instrument: all of a recording that is known before the first piece.
 
-    Parameters
-    ----------
-    codec : Codec
-        Reads the pieces that are going to be recorded.
-    info : Info
-    calibration : Record, optional
-    provenance : dict
-        How the recording came about; any JSON-serialisable tree.
-
-    Returns
-    -------
-    Record
-        For `RecordingWriter`.
+    `codec`: reads the pieces that are going to be recorded; `provenance`: how the recording came
+    about; any JSON-serialisable tree. Returns for `RecordingWriter`.
     """
     attributes = {
         "codec": codec.name,
@@ -70,21 +59,8 @@ class RecordingWriter:
     nothing waits for more to come. The system may take longer to bring it to the disk: only
     `close` waits for that.
 
-    Parameters
-    ----------
-    path : Path
-        Locked until `close`, so that no second recorder writes to it.
-    head : Record
-        Made by `make_head`.
-    overwrite : bool
-        Replace a file that exists.
-
-    Raises
-    ------
-    InputError
-        The file exists and may not be replaced.
-    StorageError
-        Another recorder writes it, the folder is missing, or writing is not permitted.
+    `path`: locked until `close`, so that no second recorder writes to it; `head`: made by
+    `make_head`; `overwrite`: replace a file that exists.
     """
 
     def __init__(self, path: Path, head: Record, overwrite: bool = False) -> None:
@@ -108,13 +84,7 @@ class RecordingWriter:
         self._inode = os.fstat(self._file).st_ino
 
     def add(self, piece: Piece) -> None:
-        """Append a piece of the stream.
-
-        Raises
-        ------
-        StorageError
-            The disk is full or the file was removed; what was recorded before is safe.
-        """
+        """Append a piece of the stream."""
         self._append(BlockKind.PIECE, piece.data, piece.records, piece.gap)
         self.bytes_written += len(piece.data)
         self._bytes_since_head += len(piece.data)
@@ -124,13 +94,7 @@ class RecordingWriter:
         self.check()
 
     def check(self) -> None:
-        """Look now and then whether the file is still there.
-
-        Raises
-        ------
-        StorageError
-            It was removed or replaced, so that what is being written would not be found.
-        """
+        """Look now and then whether the file is still there."""
         if monotonic() < self._checked_at + CHECK_INTERVAL_S:
             return
         self._checked_at = monotonic()
@@ -146,26 +110,15 @@ class RecordingWriter:
     def finish(self, stats: Stats, fault: str = "", is_complete: bool = True) -> None:
         """Append the accounts.
 
-        Parameters
-        ----------
-        stats : Stats
-        fault : str
-            What ended the recording if it was not meant to end.
-        is_complete : bool
-            False where something of it is known to be missing: a copy of a damaged recording.
+        `fault`: what ended the recording if it was not meant to end; `is_complete`: false where
+        something of it is known to be missing: a copy of a damaged recording.
         """
         with contextlib.suppress(StorageError):  # a full disk may still have room for the accounts
             self._append(BlockKind.HEAD, self._head)
         self._append(BlockKind.END, Ending(stats.as_dict(), fault, is_complete).to_json())
 
     def close(self) -> None:
-        """Hand everything to the disk, unlock and close; closing twice is fine.
-
-        Raises
-        ------
-        StorageError
-            The disk failed.
-        """
+        """Hand everything to the disk, unlock and close; closing twice is fine."""
         if self._file < 0:
             return
         try:

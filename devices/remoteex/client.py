@@ -32,24 +32,13 @@ MAX_MESSAGES = 4096
 
 @dataclass(frozen=True)
 class CameraFrame:
-    """A picture as it came.
-
-    Parameters
-    ----------
-    rows, columns : int
-    pixel_bytes : int
-        1, 2 or 4.
-    pixels : bytes
-        Row by row, little-endian.
-    number : int
-        In the ring buffer.
-    """
+    """A picture as it came."""
 
     rows: int
     columns: int
-    pixel_bytes: int
-    pixels: bytes
-    number: int
+    pixel_bytes: int  # 1, 2 or 4
+    pixels: bytes  # row by row, little-endian
+    number: int  # in the ring buffer
 
 
 class RemoteExClient:
@@ -58,19 +47,7 @@ class RemoteExClient:
     A command that found no answer in time may still be carried out, so it is never sent again:
     the next command first waits for the answer that is owed.
 
-    Parameters
-    ----------
-    host : str
-    port, data_port : int
-    timeout : float
-        Seconds to wait for an answer.
-
-    Raises
-    ------
-    DeviceNotFoundError
-        Nothing answers there.
-    ProtocolError
-        Another program answers there.
+    `timeout`: seconds to wait for an answer.
     """
 
     def __init__(self, host: str, port: int, data_port: int, timeout: float = 5.0) -> None:
@@ -94,51 +71,21 @@ class RemoteExClient:
             raise
 
     def ask(self, name: str, *arguments: str) -> tuple[str, ...]:
-        """Send a command and return its answer's arguments.
-
-        Raises
-        ------
-        DeviceTimeoutError
-            No answer came in time, to this command or to the one before.
-        DeviceError
-            RemoteEx refused, or the connection broke.
-        """
+        """Send a command and return its answer's arguments."""
         answer, command = self._exchange(name, arguments)
         return answer.require_done(command)
 
     def is_done(self, name: str, *arguments: str) -> bool:
         """Send a command that may be refused.
 
-        Parameters
-        ----------
-        name : str
-        *arguments : str
-
-        Returns
-        -------
-        bool
-            False where RemoteEx refused.
-
-        Raises
-        ------
-        DeviceTimeoutError
-            No answer came in time.
-        DeviceError
-            The connection broke.
+        Returns false where RemoteEx refused.
         """
         return self._exchange(name, arguments)[0].code is AnswerCode.DONE
 
     def start_application(self, timeout: float) -> bool:
         """Start HPD-TA where it is not up, which takes a while; False where that is refused.
 
-        Parameters
-        ----------
-        timeout : float
-            Seconds to wait.
-
-        Returns
-        -------
-        bool
+        `timeout`: seconds to wait.
         """
         usual = self._timeout
         self._timeout = timeout
@@ -169,11 +116,6 @@ class RemoteExClient:
         """Send commands at once, whatever is still owed, and wait until each has been answered.
 
         Closing without waiting could make the network drop the commands.
-
-        Raises
-        ------
-        DeviceError
-            The first thing that went wrong, after everything else was tried.
         """
         last_words = [self.send_command(*words) for words in commands]
         fault: DeviceError | None = None
@@ -203,13 +145,7 @@ class RemoteExClient:
         return answer
 
     def read_frame(self, number: int) -> CameraFrame:
-        """Return picture `number` of the ring buffer, or the oldest one where that is gone already.
-
-        Raises
-        ------
-        ProtocolError
-            It is larger than any camera's picture, or of no known depth.
-        """
+        """Return picture `number` of the ring buffer, or the oldest one where that is gone already."""
         shape = self.ask("ImgRingBufferGet", "Data", str(number))
         if len(shape) < 5:
             raise ProtocolError(

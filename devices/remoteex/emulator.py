@@ -30,31 +30,15 @@ FAULT_DELAY_S = 0.1
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What a client finds.
+    """What a client finds."""
 
-    Parameters
-    ----------
-    is_application_up : bool
-        HPD-TA runs; otherwise all but the start of it is refused.
-    is_live : bool
-        An operator has started live mode.
-    busy_for : int
-        Questions for the state of an asynchronous command after which that is over.
-    time_range : str
-        ``20 ns`` of a single sweep, ``3`` of a synchroscan unit.
-    has_scaling_table : bool
-    stray_bytes : int
-        That wait on the data port, right behind the greeting.
-    restart_at : int or None
-        Number of the picture after which live mode is started anew, at the computer itself.
-    """
-
-    is_application_up: bool = True
-    is_live: bool = False
-    busy_for: int = 0
-    time_range: str = "20 ns"
+    is_application_up: bool = True  # HPD-TA runs; otherwise all but the start of it is refused
+    is_live: bool = False  # an operator has started live mode
+    busy_for: int = 0  # questions for the state of an asynchronous command after which that is over
+    time_range: str = "20 ns"  # ``20 ns`` of a single sweep, ``3`` of a synchroscan unit
     has_scaling_table: bool = True
-    stray_bytes: int = 17
+    stray_bytes: int = 17  # that wait on the data port, right behind the greeting
+    # number of the picture after which live mode is started anew, at the computer itself
     restart_at: int | None = None
 
 
@@ -73,19 +57,11 @@ class _Acquisition:
 class EmulatedStreakCamera:
     """The server. Pictures are numbered from 0 for each client.
 
-    Parameters
-    ----------
-    light : EmulatedLight
-    frame_rate : float
-        Pictures per second.
-    frames : int
-        Pictures until it is dark.
-    faults : sequence of Fault
-        By number of the request for a picture, from 0: ``timeout`` answers `amount` tenths of a
-        second late, ``short`` pauses so long in the middle of a picture, ``unplug`` hangs up,
-        ``corrupt`` answers nonsense, ``lost`` lets `amount` pictures fall out of the ring buffer,
-        ``overflow`` announces more than any picture takes.
-    found : Circumstances, optional
+    `frame_rate`: pictures per second; `frames`: pictures until it is dark; `faults`: by number of
+    the request for a picture, from 0: ``timeout`` answers `amount` tenths of a second late,
+    ``short`` pauses so long in the middle of a picture, ``unplug`` hangs up, ``corrupt`` answers
+    nonsense, ``lost`` lets `amount` pictures fall out of the ring buffer, ``overflow`` announces
+    more than any picture takes.
     """
 
     def __init__(

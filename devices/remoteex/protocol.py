@@ -71,26 +71,14 @@ _ERRORS: dict[AnswerCode, type[DeviceError]] = {
 
 @dataclass(frozen=True)
 class Command:
-    """Something to do.
-
-    Parameters
-    ----------
-    name : str
-    arguments : tuple of str
-        Without commas, parentheses and control characters; the protocol has no way to quote them.
-    """
+    """Something to do."""
 
     name: str
+    # without commas, parentheses and control characters; the protocol has no way to quote them
     arguments: tuple[str, ...] = ()
 
     def encode(self) -> bytes:
-        """Return the bytes to send.
-
-        Raises
-        ------
-        InputError
-            A name or argument holds what the protocol cannot carry.
-        """
+        """Return the bytes to send."""
         _require_valid(self.name, self.arguments)
         return f"{self.name}({','.join(self.arguments)})".encode(ENCODING) + TERMINATOR
 
@@ -109,22 +97,12 @@ class Command:
 
 @dataclass(frozen=True)
 class Answer:
-    """What RemoteEx says.
-
-    Parameters
-    ----------
-    code : AnswerCode
-    name : str
-        The command's, or what a message is about.
-    arguments : tuple of str
-    received_at : float
-        When it came, s of `time.monotonic`.
-    """
+    """What RemoteEx says."""
 
     code: AnswerCode
-    name: str
+    name: str  # the command's, or what a message is about
     arguments: tuple[str, ...] = ()
-    received_at: float = field(default=0.0, compare=False)
+    received_at: float = field(default=0.0, compare=False)  # when it came, s of `time.monotonic`
 
     @property
     def is_message(self) -> bool:
@@ -132,13 +110,7 @@ class Answer:
         return self.code in (AnswerCode.MESSAGE, AnswerCode.NOTICE)
 
     def encode(self) -> bytes:
-        """Return the bytes to send.
-
-        Raises
-        ------
-        InputError
-            A name or argument holds what the protocol cannot carry.
-        """
+        """Return the bytes to send."""
         _require_valid(self.name, self.arguments)
         return (
             ",".join([str(int(self.code)), self.name, *self.arguments]).encode(ENCODING)
@@ -147,13 +119,7 @@ class Answer:
 
     @classmethod
     def decode(cls, message: bytes) -> Answer:
-        """Read an answer, its end taken off.
-
-        Raises
-        ------
-        ProtocolError
-            It does not begin with a known code and a name.
-        """
+        """Read an answer, its end taken off."""
         text = _decode_text(message)
         code, _, rest = text.partition(",")
         name, *arguments = rest.split(",")
@@ -168,17 +134,7 @@ class Answer:
         return cls(AnswerCode(int(code)), name, tuple(arguments))
 
     def require_done(self, command: Command) -> tuple[str, ...]:
-        """Return the arguments, or raise what the code means.
-
-        Raises
-        ------
-        DeviceBusyError
-            The command is not possible now.
-        DeviceError
-            It failed.
-        ProtocolError
-            RemoteEx does not understand it.
-        """
+        """Return the arguments, or raise what the code means."""
         if self.code is AnswerCode.DONE:
             return self.arguments
         said = f" ({', '.join(self.arguments)[:120]})" if self.arguments else ""
@@ -191,20 +147,7 @@ class Answer:
 def parse_integer(text: str, what: str) -> int:
     """Return a whole number that RemoteEx sent.
 
-    Parameters
-    ----------
-    text : str
-    what : str
-        What the number means, for the message.
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    ProtocolError
-        It is something else.
+    `what`: what the number means, for the message.
     """
     # Python would convert digits of any length, at a cost that grows with their square
     if not (text.isascii() and text.isdecimal() and len(text) < 16):

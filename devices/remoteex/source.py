@@ -62,32 +62,19 @@ ConnectFunction = Callable[[], RemoteExClient]
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """How to acquire.
+    """How to acquire."""
 
-    Parameters
-    ----------
-    buffers : int
-        Pictures that HPD-TA keeps for a client that is late.
-    gain : int or None
-        Of the micro-channel plate, set before the start; None leaves it as it is. It is 0 after the
-        stop in any case: an intensified tube that is not watched must not age in strong light.
-    timeout : float
-        Seconds to wait for an answer.
-    reconnect : float
-        Seconds to wait for HPD-TA to come back when the connection broke.
-    time_range : str
-        Set before the start, as HPD-TA writes it: ``20 ns``, or ``3`` for a synchroscan unit; empty
-        leaves it as it is.
-    time_ranges_ps : tuple of float
-        How long ranges 1, 2, ... of a synchroscan unit last, ps, for cameras that give no scaling
-        table.
-    """
-
-    buffers: int = 16
+    buffers: int = 16  # pictures that HPD-TA keeps for a client that is late
+    # of the micro-channel plate, set before the start; None leaves it as it is. It is 0 after the
+    # stop in any case: an intensified tube that is not watched must not age in strong light
     gain: int | None = None
-    timeout: float = 5.0
-    reconnect: float = 5.0
+    timeout: float = 5.0  # seconds to wait for an answer
+    reconnect: float = 5.0  # seconds to wait for HPD-TA to come back when the connection broke
+    # set before the start, as HPD-TA writes it: ``20 ns``, or ``3`` for a synchroscan unit; empty
+    # leaves it as it is
     time_range: str = ""
+    # how long ranges 1, 2, ... of a synchroscan unit last, ps, for cameras that give no scaling
+    # table
     time_ranges_ps: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -104,20 +91,11 @@ class LiveSettings:
 
 
 class _Announcement(NamedTuple):
-    """A message that a picture was taken.
-
-    Parameters
-    ----------
-    number : int
-    stamp : float or None
-        Its time by the camera's computer, s since live mode was started.
-    received_at : float
-        s of `time.monotonic`.
-    """
+    """A message that a picture was taken."""
 
     number: int
-    stamp: float | None
-    received_at: float
+    stamp: float | None  # its time by the camera's computer, s since live mode was started
+    received_at: float  # s of `time.monotonic`
 
 
 class RemoteExFeed:
@@ -126,12 +104,7 @@ class RemoteExFeed:
     Pictures that fell out of the ring buffer before they were asked for are lost by the instrument.
     When the connection breaks, so are those that had been announced.
 
-    Parameters
-    ----------
-    connect : callable
-        Returns a new connection.
-    ledger : Ledger
-    settings : LiveSettings
+    `connect`: returns a new connection.
     """
 
     def __init__(self, connect: ConnectFunction, ledger: Ledger, settings: LiveSettings) -> None:
@@ -264,11 +237,6 @@ class RemoteExFeed:
     def _join_or_restart(self, link: RemoteExClient) -> None:
         """Join live mode that runs already, or wait until what else keeps the camera busy is over;
         in the end, stop that.
-
-        Raises
-        ------
-        DeviceBusyError
-            The camera stays busy.
         """
         with contextlib.suppress(ProtocolError):  # not every version knows the question
             state = [word.strip().casefold() for word in link.ask("AcqStatus")]

@@ -68,25 +68,14 @@ CONFIRMED_COMMANDS = (b"V,", b"D,", b"AE,", b"S,", b"CALIB,", b"Ga,")
 class EmulatedSpadArray:
     """The server.
 
-    Parameters
-    ----------
-    photons : (512, 512) array
-        Expected photons of each pixel in one second.
-    delays : (512, 512) array, optional
-        When each pixel's light comes back after the laser's pulse, s; NaN where none does. Pictures
-        behind a gate need it.
-    seed : int
-    pictures : int
-        Until it is dark: then a request finds no answer.
-    faults : sequence of Fault
-        By number of the request, from 0: ``timeout`` answers `amount` tenths of a second late,
-        ``short`` pauses so long in the middle of a picture, ``unplug`` hangs up there, ``corrupt``
-        ends with other letters, ``stall`` says that it failed: with the mark at the end, with
-        amount 2 with the mark in front, with amount 3 in the middle of a picture.
-    is_framed : bool
-        Whether it ends its texts with `DONE_MARK`.
-    calibrates : bool
-        Whether it calibrates itself when it is first asked.
+    `photons` (512, 512): expected photons of each pixel in one second; `delays` (512, 512): when
+    each pixel's light comes back after the laser's pulse, s; NaN where none does. Pictures behind a
+    gate need it; `pictures`: until it is dark: then a request finds no answer; `faults`: by number
+    of the request, from 0: ``timeout`` answers `amount` tenths of a second late, ``short`` pauses
+    so long in the middle of a picture, ``unplug`` hangs up there, ``corrupt`` ends with other
+    letters, ``stall`` says that it failed: with the mark at the end, with amount 2 with the mark in
+    front, with amount 3 in the middle of a picture; `is_framed`: whether it ends its texts with
+    `DONE_MARK`; `calibrates`: whether it calibrates itself when it is first asked.
     """
 
     def __init__(
@@ -123,14 +112,7 @@ class EmulatedSpadArray:
         """Return the bytes of picture `number` of a request; the same numbers give the same
         picture.
 
-        Parameters
-        ----------
-        request, number : int
-        exposure : ExposureRequest
-
-        Returns
-        -------
-        (bytes,) uint8 array
+        Returns (bytes,).
         """
         light = self._photons[:, : exposure.width] * exposure.seconds
         if exposure.gate is not None:

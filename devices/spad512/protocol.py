@@ -58,33 +58,15 @@ _MICROSECOND_DEPTHS = (1, 4)  # the others take milliseconds
 
 @dataclass(frozen=True)
 class ExposureRequest:
-    """A request for pictures.
+    """A request for pictures."""
 
-    Parameters
-    ----------
-    bits : int
-        Depth of a picture; 1, 4, 6..12, behind a gate 6..12.
-    seconds : float
-        Integration time of a picture.
-    images : int
-        Pictures of one request, or scans of a gate.
-    width : int
-        Columns, a power of two within 4..512; 512 for single bits and behind a gate.
-    pile_up : bool
-        Whether the server corrects counts for photons that came in a pixel's dead time; they have
-        16 bits then.
-    gate : GateScan, optional
-
-    Raises
-    ------
-    InputError
-        The instrument cannot do that.
-    """
-
-    bits: int = 8
-    seconds: float = 1e-3
-    images: int = 1
+    bits: int = 8  # depth of a picture; 1, 4, 6..12, behind a gate 6..12
+    seconds: float = 1e-3  # integration time of a picture
+    images: int = 1  # pictures of one request, or scans of a gate
+    # columns, a power of two within 4..512; 512 for single bits and behind a gate
     width: int = ROWS
+    # whether the server corrects counts for photons that came in a pixel's dead time; they have 16
+    # bits then
     pile_up: bool = False
     gate: GateScan | None = None
 
@@ -140,20 +122,7 @@ class ExposureRequest:
     def decode(cls, line: bytes, pile_up: bool = False) -> ExposureRequest:
         """Read a command.
 
-        Parameters
-        ----------
-        line : bytes
-        pile_up : bool
-            As in the class.
-
-        Returns
-        -------
-        ExposureRequest
-
-        Raises
-        ------
-        ProtocolError
-            It is not such a command.
+        `pile_up`: as in the class.
         """
         found = _INTENSITY.fullmatch(line) or _GATED.fullmatch(line)
         if found is None:
@@ -177,14 +146,7 @@ def find_error_text(data: bytes | bytearray) -> str | None:
 
     To be asked when nothing more comes although pictures are due: pixels may spell anything.
 
-    Parameters
-    ----------
-    data : bytes-like
-        What came for the present picture.
-
-    Returns
-    -------
-    str or None
+    `data`: what came for the present picture.
     """
     tail = bytes(data[-256:])
     if tail.endswith(ERROR_MARK):

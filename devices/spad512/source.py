@@ -69,14 +69,8 @@ class Spad512Feed:
     sent again. Behind a gate a picture's number modulo the gate's steps is its step: a scan that
     was cut is never finished, and the next one's numbers begin behind it.
 
-    Parameters
-    ----------
-    connect : callable
-        Returns a new connection.
-    ledger : Ledger
-    exposure : ExposureRequest
-    patience, reconnect : float
-        Seconds to wait for an answer beyond the exposure, and for a server that went away.
+    `connect`: returns a new connection; `patience, reconnect`: seconds to wait for an answer beyond
+    the exposure, and for a server that went away.
     """
 
     def __init__(

@@ -87,22 +87,8 @@ class TimeTagCodec:
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
         """Decode whole records; `state` is a `CounterState`.
 
-        Parameters
-        ----------
-        data : bytes-like
-            Whole records.
-        state : CounterState
-        after_loss : bool
-            Records are missing right before these, so that the counter may have wrapped unseen.
-
-        Returns
-        -------
-        DecodeResult
-
-        Raises
-        ------
-        InputError
-            The bytes are not whole records.
+        `data`: whole records; `after_loss`: records are missing right before these, so that the
+        counter may have wrapped unseen.
         """
         from devices.timetag.kernels import decode_timetags
 
@@ -117,13 +103,7 @@ class TimeTagCodec:
         return DecodeResult(records[:kept], len(records) - kept, CounterState(*position))
 
     def encode(self, records: Records) -> bytes:
-        """Return the bytes that the instrument would have sent.
-
-        Raises
-        ------
-        InputError
-            No instrument would send these records: see `mark_wraps` for the ones that it adds.
-        """
+        """Return the bytes that the instrument would have sent."""
         from devices.timetag.kernels import encode_timetags
 
         _require_valid(records)
@@ -135,16 +115,9 @@ class TimeTagCodec:
 def mark_wraps(records: Records) -> Records:
     """Add the records that the instrument sends each time its counter wraps.
 
-    Parameters
-    ----------
-    records : (n,) array of RECORD
-        Times must not go back.
-
-    Returns
-    -------
-    (m,) array of RECORD
-        With one record of flag WRAP at every multiple of `COUNTER_RANGE` ticks up to the last time.
-        A record that is already at such a time gets the flag instead.
+    `records` (n,): times must not go back. Returns (m,): with one record of flag WRAP at every
+    multiple of `COUNTER_RANGE` ticks up to the last time. A record that is already at such a time
+    gets the flag instead.
     """
     ticks = records["time_ticks"]
     if len(ticks) == 0:

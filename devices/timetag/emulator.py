@@ -63,66 +63,46 @@ POLL_INTERVAL_S = 4e-3
 
 @dataclass
 class GroundTruth:
-    """What really happened, for comparison with what the driver says. All in records.
+    """What really happened, for comparison with what the driver says. All in records."""
 
-    Parameters
-    ----------
-    registered : int
-        Photons that the instrument saw.
-    lost_memory_full : int
-        Of these, found its memory full.
-    lost_power_off : int
-        Of these, were in the memory of an instrument that lost its power, and all of
-        `lost_memory_full` before that.
-    corrupted : int
-        Of these, were handed over as something that cannot be a record.
-    """
-
-    registered: int = 0
-    lost_memory_full: int = 0
+    registered: int = 0  # photons that the instrument saw
+    lost_memory_full: int = 0  # of these, found its memory full
+    # of these, were in the memory of an instrument that lost its power, and all of
+    # `lost_memory_full` before that
     lost_power_off: int = 0
-    corrupted: int = 0
+    corrupted: int = 0  # of these, were handed over as something that cannot be a record
 
 
 @dataclass(frozen=True)
 class EmulatorSettings:
-    """How the emulated instrument behaves.
+    """How the emulated instrument behaves."""
 
-    Parameters
-    ----------
-    is_paced : bool
-        Photons come when they are due, and are lost while the memory is full. Otherwise time runs
-        as fast as the host reads.
-    records : int
-        Photons after which it is dark.
-    packet_bytes : int
-        Size of a packet when it is switched on: 510 bytes, as of the public firmware, each of which
-        ends a transfer, or 512.
-    memory_bytes : int
-        What fits into the instrument besides the USB chip. By default far more than into a real one
-        (`BOARD_MEMORY_BYTES`), because it shares the processor with the host, which is not always
-        given its turn in time.
-    clear_is_level : bool
-        Register CLEAR holds the memory empty until it is set to 0 again; otherwise any write clears
-        once.
-    holds_packets : bool
-        The USB chip sends a packet when it is full, or when asked to; otherwise whenever asked.
-    flush_discards : bool
-        The request to flush throws an unfinished packet away; otherwise it sends it.
-    stale_replies, old_records, jammed_bytes : int
-        What a killed program left: replies that it never fetched, records in the USB chip and the
-        memory, and bytes of a command that was cut short.
-    """
-
+    # photons come when they are due, and are lost while the memory is full. Otherwise time runs as
+    # fast as the host reads
     is_paced: bool = False
-    records: int = MAX_TICK
+    records: int = MAX_TICK  # photons after which it is dark
+    # size of a packet when it is switched on: 510 bytes, as of the public firmware, each of which
+    # ends a transfer, or 512
     packet_bytes: int = SHORT_PACKET_BYTES
+    # what fits into the instrument besides the USB chip. By default far more than into a real one
+    # (`BOARD_MEMORY_BYTES`), because it shares the processor with the host, which is not always
+    # given its turn in time
     memory_bytes: int = 64 << 20
+    # register CLEAR holds the memory empty until it is set to 0 again; otherwise any write clears
+    # once
     clear_is_level: bool = True
+    # the USB chip sends a packet when it is full, or when asked to; otherwise whenever asked
     holds_packets: bool = True
+    # the request to flush throws an unfinished packet away; otherwise it sends it
     flush_discards: bool = True
+    # what a killed program left: replies that it never fetched, records in the USB chip and the
+    # memory, and bytes of a command that was cut short
     stale_replies: int = 1
+    # what a killed program left: replies that it never fetched, records in the USB chip and the
+    # memory, and bytes of a command that was cut short
     old_records: int = 40
+    # what a killed program left: replies that it never fetched, records in the USB chip and the
+    # memory, and bytes of a command that was cut short
     jammed_bytes: int = 3
 
     def __post_init__(self) -> None:
@@ -141,14 +121,8 @@ class EmulatedTimeTagger(VirtualDevice):
 
     Memory: the larger of its own memory and one transfer.
 
-    Parameters
-    ----------
-    light : callable
-        Makes the light that falls on it from a moment at which its counter is reset; takes how
-        often it was before.
-    serial : str
-    setting : EmulatorSettings
-    faults : iterable of Fault
+    `light`: makes the light that falls on it from a moment at which its counter is reset; takes how
+    often it was before.
     """
 
     def __init__(
@@ -193,16 +167,7 @@ class EmulatedTimeTagger(VirtualDevice):
         """Take a command of the host, byte by byte as the gateware does, and queue its reply; what is
         not a command is passed over.
 
-        Parameters
-        ----------
-        endpoint : int
-            Address.
-        data : bytes
-
-        Raises
-        ------
-        usb.core.USBError
-            The endpoint is another.
+        `endpoint`: address.
         """
         if endpoint != COMMAND_ENDPOINT:
             raise make_usb_error(errno.EPIPE)
@@ -221,17 +186,7 @@ class EmulatedTimeTagger(VirtualDevice):
     def control(self, request: int, value: int) -> None:
         """Set how many bytes make a packet, or send or discard what is unfinished.
 
-        Parameters
-        ----------
-        request : int
-            `SET_SEND_WINDOW` or `FLUSH`.
-        value : int
-            Bytes of a packet.
-
-        Raises
-        ------
-        usb.core.USBError
-            It is another request.
+        `request`: `SET_SEND_WINDOW` or `FLUSH`; `value`: bytes of a packet.
         """
         chip, rest = self._unsent_bytes()
         if request == SET_SEND_WINDOW:
@@ -251,19 +206,7 @@ class EmulatedTimeTagger(VirtualDevice):
         """Write a reply or time tags into `buffer`, with the faults that were ordered for this
         transfer.
 
-        Parameters
-        ----------
-        endpoint : int
-            Address.
-        buffer : memoryview
-            Overwritten.
-        timeout : float
-            Seconds.
-
-        Returns
-        -------
-        int
-            Bytes.
+        `endpoint`: address; `buffer`: overwritten; `timeout`: seconds. Returns bytes.
         """
         if endpoint == REPLY_ENDPOINT:
             return self._send_reply(buffer)
@@ -384,10 +327,7 @@ class EmulatedTimeTagger(VirtualDevice):
     def _register_until_now(self, in_flight: int = 0) -> None:
         """Register what fell on the instrument up to now, where that depends on the time.
 
-        Parameters
-        ----------
-        in_flight : int
-            Bytes that a transfer under way takes besides what the instrument holds.
+        `in_flight`: bytes that a transfer under way takes besides what the instrument holds.
         """
         if not self.setting.is_paced or Capture.REGISTER not in self._capture:
             return

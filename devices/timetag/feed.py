@@ -44,23 +44,14 @@ FULL_STREAM_BYTES_PER_S = 500_000
 
 @dataclass(frozen=True)
 class AcquisitionSettings:
-    """How to acquire.
+    """How to acquire."""
 
-    Parameters
-    ----------
-    channels, delta : int
-        One bit for each channel that registers edges, or levels.
-    transfer_bytes : int
-        Most that one transfer asks for: whole packets of 512 bytes, or a device may send more than
-        fits.
-    reconnect : float
-        Seconds to wait for an instrument that was unplugged.
-    """
-
-    channels: int = 0xF
-    delta: int = 0
+    channels: int = 0xF  # one bit for each channel that registers edges, or levels
+    delta: int = 0  # one bit for each channel that registers edges, or levels
+    # most that one transfer asks for: whole packets of 512 bytes, or a device may send more than
+    # fits
     transfer_bytes: int = 1 << 19
-    reconnect: float = 5.0
+    reconnect: float = 5.0  # seconds to wait for an instrument that was unplugged
 
     def __post_init__(self) -> None:
         if not (0 <= self.channels <= 0xF and 0 <= self.delta <= 0xF):
@@ -290,17 +281,7 @@ class SendWindow:
     def choose(self, length: int, seconds: float) -> int:
         """Return how many bytes should make a packet from now on.
 
-        Parameters
-        ----------
-        length : int
-            Bytes that the last transfer brought.
-        seconds : float
-            How long it took.
-
-        Returns
-        -------
-        int
-            Bytes.
+        `length`: bytes that the last transfer brought; `seconds`: how long it took. Returns bytes.
         """
         self._bytes += length
         self._transfers += 1

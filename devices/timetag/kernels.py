@@ -29,23 +29,9 @@ _DOUBLE_STEP = 2.0**-53
 def decode_timetags(data, epoch, previous, after_loss, ticks, channels, flags):
     """Decode the 6-byte words in `data` (bytes) into three arrays; see `TimeTagCodec.decode`.
 
-    Parameters
-    ----------
-    data : (bytes,) uint8 array
-    epoch, previous : int
-        State of the counter.
-    after_loss : bool
-    ticks : (words,) int64 array
-        Overwritten.
-    channels, flags : (words,) array
-        Overwritten.
-
-    Returns
-    -------
-    kept : int
-        Records written; all other words are malformed.
-    epoch, previous : int
-        How often the counter has wrapped, and its last value.
+    `data` (bytes,); `epoch, previous`: state of the counter; `ticks` (words,): overwritten;
+    `channels, flags` (words,): overwritten. Returns `kept`: records written; all other words are
+    malformed; `epoch, previous`: how often the counter has wrapped, and its last value.
     """
     kept = 0
     expects_loss = after_loss
@@ -86,11 +72,7 @@ def decode_timetags(data, epoch, previous, after_loss, ticks, channels, flags):
 def encode_timetags(ticks, channels, flags, data):
     """Write records as 6-byte words, the highest byte first.
 
-    Parameters
-    ----------
-    ticks, channels, flags : (records,) array
-    data : (6 * records,) uint8 array
-        Overwritten.
+    `ticks, channels, flags` (records,); `data` (6 * records,): overwritten.
     """
     for number in range(ticks.size):
         time = ticks[number] & TIME_MASK
@@ -119,26 +101,11 @@ def _next_random(state):
 def fill_poisson_words(state, now, scale, weights, last, words):
     """Write the words of photons that arrive at random on four channels, one at most per tick.
 
-    Parameters
-    ----------
-    state : (1,) uint64 array
-        Of the random numbers; changed in place.
-    now : (1,) int64 array
-        Tick of the last record; changed in place.
-    scale : float
-        Of the exponential distribution of which the whole part is the number of ticks between two
-        photons.
-    weights : (4,) float64 array
-        Of all photons, the fraction of each channel, added up.
-    last : int
-        No record is later than this tick.
-    words : bytes
-        Filled with as many records as fit.
-
-    Returns
-    -------
-    int
-        Records written.
+    `state` (1,): of the random numbers; changed in place; `now` (1,): tick of the last record;
+    changed in place; `scale`: of the exponential distribution of which the whole part is the number
+    of ticks between two photons; `weights` (4,): of all photons, the fraction of each channel,
+    added up; `last`: no record is later than this tick; `words`: filled with as many records as
+    fit. Returns records written.
     """
     written = 0
     while written < words.size // RECORD_BYTES:

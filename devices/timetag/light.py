@@ -26,31 +26,16 @@ class TagStream(Protocol):
 
         Wraps of the counter are among them. How a stream is cut into calls does not change it.
 
-        Parameters
-        ----------
-        limit : int
-            Words.
-        last : int
-            Tick.
-
-        Returns
-        -------
-        (6 * words,) uint8 array
+        `limit`: words; `last`: tick. Returns (6 * words,).
         """
 
 
 class PoissonStream:
     """Photons at random, at a constant rate.
 
-    Parameters
-    ----------
-    rate : float
-        Photons per second on all channels together.
-    clock_hz : int
-        Ticks per second. There is one record at most per tick.
-    seed : int
-    weights : tuple of four floats
-        How the photons are shared among the channels; any positive scale.
+    `rate`: photons per second on all channels together; `clock_hz`: ticks per second. There is one
+    record at most per tick; `weights`: how the photons are shared among the channels; any positive
+    scale.
     """
 
     def __init__(
@@ -108,14 +93,8 @@ class PulsedSceneStream:
     sees within a tick count as one; what several channels see within a tick is one record. Memory:
     one block of 8192 pulses.
 
-    Parameters
-    ----------
-    light : LineLight
-        Of the scene before it is enlarged; after that, all within the laser's period of 128 ticks.
-    rate : float
-        Photons per second on the three pixels together.
-    clock_hz : int
-    seed : int
+    `light`: of the scene before it is enlarged; after that, all within the laser's period of 128
+    ticks; `rate`: photons per second on the three pixels together.
     """
 
     def __init__(self, light: LineLight, rate: float, clock_hz: int, seed: int) -> None:

@@ -75,15 +75,6 @@ class TimeTagger:
     exchange is tried again.
 
     Making one of these synchronises.
-
-    Parameters
-    ----------
-    link : UsbLink
-
-    Raises
-    ------
-    ProtocolError
-        Its answers make no sense, or none come.
     """
 
     def __init__(self, link: UsbLink) -> None:
@@ -94,13 +85,7 @@ class TimeTagger:
         self.synchronize()
 
     def synchronize(self) -> None:
-        """Throw away replies to requests of the past, and end a command that was cut short.
-
-        Raises
-        ------
-        ProtocolError
-            The version is not the same twice in a row.
-        """
+        """Throw away replies to requests of the past, and end a command that was cut short."""
         for _ in range(ATTEMPTS):
             self._drain(REPLY_ENDPOINT)
             with contextlib.suppress(DeviceTimeoutError, DeviceStalledError):
@@ -122,16 +107,7 @@ class TimeTagger:
     def write(self, register: Register, value: int) -> None:
         """Set a register.
 
-        Parameters
-        ----------
-        register : Register
-        value : int
-            32 bits.
-
-        Raises
-        ------
-        ProtocolError
-            The instrument does not answer.
+        `value`: 32 bits.
         """
         self._transact(_WRITE, register, value)
 
@@ -168,12 +144,8 @@ class TimeTagger:
         """Start the counter, then the registration, so that the first zero of the counter is not
         taken for a wrap.
 
-        Parameters
-        ----------
-        channels, delta : int
-            One bit for each channel whose edges are recorded as strobes, or whose levels.
-        capture : Capture
-            What to switch on in the end.
+        `channels, delta`: one bit for each channel whose edges are recorded as strobes, or whose
+        levels; `capture`: what to switch on in the end.
         """
         self.write(Register.STROBE, channels)
         self.write(Register.DELTA, delta)
@@ -184,25 +156,15 @@ class TimeTagger:
         """Set how many bytes make a packet, and let the chip send what it holds now, however
         little.
 
-        Parameters
-        ----------
-        size : int
-            At most 512. Packets of 512 bytes do not end a transfer, smaller ones do.
-
-        Returns
-        -------
-        bool
-            False where the firmware has no such request.
+        `size`: at most 512. Packets of 512 bytes do not end a transfer, smaller ones do. Returns
+        false where the firmware has no such request.
         """
         return self._request(_SET_SEND_WINDOW, size)
 
     def flush(self) -> bool:
         """Let the chip get rid of an unfinished packet: send it or, by other firmware, forget it.
 
-        Returns
-        -------
-        bool
-            False where the firmware has no such request.
+        Returns false where the firmware has no such request.
         """
         return self._request(_FLUSH, 0)
 

@@ -38,17 +38,7 @@ def open_timetag(uri: Uri) -> StreamSource:
 def open_on_backend(uri: Uri, serial: str, backend: Any) -> StreamSource:
     """Open the time tagger behind a backend of pyusb, with the values of an address (`OPTIONS`).
 
-    Parameters
-    ----------
-    uri : Uri
-    serial : str
-        Of the instrument; empty: any.
-    backend : object
-        Of pyusb.
-
-    Returns
-    -------
-    StreamSource
+    `serial`: of the instrument; empty: any; `backend`: of pyusb.
     """
     standard = AcquisitionSettings()
     acquisition = AcquisitionSettings(

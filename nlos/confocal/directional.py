@@ -40,39 +40,18 @@ class DirectionalLightCone:
 
     Young, Lindell, Girod, Taubman, Wetzstein, "Non-line-of-sight surface reconstruction using the
     directional light-cone transform", CVPR 2020.
-
-    Parameters
-    ----------
-    transform : LightCone
-        Its Wiener filter and falloff.
     """
 
-    transform: LightCone = field(default_factory=LightCone)
+    transform: LightCone = field(default_factory=LightCone)  # its Wiener filter and falloff
 
     def find_front_surface(
         self, capture: Capture, grid: Grid, fraction: float = 0.3
     ) -> FrontSurface:
         """Find depth, albedo and normal on every line of sight.
 
-        Parameters
-        ----------
-        capture : Capture
-            As of `LightCone`.
-        grid : Grid
-            At least 3 voxels along every axis.
-        fraction : float
-            A line of sight shows a surface where its brightest voxel has this fraction of the
-            brightest of all.
-
-        Returns
-        -------
-        FrontSurface
-
-        Raises
-        ------
-        InputError
-            The capture is not a confocal scan of a lattice on a plane, the volume is dark, or the
-            fraction is not between 0 and 1.
+        `capture`: as of `LightCone`; `grid`: at least 3 voxels along every axis; `fraction`: A line
+        of sight shows a surface where its brightest voxel has this fraction of the brightest of
+        all.
         """
         # Refuses what the transform cannot image.
         self.transform.plan(capture, grid)
@@ -153,24 +132,8 @@ def find_imaged_surface(capture: Capture, volume: Volume, fraction: float = 0.3)
     """Find the front surface of a capture that has been imaged: by the directional light-cone
     transform where it takes the capture, else from the volume's gradients.
 
-    Parameters
-    ----------
-    capture : Capture
-        That the volume was made of.
-    volume : Volume
-        Whose voxels are taken.
-    fraction : float
-        A line of sight shows a surface where its brightest voxel has this fraction of the
-        brightest of all.
-
-    Returns
-    -------
-    FrontSurface
-
-    Raises
-    ------
-    InputError
-        The volume is too small or dark, or the fraction is not between 0 and 1.
+    `capture`: that the volume was made of; `volume`: whose voxels are taken; `fraction`: A line of
+    sight shows a surface where its brightest voxel has this fraction of the brightest of all.
     """
     here = volume.on(ComputeDevice())
     require_surface(here.magnitude, fraction)

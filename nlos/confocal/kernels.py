@@ -16,14 +16,9 @@ def migrate_row(spectrum, ky, kx, delay):
     ``F(kx, ky, kz) = kz / k * S(kx, ky, k)`` with ``k = sqrt(kx^2 + ky^2 + kz^2)``, S linearly
     interpolated and then delayed by the time that was taken off it.
 
-    Parameters
-    ----------
-    spectrum : (columns, frequencies) complex64 array
-    ky : float
-    kx : (columns,) float64 array
-        Lateral wavenumbers in samples of the frequency axis.
-    delay : float
-        Phase per sample of frequency by which the spectrum is ahead of its time, rad.
+    `spectrum` (columns, frequencies); `kx` (columns,): lateral wavenumbers in samples of the
+    frequency axis; `delay`: phase per sample of frequency by which the spectrum is ahead of its
+    time, rad.
     """
     count = spectrum.shape[1]
     for column in range(spectrum.shape[0]):

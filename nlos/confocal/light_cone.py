@@ -135,14 +135,8 @@ def build_rebinning_matrix(source_edges: FloatArray, target_edges: FloatArray) -
     """Matrix (targets, sources) of the means over target intervals of a function given by its means
     over source ones.
 
-    Parameters
-    ----------
-    source_edges, target_edges : (n + 1,) array
-        Increasing; intervals of length 0 are allowed. Targets beyond the sources count as 0 there.
-
-    Returns
-    -------
-    (targets, sources) csr_array
+    `source_edges, target_edges` (n + 1,): increasing; intervals of length 0 are allowed. Targets
+    beyond the sources count as 0 there. Returns (targets, sources).
     """
     from scipy.sparse import csr_array
 
@@ -165,20 +159,9 @@ def transform_squared_distances(
     """Return the spectrum of the signals over the square v = d^2 of the distance, in which every
     depth has the same kernel.
 
-    Parameters
-    ----------
-    scan : ConfocalScan
-    squares : float
-        Distance of samples of v, m^2.
-    falloff : float
-        Power of the distance by which light is weaker; it is made up for.
-
-    Returns
-    -------
-    spectrum : (y, x, v) complex64 array
-        Half spectrum, padded, so that no convolution wraps around.
-    shape : (int, int, int)
-        Samples along y, x and v with the padding.
+    `squares`: distance of samples of v, m^2; `falloff`: power of the distance by which light is
+    weaker; it is made up for. Returns `spectrum` (y, x, v): half spectrum, padded, so that no
+    convolution wraps around; `shape`: samples along y, x and v with the padding.
     """
     from scipy.fft import fft2, rfft
 
@@ -229,16 +212,7 @@ def tabulate_powers(
 ) -> NDArray[np.complex64]:
     """``turn[w] ** power`` from a table of one whole turn.
 
-    Parameters
-    ----------
-    turn : (w,) array
-        ``exp(-2j * pi * (first + w) / period)``.
-    power : (...) int array
-    period, first : int
-
-    Returns
-    -------
-    (..., w) complex64 array
+    `turn` (w,): ``exp(-2j * pi * (first + w) / period)``. Returns (..., w).
     """
     # powers of a root of unity repeat: a table is quicker than exponentials, and as exact
     table = np.exp(-2j * np.pi * np.arange(period) / period).astype(np.complex64)

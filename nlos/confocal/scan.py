@@ -33,44 +33,21 @@ WHOLE_BIN_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ConfocalScan:
-    """Signals on a lattice of wall points; where a point is missing, it is dark.
+    """Signals on a lattice of wall points; where a point is missing, it is dark."""
 
-    Parameters
-    ----------
-    signal : (y, x, t) float32 array
-        What every wall point saw; bin i stands for the distance ``i * spacing`` from it.
-    plane : Plane
-        The wall points.
-    spacing : float
-        Distance per bin, m: half the path.
-    """
-
+    # (y, x, t), what every wall point saw; bin i stands for the distance ``i * spacing`` from it
     signal: NDArray[np.float32]
-    plane: Plane
-    spacing: float
+    plane: Plane  # the wall points
+    spacing: float  # distance per bin, m: half the path
 
     @classmethod
     def of(cls, capture: Capture, grid: Grid) -> ConfocalScan:
         """Sort a capture onto its lattice, from distance 0 as far as any voxel of the grid is from
         any wall point.
 
-        Parameters
-        ----------
-        capture : Capture
-            Confocal, its wall points on a lattice of a plane.
-        grid : Grid
-            Says how far the signals are needed.
-
-        Returns
-        -------
-        ConfocalScan
-            Signals (y, x, t) float32; a bin is half as long as the capture's, because it counts
-            distance, not path.
-
-        Raises
-        ------
-        InputError
-            The wall points stand on no lattice.
+        `capture`: confocal, its wall points on a lattice of a plane; `grid`: says how far the
+        signals are needed. Returns signals (y, x, t) float32; a bin is half as long as the
+        capture's, because it counts distance, not path.
         """
         wall = PlanarWall.of(capture.points, LATTICE_TOLERANCE)
         traces = _shift_to_distance_zero(capture, _count_useful_bins(capture, wall.plane, grid))
@@ -145,18 +122,8 @@ def interpolate_axis(
 ) -> NDArray[np.float32]:
     """Read an axis at fractional positions by linear interpolation; it is periodic.
 
-    Parameters
-    ----------
-    values : float32 array
-        Any shape.
-    position : (n,) float array
-        In steps of the axis.
-    axis : int
-
-    Returns
-    -------
-    float32 array
-        As `values`, with n places along the axis.
+    `values`: any shape; `position` (n,): in steps of the axis. Returns as `values`, with n places
+    along the axis.
     """
     below = np.floor(position).astype(np.intp)
     weight = (position - below).astype(np.float32)
@@ -172,18 +139,8 @@ def resample_to_grid(
 ) -> NDArray[np.float32]:
     """Read an image (y, x, depth) on the padded lattice at the voxels of a grid, shape (z, y, x).
 
-    Parameters
-    ----------
-    values : (y, x, depth) float32 array
-    scan : ConfocalScan
-        Its plane gives the lattice's first point and steps, m.
-    grid : Grid
-    depth_position : (z,) float array
-        The grid's planes in steps of the third axis.
-
-    Returns
-    -------
-    (z, y, x) float32 array
+    `values` (y, x, depth); `scan`: its plane gives the lattice's first point and steps, m;
+    `depth_position` (z,): the grid's planes in steps of the third axis. Returns (z, y, x).
     """
     image = interpolate_axis(values, depth_position, 2)
     row, column = (

@@ -37,11 +37,6 @@ def read_numpy_archive(fields: NamedArrays) -> Capture:
     Lengths in m, durations in s; bin 0 holds the path ``t_start_m`` from the laser spot to the wall
     point. Bins of different widths are put into even ones. Lasers (lasers..., 3) of which each was
     combined with all wall points come with ``H`` (t, lasers..., points...).
-
-    Raises
-    ------
-    FileFormatError
-        The signal belongs to neither wall nor lasers, or its time axis is the last.
     """
     signal = fields.read_numbers("H")
     wall, laser = (fields.read_coordinates(f"{name}_xyz") for name in ("wall", "laser"))
@@ -72,25 +67,9 @@ def resample_evenly(
 
     The light of a bin is taken to be spread evenly over it; an even bin is as wide as the median.
 
-    Parameters
-    ----------
-    fields : NamedArrays
-        For the error message.
-    signal : (t, ...) array
-    paths : (t,) array
-        Path at the middle of every bin, m.
-
-    Returns
-    -------
-    signal : (t, ...) array
-        The same one where bins are even.
-    start, spacing : float
-        Path of the first bin and from one to the next, m.
-
-    Raises
-    ------
-    FileFormatError
-        Paths do not grow, or differ so much in width that even bins would be too many.
+    `fields`: for the error message; `signal` (t, ...); `paths` (t,): path at the middle of every
+    bin, m. Returns `signal` (t, ...): the same one where bins are even; `start, spacing`: path of
+    the first bin and from one to the next, m.
     """
     widths = np.diff(paths)
     if len(paths) < 2 or not widths.min() > 0:

@@ -56,11 +56,6 @@ def read_curvelet_data(fields: NamedArrays) -> Capture:
 
     Without the script points are metres: (depth, to the left, up) where the first does not vary,
     else (x, y, z).
-
-    Raises
-    ------
-    FileFormatError
-        Points are missing, or are numbers of a lattice and the script is missing.
     """
     counts = fields.array("sub_Sig", None, None)
     laser, wall = (_read_points(fields, name, len(counts)) for name in ("C_i.mat", "C_d.mat"))
@@ -87,19 +82,7 @@ def read_curvelet_data(fields: NamedArrays) -> Capture:
 def parse_setup(path: str | Path) -> Mapping[str, float]:
     """Read the first value of each of `SETUP_NAMES` in a MATLAB script.
 
-    Parameters
-    ----------
-    path : path-like
-        Assignments of sums and products of numbers, and of names set before.
-
-    Returns
-    -------
-    mapping of str to float
-
-    Raises
-    ------
-    FileFormatError
-        A name is not set, or not to a positive number.
+    `path`: assignments of sums and products of numbers, and of names set before.
     """
     with translate_read_errors(path), open(path, "rb") as file:
         text = file.read(MAX_SCRIPT_BYTES).decode(errors="replace")

@@ -24,11 +24,7 @@ Entries = Mapping[str, ArchiveEntry]
 class NamedArrays(Archive):
     """Named arrays with the file that they come from; see `Archive` for how they are taken out.
 
-    Parameters
-    ----------
-    path : path-like
-    list_entries : callable, optional
-        Lists what the file holds; by default that of a NumPy archive.
+    `list_entries`: lists what the file holds; by default that of a NumPy archive.
     """
 
     def __init__(
@@ -96,13 +92,7 @@ class NamedArrays(Archive):
 
 
 def read_hdf5(path: str | Path) -> NamedArrays:
-    """List all arrays of an HDF5 file; groups become names with dots.
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        The file cannot be read, is damaged, or an array claims more than can be read.
-    """
+    """List all arrays of an HDF5 file; groups become names with dots."""
     return NamedArrays(path, lambda opened: _list_hdf5_entries(opened, False))
 
 
@@ -111,11 +101,6 @@ def read_matlab(path: str | Path) -> NamedArrays:
     structs become dotted names.
 
     Axes are in MATLAB's order, whatever the version.
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        The file cannot be read, is damaged, or an array claims more than can be read.
     """
     if _is_hdf5(path):
         return NamedArrays(path, lambda opened: _list_hdf5_entries(opened, True))

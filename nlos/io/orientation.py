@@ -18,15 +18,7 @@ def rotate_to_scene(capture: Capture, towards_scene: NDArray[np.float64]) -> Cap
     A direction of +z leaves them as they are; of -z, they turn half around y. Otherwise the old z,
     upright in most programs, becomes -y, because y points down here.
 
-    Parameters
-    ----------
-    capture : Capture
-    towards_scene : (3,) array
-        From the wall into the hidden scene; of any length but 0.
-
-    Returns
-    -------
-    Capture
+    `towards_scene` (3,): from the wall into the hidden scene; of any length but 0.
     """
     turn = _build_rotation(towards_scene)
     laser, wall = capture.laser @ turn.T, capture.wall @ turn.T

@@ -48,24 +48,8 @@ def match_lasers_to_sensors(
 ) -> Capture:
     """Find out by the shapes which laser points belong to which sensor points.
 
-    Parameters
-    ----------
-    fields : NamedArrays
-        For the error message.
-    signal : (t, sensors...) or (t, lasers..., sensors...) array
-    sensor, laser : (..., 3) array
-        m.
-    bin_width, start : float
-        s and m.
-
-    Returns
-    -------
-    Capture
-
-    Raises
-    ------
-    FileFormatError
-        The signal's shape belongs neither to the wall points nor to the laser points.
+    `fields`: for the error message; `signal` (t, sensors...); `sensor, laser` (..., 3): m;
+    `bin_width, start`: s and m.
     """
     sensors, lasers = sensor.shape[:-1], laser.shape[:-1]
     if not signal.ndim:

@@ -37,18 +37,7 @@ def backproject_on_device(
     Memory: the volume, 64 MiB of waveforms, and five chunks (`ArrayLibrary.chunk_bytes`) for the
     pairs of voxel and wall point that are looked up at a time.
 
-    Parameters
-    ----------
-    capture : Capture
-    grid : Grid
-    band : Band
-    weighting : Weighting
-    progress : callable
-        Called with the number of look-ups just done.
-
-    Returns
-    -------
-    (z, y, x) complex64 array
+    `progress`: called with the number of look-ups just done. Returns (z, y, x).
     """
     library = ArrayLibrary(capture.device)
     rows = _VoxelRows(grid, library, weighting)
@@ -69,45 +58,21 @@ def backproject_on_device(
 
 @dataclass(frozen=True, eq=False)
 class _Waveforms:
-    """Waveforms of some wall points, one after the other in one flat array, and where these stand.
+    """Waveforms of some wall points, one after the other in one flat array, and where these stand."""
 
-    Parameters
-    ----------
-    values : (points * samples,) complex64 array
-        The first and the last two samples of a point are 0.
-    sample_count : int
-    start, spacing : float
-        Path length of the first sample, and path between samples, m.
-    first : (points,) int64 array
-        Index of each point's first sample.
-    wall, lasers : (3, points) float32 array
-        m; one laser spot, or one for each point.
-    """
-
-    values: Array
+    values: Array  # (points * samples,), the first and the last two samples of a point are 0
     sample_count: int
-    start: float
-    spacing: float
-    first: Array
-    wall: Array
-    lasers: Array
+    start: float  # path length of the first sample, and path between samples, m
+    spacing: float  # path length of the first sample, and path between samples, m
+    first: Array  # (points,), index of each point's first sample
+    wall: Array  # (3, points), m; one laser spot, or one for each point
+    lasers: Array  # (3, points), m; one laser spot, or one for each point
 
     @classmethod
     def of(cls, capture: Capture, points: slice, band: Band, analysis: BandTransform) -> _Waveforms:
         """Return the waveforms of some wall points.
 
-        Parameters
-        ----------
-        capture : Capture
-        points : slice
-            Of its valid wall points.
-        band : Band
-        analysis : BandTransform
-            From signals to the band's phasors.
-
-        Returns
-        -------
-        _Waveforms
+        `points`: of its valid wall points; `analysis`: from signals to the band's phasors.
         """
         library, (carriers, start, spacing) = ArrayLibrary(capture.device), band.carriers
         values = analysis.of(get_traces(capture, points)) @ library.put(carriers)
@@ -137,15 +102,7 @@ class _VoxelRows:
     def look_up(self, some: slice, waveforms: _Waveforms) -> Array:
         """Return what some rows (rows, x) find in the waveforms.
 
-        Parameters
-        ----------
-        some : slice
-            Of the rows.
-        waveforms : _Waveforms
-
-        Returns
-        -------
-        (rows, x) complex64 array
+        `some`: of the rows. Returns (rows, x).
         """
         xp, wall = self.library.xp, waveforms.wall
         y, z = self.y[some, ...], self.z[some, ...]

@@ -32,55 +32,28 @@ more.
 
 @dataclass(frozen=True, eq=False)
 class _DepthBlock:
-    """What some neighbouring depths need, as arrays of the library.
+    """What some neighbouring depths need, as arrays of the library."""
 
-    Parameters
-    ----------
-    indices : slice
-        Of the computed depths.
-    transfer : (z, nodes, frequencies) complex64 array
-        At the nodes of the lateral wavenumber.
-    coefficients : (z, frequencies, m) complex64 array
-        Of the illumination's functions, 0 where a depth has fewer.
-    table : (z * samples, m) float32 array
-        The functions themselves.
-    axial_distance : (z, 1, 1) float32 array
-        Distance along z from the laser spot, m.
-    turns : (z, 1, 1) float32 array
-        What the illumination's carrier turns by over `axial_distance`.
-    table_position : (z, 1, 1) and (z, 1, 1) float32 arrays
-        Of `axial_distance` in the table, and samples per metre.
-    """
-
-    indices: slice
-    transfer: Array
+    indices: slice  # of the computed depths
+    transfer: Array  # (z, nodes, frequencies), at the nodes of the lateral wavenumber
+    # (z, frequencies, m), of the illumination's functions, 0 where a depth has fewer
     coefficients: Array
-    table: Array
-    axial_distance: Array
-    turns: Array
+    table: Array  # (z * samples, m), the functions themselves
+    axial_distance: Array  # (z, 1, 1), distance along z from the laser spot, m
+    turns: Array  # (z, 1, 1), what the illumination's carrier turns by over `axial_distance`
+    # (z, 1, 1), of `axial_distance` in the table, and samples per metre
     table_position: tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
 class _BlockBetween:
-    """Some neighbouring depths that follow from computed ones, as arrays of the library.
+    """Some neighbouring depths that follow from computed ones, as arrays of the library."""
 
-    Parameters
-    ----------
-    depths : slice
-        Of the wanted depths.
-    nodes : slice
-        Of the computed ones.
-    weights : (depths, nodes) complex64 array
-    axial_distance, turns : (depths, 1, 1) float32 arrays
-        As of `_DepthBlock`.
-    """
-
-    depths: slice
-    nodes: slice
-    weights: Array
-    axial_distance: Array
-    turns: Array
+    depths: slice  # of the wanted depths
+    nodes: slice  # of the computed ones
+    weights: Array  # (depths, nodes)
+    axial_distance: Array  # (depths, 1, 1), as of `_DepthBlock`
+    turns: Array  # (depths, 1, 1), as of `_DepthBlock`
 
 
 class PortableDiffraction:
@@ -91,12 +64,6 @@ class PortableDiffraction:
     frequencies and 400 nodes), beyond that made anew for every field. Memory besides: four chunks
     (`ArrayLibrary.chunk_bytes`) for the depths that are treated together, and at least 60 bytes per
     plane wave and frequency.
-
-    Parameters
-    ----------
-    plan : DiffractionPlan
-    source : Source
-    library : Library
     """
 
     def __init__(self, plan: DiffractionPlan, source: LaserSource, library: ArrayLibrary) -> None:
@@ -118,14 +85,8 @@ class PortableDiffraction:
         """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r; see
         `nlos.rsd.image_planes.CompiledDiffraction`.
 
-        Parameters
-        ----------
-        values : (y, x, frequencies) complex64 array
-            On the way's plane.
-        total : (z, y, x) complex64 array
-            Added to.
-        progress : callable, optional
-            Called with the number of voxels just done.
+        `values` (y, x, frequencies): on the way's plane; `total` (z, y, x): added to; `progress`:
+        called with the number of voxels just done.
         """
         spectrum, between = self._to_spectrum(values), self._blocks_between
         count, wanted = self._computed_depths.nodes.size, total.shape[0]

@@ -21,12 +21,7 @@ SINGLE_PRECISION_DTYPES = {"f": np.float32, "c": np.complex64}
 
 @dataclass(frozen=True)
 class ArrayLibrary:
-    """A library at one place, computing in single precision.
-
-    Parameters
-    ----------
-    device : ComputeDevice
-    """
+    """A library at one place, computing in single precision."""
 
     device: ComputeDevice
 
@@ -63,14 +58,7 @@ class ArrayLibrary:
     def make_complex(self, real: Array, imaginary: Array) -> Array:
         """Make complex numbers of real and imaginary parts.
 
-        Parameters
-        ----------
-        real, imaginary : array
-            Of one shape.
-
-        Returns
-        -------
-        complex64 array
+        `real, imaginary`: of one shape.
         """
         xp = self.xp
         return xp.astype(real, xp.complex64) + 1j * xp.astype(imaginary, xp.complex64)

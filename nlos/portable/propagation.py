@@ -35,14 +35,7 @@ class PortablePropagation:
     frequencies (20 MB for 128 x 128 points and 120 frequencies); and four chunks
     (`ArrayLibrary.chunk_bytes`) for what is treated together.
 
-    Parameters
-    ----------
-    geometry : WallBeforePlane
-    waves : SphericalWaves
-        From points.
-    tolerance : float
-        Relative error allowed.
-    library : Library
+    `waves`: from points; `tolerance`: relative error allowed.
     """
 
     def __init__(
@@ -61,14 +54,7 @@ class PortablePropagation:
 
         Progress counts points of the plane times frequencies, all at once.
 
-        Parameters
-        ----------
-        phasors : (n, frequencies) complex64 array
-        progress : callable
-
-        Returns
-        -------
-        (y, x, frequencies) complex64 array
+        `phasors` (n, frequencies). Returns (y, x, frequencies).
         """
         if self._propagator is None:
             self._propagator = self._choose_propagator(phasors)
@@ -91,18 +77,11 @@ class PortablePropagation:
 
 @dataclass(frozen=True, eq=False)
 class _FrequencyGroup:
-    """Some neighbouring frequencies with their terms.
-
-    Parameters
-    ----------
-    frequencies : slice
-    point_factors : (m, n) complex64 array
-    node_factors : (frequencies, nodes, m) complex64 array
-    """
+    """Some neighbouring frequencies with their terms."""
 
     frequencies: slice
-    point_factors: Array
-    node_factors: Array
+    point_factors: Array  # (m, n)
+    node_factors: Array  # (frequencies, nodes, m)
 
 
 class _LowRankPropagator:

@@ -19,12 +19,7 @@ class BandTransform:
     """The Fourier transform of signals at a band's frequencies, as a matrix that is kept where the
     signals live.
 
-    Parameters
-    ----------
-    band : Band
-    bins : int
-        Of the signals; a band may have been made for a longer record.
-    library : Library
+    `bins`: of the signals; a band may have been made for a longer record.
     """
 
     def __init__(self, band: Band, bins: int, library: ArrayLibrary) -> None:
@@ -46,15 +41,7 @@ class BandTransform:
 def get_group_traces(capture: Capture, group: IlluminationGroup) -> Array:
     """Return the signals of one illumination group.
 
-    Parameters
-    ----------
-    capture : Capture
-    group : IlluminationGroup
-
-    Returns
-    -------
-    (points, t) array
-        In the capture's own library.
+    Returns (points, t): in the capture's own library.
     """
     return ArrayLibrary.of(capture.signal).xp.permute_dims(
         _select_signals(capture, group.indices), (1, 0)
@@ -64,16 +51,7 @@ def get_group_traces(capture: Capture, group: IlluminationGroup) -> Array:
 def get_traces(capture: Capture, some: slice) -> Array:
     """Return the signals (points, t) of some valid wall points.
 
-    Parameters
-    ----------
-    capture : Capture
-    some : slice
-        Of the valid wall points.
-
-    Returns
-    -------
-    (points, t) array
-        In the capture's own library.
+    `some`: of the valid wall points. Returns (points, t): in the capture's own library.
     """
     xp = ArrayLibrary.of(capture.signal).xp
     indices = np.arange(len(capture.points))[some]
@@ -84,15 +62,7 @@ def arrange_on_lattice(values: Array, wall: WallLattice, library: ArrayLibrary) 
     """Put values (..., points) into their places on a lattice, (..., rows, columns); the others are
     0.
 
-    Parameters
-    ----------
-    values : (..., points) array
-    wall : WallLattice
-    library : ArrayLibrary
-
-    Returns
-    -------
-    (..., rows, columns) array
+    `values` (..., points). Returns (..., rows, columns).
     """
     xp = library.xp
     if not wall.is_complete:

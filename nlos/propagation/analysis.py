@@ -24,16 +24,8 @@ class PlaneWaveAnalysis(Protocol):
         """Analyse ``values * weights[m]`` up to an index along x, (terms, columns, rows); see
         `LatticeAnalysis`.
 
-        Parameters
-        ----------
-        values : (points,) complex64 array
-        weights : (terms, points) complex64 array
-        reach : int
-            Largest index along x.
-
-        Returns
-        -------
-        (terms, columns, rows) complex64 array
+        `values` (points,); `weights` (terms, points); `reach`: largest index along x. Returns
+        (terms, columns, rows).
         """
         ...
 
@@ -45,15 +37,8 @@ class LatticeAnalysis:
     Along x only the rows with points in them are transformed, along y only the columns that count.
     Not to be shared between threads.
 
-    Parameters
-    ----------
-    wall : WallLattice
-    lattice : (int, int)
-        Places in a period along y and x; at least the wall's.
-    reach : int
-        Largest index along x.
-    terms : int
-        At most.
+    `lattice`: places in a period along y and x; at least the wall's; `reach`: largest index along
+    x; `terms`: at most.
     """
 
     def __init__(self, wall: WallLattice, lattice: tuple[int, int], reach: int, terms: int) -> None:

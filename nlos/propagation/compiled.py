@@ -40,13 +40,7 @@ class CompiledPropagation:
     The terms of the Fourier transforms are chosen for the spectrum of the first phasors that come;
     they stay for later ones, so that a sequence of like signals is planned once.
 
-    Parameters
-    ----------
-    geometry : WallBeforePlane
-    waves : SphericalWaves
-        From points.
-    tolerance : float
-        Relative error allowed.
+    `waves`: from points; `tolerance`: relative error allowed.
     """
 
     def __init__(self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float) -> None:
@@ -61,14 +55,7 @@ class CompiledPropagation:
 
         Progress counts points of the plane times frequencies.
 
-        Parameters
-        ----------
-        phasors : (n, frequencies) complex64 array
-        progress : callable
-
-        Returns
-        -------
-        (y, x, frequencies) complex64 array
+        `phasors` (n, frequencies). Returns (y, x, frequencies).
         """
         if not self._planned:
             self._plan, self._planned = self._choose_plan(phasors), True
@@ -109,17 +96,8 @@ def propagate_low_rank(
     20 MB for 128 x 128 points and 120 frequencies) and, per thread, for the spectra of one
     frequency's terms.
 
-    Parameters
-    ----------
-    plan : WallToPlanePlan
-    phasors : (n, frequencies) complex64 array
-    progress : callable, optional
-        Called with the number of values just done.
-
-    Returns
-    -------
-    (y, x, frequencies) complex64 array
-        In memory, frequency after frequency.
+    `phasors` (n, frequencies); `progress`: called with the number of values just done. Returns (y,
+    x, frequencies): in memory, frequency after frequency.
     """
     field = np.empty((phasors.shape[1], *plan.plane.shape), np.complex64)
     low_rank_transfer = plan.low_rank_transfer
@@ -163,13 +141,8 @@ class _Workspace:
     ) -> None:
         """Propagate one group of frequencies.
 
-        Parameters
-        ----------
-        number : int
-            Of the group.
-        phasors : (points, frequencies) complex64 array
-        field : (frequencies, y, x) complex64 array
-            Overwritten at the group's frequencies.
+        `number`: of the group; `phasors` (points, frequencies); `field` (frequencies, y, x):
+        overwritten at the group's frequencies.
         """
         plan = self.plan
         group, terms = plan.low_rank_transfer.groups[number], plan.low_rank_transfer.terms(number)
@@ -199,20 +172,9 @@ def propagate_direct(
 
     See `sum_spherical_waves`.
 
-    Parameters
-    ----------
-    points : (n, 3) float64 array
-        Wall points, m.
-    phasors : (n, frequencies) complex64 array
-    plane : Plane
-    wavenumbers : (frequencies,) float64 array
-        rad/m.
-    progress : callable
-        Called with the number of plane points times frequencies just done.
-
-    Returns
-    -------
-    (y, x, frequencies) complex64 array
+    `points` (n, 3): wall points, m; `phasors` (n, frequencies); `wavenumbers` (frequencies,):
+    rad/m; `progress`: called with the number of plane points times frequencies just done. Returns
+    (y, x, frequencies).
     """
     return sum_spherical_waves(
         plane.points.reshape(-1, 3), points, phasors, wavenumbers, progress
@@ -231,19 +193,8 @@ def sum_spherical_waves(
     Good to 1e-5 for points of any place and order; one complex product per pair of points and
     frequency. Memory for the result and a copy of the phasors.
 
-    Parameters
-    ----------
-    targets, sources : (m, 3), (n, 3) array
-        m.
-    phasors : (n, frequencies) complex64 array
-    wavenumbers : (frequencies,) array
-        Evenly spaced, rad/m.
-    progress : callable, optional
-        Called with the number of values just done.
-
-    Returns
-    -------
-    (m, frequencies) complex64 array
+    `targets, sources` (m, 3): m; `phasors` (n, frequencies); `wavenumbers` (frequencies,): evenly
+    spaced, rad/m; `progress`: called with the number of values just done. Returns (m, frequencies).
     """
     frequencies = wavenumbers.size
     padded = -(-frequencies // FREQUENCY_STEPS) * FREQUENCY_STEPS

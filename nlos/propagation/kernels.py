@@ -35,19 +35,10 @@ def add_spherical_waves(sources, phasors, targets, first, step, sums):
     e_w - e_(w-1)``, two products instead of four. All that the inner loop writes lies in two flat
     arrays, so that it becomes vector code.
 
-    Parameters
-    ----------
-    sources : (n, 3) float32 array
-        m.
-    phasors : (n, 2 * frequencies) float32 array
-        Real and imaginary parts in turns; the number of frequencies is a multiple of
-        `FREQUENCY_STEPS`.
-    targets : (3 * LANES,) float32 array
-        All x, all y, all z, m.
-    first, step : float32
-        Lowest wavenumber and distance of neighbouring ones, in turns per m.
-    sums : (frequencies * 2 * LANES,) float32 array
-        Added to: per frequency all real, then all imaginary parts.
+    `sources` (n, 3): m; `phasors` (n, 2 * frequencies): real and imaginary parts in turns; the
+    number of frequencies is a multiple of `FREQUENCY_STEPS`; `targets` (3 * LANES,): all x, all y,
+    all z, m; `first, step`: lowest wavenumber and distance of neighbouring ones, in turns per m;
+    `sums` (frequencies * 2 * LANES,): added to: per frequency all real, then all imaginary parts.
     """
     wave = np.empty(5 * TARGET_LANES, np.float32)
     for p in range(sources.shape[0]):
@@ -109,17 +100,9 @@ def shift_and_sum(signals, sources, targets, scale, latest, sums):
     """Add every source's signal, moved earlier by its way to a target and divided by it, to the
     target's.
 
-    Parameters
-    ----------
-    signals : (n, bins) float32 array
-    sources, targets : (n, 3), (m, 3) float64 array
-        m.
-    scale : float
-        Bins per m of distance.
-    latest : float
-        Distance in bins that bin 0 of the results is early by; at least the largest.
-    sums : (m, bins) float32 array
-        Added to; long enough for the earliest and the latest arrival.
+    `signals` (n, bins); `sources, targets` (n, 3): m; `scale`: bins per m of distance; `latest`:
+    distance in bins that bin 0 of the results is early by; at least the largest; `sums` (m, bins):
+    added to; long enough for the earliest and the latest arrival.
     """
     bins = signals.shape[1]
     for v in range(targets.shape[0]):
@@ -158,25 +141,13 @@ def add_low_rank_terms(
     The factors depend on the lateral wavenumber alone and are interpolated once for a column and
     its mirror image.
 
-    Parameters
-    ----------
-    spectra : (m, columns, 2 * rows) float32 array
-        Real and imaginary parts in turns; columns and rows in the order of Fourier transforms.
-    node_factors : (nodes, n) float32 array
-        Factors at the nodes: the real parts of all m terms, then the imaginary parts, then
-        anything.
-    node : (columns, rows) int64 array
-        First node about every wave whose indices are not negative.
-    weight : (columns, rows, taps) float32 array
-        Weights of the nodes from it on.
-    reach : (some columns,) int64 array
-        Largest index along y that counts in every column from 0 on.
-    shift_x, shift_y : complex64 array
-        Phases of all indices from the most negative on.
-    cell_x, cell_y : int64 array
-        Where plane waves go: the sum of the numbers of their indices.
-    joined : (cells,) complex64 array
-        Added to.
+    `spectra` (m, columns, 2 * rows): real and imaginary parts in turns; columns and rows in the
+    order of Fourier transforms; `node_factors` (nodes, n): factors at the nodes: the real parts of
+    all m terms, then the imaginary parts, then anything; `node` (columns, rows): first node about
+    every wave whose indices are not negative; `weight` (columns, rows, taps): weights of the nodes
+    from it on; `reach` (some columns,): largest index along y that counts in every column from 0
+    on; `shift_x, shift_y`: phases of all indices from the most negative on; `cell_x, cell_y`: where
+    plane waves go: the sum of the numbers of their indices; `joined` (cells,): added to.
     """
     highest = shift_y.size // 2
     factors = np.empty((node_factors.shape[1], shift_y.size), np.float32)

@@ -34,17 +34,12 @@ EIGENVALUE_CUTOFF = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class LowRankTerms:
-    """``K_k(q, d_p) ~ sum_m over_waves[k, q, m] * over_points[m, p]`` at some frequencies.
+    """``K_k(q, d_p) ~ sum_m over_waves[k, q, m] * over_points[m, p]`` at some frequencies."""
 
-    Parameters
-    ----------
-    wave_factors : (frequencies, nodes, n) float32 array
-        At the nodes of the transfer functions: all real, then all imaginary parts, then 0.
-    point_factors : (m, points) complex64 array
-    """
-
+    # (frequencies, nodes, n), at the nodes of the transfer functions: all real, then all imaginary
+    # parts, then 0
     wave_factors: NDArray[np.float32]
-    point_factors: NDArray[np.complex64]
+    point_factors: NDArray[np.complex64]  # (m, points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,25 +50,15 @@ class LowRankTransfer:
     distances that occur, weighted as they occur, come from an eigenvalue problem per group of
     frequencies: about one for each half turn that the waves differ by over the relief, and one for
     each piece of a wall of flat pieces.
-
-    Parameters
-    ----------
-    transfer : Transfer
-    distances : (points,) array
-        Along z, m.
-    lateral_limits : (frequencies,) array
-        Largest lateral wavenumber that counts at each frequency, rad/m.
-    strength : (frequencies,) array
-        How strong the field is at each frequency; decides what may be neglected.
-    tolerance : float
-        Relative error allowed.
     """
 
     transfer: TransferFunction
-    distances: FloatArray
+    distances: FloatArray  # (points,), along z, m
+    # (frequencies,), largest lateral wavenumber that counts at each frequency, rad/m
     lateral_limits: FloatArray
+    # (frequencies,), how strong the field is at each frequency; decides what may be neglected
     strength: FloatArray
-    tolerance: float
+    tolerance: float  # relative error allowed
 
     @cached_property
     def groups(self) -> list[slice]:
@@ -215,20 +200,9 @@ def count_nodes(
     Enough for the phase, which runs through ``k * half`` about its middle (Jacobi-Anger expansion),
     and for the fall with distance, which is singular at distance 0.
 
-    Parameters
-    ----------
-    wavenumbers : (frequencies,) float64 array
-        rad/m, ascending.
-    strength : (frequencies,) float64 array
-        Relative amplitude of each frequency.
-    middle, half : float
-        Middle and half width of the range of distances, m.
-    error : float
-        Relative.
-
-    Returns
-    -------
-    int
+    `wavenumbers` (frequencies,): rad/m, ascending; `strength` (frequencies,): relative amplitude of
+    each frequency; `middle, half`: middle and half width of the range of distances, m; `error`:
+    relative.
     """
     from scipy.special import jv
 

@@ -96,28 +96,9 @@ def plan_wall_to_plane(
     """Return what carries an illumination group of such captures, or another one of the same wall
     points, onto a plane; see `propagate`.
 
-    Parameters
-    ----------
-    capture : Capture
-        For the device of its signal.
-    geometry : WallBeforePlane
-        The group's wall points, and the plane.
-    group : IlluminationGroup
-    band : Band
-    backend : Backend
-    propagation : {"spectral", "time"}
-    tolerance : float
-
-    Returns
-    -------
-    callable
-        From a capture, a progress, which counts points of the plane times frequencies, and a group
-        to the field (y, x, frequencies).
-
-    Raises
-    ------
-    InputError
-        The plane is not in front of the wall, or "time" for a signal that is not NumPy's.
+    `capture`: for the device of its signal; `geometry`: the group's wall points, and the plane.
+    Returns from a capture, a progress, which counts points of the plane times frequencies, and a
+    group to the field (y, x, frequencies).
     """
     points, plane = geometry.points, geometry.plane
     foremost = float(points[:, 2].max())

@@ -52,18 +52,8 @@ class ScatteredWallToPlanePlan(WallToPlanePlan):
     ) -> WallToPlanePlan:
         """Return the plan for any wall points, in the steps of the plane.
 
-        Parameters
-        ----------
-        geometry : WallBeforePlane
-        waves : SphericalWaves
-        strength : (frequencies,) float64 array
-            Relative amplitude of each frequency.
-        tolerance : float
-            Relative error.
-
-        Returns
-        -------
-        WallToPlanePlan
+        `strength` (frequencies,): relative amplitude of each frequency; `tolerance`: relative
+        error.
         """
         points, plane = geometry.points, geometry.plane
         x, y = (
@@ -101,17 +91,9 @@ class ScatteredAnalysis:
     """Sums ``sum_p values(p) * exp(-1j * q r_p)`` of several terms, for points anywhere: what
     `LatticeAnalysis` gives.
 
-    Parameters
-    ----------
-    along_y, along_x : (points,) array
-        Phase of the wave of index 1 along each axis at every point, rad.
-    tall : float
-        Indices along y for each one along x.
-    tolerance : float
-        Relative error allowed.
+    `along_y, along_x` (points,): phase of the wave of index 1 along each axis at every point, rad;
+    `tall`: indices along y for each one along x; `tolerance`: relative error allowed.
 
-    References
-    ----------
     A. H. Barnett, J. Magland, L. af Klinteberg, "A parallel nonuniform fast Fourier transform
     library based on an 'exponential of semicircle' kernel", SIAM J. Sci. Comput. 41, C479 (2019).
     """
@@ -132,16 +114,8 @@ class ScatteredAnalysis:
     ) -> NDArray[np.complex64]:
         """Analyse ``values * weights[m]`` up to an index along x.
 
-        Parameters
-        ----------
-        values : (points,) complex64 array
-        weights : (terms, points) complex64 array
-        reach : int
-
-        Returns
-        -------
-        (terms, columns, rows) complex64 array
-            Columns and rows in the order of Fourier transforms, first 0 and last -1.
+        `values` (points,); `weights` (terms, points). Returns (terms, columns, rows): columns and
+        rows in the order of Fourier transforms, first 0 and last -1.
         """
         # whole steps, so that neighbouring frequencies share a plan
         sizes = (

@@ -48,22 +48,12 @@ voxels, or is on the edge of the window. Measured with noise."""
 
 @dataclass(frozen=True, eq=False)
 class WallBeforePlane:
-    """Points of a wall, and the plane before it that their fields get to.
+    """Points of a wall, and the plane before it that their fields get to."""
 
-    Parameters
-    ----------
-    points : (n, 3) array
-        m.
-    plane : Plane
-    lattice : WallLattice or None
-        That the points stand above; None where there is none.
-    ways : StraightWays, optional
-        The only ones that the field on the plane is wanted for; by default all of the plane is.
-    """
-
-    points: FloatArray
+    points: FloatArray  # (n, 3), m
     plane: Plane
-    lattice: WallLattice | None
+    lattice: WallLattice | None  # that the points stand above; None where there is none
+    # the only ones that the field on the plane is wanted for; by default all of the plane is
     ways: StraightWays | None = None
 
     @classmethod
@@ -74,25 +64,14 @@ class WallBeforePlane:
 
 @dataclass(frozen=True, eq=False)
 class WallToPlanePlan:
-    """How fields get from the points of a wall to a plane before it.
-
-    Parameters
-    ----------
-    geometry : WallBeforePlane
-    wall : WallLattice
-        Places of the wall's points.
-    waves : SphericalWaves
-    strength : (frequencies,) array
-        How strong the field is at each frequency; decides what may be neglected.
-    tolerance : float
-        Relative error allowed.
-    """
+    """How fields get from the points of a wall to a plane before it."""
 
     geometry: WallBeforePlane
-    wall: WallLattice
+    wall: WallLattice  # places of the wall's points
     waves: SphericalWaves
+    # (frequencies,), how strong the field is at each frequency; decides what may be neglected
     strength: FloatArray
-    tolerance: float
+    tolerance: float  # relative error allowed
 
     @classmethod
     def of(
@@ -104,18 +83,8 @@ class WallToPlanePlan:
     ) -> WallToPlanePlan | None:
         """Return the plan for wall points, or None if they stand above no lattice.
 
-        Parameters
-        ----------
-        geometry : WallBeforePlane
-        waves : SphericalWaves
-        strength : (frequencies,) float64 array
-            Relative amplitude of each frequency.
-        tolerance : float
-            Relative error.
-
-        Returns
-        -------
-        WallToPlanePlan or None
+        `strength` (frequencies,): relative amplitude of each frequency; `tolerance`: relative
+        error.
         """
         wall = geometry.lattice
         return None if wall is None else cls(geometry, wall, waves, strength, tolerance)
@@ -291,21 +260,9 @@ def find_common_period(side: float, wall: float, plane: float, count: int) -> tu
     Whole numbers of both if there are such, so that Fourier transforms lead there and back; else of
     the wall's.
 
-    Parameters
-    ----------
-    side : float
-        Shortest period, m.
-    wall, plane : float
-        Steps, m.
-    count : int
-        Steps of the plane over which the misfit adds up.
-
-    Returns
-    -------
-    length : int
-        Steps of the wall, of a length that Fourier transforms like.
-    places : float
-        Steps of the plane.
+    `side`: shortest period, m; `wall, plane`: steps, m; `count`: steps of the plane over which the
+    misfit adds up. Returns `length`: steps of the wall, of a length that Fourier transforms like;
+    `places`: steps of the plane.
     """
     shortest = find_fast_length(side / wall)
     length = shortest

@@ -32,40 +32,17 @@ BRIGHTNESS_STEPS = 10
 
 @dataclass(frozen=True, eq=False)
 class CountedPhotons:
-    """What was counted, and where.
+    """What was counted, and where."""
 
-    Parameters
-    ----------
-    capture : Capture
-        For the linear image: with the wall's own light blanked.
-    counts : (points, bins) float32 array
-        Photons.
-    observed : (points, bins) bool array
-        Bins whose counts are taken into account.
-    """
-
-    capture: Capture
-    counts: NDArray[np.float32]
-    observed: NDArray[np.bool_]
+    capture: Capture  # for the linear image: with the wall's own light blanked
+    counts: NDArray[np.float32]  # (points, bins), photons
+    observed: NDArray[np.bool_]  # (points, bins), bins whose counts are taken into account
 
     @classmethod
     def of(cls, capture: Capture, blank: float = 0.0, ramp: float = 0.0) -> CountedPhotons:
         """Read the counts of a capture.
 
-        Parameters
-        ----------
-        capture : Capture
-        blank, ramp : float
-            See `PhotonRefinement`.
-
-        Returns
-        -------
-        CountedPhotons
-
-        Raises
-        ------
-        InputError
-            The signals are not counts: some are negative, or not multiples of one step.
+        `blank, ramp`: see `PhotonRefinement`.
         """
         counts = np.ascontiguousarray(capture.traces())
         if counts.min() < 0:
@@ -97,17 +74,7 @@ class CountedPhotons:
 
         Both parts follow Poisson's law, and one says nothing of the other's noise.
 
-        Parameters
-        ----------
-        fraction : float
-            The chance, 0 to 1.
-        seed : int
-
-        Returns
-        -------
-        kept : CountedPhotons
-        held : (points, bins) float32 array
-            Photons that were set aside.
+        `fraction`: the chance, 0 to 1. Returns `held` (points, bins): photons that were set aside.
         """
         lit, held = self.counts > 0, np.zeros_like(self.counts)
         counts = np.rint(self.counts[lit]).astype(np.int64)
@@ -124,20 +91,9 @@ class CountedPhotons:
 def improve_background(background: Array, mean: float, ratios: Array, seen: Array) -> Array:
     """One step of expectation maximisation of every wall point's background, drawn to the mean.
 
-    Parameters
-    ----------
-    background : (n,) array
-        Photons per bin of some wall points, to begin with.
-    mean : float
-        Mean background of all wall points.
-    ratios : (n, bins) array
-        What was counted over what is expected.
-    seen : (n,) array
-        Bins that are taken into account.
-
-    Returns
-    -------
-    (n,) array
+    `background` (n,): photons per bin of some wall points, to begin with; `mean`: mean background
+    of all wall points; `ratios` (n, bins): what was counted over what is expected; `seen` (n,):
+    bins that are taken into account. Returns (n,).
     """
     drawn = background * ratios.sum(axis=1) + BACKGROUND_PHOTONS
     return np.asarray(np.maximum(drawn / (seen + BACKGROUND_PHOTONS / mean), MIN_BACKGROUND))
@@ -146,16 +102,7 @@ def improve_background(background: Array, mean: float, ratios: Array, seen: Arra
 def fit_brightness(photons: CountedPhotons, light: Array) -> Array:
     """Explain photons by light of a given shape, as bright as suits them, and background.
 
-    Parameters
-    ----------
-    photons : CountedPhotons
-    light : (points, bins) array
-        On any scale.
-
-    Returns
-    -------
-    (points, bins) array
-        Expected photons.
+    `light` (points, bins): on any scale. Returns (points, bins): expected photons.
     """
     counts, observed = photons.counts, photons.observed
     seen, lit = observed.sum(axis=1), float(light[observed].sum())
@@ -175,32 +122,17 @@ def fit_brightness(photons: CountedPhotons, light: Array) -> Array:
 
 @dataclass(frozen=True)
 class LikelihoodGain:
-    """How much likelier photons are under one expectation than under another.
+    """How much likelier photons are under one expectation than under another."""
 
-    Parameters
-    ----------
-    nats : float
-        Gain of the likelihood's logarithm.
-    sigma : float
-        Standard deviation that the photons' noise gives it.
-    """
-
-    nats: float
-    sigma: float
+    nats: float  # gain of the likelihood's logarithm
+    sigma: float  # standard deviation that the photons' noise gives it
 
     @classmethod
     def of(cls, photons: Array, expected: Array, other: Array, observed: Array) -> LikelihoodGain:
         """Compare two expectations of the same photons.
 
-        Parameters
-        ----------
-        photons, expected, other : (points, bins) array
-        observed : (points, bins) bool array
-            Bins that are taken into account.
-
-        Returns
-        -------
-        LikelihoodGain
+        `photons, expected, other` (points, bins); `observed` (points, bins): bins that are taken
+        into account.
         """
         counted, first, second = (
             one[observed].astype(np.float64) for one in (photons, expected, other)

@@ -26,12 +26,7 @@ class IlluminatedDepthPropagator:
     wave that `plan` carries from point v of the plane to voxel r; `to_volume` is its adjoint, real
     since the volume is.
 
-    Parameters
-    ----------
-    plan : DiffractionPlan
-    source : Source
-    dtype : dtype
-        complex64 or complex128.
+    `dtype`: complex64 or complex128.
     """
 
     def __init__(self, plan: DiffractionPlan, source: LaserSource, dtype: DTypeLike) -> None:

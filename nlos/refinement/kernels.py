@@ -24,25 +24,11 @@ def _place_light(
     A voxel's light is spread evenly over a time whose variance is that of the paths by way of its
     whole volume.
 
-    Parameters
-    ----------
-    wall, laser : (3,) float32 array
-        m.
-    cell : (3,) float32 array
-        Extent of a voxel along x, y and z, m.
-    start : float32
-        Path at which the first bin begins, m.
-    per_metre : float32
-        Bins per metre of path.
-    obliquity : int
-        Power of the cosines of both legs with z that light falls by: 0, 1 or 2.
-    x, y, z : (n,) float32 array
-        Voxels.
-    bins : int
-    begins, ends : (n,) float32 array
-        Written: when the light begins and ends, in bins from the record's beginning, cut to it.
-    rates : (n,) float32 array
-        Written: light per bin between the edges, of a voxel of albedo 1.
+    `wall, laser` (3,): m; `cell` (3,): extent of a voxel along x, y and z, m; `start`: path at
+    which the first bin begins, m; `per_metre`: bins per metre of path; `obliquity`: power of the
+    cosines of both legs with z that light falls by: 0, 1 or 2; `x, y, z` (n,): voxels; `begins,
+    ends` (n,): written: when the light begins and ends, in bins from the record's beginning, cut to
+    it; `rates` (n,): written: light per bin between the edges, of a voxel of albedo 1.
     """
     nearest = np.float32(MIN_DISTANCE_M * MIN_DISTANCE_M)
     for i in range(x.size):
@@ -74,17 +60,9 @@ def _place_light(
 def add_expected_light(walls, lasers, cell, start, per_metre, obliquity, voxels, albedo, changes):
     """Add the light that voxels send to wall points, as changes from bin to bin.
 
-    Parameters
-    ----------
-    walls : (points, 3) float32 array
-    lasers : (1, 3) or (points, 3) float32 array
-    cell, start, per_metre, obliquity
-        As of `_place_light`.
-    voxels : (3, n) float32 array
-        m.
-    albedo : (n,) float32 array
-    changes : (points, bins + 2) float64 array
-        Added to; its running sum is the light in every bin.
+    `walls` (points, 3); `lasers` (1, 3); `cell, start, per_metre, obliquity`: as of `_place_light`;
+    `voxels` (3, n): m; `albedo` (n,); `changes` (points, bins + 2): added to; its running sum is
+    the light in every bin.
     """
     bins = changes.shape[1] - 2
     begins, ends, rates = (
@@ -131,20 +109,10 @@ def add_backprojected_light(
     """Add to every voxel what the bins hold that its light arrives in: the adjoint of
     `add_expected_light`.
 
-    Parameters
-    ----------
-    walls : (points, 3) float32 array
-    lasers : (1, 3) or (points, 3) float32 array
-    cell, start, per_metre, obliquity
-        As of `_place_light`.
-    voxels : (3, n) float32 array
-        m.
-    sums : (points, bins + 2) float32 array
-        Of every bin and all later ones; 0 behind the record.
-    squared : bool
-        Whether every bin counts by the square of the light that a voxel sends it.
-    total : (n,) float32 array
-        Added to.
+    `walls` (points, 3); `lasers` (1, 3); `cell, start, per_metre, obliquity`: as of `_place_light`;
+    `voxels` (3, n): m; `sums` (points, bins + 2): of every bin and all later ones; 0 behind the
+    record; `squared`: whether every bin counts by the square of the light that a voxel sends it;
+    `total` (n,): added to.
     """
     bins = sums.shape[1] - 2
     begins, ends, rates = (

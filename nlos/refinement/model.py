@@ -36,16 +36,8 @@ class HiddenToWall(LinearOperator):
 
     Memory beyond volume and phasors: some 40 bytes per plane wave and frequency and thread.
 
-    Parameters
-    ----------
-    points : (n, 3) array
-        Wall points, m.
-    plan : DiffractionPlan
-        From a virtual plane to the voxels.
-    group : IlluminationGroup
-    band : Band
-    dtype : dtype
-        float32 or float64.
+    `points` (n, 3): wall points, m; `plan`: from a virtual plane to the voxels; `dtype`: float32 or
+    float64.
     """
 
     def __init__(
@@ -110,17 +102,10 @@ class WallModel:
     confocal: what is left, ``(d_L + d_p)^2 / (d_L^2 * d_p)``, is ``4 / d_L`` for equal legs,
     changes by less than 8 % up to a ratio of 1.7, and is exactly 8 if confocal. The operator acts
     on volumes divided by `laser_distance`.
-
-    Parameters
-    ----------
-    plan : WavePlan
-        Of the hybrid.
-    capture : Capture
-        Of the plan's geometry.
     """
 
-    plan: WavePlan
-    capture: Capture
+    plan: WavePlan  # of the hybrid
+    capture: Capture  # of the plan's geometry
 
     @property
     def grid(self) -> Grid:

@@ -33,25 +33,9 @@ FINE_SUBSETS = (4, 4, 4, 2, 2)
 class PhotonFit:
     """Albedo of some voxels, and background, fitted to photons.
 
-    Parameters
-    ----------
-    photons : CountedPhotons
-    model : TimeOfFlight
-    voxels : (n,) int array
-        Flat indices into the model's grid.
-    albedo : (n,) array
-        To begin with, on any scale; nowhere 0.
-    prior_weight : float
-        See `PhotonRefinement`.
-
-    Attributes
-    ----------
-    albedo : (n,) float32 array
-    background : (points,) float32 array
-        Photons per bin.
-    likelihood : float
-        Logarithm of the likelihood before the last pass.
-    passes : int
+    `voxels` (n,): flat indices into the model's grid; `albedo` (n,): to begin with, on any scale;
+    nowhere 0; `prior_weight`: see `PhotonRefinement`. `albedo` (n,); `background` (points,):
+    photons per bin; `likelihood`: logarithm of the likelihood before the last pass.
     """
 
     def __init__(
@@ -90,16 +74,7 @@ class PhotonFit:
     def run(self, iterations: int, report_pass: Callable[[], None]) -> str:
         """Improve the albedo until the likelihood hardly grows; return why it ended.
 
-        Parameters
-        ----------
-        iterations : int
-            Passes at most.
-        report_pass : callable
-            Called after every pass.
-
-        Returns
-        -------
-        str
+        `iterations`: passes at most; `report_pass`: called after every pass.
         """
         for number in range(iterations):
             before = self.likelihood
@@ -112,11 +87,7 @@ class PhotonFit:
     def improve(self, subsets: int, prior_weight: float | None = None) -> None:
         """Improve albedo and background once by every subset of the wall points.
 
-        Parameters
-        ----------
-        subsets : int
-        prior_weight : float, optional
-            The fit's own by default.
+        `prior_weight`: the fit's own by default.
         """
         subsets = max(1, min(subsets, len(self._everyone) // MIN_POINTS_PER_SUBSET))
         weight = self.prior_weight if prior_weight is None else prior_weight
@@ -178,14 +149,7 @@ class PhotonFit:
         """Return the same fit with the response and the fall with the angle under which the photons
         are likeliest.
 
-        Parameters
-        ----------
-        sigmas : tuple of float
-            Standard deviations of responses, bins.
-
-        Returns
-        -------
-        PhotonFit
+        `sigmas`: standard deviations of responses, bins.
         """
         some = self._everyone[:: max(1, len(self._everyone) // 512)]
         best: tuple[float, PhotonFit] | None = None
@@ -218,13 +182,7 @@ def compute_beam(fit: PhotonFit) -> FloatArray:
     """Return the standard deviations along z, y and x, m, to which arrival times tell the place of
     a thing in the middle of the light.
 
-    Parameters
-    ----------
-    fit : PhotonFit
-
-    Returns
-    -------
-    (3,) array
+    Returns (3,).
     """
     capture, grid = fit.photons.capture, fit.model.grid
     volume = fit.place(fit.expected_photons).astype(np.float64)

@@ -90,48 +90,23 @@ class PhotonRefinement(Method):
     likelier under it than under light as bright as in the linear image, and than under background
     alone, the linear image is what comes back (`LINEAR_SHOWN`). Otherwise the last passes take all
     photons.
-
-    Parameters
-    ----------
-    linear : PhasorMethod
-        Gives the image to begin with.
-    iterations : int
-        Passes over all photons at the end, at most.
-    prior_weight : float
-        What faint voxels pay, relative to one standard deviation of what noise brings them; 0: the
-        likelihood alone.
-    blank : float
-        m of path after the wall's own light that are left out of account; they may hold anything.
-    ramp : float
-        m of path over which the linear image's signals rise after that.
-    response_sigma : float, optional
-        Standard deviation of the instrument's response, s; found from the photons by default.
     """
 
-    linear: PhasorMethod
-    iterations: int = 12
+    linear: PhasorMethod  # gives the image to begin with
+    iterations: int = 12  # passes over all photons at the end, at most
+    # what faint voxels pay, relative to one standard deviation of what noise brings them; 0: the
+    # likelihood alone
     prior_weight: float = 1.0
+    # m of path after the wall's own light that are left out of account; they may hold anything
     blank: float = 0.0
-    ramp: float = 0.0
+    ramp: float = 0.0  # m of path over which the linear image's signals rise after that
+    # standard deviation of the instrument's response, s; found from the photons by default
     response_sigma: float | None = None
 
     def plan(self, capture: Capture, grid: Grid) -> PhotonPlan:
         """Make the refinement ready for captures like `capture` on `grid`.
 
-        Parameters
-        ----------
-        capture : Capture
-            Counts, or multiples of one step; any wall and lasers that `linear` can image.
-        grid : Grid
-
-        Returns
-        -------
-        PhotonPlan
-
-        Raises
-        ------
-        InputError
-            `linear` cannot image such a capture on the grid, or memory does not suffice.
+        `capture`: counts, or multiples of one step; any wall and lasers that `linear` can image.
         """
         require_numpy_signal("refining by photons", capture)
         needed = 4 * VOLUME_COPIES * grid.size + 16 * capture.signal.size
@@ -147,13 +122,7 @@ class PhotonRefinement(Method):
 class PhotonPlan(Plan):
     """A refinement by photons, ready for captures of one geometry.
 
-    Parameters
-    ----------
-    capture : Capture
-    grid : Grid
-    method : PhotonRefinement
-    linear : Plan
-        Of the image to begin with.
+    `linear`: of the image to begin with.
     """
 
     def __init__(
@@ -259,19 +228,9 @@ def judge(fit: PhotonFit, linear_light: Array, held: Array) -> LikelihoodGain:
     """Compare a fit with light as bright as in the linear image, and with background alone, by
     photons that neither has seen.
 
-    Parameters
-    ----------
-    fit : PhotonFit
-        Of the photons that were kept.
-    linear_light : (points, bins) array
-        On any scale.
-    held : (points, bins) array
-        Photons that were set aside, `HELD_OUT_FRACTION` of all.
-
-    Returns
-    -------
-    LikelihoodGain
-        Over the better of the two.
+    `fit`: of the photons that were kept; `linear_light` (points, bins): on any scale; `held`
+    (points, bins): photons that were set aside, `HELD_OUT_FRACTION` of all. Returns over the better
+    of the two.
     """
     share, photons = HELD_OUT_FRACTION / (1 - HELD_OUT_FRACTION), fit.photons
     expected = share * fit.expect()
@@ -286,15 +245,8 @@ def show_with_beam(fit: PhotonFit, linear: Array) -> Array:
     """Return the photons that every voxel sent to the wall, with the sharpness that response, wall
     and voxels give them.
 
-    Parameters
-    ----------
-    fit : PhotonFit
-    linear : (z, y, x) array
-        Image in whose order voxels stand that the photons decide nothing about.
-
-    Returns
-    -------
-    (z, y, x) float32 array
+    `linear` (z, y, x): image in whose order voxels stand that the photons decide nothing about.
+    Returns (z, y, x).
     """
     from scipy.ndimage import gaussian_filter
 

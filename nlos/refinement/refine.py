@@ -34,16 +34,8 @@ def build_total_variation(
 ) -> LightFieldVariation:
     """Return the prior of even surfaces with sharp borders: total variation along x, y and z alike.
 
-    Parameters
-    ----------
-    grid : Grid
-        What will be imaged on; evenly spaced.
-    weight, iterations
-        As of `tofclip.solvers.TotalVariation`.
-
-    Returns
-    -------
-    LightFieldVariation
+    `grid`: what will be imaged on; evenly spaced; `weight, iterations`: as of
+    `tofclip.solvers.TotalVariation`.
     """
     across = axis_step(grid.x) if grid.x.size > 1 else 1.0
     along = axis_step(grid.z) if grid.z.size > 1 else across

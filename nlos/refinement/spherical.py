@@ -25,18 +25,8 @@ def propagate_spherical_waves(
     With sources and targets exchanged it is its own transpose. In single precision good to 1e-5 and
     quick; in double precision plain.
 
-    Parameters
-    ----------
-    sources, targets : (n, 3), (m, 3) array
-        m.
-    values : (n, frequencies) complex array
-    wavenumbers : (frequencies,) array
-        Evenly spaced, rad/m.
-
-    Returns
-    -------
-    (m, frequencies) complex array
-        Of the type of `values`.
+    `sources, targets` (n, 3): m; `values` (n, frequencies); `wavenumbers` (frequencies,): evenly
+    spaced, rad/m. Returns (m, frequencies): of the type of `values`.
     """
     if values.dtype == np.complex128:
         return _propagate_in_double_precision(sources, values, targets, wavenumbers)

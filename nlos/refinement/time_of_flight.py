@@ -31,38 +31,21 @@ class TimeOfFlight:
     A voxel of albedo a returns ``a / (d_L * d_p)^2`` after the path ``d_L + d_p``, spread over the
     paths of its whole volume, the bin, and the instrument's response. Nothing is held per pair of
     voxel and wall point.
-
-    Parameters
-    ----------
-    capture : Capture
-        Wall, lasers and time axis are what counts.
-    grid : Grid
-    response : (n,) array
-        Instrument's response in bins, of sum 1; its middle element stands for no delay.
-    obliquity : int
-        Light also falls with this power of the cosines of both legs with z: 0 for points that
-        scatter evenly, 2 for matte surfaces that face a matte wall; 1 lies between.
     """
 
-    capture: Capture
+    capture: Capture  # wall, lasers and time axis are what counts
     grid: Grid
+    # (n,), instrument's response in bins, of sum 1; its middle element stands for no delay
     response: FloatArray
+    # light also falls with this power of the cosines of both legs with z: 0 for points that scatter
+    # evenly, 2 for matte surfaces that face a matte wall; 1 lies between
     obliquity: int = 0
 
     def compute_light(self, albedo: Array, voxels: Array, points: Array) -> Array:
         """Return the light (points, bins) of some voxels at some wall points.
 
-        Parameters
-        ----------
-        albedo : (n,) array
-        voxels : (n,) int array
-            Flat indices into the grid.
-        points : (m,) int array
-            Indices into the capture's points.
-
-        Returns
-        -------
-        (m, bins) float32 array
+        `albedo` (n,); `voxels` (n,): flat indices into the grid; `points` (m,): indices into the
+        capture's points. Returns (m, bins).
         """
         light = np.empty((len(points), self._bins), np.float32)
         places, albedo = np.take(self._places, voxels, axis=1), np.asarray(albedo, np.float32)
@@ -81,18 +64,9 @@ class TimeOfFlight:
         """Return what some voxels (n,) see of values (points, bins): the adjoint of
         `compute_light`.
 
-        Parameters
-        ----------
-        values : (m, bins) array
-        voxels : (n,) int array
-        points : (m,) int array
-        squared : bool
-            Weight by the square of the light instead: with the inverse of the expected counts this
-            is what they tell of a voxel, Fisher's information.
-
-        Returns
-        -------
-        (n,) float32 array
+        `values` (m, bins); `voxels` (n,); `points` (m,); `squared`: weight by the square of the
+        light instead: with the inverse of the expected counts this is what they tell of a voxel,
+        Fisher's information. Returns (n,).
         """
         # Running sums from the end on: a box of light is the difference of two, see the kernel. The
         # response is turned around, as the adjoint of a convolution asks for.
@@ -141,14 +115,7 @@ class TimeOfFlight:
     def spread(self, values: Array, response: FloatArray) -> Array:
         """Convolve values (points, bins) with a response in time, whose middle stands for no delay.
 
-        Parameters
-        ----------
-        values : (m, bins) array
-        response : (n,) array
-
-        Returns
-        -------
-        (m, bins) float32 array
+        `values` (m, bins); `response` (n,). Returns (m, bins).
         """
         if response.size == 1:
             return np.asarray(values, np.float32)

@@ -42,17 +42,10 @@ LATERAL_ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PlaneWaves:
-    """The plane waves of a periodic lattice that carry anything, ordered by lateral wavenumber.
+    """The plane waves of a periodic lattice that carry anything, ordered by lateral wavenumber."""
 
-    Parameters
-    ----------
-    period : (float, float)
-        Of the lattice in space along y and x, m.
-    lateral_limits : (frequencies,) array
-        Largest lateral wavenumber that counts at each frequency, rad/m; increasing.
-    """
-
-    period: tuple[float, float]
+    period: tuple[float, float]  # of the lattice in space along y and x, m
+    # (frequencies,), largest lateral wavenumber that counts at each frequency, rad/m; increasing
     lateral_limits: FloatArray
 
     @property
@@ -115,27 +108,15 @@ BYTES_PER_WAVE = 8
 
 @dataclass(frozen=True, eq=False)
 class DiffractionPlan:
-    """How fields on one plane reach one grid of voxels.
-
-    Parameters
-    ----------
-    plane : Plane
-    grid : Grid
-        x and y evenly spaced, z as you like.
-    waves : SphericalWaves
-    strength : (frequencies,) array
-        Of each frequency in the pulse; decides what may be neglected.
-    tolerance : float
-        Relative error allowed.
-    ways : StraightWays, optional
-        The only ones between plane and voxels that carry anything; by default all do.
-    """
+    """How fields on one plane reach one grid of voxels."""
 
     plane: Plane
-    grid: Grid
+    grid: Grid  # x and y evenly spaced, z as you like
     waves: SphericalWaves
+    # (frequencies,), of each frequency in the pulse; decides what may be neglected
     strength: FloatArray
-    tolerance: float
+    tolerance: float  # relative error allowed
+    # the only ones between plane and voxels that carry anything; by default all do
     ways: StraightWays | None = None
 
     @cached_property
@@ -251,18 +232,10 @@ does not enlarge them."""
 
 @dataclass(frozen=True, eq=False)
 class AxialSpectrum:
-    """How an image without the laser's carrier varies along z.
+    """How an image without the laser's carrier varies along z."""
 
-    Parameters
-    ----------
-    wavenumbers : (n,) array
-        f, rad/m.
-    energies : (n,) array
-        Of the waves at each f; they add up to 1.
-    """
-
-    wavenumbers: FloatArray
-    energies: FloatArray
+    wavenumbers: FloatArray  # (n,), f, rad/m
+    energies: FloatArray  # (n,), of the waves at each f; they add up to 1
 
     @classmethod
     def of(
@@ -274,20 +247,9 @@ class AxialSpectrum:
     ) -> AxialSpectrum:
         """Return the spectrum of a field of all directions forward.
 
-        Parameters
-        ----------
-        wavenumbers : (frequencies,) array
-            k, rad/m.
-        strength : (frequencies,) array
-            Of each frequency.
-        centre : float
-            k_0, the carrier's wavenumber, rad/m.
-        cosines : (float, float)
-            Range of the cosine of the angle between the laser's wave and z; both 0 without one.
-
-        Returns
-        -------
-        AxialSpectrum
+        `wavenumbers` (frequencies,): k, rad/m; `strength` (frequencies,): of each frequency;
+        `centre`: k_0, the carrier's wavenumber, rad/m; `cosines`: range of the cosine of the angle
+        between the laser's wave and z; both 0 without one.
         """
         steps = (np.arange(ANGLES) + 0.5) / ANGLES
         low, high = cosines
@@ -303,18 +265,8 @@ class AxialSpectrum:
     ) -> tuple[NDArray[np.complex128], FloatArray]:
         """Return the best linear interpolation between depths, and its error.
 
-        Parameters
-        ----------
-        wanted, known : (m,), (n,) array
-            Depths, m.
-        noise : float
-            Relative error of the known ones, independent of each other.
-
-        Returns
-        -------
-        weights : (m, n) complex128 array
-        errors : (m,) float64 array
-            Root mean square, relative.
+        `wanted, known` (m,): depths, m; `noise`: relative error of the known ones, independent of
+        each other. Returns `weights` (m, n); `errors` (m,): root mean square, relative.
         """
         middle = float(known.mean())
         waves, at_known = (
@@ -330,52 +282,26 @@ class AxialSpectrum:
 
 @dataclass(frozen=True, eq=False)
 class InterpolatedBlock:
-    """Some neighbouring depths as sums of computed ones.
+    """Some neighbouring depths as sums of computed ones."""
 
-    Parameters
-    ----------
-    depths : slice
-        Of the wanted depths.
-    nodes : slice
-        Of the computed ones.
-    weights : (depths, nodes) complex64 array
-    """
-
-    depths: slice
-    nodes: slice
-    weights: NDArray[np.complex64]
+    depths: slice  # of the wanted depths
+    nodes: slice  # of the computed ones
+    weights: NDArray[np.complex64]  # (depths, nodes)
 
 
 @dataclass(frozen=True, eq=False)
 class DepthInterpolation:
-    """Which depths are computed, and how all follow.
+    """Which depths are computed, and how all follow."""
 
-    Parameters
-    ----------
-    nodes : (n,) int64 array
-        Indices of the depths that are computed, ascending.
-    blocks : list of InterpolatedBlock
-        All wanted depths; empty where every one is computed.
-    """
-
-    nodes: IntArray
-    blocks: list[InterpolatedBlock]
+    nodes: IntArray  # (n,), indices of the depths that are computed, ascending
+    blocks: list[InterpolatedBlock]  # all wanted depths; empty where every one is computed
 
 
 def choose_depths(z: FloatArray, spectrum: AxialSpectrum, error: float) -> DepthInterpolation:
     """Choose the fewest depths from which all others follow.
 
-    Parameters
-    ----------
-    z : (n,) float64 array
-        Wanted depths, ascending, m.
-    spectrum : AxialSpectrum
-    error : float
-        Root mean square error allowed at every depth, relative.
-
-    Returns
-    -------
-    DepthInterpolation
+    `z` (n,): wanted depths, ascending, m; `error`: root mean square error allowed at every depth,
+    relative.
     """
     everything = DepthInterpolation(np.arange(z.size), [])
     ratio = _find_spacing_ratio(z, spectrum, error)

@@ -28,20 +28,13 @@ FREQUENCIES_PER_BLOCK = 4
 
 @dataclass(frozen=True, eq=False)
 class Interpolation:
-    """How every group finds a transfer function between its nodes.
+    """How every group finds a transfer function between its nodes."""
 
-    Parameters
-    ----------
-    begin : (groups,) int64 array
-        First node.
-    offset : (groups + 1,) int64 array
-        Where a group's weights begin, one row of `weights` for each node from `begin` on.
-    weights : (some, LANES) float32 array
-    """
-
-    begin: IntArray
+    begin: IntArray  # (groups,), first node
+    # (groups + 1,), where a group's weights begin, one row of `weights` for each node from `begin`
+    # on
     offset: IntArray
-    weights: NDArray[np.float32]
+    weights: NDArray[np.float32]  # (some, LANES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +44,6 @@ class WaveGroups:
     A group is `LANES` waves whose indices are not negative, and their `MIRROR_IMAGES` images. Waves
     on an axis are images of themselves; a fraction of 0 marks repeated ones, and those that fill up
     the last group.
-
-    Parameters
-    ----------
-    waves : PlaneWaves
     """
 
     waves: PlaneWaves
@@ -127,17 +116,8 @@ class WaveGroups:
         By matrix products: the plane's spacing need not fit the lattice, and a coarse one repeats
         itself in q as it should. Waves beyond their limit are 0.
 
-        Parameters
-        ----------
-        values : (y, x, frequencies) complex64 array
-        plane : Plane
-        origin : (float, float)
-            y and x of the point whose phase is 0, m.
-
-        Returns
-        -------
-        (groups, ahead + frequencies, 2, MIRRORED, LANES) float32 array
-            Real and imaginary parts.
+        `values` (y, x, frequencies); `origin`: y and x of the point whose phase is 0, m. Returns
+        (groups, ahead + frequencies, 2, MIRRORED, LANES): real and imaginary parts.
         """
         waves, count = self.waves, values.shape[-1]
         row, column, lateral, distinct = self._quadrant
@@ -175,37 +155,18 @@ class WaveGroups:
 
 @dataclass(frozen=True, eq=False)
 class _AxisTransform:
-    """Waves along an axis of evenly spaced points, about its middle: real, and half as many points.
+    """Waves along an axis of evenly spaced points, about its middle: real, and half as many points."""
 
-    Parameters
-    ----------
-    cosines, sines : (waves, half the points) float32 array
-    turns : (waves,) complex64 array
-        Waves at the middle.
-    """
-
-    cosines: NDArray[np.float32]
-    sines: NDArray[np.float32]
-    turns: NDArray[np.complex64]
+    cosines: NDArray[np.float32]  # (waves, half the points)
+    sines: NDArray[np.float32]  # (waves, half the points)
+    turns: NDArray[np.complex64]  # (waves,), waves at the middle
 
     @classmethod
     def of(cls, axis: FloatArray, origin: float, step: float, reach: int) -> _AxisTransform:
         """Return the transform of an axis for the plane waves of index 0 to `reach`.
 
-        Parameters
-        ----------
-        axis : (points,) float64 array
-            Evenly spaced, m.
-        origin : float
-            Where all waves have phase 0, m.
-        step : float
-            Lateral wavenumber of index 1, rad/m.
-        reach : int
-            Largest index.
-
-        Returns
-        -------
-        _AxisTransform
+        `axis` (points,): evenly spaced, m; `origin`: where all waves have phase 0, m; `step`:
+        lateral wavenumber of index 1, rad/m; `reach`: largest index.
         """
         numbers = step * np.arange(reach + 1)
         half = (axis.size + 1) // 2
@@ -223,16 +184,8 @@ class _AxisTransform:
         """Sums of complex values (points, ...) with the first cosines and with the first sines,
         (count, ...).
 
-        Parameters
-        ----------
-        values : (points, ...) complex64 array
-        count : int
-            Number of waves, from index 0 on.
-
-        Returns
-        -------
-        list of two (count, ...) complex64 arrays
-            Cosine and sine sums.
+        `values` (points, ...); `count`: number of waves, from index 0 on. Returns cosine and sine
+        sums.
         """
         half = self.cosines.shape[1]
         before, after = values[:half], values[::-1][:half]

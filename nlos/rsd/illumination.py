@@ -25,23 +25,12 @@ class Illumination:
 
     The even and the odd part in R are each split by their own eigenvectors, which keeps everything
     real and takes some two thirds of the terms of a Chebyshev expansion.
-
-    Parameters
-    ----------
-    coefficients : (frequencies, m) float32 array
-        b, even functions first.
-    even : int
-        How many functions are even.
-    table : (samples, m) float32 array
-        f over `span`.
-    span : (2,) float64 array
-        Smallest and largest R, m; `split_illumination` has it about 0.
     """
 
-    coefficients: NDArray[np.float32]
-    even: int
-    table: NDArray[np.float32]
-    span: FloatArray
+    coefficients: NDArray[np.float32]  # (frequencies, m), b, even functions first
+    even: int  # how many functions are even
+    table: NDArray[np.float32]  # (samples, m), f over `span`
+    span: FloatArray  # (2,), smallest and largest R, m; `split_illumination` has it about 0
 
 
 def build_constant_illumination(frequencies: int) -> Illumination:
@@ -56,20 +45,8 @@ def split_illumination(
 ) -> Illumination:
     """Split the illumination of distances from ``-half`` to ``half`` about a middle one.
 
-    Parameters
-    ----------
-    detuning : (frequencies,) array
-        ``k - k_0``, rad/m.
-    strength : (frequencies,) array
-        How much each frequency counts.
-    half : float
-        m.
-    tolerance : float
-        Root mean square error allowed, relative.
-
-    Returns
-    -------
-    Illumination
+    `detuning` (frequencies,): ``k - k_0``, rad/m; `strength` (frequencies,): how much each
+    frequency counts; `half`: m; `tolerance`: root mean square error allowed, relative.
     """
     # Even and odd functions are known by their values at the positive half of the nodes.
     angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES

@@ -54,23 +54,14 @@ DEPTH_ERROR_FRACTION = 0.35
 
 @dataclass(frozen=True, eq=False)
 class LaserSource:
-    """What shines on the hidden scene while the wall is watched.
+    """What shines on the hidden scene while the wall is watched."""
 
-    Parameters
-    ----------
-    laser : (3,) array or None
-        A spot, m; None where its way is part of the field already (confocal).
-    wavenumbers : (frequencies,) array
-        rad/m.
-    strength : (frequencies,) array
-        Share of each frequency in the pulse; decides what may be neglected.
-    splits : dict
-        Illuminations split so far, which spots at other places share.
-    """
-
+    # (3,), A spot, m; None where its way is part of the field already (confocal)
     laser: FloatArray | None
-    wavenumbers: FloatArray
+    wavenumbers: FloatArray  # (frequencies,), rad/m
+    # (frequencies,), share of each frequency in the pulse; decides what may be neglected
     strength: FloatArray
+    # illuminations split so far, which spots at other places share
     splits: dict[tuple[float, float], Illumination] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -96,17 +87,8 @@ class LaserSource:
     def illuminate_plane(self, plan: DiffractionPlan, depth: float) -> Illumination:
         """Split the illumination of the plane at one depth.
 
-        Parameters
-        ----------
-        plan : DiffractionPlan
-            Its grid and tolerance.
-        depth : float
-            z of the plane, m.
-
-        Returns
-        -------
-        Illumination
-            With ``span``, the smallest and largest distance of the spot from the plane's voxels, m.
+        `plan`: its grid and tolerance; `depth`: z of the plane, m. Returns with ``span``, the
+        smallest and largest distance of the spot from the plane's voxels, m.
         """
         if self.laser is None:
             return build_constant_illumination(self.wavenumbers.size)
@@ -141,11 +123,6 @@ class CompiledDiffraction:
     Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
     imaging systems", Nat. Commun. 11, 1645 (2020); the illumination is split per depth, so that few
     inverse transforms replace one per frequency.
-
-    Parameters
-    ----------
-    plan : DiffractionPlan
-    source : LaserSource
     """
 
     def __init__(self, plan: DiffractionPlan, source: LaserSource) -> None:
@@ -172,14 +149,8 @@ class CompiledDiffraction:
         """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r, S_k the field carried
         there from the plane.
 
-        Parameters
-        ----------
-        values : (y, x, frequencies) complex64 array
-            On the plan's plane.
-        total : (z, y, x) complex64 array
-            Added to.
-        progress : callable, optional
-            Called with the number of voxels just done.
+        `values` (y, x, frequencies): on the plan's plane; `total` (z, y, x): added to; `progress`:
+        called with the number of voxels just done.
         """
         plan = self.plan
         with limit_blas_threads():
@@ -288,19 +259,9 @@ class _Workspace:
     ) -> None:
         """Add a few depth planes.
 
-        Parameters
-        ----------
-        spectrum : float32 array
-            Plane waves of the wall's field at all frequencies.
-        source : LaserSource
-        lights : list of Illumination
-            One for each plane.
-        depths : (z,) float64 array
-            m.
-        total : (z, y, x) complex64 array
-            Added to, in place.
-        without_carrier : bool
-            Leave out the laser's carrier wave.
+        `spectrum`: plane waves of the wall's field at all frequencies; `lights`: one for each
+        plane; `depths` (z,): m; `total` (z, y, x): added to, in place; `without_carrier`: leave out
+        the laser's carrier wave.
         """
         wavenumber = 0.0 if without_carrier else source.centre_wavenumber
         carried = self._propagate_terms(spectrum, source, lights, depths)

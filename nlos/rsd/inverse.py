@@ -60,20 +60,8 @@ def choose_inverse(
     Parameters are those of `InverseTransform`; a period that is not a whole number of voxels leaves
     matrix products only.
 
-    Parameters
-    ----------
-    waves : (rows, columns) int arrays
-        Indices along y and x.
-    lattice : (float, float)
-        Voxels in a period along y and x.
-    wanted : (int, int)
-        Voxels wanted along y and x, from the origin on.
-    terms : int
-        Maximum number of spectra.
-
-    Returns
-    -------
-    InverseProduct or InverseTransform
+    `waves` (rows, columns): indices along y and x; `lattice`: voxels in a period along y and x;
+    `wanted`: voxels wanted along y and x, from the origin on; `terms`: maximum number of spectra.
     """
     rows, columns = (2 * int(np.max(index)) + 1 for index in waves)
     high, wide = (int(length) for length in lattice)
@@ -128,16 +116,8 @@ class InverseTransform:
     voxels lie in. Where voxels are too coarse for the finest waves, these are folded into the
     lattice, as the voxels see them.
 
-    Parameters
-    ----------
-    waves : (rows, columns)
-        Indices along y and x.
-    lattice : (int, int)
-        Voxels in a period along y and x.
-    wanted : (int, int)
-        Voxels wanted along y and x, from the origin on.
-    terms : int
-        Spectra at most.
+    `waves` (rows, columns): indices along y and x; `lattice`: voxels in a period along y and x;
+    `wanted`: voxels wanted along y and x, from the origin on; `terms`: spectra at most.
     """
 
     def __init__(

@@ -41,20 +41,10 @@ def sample_waves(radius, distance, first, step, delay, continued, leading_zeros,
     integral; at a negative distance they run backwards. Steps from one frequency to the next with
     one complex product.
 
-    Parameters
-    ----------
-    radius : (n,) float64 array
-    distance : float
-        Along the axis, m.
-    first, step : float
-        Lowest wavenumber and distance of neighbouring ones, rad/m.
-    delay : (2,) float64 array
-        A path added to all, m, and the wavenumber k_0 whose phase it leaves alone.
-    continued : bool
-    leading_zeros : int
-        Entries before the lowest frequency, left alone.
-    waves : (n, 2, ahead + frequencies) float32 array
-        Real and imaginary parts, overwritten.
+    `radius` (n,); `distance`: along the axis, m; `first, step`: lowest wavenumber and distance of
+    neighbouring ones, rad/m; `delay` (2,): A path added to all, m, and the wavenumber k_0 whose
+    phase it leaves alone; `leading_zeros`: entries before the lowest frequency, left alone; `waves`
+    (n, 2, ahead + frequencies): real and imaginary parts, overwritten.
     """
     direction = math.copysign(1.0, distance)
     for i in range(radius.size):
@@ -84,14 +74,8 @@ def find_interpolation_weights(place, node, share):
     """Find the first of the `TAPS` nodes about every place, and their Lagrange weights (places,
     taps).
 
-    Parameters
-    ----------
-    place : (places,) float array
-        In steps of the nodes.
-    node : (places,) int array
-        Overwritten with the first node of each place.
-    share : (places, TAPS) float array
-        Overwritten with the weights.
+    `place` (places,): in steps of the nodes; `node` (places,): overwritten with the first node of
+    each place; `share` (places, TAPS): overwritten with the weights.
     """
     for b in range(place.size):
         node[b] = int(place[b]) - TAPS // 2 + 1
@@ -113,24 +97,12 @@ def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coef
     spectrum is in cache, and sums over frequencies stay in registers. Frequencies come in steps of
     `FREQUENCY_STEPS`.
 
-    Parameters
-    ----------
-    spectrum : (groups, frequencies, 2, MIRROR_IMAGES, LANES) float32 array
-        Real and imaginary parts.
-    first : (groups,) int64 array
-        Frequency that each group starts at.
-    nodes : (depths, n, 2, frequencies) float32 array
-        Transfer functions.
-    begin : (groups,) int64 array
-        First node that each group takes.
-    offset : (groups + 1,) int64 array
-        Where its interpolation weights begin.
-    node_weights : (some, LANES) float32 array
-        Interpolation weights.
-    coefficients : (depths, m, frequencies) float32 array
-        An even number of terms.
-    terms : (depths, m, groups, 2, MIRROR_IMAGES, LANES) float32 array
-        Overwritten.
+    `spectrum` (groups, frequencies, 2, MIRROR_IMAGES, LANES): real and imaginary parts; `first`
+    (groups,): frequency that each group starts at; `nodes` (depths, n, 2, frequencies): transfer
+    functions; `begin` (groups,): first node that each group takes; `offset` (groups + 1,): where
+    its interpolation weights begin; `node_weights` (some, LANES): interpolation weights;
+    `coefficients` (depths, m, frequencies): an even number of terms; `terms` (depths, m, groups, 2,
+    MIRROR_IMAGES, LANES): overwritten.
     """
     groups, frequencies, count = spectrum.shape[0], spectrum.shape[1], coefficients.shape[1]
     waves, weights, flat = spectrum.reshape(-1), node_weights.reshape(-1), terms.reshape(-1)
@@ -311,22 +283,12 @@ def assemble_groups(parts, row, column, along_y, along_x, share, counts, first, 
     """Put together the plane waves of some frequencies, as many as count there, and put them into
     their groups.
 
-    Parameters
-    ----------
-    parts : (4, columns, k, rows) complex64 array
-        Sums with cosine and with sine along x, first with cosine and then with sine along y.
-    row, column : (groups, LANES) int64 array
-        Indices of the waves, not negative.
-    along_y, along_x : (n,) complex64 array
-        What waves of every index are multiplied by, those of negative ones by its conjugate.
-    share : (groups, MIRROR_IMAGES, LANES) float32 array
-        What they are multiplied by besides.
-    counts : (k,) int64 array
-        Lanes of all groups that count at each frequency.
-    first : int
-        Where the frequencies begin in `spectrum`.
-    spectrum : (groups, frequencies, 2, MIRROR_IMAGES, LANES) float32 array
-        Written to.
+    `parts` (4, columns, k, rows): sums with cosine and with sine along x, first with cosine and
+    then with sine along y; `row, column` (groups, LANES): indices of the waves, not negative;
+    `along_y, along_x` (n,): what waves of every index are multiplied by, those of negative ones by
+    its conjugate; `share` (groups, MIRROR_IMAGES, LANES): what they are multiplied by besides;
+    `counts` (k,): lanes of all groups that count at each frequency; `first`: where the frequencies
+    begin in `spectrum`; `spectrum` (groups, frequencies, 2, MIRROR_IMAGES, LANES): written to.
     """
     for k in range(counts.size):
         for lane in range(counts[k]):
@@ -363,11 +325,7 @@ def transpose(source, target):
     """Copy ``target[i, j] = source[j, i]``, in squares that stay in cache; quickest for complex64
     seen as float64.
 
-    Parameters
-    ----------
-    source : (columns, rows) array
-    target : (rows, columns) array
-        Overwritten.
+    `source` (columns, rows); `target` (rows, columns): overwritten.
     """
     rows, columns = target.shape
     for top in range(0, rows, TILE_SIDE):
@@ -391,14 +349,9 @@ def transpose(source, target):
 def scatter_terms(terms, cell, folded, spectra):
     """Put the waves of some terms into their cells.
 
-    Parameters
-    ----------
-    terms : (m, groups, 2, MIRROR_IMAGES, LANES) float32 array
-        Real and imaginary parts.
-    cell : (groups, MIRROR_IMAGES, LANES) int64 array
-    folded : bool
-        Waves may meet in one cell, and then add up.
-    spectra : (m, cells) complex64 array
+    `terms` (m, groups, 2, MIRROR_IMAGES, LANES): real and imaginary parts; `cell` (groups,
+    MIRROR_IMAGES, LANES); `folded`: waves may meet in one cell, and then add up; `spectra` (m,
+    cells).
     """
     flat, cells, half = terms.reshape(-1), cell.reshape(-1), np.uint64(GROUP_FLOATS // 2)
     for m in range(terms.shape[0]):

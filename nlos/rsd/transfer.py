@@ -46,36 +46,19 @@ VECTOR_LENGTH = 8
 
 @dataclass(frozen=True)
 class Window:
-    """A circle about every source, outside of which its wave is cut off smoothly.
+    """A circle about every source, outside of which its wave is cut off smoothly."""
 
-    Parameters
-    ----------
-    inner_radius, outer_radius : float
-        Radii up to which waves are whole, and from which on they are gone, m.
-    steepness : float
-        Of the edge, an error function: it is cut off at this argument on both ends.
-    """
-
-    inner_radius: float
-    outer_radius: float
-    steepness: float
+    inner_radius: float  # radii up to which waves are whole, and from which on they are gone, m
+    outer_radius: float  # radii up to which waves are whole, and from which on they are gone, m
+    steepness: float  # of the edge, an error function: it is cut off at this argument on both ends
 
     @classmethod
     def within(cls, offsets: Offsets, periods: Sides, tolerance: float) -> Window:
         """Return the widest window that lets no image of a source in a periodic lattice meet a
         target.
 
-        Parameters
-        ----------
-        offsets : Offsets
-        periods : (float, float)
-            Along y and x, m; at least `find_min_periods`.
-        tolerance : float
-            Relative error allowed.
-
-        Returns
-        -------
-        Window
+        `periods`: along y and x, m; at least `find_min_periods`; `tolerance`: relative error
+        allowed.
         """
         room = min(period - far for period, far in zip(periods, offsets.farthest, strict=True))
         inner = min(offsets.reach, room - MIN_EDGE_FRACTION * offsets.along)
@@ -112,38 +95,19 @@ class Window:
 
 @dataclass(frozen=True)
 class Offsets:
-    """How far sources and targets are apart along y and x.
+    """How far sources and targets are apart along y and x."""
 
-    Parameters
-    ----------
-    farthest : (float, float)
-        The largest there are, m: within these, no image of a source may meet a target.
-    reach : float
-        The largest distance across that a window may have to hold, m.
-    along : float
-        The largest along an axis that it may have to, m.
-    extents : (float, float)
-        Of sources or of targets, whichever are wider, m: a period holds them.
-    """
-
+    # the largest there are, m: within these, no image of a source may meet a target
     farthest: Sides
-    reach: float
-    along: float
-    extents: Sides
+    reach: float  # the largest distance across that a window may have to hold, m
+    along: float  # the largest along an axis that it may have to, m
+    extents: Sides  # of sources or of targets, whichever are wider, m: a period holds them
 
     @classmethod
     def between(cls, sources: Plane, y: FloatArray, x: FloatArray) -> Offsets:
         """Return those of all sources on a plane from all targets.
 
-        Parameters
-        ----------
-        sources : Plane
-        y, x : (n,) float64 array
-            Coordinates of the targets, ascending, m.
-
-        Returns
-        -------
-        Offsets
+        `y, x` (n,): coordinates of the targets, ascending, m.
         """
         pairs = ((y, sources.y), (x, sources.x))
         along_y, along_x = (float(max(abs(a[-1] - b[0]), abs(a[0] - b[-1]))) for a, b in pairs)
@@ -157,16 +121,7 @@ class Offsets:
         """Return the offsets where less reach is wanted, and where a rim carries little of the
         field.
 
-        Parameters
-        ----------
-        reach : float
-            m.
-        rim : (float, float)
-            Width of the rim along y and x, m.
-
-        Returns
-        -------
-        Offsets
+        `reach`: m; `rim`: width of the rim along y and x, m.
         """
         y, x = (far - width for far, width in zip(self.farthest, rim, strict=True))
         reach = min(reach, float(np.hypot(y, x)))
@@ -177,15 +132,7 @@ class Offsets:
 def find_min_periods(offsets: Offsets, tolerance: float) -> Sides:
     """Return the shortest periods along y and x in which a window has room, m.
 
-    Parameters
-    ----------
-    offsets : Offsets
-    tolerance : float
-        Relative error allowed.
-
-    Returns
-    -------
-    (float, float)
+    `tolerance`: relative error allowed.
     """
     inner = INNER_RADIUS_FRACTION - INNER_RADIUS_FRACTION_PER_DIGIT * np.log10(tolerance)
     edge = inner * offsets.reach + MIN_EDGE_FRACTION * offsets.along
@@ -217,21 +164,14 @@ RADII_PER_PERIOD = 1.25
 
 @dataclass(frozen=True, eq=False)
 class SphericalWaves:
-    """The spherical waves that carry a field on.
+    """The spherical waves that carry a field on."""
 
-    Parameters
-    ----------
-    first, step, count : float, float, int
-        Evenly spaced wavenumbers, rad/m.
-    continued : bool
-        False for ``exp(1j * k * R) / R``, the wave of a point; True for the first
-        Rayleigh-Sommerfeld integral's ``z / (2 pi R^2) * (1 / R - 1j * k) * exp(1j * k * R)``,
-        which continues a field known on a plane.
-    """
-
-    first: float
-    step: float
-    count: int
+    first: float  # evenly spaced wavenumbers, rad/m
+    step: float  # evenly spaced wavenumbers, rad/m
+    count: int  # evenly spaced wavenumbers, rad/m
+    # false for ``exp(1j * k * R) / R``, the wave of a point; True for the first Rayleigh-Sommerfeld
+    # integral's ``z / (2 pi R^2) * (1 / R - 1j * k) * exp(1j * k * R)``, which continues a field
+    # known on a plane
     continued: bool
 
     @property
@@ -254,23 +194,14 @@ class TransferFunction:
     d rho``. Since the window, not a period, ends the wave, a convolution through it is as exact as
     one with the sampled wave, wherever source and target are nearer to each other than the window's
     reach; and since it depends on q alone, few values make it up.
-
-    Parameters
-    ----------
-    waves : SphericalWaves
-    window : Window
-    max_lateral_wavenumber : float
-        Largest lateral wavenumber q wanted, rad/m.
-    min_distance : float
-        Smallest distance that will be asked for, m: the nearer, the more sharply peaked the wave.
-    oversampling : float
-        Nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius.
     """
 
     waves: SphericalWaves
     window: Window
-    max_lateral_wavenumber: float
+    max_lateral_wavenumber: float  # largest lateral wavenumber q wanted, rad/m
+    # smallest distance that will be asked for, m: the nearer, the more sharply peaked the wave
     min_distance: float
+    # nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius
     oversampling: float = NODE_OVERSAMPLING
 
     @cached_property
@@ -333,17 +264,8 @@ class TransferFunction:
         distance undoes a positive one, as far as waves travel at all. `leading_zeros` zeros stand
         before the lowest frequency.
 
-        Parameters
-        ----------
-        distance : float
-            Metres.
-        delay : (2,) float64 array
-            Path in m and the wavenumber k_0 in rad/m.
-        leading_zeros : int
-
-        Returns
-        -------
-        (nodes, 2, leading_zeros + frequencies) float32 array
+        `distance`: metres; `delay` (2,): path in m and the wavenumber k_0 in rad/m. Returns (nodes,
+        2, leading_zeros + frequencies).
         """
         radii, _ = self._radii
         waves = np.zeros((radii.size, 2, leading_zeros + self.waves.count), np.float32)
@@ -377,20 +299,8 @@ def find_lateral_limits(
     frequencies together: among them waves that travel aside at the band's edges, where the pulse is
     weak, and evanescent ones.
 
-    Parameters
-    ----------
-    waves : SphericalWaves
-    window : Window
-    strength : (frequencies,) float64 array
-        Relative amplitude of each frequency.
-    distance : float
-        From the sources, along z, m.
-    error : float
-        Allowed, root mean square, relative.
-
-    Returns
-    -------
-    (frequencies,) float64 array
+    `strength` (frequencies,): relative amplitude of each frequency; `distance`: from the sources,
+    along z, m; `error`: allowed, root mean square, relative. Returns (frequencies,).
     """
     # of the window's fall only, not of where it is cut: that lies beyond all targets
     whole = window.without_cut

@@ -19,16 +19,8 @@ def is_occluded(start, end, triangles):
     """Whether a triangle crosses the path between two points (T. Moller, B. Trumbore, J. Graph.
     Tools 2, 21 (1997)).
 
-    Parameters
-    ----------
-    start, end : (3,) array
-        Metres.
-    triangles : (n, 3, 3) array
-        Corners; first axis triangles, last axis x, y, z.
-
-    Returns
-    -------
-    bool
+    `start, end` (3,): metres; `triangles` (n, 3, 3): corners; first axis triangles, last axis x, y,
+    z.
     """
     dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     near, far = min(start[2], end[2]), max(start[2], end[2])
@@ -65,19 +57,8 @@ def is_occluded(start, end, triangles):
 def cosine_to_normal(normal, from_point, to_point, distance):
     """Cosine of the angle between a normal and a path, 0 behind the surface.
 
-    Parameters
-    ----------
-    normal : (3,) array
-        Of length 1.
-    from_point, to_point : (3,) array
-        Metres.
-    distance : float
-        Between the points, m.
-
-    Returns
-    -------
-    float
-        0 to 1.
+    `normal` (3,): of length 1; `from_point, to_point` (3,): metres; `distance`: between the points,
+    m. Returns 0 to 1.
     """
     inner = 0.0
     for i in range(3):
@@ -102,20 +83,10 @@ def add_facet_light(
 ):
     """Add the light of all facets to fine bins, shared between the two that it falls between.
 
-    Parameters
-    ----------
-    wall, wall_normals : (points, 3) float64 array
-    lasers, laser_normals : (1 or points, 3) float64 array
-    positions, normals : (facets, 3) float64 array
-    areas : (facets,) float64 array
-    material : (3,) float64 array
-        Diffuse share, retroreflected share, and spread of the latter.
-    triangles : (m, 3, 3) float64 array
-        What hides.
-    start, fine : float
-        Path of the middle of the first bin and path per bin, m.
-    bins : (points, fine bins) float64 array
-        Added to.
+    `wall, wall_normals` (points, 3); `lasers, laser_normals` (1 or points, 3); `positions, normals`
+    (facets, 3); `areas` (facets,); `material` (3,): diffuse share, retroreflected share, and spread
+    of the latter; `triangles` (m, 3, 3): what hides; `start, fine`: path of the middle of the first
+    bin and path per bin, m; `bins` (points, fine bins): added to.
     """
     outward = np.empty(positions.shape[0])
     lit = np.empty(positions.shape[0])
@@ -165,15 +136,7 @@ def add_facet_light(
 def distance_between(one, other):
     """Distance of two points.
 
-    Parameters
-    ----------
-    one, other : (3,) array
-        Metres.
-
-    Returns
-    -------
-    float
-        Metres.
+    `one, other` (3,): metres. Returns metres.
     """
     return math.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)
 
@@ -182,22 +145,10 @@ def distance_between(one, other):
 def evaluate_reflectance(material, position, laser, observer, to_laser, to_observer):
     """Reflectance per steradian; see `nlos.simulate.materials.Material`.
 
-    Parameters
-    ----------
-    material : (3,) array
-        Diffuse fraction, retroreflected fraction, and the latter's standard deviation in rad; see
-        `nlos.simulate.materials.Material`.
-    position : (3,) array
-        The facet, m.
-    laser, observer : (3,) array
-        Wall points that light comes from and goes to, m.
-    to_laser, to_observer : float
-        Their distances from the facet, m.
-
-    Returns
-    -------
-    float
-        Per steradian.
+    `material` (3,): diffuse fraction, retroreflected fraction, and the latter's standard deviation
+    in rad; see `nlos.simulate.materials.Material`; `position` (3,): the facet, m; `laser, observer`
+    (3,): wall points that light comes from and goes to, m; `to_laser, to_observer`: their distances
+    from the facet, m. Returns per steradian.
     """
     # Lambert: even radiance, whose integral over the half space is the albedo
     value = material[0] / math.pi

@@ -27,16 +27,9 @@ fast_loop = compile_loop(fastmath=True)
 def sample_in_time(counts, dark, raw_row, delay, measurements):
     """Sample every column linearly between two of its rows, and take off the dark level.
 
-    Parameters
-    ----------
-    counts : (raw rows, columns) float32 array
-    dark : float32
-    raw_row : (some rows, columns) float32 array
-        Where each rectified pixel lies in the raw image.
-    delay : float32
-        Rows to add to all raw rows.
-    measurements : (some rows, columns) float32 array, overwritten
-        0 beyond the raw image.
+    `counts` (raw rows, columns); `raw_row` (some rows, columns): where each rectified pixel lies in
+    the raw image; `delay`: rows to add to all raw rows; `measurements` (some rows, columns): 0
+    beyond the raw image.
     """
     rows, columns = counts.shape
     last, lowest = np.float32(rows - 1), np.int32(max(rows - 2, 0))
@@ -65,18 +58,10 @@ def sample_row(counts, dark, position, runs, reading):
     """Sample a row as `sample_in_time` does without a delay, between rows that were looked up
     beforehand.
 
-    Parameters
-    ----------
-    counts : (raw rows, columns) float32 array
-    dark : float32
-    position : (columns,) float32 array
-        Where each rectified pixel lies in the raw image.
-    runs : (n, 3) uint64 array
-        First column, the one after the last, and the upper of the two raw rows between which all of
-        them lie; from the number of raw rows on, they lie beyond the image. In the order of columns
-        and without gaps.
-    reading : (columns,) float32 array, overwritten
-        0 beyond the raw image.
+    `counts` (raw rows, columns); `position` (columns,): where each rectified pixel lies in the raw
+    image; `runs` (n, 3): first column, the one after the last, and the upper of the two raw rows
+    between which all of them lie; from the number of raw rows on, they lie beyond the image;
+    `reading` (columns,): 0 beyond the raw image.
     """
     rows, columns = np.uintp(counts.shape[0]), np.uintp(counts.shape[1])
     below, level = np.uintp(min(1, counts.shape[0] - 1)), fill_vector(dark)
@@ -104,18 +89,9 @@ def sample_row(counts, dark, position, runs, reading):
 def sample_rows(counts, dark, raw_row, runs, run_starts, numbers, measurements):
     """Sample some rows; see `sample_row`.
 
-    Parameters
-    ----------
-    counts : (raw rows, columns) float32 array
-    dark : float32
-    raw_row : (rows, columns) float32 array
-        Where each rectified pixel lies in the raw image.
-    runs : (n, 3) uint64 array
-        Of all rows, one after the other.
-    run_starts : (rows + 1,) int64 array
-        Where each row's runs begin.
-    numbers : (some rows,) int64 array
-    measurements : (some rows, columns) float32 array, overwritten
+    `counts` (raw rows, columns); `raw_row` (rows, columns): where each rectified pixel lies in the
+    raw image; `runs` (n, 3): of all rows, one after the other; `run_starts` (rows + 1,): where each
+    row's runs begin; `numbers` (some rows,); `measurements` (some rows, columns).
     """
     for place in range(numbers.size):
         row = numbers[place]
@@ -158,14 +134,8 @@ def write_transposed(rows, first, columns):
 def sum_boxes(measurements, starts, length, span, sums):
     """``sums[c, i] = measurements[starts[i] : starts[i] + length, c].sum()`` for the instants of a span.
 
-    Parameters
-    ----------
-    measurements : (rows, columns) float32 array
-    starts : (instants,) int64 array
-    length : int
-    span : (int, int)
-        First instant, and the one after the last: whole vectors of them.
-    sums : (columns, at least instants) float32 array, overwritten in this span
+    `measurements` (rows, columns); `starts` (instants,); `span`: first instant, and the one after
+    the last: whole vectors of them; `sums` (columns, at least instants).
     """
     room = np.empty((LENGTH, measurements.shape[1]), np.float32)
     for first in range(np.uintp(span[0]), np.uintp(span[1]), STEP):
@@ -181,15 +151,9 @@ def sum_sampled_boxes(
 ):
     """Do as `sum_boxes` with rows that are sampled meanwhile, each once, and add up raw rows.
 
-    Parameters
-    ----------
-    counts, raw_row, runs, run_starts
-        As for `sample_rows`; no dark level is taken off.
-    starts, length, span, sums
-        As for `sum_boxes`.
-    raw_span : (int, int)
-        Raw rows that are added up: about those that the sums look at, which are in the cache then.
-    row_sums : (raw rows,) float32 array, overwritten in that span
+    `counts, raw_row, runs, run_starts`: as for `sample_rows`; no dark level is taken off; `starts,
+    length, span, sums`: as for `sum_boxes`; `raw_span`: raw rows that are added up: about those
+    that the sums look at, which are in the cache then; `row_sums` (raw rows,).
     """
     columns = counts.shape[1]
     room, ring = np.empty((LENGTH, columns), np.float32), np.empty((length, columns), np.float32)
@@ -234,15 +198,9 @@ def add_columns(row):
 def subtract_dark_level(measured, dark, sums, lit):
     """Take the dark level off sums of rows, as often as each has measurements.
 
-    Parameters
-    ----------
-    measured : (columns, sums) float32 array
-        Number of rows that were measured.
-    dark : float32
-    sums : (columns, at least sums) float32 array, changed in place
-        Zero where nothing was measured, and so they stay.
-    lit : (columns,) bool array, overwritten
-        Whether anything rises above the dark level.
+    `measured` (columns, sums): number of rows that were measured; `sums` (columns, at least sums):
+    zero where nothing was measured, and so they stay; `lit` (columns,): whether anything rises
+    above the dark level.
     """
     for column in range(measured.shape[0]):
         here, number, above = sums[column], measured[column], np.float32(0)
@@ -257,17 +215,10 @@ def subtract_dark_level(measured, dark, sums, lit):
 def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
     """Sample bilinearly; see `sample_in_time`.
 
-    Parameters
-    ----------
-    counts : (raw rows, raw columns) float32 array
-    dark : float
-        Level that is taken off, counts.
-    raw_row, raw_column : (some rows, columns) float32 array
-        Where each measurement lies in the raw image, pixels.
-    delay : float
-        Rows by which the light comes later than the sweep says.
-    measurements : (some rows, columns) float32 array
-        Overwritten.
+    `counts` (raw rows, raw columns); `dark`: level that is taken off, counts; `raw_row, raw_column`
+    (some rows, columns): where each measurement lies in the raw image, pixels; `delay`: rows by
+    which the light comes later than the sweep says; `measurements` (some rows, columns):
+    overwritten.
     """
     rows, columns = counts.shape
     flat, zero, width = counts.reshape(counts.size), np.int32(0), np.int32(columns)
@@ -294,12 +245,8 @@ def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
 def mark_valid(bad, raw_row, raw_column, delay, valid):
     """Mark the measurements that lie within the raw image and to which no bad pixel contributes.
 
-    Parameters
-    ----------
-    bad : (rows, raw columns) bool array
-    raw_row, raw_column, delay
-        As for `sample_bilinear`.
-    valid : (some rows, columns) bool array, overwritten
+    `bad` (rows, raw columns); `raw_row, raw_column, delay`: as for `sample_bilinear`; `valid` (some
+    rows, columns).
     """
     rows, columns = bad.shape
     for row in range(valid.shape[0]):

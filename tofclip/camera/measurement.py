@@ -435,23 +435,13 @@ class MeasurementNoise:
     The last is what the model does not explain, which falls beside the light, on measurements that
     should be dark; `usual` is the root mean square of a frame's signal. Beside light that dazzles
     there is `DAZZLE_MISFIT` of that light in addition.
-
-    Parameters
-    ----------
-    floor : float
-        Standard deviation in the dark, counts.
-    gain : float
-        Counts of variance for a count of signal.
-    misfit : float
-        Of the recovery's residual, what noise does not explain, relative to the signal.
-    dazzle : float
-        Light above this, counts, dazzles the columns beside it.
     """
 
-    floor: float
-    gain: float
+    floor: float  # standard deviation in the dark, counts
+    gain: float  # counts of variance for a count of signal
+    # of the recovery's residual, what noise does not explain, relative to the signal
     misfit: float = 0.0
-    dazzle: float = np.inf
+    dazzle: float = np.inf  # light above this, counts, dazzles the columns beside it
 
     @classmethod
     def from_figures(cls, known: Mapping[str, Scalar]) -> MeasurementNoise | None:
@@ -477,10 +467,7 @@ class MeasurementNoise:
     def compute_variance(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the variance of each measurement, (columns, frames).
 
-        Parameters
-        ----------
-        light : (columns, frames) float32 array
-            What the frames predict, not negative.
+        `light` (columns, frames): what the frames predict, not negative.
         """
         variance = self.floor**2 + self.gain * light
         if light.max(initial=0) <= self.dazzle:
@@ -497,14 +484,7 @@ class MeasurementNoise:
 
         Where a bright object is alone, there is nothing that it could dazzle.
 
-        Parameters
-        ----------
-        light : (columns, frames) float32 array
-            Counts.
-
-        Returns
-        -------
-        (columns, frames) bool array
+        `light` (columns, frames): counts. Returns (columns, frames).
         """
         dazzling = light > self.dazzle
         for frame in np.flatnonzero(dazzling.any(axis=0)):
@@ -517,16 +497,7 @@ class MeasurementNoise:
 def find_dazzle_limit(measurement: Measurement, floor: float) -> float:
     """Return the light that dazzles where there is other light at the same instant, counts.
 
-    Parameters
-    ----------
-    measurement : Measurement
-    floor : float
-        Standard deviation of a dark measurement, counts.
-
-    Returns
-    -------
-    float
-        Infinite where there is none.
+    `floor`: standard deviation of a dark measurement, counts. Returns infinite where there is none.
     """
     light = measurement.values[measurement.valid]
     lit = light[light > LIT_DEVIATIONS * floor]
@@ -540,14 +511,7 @@ def find_dazzle_limit(measurement: Measurement, floor: float) -> float:
 def find_dazzled(measurement: Measurement, noise: MeasurementNoise) -> NDArray[np.bool_]:
     """Find the measurements beside light far brighter than what else there is.
 
-    Parameters
-    ----------
-    measurement : Measurement
-    noise : MeasurementNoise
-
-    Returns
-    -------
-    (columns, frames) bool array
+    Returns (columns, frames).
     """
     light = np.where(measurement.valid, measurement.values, 0)
     return _take_brightest_around(noise.find_dazzling(light))
@@ -556,14 +520,7 @@ def find_dazzled(measurement: Measurement, noise: MeasurementNoise) -> NDArray[n
 def find_glints(operator: LineProjection, dazzled: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Find the pixels that are seen by dazzled measurements only.
 
-    Parameters
-    ----------
-    operator : LineProjection
-    dazzled : (columns, frames) bool array
-
-    Returns
-    -------
-    (frames, rows, columns) bool array
+    `dazzled` (columns, frames). Returns (frames, rows, columns).
     """
     transposed = operator.matrix.T
     weight = transposed @ np.ones(dazzled.shape[0], np.float32)

@@ -18,16 +18,8 @@ from tofclip.threads import LANES, count_block_threads, run_blocks
 class RowSums:
     """What stays the same from shot to shot in sums of rectified rows.
 
-    Parameters
-    ----------
-    rectifier : Rectifier
-    starts : (sums,) int array
-        First row of each sum; a multiple of `LANES` of them.
-    length : int
-        Rows of a sum.
+    `starts` (sums,): first row of each sum; a multiple of `LANES` of them; `length`: rows of a sum.
 
-    Notes
-    -----
     Memory: as much as the sums.
     """
 
@@ -42,23 +34,9 @@ class RowSums:
     def add_up(self, counts: NDArray[np.float32], sums: NDArray[np.float32]) -> float:
         """Add up the rows of a shot; return its dark level.
 
-        Parameters
-        ----------
-        counts : (rows, columns) float32 array
-            Raw streak image.
-        sums : (columns, at least sums) float32 array
-            Overwritten as far as there are sums: of measurements, without the dark level; 0 where
-            nothing was measured.
-
-        Returns
-        -------
-        float
-            Counts.
-
-        Raises
-        ------
-        CalibrationError, InputError
-            As for `Rectifier.rectify`.
+        `counts` (rows, columns): raw streak image; `sums` (columns, at least sums): overwritten as
+        far as there are sums: of measurements, without the dark level; 0 where nothing was
+        measured. Returns counts.
         """
         # the compiler takes as long to import as all else
         from tofclip.camera.kernels import subtract_dark_level

@@ -31,19 +31,11 @@ MEMBER_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 @dataclass(frozen=True)
 class ArchiveEntry:
-    """An array in a file that has not been read yet.
-
-    Parameters
-    ----------
-    shape : tuple of int
-    dtype : dtype
-    load : callable
-        Reads the values.
-    """
+    """An array in a file that has not been read yet."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    load: Callable[[], NDArray[Any]]
+    load: Callable[[], NDArray[Any]]  # reads the values
 
     @classmethod
     def of(cls, values: Any) -> ArchiveEntry:
@@ -53,17 +45,7 @@ class ArchiveEntry:
 
 
 def list_npz_entries(path: Path) -> dict[str, ArchiveEntry]:
-    """List the arrays of an ``.npz`` file by name; pickled objects are refused.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    FileFormatError
-        An array claims more than the file can hold.
-    """
+    """List the arrays of an ``.npz`` file by name; pickled objects are refused."""
     entries = {}
     with BoundedFile(path) as opened, zipfile.ZipFile(opened) as archive:
         for member in archive.infolist():
@@ -86,15 +68,7 @@ def list_npz_entries(path: Path) -> dict[str, ArchiveEntry]:
 def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Read shape and type of an ``.npy`` file, up to its first value.
 
-    Parameters
-    ----------
-    file : binary file
-        At its beginning.
-
-    Raises
-    ------
-    ValueError
-        It is something else, or holds pickled objects.
+    `file`: at its beginning.
     """
     version = np.lib.format.read_magic(file)
     read = (
@@ -121,17 +95,7 @@ def _make_loader(path: Path, member: zipfile.ZipInfo) -> Callable[[], NDArray[An
 
 
 class Archive:
-    """The arrays of an ``.npz`` file; pickled objects are never loaded.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        The file cannot be read, is truncated, or is not a NumPy archive.
-    """
+    """The arrays of an ``.npz`` file; pickled objects are never loaded."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)

@@ -24,22 +24,8 @@ EXTENDED_COUNT = 0x7FFF
 def read_sdt_blocks(path: Path) -> tuple[list[NDArray[Any]], float]:
     """Read all histograms of a file.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    list of arrays
-        (..., bins) counts of each block: (rows, columns, bins) of an image.
-    float
-        Duration of a bin, s.
-
-    Raises
-    ------
-    FileFormatError
-        It is damaged, or its blocks have different resolutions.
-    MissingDependencyError
+    Returns (..., bins) counts of each block: (rows, columns, bins) of an image; duration of a bin,
+    s.
     """
     sdtfile = import_file_reader("sdtfile", "tofclip[tcspc]")
     require_bounded_sdt(path)
@@ -54,16 +40,7 @@ def read_sdt_blocks(path: Path) -> tuple[list[NDArray[Any]], float]:
 
 
 def require_bounded_sdt(path: Path) -> None:
-    """Refuse a file that claims more in its blocks than it can hold.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    FileFormatError
-    """
+    """Refuse a file that claims more in its blocks than it can hold."""
     from sdtfile import sdtfile
 
     layout = np.dtype(sdtfile.FILE_HEADER).newbyteorder("<")

@@ -19,23 +19,7 @@ Channels = dict[str, NDArray[Any]]
 
 
 def read_exr_parts(path: Path) -> list[tuple[str, Channels]]:
-    """Read name and channels of every part.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    list of (str, mapping of str to (rows, columns) array)
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        The file cannot be read, is damaged, or claims more than it can hold.
-    MissingDependencyError
-        OpenEXR is not installed.
-    """
+    """Read name and channels of every part."""
     try:
         import OpenEXR
     except ImportError as fault:

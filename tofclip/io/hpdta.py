@@ -69,23 +69,8 @@ def read_row_times(
     (``areSource`` = left, top, width, height) begins at its row ``top``. In focus mode, or without
     a unit of time, there is no axis.
 
-    Parameters
-    ----------
-    metadata : mapping
-        What `parse_text` returned.
-    path : path-like
-        The file that holds the table.
-    rows : int
-        Rows of the picture.
-
-    Returns
-    -------
-    (rows,) float64 array or None
-
-    Raises
-    ------
-    FileFormatError
-        The table does not lie in the file, is shorter than the picture, or does not increase.
+    `metadata`: what `parse_text` returned; `path`: the file that holds the table; `rows`: rows of
+    the picture. Returns (rows,).
     """
     unit = TIME_UNITS.get(metadata.get("Scaling/ScalingYUnit", ""))
     if unit is None or metadata.get("Scaling/ScalingYScalingFile") == _FOCUS_MODE:
@@ -114,16 +99,7 @@ def find_table(metadata: Mapping[str, str], axis: str) -> tuple[int, int] | None
 
     None where the axis has no table: it is linear, or has no unit at all.
 
-    Parameters
-    ----------
-    metadata : mapping of str to str
-        ``Section/Key`` to value.
-    axis : str
-        ``"X"`` or ``"Y"``.
-
-    Returns
-    -------
-    (int, int) or None
+    `metadata`: ``Section/Key`` to value; `axis`: ``"X"`` or ``"Y"``.
     """
     found = _TABLE.fullmatch(metadata.get(f"Scaling/Scaling{axis}ScalingFile", ""))
     return (int(found[1]), int(found[2])) if found else None
@@ -135,23 +111,8 @@ def find_saturated_pixels(
     """Mark the pixels that reached the sensor's limit; None for floating-point pictures, which have
     none.
 
-    Parameters
-    ----------
-    pixels : (rows, columns) array
-        Counts.
-    metadata : mapping of str to str
-        Gives the sensor's full scale.
-    path : str or Path
-        For the message.
-
-    Returns
-    -------
-    (rows, columns) bool array or None
-
-    Raises
-    ------
-    InputError
-        Every pixel reached it.
+    `pixels` (rows, columns): counts; `metadata`: gives the sensor's full scale; `path`: for the
+    message. Returns (rows, columns).
     """
     if pixels.dtype.kind == "f":
         return None

@@ -41,29 +41,14 @@ _MAX_TRAILER_BYTES = 1 << 20  # scaling tables are a few kilobytes
 
 @dataclass(frozen=True)
 class ItexImage:
-    """What an ITEX file holds.
+    """What an ITEX file holds."""
 
-    Parameters
-    ----------
-    pixels : (rows, columns) uint8, uint16 or uint32 array
-    text : str
-        HPD-TA's text, see `tofclip.io.hpdta.parse_text`. It has to name a place for every table in
-        `tables` (``ScalingYScalingFile="..."``); `encode_itex` fills in where the table really
-        lies.
-    offset_px : (int, int)
-        Column and row of the sensor at which the picture begins.
-    tables : mapping of str to (entries,) float32 array
-        Scaling of ``"X"`` (columns) and ``"Y"`` (rows), in the units that the text names.
-
-    Raises
-    ------
-    ShapeError, InputError
-        The pixels are not 2D, empty, too many or of another type, or the text is too long.
-    """
-
-    pixels: NDArray[Any]
+    pixels: NDArray[Any]  # (rows, columns)
+    # HPD-TA's text, see `tofclip.io.hpdta.parse_text`. It has to name a place for every table in
+    # `tables` (``ScalingYScalingFile="..."``); `encode_itex` fills in where the table really lies
     text: str
-    offset_px: tuple[int, int] = (0, 0)
+    offset_px: tuple[int, int] = (0, 0)  # column and row of the sensor at which the picture begins
+    # scaling of ``"X"`` (columns) and ``"Y"`` (rows), in the units that the text names
     tables: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -108,13 +93,7 @@ def outline_itex(path: str | Path) -> Record:
 
 
 def write_itex(image: ItexImage, path: str | Path) -> None:
-    """Write an ITEX file, whole or not at all.
-
-    Parameters
-    ----------
-    image : ItexImage
-    path : str or Path
-    """
+    """Write an ITEX file, whole or not at all."""
     data = encode_itex(image)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
@@ -126,20 +105,7 @@ def decode_itex(data: bytes | memoryview, path: str | Path = "ITEX picture") -> 
     The pixels are a view of `data`; nothing else is larger than the text, so that a damaged header
     cannot make this allocate more than `data` itself takes.
 
-    Parameters
-    ----------
-    data : bytes or memoryview
-    path : path-like
-        Where they come from, for messages.
-
-    Returns
-    -------
-    ItexImage
-
-    Raises
-    ------
-    FileFormatError
-        They are not an ITEX file, or less than the header and the text say.
+    `path`: where they come from, for messages.
     """
     if len(data) < _HEADER.size or bytes(data[:2]) != SIGNATURE:
         raise FileFormatError(path, "has no ITEX header")
@@ -166,13 +132,7 @@ def decode_itex(data: bytes | memoryview, path: str | Path = "ITEX picture") -> 
 
 
 def encode_itex(image: ItexImage) -> bytes:
-    """Return the bytes of an ITEX file, the tables right behind the pixels, X first.
-
-    Raises
-    ------
-    InputError
-        The text is longer than the header can say, or names no place for a table.
-    """
+    """Return the bytes of an ITEX file, the tables right behind the pixels, X first."""
     kind = next(number for number, dtype in PIXEL_TYPES.items() if dtype == image.pixels.dtype)
     text = _fill_table_offsets(image)
     if len(text) > _MAX_FIELD:

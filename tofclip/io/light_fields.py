@@ -39,13 +39,7 @@ PART_NAME_PATTERN = re.compile(rf"v={NUMBER_PATTERN},u={NUMBER_PATTERN}")
 
 
 def read_exr(path: Path) -> LightField:
-    """Read the parts named like ``v=-1,u=0``, with a channel Y or with R, G and B.
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        The file cannot be read, a part has another name or channels, or the parts differ in size.
-    """
+    """Read the parts named like ``v=-1,u=0``, with a channel Y or with R, G and B."""
     named = read_exr_parts(path)
     pictures = [_read_luminance(path, name, channels) for name, channels in named]
     if len({picture.shape for picture in pictures}) != 1:
@@ -54,13 +48,7 @@ def read_exr(path: Path) -> LightField:
 
 
 def write_exr(light_field: LightField, path: Path) -> None:
-    """Write one part for each view with a channel Y of float32.
-
-    Parameters
-    ----------
-    light_field : LightField
-    path : Path
-    """
+    """Write one part for each view with a channel Y of float32."""
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -104,14 +92,7 @@ RASTER_NAME_PATTERN = re.compile(r"(\d+)\D*")
 
 
 def read_folder(folder: Path) -> LightField:
-    """Read a folder of pictures; whole numbers are scaled to 0..1, colours become luminance.
-
-    Raises
-    ------
-    FileFormatError
-        There are no pictures, names carry no numbers, views are missing, or pictures differ in
-        size.
-    """
+    """Read a folder of pictures; whole numbers are scaled to 0..1, colours become luminance."""
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
     if not paths:
         raise FileFormatError(folder, f"holds no pictures ({', '.join(IMAGE_SUFFIXES)})")
@@ -230,19 +211,9 @@ def _decode(path: Path) -> NDArray[Any]:
 def read_light_field(path: str | Path) -> LightField:
     """Read a light field; the name's ending says how.
 
-    Parameters
-    ----------
-    path : path-like
-        ``.npz``: `lf` (v, u, y, x), `scale`, a factor for it, and the view numbers `v` and `u`.
-        ``.h5``, ``.hdf5``: written by `write_light_field`. ``.exr``: one part for each view, named
-        ``v=0,u=-1``. A folder: one picture for each view, see `tofclip.io.light_fields`.
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        The file cannot be read, is of another format, or lacks views.
-    InputError
-        The pictures hold NaN or are constant.
+    `path`: ``.npz``: `lf` (v, u, y, x), `scale`, a factor for it, and the view numbers `v` and `u`.
+    ``.h5``, ``.hdf5``: written by `write_light_field`. ``.exr``: one part for each view, named
+    ``v=0,u=-1``.
     """
     source = Path(path)
     if source.is_dir():
@@ -260,18 +231,6 @@ def read_light_field(path: str | Path) -> LightField:
 def write_light_field(light_field: LightField, path: str | Path) -> None:
     """Write a light field, whole or not at all, as ``.h5``, ``.hdf5`` or ``.exr`` (float32 values,
     ZIP compression).
-
-    Parameters
-    ----------
-    light_field : LightField
-    path : str or Path
-
-    Raises
-    ------
-    InputError
-        The name has another ending.
-    StorageError
-        The file cannot be written.
     """
     target = Path(path)
     require_suffix(target, *_WRITERS)
@@ -281,20 +240,9 @@ def write_light_field(light_field: LightField, path: str | Path) -> None:
 def read_depth_map(path: str | Path) -> NDArray[np.float64]:
     """Read the shear of each pixel of the reference view.
 
-    Parameters
-    ----------
-    path : path-like
-        ``.npy``: an array (rows, columns), pixels per view step, infinite where there is nothing.
-        ``.h5``: a picture with its shears, written by ``tofclip clip recover --all-in-focus``.
-
-    Returns
-    -------
-    (rows, columns) float64 array
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        The file cannot be read, or holds something else.
+    `path`: ``.npy``: an array (rows, columns), pixels per view step, infinite where there is
+    nothing. ``.h5``: a picture with its shears, written by ``tofclip clip recover --all-in-focus``.
+    Returns (rows, columns).
     """
     source = Path(path)
     if source.suffix.lower() != NPY_SUFFIX:

@@ -54,37 +54,16 @@ VALUE_TYPES = {
 
 @dataclass(frozen=True)
 class MatVariable:
-    """A variable that has not been read yet.
+    """A variable that has not been read yet."""
 
-    Parameters
-    ----------
-    name : str
-        With a dot for a field of a struct.
-    shape : tuple of int
-    dtype : dtype
-        Objects for cells.
-    load : callable
-        Returns its values: numbers, or an object array of arrays.
-    """
-
-    name: str
+    name: str  # with a dot for a field of a struct
     shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    load: Callable[[], NDArray[Any]]
+    dtype: np.dtype[Any]  # objects for cells
+    load: Callable[[], NDArray[Any]]  # returns its values: numbers, or an object array of arrays
 
 
 def list_mat_variables(path: Path) -> list[MatVariable]:
-    """List the numeric and cell arrays of a MAT file of version 5, and those in its structs.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    FileFormatError
-        The file is truncated or damaged, or an array claims more than the file can hold.
-    """
+    """List the numeric and cell arrays of a MAT file of version 5, and those in its structs."""
     size = path.stat().st_size
     found: list[MatVariable] = []
     with open(path, "rb") as file:
@@ -153,14 +132,8 @@ def _list_matrix(matrix: _Matrix, element: _Element) -> Iterator[MatVariable]:
 class _Matrix:
     """A matrix element whose parts are looked at one after the other.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    order : str
-        ``<`` or ``>``.
-    content : memoryview
-        The element without its tag, or its beginning, if only name and shape are wanted.
+    `path`: for messages; `order`: ``<`` or ``>``; `content`: the element without its tag, or its
+    beginning, if only name and shape are wanted.
     """
 
     def __init__(self, path: Path, order: str, content: memoryview) -> None:
@@ -280,11 +253,8 @@ class _Matrix:
         Photon times of every pixel are a hundred thousand cells: to look at each as a whole takes a
         fifth of the time that part by part takes.
 
-        Parameters
-        ----------
-        usual : Struct
-            Fourteen words: from a matrix's tag to that of its values, where it has two dimensions
-            and no name.
+        `usual`: fourteen words: from a matrix's tag to that of its values, where it has two
+        dimensions and no name.
         """
         start = self._place
         if start + usual.size > len(self._content):

@@ -37,19 +37,11 @@ MARKER_TAGS = ("LineStart", "LineStop", "Frame")
 
 @dataclass(frozen=True)
 class PulseCount:
-    """The laser's pulses up to some event.
+    """The laser's pulses up to some event."""
 
-    Parameters
-    ----------
-    pulses : int
-        How many there were.
-    first, last : int
-        Times of the first and last one in ticks, `NO_PULSE` before the first.
-    """
-
-    pulses: int = 0
-    first: int = NO_PULSE
-    last: int = NO_PULSE
+    pulses: int = 0  # how many there were
+    first: int = NO_PULSE  # times of the first and last one in ticks, `NO_PULSE` before the first
+    last: int = NO_PULSE  # times of the first and last one in ticks, `NO_PULSE` before the first
 
     @property
     def period_ticks(self) -> float:
@@ -61,20 +53,8 @@ class PulseCount:
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], PulseCount]:
         """Find the last pulse before each of the events that follow.
 
-        Parameters
-        ----------
-        times : (n,) int64 array
-            Ticks, not going back.
-        is_pulse : (n,) bool array
-
-        Returns
-        -------
-        (n,) int64 array
-            Number of each event's pulse from 0, -1 where there was none.
-        (n,) int64 array
-            Ticks since it.
-        PulseCount
-            Behind these events.
+        `times` (n,): ticks, not going back; `is_pulse` (n,). Returns (n,): number of each event's
+        pulse from 0, -1 where there was none; (n,): ticks since it; behind these events.
         """
         at = np.concatenate([[self.last], times[is_pulse]])
         own = np.cumsum(is_pulse)
@@ -96,44 +76,22 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class Events:
-    """Events of a piece, in their order; each array has one value for each.
+    """Events of a piece, in their order; each array has one value for each."""
 
-    Parameters
-    ----------
-    time : int64 array
-        Number of the pulse in T3 mode, ticks in T2 mode.
-    pulse : int64 array
-        Number of the last pulse from 0.
-    delay : int64 array
-        Time after it, in bins.
-    channel : int16 array
-        Of photons from 0.
-    is_photon : bool array
-        Others are pulses, markers, overflows, and photons before the first pulse.
-    marker : uint8 array
-        One bit for each marker, where the event is one.
-    """
-
-    time: NDArray[np.int64]
-    pulse: NDArray[np.int64]
-    delay: NDArray[np.int64]
-    channel: NDArray[np.int16]
+    time: NDArray[np.int64]  # number of the pulse in T3 mode, ticks in T2 mode
+    pulse: NDArray[np.int64]  # number of the last pulse from 0
+    delay: NDArray[np.int64]  # time after it, in bins
+    channel: NDArray[np.int16]  # of photons from 0
+    # others are pulses, markers, overflows, and photons before the first pulse
     is_photon: NDArray[np.bool_]
-    marker: NDArray[np.uint8]
+    marker: NDArray[np.uint8]  # one bit for each marker, where the event is one
 
 
 class PtuEvents:
     """A PTU file as pieces of a million events. Memory: one piece, decoded.
 
-    Parameters
-    ----------
-    path : path-like
-    sync : int, optional
-        Channel of the laser's pulses in T2 mode; by default the electronics' own input for them.
-
-    Raises
-    ------
-    MissingDependencyError, StorageError
+    `sync`: channel of the laser's pulses in T2 mode; by default the electronics' own input for
+    them.
     """
 
     def __init__(self, path: str | Path, sync: int | None = None) -> None:
@@ -164,16 +122,7 @@ class PtuEvents:
     def decode(self, piece: int, before: Checkpoint) -> tuple[Events, Checkpoint]:
         """Decode a piece.
 
-        Parameters
-        ----------
-        piece : int
-        before : Checkpoint
-
-        Returns
-        -------
-        Events
-        Checkpoint
-            Behind it.
+        Returns behind it.
         """
         first = piece * CHUNK_EVENTS
         # Read, not mapped: mapped pages would count as this program's memory.
@@ -223,19 +172,11 @@ def require_pulses(path: Path, count: PulseCount) -> None:
 
 @dataclass(frozen=True)
 class ScannedPhotons:
-    """Photons of a scanner's picture; all its frames together.
+    """Photons of a scanner's picture; all its frames together."""
 
-    Parameters
-    ----------
-    x, y : (photons,) uint16 arrays
-        Pixel.
-    time : (photons,) float64 array
-        s after the laser's pulse.
-    """
-
-    x: NDArray[np.uint16]
-    y: NDArray[np.uint16]
-    time: NDArray[np.float64]
+    x: NDArray[np.uint16]  # (photons,), pixel
+    y: NDArray[np.uint16]  # (photons,), pixel
+    time: NDArray[np.float64]  # (photons,), s after the laser's pulse
 
 
 @dataclass(frozen=True)
@@ -264,19 +205,6 @@ def read_scan(events: PtuEvents) -> ScannedPhotons:
 
     Photons between lines are left out. The file is read twice. Memory: a piece of it, and 12 bytes
     for each photon.
-
-    Parameters
-    ----------
-    events : PtuEvents
-
-    Returns
-    -------
-    ScannedPhotons
-
-    Raises
-    ------
-    FileFormatError
-        There are no lines, or no pulses to count from, or the picture is too large.
     """
     rows, columns = get_scan_shape(events)
     lines = _find_lines(events, rows, columns)

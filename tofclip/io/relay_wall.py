@@ -16,27 +16,17 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RelayWall:
-    """The wall as a window of the picture sees it.
+    """The wall as a window of the picture sees it."""
 
-    Parameters
-    ----------
-    points : (rows, columns, 3) array
-        The wall point seen by each pixel of the window, m; NaN where unknown.
-    camera, laser : (3,) array
-        Position of the camera and of the laser spot on the wall, m, in the same frame.
-    offset_px : (int, int)
-        First row and column of the window in the picture.
-    axis_px : (int, int)
-        Row and column of the optical axis in the picture.
-    receive_delay_bins : float
-        Bins by which the record starts late: bin i stands for (i + delay) bin widths of travel.
-    """
-
+    # (rows, columns, 3), the wall point seen by each pixel of the window, m; NaN where unknown
     points: FloatArray
+    # (3,), position of the camera and of the laser spot on the wall, m, in the same frame
     camera: FloatArray
+    # (3,), position of the camera and of the laser spot on the wall, m, in the same frame
     laser: FloatArray
-    offset_px: tuple[int, int]
-    axis_px: tuple[int, int]
+    offset_px: tuple[int, int]  # first row and column of the window in the picture
+    axis_px: tuple[int, int]  # row and column of the optical axis in the picture
+    # bins by which the record starts late: bin i stands for (i + delay) bin widths of travel
     receive_delay_bins: float
 
     def to_record(self) -> Record:
@@ -63,10 +53,8 @@ class RelayWall:
         decomposition, and the sum of the singular values tells how well they align (G. Wahba, SIAM
         Review 7, 409 (1965)); f is then found by zooming in.
 
-        Returns
-        -------
-        focal_length_px, residual_px : float
-            In pixels of the picture; the residual is the root mean square distance on the picture.
+        Returns `focal_length_px, residual_px`: in pixels of the picture; the residual is the root
+        mean square distance on the picture.
         """
         pixels, directions = self._sight_lines()
         # From a fisheye of one pixel to a telephoto lens: any camera lies in between.
@@ -101,22 +89,8 @@ def read_relay_wall(archive: Archive, image_shape: tuple[int, int]) -> RelayWall
     """Take the relay wall out of a LIFT archive; its window has the picture's middle pixel in its
     own middle.
 
-    Parameters
-    ----------
-    archive : Archive
-        A LIFT shot.
-    image_shape : (int, int)
-        Rows and columns of the recovered picture.
-
-    Returns
-    -------
-    RelayWall
-        Points (rows, columns, 3), m.
-
-    Raises
-    ------
-    FileFormatError
-        The wall does not fit into the picture, or has fewer than four points.
+    `archive`: A LIFT shot; `image_shape`: rows and columns of the recovered picture. Returns points
+    (rows, columns, 3), m.
     """
     points = np.moveaxis(archive.array("wall_grid_m", 3, None, None), 0, -1).astype(np.float64)
     axis_px = (image_shape[0] // 2, image_shape[1] // 2)

@@ -78,19 +78,7 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
 def outline_streak_file(path: str | Path) -> Record:
     """Describe the streak image in a file without reading its pixels.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    Record
-        See `tofclip.storage.read_outline`.
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        See `read_streak`.
+    Returns see `tofclip.storage.read_outline`.
     """
     outline = _select_reader(path)[1](path)
     if outline.provenance:

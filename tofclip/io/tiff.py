@@ -105,15 +105,7 @@ def require_whole_chain(tiff: tifffile.TiffFile, path: str | Path) -> None:
     """Refuse a file whose pictures follow each other in a circle, or on beyond its end; tifffile
     takes either for the end of the row.
 
-    Parameters
-    ----------
-    tiff : TiffFile
-    path : path-like
-        The file, for the message.
-
-    Raises
-    ------
-    FileFormatError
+    `path`: the file, for the message.
     """
     file, layout = tiff.filehandle, tiff.tiff
     seen: set[int] = set()
@@ -135,17 +127,7 @@ def require_whole_chain(tiff: tifffile.TiffFile, path: str | Path) -> None:
 
 
 def require_bounded_page(page: tifffile.TiffPage, path: str | Path) -> None:
-    """Refuse a picture that claims more than its file can hold.
-
-    Parameters
-    ----------
-    page : tifffile.TiffPage
-    path : path-like
-
-    Raises
-    ------
-    FileFormatError
-    """
+    """Refuse a picture that claims more than its file can hold."""
     if not 0 < page.size <= MAX_PIXELS:
         raise FileFormatError(path, f"claims an impossible size of {page.shape} pixels")
     size, packed = page.parent.filehandle.size, page.compression != 1

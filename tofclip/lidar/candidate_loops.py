@@ -18,16 +18,8 @@ from tofclip.units import SPEED_OF_LIGHT
 def raise_maxima(pixel, time, intensity, axis, strongest, brightest):
     """Raise the largest intensity of each pixel and of each instant to those of some candidates.
 
-    Parameters
-    ----------
-    pixel : (n,) int64 array
-    time, intensity : (n,) array
-    axis : (float, float)
-        First instant, s, and how many slots there are in a second.
-    strongest : (pixels,) array
-        Raised.
-    brightest : (slots,) array
-        Raised.
+    `pixel` (n,); `time, intensity` (n,); `axis`: first instant, s, and how many slots there are in
+    a second; `strongest` (pixels,): raised; `brightest` (slots,): raised.
     """
     for number in range(pixel.size):
         here, own, at = intensity[number], pixel[number], find_slot(time[number], axis)
@@ -39,16 +31,7 @@ def raise_maxima(pixel, time, intensity, axis, strongest, brightest):
 def find_slot(time, axis):
     """Number of the slot that is nearest to an instant.
 
-    Parameters
-    ----------
-    time : float
-        s.
-    axis
-        As for `raise_maxima`.
-
-    Returns
-    -------
-    int
+    `time`: s; `axis`: as for `raise_maxima`.
     """
     return int((time - axis[0]) * axis[1] + 0.5)
 
@@ -57,16 +40,8 @@ def find_slot(time, axis):
 def mark_strong(pixel, time, intensity, axis, of_pixel, of_slot, strong):
     """Say which candidates are as bright as their pixel and their instant ask.
 
-    Parameters
-    ----------
-    pixel, time, intensity, axis
-        As for `raise_maxima`.
-    of_pixel : (pixels,) array
-        Least intensity in each pixel.
-    of_slot : (slots,) array
-        Least intensity at each instant.
-    strong : (n,) bool array
-        Overwritten.
+    `pixel, time, intensity, axis`: as for `raise_maxima`; `of_pixel` (pixels,): least intensity in
+    each pixel; `of_slot` (slots,): least intensity at each instant; `strong` (n,): overwritten.
     """
     for number in range(pixel.size):
         here = intensity[number] >= of_pixel[pixel[number]]
@@ -77,25 +52,11 @@ def mark_strong(pixel, time, intensity, axis, of_pixel, of_slot, strong):
 def list_kept(pixel, values, kept, columns, pixels, places, numbers, lengths, intensity):
     """List the candidates that are returns.
 
-    Parameters
-    ----------
-    pixel : (n,) int64 array
-        Not decreasing.
-    values : (3, n) array
-        Instants, s, intensities, and deviations of the instants, s.
-    kept : (n,) bool array
-    columns : int
-        Of the picture.
-    pixels : (k,) int64 array
-        Overwritten: pixels of those that are kept.
-    places : (2, k) int32 array
-        Overwritten: their rows and columns.
-    numbers : (k,) uint8 array
-        Overwritten: 1 for the first of a pixel.
-    lengths : (3, k) array
-        Overwritten: instants, s, ranges and deviations of these, m.
-    intensity : (k,) float32 array
-        Overwritten.
+    `pixel` (n,): not decreasing; `values` (3, n): instants, s, intensities, and deviations of the
+    instants, s; `kept` (n,); `columns`: of the picture; `pixels` (k,): overwritten: pixels of those
+    that are kept; `places` (2, k): overwritten: their rows and columns; `numbers` (k,):
+    overwritten: 1 for the first of a pixel; `lengths` (3, k): overwritten: instants, s, ranges and
+    deviations of these, m; `intensity` (k,): overwritten.
     """
     listed, before, rank, row, row_start = np.uintp(0), -1, 0, 0, 0
     for number in range(pixel.size):
@@ -122,22 +83,9 @@ def list_kept(pixel, values, kept, columns, pixels, places, numbers, lengths, in
 def pool_significance(pixel, at, distance, own, starts, image_shape, limits, pooled):
     """Add to each candidate's significance those of its neighbours at the same range.
 
-    Parameters
-    ----------
-    pixel : (n,) int64 array
-        Not decreasing.
-    at : (n,) array
-        Range at which neighbours are looked for, m.
-    distance : (n,) array
-        Range of each candidate, m.
-    own : (n,) array
-    starts : (pixels + 1,) int64 array
-        First candidate of each pixel.
-    image_shape : (int, int)
-    limits : (float, float)
-        Radius in pixels, and gate in m for each of them.
-    pooled : (n,) array
-        Overwritten.
+    `pixel` (n,): not decreasing; `at` (n,): range at which neighbours are looked for, m; `distance`
+    (n,): range of each candidate, m; `own` (n,); `starts` (pixels + 1,): first candidate of each
+    pixel; `limits`: radius in pixels, and gate in m for each of them; `pooled` (n,): overwritten.
     """
     rows, columns = image_shape
     radius, gate = limits

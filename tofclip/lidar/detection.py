@@ -142,23 +142,11 @@ class Detection:
     ) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
         """What a return is compared with.
 
-        Parameters
-        ----------
-        pixel, time, intensity
-            As for `find_significant`; at least one candidate.
-        width : float
-            Of a pulse, s.
-        at : (m,) array
-            Instants of interest, s.
-
-        Returns
-        -------
-        strongest : (pixels,) array
-            Largest intensity of each pixel, 0 where there is no candidate.
-        needed : (slots,) array
-            What the scene and its brightest return within a pulse's width ask of each instant.
-        axis : (float, float)
-            First slot's instant, s, and how many slots there are in a second.
+        `pixel, time, intensity`: as for `find_significant`; at least one candidate; `width`: of a
+        pulse, s; `at` (m,): instants of interest, s. Returns `strongest` (pixels,): largest
+        intensity of each pixel, 0 where there is no candidate; `needed` (slots,): what the scene
+        and its brightest return within a pulse's width ask of each instant; `axis`: first slot's
+        instant, s, and how many slots there are in a second.
         """
         # the compiler takes as long to import as all else
         from tofclip.lidar.candidate_loops import raise_maxima
@@ -178,15 +166,7 @@ def find_quantile_value(values: NDArray[np.floating], fraction: float) -> float:
     """Return a quantile as `numpy.quantile` does, which looks for two numbers at once, by a way that
     takes ten times as long.
 
-    Parameters
-    ----------
-    values : (n,) float array
-        At least one.
-    fraction : float
-
-    Returns
-    -------
-    float
+    `values` (n,): at least one.
     """
     place = fraction * (values.size - 1)
     before = int(place)

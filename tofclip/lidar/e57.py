@@ -35,16 +35,7 @@ STANDARD_NAMES = {
 def write_e57(path: Path, columns: Columns) -> None:
     """Write columns x, y, z, intensity and others to an E57 file of one scan.
 
-    Parameters
-    ----------
-    path : Path
-    columns : sequence of Column
-        float32 or uint8, (n,) values each.
-
-    Raises
-    ------
-    MissingDependencyError
-        pye57 is not installed.
+    `columns`: float32 or uint8, (n,) values each.
     """
     pye57 = _import_pye57()
     # The library makes its files itself.

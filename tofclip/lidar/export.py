@@ -35,19 +35,8 @@ MAX_HEADER_BYTES = 1 << 16
 def write_table(path: str | Path, columns: Columns, shape: tuple[int, int] | None = None) -> None:
     """Write columns to the format that the suffix of `path` names, whole or not at all.
 
-    Parameters
-    ----------
-    path : str or Path
-    columns : sequence of Column
-        With name, unit and (n,) values each.
-    shape : (int, int), optional
-        Rows and columns of a picture whose pixels the values are, in raster order. PCD and NPZ say
-        so.
-
-    Raises
-    ------
-    InputError
-        There is no format of that suffix.
+    `columns`: with name, unit and (n,) values each; `shape`: rows and columns of a picture whose
+    pixels the values are, in raster order. PCD and NPZ say so.
     """
     writer = _look_up_format(path)[0]
     with atomic_path(path) as temporary:

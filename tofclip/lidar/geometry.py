@@ -47,19 +47,7 @@ def compute_slopes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Slopes x / z and y / z of the directions of `compute_ray_directions`.
 
-    Parameters
-    ----------
-    camera, rows, columns
-        As for `compute_ray_directions`.
-
-    Returns
-    -------
-    right, down : (n,) float64 array
-
-    Raises
-    ------
-    CalibrationError
-        A distortion so strong that no direction leads to a pixel.
+    `camera, rows, columns`: as for `compute_ray_directions`. Returns `right, down` (n,).
     """
     axis_row, axis_column = camera.optical_axis_px
     right = (np.asarray(columns, dtype=np.float64) - axis_column) / camera.focal_length_px
@@ -74,16 +62,8 @@ def distort_directions(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where a lens puts the direction (right, down, 1), in units of the focal length.
 
-    Parameters
-    ----------
-    right, down : (n,) array
-    coefficients : (5,) array
-        k1, k2, p1, p2, k3 of D. C. Brown, "Close-range camera calibration", Photogramm. Eng. 37,
-        855 (1971).
-
-    Returns
-    -------
-    right, down : (n,) float64 array
+    `right, down` (n,); `coefficients` (5,): k1, k2, p1, p2, k3 of D. C. Brown, "Close-range camera
+    calibration", Photogramm. Eng. 37, 855 (1971). Returns `right, down` (n,).
     """
     k1, k2, p1, p2, k3 = coefficients
     square = right**2 + down**2
@@ -99,22 +79,8 @@ def undistort_directions(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Undo `distort_directions`, by a fixed-point iteration.
 
-    Parameters
-    ----------
-    right, down : (n,) float64 array
-        Slopes x / z and y / z as the lens shows them.
-    coefficients : (5,) float64 array
-        As for `distort_directions`.
-
-    Returns
-    -------
-    right, down : (n,) float64 array
-        Slopes in front of the lens.
-
-    Raises
-    ------
-    CalibrationError
-        The iteration does not converge.
+    `right, down` (n,): slopes x / z and y / z as the lens shows them; `coefficients` (5,): as for
+    `distort_directions`. Returns `right, down` (n,): slopes in front of the lens.
     """
     x, y = right.copy(), down.copy()
     with np.errstate(over="ignore", invalid="ignore"):

@@ -31,18 +31,7 @@ DIMENSION_PREFIX = "tofclip_"
 def write_las(path: Path, columns: Columns) -> None:
     """Write columns x, y, z and others to LAS 1.4, compressed if the name ends in ``.laz``.
 
-    Parameters
-    ----------
-    path : Path
-    columns : sequence of Column
-        With ``x``, ``y`` and ``z`` in m, ``intensity`` and ``return_number``.
-
-    Raises
-    ------
-    MissingDependencyError
-        laspy, or its LAZ backend, is not installed.
-    InputError
-        A position is further away than LAS can say.
+    `columns`: with ``x``, ``y`` and ``z`` in m, ``intensity`` and ``return_number``.
     """
     laspy = _import_laspy()
     values = {column.name: column.values for column in columns}

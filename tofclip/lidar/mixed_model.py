@@ -36,26 +36,14 @@ TINY = 1e-30
 
 @dataclass(frozen=True)
 class Measurements:
-    """Measurements of one quantity in many pixels and several shots.
+    """Measurements of one quantity in many pixels and several shots."""
 
-    Parameters
-    ----------
-    value, sigma : (n,) array
-        With one standard deviation, right up to a factor.
-    design : (n, effects) array
-        Fixed effects.
-    shot, pixel : (n,) int array
-        Numbers from 0.
-    place : ((n,), (n,)) int arrays
-        Row and column of the pixel.
-    """
-
-    value: FloatArray
-    sigma: FloatArray
-    design: FloatArray
-    shot: NDArray[np.int64]
-    pixel: NDArray[np.int64]
-    place: tuple[NDArray[np.int64], NDArray[np.int64]]
+    value: FloatArray  # (n,), with one standard deviation, right up to a factor
+    sigma: FloatArray  # (n,), with one standard deviation, right up to a factor
+    design: FloatArray  # (n, effects), fixed effects
+    shot: NDArray[np.int64]  # (n,), numbers from 0
+    pixel: NDArray[np.int64]  # (n,), numbers from 0
+    place: tuple[NDArray[np.int64], NDArray[np.int64]]  # row and column of the pixel
 
     def __getitem__(self, chosen: NDArray[np.bool_]) -> Measurements:
         return Measurements(
@@ -70,46 +58,24 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Variances:
-    """What varies.
+    """What varies."""
 
-    Parameters
-    ----------
-    noise : float
-        Factor of the measurements' own variances.
-    shots, pixels : float
-        Variances of the shots' and the pixels' effects; 0: none.
-    """
-
-    noise: float
-    shots: float
-    pixels: float
+    noise: float  # factor of the measurements' own variances
+    shots: float  # variances of the shots' and the pixels' effects; 0: none
+    pixels: float  # variances of the shots' and the pixels' effects; 0: none
 
 
 @dataclass(frozen=True)
 class Effects:
-    """What was found.
+    """What was found."""
 
-    Parameters
-    ----------
-    fixed : (effects,) array
-    covariance : (effects, effects) array
-        Of the fixed effects.
-    shots : (shots,) array
-        Each shot's own.
-    pixels, pixel_sigma : (pixels,) array
-        Each pixel's own, and its standard deviation.
-    variances : Variances
-    inliers : (n,) bool array
-        Measurements that were used.
-    """
-
-    fixed: FloatArray
-    covariance: FloatArray
-    shots: FloatArray
-    pixels: FloatArray
-    pixel_sigma: FloatArray
+    fixed: FloatArray  # (effects,)
+    covariance: FloatArray  # (effects, effects), of the fixed effects
+    shots: FloatArray  # (shots,), each shot's own
+    pixels: FloatArray  # (pixels,), each pixel's own, and its standard deviation
+    pixel_sigma: FloatArray  # (pixels,), each pixel's own, and its standard deviation
     variances: Variances
-    inliers: NDArray[np.bool_]
+    inliers: NDArray[np.bool_]  # (n,), measurements that were used
 
 
 @dataclass(frozen=True)
@@ -126,15 +92,7 @@ class _Solution:
 def fit_effects(data: Measurements, with_shots: bool = True, with_pixels: bool = True) -> Effects:
     """Estimate all effects and what they vary by.
 
-    Parameters
-    ----------
-    data : Measurements
-    with_shots, with_pixels : bool
-        Whether shots and pixels have effects of their own.
-
-    Returns
-    -------
-    Effects
+    `with_shots, with_pixels`: whether shots and pixels have effects of their own.
     """
     shots, pixels = int(data.shot.max()) + 1, int(data.pixel.max()) + 1
     step = -(-pixels // MAX_FITTED_PIXELS)
@@ -176,17 +134,8 @@ def fit_effects(data: Measurements, with_shots: bool = True, with_pixels: bool =
 def measure_correlation(standardised: FloatArray, data: Measurements) -> float:
     """Return how many neighbouring pixels share one error: 1 where each has its own.
 
-    Parameters
-    ----------
-    standardised : (n,) array
-        Residuals in standard deviations.
-    data : Measurements
-
-    Returns
-    -------
-    float
-        Variance of the sums over blocks of pixels, over that of independent errors; 1 where the
-        difference is within chance.
+    `standardised` (n,): residuals in standard deviations. Returns variance of the sums over blocks
+    of pixels, over that of independent errors; 1 where the difference is within chance.
     """
     row, column = (place // CORRELATION_BLOCK_PX for place in data.place)
     blocks = np.stack([data.shot, row, column], axis=1)
@@ -207,19 +156,8 @@ def _estimate_variances(
 ) -> Variances:
     """Estimate what varies, from the scatter of the means over shots and over pixels.
 
-    Parameters
-    ----------
-    data : Measurements
-    sizes : (int, int)
-        Numbers of shots and of pixels.
-    present : (bool, bool)
-        Whether shots and pixels have effects of their own.
-    rounds : int
-        At most.
-
-    Returns
-    -------
-    Variances
+    `sizes`: numbers of shots and of pixels; `present`: whether shots and pixels have effects of
+    their own; `rounds`: at most.
     """
     start = _solve(data, Variances(1.0, 0.0, 0.0), sizes)
     if data.value.size <= data.design.shape[1]:
@@ -271,16 +209,7 @@ def _average(values: FloatArray, group: NDArray[np.int64], size: int) -> FloatAr
 def _solve(data: Measurements, variances: Variances, sizes: tuple[int, int]) -> _Solution:
     """Solve for all effects at once; those of pixels are eliminated first.
 
-    Parameters
-    ----------
-    data : Measurements
-    variances : Variances
-    sizes : (int, int)
-        Numbers of shots and of pixels.
-
-    Returns
-    -------
-    _Solution
+    `sizes`: numbers of shots and of pixels.
     """
     shots, pixels = sizes
     weight = 1 / (variances.noise * data.sigma**2)

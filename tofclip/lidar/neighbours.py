@@ -89,24 +89,11 @@ def add_recovery_error(
 ) -> FloatArray:
     """Return the deviation of ranges with the recovery's own errors.
 
-    Parameters
-    ----------
-    sigma : (n,) array
-        Deviation that the noise in each pixel's trace explains, m.
-    distance : (n,) array
-        Range, m.
-    along_axis : (n,) array
-        Depth along the optical axis for a range of 1: the direction's z.
-    pixel : (n,) int array
-        Number of the pixel, not decreasing.
-    image_shape : (int, int)
-    gate : float
-        A neighbour that is further away than this, m, is on another surface.
-
-    Returns
-    -------
-    (n,) float64 array
-        One standard deviation, m. Returns with few neighbours get what is usual for the others.
+    `sigma` (n,): deviation that the noise in each pixel's trace explains, m; `distance` (n,):
+    range, m; `along_axis` (n,): depth along the optical axis for a range of 1: the direction's z;
+    `pixel` (n,): number of the pixel, not decreasing; `gate`: A neighbour that is further away than
+    this, m, is on another surface. Returns (n,): one standard deviation, m. Returns with few
+    neighbours get what is usual for the others.
     """
     total = np.array(sigma, dtype=np.float64)
     if pixel.size == 0:
@@ -170,21 +157,10 @@ def layer_returns(
 ) -> NDArray[np.float32]:
     """Lay out the returns so that those at the neighbours' distance lie side by side.
 
-    Parameters
-    ----------
-    nearness : (n,) array
-        Inverse depth along the optical axis, 1/m.
-    pixel : (n,) int64 array
-        Not decreasing.
-    starts : (pixels + 1,) int64 array
-        First return of each pixel.
-    image_shape : (int, int)
-
-    Returns
-    -------
-    (most returns of a pixel, 4, rows, columns) float32 array
-        `nearness` of each pixel's first, second, ... returns, `FAR` where there is none; of pixels of
-        even rows and columns, even rows and odd columns, and so on, within a margin.
+    `nearness` (n,): inverse depth along the optical axis, 1/m; `pixel` (n,): not decreasing;
+    `starts` (pixels + 1,): first return of each pixel. Returns (most returns of a pixel, 4, rows,
+    columns): `nearness` of each pixel's first, second, ... returns, `FAR` where there is none; of
+    pixels of even rows and columns, even rows and odd columns, and so on, within a margin.
     """
     rows, columns = (-(-size // STRIDE_PX) + 2 * MARGIN for size in image_shape)
     shape = (int(np.diff(starts).max()), STRIDE_PX**2, rows, columns + LENGTH - SIDE)
@@ -208,16 +184,7 @@ def allocate_window() -> NDArray[np.float32]:
 def count_returns(pixel, starts):
     """List the first return of each pixel; return how many the pixel has that has most.
 
-    Parameters
-    ----------
-    pixel : (n,) int64 array
-        Not decreasing.
-    starts : (pixels + 1,) int64 array
-        Overwritten.
-
-    Returns
-    -------
-    int
+    `pixel` (n,): not decreasing; `starts` (pixels + 1,): overwritten.
     """
     most = number = np.uintp(0)
     for p in range(starts.size):
@@ -232,12 +199,8 @@ def count_returns(pixel, starts):
 def fill_layers(nearness, pixel, starts, columns, layers):
     """Lay out the returns in `layers`.
 
-    Parameters
-    ----------
-    nearness, pixel, starts, layers
-        As for `layer_returns`; those of `layers` in which returns lie are overwritten.
-    columns : int
-        Of the picture.
+    `nearness, pixel, starts, layers`: as for `layer_returns`; those of `layers` in which returns
+    lie are overwritten; `columns`: of the picture.
     """
     y = row_start = 0
     for number in range(pixel.size):
@@ -255,25 +218,11 @@ def fill_layers(nearness, pixel, starts, columns, layers):
 def scatter_about_planes(nearness, metres, pixel, columns, layers, gate, chosen, memory, scatter):
     """Robust deviation of the returns around each from a plane through them, -1 if they are few.
 
-    Parameters
-    ----------
-    nearness : (n,) array
-        Inverse depth along the optical axis, 1/m.
-    metres : (n,) array
-        Change of a return's range for a change of its nearness, m^2.
-    pixel : (n,) int64 array
-    columns : int
-        Of the picture.
-    layers : (most returns of a pixel, 4, rows, columns) array
-        See `layer_returns`.
-    gate : float
-        m.
-    chosen : (k,) int64 array
-        Numbers of the returns.
-    memory : (5, NEIGHBOURS) float32 array
-        As `allocate_window` returns it; all but the first two rows are overwritten.
-    scatter : (n,) array
-        Overwritten at the chosen: m.
+    `nearness` (n,): inverse depth along the optical axis, 1/m; `metres` (n,): change of a return's
+    range for a change of its nearness, m^2; `pixel` (n,); `columns`: of the picture; `layers` (most
+    returns of a pixel, 4, rows, columns): see `layer_returns`; `gate`: m; `chosen` (k,): numbers of
+    the returns; `memory` (5, NEIGHBOURS): as `allocate_window` returns it; all but the first two
+    rows are overwritten; `scatter` (n,): overwritten at the chosen: m.
     """
     for own in chosen:
         y, x = pixel[own] // columns, pixel[own] % columns
@@ -302,16 +251,10 @@ def scatter_about_planes(nearness, metres, pixel, columns, layers, gate, chosen,
 def take_nearest(layers, own, nearness, metres, off):
     """Of each pixel around, take the return that is nearest in range.
 
-    Parameters
-    ----------
-    layers : (most returns of a pixel, 4, rows, columns) array
-        See `layer_returns`.
-    own : (int, int)
-        Row and column of the pixel in the middle.
-    nearness, metres : float32
-        Of its return, 1/m, and change of its range for a change of that, m^2.
-    off : (NEIGHBOURS,) float32 array
-        Overwritten: by how much further each neighbour is, m; beyond any gate where there is none.
+    `layers` (most returns of a pixel, 4, rows, columns): see `layer_returns`; `own`: row and column
+    of the pixel in the middle; `nearness, metres`: of its return, 1/m, and change of its range for
+    a change of that, m^2; `off` (NEIGHBOURS,): overwritten: by how much further each neighbour is,
+    m; beyond any gate where there is none.
     """
     top, left = own[0] // STRIDE_PX, np.uintp(own[1] // STRIDE_PX)
     part = own[0] % STRIDE_PX * STRIDE_PX + own[1] % STRIDE_PX
@@ -333,11 +276,7 @@ def take_nearest(layers, own, nearness, metres, off):
 def measure_offsets(memory, a, b, c):
     """Distance of each neighbour from the plane ``a * right + b * down + c``.
 
-    Parameters
-    ----------
-    memory : (5, NEIGHBOURS) float32 array
-        See `scatter_about_planes`; the last row is overwritten, m.
-    a, b, c : float
+    `memory` (5, NEIGHBOURS): see `scatter_about_planes`; the last row is overwritten, m.
     """
     right, down, off, residual = memory[0], memory[1], memory[2], memory[4]
     slope, fall = fill_vector(np.float32(a)), fill_vector(np.float32(b))
@@ -352,16 +291,8 @@ def measure_offsets(memory, a, b, c):
 def mark_near(memory, most):
     """Use the neighbours that are off by at most so much; return whether others were used before.
 
-    Parameters
-    ----------
-    memory : (5, NEIGHBOURS) float32 array
-        See `scatter_about_planes`; 1 or 0 is written to the row that says which are used.
-    most : float
-        m.
-
-    Returns
-    -------
-    bool
+    `memory` (5, NEIGHBOURS): see `scatter_about_planes`; 1 or 0 is written to the row that says
+    which are used; `most`: m.
     """
     used, residual = memory[3], memory[4]
     farthest, changed = fill_vector(np.float32(most)), np.uint64(0)
@@ -377,19 +308,9 @@ def mark_near(memory, most):
 def find_median(memory, count, guess):
     """Return the median of what is used, by narrowing an interval: each step is one look at all.
 
-    Parameters
-    ----------
-    memory : (5, NEIGHBOURS) float32 array
-        See `scatter_about_planes`.
-    count : int
-        Of those used, at least one.
-    guess : float32
-        Where the first look is; not above zero where nothing is known.
-
-    Returns
-    -------
-    float32
-        To `MEDIAN_PRECISION` of the largest where some in the middle are that close together.
+    `memory` (5, NEIGHBOURS): see `scatter_about_planes`; `count`: of those used, at least one;
+    `guess`: where the first look is; not above zero where nothing is known. Returns to
+    `MEDIAN_PRECISION` of the largest where some in the middle are that close together.
     """
     low, high = np.float32(0), find_residuals_beside(memory, np.float32(FAR))[0]
     precision, middle = np.float32(MEDIAN_PRECISION) * high, high
@@ -420,15 +341,7 @@ def find_median(memory, count, guess):
 def count_used_below(memory, limit):
     """How many of those used are off by at most `limit`.
 
-    Parameters
-    ----------
-    memory : (5, NEIGHBOURS) float32 array
-        See `scatter_about_planes`.
-    limit : float32
-
-    Returns
-    -------
-    int
+    `memory` (5, NEIGHBOURS): see `scatter_about_planes`.
     """
     used, residual, below = memory[3], memory[4], 0
     most, zero = fill_vector(limit), fill_vector(np.float32(0))
@@ -442,15 +355,7 @@ def count_used_below(memory, limit):
 def find_residuals_beside(memory, limit):
     """The largest residual of those used that is at most `limit`, and the smallest above it.
 
-    Parameters
-    ----------
-    memory, limit
-        As for `count_used_below`.
-
-    Returns
-    -------
-    float32, float32
-        0 and `FAR` where there is none.
+    `memory, limit`: as for `count_used_below`. Returns 0 and `FAR` where there is none.
     """
     used, residual = memory[3], memory[4]
     most, zero = fill_vector(limit), fill_vector(np.float32(0))
@@ -466,16 +371,8 @@ def find_residuals_beside(memory, limit):
 def fit_plane_around(memory):
     """Least-squares plane ``a * right + b * down + c`` through the neighbours that are used.
 
-    Parameters
-    ----------
-    memory : (5, NEIGHBOURS) float32 array
-        See `scatter_about_planes`.
-
-    Returns
-    -------
-    a, b, c : float
-    count : int
-        Neighbours used; 0 if they lie in one line, which says nothing of the slope across it.
+    `memory` (5, NEIGHBOURS): see `scatter_about_planes`. Returns `count`: neighbours used; 0 if
+    they lie in one line, which says nothing of the slope across it.
     """
     right, down, off, used = memory[0], memory[1], memory[2], memory[3]
     number = total = along = across = zero = fill_vector(np.float32(0))
@@ -515,18 +412,11 @@ def borrow_scatter(nearness, metres, starts, image_shape, gate, memory, scatter)
 
     All returns of a cell of ``PLANE_STEP_PX**2`` pixels have the same ones around them.
 
-    Parameters
-    ----------
-    nearness, metres, gate
-        As for `scatter_about_planes`.
-    starts : (pixels + 1,) int64 array
-        First return of each pixel.
-    image_shape : (int, int)
-    memory : (3, whole vectors of PLANE_STEP_PX**2 * most returns of a pixel) float32 array
-        Overwritten: nearness of a cell's returns, how far off the nearest is, and its scatter.
-    scatter : (n,) array
-        Known of the pixels whose row and column `PLANE_STEP_PX` divides; overwritten elsewhere: m,
-        NaN where there is no such return or it has few neighbours.
+    `nearness, metres, gate`: as for `scatter_about_planes`; `starts` (pixels + 1,): first return of
+    each pixel; `memory` (3, whole vectors of PLANE_STEP_PX**2 * most returns of a pixel):
+    overwritten: nearness of a cell's returns, how far off the nearest is, and its scatter;
+    `scatter` (n,): known of the pixels whose row and column `PLANE_STEP_PX` divides; overwritten
+    elsewhere: m, NaN where there is no such return or it has few neighbours.
     """
     rows, columns = image_shape
     step, zero = PLANE_STEP_PX, fill_vector(np.float32(0))
@@ -562,14 +452,8 @@ def borrow_scatter(nearness, metres, starts, image_shape, gate, memory, scatter)
 def open_cell(nearness, starts, columns, cell, memory):
     """Return how many returns a cell has, and list their nearness.
 
-    Parameters
-    ----------
-    nearness, starts, memory
-        As for `borrow_scatter`.
-    columns : int
-        Of the picture.
-    cell : (int, int, int, int)
-        First row and the one after the last, first column and the one after the last.
+    `nearness, starts, memory`: as for `borrow_scatter`; `columns`: of the picture; `cell`: first
+    row and the one after the last, first column and the one after the last.
     """
     own, least, held = memory[0], memory[1], memory[2]
     top, below, left, right = cell
@@ -585,18 +469,9 @@ def open_cell(nearness, starts, columns, cell, memory):
 def widen_deviations(scatter, total, ratios):
     """Add what planes show of the recovery's errors to the deviations; return of how many.
 
-    Parameters
-    ----------
-    scatter : (n,) array
-        Of `scatter_about_planes`, m; negative where it is not known.
-    total : (n,) array
-        Deviation that the noise explains, m; overwritten where `scatter` is known.
-    ratios : (n,) float32 array
-        Its beginning is overwritten: by what factor those became larger.
-
-    Returns
-    -------
-    int
+    `scatter` (n,): of `scatter_about_planes`, m; negative where it is not known; `total` (n,):
+    deviation that the noise explains, m; overwritten where `scatter` is known; `ratios` (n,): its
+    beginning is overwritten: by what factor those became larger.
     """
     known = 0
     for number in range(total.size):

@@ -19,55 +19,23 @@ SIZE_PERCENTILES = (
 
 @dataclass(frozen=True)
 class DetectedObject:
-    """One object.
+    """One object."""
 
-    Parameters
-    ----------
-    points : (n,) int array
-        Numbers of its points in the cloud.
-    range : float
-        Median distance from the camera, m.
-    range_sigma : float
-        Median of its points' expected standard deviations of range, m.
-    scatter : float
-        Robust standard deviation of its points' ranges, m: noise and its own depth.
-    centre : (float, float, float)
-        Median position, m; x right, y down, z forward.
-    width, height : float
-        Extent along x and y of the inner nine tenths of its points, m.
-    intensity : float
-        Median, counts referred to 1 m.
-    """
-
-    points: NDArray[np.intp]
-    range: float
-    range_sigma: float
-    scatter: float
-    centre: tuple[float, float, float]
-    width: float
-    height: float
-    intensity: float
+    points: NDArray[np.intp]  # (n,), numbers of its points in the cloud
+    range: float  # median distance from the camera, m
+    range_sigma: float  # median of its points' expected standard deviations of range, m
+    scatter: float  # robust standard deviation of its points' ranges, m: noise and its own depth
+    centre: tuple[float, float, float]  # median position, m; x right, y down, z forward
+    width: float  # extent along x and y of the inner nine tenths of its points, m
+    height: float  # extent along x and y of the inner nine tenths of its points, m
+    intensity: float  # median, counts referred to 1 m
 
 
 def find_objects(cloud: PointCloud, reach: float, min_points: int = 40) -> list[DetectedObject]:
     """Group points that lie within `reach`, m, of each other, directly or through others; the
     nearest object first.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    reach : float
-    min_points : int
-        Smaller groups are left out.
-
-    Returns
-    -------
-    list of DetectedObject
-
-    Raises
-    ------
-    InputError
-        The reach is not positive, or an object may have no point.
+    `min_points`: smaller groups are left out.
     """
     if not (np.isfinite(reach) and reach > 0) or min_points < 1:
         raise InputError("objects need a positive reach, and at least one point")

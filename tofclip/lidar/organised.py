@@ -22,25 +22,9 @@ ORGANISED_SUFFIXES = (".pcd", ".ply", ".npz", ".csv")
 def save_organised(returns: Returns, path: str | Path) -> int:
     """Write a point for every pixel, whole or not at all; return how many there are.
 
-    Parameters
-    ----------
-    returns : Returns
-        At most one for each pixel, see `Returns.select`.
-    path : path-like
-        Ends in ``.pcd`` (WIDTH and HEIGHT are the picture's), ``.ply``, ``.npz`` (pictures, (rows,
-        columns)) or ``.csv``.
-
-    Returns
-    -------
-    int
-        Pixels with a point.
-
-    Raises
-    ------
-    InputError
-        A pixel has two returns, or the format has no place for a missing point.
-    StorageError
-        The file could not be written.
+    `returns`: at most one for each pixel, see `Returns.select`; `path`: ends in ``.pcd`` (WIDTH and
+    HEIGHT are the picture's), ``.ply``, ``.npz`` (pictures, (rows, columns)) or ``.csv``. Returns
+    pixels with a point.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in ORGANISED_SUFFIXES:

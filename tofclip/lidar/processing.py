@@ -24,56 +24,27 @@ MIN_SPACING_RATIO = 3.0
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane ``normal . x = offset``.
+    """A plane ``normal . x = offset``."""
 
-    Parameters
-    ----------
-    normal : (3,) array
-        Unit vector, towards the camera.
-    offset : float
-        Its distance from the origin along the normal, m; not positive.
-    inliers : (n,) bool array
-        Points of the cloud that lie on it.
-    rms : float
-        Root mean square distance of these from it, m.
-    """
-
-    normal: FloatArray
-    offset: float
-    inliers: NDArray[np.bool_]
-    rms: float
+    normal: FloatArray  # (3,), unit vector, towards the camera
+    offset: float  # its distance from the origin along the normal, m; not positive
+    inliers: NDArray[np.bool_]  # (n,), points of the cloud that lie on it
+    rms: float  # root mean square distance of these from it, m
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How one cloud is laid over another.
+    """How one cloud is laid over another."""
 
-    Parameters
-    ----------
-    pose : (4, 4) array
-        Rotation and translation (m) that takes the source to the target.
-    overlap : float
-        Share of the source's points with a neighbour in the target.
-    rms : float
-        Root mean square distance to these neighbours, m.
-    """
-
-    pose: FloatArray
-    overlap: float
-    rms: float
+    pose: FloatArray  # (4, 4), rotation and translation (m) that takes the source to the target
+    overlap: float  # share of the source's points with a neighbour in the target
+    rms: float  # root mean square distance to these neighbours, m
 
 
 def select_points(cloud: PointCloud, chosen: NDArray[Any]) -> PointCloud:
     """Return some points of a cloud, by mask or by numbers.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    chosen : (points,) bool or (n,) int array
-
-    Returns
-    -------
-    PointCloud
+    `chosen` (points,).
     """
     columns: dict[str, Any] = {name: getattr(cloud, name)[chosen] for name in PROPERTY_COLUMNS}
     return replace(cloud, xyz=cloud.xyz[chosen], **columns)
@@ -83,22 +54,7 @@ def transform_cloud(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
     """Return a cloud in another frame, such as that of a mount or of a map; ranges stay those from
     the camera.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    pose : (4, 4) array
-        Extrinsics: rotation and translation (m) from the camera's frame to the other.
-
-    Returns
-    -------
-    PointCloud
-
-    Raises
-    ------
-    ShapeError
-        The pose is not (4, 4).
-    InputError
-        It has a scale or a mirror.
+    `pose` (4, 4): extrinsics: rotation and translation (m) from the camera's frame to the other.
     """
     matrix = np.asarray(pose, dtype=np.float64)
     if matrix.shape != (4, 4):
@@ -114,20 +70,7 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
 
     Deviations of independent points shrink with their number; the return number is the least.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    voxel : float
-        Metres.
-
-    Returns
-    -------
-    PointCloud
-
-    Raises
-    ------
-    InputError
-        The side is not a positive length.
+    `voxel`: metres.
     """
     if not (np.isfinite(voxel) and voxel > 0):
         raise InputError(f"the side of a voxel must be a positive length, got {voxel}")
@@ -157,21 +100,7 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
 def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0) -> PointCloud:
     """Leave out points that lie far from their neighbours, by the density of where these are.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    neighbours : int
-    deviations : float
-        See `find_outliers`.
-
-    Returns
-    -------
-    PointCloud
-
-    Raises
-    ------
-    InputError
-        There is no neighbour to ask, or the number of deviations is not positive.
+    `deviations`: see `find_outliers`.
     """
     return select_points(cloud, ~find_outliers(cloud, neighbours, deviations))
 
@@ -186,23 +115,8 @@ def find_outliers(
     what is usual in the cloud at its range, and with what these neighbours have (a local outlier
     factor: M. M. Breunig et al., ACM SIGMOD Rec. 29, 93 (2000)), whichever is less.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    neighbours : int
-    deviations : float
-        Robust standard deviations of the logarithm of that ratio beyond which a point is an
-        outlier. At least a factor of `MIN_SPACING_RATIO`: at its border a surface has neighbours on
-        one side only.
-
-    Returns
-    -------
-    (points,) bool array
-
-    Raises
-    ------
-    InputError
-        There is no neighbour to ask, or the number of deviations is not positive.
+    `deviations`: robust standard deviations of the logarithm of that ratio beyond which a point is
+    an outlier. Returns (points,).
     """
     if neighbours < 1 or not deviations > 0:
         raise InputError("outliers need at least one neighbour and a positive number of deviations")
@@ -227,21 +141,7 @@ def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
     """Return each point's surface normal, (n, 3), towards the camera, from a plane through its
     neighbours.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    neighbours : int
-        Points of the plane, at least 3.
-
-    Returns
-    -------
-    (n, 3) float64 array
-        Of length 1.
-
-    Raises
-    ------
-    InputError
-        There are fewer than three points or neighbours.
+    `neighbours`: points of the plane, at least 3. Returns (n, 3): of length 1.
     """
     if len(cloud) < 3 or neighbours < 3:
         raise InputError("a normal needs at least three points and three neighbours")
@@ -255,22 +155,8 @@ def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
 def fit_plane(cloud: PointCloud, reach: float, seed: int = 0) -> Plane:
     """Find the plane with most points, by random sampling, and fit it to them.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    reach : float
-        Points within this distance, m, lie on the plane.
-    seed : int
-
-    Returns
-    -------
-    Plane
-        Its points lie at ``normal . x = distance``, m.
-
-    Raises
-    ------
-    InputError
-        There are fewer than three points, or the reach is not positive.
+    `reach`: points within this distance, m, lie on the plane. Returns its points lie at ``normal .
+    x = distance``, m.
     """
     if len(cloud) < 3 or not reach > 0:
         raise InputError("a plane needs at least three points and a positive reach")
@@ -293,24 +179,9 @@ def align_clouds(
     """Lay a cloud over another one, such as the next of a sequence (point-to-plane iterated closest
     points).
 
-    Parameters
-    ----------
-    source, target : PointCloud
-    reach : float
-        Largest distance of points that may belong together, m.
-    start : (4, 4) array, optional
-        First guess of the pose.
-
-    Returns
-    -------
-    Alignment
-        Pose (4, 4) from source to target, fraction of matched points, and their root mean square
-        distance, m.
-
-    Raises
-    ------
-    InputError
-        A cloud has fewer than three points, or the reach is not positive.
+    `reach`: largest distance of points that may belong together, m; `start` (4, 4): first guess of
+    the pose. Returns pose (4, 4) from source to target, fraction of matched points, and their root
+    mean square distance, m.
     """
     if min(len(source), len(target)) < 3 or not reach > 0:
         raise InputError(

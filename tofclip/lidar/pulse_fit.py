@@ -31,20 +31,8 @@ def find_pulse_window(times, near, arrival, scale):
     """First bin and the bin after the last one that a return at `arrival` reaches; `near` guesses
     them.
 
-    Parameters
-    ----------
-    times : (bins,) array
-        Seconds, increasing.
-    near : (int, int)
-        Guesses of the two bins.
-    arrival : float
-        Seconds.
-    scale : (4,) array or tuple
-        Samples per second, origin, first and last instant of the pulse.
-
-    Returns
-    -------
-    (int, int)
+    `times` (bins,): seconds, increasing; `near`: guesses of the two bins; `arrival`: seconds;
+    `scale` (4,): samples per second, origin, first and last instant of the pulse.
     """
     return find_first_bin(times, near[0], arrival + scale[2]), find_first_bin(
         times, near[1], arrival + scale[3]
@@ -55,18 +43,7 @@ def find_pulse_window(times, near, arrival, scale):
 def find_first_bin(times, near, instant):
     """First bin at `instant` or later, step by step from a bin near it.
 
-    Parameters
-    ----------
-    times : (bins,) array
-        Seconds, increasing.
-    near : int
-        Where the search starts.
-    instant : float
-        Seconds.
-
-    Returns
-    -------
-    int
+    `times` (bins,): seconds, increasing; `near`: where the search starts; `instant`: seconds.
     """
     while near > 0 and times[near - 1] >= instant:
         near -= 1
@@ -76,17 +53,7 @@ def find_first_bin(times, near, instant):
 
 
 def get_level(background, i):
-    """Background of bin i: the same in all bins, or an array of them.
-
-    Parameters
-    ----------
-    background : float or (bins,) array
-    i : int
-
-    Returns
-    -------
-    float
-    """
+    """Background of bin i: the same in all bins, or an array of them."""
     return background if np.ndim(background) == 0 else background[i]
 
 
@@ -104,17 +71,8 @@ def get_variance(variance, i, expected):
     A bin in which the detector was ready in a fraction 1 / s of the cycles tells its rate, photons
     in a cycle, with the variance ``s expm1(rate) / cycles`` (of a binomial law's logarithm).
 
-    Parameters
-    ----------
-    variance : (float, float) or ((bins,) array, float)
-        Constant and factor; or s of each bin and the number of cycles.
-    i : int
-    expected : float
-        Photons of all cycles.
-
-    Returns
-    -------
-    float
+    `variance`: constant and factor; or s of each bin and the number of cycles; `expected`: photons
+    of all cycles.
     """
     if np.ndim(variance[0]) == 0:
         return variance[0] + variance[1] * expected
@@ -135,19 +93,9 @@ def interpolate_pulse(time, curve, scale):
     """Pulse and its slope at `time` after the arrival, by linear interpolation; zero outside the
     samples.
 
-    Parameters
-    ----------
-    time : float
-        Seconds after the arrival.
-    curve : (samples, 2) array
-        Pulse and slope.
-    scale : (4,) array or tuple
-        Samples per second, origin, first and last instant of the pulse.
-
-    Returns
-    -------
-    (float, float)
-        Pulse, and its slope per second.
+    `time`: seconds after the arrival; `curve` (samples, 2): pulse and slope; `scale` (4,): samples
+    per second, origin, first and last instant of the pulse. Returns pulse, and its slope per
+    second.
     """
     position = time * scale[0] + scale[1]
     if not 0 <= position < curve.shape[0] - 1:
@@ -161,24 +109,9 @@ def interpolate_pulse(time, curve, scale):
 def subtract_returns(rest, time, curve, scale, estimate, without):
     """What is left of a bin's brightness less all returns except number `without` (-1: less all).
 
-    Parameters
-    ----------
-    rest : float
-        Brightness less the background.
-    time : float
-        Instant of the bin, s.
-    curve : (samples, 2) array
-        Pulse and slope.
-    scale : (4,) array or tuple
-        Of the pulse.
-    estimate : (returns, 5) array
-        See `refine_returns`.
-    without : int
-        Return that is not taken off.
-
-    Returns
-    -------
-    float
+    `rest`: brightness less the background; `time`: instant of the bin, s; `curve` (samples, 2):
+    pulse and slope; `scale` (4,): of the pulse; `estimate` (returns, 5): see `refine_returns`;
+    `without`: return that is not taken off.
     """
     for k in range(estimate.shape[0]):
         if k != without:
@@ -200,21 +133,9 @@ def refine_returns(trace, times, background, curve, scale, estimate, variance, r
     `estimate` is (returns, 5): arrival, height, first bin and the bin after the last one that it
     reaches, or what is near them, and by how many bins it moved last, which is overwritten.
 
-    Parameters
-    ----------
-    trace, times : (bins,) array
-        Brightness, and seconds.
-    background : float or (bins,) array
-    curve : (samples, 2) array
-        Pulse and slope.
-    scale : (4,) array or tuple
-        Of the pulse.
-    estimate : (returns, 5) array
-        Updated in place.
-    variance : (float, float) or ((bins,) array, float)
-        See `get_variance`.
-    rounds : int
-        Maximum number of steps for each return.
+    `trace, times` (bins,): brightness, and seconds; `curve` (samples, 2): pulse and slope; `scale`
+    (4,): of the pulse; `estimate` (returns, 5): updated in place; `variance`: see `get_variance`;
+    `rounds`: maximum number of steps for each return.
     """
     for k in range(estimate.shape[0]):
         estimate[k, 4] = np.inf
@@ -238,21 +159,8 @@ def check_overlap(estimate, k, curve, scale):
 
     One reaches the other if it has light in bins that count for the other.
 
-    Parameters
-    ----------
-    estimate : (returns, 5) array
-    k : int
-        Number of the return.
-    curve : (samples, 2) array
-        Pulse and slope.
-    scale : (4,) array or tuple
-        Of the pulse.
-
-    Returns
-    -------
-    crowded : bool
-    moving : float
-        Bins.
+    `estimate` (returns, 5); `k`: number of the return; `curve` (samples, 2): pulse and slope;
+    `scale` (4,): of the pulse. Returns `moving`: bins.
     """
     before, after = (
         scale[1] / scale[0] + scale[3],
@@ -274,26 +182,9 @@ def sum_normal_equations(trace, times, background, curve, scale, estimate, k, cr
 
     The bins are entered in `estimate`. Only if it is `crowded` are the other returns taken off.
 
-    Parameters
-    ----------
-    trace, times : (bins,) array
-        Brightness, and seconds.
-    background : float or (bins,) array
-    curve : (samples, 2) array
-        Pulse and slope.
-    scale : (4,) array or tuple
-        Of the pulse.
-    estimate : (returns, 5) array
-        Columns 2 and 3 of row k are overwritten.
-    k : int
-        Number of the return.
-    crowded : bool
-    variance : (float, float)
-        See `refine_returns`.
-
-    Returns
-    -------
-    five floats
+    `trace, times` (bins,): brightness, and seconds; `curve` (samples, 2): pulse and slope; `scale`
+    (4,): of the pulse; `estimate` (returns, 5): columns 2 and 3 of row k are overwritten; `k`:
+    number of the return; `variance`: see `refine_returns`.
     """
     own = estimate[k]
     arrival, height = own[0], own[1]
@@ -323,14 +214,8 @@ def take_gauss_newton_step(times, sums, own):
     """Improve one return's arrival and height in place, and enter by how many bins it moved (at
     most one).
 
-    Parameters
-    ----------
-    times : (bins,) array
-        Seconds.
-    sums : five floats
-        From `sum_normal_equations`.
-    own : (5,) array
-        The return's row of the estimate, updated in place.
+    `times` (bins,): seconds; `sums`: from `sum_normal_equations`; `own` (5,): the return's row of
+    the estimate, updated in place.
     """
     pp, pd, dd, pr, dr = sums
     determinant = pp * dd - pd * pd
@@ -362,27 +247,11 @@ def measure_returns(trace, times, background, noise, curve, scale, estimate, lea
     It has to lie on the time axis and to respond, height times root of the pulse's energy, by more
     than `least`. `profile`, (bins, 3), is overwritten.
 
-    Parameters
-    ----------
-    trace, times : (bins,) array
-        Brightness, and seconds.
-    background, noise : float
-        Mean and standard deviation of the bins without a return.
-    curve : (samples, 2) array
-        Pulse and slope.
-    scale : (4,) array or tuple
-        Of the pulse.
-    estimate : (returns, 5) array
-    least : float
-        Response that a return must exceed.
-    profile : (bins, 3) array
-        Overwritten.
-    found : (returns, 3) array
-        Overwritten: seconds, sum over the bins, standard deviation in seconds.
-
-    Returns
-    -------
-    int
+    `trace, times` (bins,): brightness, and seconds; `background, noise`: mean and standard
+    deviation of the bins without a return; `curve` (samples, 2): pulse and slope; `scale` (4,): of
+    the pulse; `estimate` (returns, 5); `least`: response that a return must exceed; `profile`
+    (bins, 3): overwritten; `found` (returns, 3): overwritten: seconds, sum over the bins, standard
+    deviation in seconds.
     """
     number = 0
     for k in range(estimate.shape[0]):
@@ -429,13 +298,8 @@ def estimate_sum_and_deviation(profile, height, noise, pp, pd, dd):
     with the fit's leverages h, equal to the one found; the variances are then carried through the
     least-squares fit.
 
-    Parameters
-    ----------
-    profile : (bins, 3) array
-        Pulse, slope and residual in each bin that the return reaches.
-    height, noise : float
-    pp, pd, dd : float
-        Sums of squared pulse, pulse times slope, and squared slope.
+    `profile` (bins, 3): pulse, slope and residual in each bin that the return reaches; `pp, pd,
+    dd`: sums of squared pulse, pulse times slope, and squared slope.
     """
     slant, per_pp = pd / pp, 1 / pp
     across_energy = dd - pd * slant
@@ -460,11 +324,7 @@ def estimate_sum_and_deviation(profile, height, noise, pp, pd, dd):
 def sort_rows(table, number):
     """Sort the first few rows of a table by their first column, in place.
 
-    Parameters
-    ----------
-    table : (rows, columns) array
-    number : int
-        Of rows that are sorted.
+    `table` (rows, columns); `number`: of rows that are sorted.
     """
     for last in range(1, number):
         place = last

@@ -47,26 +47,9 @@ def correct_ranges(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Undo range walk and the pixels' offsets.
 
-    Parameters
-    ----------
-    known : RangeCalibration
-    distance : (n,) array
-        Ranges as they were measured, m.
-    signal : (n,) array
-        Counts of the returns.
-    sigma : (n,) array
-        One standard deviation of the ranges, m.
-    pixel : ((n,), (n,)) int arrays
-        Rows and columns.
-
-    Returns
-    -------
-    distance : (n,) float64 array
-        m.
-    intensity : (n,) float64 array
-        Counts, referred to a range of 1 m.
-    sigma : (n,) float64 array
-        m.
+    `distance` (n,): ranges as they were measured, m; `signal` (n,): counts of the returns; `sigma`
+    (n,): one standard deviation of the ranges, m; `pixel`: rows and columns. Returns `distance`
+    (n,): m; `intensity` (n,): counts, referred to a range of 1 m; `sigma` (n,): m.
     """
     excess, further = known.compute_excess(signal, *pixel)
     corrected = distance - excess

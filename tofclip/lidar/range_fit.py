@@ -77,30 +77,17 @@ MAX_BRIGHTNESS_RATIO = 1.5
 
 @dataclass(frozen=True)
 class TargetShot:
-    """What was seen of a target at a known distance.
+    """What was seen of a target at a known distance."""
 
-    Parameters
-    ----------
-    returns : Returns
-        As they were measured, without a range calibration; ranges from the camera's time zero.
-    distance : float
-        Of the target along the optical axis, m.
-    record : (float, float)
-        First and last time of flight of the record, s, from the same time zero.
-    name : str
-        For messages.
-    reflectance_percent : float
-        Of the target; NaN where it is not known.
-    brightest : float
-        Counts of the brightest returns of the whole picture, where `returns` are those of a part of
-        it; by default of `returns`.
-    """
-
+    # as they were measured, without a range calibration; ranges from the camera's time zero
     returns: Returns
-    distance: float
+    distance: float  # of the target along the optical axis, m
+    # first and last time of flight of the record, s, from the same time zero
     record: tuple[float, float]
-    name: str = "the shot"
-    reflectance_percent: float = np.nan
+    name: str = "the shot"  # for messages
+    reflectance_percent: float = np.nan  # of the target; NaN where it is not known
+    # counts of the brightest returns of the whole picture, where `returns` are those of a part of
+    # it; by default of `returns`
     brightest: float = np.nan
 
     def __post_init__(self) -> None:
@@ -114,9 +101,7 @@ class TargetShot:
     def cut(self, inside: NDArray[np.bool_]) -> TargetShot:
         """Return the shot with a part of its returns, and what is known of the others.
 
-        Parameters
-        ----------
-        inside : (returns,) bool array
+        `inside` (returns,).
         """
         brightest = self.measure_brightest() if np.isnan(self.brightest) else self.brightest
         return replace(self, returns=self.returns[inside], brightest=brightest)
@@ -130,35 +115,18 @@ class TargetShot:
 
 @dataclass(frozen=True)
 class RangeFit:
-    """A camera whose ranges are calibrated, and what the fit looked like.
+    """A camera whose ranges are calibrated, and what the fit looked like."""
 
-    Parameters
-    ----------
-    camera : Camera
-        With its time zero and range calibration.
-    jitter : float
-        One standard deviation of the shots' own time zeros, s; NaN of a single shot.
-    offset_spread : float
-        One standard deviation of the pixels' offsets, m; NaN of a single shot.
-    signal : (n,) array
-        Counts of the returns that were fitted.
-    excess : (n,) array
-        What they measured too long, offsets of pixels and shots taken off, m.
-    target_fraction : float
-        Of the pixels with a return, those whose return is the target's.
-    walk_note, offsets_note, response_note : str
-        Why a part was not fitted; empty where it was.
-    """
-
-    camera: Camera
-    jitter: float
-    offset_spread: float
-    signal: FloatArray
+    camera: Camera  # with its time zero and range calibration
+    jitter: float  # one standard deviation of the shots' own time zeros, s; NaN of a single shot
+    offset_spread: float  # one standard deviation of the pixels' offsets, m; NaN of a single shot
+    signal: FloatArray  # (n,), counts of the returns that were fitted
+    # (n,), what they measured too long, offsets of pixels and shots taken off, m
     excess: FloatArray
-    target_fraction: float
-    walk_note: str
-    offsets_note: str
-    response_note: str
+    target_fraction: float  # of the pixels with a return, those whose return is the target's
+    walk_note: str  # why a part was not fitted; empty where it was
+    offsets_note: str  # why a part was not fitted; empty where it was
+    response_note: str  # why a part was not fitted; empty where it was
 
     @property
     def calibration(self) -> RangeCalibration:
@@ -186,23 +154,9 @@ class _Sample:
 def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None) -> RangeFit:
     """Calibrate ranges by shots of a target at known distances.
 
-    Parameters
-    ----------
-    shots : sequence of TargetShot
-        From three on, of different brightness, they give the range walk; from two on the pixels'
-        offsets and response.
-    walk : bool, optional
-        Whether a range walk must be fitted, or must not; by default where the shots can tell it.
-
-    Returns
-    -------
-    RangeFit
-
-    Raises
-    ------
-    CalibrationError
-        A shot has no return, shows two surfaces or no flat plate, or disagrees with the others; the targets lie
-        further apart than the record is long; or a walk is asked for that the shots cannot tell.
+    `shots`: from three on, of different brightness, they give the range walk; from two on the
+    pixels' offsets and response; `walk`: whether a range walk must be fitted, or must not; by
+    default where the shots can tell it.
     """
     if not shots:
         raise InputError("a range calibration needs a shot of a target")
@@ -279,18 +233,8 @@ def _require_reach(shots: Sequence[TargetShot]) -> None:
 def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
     """Keep the strongest return of each pixel where it is the target's.
 
-    Parameters
-    ----------
-    shot : TargetShot
-    camera : Camera
-        Says where the pixels look.
-    pulse : float
-        Width of a pulse, m.
-
-    Returns
-    -------
-    _Sample
-        Excess over the target's range, from the start of the time axis rather than any time zero.
+    `camera`: says where the pixels look; `pulse`: width of a pulse, m. Returns excess over the
+    target's range, from the start of the time axis rather than any time zero.
     """
     if shot.returns.camera.image_shape != camera.image_shape:
         raise CalibrationError(
@@ -455,19 +399,7 @@ def _add_brightness(
 ) -> RangeCalibration:
     """Add the pixels' response and the scale of reflectance, from logarithms of intensities.
 
-    Parameters
-    ----------
-    calibration : RangeCalibration
-        Of the ranges.
-    shots : sequence of TargetShot
-    sample : _Sample
-    effects : Effects
-        Of the ranges, which say what belongs to the target.
-    camera : Camera
-
-    Returns
-    -------
-    RangeCalibration
+    `calibration`: of the ranges; `effects`: of the ranges, which say what belongs to the target.
     """
     used = effects.inliers
     shot, pixel = sample.shot[used], sample.pixel[used]

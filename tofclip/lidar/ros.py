@@ -31,42 +31,18 @@ NANOSECONDS_PER_SECOND = 1_000_000_000
 
 @dataclass(frozen=True)
 class StampedCloud:
-    """A cloud and when it was taken.
-
-    Parameters
-    ----------
-    cloud : PointCloud
-    stamp_ns : int
-        Nanoseconds since the epoch of the recording's clock.
-    """
+    """A cloud and when it was taken."""
 
     cloud: PointCloud
-    stamp_ns: int
+    stamp_ns: int  # nanoseconds since the epoch of the recording's clock
 
 
 def write_bag(clouds: Iterable[StampedCloud], path: str | Path) -> int:
     """Write clouds as a ROS 2 recording, whole or not at all; return how many.
 
-    Parameters
-    ----------
-    clouds : iterable of StampedCloud
-        Taken one at a time, in the order of their stamps.
-    path : path-like
-        A name that ends in ``.mcap`` becomes one MCAP file. Any other name becomes a folder, a bag
-        in SQLite, and must not exist yet.
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    InputError
-        There is no cloud, or a stamp is negative or earlier than the one before.
-    MissingDependencyError
-        rosbags is not installed.
-    StorageError
-        The recording could not be written.
+    `clouds`: taken one at a time, in the order of their stamps; `path`: A name that ends in
+    ``.mcap`` becomes one MCAP file. Any other name becomes a folder, a bag in SQLite, and must not
+    exist yet.
     """
     target = Path(path)
     single = target.suffix.lower() == MCAP_SUFFIX
@@ -108,15 +84,7 @@ def _write_messages(clouds: Iterable[StampedCloud], writer: Any, typestore: Any)
 def make_point_cloud_message(stamped: StampedCloud, typestore: Any) -> Any:
     """Return a cloud as the message that ROS 2 passes on.
 
-    Parameters
-    ----------
-    stamped : StampedCloud
-    typestore : rosbags.typesys.Typestore
-        With ROS 2's common messages.
-
-    Returns
-    -------
-    sensor_msgs/msg/PointCloud2
+    `typestore`: with ROS 2's common messages.
     """
     types, cloud = typestore.types, stamped.cloud
     columns = {axis: cloud.xyz[:, number] for number, axis in enumerate("xyz")}

@@ -83,26 +83,12 @@ FRAMES_PER_BLOCK = 32
 
 @dataclass(frozen=True)
 class SignificanceJudge:
-    """Decides which candidates of a transient cube are returns.
+    """Decides which candidates of a transient cube are returns."""
 
-    Parameters
-    ----------
-    frames : Frames
-        Recovered, with what was known of the measurements' noise.
-    noise : MeasurementNoise
-    pulse : Pulse
-    max_false_alarm : float
-        Candidates that are noise with a higher probability are dropped.
-
-    Raises
-    ------
-    InputError
-        The probability is not one.
-    """
-
-    frames: Frames
+    frames: Frames  # recovered, with what was known of the measurements' noise
     noise: MeasurementNoise
     pulse: Pulse
+    # candidates that are noise with a higher probability are dropped
     max_false_alarm: float = DEFAULT_FALSE_ALARM
 
     def __post_init__(self) -> None:
@@ -116,19 +102,8 @@ class SignificanceJudge:
     ) -> tuple[NDArray[np.bool_], FloatArray]:
         """Say which candidates are returns, and how probable it is that each is noise.
 
-        Parameters
-        ----------
-        pixel : (n,) int array
-            Number of the pixel, not decreasing.
-        time : (n,) array
-            Instant, s.
-        signal : (n,) array
-            Counts, summed over the bins.
-
-        Returns
-        -------
-        kept : (n,) bool array
-        probability : (n,) array
+        `pixel` (n,): number of the pixel, not decreasing; `time` (n,): instant, s; `signal` (n,):
+        counts, summed over the bins. Returns `kept` (n,); `probability` (n,).
         """
         length = SPEED_OF_LIGHT / 2 * self.pulse.fwhm
         gate = GATE_PULSES_PER_PX * length
@@ -154,18 +129,8 @@ def find_most_significant(
 ) -> tuple[FloatArray, FloatArray]:
     """Return significance and signal of the most significant candidate in each one's pixel.
 
-    Parameters
-    ----------
-    pixel : (n,) int array
-        Not decreasing.
-    pooled : (n,) array
-        Significance.
-    signal : (n,) array
-        Counts.
-
-    Returns
-    -------
-    significance, signal : (n,) array
+    `pixel` (n,): not decreasing; `pooled` (n,): significance; `signal` (n,): counts. Returns
+    `significance, signal` (n,).
     """
     order = np.lexsort((pooled, pixel))
     last = order[np.searchsorted(pixel, pixel, side="right") - 1]
@@ -182,20 +147,7 @@ def weigh_candidates(
 ) -> FloatArray:
     """Return by how many of its own standard deviations each candidate is brighter than nothing.
 
-    Parameters
-    ----------
-    frames : Frames
-    noise : MeasurementNoise
-    pulse : Pulse
-    pixel : (n,) int array
-    time : (n,) array
-        s.
-    signal : (n,) array
-        Counts, summed over the bins.
-
-    Returns
-    -------
-    (n,) float64 array
+    `pixel` (n,); `time` (n,): s; `signal` (n,): counts, summed over the bins. Returns (n,).
     """
     values = to_numpy(frames.values)
     order = np.argsort(time)
@@ -236,41 +188,21 @@ def _list_blocks(shears: FloatArray) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class CandidatePool:
-    """Candidates and what their neighbours bring.
+    """Candidates and what their neighbours bring."""
 
-    Parameters
-    ----------
-    pixel : (n,) int array
-        Not decreasing.
-    distance : (n,) array
-        m.
-    own : (n,) array
-        Significance of each.
-    image_shape : (int, int)
-    gate : float
-        What ranges may differ by for each pixel of the pool's radius, m: it reaches less far in
-        range the further a neighbour is, like a ball.
-    """
-
-    pixel: NDArray[np.int64]
-    distance: FloatArray
-    own: FloatArray
+    pixel: NDArray[np.int64]  # (n,), not decreasing
+    distance: FloatArray  # (n,), m
+    own: FloatArray  # (n,), significance of each
     image_shape: tuple[int, int]
+    # what ranges may differ by for each pixel of the pool's radius, m: it reaches less far in range
+    # the further a neighbour is, like a ball
     gate: float
 
     def sum_around(self, radius: float, displaced: FloatArray | None = None) -> FloatArray:
         """Return each candidate's significance together with those around it, at the same range.
 
-        Parameters
-        ----------
-        radius : float
-            Pixels.
-        displaced : (n,) array, optional
-            Ranges at which neighbours are looked for instead, m.
-
-        Returns
-        -------
-        (n,) float64 array
+        `radius`: pixels; `displaced` (n,): ranges at which neighbours are looked for instead, m.
+        Returns (n,).
         """
         from tofclip.lidar.candidate_loops import pool_significance
 
@@ -295,18 +227,8 @@ class CandidatePool:
 def find_usual_at_range(distance: FloatArray, pooled: FloatArray, length: float) -> FloatArray:
     """Return what the upper candidates within a pulse of each one's range have.
 
-    Parameters
-    ----------
-    distance : (n,) array
-        m.
-    pooled : (n,) array
-        Significance; candidates of 0 do not count.
-    length : float
-        Of a pulse, m.
-
-    Returns
-    -------
-    (n,) float64 array
+    `distance` (n,): m; `pooled` (n,): significance; candidates of 0 do not count; `length`: of a
+    pulse, m. Returns (n,).
     """
     slot = np.floor((distance - distance.min()) / length).astype(np.int64)
     order = np.argsort(slot, kind="stable")
@@ -326,16 +248,8 @@ def find_usual_at_range(distance: FloatArray, pooled: FloatArray, length: float)
 def estimate_false_alarms(pool: CandidatePool, pooled: FloatArray) -> FloatArray:
     """Return the probability that each candidate is noise, by decoys at displaced ranges.
 
-    Parameters
-    ----------
-    pool : CandidatePool
-    pooled : (n,) array
-        Of `CandidatePool.sum_around` with `POOL_RADIUS_PX`.
-
-    Returns
-    -------
-    (n,) float64 array
-        0 where all candidates lie so close together that no decoy can be had.
+    `pooled` (n,): of `CandidatePool.sum_around` with `POOL_RADIUS_PX`. Returns (n,): 0 where all
+    candidates lie so close together that no decoy can be had.
     """
     span = float(np.ptp(pool.distance)) if pooled.size else 0.0
     if span < MIN_RANGE_GATES * pool.gate:

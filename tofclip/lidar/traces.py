@@ -15,21 +15,13 @@ from tofclip.shots import Frames
 
 @dataclass(frozen=True)
 class TraceBins:
-    """Which bins of a time axis traces hold.
+    """Which bins of a time axis traces hold."""
 
-    Parameters
-    ----------
-    numbers : (n,) int array
-        Increasing.
-    search_mask : (n,) bool array
-        Whether a return may lie there. Wherever one may, all bins that its search and its fit look
-        at are held.
-    bin_weights : (n,) float32 array
-        For how many bins of the axis each one stands where background and noise are concerned.
-    """
-
-    numbers: NDArray[np.int64]
+    numbers: NDArray[np.int64]  # (n,), increasing
+    # (n,), whether a return may lie there. Wherever one may, all bins that its search and its fit
+    # look at are held
     search_mask: NDArray[np.bool_]
+    # (n,), for how many bins of the axis each one stands where background and noise are concerned
     bin_weights: NDArray[np.float32]
 
     @classmethod
@@ -52,12 +44,7 @@ class Traces(Protocol):
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         """Write the traces of ``pixels[piece]`` into (n, bins) contiguous memory.
 
-        Parameters
-        ----------
-        piece : slice
-            Of the pixels.
-        traces : (n, bins) float32 array
-            Overwritten.
+        `piece`: of the pixels; `traces` (n, bins): overwritten.
         """
         ...
 
@@ -65,11 +52,7 @@ class Traces(Protocol):
 class PictureTraces:
     """Traces of pictures at some bins that are there already.
 
-    Parameters
-    ----------
-    pictures : (bins, rows, columns) array
-    bins : TraceBins
-        Which ones they show.
+    `pictures` (bins, rows, columns); `bins`: which ones they show.
     """
 
     def __init__(self, pictures: NDArray[np.float32], bins: TraceBins) -> None:
@@ -88,12 +71,7 @@ class PictureTraces:
 
 
 class FrameTraces(PictureTraces):
-    """Traces of a transient cube.
-
-    Parameters
-    ----------
-    frames : Frames
-    """
+    """Traces of a transient cube."""
 
     def __init__(self, frames: Frames) -> None:
         super().__init__(frames.values, TraceBins.all_bins(frames.times.size))

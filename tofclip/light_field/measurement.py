@@ -25,18 +25,11 @@ from tofclip.records import (
 
 @dataclass(frozen=True)
 class CameraSetup:
-    """Which camera measures.
+    """Which camera measures."""
 
-    Parameters
-    ----------
-    encoder : str
-        A name in `tofclip.operators.light_field_camera.CAMERAS`.
-    sampling_ratio : float
-        Measurements over pixels of one picture.
-    seed : int
-    """
-
+    # A name in `tofclip.operators.light_field_camera.CAMERAS`
     encoder: str = field(metadata=stored_value(dtype=str))
+    # measurements over pixels of one picture
     sampling_ratio: float = field(metadata=stored_value())
     seed: int = field(metadata=stored_value(dtype=int))
 
@@ -48,21 +41,7 @@ class CameraSetup:
     def camera(self, image_shape: tuple[int, int], views: NDArray[np.float64]) -> LightFieldCamera:
         """Build the camera; the same setup builds the same one again.
 
-        Parameters
-        ----------
-        image_shape : (int, int)
-            Rows and columns of a view's picture.
-        views : (views, 2) float64 array
-            View steps (v, u).
-
-        Returns
-        -------
-        LightFieldCamera
-
-        Raises
-        ------
-        InputError
-            There is no encoder of that name.
+        `image_shape`: rows and columns of a view's picture; `views` (views, 2): view steps (v, u).
         """
         if self.encoder not in CAMERAS:
             raise InputError(f"unknown encoder '{self.encoder}'; take one of {', '.join(CAMERAS)}")
@@ -73,30 +52,20 @@ class CameraSetup:
 
 @dataclass(frozen=True)
 class ClipMeasurement(Storable):
-    """Measurements and the camera that made them.
-
-    Parameters
-    ----------
-    values : (measurements,) float32 array
-    views : (views, 2) array
-        (v, u) of every view.
-    image_shape : (int, int)
-    setup : CameraSetup
-    photons_per_unit : float
-        What a measurement of 1 means in counted photons; 0: not known.
-    provenance : mapping
-        How they came about.
-    """
+    """Measurements and the camera that made them."""
 
     RECORD_KIND = "clip_measurement"
 
     values: NDArray[Any] = field(
         metadata=stored_array("", "reading", dtype=np.float32, name="readings")
-    )
+    )  # (measurements,)
+    # (views, 2), (v, u) of every view
     views: NDArray[np.float64] = field(metadata=stored_array("", "view", "vu"))
     image_shape: tuple[int, int] = field(metadata=stored_value("rows", "columns", dtype=int))
     setup: CameraSetup = field(metadata=stored_part(CameraSetup))
+    # what a measurement of 1 means in counted photons; 0: not known
     photons_per_unit: float = field(default=0.0, metadata=stored_value())
+    # how they came about
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
 
     def __post_init__(self) -> None:
@@ -106,13 +75,7 @@ class ClipMeasurement(Storable):
             raise InputError("every reading is zero; there is nothing to recover")
 
     def camera(self) -> LightFieldCamera:
-        """Build the camera that made the measurements.
-
-        Raises
-        ------
-        ShapeError
-            It makes another number of measurements: the file is not from this setup.
-        """
+        """Build the camera that made the measurements."""
         camera = self.setup.camera(self.image_shape, self.views)
         if self.values.shape != (camera.measurements,):
             raise ShapeError(
@@ -121,13 +84,7 @@ class ClipMeasurement(Storable):
         return camera
 
     def counts(self) -> NDArray[Any]:
-        """Return the measurements in photons, (measurements,) float32.
-
-        Raises
-        ------
-        InputError
-            The number of photons of a measurement is not known.
-        """
+        """Return the measurements in photons, (measurements,) float32."""
         if self.photons_per_unit <= 0:
             raise InputError(
                 "these measurements do not say how many photons they stand for; take squares or huber"
@@ -139,16 +96,7 @@ class ClipMeasurement(Storable):
 def measure(light_field: LightField, setup: CameraSetup) -> ClipMeasurement:
     """Encode the true views, each by its own A_k: no model of refocusing takes part.
 
-    Parameters
-    ----------
-    light_field : LightField
-        Pictures (views, rows, columns).
-    setup : CameraSetup
-
-    Returns
-    -------
-    ClipMeasurement
-        Without noise.
+    `light_field`: pictures (views, rows, columns). Returns without noise.
     """
     shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])
     camera = setup.camera(shape, light_field.views)
@@ -161,22 +109,7 @@ def corrupt_measurement(
 ) -> ClipMeasurement:
     """Add photon noise, then set a fraction of all measurements to 0 or to the largest, at random.
 
-    Parameters
-    ----------
-    measurement : ClipMeasurement
-    photons : float or None
-        Photons of the largest measurement; None: no noise.
-    bad_fraction : float
-        Between 0 and 1.
-
-    Returns
-    -------
-    ClipMeasurement
-
-    Raises
-    ------
-    InputError
-        The fraction is outside 0 to 1, or the number of photons is not positive.
+    `photons`: photons of the largest measurement; None: no noise; `bad_fraction`: between 0 and 1.
     """
     if not 0 <= bad_fraction <= 1:
         raise InputError(

@@ -27,24 +27,9 @@ def make_view_warp(labels: Labels, shears: FloatArray, views: list[View]) -> Spa
     A view's pixel takes the light of the reference pixels that its own surface has there, ``h(x - s
     u, y - s v)`` with the shear s of what the view sees, between pixels linearly.
 
-    Parameters
-    ----------
-    labels : (rows, columns) int array
-        Which of the shears each pixel of the reference view has.
-    shears : (depths,) float array
-        Pixels per view step, ascending: the farther, the larger.
-    views : list of (float, float)
-        (v, u) from the reference view.
-
-    Returns
-    -------
-    SparseMatrix
-        (rows, columns) pictures to (views, rows, columns).
-
-    Raises
-    ------
-    ShapeError, InputError
-        Labels are not a picture, or name shears that there are not.
+    `labels` (rows, columns): which of the shears each pixel of the reference view has; `shears`
+    (depths,): pixels per view step, ascending: the farther, the larger; `views`: (v, u) from the
+    reference view. Returns (rows, columns) pictures to (views, rows, columns).
     """
     if labels.ndim != 2 or min(labels.shape) < 2:
         raise ShapeError("a map of depths", "(rows, columns), two or more of either", labels.shape)
@@ -68,16 +53,8 @@ def make_view_warp(labels: Labels, shears: FloatArray, views: list[View]) -> Spa
 def find_view_labels(labels: Labels, shears: FloatArray, view: View) -> Labels:
     """Return which shear each pixel of another view has, (rows, columns).
 
-    Parameters
-    ----------
-    labels, shears
-        As for `make_view_warp`.
-    view : (float, float)
-        (v, u) from the reference view.
-
-    Returns
-    -------
-    (rows, columns) int array
+    `labels, shears`: as for `make_view_warp`; `view`: (v, u) from the reference view. Returns
+    (rows, columns).
     """
     seen = np.full(labels.shape, -1, np.int64)
     for label in np.unique(labels)[::-1]:  # nearer surfaces are painted over farther ones

@@ -39,20 +39,11 @@ DISTANCE_SAMPLES = (
 
 @dataclass(frozen=True)
 class Rig:
-    """The instrument: where views and lamps stand, and what each view reads.
-
-    Parameters
-    ----------
-    array : CameraArray
-    lamps : (lamps, 3) array
-        m; they flash together.
-    setup : CameraSetup
-        Which nonlocal measurements the views get.
-    """
+    """The instrument: where views and lamps stand, and what each view reads."""
 
     array: CameraArray
-    lamps: NDArray[np.float64]
-    setup: CameraSetup
+    lamps: NDArray[np.float64]  # (lamps, 3), m; they flash together
+    setup: CameraSetup  # which nonlocal measurements the views get
 
     @cached_property
     def camera(self) -> LightFieldCamera:
@@ -74,37 +65,17 @@ class Rig:
 
 @dataclass(frozen=True)
 class Return:
-    """What comes back from about one distance.
+    """What comes back from about one distance."""
 
-    Parameters
-    ----------
-    distance : float
-        m along the axis.
-    bins : slice
-        Instants at which its light arrives.
-    """
-
-    distance: float
-    bins: slice
+    distance: float  # m along the axis
+    bins: slice  # instants at which its light arrives
 
 
 @dataclass(frozen=True)
 class TimedMeasurements:
-    """Measurements of every view at every instant.
+    """Measurements of every view at every instant."""
 
-    Parameters
-    ----------
-    values : (measurements, bins) float32 array
-    rig : Rig
-    time_axis : TimeAxis
-
-    Raises
-    ------
-    ShapeError
-        The rig makes another number of measurements, or the clock has other bins.
-    """
-
-    values: Array
+    values: Array  # (measurements, bins)
     rig: Rig
     time_axis: TimeAxis
 
@@ -159,15 +130,8 @@ class TimedMeasurements:
     def split_returns(self, distance: float) -> tuple[Return, ...]:
         """Divide the light by a gate that opens when that of a distance arrives.
 
-        Parameters
-        ----------
-        distance : float
-            m along the axis.
-
-        Returns
-        -------
-        tuple of Return
-            What came before the gate opened, and what came after; dark parts are left out.
+        `distance`: m along the axis. Returns what came before the gate opened, and what came after;
+        dark parts are left out.
         """
         opens = float(self.rig.compute_flight_time(np.array([distance]))[0])
         cut = int(np.searchsorted(self.time_axis.times, opens))
@@ -199,17 +163,7 @@ class TimedMeasurements:
 def measure_views(pictures: Array, rig: Rig, time_axis: TimeAxis) -> TimedMeasurements:
     """Measure true views, (views, rows, columns, bins), without noise.
 
-    Parameters
-    ----------
-    pictures : (views, rows, columns, bins) float32 array
-    rig : Rig
-        Camera and geometry.
-    time_axis : TimeAxis
-        Of the bins.
-
-    Returns
-    -------
-    TimedMeasurements
+    `pictures` (views, rows, columns, bins); `rig`: camera and geometry; `time_axis`: of the bins.
     """
     camera = rig.camera
     return TimedMeasurements(
@@ -220,18 +174,8 @@ def measure_views(pictures: Array, rig: Rig, time_axis: TimeAxis) -> TimedMeasur
 def add_poisson_noise(light: Array, photons_per_unit: float, random: np.random.Generator) -> Array:
     """Return light as photon counts report it, in the unit it came in.
 
-    Parameters
-    ----------
-    light : float array
-        Any shape; what is below zero counts as zero.
-    photons_per_unit : float
-        Mean photons where `light` is 1.
-    random : numpy.random.Generator
-
-    Returns
-    -------
-    float32 array
-        Of the same shape.
+    `light`: any shape; what is below zero counts as zero; `photons_per_unit`: mean photons where
+    `light` is 1. Returns of the same shape.
     """
     photons = random.poisson(np.maximum(light, 0) * photons_per_unit)
     found: Array = (photons / photons_per_unit).astype(np.float32)

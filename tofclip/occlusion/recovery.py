@@ -33,23 +33,17 @@ GLINT_QUANTILE = 0.98
 
 @dataclass(frozen=True)
 class SeparatedImages:
-    """Occluder and target, each from its own return.
+    """Occluder and target, each from its own return."""
 
-    Parameters
-    ----------
-    occluder, target : (rows, columns) float32 arrays
-        As the reference view sees them at their own shears; the target as if nothing stood before
-        it.
-    plain : (rows, columns) float32 array
-        The target by the model that knows of no occluder.
-    distances : tuple of float
-        Of what sent light back, as the times of flight tell, m: occluder and target, or the
-        occluder alone, and then the target's pictures are dark.
-    """
-
+    # (rows, columns), as the reference view sees them at their own shears; the target as if nothing
+    # stood before it
     occluder: Array
+    # (rows, columns), as the reference view sees them at their own shears; the target as if nothing
+    # stood before it
     target: Array
-    plain: Array
+    plain: Array  # (rows, columns), the target by the model that knows of no occluder
+    # of what sent light back, as the times of flight tell, m: occluder and target, or the occluder
+    # alone, and then the target's pictures are dark
     distances: tuple[float, ...]
 
     @property
@@ -75,18 +69,9 @@ def build_occluded_model(
     """Return F(d) of a target behind an occluder: lamps' shadows, shear, hidden pixels, encoder of
     each view.
 
-    Parameters
-    ----------
-    rig : Rig
-    occlusion_mask : (rows, columns) array
-        Pixels that the occluder fills in the reference view.
-    shears : (float, float)
-        Of occluder and target, pixels per view step.
-
-    Returns
-    -------
-    LinearOperator
-        (rows, columns) pictures of the target to (measurements,) vectors.
+    `occlusion_mask` (rows, columns): pixels that the occluder fills in the reference view;
+    `shears`: of occluder and target, pixels per view step. Returns (rows, columns) pictures of the
+    target to (measurements,) vectors.
     """
     near, far = shears
     camera, array = rig.camera, rig.array
@@ -111,23 +96,9 @@ def separate_occluder(
 ) -> SeparatedImages:
     """Recover occluder and target from their returns.
 
-    Parameters
-    ----------
-    measurements : TimedMeasurements
-    weight : float
-        Of total variation, relative to the largest value of A'f.
-    returns : tuple of Return, optional
-        Of the occluder, and of what stands behind; found in the measurements by default.
-
-    Returns
-    -------
-    SeparatedImages
-        Where there is a single return the target's pictures are zero.
-
-    Raises
-    ------
-    InputError
-        Nothing sends light back.
+    `weight`: of total variation, relative to the largest value of A'f; `returns`: of the occluder,
+    and of what stands behind; found in the measurements by default. Returns where there is a single
+    return the target's pictures are zero.
     """
     returns = measurements.find_returns() if returns is None else returns
     if not returns:

@@ -93,27 +93,10 @@ def make_coded_line(
 ) -> NDArray[np.float64]:
     """Make a line PSF times a random 0/1 code (supplement Note 4).
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns of the PSF; the line runs through all rows.
-    width_px : int
-        N_p, cells of the code in each row.
-    angle : float
-        Of the line from the vertical, rad; each row's cells are moved by ``row * tan(angle)``
-        columns, and shared between two columns where that is not a whole number.
-    random : numpy Generator
-        Of the code.
-
-    Returns
-    -------
-    (rows, columns) array
-        Its sum is 1.
-
-    Raises
-    ------
-    InputError
-        The line is wider than the picture, or lies flat.
+    `shape`: rows and columns of the PSF; the line runs through all rows; `width_px`: n_p, cells of
+    the code in each row; `angle`: of the line from the vertical, rad; each row's cells are moved by
+    ``row * tan(angle)`` columns, and shared between two columns where that is not a whole number;
+    `random`: of the code. Returns (rows, columns): its sum is 1.
     """
     rows, columns = shape
     if not 1 <= width_px <= columns:

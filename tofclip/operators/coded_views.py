@@ -136,19 +136,9 @@ def make_sheared_mask(
 ) -> NDArray[np.float64]:
     """Make the codes of a random mask at some distance in front of the sensor.
 
-    Parameters
-    ----------
-    image_shape : (int, int)
-    views : sequence of (float, float)
-    mask_shear : float
-        Pixels by which the mask appears moved from view to view: 0 on the sensor, where all views
-        see it alike.
-    random : numpy Generator
-        Of the mask's transmissions, evenly from 0 to 1.
-
-    Returns
-    -------
-    (views, rows, columns) array
+    `mask_shear`: pixels by which the mask appears moved from view to view: 0 on the sensor, where
+    all views see it alike; `random`: of the mask's transmissions, evenly from 0 to 1. Returns
+    (views, rows, columns).
     """
     # So much larger that no view looks past the edge of the mask.
     margin = int(np.ceil(abs(mask_shear) * np.abs(np.asarray(views)).max())) + 1

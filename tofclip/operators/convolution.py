@@ -103,22 +103,8 @@ def validate_point_spread(
 ) -> NDArray[np.float64]:
     """Return a point-spread function as float64 once it is known to fit pictures of `image_shape`.
 
-    Parameters
-    ----------
-    point_spread : (rows, columns) array_like
-    image_shape : (int, int)
-        Rows and columns of the picture.
-
-    Returns
-    -------
-    (rows, columns) float64 array
-
-    Raises
-    ------
-    ShapeError
-        It has not two dimensions, or is empty.
-    InputError
-        It is larger than the picture, holds NaN or infinity, or is zero everywhere.
+    `point_spread` (rows, columns); `image_shape`: rows and columns of the picture. Returns (rows,
+    columns).
     """
     spread = np.asarray(point_spread, dtype=np.float64)
     if spread.ndim != 2 or 0 in spread.shape:
@@ -152,22 +138,8 @@ def alias_free_length(image: int, sensor: int, spread: int, first: int, centre: 
     the PSF reaches from
     -centre to spread - 1 - centre.
 
-    Parameters
-    ----------
-    image : int
-        Pixels of the picture along the axis.
-    sensor : int
-        Pixels of the sensor.
-    spread : int
-        Pixels of the PSF.
-    first : int
-        The sensor's first pixel, counted in the picture's.
-    centre : int
-        The PSF's pixel that stands for no displacement.
-
-    Returns
-    -------
-    int
-        Pixels, as a circular convolution needs them.
+    `image`: pixels of the picture along the axis; `sensor`: pixels of the sensor; `spread`: pixels
+    of the PSF; `first`: the sensor's first pixel, counted in the picture's; `centre`: the PSF's
+    pixel that stands for no displacement. Returns pixels, as a circular convolution needs them.
     """
     return max(image, sensor, spread, first + sensor + centre, image - first + spread - 1 - centre)

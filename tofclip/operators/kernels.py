@@ -34,21 +34,12 @@ WIDE_LANES = 4 * LANES
 def _make_row_product(lanes: int, unroll: int) -> Any:
     """Make the product of a sparse row with the rows of a block.
 
-    Parameters
-    ----------
-    lanes : int
-        Numbers of a row of the block that are taken.
-    unroll : int
-        Accumulators for each of them, which hide the latency of the fused multiply-add.
-
-    Returns
-    -------
-    callable
-        ``(result, start, stride, block, columns, values, first, last, onto)``, for compiled loops:
-        ``result[start : start + lanes] = present + sum_q values[q] * block[columns[q], :lanes]``
-        for q in [first, last), `result` flat. `present` is 0, or what stands there already where
-        the boolean `onto` says so. `stride` is the distance of two rows of the block; a row's
-        elements and the result's lie side by side.
+    `lanes`: numbers of a row of the block that are taken; `unroll`: accumulators for each of them,
+    which hide the latency of the fused multiply-add. Returns ``(result, start, stride, block,
+    columns, values, first, last, onto)``, for compiled loops: ``result[start : start + lanes] =
+    present + sum_q values[q] * block[columns[q], :lanes]`` for q in [first, last), `result` flat.
+    `present` is 0, or what stands there already where the boolean `onto` says so. `stride` is the
+    distance of two rows of the block; a row's elements and the result's lie side by side.
     """
     selector = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
 
@@ -138,14 +129,8 @@ def multiply_sparse_block(tile_starts, columns, values, block, result):
     """``result = M @ block`` for a sparse matrix M in column tiles; see
     `tofclip.operators.sparse.Tiles`.
 
-    Parameters
-    ----------
-    tile_starts : (tiles, rows + 1) int64 array
-        Where each row's nonzeros begin, tile by tile.
-    columns : (nonzeros,) uint32 array
-    values : (nonzeros,) float32 or float64 array
-    block : (M's columns, LANES) C-contiguous array of the type of `values`
-    result : (rows, LANES) C-contiguous array, overwritten
+    `tile_starts` (tiles, rows + 1): where each row's nonzeros begin, tile by tile; `columns`
+    (nonzeros,); `values` (nonzeros,); `block` (M's columns, LANES); `result` (rows, LANES).
     """
     for tile in range(tile_starts.shape[0]):
         # the first tile overwrites the result, the others add to it
@@ -166,16 +151,9 @@ def _make_rows_product(emit_row_product: Any) -> Any:
         """``result[:, place + j] = (M @ block)[:, first + j]`` for all lanes j; see
         `multiply_sparse_block`.
 
-        Parameters
-        ----------
-        tile_starts, columns, values
-            As for `multiply_sparse_block`.
-        block : (M's columns, at least first + lanes) C-contiguous array of the type of `values`
-            Rows that begin at whole cache lines are read 1.6 times as fast; see
-            `tofclip.arrays.empty_aligned`.
-        first : int
-        result : (rows, at least place + lanes) C-contiguous array, overwritten in these columns
-        place : int
+        `tile_starts, columns, values`: as for `multiply_sparse_block`; `block` (M's columns, at
+        least first + lanes): rows that begin at whole cache lines are read 1.6 times as fast; see
+        `tofclip.arrays.empty_aligned`; `result` (rows, at least place + lanes).
         """
         lanes, stride = block[:, first:], block.shape[1]
         for tile in range(tile_starts.shape[0]):
@@ -223,15 +201,9 @@ def project_onto_lines(picture, starts, rightward, downward, lines):
     the steps from pixel to pixel in units of 2^-32 bins; every position and the next bin must lie
     on the line. Two lines at a time keep the processor busy while a sum is on its way to memory.
 
-    Parameters
-    ----------
-    picture : (rows, columns) array
-    starts : (lines,) int64 array
-        Fixed-point position of the first pixel on each line, 2^-32 bins.
-    rightward, downward : (lines,) int64 array
-        Steps to the next column and row, 2^-32 bins.
-    lines : (lines, bins, 2) array
-        Added to, in place.
+    `picture` (rows, columns); `starts` (lines,): fixed-point position of the first pixel on each
+    line, 2^-32 bins; `rightward, downward` (lines,): steps to the next column and row, 2^-32 bins;
+    `lines` (lines, bins, 2): added to, in place.
     """
     # Light times 2^-32: the fraction stays a whole number until it is multiplied once.
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
@@ -261,13 +233,8 @@ def back_project_lines(lines, starts, rightward, downward, picture):
     """The adjoint of `project_onto_lines` for lines (lines, bins) of one value a bin; overwrites
     `picture`.
 
-    Parameters
-    ----------
-    lines : (lines, bins) array
-    starts, rightward, downward : (lines,) int64 array
-        As for `project_onto_lines`.
-    picture : (rows, columns) array
-        Overwritten.
+    `lines` (lines, bins); `starts, rightward, downward` (lines,): as for `project_onto_lines`;
+    `picture` (rows, columns): overwritten.
     """
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
     for row in range(picture.shape[0]):
@@ -292,16 +259,9 @@ def count_line_nonzeros(starts, rightward, downward, before, shape, counts):
     `counts` is (lines, detector pixels), zeros; the detector's first pixel is bin `before`, `shape`
     the picture's.
 
-    Parameters
-    ----------
-    starts, rightward, downward : (lines,) int64 array
-        As for `project_onto_lines`.
-    before : int
-        Bins in front of the detector's first pixel.
-    shape : (int, int)
-        Rows and columns of the picture.
-    counts : (lines, detector pixels) int array
-        Zeros; counted up in place.
+    `starts, rightward, downward` (lines,): as for `project_onto_lines`; `before`: bins in front of
+    the detector's first pixel; `shape`: rows and columns of the picture; `counts` (lines, detector
+    pixels): zeros; counted up in place.
     """
     for number in range(starts.size):
         for row in range(shape[0]):
@@ -322,20 +282,10 @@ def fill_line_nonzeros(starts, rightward, downward, before, shape, places, colum
     `places`, (lines, detector pixels), says where each row of the matrix begins in `columns` and
     `values`, and says afterwards where it ends.
 
-    Parameters
-    ----------
-    starts, rightward, downward : (lines,) int64 array
-        As for `project_onto_lines`.
-    before : int
-        Bins in front of the detector's first pixel.
-    shape : (int, int)
-        Rows and columns of the picture.
-    places : (lines, detector pixels) int array
-        Advanced in place.
-    columns : (nonzeros,) int array
-        Overwritten with raster numbers of pixels.
-    values : (nonzeros,) float array
-        Overwritten with weights from 0 to 1.
+    `starts, rightward, downward` (lines,): as for `project_onto_lines`; `before`: bins in front of
+    the detector's first pixel; `shape`: rows and columns of the picture; `places` (lines, detector
+    pixels): advanced in place; `columns` (nonzeros,): overwritten with raster numbers of pixels;
+    `values` (nonzeros,): overwritten with weights from 0 to 1.
     """
     whole, step = values.dtype.type(1), values.dtype.type(1 / (1 << FRACTION_BITS))
     for number in range(starts.size):
@@ -358,16 +308,8 @@ def fill_line_nonzeros(starts, rightward, downward, before, shape, places, colum
 def count_tile_nonzeros(row_starts, indices, width, counts):
     """Count a CSR matrix's nonzeros in each tile of `width` columns and row, (tiles, rows) zeros.
 
-    Parameters
-    ----------
-    row_starts : (rows + 1,) int array
-        The matrix's ``indptr``.
-    indices : (nonzeros,) int array
-        Column of each nonzero.
-    width : int
-        Columns of a tile.
-    counts : (tiles, rows) int array
-        Zeros; counted up in place.
+    `row_starts` (rows + 1,): the matrix's ``indptr``; `indices` (nonzeros,): column of each
+    nonzero; `width`: columns of a tile; `counts` (tiles, rows): zeros; counted up in place.
     """
     for row in range(row_starts.size - 1):
         for entry in range(row_starts[row], row_starts[row + 1]):
@@ -379,18 +321,9 @@ def sort_into_tiles(row_starts, indices, data, width, places, columns, values):
     """Write a CSR matrix's nonzeros in the order of tile, row and column; `places` as in
     `fill_line_nonzeros`.
 
-    Parameters
-    ----------
-    row_starts : (rows + 1,) int array
-        The matrix's ``indptr``.
-    indices, data : (nonzeros,) array
-        Column and value of each nonzero.
-    width : int
-        Columns of a tile.
-    places : (tiles, rows) int array
-        Advanced in place.
-    columns, values : (nonzeros,) array
-        Overwritten.
+    `row_starts` (rows + 1,): the matrix's ``indptr``; `indices, data` (nonzeros,): column and value
+    of each nonzero; `width`: columns of a tile; `places` (tiles, rows): advanced in place;
+    `columns, values` (nonzeros,): overwritten.
     """
     for row in range(row_starts.size - 1):
         for entry in range(row_starts[row], row_starts[row + 1]):
@@ -436,15 +369,8 @@ def shift_linearly(block, down, right, below, beside, shifted):
     `down` and `right` are whole numbers, `below` and `beside` the shares of the next row and
     column, from 0 to 1.
 
-    Parameters
-    ----------
-    block : (rows, columns, lanes) array
-    down, right : int
-        Whole pixels.
-    below, beside : scalar of the block's dtype
-        Fractions of a pixel, from 0 to 1.
-    shifted : (rows, columns, lanes) array
-        Overwritten.
+    `block` (rows, columns, lanes); `down, right`: whole pixels; `below, beside`: fractions of a
+    pixel, from 0 to 1; `shifted` (rows, columns, lanes): overwritten.
     """
     rows, columns, lanes = block.shape
     length, whole = columns * lanes, block.dtype.type(1)

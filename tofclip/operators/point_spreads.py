@@ -40,14 +40,7 @@ class ApertureElement(Protocol):
         """Return what fraction of each ray passes, and by how many pixels it is deflected down and
         to the right.
 
-        Parameters
-        ----------
-        v, u : (rays, 1) and (1, rays) arrays
-            Increasing.
-
-        Returns
-        -------
-        transmission, down_px, right_px : (rays, rays) arrays
+        `v, u` (rays, 1): increasing. Returns `transmission, down_px, right_px` (rays, rays).
         """
         ...
 
@@ -58,14 +51,9 @@ class CodedAperture:
 
     ``g(x, s) = f(-x / s)`` up to the factor that keeps the light the same at every depth; at s = 0
     it is a point.
-
-    Parameters
-    ----------
-    code : (rows, columns) array
-        Transmission of the mask's cells, which fill the aperture.
     """
 
-    code: NDArray[Any]
+    code: NDArray[Any]  # (rows, columns), transmission of the mask's cells, which fill the aperture
 
     def trace_rays(
         self, v: Coordinates, u: Coordinates
@@ -91,14 +79,9 @@ class CubicPhasePlate:
 
     The phase ``u^3 + v^3`` deflects by its gradient, so rays land at ``strength * (v^2, u^2)``, the
     middle taken off.
-
-    Parameters
-    ----------
-    strength_px : float
-        Extent of the PSF on either axis.
     """
 
-    strength_px: float
+    strength_px: float  # extent of the PSF on either axis
 
     def trace_rays(
         self, v: Coordinates, u: Coordinates
@@ -116,19 +99,10 @@ class CubicPhasePlate:
 
 @dataclass(frozen=True)
 class Diffuser:
-    """A thin diffuser: a smooth random phase whose slopes throw a caustic pattern.
+    """A thin diffuser: a smooth random phase whose slopes throw a caustic pattern."""
 
-    Parameters
-    ----------
-    spread_px : float
-        Standard deviation of the deflection on either axis.
-    grain : float
-        Correlation length of the phase on the aperture, whose half width is 1.
-    seed : int
-    """
-
-    spread_px: float
-    grain: float
+    spread_px: float  # standard deviation of the deflection on either axis
+    grain: float  # correlation length of the phase on the aperture, whose half width is 1
     seed: int
 
     def trace_rays(
@@ -176,21 +150,10 @@ def trace_view_point_spreads(
     """Trace each view's PSF ``r(x, -u_k)``: the light that passes its patch of the aperture from a
     point at infinity.
 
-    Parameters
-    ----------
-    element : ApertureElement
-    views : sequence of (float, float)
-        (v, u) of every view; a view's patch is one view step wide, and the patches fill the
-        aperture.
-    shape : (int, int)
-        Rows and columns of the PSFs; rays that land beyond are lost.
-    rays : int
-        Along each side of a patch.
-
-    Returns
-    -------
-    (views, rows, columns) array
-        All PSFs together have the sum 1 for an element that lets all light pass onto `shape`.
+    `views`: (v, u) of every view; a view's patch is one view step wide, and the patches fill the
+    aperture; `shape`: rows and columns of the PSFs; rays that land beyond are lost; `rays`: along
+    each side of a patch. Returns (views, rows, columns): all PSFs together have the sum 1 for an
+    element that lets all light pass onto `shape`.
     """
     grid = np.asarray(views, dtype=np.float64)
     middle = (grid.max(axis=0) + grid.min(axis=0)) / 2
@@ -216,18 +179,8 @@ def shear_point_spreads(
     """Move each view's PSF by ``s (u - u_ref)``: convolving with it is shearing the picture and
     convolving then.
 
-    Parameters
-    ----------
-    spreads : (views, rows, columns) array
-    views : sequence of (float, float)
-    shear : float
-        s, pixels per view step.
-    reference : (float, float)
-
-    Returns
-    -------
-    (views, rows, columns) array
-        Their sum over the views is the camera's ``g(x, s)`` (supplement Eq. 4).
+    `spreads` (views, rows, columns); `shear`: s, pixels per view step. Returns (views, rows,
+    columns): their sum over the views is the camera's ``g(x, s)`` (supplement Eq. 4).
     """
     shape = (spreads.shape[1], spreads.shape[2])
     pairs = zip(spreads, views, strict=True)
@@ -240,19 +193,9 @@ class MeasuredPointSpreads:
     """PSFs measured once with a point source at several depths (supplement Note 4), and those in
     between.
 
-    Parameters
-    ----------
-    stack : (depths, rows, columns) array
-        Background taken off. Each PSF is brought to the sum 1: a point source looks brighter when
-        it is near.
-    shears : (depths,) array
-        s of each depth, in pixels per view step; any order.
-
-    Raises
-    ------
-    ShapeError, InputError
-        There is not one shear for each PSF, a shear repeats, or a PSF is not finite or holds no
-        light.
+    `stack` (depths, rows, columns): background taken off. Each PSF is brought to the sum 1: a point
+    source looks brighter when it is near; `shears` (depths,): s of each depth, in pixels per view
+    step; any order.
     """
 
     def __init__(self, stack: ArrayLike, shears: ArrayLike) -> None:

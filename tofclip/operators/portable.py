@@ -35,29 +35,15 @@ class Product(Protocol):
 def make_portable_product(matrix: scipy.sparse.csr_array, device: ComputeDevice) -> Product:
     """Bring a CSR matrix to `device` and return the product with it there.
 
-    Parameters
-    ----------
-    matrix : csr_array of shape (rows, columns)
-    device : ComputeDevice
-        Library and device of the arrays to come.
-
-    Returns
-    -------
-    Product
-        Takes (columns, frames) arrays on that device.
+    `device`: library and device of the arrays to come. Returns takes (columns, frames) arrays on
+    that device.
     """
     kinds: dict[str, Callable[..., Product]] = {"torch": TorchProduct, "cupy": CupyProduct}
     return kinds.get(device.library, GatheredProduct)(matrix, device)
 
 
 class TorchProduct:
-    """PyTorch's own product with a CSR matrix.
-
-    Parameters
-    ----------
-    matrix : CSR matrix
-    device : ComputeDevice
-    """
+    """PyTorch's own product with a CSR matrix."""
 
     def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:
         import torch
@@ -80,13 +66,7 @@ class TorchProduct:
 
 
 class CupyProduct:
-    """CuPy's own product with a CSR matrix.
-
-    Parameters
-    ----------
-    matrix : CSR matrix
-    device : ComputeDevice
-    """
+    """CuPy's own product with a CSR matrix."""
 
     def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:
         from cupyx.scipy.sparse import csr_matrix
@@ -104,11 +84,6 @@ class GatheredProduct:
 
     Every row is filled up with zeros to the longest, so rows of much the same length cost least
     memory.
-
-    Parameters
-    ----------
-    matrix : CSR matrix
-    device : ComputeDevice
     """
 
     def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:

@@ -12,13 +12,8 @@ from tofclip.operators.base import Array, LinearOperator
 class _Sensor(LinearOperator):
     """The measurements of some pixels of a plane; the adjoint leaves the others dark.
 
-    Parameters
-    ----------
-    plane_shape : (int, int)
-        Rows and columns of the light on the sensor's plane.
-    pixels : (measurements,) int array
-        Flat numbers of the pixels that are read, without repeats.
-    dtype : dtype
+    `plane_shape`: rows and columns of the light on the sensor's plane; `pixels` (measurements,):
+    flat numbers of the pixels that are read, without repeats.
     """
 
     def __init__(

@@ -21,21 +21,9 @@ class _Shear(LinearOperator):
     View (v, u) sees ``p(x, y) = h(x - s (u - u_ref), y - s (v - v_ref))``. The adjoint is the
     opposite shift, exactly.
 
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns.
-    shear : float
-        s, pixels per view step.
-    view, reference : (float, float)
-        (v, u) on the view grid. The reference may lie anywhere (viewpoint synthesis).
-    dtype : dtype
-        float32 or float64.
-
-    Raises
-    ------
-    InputError
-        The shift is not finite or pushes the whole picture out of the field.
+    `image_shape`: rows and columns; `shear`: s, pixels per view step; `view, reference`: (v, u) on
+    the view grid. The reference may lie anywhere (viewpoint synthesis); `dtype`: float32 or
+    float64.
     """
 
     def __init__(

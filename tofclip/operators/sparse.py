@@ -168,16 +168,8 @@ class LineProjection(SparseMatrix):
 def make_product(device: ComputeDevice, matrix: scipy.sparse.csr_array) -> Product:
     """Set up the product with `matrix` for the arrays of a device.
 
-    Parameters
-    ----------
-    device : ComputeDevice
-        Library and device of the arrays to come.
-    matrix : csr_array of shape (rows, columns)
-
-    Returns
-    -------
-    Product
-        Takes (columns, frames) arrays on that device.
+    `device`: library and device of the arrays to come. Returns takes (columns, frames) arrays on
+    that device.
     """
     return (
         TiledProduct(matrix) if device.has_compiled_loops else make_portable_product(matrix, device)
@@ -190,12 +182,7 @@ def _apply_product(product: Product, block: Array, target: Shape) -> Array:
 
 
 class TiledProduct:
-    """The product with a CSR matrix on NumPy arrays, by compiled loops on blocks of frames.
-
-    Parameters
-    ----------
-    matrix : CSR matrix
-    """
+    """The product with a CSR matrix on NumPy arrays, by compiled loops on blocks of frames."""
 
     def __init__(self, matrix: scipy.sparse.csr_array) -> None:
         self._tiles, self._count = Tiles.from_csr(matrix), matrix.shape[0]
@@ -226,18 +213,12 @@ class TiledProduct:
 class Tiles(NamedTuple):
     """A CSR matrix cut into groups of neighbouring columns, so that a group's part of the operand
     stays in cache.
-
-    Parameters
-    ----------
-    starts : (tiles, rows + 1) int64 array
-        Where each row's nonzeros begin in the other two, tile by tile.
-    columns : (nonzeros,) uint32 array
-    values : (nonzeros,) array
     """
 
+    # (tiles, rows + 1), where each row's nonzeros begin in the other two, tile by tile
     starts: NDArray[np.int64]
-    columns: NDArray[np.uint32]
-    values: NDArray[Any]
+    columns: NDArray[np.uint32]  # (nonzeros,)
+    values: NDArray[Any]  # (nonzeros,)
 
     @classmethod
     def from_csr(cls, matrix: scipy.sparse.csr_array) -> Tiles:
@@ -269,17 +250,9 @@ def split_between_bins(
     """Share every pixel's light between the two bins nearest to where it falls, by linear
     interpolation.
 
-    Parameters
-    ----------
-    position : (groups, rows, columns) array
-        Where each pixel falls among the bins of each group, in bins.
-    bins : int
-        What falls beyond them is lost.
-
-    Returns
-    -------
-    entry, bin, weight : (nonzeros,) arrays
-        Flat index into `position`, the bin, and the fraction of the light that it gets.
+    `position` (groups, rows, columns): where each pixel falls among the bins of each group, in
+    bins; `bins`: what falls beyond them is lost. Returns `entry, bin, weight` (nonzeros,): flat
+    index into `position`, the bin, and the fraction of the light that it gets.
     """
     left = np.floor(position).astype(np.int64)
     share = position - left

@@ -42,27 +42,13 @@ SHEAR_STEP_PX = 0.6  # by which the outermost view moves between depths that are
 
 @dataclass(frozen=True)
 class AllInFocus:
-    """A picture with the depth of each pixel.
+    """A picture with the depth of each pixel."""
 
-    Parameters
-    ----------
-    picture : (rows, columns) float32 array
-        What the reference view (0, 0) sees.
-    shears : (rows, columns) float64 array
-        Pixels per view step.
-    refocused : (rows, columns) float32 array or None
-        The same from pictures refocused one by one; None where the depths were known.
-    weight : float
-        Of the prior, relative to the largest value of A'f.
-    iterations : int
-    stop_reason : str
-    seconds : float
-    """
-
-    picture: NDArray[Any]
-    shears: NDArray[np.float64]
+    picture: NDArray[Any]  # (rows, columns), what the reference view (0, 0) sees
+    shears: NDArray[np.float64]  # (rows, columns), pixels per view step
+    # (rows, columns), the same from pictures refocused one by one; None where the depths were known
     refocused: NDArray[Any] | None
-    weight: float
+    weight: float  # of the prior, relative to the largest value of A'f
     iterations: int
     stop_reason: str
     seconds: float
@@ -70,14 +56,7 @@ class AllInFocus:
     def render_views(self, views: ArrayLike) -> LightField:
         """Return what other views see of the picture, each pixel moved by its own shear.
 
-        Parameters
-        ----------
-        views : (views, 2) array_like
-            (v, u) in view steps.
-
-        Returns
-        -------
-        LightField
+        `views` (views, 2): (v, u) in view steps.
         """
         wanted = np.asarray(views, np.float64)
         depths, labels = np.unique(self.shears, return_inverse=True)
@@ -92,21 +71,8 @@ def make_shear_range(
 ) -> NDArray[np.float64]:
     """Return shears to look for surfaces at, as close as the views can tell them apart.
 
-    Parameters
-    ----------
-    nearest, farthest : float
-        Pixels per view step.
-    views : (views, 2) array
-        (v, u) in view steps.
-
-    Returns
-    -------
-    (depths,) float64 array
-
-    Raises
-    ------
-    InputError
-        The range is empty or not finite.
+    `nearest, farthest`: pixels per view step; `views` (views, 2): (v, u) in view steps. Returns
+    (depths,).
     """
     if not (np.isfinite([nearest, farthest]).all() and nearest < farthest):
         raise InputError(
@@ -125,26 +91,10 @@ def recover_all_in_focus(
 ) -> AllInFocus:
     """Recover an all-in-focus picture and its depths from one shot.
 
-    Parameters
-    ----------
-    measurement : ClipMeasurement
-    shears : (depths,) array_like
-        That surfaces may have, pixels per view step, ascending; two or more.
-    weight : float, optional
-        Of the prior, relative to the largest value of A'f; chosen by cross-validation if not given.
-    recovery : ClipRecovery, optional
-        Prior and data term of all pictures, and the weight of the refocused ones.
-    progress : callable
-        Called with the number of recoveries just done, of `count_recoveries`.
-
-    Returns
-    -------
-    AllInFocus
-
-    Raises
-    ------
-    InputError
-        The shears do not ascend, or the pictures have no texture.
+    `shears` (depths,): that surfaces may have, pixels per view step, ascending; two or more;
+    `weight`: of the prior, relative to the largest value of A'f; chosen by cross-validation if not
+    given; `recovery`: prior and data term of all pictures, and the weight of the refocused ones;
+    `progress`: called with the number of recoveries just done, of `count_recoveries`.
     """
     began = perf_counter()
     depths = np.asarray(shears, np.float64)
@@ -185,24 +135,9 @@ def recover_on_depth_map(
 ) -> AllInFocus:
     """Recover an all-in-focus picture where the depths are known.
 
-    Parameters
-    ----------
-    measurement : ClipMeasurement
-    shears : (rows, columns) array
-        Of the reference view's pixels, pixels per view step; infinite where there is nothing.
-    weight : float, optional
-        Of the prior, relative to the largest value of A'f; chosen by cross-validation if not given.
-    recovery : ClipRecovery, optional
-        Prior and data term.
-
-    Returns
-    -------
-    AllInFocus
-
-    Raises
-    ------
-    ShapeError, InputError
-        The map is of another size, or has no finite shear.
+    `shears` (rows, columns): of the reference view's pixels, pixels per view step; infinite where
+    there is nothing; `weight`: of the prior, relative to the largest value of A'f; chosen by
+    cross-validation if not given; `recovery`: prior and data term.
     """
     began = perf_counter()
     if shears.shape != measurement.image_shape:

@@ -86,18 +86,10 @@ MIN_NOISE_COUNT = 0.3
 
 @dataclass(frozen=True)
 class Defects:
-    """What is wrong with a streak image.
+    """What is wrong with a streak image."""
 
-    Parameters
-    ----------
-    pixels : (rows, columns) bool array
-        Measurements that are sharper in time than a pulse.
-    columns : (columns,) bool array
-        Columns that see nothing.
-    """
-
-    pixels: Mask
-    columns: Mask
+    pixels: Mask  # (rows, columns), measurements that are sharper in time than a pulse
+    columns: Mask  # (columns,), columns that see nothing
 
     @property
     def mask(self) -> Mask:
@@ -113,15 +105,7 @@ class Defects:
 def find_defects(streak: Streak, pulse_rows: float) -> Defects:
     """Find measurements that no light explains.
 
-    Parameters
-    ----------
-    streak : Streak
-    pulse_rows : float
-        Full width at half maximum of the shortest pulse, in rows.
-
-    Returns
-    -------
-    Defects
+    `pulse_rows`: full width at half maximum of the shortest pulse, in rows.
     """
     counts = streak.counts.astype(np.float32)
     defects = np.zeros(counts.shape, bool)
@@ -164,14 +148,7 @@ def find_clipping_level(counts: FloatImage) -> float:
     What is cut off is at least as bright as it shows, which says more than nothing: it is not
     masked, but fitted from below (`tofclip.solvers.ClippedSquares`).
 
-    Parameters
-    ----------
-    counts : (rows, columns) array
-
-    Returns
-    -------
-    float
-        Infinite where nothing is.
+    `counts` (rows, columns). Returns infinite where nothing is.
     """
     highest = float(np.max(counts))
     number = np.count_nonzero(counts == highest)
@@ -188,14 +165,7 @@ def find_clipping_level(counts: FloatImage) -> float:
 def estimate_noise(counts: FloatImage) -> tuple[float, float, float]:
     """Estimate dark level, its noise, and the variance that a count of light adds.
 
-    Parameters
-    ----------
-    counts : (rows, columns) array
-
-    Returns
-    -------
-    (float, float, float)
-        Counts, counts, and counts squared per count.
+    `counts` (rows, columns). Returns counts, counts, and counts squared per count.
     """
     if len(counts) < 3:  # no row has two neighbours to differ from: photons' own noise
         dark = float(np.median(counts))
@@ -235,15 +205,7 @@ def estimate_noise(counts: FloatImage) -> tuple[float, float, float]:
 def find_dead_columns(counts: FloatImage, noise: float) -> Mask:
     """Find columns that do not even show the noise of the others.
 
-    Parameters
-    ----------
-    counts : (rows, columns) array
-    noise : float
-        Standard deviation in the dark, counts.
-
-    Returns
-    -------
-    (columns,) bool array
+    `counts` (rows, columns); `noise`: standard deviation in the dark, counts. Returns (columns,).
     """
     changes = np.abs(np.diff(counts, axis=0))
     rough = changes.mean(axis=0)
@@ -258,14 +220,7 @@ def find_dead_columns(counts: FloatImage, noise: float) -> Mask:
 def interpolate_rows(values: FloatImage, defects: Mask) -> FloatImage:
     """Replace defective measurements by what those before and after them say.
 
-    Parameters
-    ----------
-    values : (rows, columns) array
-    defects : (rows, columns) bool array
-
-    Returns
-    -------
-    (rows, columns) array
+    `values` (rows, columns); `defects` (rows, columns). Returns (rows, columns).
     """
     mended = values.copy()
     rows = np.arange(values.shape[0])
@@ -279,18 +234,9 @@ def interpolate_rows(values: FloatImage, defects: Mask) -> FloatImage:
 def mask_defects(streak: Streak, pulse_fwhm: float) -> Streak:
     """Return a streak image whose defects are masked, and mended for methods that know no mask.
 
-    Parameters
-    ----------
-    streak : Streak
-        With a time axis.
-    pulse_fwhm : float
-        Full width at half maximum of the instrument's response, s.
-
-    Returns
-    -------
-    Streak
-        The same image where nothing is wrong with it. Otherwise ``saturated`` marks the defects
-        too, and ``metadata`` says how many there are (``defective_readings``).
+    `streak`: with a time axis; `pulse_fwhm`: full width at half maximum of the instrument's
+    response, s. Returns the same image where nothing is wrong with it. Otherwise ``saturated``
+    marks the defects too, and ``metadata`` says how many there are (``defective_readings``).
     """
     rows = streak.counts.shape[0]
     if rows < 2:
@@ -312,15 +258,7 @@ def mask_defects(streak: Streak, pulse_fwhm: float) -> Streak:
 def count_defects(streak: Streak, clipping: float) -> dict[str, Scalar]:
     """Count the readings that are defective and those that are cut off, where there are any.
 
-    Parameters
-    ----------
-    streak : Streak
-    clipping : float
-        Value at which it is cut off, see `find_clipping_level`.
-
-    Returns
-    -------
-    dict of str to int
+    `clipping`: value at which it is cut off, see `find_clipping_level`.
     """
     clipped = int(np.count_nonzero(streak.counts >= clipping))
     defective = int(streak.metadata.get(DEFECTS_KEY, 0))
@@ -331,17 +269,8 @@ def count_defects(streak: Streak, clipping: float) -> dict[str, Scalar]:
 def adapt_to_clipping(method: Method, streak: Streak, clipping: float) -> Method:
     """Return a method with a prior that knows where a streak image is cut off.
 
-    Parameters
-    ----------
-    method : Method
-    streak : Streak
-    clipping : float
-        Value at which it is cut off, see `find_clipping_level`.
-
-    Returns
-    -------
-    Method
-        The same where nothing is cut off, or where it has a data term of its own.
+    `clipping`: value at which it is cut off, see `find_clipping_level`. Returns the same where
+    nothing is cut off, or where it has a data term of its own.
     """
     if not isinstance(method, ProximalMethod) or method.data_term is not LeastSquares:
         return method
@@ -357,16 +286,7 @@ def describe_noise(streak: Streak, measurement: Measurement) -> MeasurementNoise
     For frames with a prior, which fit the measurements as well as these allow: what a linear
     inverse spreads over the picture has another cause.
 
-    Parameters
-    ----------
-    streak : Streak
-    measurement : Measurement
-        Made of it.
-
-    Returns
-    -------
-    MeasurementNoise
-        Its misfit is known only after the recovery.
+    `measurement`: made of it. Returns its misfit is known only after the recovery.
     """
     _, floor, gain = estimate_noise(streak.counts)
     least = max(float(floor), MIN_NOISE_COUNT)
@@ -378,18 +298,8 @@ def list_noise_figures(
 ) -> dict[str, Scalar]:
     """List what the frames have to know of their measurements: noise, and what the model misses.
 
-    Parameters
-    ----------
-    noise : MeasurementNoise
-    measurement : Measurement
-    used : (readings, frames) bool array
-        The measurements that were fitted.
-    residual : float
-        Norm of what is left of those over theirs.
-
-    Returns
-    -------
-    dict of str to float
+    `used` (readings, frames): the measurements that were fitted; `residual`: norm of what is left
+    of those over theirs.
     """
     light = np.where(used, measurement.values, 0)
     energy = float(np.sum(light**2, dtype=np.float64))

@@ -77,20 +77,11 @@ the one with the lowest error.
 
 @dataclass(frozen=True)
 class WeightSearch:
-    """How a weight is looked for by cross-validation.
+    """How a weight is looked for by cross-validation."""
 
-    Parameters
-    ----------
-    first : float
-        Weight that is tried first.
-    max_folds : int
-        Folds that are tried.
-    tolerance : float
-        Of the objective in an iteration, at which a trial stops.
-    """
-
-    first: float = INITIAL_WEIGHT
-    max_folds: int = FOLD_COUNT
+    first: float = INITIAL_WEIGHT  # weight that is tried first
+    max_folds: int = FOLD_COUNT  # folds that are tried
+    # of the objective in an iteration, at which a trial stops
     tolerance: float = OBJECTIVE_TOLERANCE
 
 
@@ -99,60 +90,32 @@ THOROUGH_SEARCH = WeightSearch()
 
 @dataclass(frozen=True)
 class ClipResult:
-    """A picture and how it came about.
+    """A picture and how it came about."""
 
-    Parameters
-    ----------
-    picture : (rows, columns) float32 array
-    weight : float
-        Of the variational prior, relative to the largest value of A'f.
-    iterations : int
-    stop_reason : str
-    seconds : float
-        Of the recovery at its final weight.
-    seconds_setup : float
-        Of building the camera's model and whatever depends on it alone.
-    seconds_weight : float
-        Of choosing the weight and the data term's threshold.
-    """
-
-    picture: NDArray[Any]
-    weight: float
+    picture: NDArray[Any]  # (rows, columns)
+    weight: float  # of the variational prior, relative to the largest value of A'f
     iterations: int
     stop_reason: str
-    seconds: float
-    seconds_setup: float
-    seconds_weight: float
+    seconds: float  # of the recovery at its final weight
+    seconds_setup: float  # of building the camera's model and whatever depends on it alone
+    seconds_weight: float  # of choosing the weight and the data term's threshold
 
 
 @dataclass(frozen=True)
 class ClipRecovery:
-    """How to recover; every choice has a name.
+    """How to recover; every choice has a name."""
 
-    Parameters
-    ----------
-    prior : str
-        ``tv``, ``wavelet`` or ``l1``: minimised with the data term. ``collaborative``, ``bm3d`` or
-        ``nlm``: a denoiser, plugged into the recovery after total variation.
-    preset : str
-        ``fast`` stops where the prior's own problem has converged (denoisers: 2 calls). ``quality``
-        goes on with ten calls of the denoiser, the collaborative one if the prior is none.
-    weight : float, optional
-        Of the variational prior, relative to the largest value of A'f; chosen by cross-validation
-        if not given.
-    data_term : str
-        ``squares``; ``huber`` where some measurements are wildly wrong; ``poisson`` the likelihood of
-        photon counts.
-
-    Raises
-    ------
-    InputError
-        A name is unknown or the weight no positive number.
-    """
-
+    # ``tv``, ``wavelet`` or ``l1``: minimised with the data term. ``collaborative``, ``bm3d`` or
+    # ``nlm``: a denoiser, plugged into the recovery after total variation
     prior: str = "tv"
+    # ``fast`` stops where the prior's own problem has converged (denoisers: 2 calls). ``quality``
+    # goes on with ten calls of the denoiser, the collaborative one if the prior is none
     preset: str = "fast"
+    # of the variational prior, relative to the largest value of A'f; chosen by cross-validation if
+    # not given
     weight: float | None = None
+    # ``squares``; ``huber`` where some measurements are wildly wrong; ``poisson`` the likelihood of
+    # photon counts
     data_term: str = "squares"
 
     def __post_init__(self) -> None:
@@ -172,18 +135,8 @@ class ClipRecovery:
     ) -> ClipResult:
         """Recover the picture refocused at `shear`, pixels per view step.
 
-        Parameters
-        ----------
-        measurement : ClipMeasurement
-        shear : float
-            Pixels per view step.
-        progress : callable
-            Called with the number of recoveries just done, of `work`.
-
-        Returns
-        -------
-        ClipResult
-            Picture (rows, columns), weight of the prior, and seconds of each step.
+        `shear`: pixels per view step; `progress`: called with the number of recoveries just done,
+        of `work`. Returns picture (rows, columns), weight of the prior, and seconds of each step.
         """
         camera = measurement.camera()
         return self.recover_picture(measurement, camera, camera.model(shear), progress)
@@ -198,22 +151,10 @@ class ClipRecovery:
     ) -> ClipResult:
         """Recover the picture that a model of one's own explains the measurements by.
 
-        Parameters
-        ----------
-        measurement : ClipMeasurement
-        camera : LightFieldCamera
-            That made them.
-        model : LinearOperator
-            Picture (rows, columns) to measurements (measurements,), such as ``camera.model(shear)``.
-        progress : callable
-            As for `recover`.
-        search : WeightSearch
-            For a weight, if none is given.
-
-        Returns
-        -------
-        ClipResult
-            Picture (rows, columns), weight of the prior, and seconds of each step.
+        `camera`: that made them; `model`: picture (rows, columns) to measurements (measurements,),
+        such as ``camera.model(shear)``; `progress`: as for `recover`; `search`: for a weight, if
+        none is given. Returns picture (rows, columns), weight of the prior, and seconds of each
+        step.
         """
         begin = perf_counter()
         problem = self._make_problem(measurement, camera, model)
@@ -297,22 +238,8 @@ def recover_light_field(
     agree. Views without measurements are filled in from their neighbours. Memory: about ten times
     the light field.
 
-    Parameters
-    ----------
-    measurement : ClipMeasurement
-        Of views on a complete grid.
-    weight : float
-        Relative to the largest value of A'f.
-
-    Returns
-    -------
-    LightField
-        Its views in the measurement's order.
-
-    Raises
-    ------
-    InputError
-        The views are not a complete grid, row by row.
+    `measurement`: of views on a complete grid; `weight`: relative to the largest value of A'f.
+    Returns its views in the measurement's order.
     """
     camera = measurement.camera()
     grid = _view_grid_shape(measurement.views)

@@ -120,19 +120,8 @@ def split_gates_by_brightness(
     """Cut the frames into gates of equal brightness (root of the light); also their light's mean
     range, m.
 
-    Parameters
-    ----------
-    measurement : Measurement
-    times : (frames,) float array
-        Times of flight, s.
-    number : int
-        Gates asked for; where light is concentrated there may be fewer.
-
-    Returns
-    -------
-    gates : list of slice
-    ranges : (gates,) float64 array
-        Metres.
+    `times` (frames,): times of flight, s; `number`: gates asked for; where light is concentrated
+    there may be fewer. Returns `ranges` (gates,): metres.
     """
     light = np.maximum((measurement.values * measurement.valid).sum(axis=0, dtype=np.float64), 0)
     # the root, so that a bright near surface does not take all gates

@@ -38,24 +38,10 @@ def recover_segments(
     treated alike, it is made relative to what a surface like the shot's brightest would send back
     from each segment's range.
 
-    Parameters
-    ----------
-    method : Method
-    camera : Camera
-    measurement : Measurement
-        Its arrays may be of any library that the method takes; the frames are where they are.
-    segments : sequence of FrameSegment
-        All frames, in order.
-    progress : callable
-        Called with the number of frame iterations just done.
+    `measurement`: its arrays may be of any library that the method takes; the frames are where they
+    are; `segments`: all frames, in order; `progress`: called with the number of frame iterations
+    just done. Returns frames (frames, rows, columns).
 
-    Returns
-    -------
-    Result
-        Frames (frames, rows, columns).
-
-    Notes
-    -----
     Memory: the frames, and one operator at a time.
     """
     if len(segments) == 1:
@@ -102,22 +88,9 @@ def recover_glints(
 ) -> NDArray[np.float32]:
     """Return the frames with the pixels that dazzled measurements alone see.
 
-    Parameters
-    ----------
-    frames : (frames, rows, columns) float32 array
-        Recovered without the dazzled measurements.
-    method : Method
-    camera : Camera
-    measurement : Measurement
-        NumPy arrays.
-    segments : sequence of FrameSegment
-    dazzled : (readings, frames) bool array
-    device : ComputeDevice
-        Where the method runs.
-
-    Returns
-    -------
-    (frames, rows, columns) float32 array
+    `frames` (frames, rows, columns): recovered without the dazzled measurements; `measurement`:
+    NumPy arrays; `dazzled` (readings, frames); `device`: where the method runs. Returns (frames,
+    rows, columns).
     """
     complete = frames.copy()
     for segment in segments:
@@ -141,19 +114,8 @@ def compute_segments_residual(
 ) -> float:
     """Return ``|F h - f| / |f|`` over all valid measurements, each frame with its own operator.
 
-    Parameters
-    ----------
-    camera : Camera
-    frames : (frames, rows, columns) array
-        Recovered.
-    measurement : Measurement
-    segments : sequence of FrameSegment
-        Without gaps; each has its shear.
-
-    Returns
-    -------
-    float
-        0 is a perfect fit.
+    `frames` (frames, rows, columns): recovered; `segments`: without gaps; each has its shear.
+    Returns 0 is a perfect fit.
     """
     misfit = energy = 0.0
     for segment in segments:

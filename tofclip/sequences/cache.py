@@ -45,15 +45,7 @@ class CachingCamera(Camera):
     def operator(self, shear: float = 0.0, dtype: DTypeLike = np.float32) -> LineProjection:
         """Return F(d), see `Camera.operator`; the same object for the same arguments.
 
-        Parameters
-        ----------
-        shear : float
-            Pixels per view step.
-        dtype : dtype
-
-        Returns
-        -------
-        LineProjection
+        `shear`: pixels per view step.
         """
         # The dataclass is frozen, so that the cache is put past it into the instance dictionary.
         kept: dict[tuple[float, str], LineProjection] = self.__dict__.setdefault("_kept", {})
@@ -105,21 +97,8 @@ def prepare_inverse(
     The 16 inverses used last are kept. Threads that ask for one at the same time wait for a single
     preparation.
 
-    Parameters
-    ----------
-    method : LinearInverse
-    operator : LinearOperator
-        Of a camera that `get_cached_camera` returned; another one is not found again.
-    alive : (measurements,) bool array
-
-    Returns
-    -------
-    PreparedInverse
-
-    Raises
-    ------
-    InputError
-        As for `LinearInverse.prepare`.
+    `operator`: of a camera that `get_cached_camera` returned; another one is not found again;
+    `alive` (measurements,).
     """
     key = method, operator, alive.tobytes()
     with _inverse_lock:
@@ -133,12 +112,7 @@ def prepare_inverse(
 
 @dataclass(frozen=True, repr=False)
 class CachedInverse:
-    """The linear inverse, whose Gram matrices are inverted once for each operator that is kept.
-
-    Parameters
-    ----------
-    method : LinearInverse
-    """
+    """The linear inverse, whose Gram matrices are inverted once for each operator that is kept."""
 
     method: LinearInverse
     name = "linear"
@@ -156,19 +130,9 @@ class CachedInverse:
     ) -> Result:
         """Recover one picture per column of `measurements`; see `LinearInverse.recover`.
 
-        Parameters
-        ----------
-        operator : LinearOperator
-            Pictures (rows, columns) to measurements (measurements,).
-        measurements : (measurements, frames) array
-        valid : (measurements, frames) bool array, optional
-            Measurements that are False in every frame are left out.
-        progress : callable
-            Called with the number of frames just recovered.
-
-        Returns
-        -------
-        Result
+        `operator`: pictures (rows, columns) to measurements (measurements,); `measurements`
+        (measurements, frames); `valid` (measurements, frames): measurements that are False in every
+        frame are left out; `progress`: called with the number of frames just recovered.
         """
         alive = (
             # A slit column that is dead in every frame drops out of the Gram matrix; one masked in

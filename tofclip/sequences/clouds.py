@@ -158,21 +158,6 @@ def write_cloud(clouds: CloudSettings, frames: Path, result: Path) -> int:
     number of points.
 
     Memory: the frames, and about as much again while returns are looked for.
-
-    Parameters
-    ----------
-    clouds : CloudSettings
-    frames : Path
-    result : Path
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    InputError
-        The frames hold no return.
     """
     cloud, returns = clouds.make_cloud(Frames.load(frames), str(frames))
     save_cloud(cloud, returns, result, clouds.organised)
@@ -182,13 +167,7 @@ def write_cloud(clouds: CloudSettings, frames: Path, result: Path) -> int:
 def save_cloud(cloud: PointCloud, returns: Returns, path: Path, organised: bool = False) -> None:
     """Write a cloud, or the depth picture of its returns where the name ends in .exr.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-    returns : Returns
-    path : Path
-    organised : bool
-        Write a point for every pixel.
+    `organised`: write a point for every pixel.
     """
     if path.suffix.lower() == DEPTH_IMAGE_SUFFIX:
         from tofclip.lidar import save_depth

@@ -54,18 +54,11 @@ class CloudPipeline(Protocol):
 
 
 class SummedShot(NamedTuple):
-    """What a look at all rows of a shot brings.
+    """What a look at all rows of a shot brings."""
 
-    Parameters
-    ----------
-    sums : (columns, instants and some) float32 array
-        See `tofclip.lidar.signal_rows.selection.SignalRowFinder.bins`.
-    dark : float
-        Dark level, counts.
-    """
-
+    # (columns, instants and some), see `tofclip.lidar.signal_rows.selection.SignalRowFinder.bins`
     sums: NDArray[np.float32]
-    dark: float
+    dark: float  # dark level, counts
 
 
 class RangingPipeline:
@@ -80,28 +73,13 @@ class RangingPipeline:
     (`tofclip.solvers.traces`). Rows that hold no light are left out, but for a sample that tells
     background and noise (`tofclip.lidar.signal_rows`).
 
-    Parameters
-    ----------
-    camera : Camera
-        With its sweep; one that has to be found from a shot is found from the first
-        (`fit_camera_to_shot`) beforehand.
-    row_times : (rows,) array
-        Instant of each row, s.
-    method : LinearInverse or ProximalMethod, optional
-        The linear inverse by default.
-    focus : Focus, optional
-        One that needs no look at the shot: `FixedFocus` or `DepthLockedFocus`.
-    detection : Detection, optional
+    `camera`: with its sweep; one that has to be found from a shot is found from the first
+    (`fit_camera_to_shot`) beforehand; `row_times` (rows,): instant of each row, s; `method`: the
+    linear inverse by default; `focus`: one that needs no look at the shot: `FixedFocus` or
+    `DepthLockedFocus`.
 
-    Notes
-    -----
     Memory: two (columns, columns) matrices for each shear, and for a shot as much again as its
     measurements; with a prior, four times the pictures of all rows that hold light.
-
-    Raises
-    ------
-    InputError
-        A prior with a focus that has several shears.
     """
 
     def __init__(
@@ -160,26 +138,8 @@ class RangingPipeline:
     ) -> RangingPipeline:
         """Prepare for shots like this one; a sweep that is not known is found from it.
 
-        Parameters
-        ----------
-        shot : Streak
-            With a time axis.
-        camera : Path or Camera, optional
-            Defaults to the one that the shot carries.
-        focus : Focus
-        time_zero : float, optional
-            Reading of the time axis at which light of range 0 would arrive, s; the camera's by
-            default.
-        method : LinearInverse or ProximalMethod, optional
-
-        Returns
-        -------
-        RangingPipeline
-
-        Raises
-        ------
-        MissingTimeAxisError, InputError, CalibrationError
-            As for `tofclip.recover`.
+        `shot`: with a time axis; `camera`: defaults to the one that the shot carries; `time_zero`:
+        reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
         """
         opened = open_shot(shot, camera, time_zero)
         focus.check_camera(opened.camera)
@@ -197,10 +157,7 @@ class RangingPipeline:
     def recover(self, measurements: NDArray[np.float32]) -> Traces:
         """Do what a shot needs as a whole before its pixels are recovered, a few at a time, as they are asked for.
 
-        Parameters
-        ----------
-        measurements : (columns, rows) float32 array
-            Rectified.
+        `measurements` (columns, rows): rectified.
         """
         if measurements.shape != (self.camera.slit_width_px, self.times.size):
             raise ShapeError(
@@ -223,11 +180,7 @@ class RangingPipeline:
     def recover_shot(self, shot: Streak, rectified: SummedShot) -> Traces:
         """As `recover`, rectifying the rows with light and no others.
 
-        Parameters
-        ----------
-        shot : Streak
-        rectified : SummedShot
-            Of the shot; overwritten.
+        `rectified`: of the shot; overwritten.
         """
         bins = self._lit.bins(rectified.sums)
         measurements = self.rectifier.rectify_rows(shot.counts, rectified.dark, bins.numbers)
@@ -260,12 +213,7 @@ class _ShotTraces:
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         """Write the traces of some pixels, recovered now; see `tofclip.lidar.traces.Traces`.
 
-        Parameters
-        ----------
-        piece : slice
-            Of the pixels.
-        traces : (n, bins) float32 array
-            Overwritten.
+        `piece`: of the pixels; `traces` (n, bins): overwritten.
         """
         for inverse, held, weights in self._parts:
             inverse.fill(weights, piece, traces, held)
@@ -273,15 +221,9 @@ class _ShotTraces:
 
 @dataclass
 class JitterEstimator:
-    """Finds by how many rows a shot is late, from its light over time.
+    """Finds by how many rows a shot is late, from its light over time."""
 
-    Parameters
-    ----------
-    reference : (rows,) array
-        Light of the shot with which the others are compared.
-    """
-
-    reference: FloatArray
+    reference: FloatArray  # (rows,), light of the shot with which the others are compared
     _spectrum: Any = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -315,15 +257,7 @@ def compute_light_curve(streak: Streak, camera: Camera) -> FloatArray:
     """Sum of each raw row over the reference view's middle, where neighbouring views' skew does not
     matter.
 
-    Parameters
-    ----------
-    streak : Streak
-    camera : Camera
-
-    Returns
-    -------
-    (rows,) float64 array
-        Counts.
+    Returns (rows,): counts.
     """
     reference = int(np.argmin(np.abs(camera.view_positions)))
     # the middle half of one view, which neighbours do not reach
@@ -339,24 +273,9 @@ def make_average_cloud(
 ) -> tuple[PointCloud, FloatArray]:
     """Make one cloud of successive shots.
 
-    Parameters
-    ----------
-    shots : sequence of callables
-        At least one. Each reads its shot when it is called; one is in memory at a time.
-    pipeline : RangingPipeline
-    jitter : JitterEstimator, optional
-        None: the shots are taken as they come.
-
-    Returns
-    -------
-    PointCloud
-    (shots,) array
-        Rows by which each shot was late, as far as that was asked for.
-
-    Raises
-    ------
-    InputError
-        No shot.
+    `shots`: at least one. Each reads its shot when it is called; one is in memory at a time;
+    `jitter`: none: the shots are taken as they come. Returns (shots,): rows by which each shot was
+    late, as far as that was asked for.
     """
     if not shots:
         raise InputError("a cloud needs at least one shot")
@@ -377,18 +296,7 @@ def make_average_cloud(
 
 
 def build_cloud_path(folder: Path, number: int, suffix: str) -> Path:
-    """Return where cloud `number` of a sequence is kept.
-
-    Parameters
-    ----------
-    folder : Path
-    number : int
-    suffix : str
-
-    Returns
-    -------
-    Path
-    """
+    """Return where cloud `number` of a sequence is kept."""
     return folder / f"cloud_{number:06d}{suffix}"
 
 

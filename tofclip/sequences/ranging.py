@@ -144,10 +144,7 @@ class RangingSettings:
 def name_cloud(shots: Sequence[str]) -> str:
     """Return the name of the cloud of some shots: theirs, or the first one's and the last one's.
 
-    Parameters
-    ----------
-    shots : sequence of str
-        At least one; of a shot in a folder inside the sequence's, the path with the folder.
+    `shots`: at least one; of a shot in a folder inside the sequence's, the path with the folder.
 
     Examples
     --------
@@ -166,19 +163,7 @@ def write_average_cloud(
     The pipeline is made once in a process for each `version` (SHA-256) of the plan. Memory: one
     shot, and twice as much again for its measurements and what is recovered of them.
 
-    Parameters
-    ----------
-    plan : Path
-    version : str
-        SHA-256 of the plan.
-    shots : tuple of Shot
-    result : Path
-
-    Returns
-    -------
-    points : int
-    delays : list of float
-        Rows by which each shot was late.
+    `version`: SHA-256 of the plan. Returns `delays`: rows by which each shot was late.
     """
     pipeline, jitter = _load_plan(plan, version)
     cloud, late = make_average_cloud(shots, pipeline, jitter)

@@ -136,12 +136,7 @@ def recover_shot(recovery: RecoverySettings, shot: Shot, result: Path) -> None:
 
     Memory: the shot, its measurements and mask, and the frames twice while they are written.
 
-    Parameters
-    ----------
-    recovery : RecoverySettings
-    shot : Shot
-        Called to read it.
-    result : Path
+    `shot`: called to read it.
     """
     plan = recovery.plan(shot())
     if plan.shot.camera.sweep is not None:  # otherwise it is fitted to the shot, another for each

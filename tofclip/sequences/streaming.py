@@ -50,16 +50,7 @@ class ChannelClosedError(Exception):
 class Channel(Generic[Entry]):
     """Hands entries from one thread to another, in order.
 
-    Parameters
-    ----------
-    capacity : int
-        Entries held at most.
-    policy : "block" or "drop_oldest"
-
-    Raises
-    ------
-    InputError
-        A capacity below one, or another policy.
+    `capacity`: entries held at most.
     """
 
     def __init__(self, capacity: int, policy: Policy = "block") -> None:
@@ -78,13 +69,7 @@ class Channel(Generic[Entry]):
         self.dropped = 0
 
     def put(self, entry: Entry) -> None:
-        """Hand one entry over.
-
-        Raises
-        ------
-        ChannelClosedError
-            The channel was closed.
-        """
+        """Hand one entry over."""
         with self._changed:
             while len(self._entries) >= self._capacity and not self._closed:
                 if self._policy == "drop_oldest":
@@ -134,24 +119,12 @@ class Channel(Generic[Entry]):
 
 @dataclass(frozen=True)
 class StreamItem:
-    """What became of one thing of a stream.
+    """What became of one thing of a stream."""
 
-    Parameters
-    ----------
-    number : int
-        Its place in the source, from 0; those that were dropped have been counted.
-    value : object
-        What the work made of it.
-    read_seconds : float
-        Time that the source took to bring it, which is not latency.
-    latency : float
-        Time from when the source brought it until it was handed out, s.
-    """
-
-    number: int
-    value: Any
-    read_seconds: float
-    latency: float
+    number: int  # its place in the source, from 0; those that were dropped have been counted
+    value: Any  # what the work made of it
+    read_seconds: float  # time that the source took to bring it, which is not latency
+    latency: float  # time from when the source brought it until it was handed out, s
 
 
 @dataclass(frozen=True)
@@ -186,29 +159,12 @@ def run_in_order(
     that are worked on or done before their turn, and the one that the reader holds. Closing the
     generator stops the threads, and closes the source on its own thread if it can be closed.
 
-    Parameters
-    ----------
-    source : iterable
-    work : callable
-        Called by the executor; must not depend on the order in which things are done.
-    executor : concurrent.futures.Executor
-        Threads, processes or a cluster's workers; where they are processes, work and things have to
-        survive pickling.
-    at_once : int
-        Things that the executor has at a time, at most.
-    queue_size : int
-        Things that wait before it, at most.
-    policy : "block" or "drop_oldest"
-        ``"block"`` lets the source wait: nothing is lost of a file, and an instrument's own buffer
-        fills up. ``"drop_oldest"`` keeps the latency low: a live view takes the newest.
-
-    Yields
-    ------
-    StreamItem
-
-    Raises
-    ------
-    Whatever the source or the work raises, once everything before it has been yielded.
+    `work`: called by the executor; must not depend on the order in which things are done;
+    `executor`: threads, processes or a cluster's workers; where they are processes, work and things
+    have to survive pickling; `at_once`: things that the executor has at a time, at most;
+    `queue_size`: things that wait before it, at most; `policy`: ``"block"`` lets the source wait:
+    nothing is lost of a file, and an instrument's own buffer fills up. ``"drop_oldest"`` keeps the
+    latency low: a live view takes the newest.
     """
     if at_once < 1:
         raise InputError(f"a stream works on one thing or more at once, not {at_once}")
@@ -296,33 +252,17 @@ def _read_source(source: Iterable[Any], target: Channel[_Arrival]) -> None:
 
 @dataclass(frozen=True)
 class StreamedCloud:
-    """A cloud as it comes out of a stream.
-
-    Parameters
-    ----------
-    cloud : PointCloud
-    returns : Returns
-        Those that the cloud's points are, in the same order.
-    streak : Streak
-        The shot.
-    rectifier : Rectifier
-        Of its camera.
-    shot : int
-        Number of its shot in the source, from 0; what was dropped has been counted.
-    seconds : mapping
-        What each step took: ``"read"`` (the source, which is not latency), ``"wait"`` (until its
-        turn came), ``"rectify"``, ``"recover"``, ``"range"`` and ``"place"``.
-    latency : float
-        Time from when the shot was there until its cloud was handed out, s.
-    """
+    """A cloud as it comes out of a stream."""
 
     cloud: PointCloud
-    returns: Returns
-    streak: Streak
-    rectifier: Rectifier
-    shot: int
+    returns: Returns  # those that the cloud's points are, in the same order
+    streak: Streak  # the shot
+    rectifier: Rectifier  # of its camera
+    shot: int  # number of its shot in the source, from 0; what was dropped has been counted
+    # what each step took: ``"read"`` (the source, which is not latency), ``"wait"`` (until its turn
+    # came), ``"rectify"``, ``"recover"``, ``"range"`` and ``"place"``
     seconds: Mapping[str, float]
-    latency: float
+    latency: float  # time from when the shot was there until its cloud was handed out, s
 
     @cached_property
     def measurements(self) -> NDArray[np.float32]:
@@ -346,38 +286,15 @@ def stream_clouds(
     A shot is rectified and recovered, its returns are found and placed in space, while other shots
     are worked on and the next ones are read.
 
-    Parameters
-    ----------
-    shots : iterable of Streak
-        A file's, a folder's or an instrument's; it is read on a thread of its own. In the place of a
-        shot that cannot be read may come its error.
-    pipeline : RangingPipeline or SurfacePipeline, optional
-        By default a `RangingPipeline` for the camera that the first shot carries.
-    queue_size : int
-        Shots that wait for their turn, at most.
-    policy : "block" or "drop_oldest"
-        What happens when shots come faster than the clouds are taken; see `run_in_order`.
-    executor : concurrent.futures.Executor, optional
-        Where the work is done. By default a thread for each core, each of which keeps a shot to
-        itself; NumPy's products keep to one thread until the stream ends. With a method that takes
-        shots in order, all cores work on one shot.
-    at_once : int, optional
-        Shots that the executor has at a time; by default as many as there are cores, and one more
-        where all shots are worth waiting for.
-    on_failure : callable, optional
-        Called with the number of a shot of which no cloud can be made, and its error; the stream
-        goes on. By default the error ends it.
+    `shots`: A file's, a folder's or an instrument's; it is read on a thread of its own. In the
+    place of a shot that cannot be read may come its error; `pipeline`: by default a
+    `RangingPipeline` for the camera that the first shot carries; `queue_size`: shots that wait for
+    their turn, at most; `policy`: what happens when shots come faster than the clouds are taken;
+    see `run_in_order`; `executor`: where the work is done; `at_once`: shots that the executor has
+    at a time; by default as many as there are cores, and one more where all shots are worth waiting
+    for; `on_failure`: called with the number of a shot of which no cloud can be made, and its
+    error; the stream goes on. By default the error ends it.
 
-    Yields
-    ------
-    StreamedCloud
-
-    Raises
-    ------
-    Whatever reading a shot or making its cloud raises, once the clouds before it have been yielded.
-
-    Notes
-    -----
     Memory: ``queue_size + at_once + 1`` shots, one more for each core with what is recovered of it,
     and what a `RangingPipeline` takes.
     """

@@ -21,14 +21,8 @@ class SurfacePipeline:
     they no longer explain the shot, as when something has come in, surfaces are found anew. Shots
     are taken in order.
 
-    Parameters
-    ----------
-    shot : Shot
-        Opened, its sweep known.
-    method : SurfaceRecovery, optional
+    `shot`: opened, its sweep known.
 
-    Notes
-    -----
     Memory: as `SurfaceRecovery`; nothing is kept of the shots before but the last fit.
     """
 
@@ -52,25 +46,8 @@ class SurfacePipeline:
     ) -> SurfacePipeline:
         """Prepare for shots like this one; a sweep that is not known is found from it.
 
-        Parameters
-        ----------
-        shot : Streak
-            With a time axis.
-        camera : Path or Camera, optional
-            Defaults to the one that the shot carries.
-        time_zero : float, optional
-            Reading of the time axis at which light of range 0 would arrive, s; the camera's by
-            default.
-        method : SurfaceRecovery, optional
-
-        Returns
-        -------
-        SurfacePipeline
-
-        Raises
-        ------
-        MissingTimeAxisError, InputError, CalibrationError
-            As for `tofclip.recover`.
+        `shot`: with a time axis; `camera`: defaults to the one that the shot carries; `time_zero`:
+        reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
         """
         return cls(open_shot(shot, camera, time_zero).fit_camera(), method)
 
@@ -78,22 +55,7 @@ class SurfacePipeline:
         """Do nothing: surfaces explain the raw image."""
 
     def recover_shot(self, shot: Streak, rectified: None) -> SurfaceFit:
-        """Fit the surfaces of a shot.
-
-        Parameters
-        ----------
-        shot : Streak
-        rectified : None
-
-        Returns
-        -------
-        SurfaceFit
-
-        Raises
-        ------
-        InputError
-            The shot's light is not on surfaces.
-        """
+        """Fit the surfaces of a shot."""
         with self._lock:
             if self._fit is not None:
                 self._fit = follow_surfaces(self._fit, shot, self.method.weight)

@@ -25,16 +25,8 @@ class WarmStartedRecovery:
     Shots are taken one after the other, each with all cores: what comes out of a shot depends on
     those before it, and only on them.
 
-    Parameters
-    ----------
-    method : ProximalMethod
-        Its iterations are the first shot's.
-    operator : LinearOperator
-        Of all rows.
-    alive : (columns,) bool array
-        False for slit columns that are never to be trusted.
-    iterations : int
-        Of each further shot.
+    `method`: its iterations are the first shot's; `operator`: of all rows; `alive` (columns,):
+    false for slit columns that are never to be trusted; `iterations`: of each further shot.
     """
 
     def __init__(
@@ -53,16 +45,8 @@ class WarmStartedRecovery:
     def recover(self, measurements: NDArray[np.float32], bins: TraceBins) -> PictureTraces:
         """Recover some rows of a shot.
 
-        Parameters
-        ----------
-        measurements : (columns, bins) float32 array
-            Rectified, of these rows.
-        bins : TraceBins
-            Rows of which one stands for several are dark, and stay so.
-
-        Returns
-        -------
-        PictureTraces
+        `measurements` (columns, bins): rectified, of these rows; `bins`: rows of which one stands
+        for several are dark, and stay so.
         """
         lit = bins.bin_weights == 1
         rows = bins.numbers[lit]

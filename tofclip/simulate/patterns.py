@@ -23,10 +23,7 @@ def make_letter(name: str) -> list[Outline]:
     """Outlines of a capital letter: closed polygons, (corners, 2); a second one inside the first is
     a hole.
 
-    Parameters
-    ----------
-    name : str
-        ``"A"``, ``"C"``, ``"L"``, ``"U"`` or ``"V"``.
+    `name`: ``"A"``, ``"C"``, ``"L"``, ``"U"`` or ``"V"``.
     """
     if name not in LETTERS:
         raise InputError(f"no outline is known for '{name}'; known are {', '.join(LETTERS)}")
@@ -36,16 +33,8 @@ def make_letter(name: str) -> list[Outline]:
 def cut_pattern(outlines: list[Outline], pattern: Pattern) -> Pattern:
     """Keep of `pattern` what lies inside the outlines (even-odd rule); the rest becomes NaN.
 
-    Parameters
-    ----------
-    outlines : list of outlines
-        Polygons over the unit square, x to the right, y down.
-    pattern : (rows, columns) array
-        Reflectance.
-
-    Returns
-    -------
-    (rows, columns) float32 array
+    `outlines`: polygons over the unit square, x to the right, y down; `pattern` (rows, columns):
+    reflectance. Returns (rows, columns).
     """
     rows, columns = pattern.shape
     y, x = np.meshgrid(
@@ -66,16 +55,7 @@ def make_plain_pattern(reflectance: float) -> Pattern:
 def make_checkerboard(squares: int, dark: float, bright: float) -> Pattern:
     """A board of `squares` x `squares` fields, bright in the upper left corner.
 
-    Parameters
-    ----------
-    squares : int
-        Fields on a side.
-    dark, bright : float
-        Reflectance, 0 to 1.
-
-    Returns
-    -------
-    (texels, texels) float32 array
+    `squares`: fields on a side; `dark, bright`: reflectance, 0 to 1. Returns (texels, texels).
     """
     field = np.arange(TEXELS) * squares // TEXELS
     odd = (field[:, np.newaxis] + field) % 2 == 1
@@ -85,15 +65,7 @@ def make_checkerboard(squares: int, dark: float, bright: float) -> Pattern:
 def make_stripes(number: int, dark: float, bright: float) -> Pattern:
     """Slanted stripes with smooth borders, `number` of them across the plate.
 
-    Parameters
-    ----------
-    number : int
-    dark, bright : float
-        Reflectance, 0 to 1.
-
-    Returns
-    -------
-    (texels, texels) float32 array
+    `dark, bright`: reflectance, 0 to 1. Returns (texels, texels).
     """
     y, x = np.meshgrid(np.arange(TEXELS) / TEXELS, np.arange(TEXELS) / TEXELS, indexing="ij")
     wave = 0.5 + 0.5 * np.sin(2 * np.pi * number * (x + 0.5 * y))
@@ -103,16 +75,8 @@ def make_stripes(number: int, dark: float, bright: float) -> Pattern:
 def make_rings(number: int, dark: float, bright: float) -> Pattern:
     """A round plate with concentric rings; NaN outside the disc.
 
-    Parameters
-    ----------
-    number : int
-        Rings from the centre to the rim.
-    dark, bright : float
-        Reflectance, 0 to 1; the centre is bright.
-
-    Returns
-    -------
-    (texels, texels) float32 array
+    `number`: rings from the centre to the rim; `dark, bright`: reflectance, 0 to 1; the centre is
+    bright. Returns (texels, texels).
     """
     y, x = np.meshgrid(np.linspace(-1, 1, TEXELS), np.linspace(-1, 1, TEXELS), indexing="ij")
     radius = np.hypot(x, y)
@@ -125,23 +89,9 @@ def make_text_pattern(
 ) -> Pattern:
     """Bold capitals that fill a rectangle; each line is as wide as the rectangle.
 
-    Parameters
-    ----------
-    text : str
-        Lines divided by line breaks.
-    ink, paper : float
-        Reflectances; a paper of NaN leaves letters that are cut out.
-    margin : float
-        Share of the rectangle left free at each side.
-
-    Returns
-    -------
-    (rows, columns) float32 array
-
-    Raises
-    ------
-    InputError
-        A line has no letter.
+    `text`: lines divided by line breaks; `ink, paper`: reflectances; a paper of NaN leaves letters
+    that are cut out; `margin`: share of the rectangle left free at each side. Returns (rows,
+    columns).
     """
     lines = text.split("\n")
     if not all(line.strip() for line in lines):
@@ -158,22 +108,7 @@ def make_mottled_pattern(dark: float, bright: float, grains: int, seed: int) -> 
     """Smooth random blotches, about `grains` across the pattern, with every brightness from dark to
     bright.
 
-    Parameters
-    ----------
-    dark, bright : float
-        Reflectance, 0 to 1.
-    grains : int
-    seed : int
-        Of the pattern.
-
-    Returns
-    -------
-    (texels, texels) float32 array
-
-    Raises
-    ------
-    InputError
-        More grains than the pattern can show, or none.
+    `dark, bright`: reflectance, 0 to 1; `seed`: of the pattern. Returns (texels, texels).
     """
     if not 0 < grains < TEXT_TEXELS:
         raise InputError(

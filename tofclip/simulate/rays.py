@@ -29,40 +29,18 @@ EXTENT_SIGMAS = 5.0  # a Gaussian leaves 6e-7 of its energy outside
 
 @dataclass(frozen=True)
 class FirstHits:
-    """What rays meet first.
+    """What rays meet first."""
 
-    Parameters
-    ----------
-    distance : (rays,) float array
-        In lengths of the ray's direction; infinite where it meets nothing.
-    body : (rays,) int array
-        Number of the body; `NO_BODY` where there is none.
-    normal : (rays, 3) float array
-        Of length 1, towards the ray's origin.
-    pattern_position : (rays, 2) float array
-        On the body's pattern.
-    """
-
-    distance: Array
-    body: Array
-    normal: Array
-    pattern_position: Array
+    distance: Array  # (rays,), in lengths of the ray's direction; infinite where it meets nothing
+    body: Array  # (rays,), number of the body; `NO_BODY` where there is none
+    normal: Array  # (rays, 3), of length 1, towards the ray's origin
+    pattern_position: Array  # (rays, 2), on the body's pattern
 
 
 def cast_rays(bodies: Sequence[Body], origin: Array, directions: Array) -> FirstHits:
     """Follow rays to the nearest surface.
 
-    Parameters
-    ----------
-    bodies : sequence of Body
-    origin : (3,) float array
-        Where all rays start, m.
-    directions : (rays, 3) float array
-        Of any length, all with z > 0.
-
-    Returns
-    -------
-    FirstHits
+    `origin` (3,): where all rays start, m; `directions` (rays, 3): of any length, all with z > 0.
     """
     count = len(directions)
     nearest, number = np.full(count, np.inf), np.full(count, NO_BODY, np.intp)
@@ -81,15 +59,7 @@ def cast_rays(bodies: Sequence[Body], origin: Array, directions: Array) -> First
 def look_up_reflectance(bodies: Sequence[Body], hits: FirstHits) -> Array:
     """Return the pattern's value where each ray hits, (rays,) float64; 0 where it hits nothing.
 
-    Parameters
-    ----------
-    bodies : sequence of Body
-    hits : FirstHits
-        Numbers of the bodies, and the places on their patterns.
-
-    Returns
-    -------
-    (rays,) float64 array
+    `hits`: numbers of the bodies, and the places on their patterns. Returns (rays,).
     """
     found = np.zeros(hits.body.size)
     for number, one in enumerate(bodies):
@@ -101,19 +71,9 @@ def look_up_reflectance(bodies: Sequence[Body], hits: FirstHits) -> Array:
 def compute_irradiance(bodies: Sequence[Body], lamp: Array, points: Array, normal: Array) -> Array:
     """Return how strongly a lamp lights points: cosine over distance squared, nothing in shadow.
 
-    Parameters
-    ----------
-    bodies : sequence of Body
-        What may stand between lamp and points.
-    lamp : (3,) float array
-        m; all points lie at larger z.
-    points, normal : (points, 3) float arrays
-        On surfaces, m; and where these face, length 1.
-
-    Returns
-    -------
-    (points,) float64 array
-        1 / m^2 for a lamp of unit power per solid angle.
+    `bodies`: what may stand between lamp and points; `lamp` (3,): m; all points lie at larger z;
+    `points, normal` (points, 3): on surfaces, m; and where these face, length 1. Returns (points,):
+    1 / m^2 for a lamp of unit power per solid angle.
     """
     rays = points - lamp
     distance = np.linalg.norm(rays, axis=1)
@@ -131,17 +91,9 @@ def compute_irradiance(bodies: Sequence[Body], lamp: Array, points: Array, norma
 def number_ray_pixels(image_shape: tuple[int, int], rays_per_side: int) -> NDArray[np.intp]:
     """Return the raster number of the pixel to which each ray belongs.
 
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns of the picture.
-    rays_per_side : int
-        Rays along each side of a pixel.
-
-    Returns
-    -------
-    (rows * columns * rays_per_side**2,) int array
-        Rays are in raster order over the whole picture.
+    `image_shape`: rows and columns of the picture; `rays_per_side`: rays along each side of a
+    pixel. Returns (rows * columns * rays_per_side**2,): rays are in raster order over the whole
+    picture.
     """
     numbers = np.arange(int(np.prod(image_shape))).reshape(image_shape)
     return numbers.repeat(rays_per_side, axis=0).repeat(rays_per_side, axis=1).ravel()
@@ -150,16 +102,7 @@ def number_ray_pixels(image_shape: tuple[int, int], rays_per_side: int) -> NDArr
 def accumulate_cells(cell: NDArray[np.intp], amount: Array, shape: tuple[int, ...]) -> Array:
     """Add each amount to its cell, numbered in raster order, of a float64 array of `shape`.
 
-    Parameters
-    ----------
-    cell : (n,) int array
-    amount : (n,) array
-    shape : tuple of int
-        Of the result.
-
-    Returns
-    -------
-    float64 array of `shape`
+    `cell` (n,); `amount` (n,); `shape`: of the result.
     """
     total: Any = np.bincount(cell.ravel(), amount.ravel(), minlength=int(np.prod(shape)))
     return np.asarray(total, dtype=np.float64).reshape(shape)
@@ -168,19 +111,9 @@ def accumulate_cells(cell: NDArray[np.intp], amount: Array, shape: tuple[int, ..
 def spread_pulse(position: Array, sigma: Array) -> tuple[NDArray[np.intp], Array]:
     """Integrate a Gaussian pulse over the bins around it.
 
-    Parameters
-    ----------
-    position : (n,) float array
-        Middle of each pulse, in bins; bin i reaches from i - 1/2 to i + 1/2.
-    sigma : (n,) float array
-        Standard deviations, in bins.
-
-    Returns
-    -------
-    first : (n,) int array
-        First bin of each pulse.
-    shares : (n, reach) float array
-        Fraction of the pulse's energy in that bin and those after it.
+    `position` (n,): middle of each pulse, in bins; bin i reaches from i - 1/2 to i + 1/2; `sigma`
+    (n,): standard deviations, in bins. Returns `first` (n,): first bin of each pulse; `shares` (n,
+    reach): fraction of the pulse's energy in that bin and those after it.
     """
     if position.size == 0:
         return np.zeros(0, dtype=np.intp), np.zeros((0, 1))
@@ -197,20 +130,9 @@ def bin_by_time(
 ) -> Array:
     """Add the light of rays to the bins of their pixels, each spread over its pulse.
 
-    Parameters
-    ----------
-    pixel : (rays,) int array
-    position : (rays,) float array
-        Arrival, in bins; light outside of the axis is lost.
-    light : (rays,) float array
-    sigma : float
-        Standard deviation of the Gaussian pulse, in bins.
-    shape : (int, int)
-        Pixels and bins.
-
-    Returns
-    -------
-    (pixels, bins) float64 array
+    `pixel` (rays,); `position` (rays,): arrival, in bins; light outside of the axis is lost;
+    `light` (rays,); `sigma`: standard deviation of the Gaussian pulse, in bins; `shape`: pixels and
+    bins. Returns (pixels, bins).
     """
     first, shares = spread_pulse(position, np.full(position.shape, sigma))
     bins = first[:, np.newaxis] + np.arange(shares.shape[1])

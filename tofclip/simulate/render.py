@@ -21,38 +21,20 @@ FloatArray = NDArray[np.float64]
 
 
 class RayBundle(NamedTuple):
-    """The light that one view receives.
+    """The light that one view receives."""
 
-    Attributes
-    ----------
-    x, y : (n,) array
-        Where the rays fall in the view's picture, pixels from its optical axis.
-    time : (n,) array
-        Arrival, s after time zero.
-    brightness : (n,) array
-        Arbitrary units, the same for all views; proportional to reflectance / range^2.
-    """
-
-    x: FloatArray
-    y: FloatArray
-    time: FloatArray
+    x: FloatArray  # (n,), where the rays fall in the view's picture, pixels from its optical axis
+    y: FloatArray  # (n,), where the rays fall in the view's picture, pixels from its optical axis
+    time: FloatArray  # (n,), arrival, s after time zero
+    # (n,), arbitrary units, the same for all views; proportional to reflectance / range^2
     brightness: FloatArray
 
 
 def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundle:
     """Cast the rays of the view at `position` view steps; those that bring no light are left out.
 
-    Parameters
-    ----------
-    scene : Scene
-    instrument : Instrument
-    position : float
-        Of the view, in view steps.
-
-    Returns
-    -------
-    RayBundle
-        Picture point in pixels, time of flight in seconds and brightness of each ray.
+    `position`: of the view, in view steps. Returns picture point in pixels, time of flight in
+    seconds and brightness of each ray.
     """
     x, y = instrument.pixel_grid()
     hits = scene.trace(instrument.viewpoint(position), instrument.directions(x, y, position))
@@ -71,18 +53,8 @@ def render_streak(rays: RayBundle, view: int, instrument: Instrument) -> FloatAr
     """Put one view's light on the streak image: (rows, columns), in the units of the rays'
     brightness.
 
-    Parameters
-    ----------
-    rays : RayBundle
-        Of the view, from `cast_view_rays`.
-    view : int
-        Number of the lenslet, counted from 0.
-    instrument : Instrument
-
-    Returns
-    -------
-    (rows, columns) float64 array
-        Time runs along the rows.
+    `rays`: of the view, from `cast_view_rays`; `view`: number of the lenslet, counted from 0.
+    Returns (rows, columns): time runs along the rows.
     """
     camera, detector = instrument.camera, instrument.detector
     # a cylindrical lenslet turned by the angle images a point as a slanted line, which crosses the

@@ -36,20 +36,11 @@ SINGLE_FOLD_RUNS = 4096
 
 @dataclass(frozen=True)
 class WeightChoice:
-    """The weights tried and what their recoveries failed to predict.
+    """The weights tried and what their recoveries failed to predict."""
 
-    Parameters
-    ----------
-    weight : float
-        The best, between those tried.
-    trial_weights : (trials,) array
-        Ascending.
-    errors : (trials,) array
-        Value of the data term on the measurements held out, all folds together.
-    """
-
-    weight: float
-    trial_weights: NDArray[np.float64]
+    weight: float  # the best, between those tried
+    trial_weights: NDArray[np.float64]  # (trials,), ascending
+    # (trials,), value of the data term on the measurements held out, all folds together
     errors: NDArray[np.float64]
 
 
@@ -76,35 +67,13 @@ def choose_weight(
     the first weight until the minimum is bracketed; a parabola in the weight's logarithm refines
     it.
 
-    Parameters
-    ----------
-    method : ProximalMethod
-        Its own weight does not matter.
-    operator : LinearOperator
-        Pictures (rows, columns) to measurements (measurements,).
-    measurements : (measurements,) array
-        Of one picture.
-    run : int
-        Consecutive measurements that are left out together: neighbours on a detector hardly differ, so
-        that single ones would be predicted by their neighbours' errors.
-    seed : int
-        Of the assignment.
-    progress : callable
-        Called with the number of recoveries just done, of `MAX_WEIGHT_WORK`; those that are not
-        needed count as done at the end.
-    first : float
-        Weight that is tried first.
-    max_folds : int
-        Of the eight, that are tried; fewer take less time and know the error less well.
-
-    Returns
-    -------
-    WeightChoice
-
-    Raises
-    ------
-    InputError
-        There is a single measurement, or the arrays are not NumPy's.
+    `method`: its own weight does not matter; `operator`: pictures (rows, columns) to measurements
+    (measurements,); `measurements` (measurements,): of one picture; `run`: consecutive measurements
+    that are left out together: neighbours on a detector hardly differ, so that single ones would be
+    predicted by their neighbours' errors; `seed`: of the assignment; `progress`: called with the
+    number of recoveries just done, of `MAX_WEIGHT_WORK`; those that are not needed count as done at
+    the end; `first`: weight that is tried first; `max_folds`: of the eight, that are tried; fewer
+    take less time and know the error less well.
     """
     require_numpy("the choice of a prior's weight", measurements)
     held = assign_folds(measurements.size, run, seed)[:, :max_folds]
@@ -131,25 +100,10 @@ def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
     """Assign runs of consecutive measurements to folds at random; True where a measurement is left
     out.
 
-    Parameters
-    ----------
-    count : int
-        Number of measurements.
-    run : int
-        Consecutive measurements that stay together; shortened where there would be fewer runs than
-        `FOLD_COUNT`.
-    seed : int
-        Of the assignment.
-
-    Returns
-    -------
-    (count, folds) bool array
-        One column for each fold that is tried: `FOLD_COUNT`, or 1 from `SINGLE_FOLD_RUNS` runs on.
-
-    Raises
-    ------
-    InputError
-        There is a single measurement.
+    `count`: number of measurements; `run`: consecutive measurements that stay together; shortened
+    where there would be fewer runs than `FOLD_COUNT`; `seed`: of the assignment. Returns (count,
+    folds): one column for each fold that is tried: `FOLD_COUNT`, or 1 from `SINGLE_FOLD_RUNS` runs
+    on.
     """
     # Too few runs for the folds: shorter ones, although neighbours then know more of each other.
     if -(-count // run) < FOLD_COUNT:

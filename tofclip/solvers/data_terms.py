@@ -234,13 +234,7 @@ class Poisson(DataTerm):
 
 
 def estimate_robust_deviation(residual: Array) -> float:
-    """Return the standard deviation that Gaussian errors with the median size of `residual` have.
-
-    Raises
-    ------
-    InputError
-        More than half of the residual is zero: there is no scale to be had.
-    """
+    """Return the standard deviation that Gaussian errors with the median size of `residual` have."""
     # the median size of Gaussian numbers is 1 / 1.4826 of their standard deviation
     deviation = 1.4826 * float(np.median(np.abs(residual)))
     if not deviation > 0:

@@ -167,20 +167,10 @@ def filter_patch_groups(noisy, pilot, deviation, settings):
     `settings` is (side of a patch, stride, reach of the search, patches in a group); pictures are
     float32.
 
-    Parameters
-    ----------
-    noisy : (rows, columns) float32 array
-    pilot : (rows, columns) float32 array
-        A first estimate, in which similar patches are looked for and the filter's gain is found.
-    deviation : float32
-        Standard deviation of the noise, in the pictures' unit.
-    settings : (int, int, int, int)
-        Side of a patch and stride in pixels, reach of the search in pixels, patches in a group.
-
-    Returns
-    -------
-    (rows, columns) float32 array
-        Weighted average of the overlapping patches.
+    `noisy` (rows, columns); `pilot` (rows, columns): A first estimate, in which similar patches are
+    looked for and the filter's gain is found; `deviation`: standard deviation of the noise, in the
+    pictures' unit; `settings`: side of a patch and stride in pixels, reach of the search in pixels,
+    patches in a group. Returns (rows, columns): weighted average of the overlapping patches.
     """
     patch, stride, reach, wanted = settings
     rows, columns = noisy.shape

@@ -37,20 +37,11 @@ class NonlocalMeans:
     """Means over patches that look alike (scikit-image).
 
     A. Buades, B. Coll, J.-M. Morel, CVPR 2005, 60.
-
-    Parameters
-    ----------
-    patch_px : int
-        Side of a patch.
-    reach_px : int
-        How far away patches are looked for, each way.
-    filtering : float
-        Decay of a patch's say with its distance, over the noise's deviation.
     """
 
-    patch_px: int = 5
-    reach_px: int = 10
-    filtering: float = 0.6
+    patch_px: int = 5  # side of a patch
+    reach_px: int = 10  # how far away patches are looked for, each way
+    filtering: float = 0.6  # decay of a patch's say with its distance, over the noise's deviation
 
     def __call__(self, noisy: Picture, pilot: Picture, deviation: float) -> Picture:
         """Return the picture without its noise; the pilot is not needed."""
@@ -72,11 +63,6 @@ class BlockMatching:
     """Block matching and 3D filtering by its authors' package `bm3d`.
 
     K. Dabov, A. Foi, V. Katkovnik, K. Egiazarian, IEEE Trans. Image Process. 16, 2080 (2007).
-
-    Raises
-    ------
-    MissingDependencyError
-        The package is not installed.
     """
 
     def __call__(self, noisy: Picture, pilot: Picture, deviation: float) -> Picture:
@@ -102,34 +88,15 @@ class CollaborativeWiener:
     mean)`` is the best linear estimate of each of its patches. In a loop that calls a denoiser
     again and again, the pilot is what the last call returned. About as good as BM3D here and five
     times faster, under our own licence.
-
-    Parameters
-    ----------
-    patch_px : int
-        Side of a patch.
-    stride_px : int
-        Distance between the patches that groups are made for.
-    reach_px : int
-        How far away similar patches are looked for, each way.
-    group : int
-        Patches in a group.
     """
 
-    patch_px: int = 6
-    stride_px: int = 3
-    reach_px: int = 10
-    group: int = 40
+    patch_px: int = 6  # side of a patch
+    stride_px: int = 3  # distance between the patches that groups are made for
+    reach_px: int = 10  # how far away similar patches are looked for, each way
+    group: int = 40  # patches in a group
 
     def __call__(self, noisy: Picture, pilot: Picture, deviation: float) -> Picture:
-        """Return the picture without its noise.
-
-        Raises
-        ------
-        InputError
-            The picture is smaller than a patch.
-        ShapeError
-            Picture and pilot differ in shape.
-        """
+        """Return the picture without its noise."""
         from tofclip.solvers.denoiser_kernels import filter_patch_groups
 
         if pilot.shape != noisy.shape:

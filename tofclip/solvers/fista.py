@@ -575,18 +575,8 @@ class Wavelets(ProximalMethod):
 class _ZeroPictures:
     """What is known about pictures of nothing, frame by frame.
 
-    Parameters
-    ----------
-    frames : int
-
-    Attributes
-    ----------
-    peaks : (frames,) array
-        Largest value of A'f.
-    pulls : (frames,) array
-        Largest value of the data term's negative gradient.
-    values : (frames,) array
-        The data term.
+    `peaks` (frames,): largest value of A'f; `pulls` (frames,): largest value of the data term's
+    negative gradient; `values` (frames,): the data term.
     """
 
     def __init__(self, frames: int) -> None:

@@ -50,20 +50,10 @@ def shrink_nonnegative(
     A stretch of pixels at a time, which stays in the first-level cache with all that lanes have for
     themselves: whole rows of a picture took twice as long.
 
-    Parameters
-    ----------
-    current : (n,) array
-        Pictures, all lanes of a pixel side by side.
-    previous : (n,) array
-        Overwritten with the result.
-    momentum : (stretch,) array
-    gradient : (n,) array
-    step, threshold : (stretch,) array
-        Step size, and step size times weight.
-    memory : (3, stretch) array
-        Zeros; overwritten.
-    total, distance : (stretch,) float64 array
-        To which sums over stretches of the result, and of its squared difference from z, are added.
+    `current` (n,): pictures, all lanes of a pixel side by side; `previous` (n,): overwritten with
+    the result; `momentum` (stretch,); `gradient` (n,); `step, threshold` (stretch,): step size, and
+    step size times weight; `memory` (3, stretch): zeros; overwritten; `total, distance` (stretch,):
+    to which sums over stretches of the result, and of its squared difference from z, are added.
     """
     result, some, far = memory[0], memory[1], memory[2]
     for number in range((current.size + result.size - 1) // result.size):
@@ -123,13 +113,8 @@ def _move_sum(some, total):
 def take_gradient_step(current, previous, momentum, gradient, step):
     """``gradient = z - step * gradient`` with ``z = current + momentum * (current - previous)``.
 
-    Parameters
-    ----------
-    current, previous : (rows, columns, lanes) array
-    momentum : (lanes,) array
-    gradient : (rows, columns, lanes) array
-        Overwritten.
-    step : scalar of the arrays' dtype
+    `current, previous` (rows, columns, lanes); `momentum` (lanes,); `gradient` (rows, columns,
+    lanes): overwritten.
     """
     lanes = current.shape[2]
     for row in range(current.shape[0]):
@@ -148,11 +133,7 @@ def copy_lanes_to_frames(block, frames):
     Tile by tile, so that both sides move whole cache lines: several times faster than a strided
     copy.
 
-    Parameters
-    ----------
-    block : (pixels, lanes) array
-    frames : (frames, pixels) array
-        Overwritten; not more frames than lanes.
+    `block` (pixels, lanes); `frames` (frames, pixels): overwritten; not more frames than lanes.
     """
     pixels = block.shape[0]
     # Tile by tile, as a transposition reads along one axis and writes along the other.
@@ -168,16 +149,9 @@ def compute_traces(tile_starts, columns, values, rows, weights, traces, span):
     """``traces[:, span[0] : span[1]] = M[rows[0] : rows[1]] @ weights`` for a sparse matrix M in
     column tiles.
 
-    Parameters
-    ----------
-    tile_starts, columns, values
-        See `tofclip.operators.sparse.Tiles`; a row for each trace.
-    rows : (int, int)
-    weights : (M's columns, time) array
-        Its rows are a multiple of `LANES` long at least.
-    traces : (rows[1] - rows[0], time) array
-        Overwritten from column ``span[0]`` to below ``span[1]``.
-    span : (int, int)
+    `tile_starts, columns, values`: see `tofclip.operators.sparse.Tiles`; a row for each trace;
+    `weights` (M's columns, time): its rows are a multiple of `LANES` long at least; `traces`
+    (rows[1] - rows[0], time): overwritten from column ``span[0]`` to below ``span[1]``.
     """
     starts, time, done = tile_starts[:, rows[0] : rows[1] + 1], span[1] - span[0], 0
     while done + WIDE_LANES <= time:
@@ -201,13 +175,8 @@ def restore_frames(candidate, current, rejected):
     """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are
     (..., lanes).
 
-    Parameters
-    ----------
-    candidate : (rows, columns, lanes) array
-        Overwritten in rejected lanes.
-    current : (rows, columns, lanes) array
-    rejected : (lanes,) array of the pictures' dtype
-        1 or 0.
+    `candidate` (rows, columns, lanes): overwritten in rejected lanes; `current` (rows, columns,
+    lanes); `rejected` (lanes,): 1 or 0.
     """
     lanes = candidate.shape[2]
     for row in range(current.shape[0]):
@@ -230,28 +199,14 @@ def descend_total_variation(
     0`` (Chambolle 2004). Every row passes through memory once: the primal row below is made before
     a row's dual changes.
 
-    Parameters
-    ----------
-    lanes : int
-        Pixels of a row are `lanes` numbers apart.
-    current : (rows, row) array
-        Pictures, all lanes of a pixel side by side.
-    previous : (rows, row) array
-        Overwritten with the result.
-    momentum : (row,) array
-    gradient : (rows, row) array
-        Overwritten with ``noisy = z - step * gradient``.
-    step, weight : (row,) array
-        Step size, and step size times the variation's weight.
-    dual : (2, rows, row) array
-        Vertical and horizontal; updated in place. The last row of the one and the last column of
-        the other stay zero: the difference across the border is.
-    sweep : (row,) array
-        Step size of the dual.
-    scratch : (4, row) array
-        The first row is zero; the others are overwritten.
-    total : (row,) array
-        To which the sum over rows of the result's isotropic total variation is added.
+    `lanes`: pixels of a row are `lanes` numbers apart; `current` (rows, row): pictures, all lanes
+    of a pixel side by side; `previous` (rows, row): overwritten with the result; `momentum` (row,);
+    `gradient` (rows, row): overwritten with ``noisy = z - step * gradient``; `step, weight` (row,):
+    step size, and step size times the variation's weight; `dual` (2, rows, row): vertical and
+    horizontal; updated in place. The last row of the one and the last column of the other stay
+    zero: the difference across the border is; `sweep` (row,): step size of the dual; `scratch` (4,
+    row): the first row is zero; the others are overwritten; `total` (row,): to which the sum over
+    rows of the result's isotropic total variation is added.
     """
     rows, dark, room = current.shape[0], scratch[0], scratch[1]
     for row in range(rows + 1):
@@ -338,16 +293,9 @@ def compute_light_field_primal(noisy, dual, weight, angular, result):
     The last difference along every axis crosses the border and is always zero, so only the first
     needs care.
 
-    Parameters
-    ----------
-    noisy : (v, u, rows, columns, lanes) array
-    dual : (4, v, u, rows, columns, lanes) array
-        Along rows, columns, v and u.
-    weight : scalar of the arrays' dtype
-    angular : scalar of the arrays' dtype
-        How many times the differences between views count.
-    result : (v, u, rows, columns, lanes) array
-        Overwritten.
+    `noisy` (v, u, rows, columns, lanes); `dual` (4, v, u, rows, columns, lanes): along rows,
+    columns, v and u; `angular`: how many times the differences between views count; `result` (v, u,
+    rows, columns, lanes): overwritten.
     """
     down, across, rows, columns, lanes = noisy.shape
     for v in range(down):
@@ -392,14 +340,8 @@ def _forward_differences(field, v, u, row, column, lane, angular):
 def update_light_field_dual(field, dual, step, angular):
     """``dual = project(dual + step * grad(field))`` onto vectors of length at most 1.
 
-    Parameters
-    ----------
-    field : (v, u, rows, columns, lanes) array
-    dual : (4, v, u, rows, columns, lanes) array
-        Updated in place.
-    step : scalar of the arrays' dtype
-    angular : scalar of the arrays' dtype
-        How many times the differences between views count.
+    `field` (v, u, rows, columns, lanes); `dual` (4, v, u, rows, columns, lanes): updated in place;
+    `angular`: how many times the differences between views count.
     """
     down, across, rows, columns, lanes = field.shape
     for v in range(down):
@@ -423,13 +365,8 @@ def update_light_field_dual(field, dual, step, angular):
 def sum_light_field_variation(field, angular, total):
     """Add the isotropic variation of each lane to `total` (lanes,), float64.
 
-    Parameters
-    ----------
-    field : (v, u, rows, columns, lanes) array
-    angular : scalar of the arrays' dtype
-        How many times the differences between views count.
-    total : (lanes,) float64 array
-        Added to, in place.
+    `field` (v, u, rows, columns, lanes); `angular`: how many times the differences between views
+    count; `total` (lanes,): added to, in place.
     """
     down, across, rows, columns, lanes = field.shape
     for v in range(down):

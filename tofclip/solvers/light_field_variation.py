@@ -19,14 +19,8 @@ class NonnegativeLightFieldVariation:
     call, as in `NonnegativeTotalVariation`; one sweep a call. Memory: four duals and two
     temporaries of the light field's size.
 
-    Parameters
-    ----------
-    weight : float
-        In the unit of ``A'f``.
-    grid : (int, int)
-        Views down and across; the views come row by row.
-    angular : float
-        0: every view on its own.
+    `weight`: in the unit of ``A'f``; `grid`: views down and across; the views come row by row;
+    `angular`: 0: every view on its own.
     """
 
     zero_bound = 0.0
@@ -42,25 +36,10 @@ class NonnegativeLightFieldVariation:
     ) -> ProximalStep:
         """Take a proximal gradient step on a block of light fields; see `Regulariser`.
 
-        Parameters
-        ----------
-        current, previous : (views, rows, columns, lanes) array
-            The last two solutions; `previous` is overwritten with the result.
-        momentum : (lanes,) array
-        gradient : (views, rows, columns, lanes) array
-            Overwritten.
-        step : (lanes,) array
-            The same for all: they keep their size, as no distance is returned.
-
-        Returns
-        -------
-        ProximalStep
-            Its penalty is weight times total variation.
-
-        Raises
-        ------
-        ShapeError
-            The number of views is not that of the grid.
+        `current, previous` (views, rows, columns, lanes): the last two solutions; `previous` is
+        overwritten with the result; `momentum` (lanes,); `gradient` (views, rows, columns, lanes):
+        overwritten; `step` (lanes,): the same for all: they keep their size, as no distance is
+        returned. Returns its penalty is weight times total variation.
         """
         from tofclip.solvers import kernels
 
@@ -99,20 +78,14 @@ class NonnegativeLightFieldVariation:
 class LightFieldVariation(ProximalMethod):
     """Nonnegative light fields with sharp borders, their views alike (4D total variation;
     supplement Eq. 20).
-
-    Parameters
-    ----------
-    grid : (int, int)
-        Views down and across.
-    angular : float
-        How much a difference between neighbouring views counts beside one between neighbouring
-        pixels. Views differ by their parallax: 0.5 suits disparities of about a pixel, more suits
-        less.
     """
 
     weight: float = 1e-2
     iterations: int = 200
-    grid: tuple[int, int] = (1, 1)
+    grid: tuple[int, int] = (1, 1)  # views down and across
+    # how much a difference between neighbouring views counts beside one between neighbouring
+    # pixels. Views differ by their parallax: 0.5 suits disparities of about a pixel, more suits
+    # less
     angular: float = 0.5
     name = "light-field tv"
 

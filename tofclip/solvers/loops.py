@@ -43,23 +43,11 @@ class Loops(Protocol):
 
         ``z = current + momentum * (current - previous)``. `previous` may be overwritten.
 
-        Parameters
-        ----------
-        current, previous : (..., columns, frames) array
-            The last two solutions.
-        momentum : (frames,) array
-            Weight of the extrapolation, 0 after a restart.
-        gradient : (..., columns, frames) array
-            Of the data term at z; may be overwritten.
-        step : (frames,) array
-            Step sizes, of the pictures' dtype.
-        weight : float
-            Of the prior.
-
-        Returns
-        -------
-        result : (..., columns, frames) array
-        total, distance : (frames,) float64 array
+        `current, previous` (..., columns, frames): the last two solutions; `momentum` (frames,):
+        weight of the extrapolation, 0 after a restart; `gradient` (..., columns, frames): of the
+        data term at z; may be overwritten; `step` (frames,): step sizes, of the pictures' dtype;
+        `weight`: of the prior. Returns `result` (..., columns, frames); `total, distance`
+        (frames,).
         """
         ...
 
@@ -80,26 +68,12 @@ class Loops(Protocol):
         0`` (A. Chambolle, J. Math. Imaging Vis. 20, 89 (2004)), from `dual` on or from zero. z is as
         in `prox_l1`; all arrays may be overwritten but `current`.
 
-        Parameters
-        ----------
-        current, previous : (rows, columns, frames) array
-            The last two solutions.
-        momentum : (frames,) array
-        gradient : (rows, columns, frames) array
-            Of the data term at z.
-        step : (frames,) array
-            Step sizes, of the pictures' dtype.
-        weight : float
-            Of the total variation; 0 only clips at zero.
-        dual : (2, rows, columns, frames) array, optional
-            Where the sweep starts; None is zero.
-
-        Returns
-        -------
-        result : (rows, columns, frames) array
-        total : (frames,) float64 array
-            Isotropic total variation.
-        dual : (2, rows, columns, frames) array
+        `current, previous` (rows, columns, frames): the last two solutions; `momentum` (frames,);
+        `gradient` (rows, columns, frames): of the data term at z; `step` (frames,): step sizes, of
+        the pictures' dtype; `weight`: of the total variation; 0 only clips at zero; `dual` (2,
+        rows, columns, frames): where the sweep starts; None is zero. Returns `result` (rows,
+        columns, frames); `total` (frames,): isotropic total variation; `dual` (2, rows, columns,
+        frames).
         """
         ...
 
@@ -113,15 +87,7 @@ class Loops(Protocol):
 
         `values` may be overwritten.
 
-        Parameters
-        ----------
-        values : (..., frames) array
-        before : (..., frames) array
-        rejected : (frames,) bool array
-
-        Returns
-        -------
-        (..., frames) array
+        `values` (..., frames); `before` (..., frames); `rejected` (frames,). Returns (..., frames).
         """
         ...
 
@@ -388,15 +354,9 @@ temporaries.
 
 
 class Batches(Protocol):
-    """A batch of measurements, its results, and how they are cut up.
+    """A batch of measurements, its results, and how they are cut up."""
 
-    Attributes
-    ----------
-    frames : (frames, rows, columns) array
-        The results; where nothing was written yet, anything.
-    """
-
-    frames: Array
+    frames: Array  # (frames, rows, columns), the results; where nothing was written yet, anything
 
     def zero_measurements(self) -> Array:
         """Return measurements of zero, as few frames as a block may have."""
@@ -406,38 +366,24 @@ class Batches(Protocol):
         """Return the columns `piece` of (measurements, frames) values, perhaps with empty ones
         after them.
 
-        Parameters
-        ----------
-        values : (measurements, frames) array
-            Of the whole batch, or the mask that belongs to it.
-        piece : slice
-            Frames of the block.
-
-        Returns
-        -------
-        (measurements, frames of the block) array
-            May have more columns than the piece, zeros after the last frame.
+        `values` (measurements, frames): of the whole batch, or the mask that belongs to it;
+        `piece`: frames of the block. Returns (measurements, frames of the block): may have more
+        columns than the piece, zeros after the last frame.
         """
         ...
 
     def write_block(self, block: Array, piece: slice) -> None:
         """Put a (rows, columns, frames of the block) block where its frames belong.
 
-        Parameters
-        ----------
-        block : (rows, columns, frames of the block) array
-            Columns beyond the piece are left out.
-        piece : slice
-            Frames of `frames` that are overwritten.
+        `block` (rows, columns, frames of the block): columns beyond the piece are left out;
+        `piece`: frames of `frames` that are overwritten.
         """
         ...
 
     def leave_out(self, dark: NDArray[np.bool_]) -> None:
         """Make zero the frames that are dark; pieces count the others only.
 
-        Parameters
-        ----------
-        dark : (frames,) bool array
+        `dark` (frames,).
         """
         ...
 
@@ -450,17 +396,9 @@ def make_batches(operator: LinearOperator, measurements: Array) -> Batches:
     """Return how the columns of (measurements, frames) values are cut up for recovery with
     `operator`.
 
-    Parameters
-    ----------
-    operator : LinearOperator
-        Pictures (rows, columns) to measurements (measurements,); gives the shape and dtype of the
-        results.
-    measurements : (measurements, frames) array
-        Their library decides: compiled loops for NumPy, whole batches for others.
-
-    Returns
-    -------
-    Batches
+    `operator`: pictures (rows, columns) to measurements (measurements,); gives the shape and dtype
+    of the results; `measurements` (measurements, frames): their library decides: compiled loops for
+    NumPy, whole batches for others.
     """
     return (
         CompiledBatches(operator, measurements)
@@ -472,17 +410,9 @@ def make_batches(operator: LinearOperator, measurements: Array) -> Batches:
 def frames_per_block(operator: LinearOperator, measurements: Array) -> int:
     """Return how many frames a block has at most.
 
-    Parameters
-    ----------
-    operator : LinearOperator
-        Its ``shape_in`` and dtype give the memory of one frame.
-    measurements : (measurements, frames) array
-        Only their library counts.
-
-    Returns
-    -------
-    int
-        `LANES` for NumPy arrays; for others as many frames as `WORKING_BYTES` hold, at least one.
+    `operator`: its ``shape_in`` and dtype give the memory of one frame; `measurements`
+    (measurements, frames): only their library counts. Returns `LANES` for NumPy arrays; for others
+    as many frames as `WORKING_BYTES` hold, at least one.
     """
     if is_numpy(measurements):
         return LANES
@@ -599,16 +529,8 @@ def pad_block(values: NDArray[Any], chosen: NDArray[np.intp]) -> NDArray[Any]:
     """Copy the columns `chosen` into a block of exactly `LANES` columns, zero beyond them; a lone
     frame stays alone.
 
-    Parameters
-    ----------
-    values : (measurements, frames) array
-    chosen : (at most LANES,) int array
-        Numbers of the frames.
-
-    Returns
-    -------
-    (measurements, LANES) array
-        Of the same dtype; (measurements, 1) where there is a single frame.
+    `values` (measurements, frames); `chosen` (at most LANES,): numbers of the frames. Returns
+    (measurements, LANES): of the same dtype; (measurements, 1) where there is a single frame.
     """
     # always the same width: the compiled loops unroll it, and results do not depend on how many
     # frames share a block
@@ -620,14 +542,8 @@ def pad_block(values: NDArray[Any], chosen: NDArray[np.intp]) -> NDArray[Any]:
 def write_frames(block: NDArray[Any], frames: NDArray[Any], piece: slice) -> None:
     """Put a (rows, columns, lanes) block where its frames belong.
 
-    Parameters
-    ----------
-    block : (rows, columns, lanes) array
-        Contiguous.
-    frames : (frames, rows, columns) array
-        Overwritten in `piece`.
-    piece : slice
-        Lanes beyond it are left out.
+    `block` (rows, columns, lanes): contiguous; `frames` (frames, rows, columns): overwritten in
+    `piece`; `piece`: lanes beyond it are left out.
     """
     from tofclip.solvers.kernels import copy_lanes_to_frames
 

@@ -365,24 +365,9 @@ def validate_measurements(operator: LinearOperator, measurements: Array, valid: 
     """Return `measurements` contiguous and in the operator's type, refusing wrong shapes, NaN and
     infinity.
 
-    Parameters
-    ----------
-    operator : LinearOperator
-        Pictures (rows, columns) to measurements (measurements,).
-    measurements : (measurements, frames) array
-    valid : (measurements, frames) bool array or None
-
-    Returns
-    -------
-    (measurements, frames) array
-        Contiguous, of the operator's dtype.
-
-    Raises
-    ------
-    ShapeError
-        The measurements do not fit the operator, or the mask not the measurements.
-    InputError
-        A measurement is NaN or infinite.
+    `operator`: pictures (rows, columns) to measurements (measurements,); `measurements`
+    (measurements, frames); `valid` (measurements, frames). Returns (measurements, frames):
+    contiguous, of the operator's dtype.
     """
     xp = namespace(measurements) if valid is None else namespace(measurements, valid)
     if measurements.ndim != 2 or measurements.shape[:1] != operator.shape_out:

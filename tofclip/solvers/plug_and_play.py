@@ -158,20 +158,9 @@ def solve_data_step(
 
     The misfit's weights are those at `anchor` (one pass of iteratively reweighted least squares).
 
-    Parameters
-    ----------
-    operator : LinearOperator
-        Pictures (rows, columns) to measurements (measurements,).
-    misfit : DataTerm
-        Of a single frame.
-    anchor : (rows, columns) array
-    coupling : float
-    iterations : int
-        Of conjugate gradients; ten leave 1 % of the first gradient at the couplings in use.
-
-    Returns
-    -------
-    (rows, columns) array
+    `operator`: pictures (rows, columns) to measurements (measurements,); `misfit`: of a single
+    frame; `anchor` (rows, columns); `iterations`: of conjugate gradients; ten leave 1 % of the
+    first gradient at the couplings in use. Returns (rows, columns).
     """
     predicted = operator(anchor)[:, np.newaxis]
     weights = misfit.weights(predicted)[:, 0]

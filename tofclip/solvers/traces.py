@@ -33,12 +33,8 @@ def order_by_patch(image_shape: tuple[int, int]) -> NDArray[np.int64]:
 class InverseTraces:
     """A prepared inverse whose sparse part is applied to pixels in an order of their own.
 
-    Parameters
-    ----------
-    inverse : PreparedInverse
-        Of a sparse matrix in float32.
-    pixels : (n,) int array
-        Numbers of the pixels, counted in raster order; see `order_by_patch`.
+    `inverse`: of a sparse matrix in float32; `pixels` (n,): numbers of the pixels, counted in
+    raster order; see `order_by_patch`.
     """
 
     def __init__(self, inverse: PreparedInverse, pixels: NDArray[np.int64]) -> None:
@@ -61,15 +57,9 @@ class InverseTraces:
     def fill(self, weights: Array, piece: slice, traces: Array, frames: slice) -> None:
         """Write what the inverse makes of a shot at the pixels ``pixels[piece]``.
 
-        Parameters
-        ----------
-        weights : (used measurements, time and some) array
-            `PreparedInverse.weights` of the shot's measurements.
-        piece : slice
-        traces : (pixels of the piece, time) contiguous array
-            Its columns `frames` are overwritten.
-        frames : slice
-            Time bins; as many as the measurements have.
+        `weights` (used measurements, time and some): `PreparedInverse.weights` of the shot's
+        measurements; `traces` (pixels of the piece, time): its columns `frames` are overwritten;
+        `frames`: time bins; as many as the measurements have.
         """
         from tofclip.solvers.kernels import compute_traces
 

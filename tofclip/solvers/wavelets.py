@@ -21,14 +21,7 @@ class NonnegativeWavelets:
     solver's objective still falls. The approximation is not shrunk. One instance belongs to one
     block.
 
-    Parameters
-    ----------
-    weight : float
-        In the unit of ``A'f``.
-    wavelet : str
-        Name in PyWavelets.
-    seed : int
-        Of the shifts.
+    `weight`: in the unit of ``A'f``; `wavelet`: name in PyWavelets; `seed`: of the shifts.
     """
 
     zero_bound = 0.0
@@ -45,21 +38,10 @@ class NonnegativeWavelets:
     ) -> ProximalStep:
         """Shrink the wavelet details at `SHIFT_COUNT` shifts and average; see `Regulariser`.
 
-        Parameters
-        ----------
-        current : (rows, columns, lanes) array
-        previous : (rows, columns, lanes) array
-            Overwritten with the result.
-        momentum : (lanes,) array
-        gradient : (rows, columns, lanes) array
-            Overwritten.
-        step : (lanes,) array
-            The same for all: they keep their size, as no distance is returned.
-
-        Returns
-        -------
-        ProximalStep
-            `previous`, and the weight times its details' l1 norm, averaged over the shifts.
+        `current` (rows, columns, lanes); `previous` (rows, columns, lanes): overwritten with the
+        result; `momentum` (lanes,); `gradient` (rows, columns, lanes): overwritten; `step`
+        (lanes,): the same for all: they keep their size, as no distance is returned. Returns
+        `previous`, and the weight times its details' l1 norm, averaged over the shifts.
         """
         from tofclip.solvers.kernels import take_gradient_step
 

@@ -53,18 +53,11 @@ BOX_M = ((-0.8, 0.8), (-0.5, 0.5), (0.72, 1.32))
 
 @dataclass(frozen=True)
 class DemoRun:
-    """Everything that a demonstration made.
-
-    Parameters
-    ----------
-    capture : Capture
-    truth : HiddenTruth
-    images : mapping
-        By method; ``flat`` is the hybrid method for a wall without its depth.
-    """
+    """Everything that a demonstration made."""
 
     capture: Capture
     truth: HiddenTruth
+    # by method; ``flat`` is the hybrid method for a wall without its depth
     images: Mapping[str, MeasuredVolume]
 
 

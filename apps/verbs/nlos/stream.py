@@ -235,16 +235,8 @@ def _list_present(folder: Path) -> list[Path]:
 class _VolumeStream:
     """Captures imaged while others are read and written.
 
-    Parameters
-    ----------
-    coming : iterable of _NamedCapture
-    prepared : PreparedImaging
-        Of the first of them.
-    imaging : callable
-        From a capture to its volume.
-    out : Path
-    live : bool
-        Whether captures do not wait: then the oldest that waits is dropped.
+    `prepared`: of the first of them; `imaging`: from a capture to its volume; `live`: whether
+    captures do not wait: then the oldest that waits is dropped.
     """
 
     def __init__(

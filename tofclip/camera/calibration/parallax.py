@@ -122,14 +122,8 @@ def fit_parallax_to_shears(
 def _require_signal(strength: float, design: FloatArray, squares: float) -> None:
     """Refuse a strength that could as well be zero, and with it a sign and a focus at random.
 
-    Parameters
-    ----------
-    strength : float
-        Of the fit, px m.
-    design : (n, 2) array
-        Weighted; its first column is what the strength is multiplied with.
-    squares : float
-        Weighted sum of the squares that the fit leaves.
+    `strength`: of the fit, px m; `design` (n, 2): weighted; its first column is what the strength
+    is multiplied with; `squares`: weighted sum of the squares that the fit leaves.
     """
     used = design[np.any(design != 0, axis=1)]
     freedom = max(len(used) - 2, 1)  # two shears fit exactly, and say nothing about their errors

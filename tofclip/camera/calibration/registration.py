@@ -264,20 +264,9 @@ class _Evidence:
         A centre that has drifted far from its calibration is held back by a prior of
         `CENTRE_PRIOR_PX`.
 
-        Parameters
-        ----------
-        camera : Camera
-        view : int
-            Number of the view, from 0.
-        drift : float
-            How far the centre has moved from its calibration, px.
-        slope : (columns, frames) array
-            Of the measurements in time, a row.
-
-        Returns
-        -------
-        (4,) float64 array
-            Offset in rows, stretch, relative gain and centre in px.
+        `view`: number of the view, from 0; `drift`: how far the centre has moved from its
+        calibration, px; `slope` (columns, frames): of the measurements in time, a row. Returns
+        (4,): offset in rows, stretch, relative gain and centre in px.
         """
         operators = _make_operators(_select_view(camera, view), self.groups)
         predicted = _predict(operators, self.pictures, self.groups)

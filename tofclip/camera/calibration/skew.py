@@ -85,22 +85,8 @@ def estimate_skew(counts: NDArray[np.float32], camera: Camera) -> SkewEstimate:
 def sum_view_energies(counts: NDArray[np.float32], camera: Camera) -> FloatArray:
     """Sum of each row over each view's part of the slit, above the dark level; (views, rows).
 
-    Parameters
-    ----------
-    counts : (rows, columns) float32 array
-        Raw streak image.
-    camera : Camera
-        Centres of the views, px.
-
-    Returns
-    -------
-    (views, rows) float64 array
-        Counts above the dark level.
-
-    Raises
-    ------
-    CalibrationError
-        The image is not as wide as the camera's slit.
+    `counts` (rows, columns): raw streak image; `camera`: centres of the views, px. Returns (views,
+    rows): counts above the dark level.
     """
     require_width(counts, camera)
     # Without its dark level, which would swamp the correlation with a constant.

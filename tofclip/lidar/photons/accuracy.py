@@ -117,19 +117,9 @@ def draw_histograms(
 ) -> FloatArray:
     """Draw histograms with one return each, (n, bins).
 
-    Parameters
-    ----------
-    detector : PhotonDetector
-    arrival : (n,) array
-        Instants of the returns, s; the middle of the first bin is 0.
-    photons, background : float
-        Expected photons of a return, and of the background in each bin.
-    noise : numpy.random.Generator
-
-    Returns
-    -------
-    (n, bins) float64 array
-        Photons.
+    `arrival` (n,): instants of the returns, s; the middle of the first bin is 0; `photons,
+    background`: expected photons of a return, and of the background in each bin. Returns (n, bins):
+    photons.
     """
     shape = detector.shape
     share = shape(detector.times - arrival[:, np.newaxis]) * detector.bin_width / shape.area

@@ -97,17 +97,8 @@ def learn_background(histograms: FloatArray, width: float) -> FloatArray | None:
 def segment_counts(counts: FloatArray) -> FloatArray:
     """Return the mean of each block of bins that do not differ.
 
-    Parameters
-    ----------
-    counts : (bins,) array
-        Poisson distributed.
+    `counts` (bins,): Poisson distributed. Returns (bins,).
 
-    Returns
-    -------
-    (bins,) float64 array
-
-    Notes
-    -----
     J. D. Scargle and others, Astrophys. J. 764, 167 (2013): the most likely piecewise constant
     course, by dynamic programming. Memory and time grow with the square of the bins.
     """
@@ -135,14 +126,7 @@ def segment_counts(counts: FloatArray) -> FloatArray:
 def find_clumps(counts: FloatArray) -> NDArray[np.bool_]:
     """Say in which windows the photons of a pixel vary more than a Poisson law allows.
 
-    Parameters
-    ----------
-    counts : (n, windows) array
-        Photons of each histogram.
-
-    Returns
-    -------
-    (windows,) bool array
+    `counts` (n, windows): photons of each histogram. Returns (windows,).
     """
     whole = counts.sum(axis=1, keepdims=True)
     share = counts.sum(axis=0) / max(float(whole.sum()), 1.0)
@@ -161,14 +145,7 @@ def find_lower_mean(counts: FloatArray) -> float:
     Numbers of a return's photons are taken as geometrically distributed, so that returns of any
     strength find room; fraction and mean of either part are those of the largest likelihood.
 
-    Parameters
-    ----------
-    counts : (n,) array
-        Photons of a window.
-
-    Returns
-    -------
-    float
+    `counts` (n,): photons of a window.
     """
     # What is far beyond the usual is no background, and a list as long as its photons takes hours.
     limit = 4 * float(np.median(counts)) + MAX_USUAL_COUNT
@@ -203,19 +180,9 @@ def find_lower_mean(counts: FloatArray) -> float:
 def remove_bumps(level: FloatArray, counts: FloatArray, width: float) -> FloatArray:
     """Take off what a surface at the same distance in all pixels brings.
 
-    Parameters
-    ----------
-    level : (bins,) array
-        Counts, smoothed.
-    counts : (bins,) array
-        Of all pixels.
-    width : float
-        Full width at half maximum of the pulse, bins.
-
-    Returns
-    -------
-    (bins,) float64 array
-        `level`, with a straight line in place of each bump.
+    `level` (bins,): counts, smoothed; `counts` (bins,): of all pixels; `width`: full width at half
+    maximum of the pulse, bins. Returns (bins,): `level`, with a straight line in place of each
+    bump.
     """
     smooth = level.copy()
     for ratio in BUMP_WIDTHS:

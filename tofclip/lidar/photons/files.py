@@ -77,22 +77,12 @@ PhotonReader = Callable[[Path], "PhotonFile"]
 
 @dataclass(frozen=True)
 class ArrayEntry:
-    """An array in a file that has not been read yet.
-
-    Parameters
-    ----------
-    name : str
-    shape : tuple of int
-    type : str
-        Of its values; ``cell`` for lists of different length.
-    load : callable
-        Reads the values.
-    """
+    """An array in a file that has not been read yet."""
 
     name: str
     shape: tuple[int, ...]
-    type: str
-    load: Callable[[], NDArray[Any]]
+    type: str  # of its values; ``cell`` for lists of different length
+    load: Callable[[], NDArray[Any]]  # reads the values
 
     @property
     def length(self) -> tuple[int, ...]:
@@ -102,22 +92,12 @@ class ArrayEntry:
 
 @dataclass(frozen=True)
 class PhotonFile:
-    """What a file says it holds.
-
-    Parameters
-    ----------
-    arrays : sequence of ArrayEntry
-    bin_width : float or None
-        Duration of a bin, s, where the file says it.
-    axes : str
-        Order of the axes of a cube where the format says it.
-    image_shape : (int, int) or None
-        Rows and columns of the picture of events where the format says them.
-    """
+    """What a file says it holds."""
 
     arrays: Sequence[ArrayEntry]
-    bin_width: float | None = None
-    axes: str = ""
+    bin_width: float | None = None  # duration of a bin, s, where the file says it
+    axes: str = ""  # order of the axes of a cube where the format says it
+    # rows and columns of the picture of events where the format says them
     image_shape: tuple[int, int] | None = None
 
 
@@ -126,32 +106,10 @@ def read_photons(
 ) -> PhotonImage:
     """Read the photons that every pixel of a picture counted.
 
-    Parameters
-    ----------
-    path : path-like
-        ``.npy``; ``.npz``; ``.mat`` (version 5 and 7.3); HDF5; multi-page TIFF; ``.ptu`` and
-        ``.sdt`` images. A cube of counts with axes in any order, a cell array with the photon times
-        of each pixel, or one-dimensional arrays x, y and time.
-    bin_width : float, optional
-        Duration of a bin, or unit of the photon times, s; overrides the file's own.
-    axes : str, optional
-        Order of a cube's axes, such as ``"yxt"`` or ``"txy"``; by default that is time along which
-        light is most concentrated and which is longest; `PhotonImage.axes` says how surely.
-
-    Returns
-    -------
-    PhotonImage
-
-    Raises
-    ------
-    StorageError
-        The file is absent or may not be read.
-    FileFormatError
-        It is damaged, claims more than it can hold, or has no suitable layout.
-    InputError
-        The bin width or the order of the axes is neither given nor recognised.
-    MissingDependencyError
-        The library for its format is not installed.
+    `path`: ``.npy``; ``.npz``; ``.mat`` (version 5 and 7.3);; `bin_width`: duration of a bin, or
+    unit of the photon times, s; overrides the file's own; `axes`: order of a cube's axes, such as
+    ``"yxt"`` or ``"txy"``; by default that is time along which light is most concentrated and which
+    is longest; `PhotonImage.axes` says how surely.
     """
     source = Path(path)
     if axes is not None and sorted(axes) != ["t", "x", "y"]:
@@ -169,17 +127,7 @@ def read_photons(
 
 
 def describe_photons(path: str | Path) -> dict[str, Any]:
-    """Return what a file of photons holds, without reading its values.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Raises
-    ------
-    StorageError, FileFormatError
-        See `read_photons`.
-    """
+    """Return what a file of photons holds, without reading its values."""
     opened = open_photons(Path(path))
     axes = opened.axes
     try:
@@ -294,21 +242,8 @@ def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | N
 def recognise_axes(cube: NDArray[Any], path: Path) -> tuple[str, float]:
     """Say which axis of a cube is time: light is concentrated along it, and it is long.
 
-    Parameters
-    ----------
-    cube : three-dimensional array
-    path : Path
-        For the message.
-
-    Returns
-    -------
-    str, float
-        ``tyx``, ``ytx`` or ``yxt``, and by what factor it is ahead of the next axis.
-
-    Raises
-    ------
-    InputError
-        Neither says so, or one says otherwise than the other.
+    `path`: for the message. Returns ``tyx``, ``ytx`` or ``yxt``, and by what factor it is ahead of
+    the next axis.
     """
     step = math.ceil((cube.size / MAX_LOOKED_AT) ** (1 / 3))
     light, score = np.empty(3), np.empty(3)

@@ -53,19 +53,9 @@ def weigh_evidence(
 ) -> FloatArray:
     """Log-likelihood ratio of each pixel's held-back photons: this surface against any instant.
 
-    Parameters
-    ----------
-    test, train : PhotonImage
-        The photons held back, and those that found the surface.
-    scene : Scene
-    surface : (rows, columns) array
-        In bins.
-    signal_pool : int
-        Side of the square of pixels, in pixels, whose share of signal photons is taken as one.
-
-    Returns
-    -------
-    (pixels,) array
+    `test, train`: the photons held back, and those that found the surface; `surface` (rows,
+    columns): in bins; `signal_pool`: side of the square of pixels, in pixels, whose share of signal
+    photons is taken as one. Returns (pixels,).
     """
     from tofclip.lidar.photons import surface_kernels as kernels
 
@@ -105,18 +95,8 @@ def judge_surface(
 ) -> float:
     """Mean log-likelihood of the photons that were held back; see `weigh_evidence`.
 
-    Parameters
-    ----------
-    test, train : PhotonImage
-        Photons held back, and those that the surface was found from.
-    scene : Scene
-    surface : (rows, columns) float64 array
-        Instants, bins.
-
-    Returns
-    -------
-    float
-        Nats per photon.
+    `test, train`: photons held back, and those that the surface was found from; `surface` (rows,
+    columns): instants, bins. Returns nats per photon.
     """
     return float(weigh_evidence(test, train, scene, surface).mean())
 
@@ -126,20 +106,9 @@ def learn_scene(
 ) -> BinnedResponse | None:
     """Learn the response from the photons held back, around the surface that the others found.
 
-    Parameters
-    ----------
-    train, test : PhotonImage
-    scene : Scene
-        With the response that is known so far.
-    surface : (rows, columns) array
-        In bins.
-    required : bool
-        There is no other response to stay with.
-
-    Returns
-    -------
-    BinnedResponse or None
-        None if the response known so far explains the photons as well.
+    `scene`: with the response that is known so far; `surface` (rows, columns): in bins; `required`:
+    there is no other response to stay with. Returns none if the response known so far explains the
+    photons as well.
     """
     fitted = fit_surface(train, scene, surface, RESPONSE_REACH_PX)[..., 0]
     before = weigh_evidence(test, train, scene, fitted)
@@ -158,17 +127,7 @@ def choose_reach(
 ) -> tuple[int, FloatArray]:
     """Find the reach of the planes that explains the photons held back best.
 
-    Parameters
-    ----------
-    train, test : PhotonImage
-    scene : Scene
-    surface : (rows, columns) array
-        In bins.
-
-    Returns
-    -------
-    int, (rows, columns) array
-        Pixels, and the surface that it gives.
+    `surface` (rows, columns): in bins. Returns pixels, and the surface that it gives.
     """
     best, chosen, highest = REACHES_PX[0], surface, -np.inf
     rounds = PLANE_ROUNDS
@@ -198,19 +157,8 @@ def calibrate_outliers(
     and the number of rivals are the most likely ones given the photons held back, in which right
     and wrong pixels are mixed.
 
-    Parameters
-    ----------
-    test, train : PhotonImage
-    scene : Scene
-    surface : (rows, columns) array
-        In bins.
-    margin : (rows, columns) array
-        By how much the label of each pixel beat the others.
-
-    Returns
-    -------
-    callable
-        Turns margins into probabilities.
+    `surface` (rows, columns): in bins; `margin` (rows, columns): by how much the label of each
+    pixel beat the others. Returns turns margins into probabilities.
     """
     # Noise of the assumed share of signal makes surfaces look surer than they are: it is taken from
     # as large a neighbourhood as explains the photons best.

@@ -33,29 +33,17 @@ NEIGHBOUR_BINS = 2
 
 @dataclass(frozen=True)
 class BinTable:
-    """Photons in the bins that are not empty.
+    """Photons in the bins that are not empty."""
 
-    Parameters
-    ----------
-    place : (n,) int64 array
-        Pixel times the number of bins, plus the bin; ascending.
-    count : (n,) float64 array
-    bins : int
-        Bins of the time axis.
-    """
-
-    place: NDArray[np.int64]
-    count: FloatArray
-    bins: int
+    place: NDArray[np.int64]  # (n,), pixel times the number of bins, plus the bin; ascending
+    count: FloatArray  # (n,)
+    bins: int  # bins of the time axis
 
     @classmethod
     def from_pixels(cls, photons: PhotonImage, chosen: NDArray[np.bool_]) -> BinTable:
         """Count the photons of some pixels.
 
-        Parameters
-        ----------
-        photons : PhotonImage
-        chosen : (pixels,) bool array
+        `chosen` (pixels,).
         """
         some = chosen[photons.pixel]
         whole = np.clip(np.rint(photons.bin[some]).astype(np.int64), 0, photons.bins - 1)
@@ -86,13 +74,7 @@ class BinTable:
 def find_hot_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
     """Say which pixels have one bin far beyond what the others count.
 
-    Parameters
-    ----------
-    photons : PhotonImage
-
-    Returns
-    -------
-    (rows, columns) bool array
+    Returns (rows, columns).
     """
     hot = np.zeros(photons.image_shape, np.bool_)
     total = photons.photons_per_pixel.ravel()
@@ -131,19 +113,7 @@ def find_hot_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
 def leave_out_pixels(photons: PhotonImage, pixels: NDArray[np.bool_]) -> PhotonImage:
     """Return the photons of the other pixels.
 
-    Parameters
-    ----------
-    photons : PhotonImage
-    pixels : (rows, columns) bool array
-
-    Returns
-    -------
-    PhotonImage
-
-    Raises
-    ------
-    InputError
-        No other pixel counted a photon.
+    `pixels` (rows, columns).
     """
     if not pixels.any():
         return photons

@@ -30,21 +30,9 @@ def find_best_score(counts, weights, shade, first):
     ``score[j] = sum_w weights[shade[j + first + w], w] * counts[j + first + w]``; photons are few,
     so each one adds to the bins it concerns. A photon where the background is bright says less.
 
-    Parameters
-    ----------
-    counts : (bins,) array
-        Photons.
-    weights : (shades, width) float array
-        Of the log-matched filter, for each brightness of the background.
-    shade : (bins,) int array
-        Row of `weights` for each bin.
-    first : int
-        Bin of the first weight, counted from the return's.
-
-    Returns
-    -------
-    best score : float
-    bin : int
+    `counts` (bins,): photons; `weights` (shades, width): of the log-matched filter, for each
+    brightness of the background; `shade` (bins,): row of `weights` for each bin; `first`: bin of
+    the first weight, counted from the return's.
     """
     score = np.zeros(counts.size)
     for i in range(counts.size):
@@ -62,14 +50,8 @@ def find_best_score(counts, weights, shade, first):
 def find_best_scores(histograms, weights, shade, first, best):
     """Fill `best` with the largest response of each histogram.
 
-    Parameters
-    ----------
-    histograms : (n, bins) array
-        Photons.
-    weights, shade, first
-        As for `find_best_score`.
-    best : (n,) float64 array
-        Overwritten.
+    `histograms` (n, bins): photons; `weights, shade, first`: as for `find_best_score`; `best` (n,):
+    overwritten.
     """
     table = spread_filter(weights, shade)
     score = np.zeros(shade.size)
@@ -81,10 +63,7 @@ def find_best_scores(histograms, weights, shade, first, best):
 def spread_filter(weights, shade):
     """Weights that each bin has in the filter, (width, bins): as `compute_best_score` takes them.
 
-    Parameters
-    ----------
-    weights, shade
-        As for `find_best_score`.
+    `weights, shade`: as for `find_best_score`.
     """
     table = np.empty((weights.shape[1], shade.size))
     for w in range(weights.shape[1]):
@@ -100,20 +79,8 @@ def compute_best_score(counts, table, first, score):
     Taking all bins at a time, one weight after the other, needs neither a question about each bin
     nor a search for what it reaches.
 
-    Parameters
-    ----------
-    counts : (bins,) array
-        Photons.
-    table : (width, bins) float array
-        From `spread_filter`.
-    first : int
-        Bin of the first weight, counted from the return's.
-    score : (bins,) float array
-        Overwritten.
-
-    Returns
-    -------
-    float
+    `counts` (bins,): photons; `table` (width, bins): from `spread_filter`; `first`: bin of the
+    first weight, counted from the return's; `score` (bins,): overwritten.
     """
     score[:] = 0
     for w in range(table.shape[0]):
@@ -138,17 +105,9 @@ def simulate_best_scores(photons, arrived, noise, weights, shade, first, best):
     """Fill `best` with the best scores of histograms over which `photons` are thrown by a random
     generator as the background is distributed.
 
-    Parameters
-    ----------
-    photons : int
-        In each histogram.
-    arrived : (bins,) float64 array
-        Fraction of the background up to the end of each bin; the last is 1.
-    noise : numpy.random.Generator
-    weights, shade, first
-        As for `find_best_score`.
-    best : (trials,) float64 array
-        Overwritten.
+    `photons`: in each histogram; `arrived` (bins,): fraction of the background up to the end of
+    each bin; the last is 1; `weights, shade, first`: as for `find_best_score`; `best` (trials,):
+    overwritten.
     """
     bins = arrived.size
     counts, score, table = np.zeros(bins), np.zeros(bins), spread_filter(weights, shade)
@@ -172,26 +131,12 @@ def extract_strongest_returns(
     """Find the strongest return of each histogram and take its bins out, for the next one to be
     sought in the rest.
 
-    Parameters
-    ----------
-    rest : (n, bins) float64 array, changed
-        Photons that belong to no return yet.
-    free : (n,) float64 array, changed
-        Background of the bins that belong to no return yet, relative to that of a usual bin.
-    dither : (n,) array
-        Added to the scores, to decide ties.
-    level : (n,) int64 array
-        Row of the table for each histogram; negative: nothing is sought.
-    table : (levels,), (levels, shades, width) arrays
-        Threshold and filter weights.
-    background : (bins,) float64 array, (bins,) int array
-        Relative brightness of each bin, and its row of the filter.
-    first : int
-        Bin of the first weight relative to the return's.
-    scale, times
-        As in `tofclip.lidar.pulse_fit`.
-    peaks : (n, most returns) int64 array, changed
-    numbers : (n,) int64 array, changed
+    `rest` (n, bins): photons that belong to no return yet; `free` (n,): background of the bins that
+    belong to no return yet, relative to that of a usual bin; `dither` (n,): added to the scores, to
+    decide ties; `level` (n,): row of the table for each histogram; negative: nothing is sought;
+    `table` (levels,): threshold and filter weights; `background` (bins,): relative brightness of
+    each bin, and its row of the filter; `first`: bin of the first weight relative to the return's;
+    `scale, times`: as in `tofclip.lidar.pulse_fit`; `peaks` (n, most returns); `numbers` (n,).
     """
     (thresholds, weights), (relative, shade) = table, background
     for row in range(rest.shape[0]):
@@ -213,24 +158,12 @@ def fit_histograms(
 ):
     """Refine the returns of each histogram to the likelihood's maximum.
 
-    Parameters
-    ----------
-    histograms : (n, bins) float64 array
-        Photons counted.
-    arrived : (n, bins) float64 array
-        Photons with pile-up corrected.
-    live : (n, bins) float64 array
-        Fraction of the cycles in which the detector was ready.
-    cycles : float
-    peaks, numbers
-        As `extract_strongest_returns` left them.
-    relative : (bins,) float64 array
-        Background of each bin, relative to that of a usual one.
-    curve, scale, times
-        As in `tofclip.lidar.pulse_fit`.
-    found : (n, most returns, 3) float64 array
-        Overwritten with arrival, photons and standard deviation of the arrival where there is a
-        return.
+    `histograms` (n, bins): photons counted; `arrived` (n, bins): photons with pile-up corrected;
+    `live` (n, bins): fraction of the cycles in which the detector was ready; `peaks, numbers`: as
+    `extract_strongest_returns` left them; `relative` (bins,): background of each bin, relative to
+    that of a usual one; `curve, scale, times`: as in `tofclip.lidar.pulse_fit`; `found` (n, most
+    returns, 3): overwritten with arrival, photons and standard deviation of the arrival where there
+    is a return.
     """
     estimate = np.empty((peaks.shape[1], 5))
     for row in range(histograms.shape[0]):
@@ -272,23 +205,9 @@ def fit_histograms(
 def estimate_background(trace, relative, times, peaks, scale):
     """Background photons of a usual bin, from the bins that no return reaches.
 
-    Parameters
-    ----------
-    trace : (bins,) array
-        Photons.
-    relative : (bins,) array
-        Background of each bin, relative to that of a usual one.
-    times : (bins,) array
-        Seconds, increasing.
-    peaks : sequence of int
-        Bins of the returns.
-    scale : (4,) array or tuple
-        The pulse's; see `tofclip.lidar.pulse_fit`.
-
-    Returns
-    -------
-    float
-        Photons per bin, above zero.
+    `trace` (bins,): photons; `relative` (bins,): background of each bin, relative to that of a
+    usual one; `times` (bins,): seconds, increasing; `peaks`: bins of the returns; `scale` (4,): the
+    pulse's; see `tofclip.lidar.pulse_fit`. Returns photons per bin, above zero.
     """
     free = np.ones(trace.size, np.bool_)
     for peak in peaks:
@@ -307,25 +226,10 @@ def estimate_background(trace, relative, times, peaks, scale):
 def estimate_height(trace, times, background, curve, scale, peak):
     """Height of a return from the photons around its bin; never less than half a photon's.
 
-    Parameters
-    ----------
-    trace : (bins,) array
-        Photons.
-    times : (bins,) array
-        Seconds, increasing.
-    background : (bins,) array
-        Photons per bin.
-    curve : (samples, 2) array
-        Pulse and slope.
-    scale : (4,) array or tuple
-        The pulse's; see `tofclip.lidar.pulse_fit`.
-    peak : int
-        Bin of the return.
-
-    Returns
-    -------
-    float
-        Photons per bin at the pulse's peak.
+    `trace` (bins,): photons; `times` (bins,): seconds, increasing; `background` (bins,): photons
+    per bin; `curve` (samples, 2): pulse and slope; `scale` (4,): the pulse's; see
+    `tofclip.lidar.pulse_fit`; `peak`: bin of the return. Returns photons per bin at the pulse's
+    peak.
     """
     arrival = times[peak]
     first, last = find_pulse_window(times, (peak, peak), arrival, scale)
@@ -340,27 +244,12 @@ def estimate_height(trace, times, background, curve, scale, peak):
 def summarise_return(trace, times, background, curve, scale, estimate, k, variance, found):
     """Write arrival, photons and the arrival's Cramer-Rao deviation at the estimate to `found`.
 
-    Parameters
-    ----------
-    trace : (bins,) array
-        Photons.
-    times : (bins,) array
-        Seconds, increasing.
-    background : (bins,) array
-        Photons per bin.
-    curve : (samples, 2) array
-        Pulse and slope.
-    scale : (4,) array or tuple
-        The pulse's; see `tofclip.lidar.pulse_fit`.
-    estimate : (returns, 5) array
-        See `tofclip.lidar.pulse_fit.refine_returns`.
-    k : int
-        Number of the return.
-    variance : ((bins,) array, float)
-        See `tofclip.lidar.pulse_fit.get_variance`.
-    found : (3,) float array
-        Overwritten: arrival in seconds, photons, standard deviation in seconds (infinite where the
-        fit says nothing).
+    `trace` (bins,): photons; `times` (bins,): seconds, increasing; `background` (bins,): photons
+    per bin; `curve` (samples, 2): pulse and slope; `scale` (4,): the pulse's; see
+    `tofclip.lidar.pulse_fit`; `estimate` (returns, 5): see
+    `tofclip.lidar.pulse_fit.refine_returns`; `k`: number of the return; `variance`: see
+    `tofclip.lidar.pulse_fit.get_variance`; `found` (3,): overwritten: arrival in seconds, photons,
+    standard deviation in seconds (infinite where the fit says nothing).
     """
     arrival, height = estimate[k, 0], estimate[k, 1]
     first, last = find_pulse_window(
@@ -387,16 +276,8 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, varian
 def compute_scores(histograms, weights, first, score):
     """Fill `score` with the log-matched filter's response of each histogram at each bin.
 
-    Parameters
-    ----------
-    histograms : (n, bins) array
-        Photons.
-    weights : (width,) float array
-        Of the filter.
-    first : int
-        Bin of the first weight, counted from the return's.
-    score : (n, bins) float array
-        Overwritten.
+    `histograms` (n, bins): photons; `weights` (width,): of the filter; `first`: bin of the first
+    weight, counted from the return's; `score` (n, bins): overwritten.
     """
     score[:] = 0
     for row in range(histograms.shape[0]):
@@ -416,13 +297,8 @@ def add_path_scores(score, slope_cost, jump_cost, total):
     `slope_cost`, or by any number at `jump_cost`: the recursion of semi-global matching. `score`
     and `total` are (steps, lanes, bins).
 
-    Parameters
-    ----------
-    score : (steps, lanes, bins) array
-    slope_cost, jump_cost : float
-        In the score's unit, nats.
-    total : (steps, lanes, bins) array
-        Added to, in place.
+    `score` (steps, lanes, bins); `slope_cost, jump_cost`: in the score's unit, nats; `total`
+    (steps, lanes, bins): added to, in place.
     """
     path, before = np.empty(score.shape[2]), np.empty(score.shape[2])
     for lane in range(score.shape[1]):
@@ -447,17 +323,10 @@ def pool_neighbours(counts, label, reach, apart, pooled, contributors):
     """Sum each pixel's histogram with those of neighbours on the same surface, moved to the pixel's
     own bin.
 
-    Parameters
-    ----------
-    counts : (rows, columns, bins) float64 array
-    label : (rows, columns) int64 array
-        Bin of the return.
-    reach : int
-        Neighbours up to this number of pixels away.
-    apart : int
-        Neighbours whose bins differ by more for each pixel of distance lie on another surface.
-    pooled : (rows, columns, bins) float64 array, overwritten
-    contributors : (rows, columns) int64 array, overwritten
+    `counts` (rows, columns, bins); `label` (rows, columns): bin of the return; `reach`: neighbours
+    up to this number of pixels away; `apart`: neighbours whose bins differ by more for each pixel
+    of distance lie on another surface; `pooled` (rows, columns, bins); `contributors` (rows,
+    columns).
     """
     rows, columns, bins = counts.shape
     pooled[:] = 0

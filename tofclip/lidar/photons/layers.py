@@ -26,16 +26,7 @@ nine pixels around it."""
 def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> PhotonImage:
     """Leave out the photons that a surface explains better than the background does.
 
-    Parameters
-    ----------
-    photons : PhotonImage
-    scene : Scene
-    layer : (rows, columns, 4) array
-        See `SurfacePlan.locate`.
-
-    Returns
-    -------
-    PhotonImage
+    `layer` (rows, columns, 4): see `SurfacePlan.locate`.
     """
     response = scene.response
     times = response.start + response.step * np.arange(response.density.size)
@@ -49,18 +40,9 @@ def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> Phot
 def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> FloatArray:
     """Drop a further surface where the background alone would explain its photons.
 
-    Parameters
-    ----------
-    photons : PhotonImage
-        Those that no nearer surface explains.
-    scene : Scene
-    layer : (rows, columns, 4) array
-        See `SurfacePlan.locate`.
-
-    Returns
-    -------
-    (rows, columns, 4) float64 array
-        NaN where the surface does not stand out of the background.
+    `photons`: those that no nearer surface explains; `layer` (rows, columns, 4): see
+    `SurfacePlan.locate`. Returns (rows, columns, 4): naN where the surface does not stand out of
+    the background.
     """
     reach = 0.5 * scene.response.width + 1
     late = photons.bin - layer[..., 0].ravel()[photons.pixel]
@@ -89,21 +71,9 @@ def combine_layers(
 ) -> SurfaceImage:
     """Turn the returns found one after the other into images, each pixel's strongest first.
 
-    Parameters
-    ----------
-    layers : list of (rows, columns, 4) arrays
-        See `SurfacePlan.locate`.
-    max_returns : int
-        Of these the strongest in each pixel are returned.
-    scene : Scene
-    to_range : float
-        Metres in a bin.
-    settings : mapping
-
-    Returns
-    -------
-    SurfaceImage
-        The strongest layer of each pixel, the others in ``further``.
+    `layers`: see `SurfacePlan.locate`; `max_returns`: of these the strongest in each pixel are
+    returned; `to_range`: metres in a bin. Returns the strongest layer of each pixel, the others in
+    ``further``.
     """
     stack = np.stack(layers, axis=2)
     order = np.argsort(-np.nan_to_num(stack[..., 2], nan=-1.0), axis=2, kind="stable")

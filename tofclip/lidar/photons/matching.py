@@ -40,21 +40,11 @@ PIXELS_PER_BLOCK = 1 << 14
 
 @dataclass(frozen=True)
 class LabelAxis:
-    """The instants on which a surface is looked for.
+    """The instants on which a surface is looked for."""
 
-    Parameters
-    ----------
-    coarse : int
-        Bins of a coarse one.
-    numbers : (labels,) int64 array
-        Coarse bins that are labels.
-    coarse_bins : int
-        Coarse bins of the whole axis.
-    """
-
-    coarse: int
-    numbers: NDArray[np.int64]
-    coarse_bins: int
+    coarse: int  # bins of a coarse one
+    numbers: NDArray[np.int64]  # (labels,), coarse bins that are labels
+    coarse_bins: int  # coarse bins of the whole axis
 
     def number_events(self, photons: PhotonImage) -> NDArray[np.int64]:
         """Return the coarse bin of each event."""
@@ -73,17 +63,7 @@ class LabelAxis:
 
 
 def choose_label_axis(photons: PhotonImage, scene: Scene) -> LabelAxis:
-    """Cut the time axis into labels and leave out those at which nothing comes back anywhere.
-
-    Parameters
-    ----------
-    photons : PhotonImage
-    scene : Scene
-
-    Returns
-    -------
-    LabelAxis
-    """
+    """Cut the time axis into labels and leave out those at which nothing comes back anywhere."""
     pixels = photons.offsets.size - 1
     coarse = max(1, round(scene.response.width / LABELS_PER_WIDTH))
     while True:
@@ -110,17 +90,8 @@ def find_occupied_bins(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> N
     """Coarse bins at which some tile of the picture is brighter than the background, and those
     around.
 
-    Parameters
-    ----------
-    photons : PhotonImage
-    scene : Scene
-        Response and background, photons per pixel and bin.
-    axis : LabelAxis
-        The coarse time axis.
-
-    Returns
-    -------
-    (coarse_bins,) bool array
+    `scene`: response and background, photons per pixel and bin; `axis`: the coarse time axis.
+    Returns (coarse_bins,).
     """
     columns = photons.image_shape[1]
     y, x = np.divmod(photons.pixel, columns)
@@ -145,15 +116,7 @@ def find_occupied_bins(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> N
 def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArray[np.float32]:
     """Log-likelihood ratio of a surface at each label against none, (pixels, labels).
 
-    Parameters
-    ----------
-    photons : PhotonImage
-    scene : Scene
-    axis : LabelAxis
-
-    Returns
-    -------
-    (pixels, labels) float32 array
+    Returns (pixels, labels).
     """
     from tofclip.lidar.photons import surface_kernels as kernels
 
@@ -183,17 +146,9 @@ def match_labels(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Find the labels of the most likely piecewise smooth surface.
 
-    Parameters
-    ----------
-    score : (pixels, labels) float32 array
-    image_shape : (int, int)
-    slope_cost : float
-        For a change by one label; others cost `JUMP_COST_RATIO` times as much.
-
-    Returns
-    -------
-    (rows, columns) int64 array, (rows, columns) float32 array
-        Labels, and by how much each beats the next best that is not beside it.
+    `score` (pixels, labels); `slope_cost`: for a change by one label; others cost `JUMP_COST_RATIO`
+    times as much. Returns (rows, columns): labels, and by how much each beats the next best that is
+    not beside it.
     """
     from tofclip.lidar.photons import surface_kernels as kernels
 

@@ -57,20 +57,8 @@ def count_live_cycles(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Count the cycles in which the detector was ready, bin by bin.
 
-    Parameters
-    ----------
-    counts, cycles, dead_bins
-        As for `correct_pile_up`.
-
-    Returns
-    -------
-    counts, live : (..., bins) float64 array
-        Photons counted, and cycles that no photon before had blinded.
-
-    Raises
-    ------
-    InputError
-        As for `correct_pile_up`.
+    `counts, cycles, dead_bins`: as for `correct_pile_up`. Returns `counts, live` (..., bins):
+    photons counted, and cycles that no photon before had blinded.
     """
     seen = np.asarray(counts, dtype=np.float64)
     if cycles < 1 or not np.all(np.isfinite(seen) & (seen >= 0)):

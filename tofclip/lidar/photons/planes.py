@@ -36,21 +36,9 @@ def fit_surface(
 ) -> FloatArray:
     """Move a surface to the likelihood's maximum, plane by plane.
 
-    Parameters
-    ----------
-    photons : PhotonImage
-    scene : Scene
-    surface : (rows, columns) array
-        Instants to start from, in bins.
-    reach : int
-        Pixels up to this far away share a plane.
-    rounds : int
-        Steps of Fisher scoring.
-
-    Returns
-    -------
-    (rows, columns, 3) array
-        See `surface_kernels.fit_planes`.
+    `surface` (rows, columns): instants to start from, in bins; `reach`: pixels up to this far away
+    share a plane; `rounds`: steps of Fisher scoring. Returns (rows, columns, 3): see
+    `surface_kernels.fit_planes`.
     """
     now = np.array(surface, dtype=np.float64)
     brightness = np.full(now.size, scene.count_signal(photons))
@@ -113,19 +101,9 @@ def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int, width: flo
     Two estimates of which one uses a part of the other's photons differ by the difference of their
     variances if neither is biased; what they differ by beyond that is bias.
 
-    Parameters
-    ----------
-    fitted, nested : (rows, columns, 3) array
-        Fits of `reach` and of half of it; see `fit_surface`.
-    reach : int
-        In pixels.
-    width : float
-        Full width of the response, bins. Where a fit is less sure than that, nothing is known.
-
-    Returns
-    -------
-    (rows, columns) float64 array
-        Bins squared.
+    `fitted, nested` (rows, columns, 3): fits of `reach` and of half of it; see `fit_surface`;
+    `reach`: in pixels; `width`: full width of the response, bins. Where a fit is less sure than
+    that, nothing is known. Returns (rows, columns): bins squared.
     """
     apart = (fitted[..., 0] - nested[..., 0]) ** 2
     wide, narrow = fitted[..., 1] ** 2, nested[..., 1] ** 2

@@ -46,32 +46,16 @@ DENSITY_FLOOR = 1e-4
 
 @dataclass(frozen=True)
 class BinnedResponse:
-    """Density of a signal photon's time around its surface, as bins show it.
+    """Density of a signal photon's time around its surface, as bins show it."""
 
-    Parameters
-    ----------
-    pulse : Pulse
-        Shape of a return, bins included.
-    bin_width : float
-        s.
-    """
-
-    pulse: Pulse
-    bin_width: float
+    pulse: Pulse  # shape of a return, bins included
+    bin_width: float  # s
 
     @classmethod
     def from_pulse(cls, pulse: Pulse, bin_width: float) -> BinnedResponse:
         """Spread a pulse over the bins in which it is counted.
 
-        Parameters
-        ----------
-        pulse : Pulse
-        bin_width : float
-            Seconds.
-
-        Returns
-        -------
-        BinnedResponse
+        `bin_width`: seconds.
         """
         return cls(pulse.integrate_bins(bin_width), bin_width)
 
@@ -106,16 +90,8 @@ class BinnedResponse:
     def coarse_shares(self, coarse: int) -> tuple[FloatArray, int]:
         """Share of the photons in each coarse bin around the one that holds the surface.
 
-        Parameters
-        ----------
-        coarse : int
-            Bins in a coarse one.
-
-        Returns
-        -------
-        (n,) array, int
-            The shares, and the number of the first coarse bin relative to the surface's. The
-            surface may lie anywhere in its coarse bin.
+        `coarse`: bins in a coarse one. Returns (n,): the shares, and the number of the first coarse
+        bin relative to the surface's. The surface may lie anywhere in its coarse bin.
         """
         times = self.start + self.step * np.arange(self.density.size)
         # The surface may lie anywhere in its coarse bin: eight places, in the middles of eighths.
@@ -158,19 +134,7 @@ def require_plausible_pulse(photons: PhotonImage, pulse: Pulse) -> None:
 def measure_pulse_width(photons: PhotonImage) -> float:
     """Estimate the full width at half maximum of the response from pairs of photons.
 
-    Parameters
-    ----------
-    photons : PhotonImage
-
-    Returns
-    -------
-    float
-        s; that of the Gaussian whose autocorrelation falls to half as soon.
-
-    Raises
-    ------
-    InputError
-        The pairs of photons of a pixel are not closer than chance makes them.
+    Returns s; that of the Gaussian whose autocorrelation falls to half as soon.
     """
     from tofclip.lidar.photons.surface_kernels import sum_pair_lags
 
@@ -206,26 +170,10 @@ def learn_response(
 ) -> tuple[Pulse, float]:
     """Estimate the shape of the response from the times of photons after their surface.
 
-    Parameters
-    ----------
-    residual_bins : (photons,) array
-        Time after the surface, which other photons found, in bins.
-    count : (photons,) array
-    width : float
-        Rough full width at half maximum, in bins.
-    bin_width : float
-        s.
-
-    Returns
-    -------
-    Pulse, float
-        The response, whose arrival is its highest point, and by how many bins later this is than
-        the arrival was before.
-
-    Raises
-    ------
-    InputError
-        There is no light around the surface.
+    `residual_bins` (photons,): time after the surface, which other photons found, in bins; `count`
+    (photons,); `width`: rough full width at half maximum, in bins; `bin_width`: s. Returns the
+    response, whose arrival is its highest point, and by how many bins later this is than the
+    arrival was before.
     """
     step = width / SAMPLES_PER_WIDTH
     first, last = (round(edge * SAMPLES_PER_WIDTH) for edge in EXTENT_WIDTHS)

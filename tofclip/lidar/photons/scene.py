@@ -19,17 +19,10 @@ MIN_BACKGROUND_PHOTONS = 1.0
 
 @dataclass(frozen=True)
 class Scene:
-    """What a picture's photons are taken to be made of.
-
-    Parameters
-    ----------
-    response : BinnedResponse
-    background : float
-        Photons of a pixel in a bin.
-    """
+    """What a picture's photons are taken to be made of."""
 
     response: BinnedResponse
-    background: float
+    background: float  # photons of a pixel in a bin
 
     def scale(self, fraction: float) -> Scene:
         """Return what remains with a fraction of the photons."""
@@ -42,12 +35,7 @@ class Scene:
 
 
 def estimate_background(photons: PhotonImage) -> float:
-    """Background photons of a pixel in a bin: what most instants have, surfaces being at few.
-
-    Parameters
-    ----------
-    photons : PhotonImage
-    """
+    """Background photons of a pixel in a bin: what most instants have, surfaces being at few."""
     groups = min(BACKGROUND_GROUPS, photons.bins)
     edges = np.linspace(0, photons.bins, groups + 1).astype(np.int64)
     level = np.add.reduceat(photons.time_profile, edges[:-1]) / np.diff(edges)

@@ -97,18 +97,8 @@ def find_surface(
     Semi-global matching along the four directions of rows and columns (H. Hirschmueller, IEEE TPAMI
     30, 328, 2008).
 
-    Parameters
-    ----------
-    detector : PhotonDetector
-        Gives the filter's weights.
-    cube : (rows, columns, bins) float64 array
-        Photons.
-    smoothness : Smoothness
-        Costs of a slope and of a jump.
-
-    Returns
-    -------
-    (rows, columns) int64 array
+    `detector`: gives the filter's weights; `cube` (rows, columns, bins): photons; `smoothness`:
+    costs of a slope and of a jump. Returns (rows, columns).
     """
     from tofclip.lidar.photons.kernels import add_path_scores, compute_scores
 

@@ -170,40 +170,19 @@ def estimate_surface(
 
 @dataclass(frozen=True)
 class SurfacePlan:
-    """How the surface of a picture's photons is located, all choices made.
-
-    Parameters
-    ----------
-    axis : LabelAxis
-    slope_cost : float
-        See `match_labels`.
-    reach : int
-        See `fit_surface`.
-    systematic : float
-        Standard deviation that no photons reduce, in bins.
-    to_probability : callable
-        See `calibrate_outliers`.
-    """
+    """How the surface of a picture's photons is located, all choices made."""
 
     axis: LabelAxis
-    slope_cost: float
-    reach: int
-    systematic: float
-    to_probability: Callable[[NDArray[np.float32]], FloatArray]
+    slope_cost: float  # see `match_labels`
+    reach: int  # see `fit_surface`
+    systematic: float  # standard deviation that no photons reduce, in bins
+    to_probability: Callable[[NDArray[np.float32]], FloatArray]  # see `calibrate_outliers`
 
     def locate(self, photons: PhotonImage, scene: Scene) -> FloatArray:
         """Find the strongest surface: (rows, columns, 4) array of instant and deviation in bins,
         photons, and probability of an outlier.
 
-        Parameters
-        ----------
-        photons : PhotonImage
-        scene : Scene
-            Response and background.
-
-        Returns
-        -------
-        (rows, columns, 4) float64 array
+        `scene`: response and background. Returns (rows, columns, 4).
         """
         volume = compute_scores(photons, scene, self.axis)
         labels, margin = match_labels(volume, photons.image_shape, self.slope_cost)

@@ -27,18 +27,10 @@ SLOPE_RIDGE_FRACTION = 1e-3
 def score_labels(offsets, coarse_bin, count, place, weights, first, score):
     """Log-likelihood ratio of a surface at each label against none: the log-matched filter.
 
-    Parameters
-    ----------
-    offsets : (pixels + 1,) int64 array
-    coarse_bin : (events,) int64 array
-        Coarse bin of each event.
-    count : (events,) float32 array
-    place : (coarse bins,) int64 array
-        Label of each coarse bin, or -1 where no surface is looked for.
-    weights : (width,) float32 array
-        Log-likelihood ratio of a photon ``first + w`` coarse bins after the surface.
-    first : int
-    score : (pixels, labels) float32 array, overwritten
+    `offsets` (pixels + 1,); `coarse_bin` (events,): coarse bin of each event; `count` (events,);
+    `place` (coarse bins,): label of each coarse bin, or -1 where no surface is looked for;
+    `weights` (width,): log-likelihood ratio of a photon ``first + w`` coarse bins after the
+    surface; `score` (pixels, labels).
     """
     for pixel in range(score.shape[0]):
         own = score[pixel]
@@ -54,14 +46,7 @@ def score_labels(offsets, coarse_bin, count, place, weights, first, score):
 def find_highest(values):
     """Largest of the values: four at a time, as one after the other each waits for the one before.
 
-    Parameters
-    ----------
-    values : (n,) float32 array
-        At least one.
-
-    Returns
-    -------
-    float32
+    `values` (n,): at least one.
     """
     first = second = third = fourth = values[0]
     whole = values.size - values.size % 8
@@ -83,24 +68,9 @@ def extend_path(score, before, highest, slope_cost, jump_cost, path, total):
     highest``; Hirschmueller, IEEE Trans. Pattern Anal. 30, 328 (2008), Eq. 13, with likelihoods
     where he has costs. `path` is overwritten and added to `total`.
 
-    Parameters
-    ----------
-    score : (labels,) float32 array
-        Log-likelihood of each label at this pixel.
-    before : (labels,) float32 array
-        The path at the pixel before.
-    highest : float32
-        Its highest score.
-    slope_cost, jump_cost : float32
-        Nats.
-    path : (labels,) float32 array
-        Overwritten.
-    total : (labels,) float32 array
-        Added to, in place.
-
-    Returns
-    -------
-    float32
+    `score` (labels,): log-likelihood of each label at this pixel; `before` (labels,): the path at
+    the pixel before; `highest`: its highest score; `slope_cost, jump_cost`: nats; `path` (labels,):
+    overwritten; `total` (labels,): added to, in place.
     """
     last = score.size - 1
     floor = highest - jump_cost
@@ -124,12 +94,8 @@ def add_path_scores(score, slope_cost, jump_cost, total):
 
     Called again with both picture axes reversed it adds the other four directions.
 
-    Parameters
-    ----------
-    score : (rows, columns, labels) float32 array
-    slope_cost, jump_cost : float32
-        For a change of the label by one, and by any number.
-    total : (rows, columns, labels) float32 array, changed
+    `score` (rows, columns, labels); `slope_cost, jump_cost`: for a change of the label by one, and
+    by any number; `total` (rows, columns, labels).
     """
     rows, columns, labels = score.shape
     above, here = (
@@ -164,14 +130,8 @@ def add_path_scores(score, slope_cost, jump_cost, total):
 def find_best_labels(score, total, extra_paths, apart, label, margin):
     """Best label of each pixel, and by how much it beats every label further than `apart` away.
 
-    Parameters
-    ----------
-    score, total : (pixels, labels) float32 array
-    extra_paths : float32
-        How often the paths counted a pixel's own score too often.
-    apart : int
-    label : (pixels,) int64 array, overwritten
-    margin : (pixels,) float32 array, overwritten
+    `score, total` (pixels, labels); `extra_paths`: how often the paths counted a pixel's own score
+    too often; `label` (pixels,); `margin` (pixels,).
     """
     for pixel in range(score.shape[0]):
         best, highest = 0, np.float32(-np.inf)
@@ -192,21 +152,11 @@ def find_best_labels(score, total, extra_paths, apart, label, margin):
 def measure_events(offsets, bin_time, count, surface, table, start, step, brightness, sums):
     """What the photons of each pixel say about moving its surface.
 
-    Parameters
-    ----------
-    offsets : (pixels + 1,) int64 array
-    bin_time, count : (events,) float32 array
-    surface : (pixels,) float64 array
-        Instant of the surface.
-    table : (n, 2) float64 array
-        Of the response, sampled from `start` by `step`: minus the slope of its logarithm, and its
-        density over that of the background for one photon of signal.
-    start, step : float
-        Bins.
-    brightness : (pixels,) float64 array
-        Expected photons of the signal.
-    sums : (pixels, 3) float64 array, overwritten
-        Slope of the log-likelihood with the instant, its Fisher information, photons of the signal.
+    `offsets` (pixels + 1,); `bin_time, count` (events,); `surface` (pixels,): instant of the
+    surface; `table` (n, 2): of the response, sampled from `start` by `step`: minus the slope of its
+    logarithm, and its density over that of the background for one photon of signal; `start, step`:
+    bins; `brightness` (pixels,): expected photons of the signal; `sums` (pixels, 3): slope of the
+    log-likelihood with the instant, its Fisher information, photons of the signal.
     """
     for pixel in range(surface.size):
         slope = information = photons = 0.0
@@ -234,21 +184,11 @@ def fit_planes(surface, sums, reach, gate, slopes, rows, fitted):
     Around the present surface the log-likelihood of every pixel is a parabola, so that a plane's
     is a weighted least-squares fit (one step of Fisher scoring).
 
-    Parameters
-    ----------
-    surface : (rows, columns) float64 array
-    sums : (rows, columns, 3) float64 array
-        See `measure_events`.
-    reach : int
-        Radius of the neighbourhood in pixels; 0: every pixel alone.
-    gate : float
-        A neighbour further off the present plane lies on another surface.
-    slopes : (rows, columns, 2) float64 array, changed
-        Of the plane, per column and per row.
-    rows : (int, int)
-        First row and the one after the last.
-    fitted : (rows, columns, 3) float64 array, overwritten in these rows
-        Instant, its standard deviation, and the mean photons of a neighbour.
+    `surface` (rows, columns); `sums` (rows, columns, 3): see `measure_events`; `reach`: radius of
+    the neighbourhood in pixels; 0: every pixel alone; `gate`: A neighbour further off the present
+    plane lies on another surface; `slopes` (rows, columns, 2): of the plane, per column and per
+    row; `rows`: first row and the one after the last; `fitted` (rows, columns, 3): instant, its
+    standard deviation, and the mean photons of a neighbour.
     """
     height, width = surface.shape
     # of the rows of a disc
@@ -314,16 +254,8 @@ def fit_planes(surface, sums, reach, gate, slopes, rows, fitted):
 def sum_pair_lags(offsets, bin_time, count, lags):
     """Add to `lags` the histogram of the time between any two photons of a pixel, in whole bins.
 
-    Parameters
-    ----------
-    offsets : (pixels + 1,) int array
-        Where each pixel's events begin.
-    bin_time : (events,) array
-        Bins.
-    count : (events,) array
-        Photons of each event.
-    lags : (lags,) float64 array
-        Added to, in place.
+    `offsets` (pixels + 1,): where each pixel's events begin; `bin_time` (events,): bins; `count`
+    (events,): photons of each event; `lags` (lags,): added to, in place.
     """
     for pixel in range(offsets.size - 1):
         for one in range(offsets[pixel], offsets[pixel + 1]):
@@ -339,18 +271,10 @@ def sum_pair_lags(offsets, bin_time, count, lags):
 def sum_evidence(offsets, bin_time, count, surface, density, start, step, signal, evidence):
     """Log-likelihood ratio of the photons of each pixel: its surface against light at any instant.
 
-    Parameters
-    ----------
-    offsets, bin_time, count, surface
-        As for `measure_events`.
-    density : (n,) float64 array
-        Density of the response over that of light spread over the whole axis, sampled from `start`
-        by `step`.
-    start, step : float
-        Bins.
-    signal : (pixels,) float64 array
-        Share of the pixel's photons that are signal.
-    evidence : (pixels,) float64 array, overwritten
+    `offsets, bin_time, count, surface`: as for `measure_events`; `density` (n,): density of the
+    response over that of light spread over the whole axis, sampled from `start` by `step`; `start,
+    step`: bins; `signal` (pixels,): share of the pixel's photons that are signal; `evidence`
+    (pixels,).
     """
     for pixel in range(surface.size):
         total = 0.0

@@ -72,23 +72,10 @@ MIN_PULSE_BINS = 2.0  # anything shorter falls between the samples
 class ReturnSearch:
     """What stays the same from shot to shot in the search for returns.
 
-    Parameters
-    ----------
-    camera : Camera
-    times : (time,) array
-        Time of flight of each frame, s, increasing.
-    detection : Detection, optional
-        What counts as a return.
-    pulse : Pulse, optional
-        Shape of a single return; by default a Gaussian as wide as ``camera.pulse_fwhm``. Two
-        returns of similar strength are separated from 1.3 widths on.
-    shears : (time,) array, optional
-        Shear at which each frame is recovered, pixels per view step; 0 by default.
-
-    Raises
-    ------
-    InputError
-        Fewer than three frames.
+    `times` (time,): time of flight of each frame, s, increasing; `detection`: what counts as a
+    return; `pulse`: shape of a single return; by default a Gaussian as wide as
+    ``camera.pulse_fwhm``. Two returns of similar strength are separated from 1.3 widths on;
+    `shears` (time,): shear at which each frame is recovered, pixels per view step; 0 by default.
     """
 
     def __init__(
@@ -117,20 +104,9 @@ class ReturnSearch:
     ) -> Returns:
         """Find the returns in the traces of all pixels.
 
-        Parameters
-        ----------
-        traces : Traces or ArrayTraces
-        provenance : mapping, optional
-            How they came about.
-        judge : SignificanceJudge, optional
-            Decides which candidates count; by default the fractions of `Detection`.
+        `provenance`: how they came about; `judge`: decides which candidates count; by default the
+        fractions of `Detection`.
 
-        Returns
-        -------
-        tofclip.lidar.Returns
-
-        Notes
-        -----
         Memory: 256 KiB of traces a thread, and 100 bytes a pixel.
         """
         # the compiler takes as long to import as all else
@@ -235,16 +211,8 @@ class ReturnSearch:
     ) -> NDArray[np.float32]:
         """Response of the matched filter below which no candidate can become a return.
 
-        Parameters
-        ----------
-        pixel, time, signal : (n,) array
-            What was found in some of the pixels. Those of all pixels are brighter or as bright, so
-            that nothing is lost.
-        bins : TraceBins
-
-        Returns
-        -------
-        (bins,) float32 array
+        `pixel, time, signal` (n,): what was found in some of the pixels. Those of all pixels are
+        brighter or as bright, so that nothing is lost. Returns (bins,).
         """
         at = self.times[bins.numbers]
         if pixel.size == 0:

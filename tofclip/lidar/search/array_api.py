@@ -30,12 +30,7 @@ WORKING_ARRAYS = 8
 
 
 class ArrayTraces:
-    """Traces of a transient cube in an array of any library.
-
-    Parameters
-    ----------
-    frames : Frames
-    """
+    """Traces of a transient cube in an array of any library."""
 
     def __init__(self, frames: Frames) -> None:
         self.values = namespace(frames.values).reshape(
@@ -49,14 +44,7 @@ class ArraySearch:
     Peaks and fits are found step for step as there; only what was found, a few numbers for each
     return, is fetched. Memory on the device: 1 GiB beside the frames.
 
-    Parameters
-    ----------
-    times : (bins,) array
-        s, increasing.
-    filters : two (width, bins) arrays
-        See `PeakSearch`.
-    pulse : Pulse
-    detection : Detection
+    `times` (bins,): s, increasing; `filters`: see `PeakSearch`.
     """
 
     def __init__(
@@ -72,9 +60,7 @@ class ArraySearch:
         """Return pixel number, instant, counts and deviation of every candidate, in raster and time
         order.
 
-        Parameters
-        ----------
-        traces : (bins, pixels) float32 array
+        `traces` (bins, pixels).
         """
         bins, pixels = traces.shape
         at_once = max(1, WORKING_BYTES // (WORKING_ARRAYS * bins * np.dtype(np.float32).itemsize))

@@ -28,30 +28,19 @@ from tofclip.lidar.search.array_peaks import Peaks
 class FitState:
     """Returns of some pixels while they are fitted; a list entry for each return, each a (pixels,)
     float64 array.
-
-    Parameters
-    ----------
-    traces : (bins, pixels) array
-    background : (pixels,) array
-    arrival, height, step_bins : lists of arrays
-        s; counts; and by how many bins the return moved last.
     """
 
-    traces: Array
-    background: Array
-    arrival: list[Array]
-    height: list[Array]
-    step_bins: list[Array]
+    traces: Array  # (bins, pixels)
+    background: Array  # (pixels,)
+    arrival: list[Array]  # s; counts; and by how many bins the return moved last
+    height: list[Array]  # s; counts; and by how many bins the return moved last
+    step_bins: list[Array]  # s; counts; and by how many bins the return moved last
 
 
 class PulseFitter:
     """Gauss-Newton steps on one return at a time, for all pixels at once.
 
-    Parameters
-    ----------
-    times : (bins,) array
-        s, increasing.
-    pulse : Pulse
+    `times` (bins,): s, increasing.
     """
 
     def __init__(self, times: NDArray[np.float64], pulse: Pulse) -> None:
@@ -70,15 +59,7 @@ class PulseFitter:
         """Return arrivals and heights that fit (bins, pixels) traces best, from those of the peaks
         on.
 
-        Parameters
-        ----------
-        traces : (bins, pixels) array
-        peaks : Peaks
-            Where the fit starts.
-
-        Returns
-        -------
-        FitState
+        `traces` (bins, pixels); `peaks`: where the fit starts.
         """
         xp = namespace(traces)
         rows = range(peaks.valid.shape[0])
@@ -105,18 +86,8 @@ class PulseFitter:
         It has to lie on the time axis and to respond, height times root of the pulse's energy, by
         more than `least`.
 
-        Parameters
-        ----------
-        fit : FitState
-        noise : (pixels,) array
-            Standard deviation of a bin.
-        least : (pixels,) array
-            Response that a return must exceed.
-
-        Returns
-        -------
-        list of (proven, sum, deviation)
-            (pixels,) arrays for each return; seconds.
+        `noise` (pixels,): standard deviation of a bin; `least` (pixels,): response that a return
+        must exceed. Returns (pixels,) arrays for each return; seconds.
         """
         xp, times = namespace(noise), self._times.get(noise)
         reported = []

@@ -33,25 +33,13 @@ Filters = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class Peaks:
-    """Peaks that might count, in the order of time.
+    """Peaks that might count, in the order of time."""
 
-    Parameters
-    ----------
-    arrival : (most returns, pixels) array
-        Instants, to a fraction of a bin, s.
-    height : (most returns, pixels) array
-        Of the trace at the bin, above the background.
-    valid : (most returns, pixels) bool array
-        Which of them there are.
-    background, noise : (pixels,) arrays
-        Mean and standard deviation of the bins that no peak claims.
-    """
-
-    arrival: Array
-    height: Array
-    valid: Array
-    background: Array
-    noise: Array
+    arrival: Array  # (most returns, pixels), instants, to a fraction of a bin, s
+    height: Array  # (most returns, pixels), of the trace at the bin, above the background
+    valid: Array  # (most returns, pixels), which of them there are
+    background: Array  # (pixels,), mean and standard deviation of the bins that no peak claims
+    noise: Array  # (pixels,), mean and standard deviation of the bins that no peak claims
 
     def select(self, pixels: Array) -> Peaks:
         """Return the peaks of some pixels, by their numbers."""
@@ -88,16 +76,7 @@ class BackgroundLevel:
         """Return the level of the `chosen` pixels less those of some values that were `free`,
         (bins, pixels) both.
 
-        Parameters
-        ----------
-        values : (bins, pixels) array
-            Less the offset.
-        free : (bins, pixels) bool array
-        chosen : (pixels,) bool array
-
-        Returns
-        -------
-        BackgroundLevel
+        `values` (bins, pixels): less the offset; `free` (bins, pixels); `chosen` (pixels,).
         """
         xp = namespace(values)
         values, counted = values * xp.astype(free, values.dtype), xp.astype(free, xp.float64)
@@ -114,16 +93,9 @@ class BackgroundLevel:
 class PeakSearch:
     """Filters and distances that stay the same from shot to shot.
 
-    Parameters
-    ----------
-    times : (bins,) array
-        s, increasing.
-    filters : two (width, bins) arrays
-        The sharp filter that shows candidates and the matched one that judges them, of unit energy,
-        nowhere negative: row w holds the weight of bin ``j + w - width // 2`` for a return at bin
-        j.
-    pulse : Pulse
-    detection : Detection
+    `times` (bins,): s, increasing; `filters`: the sharp filter that shows candidates and the
+    matched one that judges them, of unit energy, nowhere negative: row w holds the weight of bin
+    ``j + w - width // 2`` for a return at bin j.
     """
 
     def __init__(

@@ -76,74 +76,33 @@ def find_candidates(
     Peaks of a trace are taken as `take_strongest_peaks` says, judged as `confirm_peaks` says, and
     cut out as far as the table of the pulse reaches, while the trace is at hand.
 
-    Parameters
-    ----------
-    traces : (n, bins) float32 array
-        With memory for another trace after the last one.
-    pixels : (n,) int64 array
-        Number of the pixel to which each trace belongs.
-    times : (bins,) array
-        Seconds, increasing.
-    bin_weights : (bins,) float32 array
-        For how many bins each one stands where background and noise are concerned.
-    sharp : (width, bins) float32 array
-        Entry w holds the weight of bin ``j + w - width // 2`` for a return at bin j.
-    runs, edges : (some,) int64 arrays
-        First bins of the vectors, an even number of them, and single bins, in which that filter is
-        applied.
-    words : (some,) int64 array
-        First bins of the words in which maxima are sought.
-    of_interest : (bins + WORD_BINS,) float32 array
-        By how much scores of interest exceed that of the background.
-    least : (bins,) float32 array
-        Response that a return at each bin must exceed to be of interest; weaker peaks are kept only
-        where such a return overlaps them. 0 where nothing is known.
-    matched : (bins, width) float32 array
-        A filter for each bin, of unit energy and nowhere negative.
-    starts : (bins,) int64 array
-        First bin that each of them takes.
-    sums : (bins,) array
-        Over each of them.
-    gains : (3,) floats
-        Of the sharp filter and of the matched one: largest sums; and the first again for the
-        background's score, or 0 where nothing is known of what is of interest.
-    windows : (bins, 4) int64 array
-        See `tofclip.lidar.search.windows.list_windows`.
-    limits : (5,) floats
-        Reach of two pulses, s, smallest signal-to-noise, smallest fraction of the
-        strongest return, with the fall-off with range undone, the last instant at which a return
-        may lie, s, and the lowest response of interest.
-    even : (bins,) bool array
-        See `tofclip.lidar.search.phase_table.PhaseTable.find_even_bins`.
-    half : int
-        See `PhaseTable`.
-    score : (1 + bins + WORD_BINS + 1,) float32 array
-        Zero where the sharp filter is not applied; overwritten elsewhere. One bin late.
-    places : (4, bins) int32 array
-        Overwritten.
-    responses : (bins,) float32 array
-        Overwritten.
-    free : (bins,) float32 array
-        As `bin_weights`, before and afterwards.
-    peaks : (returns, 2) array
-        Overwritten.
-    moments : (n, 2) array
-        Overwritten: background and noise.
-    candidates : (n * returns, CANDIDATE_COLUMNS) array
-        Overwritten; those of one trace side by side, in the order of time.
-    rests : (n * returns, width) float32 array
-        Overwritten: trace less background in the bins of the table around each peak; zero in those
-        that fill up its width.
-    counts : (all pixels,) int64 array
-        Overwritten where `pixels` says: 0, or `NEEDS_EXACT_FIT` where a candidate's bins are not all
-        there.
-    lone, crowded : (n * returns,) int64 array
-        Overwritten: numbers of candidates.
-
-    Returns
-    -------
-    int, int, int
-        How many candidates there are, and how many of them stand alone and do not.
+    `traces` (n, bins): with memory for another trace after the last one; `pixels` (n,): number of
+    the pixel to which each trace belongs; `times` (bins,): seconds, increasing; `bin_weights`
+    (bins,): for how many bins each one stands where background and noise are concerned; `sharp`
+    (width, bins): entry w holds the weight of bin ``j + w - width // 2`` for a return at bin j;
+    `runs, edges` (some,): first bins of the vectors, an even number of them, and single bins, in
+    which that filter is applied; `words` (some,): first bins of the words in which maxima are
+    sought; `of_interest` (bins + WORD_BINS,): by how much scores of interest exceed that of the
+    background; `least` (bins,): response that a return at each bin must exceed to be of interest;
+    weaker peaks are kept only where such a return overlaps them. 0 where nothing is known;
+    `matched` (bins, width): A filter for each bin, of unit energy and nowhere negative; `starts`
+    (bins,): first bin that each of them takes; `sums` (bins,): over each of them; `gains` (3,): of
+    the sharp filter and of the matched one: largest sums; and the first again for the background's
+    score, or 0 where nothing is known of what is of interest; `windows` (bins, 4): see
+    `tofclip.lidar.search.windows.list_windows`; `limits` (5,): reach of two pulses, s, smallest
+    signal-to-noise, smallest fraction of the strongest return, with the fall-off with range undone,
+    the last instant at which a return may lie, s, and the lowest response of interest; `even`
+    (bins,): see `tofclip.lidar.search.phase_table.PhaseTable.find_even_bins`; `half`: see
+    `PhaseTable`; `score` (1 + bins + WORD_BINS + 1,): zero where the sharp filter is not applied;
+    overwritten elsewhere. One bin late; `places` (4, bins): overwritten; `responses` (bins,):
+    overwritten; `free` (bins,): as `bin_weights`, before and afterwards; `peaks` (returns, 2):
+    overwritten; `moments` (n, 2): overwritten: background and noise; `candidates` (n * returns,
+    CANDIDATE_COLUMNS): overwritten; those of one trace side by side, in the order of time; `rests`
+    (n * returns, width): overwritten: trace less background in the bins of the table around each
+    peak; zero in those that fill up its width; `counts` (all pixels,): overwritten where `pixels`
+    says: 0, or `NEEDS_EXACT_FIT` where a candidate's bins are not all there; `lone, crowded` (n *
+    returns,): overwritten: numbers of candidates. Returns how many candidates there are, and how
+    many of them stand alone and do not.
     """
     listed = alone = others = 0
     all_bins = np.float32(0)
@@ -209,15 +168,8 @@ def find_candidates(
 def cut_out(trace, background, start, held, rest):
     """Cut bins out of a trace, less its background.
 
-    Parameters
-    ----------
-    trace : (bins,) float32 array
-        With memory behind its last bin.
-    background : float
-    start, held : int
-        First bin, and how many.
-    rest : (width,) float32 array
-        Overwritten, behind those bins with zero.
+    `trace` (bins,): with memory behind its last bin; `start, held`: first bin, and how many; `rest`
+    (width,): overwritten, behind those bins with zero.
     """
     zero, level, lanes = (
         fill_vector(np.float32(0)),
@@ -234,17 +186,7 @@ def cut_out(trace, background, start, held, rest):
 def is_near(candidates, k, other, half):
     """Whether two candidates are of the same trace and may share bins.
 
-    Parameters
-    ----------
-    candidates : (n, CANDIDATE_COLUMNS) array
-    k, other : int
-        The later one last.
-    half : int
-        See `PhaseTable`.
-
-    Returns
-    -------
-    bool
+    `candidates` (n, CANDIDATE_COLUMNS); `k, other`: the later one last; `half`: see `PhaseTable`.
     """
     apart = candidates[other, PEAK_BIN] - candidates[k, PEAK_BIN]
     return candidates[other, TRACE] == candidates[k, TRACE] and apart < 2 * half + 1
@@ -256,24 +198,10 @@ def confirm_peaks(
 ):
     """List the peaks of a trace that the matched filter confirms, placed below a bin.
 
-    Parameters
-    ----------
-    trace : (bins,) float32 array
-    times, matched, starts, sums, limits, least
-        As for `find_candidates`.
-    known : (float, float, int)
-        Background and noise, and place of the trace among those searched together.
-    peaks : (n, 2) array
-        Of `take_strongest_peaks`.
-    candidates : (room, CANDIDATE_COLUMNS) array
-        Overwritten from `listed` on.
-    listed : int
-        How many there are.
-
-    Returns
-    -------
-    int
-        How many there are now.
+    `trace` (bins,); `times, matched, starts, sums, limits, least`: as for `find_candidates`;
+    `known`: background and noise, and place of the trace among those searched together; `peaks` (n,
+    2): of `take_strongest_peaks`; `candidates` (room, CANDIDATE_COLUMNS): overwritten from `listed`
+    on; `listed`: how many there are. Returns how many there are now.
     """
     background, noise, place = known
     needed = 0.0
@@ -310,19 +238,8 @@ def confirm_peaks(
 def is_wanted(times, reach, least, peaks, k):
     """Whether a return of interest lies at a peak, or overlaps it.
 
-    Parameters
-    ----------
-    times, least
-        As for `find_candidates`.
-    reach : float
-        Of two pulses, s.
-    peaks : (n, 2) array
-        Of `take_strongest_peaks`.
-    k : int
-
-    Returns
-    -------
-    bool
+    `times, least`: as for `find_candidates`; `reach`: of two pulses, s; `peaks` (n, 2): of
+    `take_strongest_peaks`.
     """
     best = np.uintp(peaks[k, 0])
     wanted = peaks[k, 1] >= least[best]
@@ -338,16 +255,9 @@ def is_wanted(times, reach, least, peaks, k):
 def interpolate_peak(before, here, after):
     """Where between three neighbours a response is highest: by a parabola in its logarithm.
 
-    Parameters
-    ----------
-    before, here, after : float
-        Responses, the highest in the middle.
-
-    Returns
-    -------
-    float
-        After the middle, as a part of the distance between the outer two; 0 where these are not
-        above zero or one of them is higher.
+    `before, here, after`: responses, the highest in the middle. Returns after the middle, as a part
+    of the distance between the outer two; 0 where these are not above zero or one of them is
+    higher.
     """
     rise = fall = 0.0
     if before > 0 and after > 0 and here >= before and here >= after:

@@ -40,34 +40,16 @@ def fit_returns_exactly(
 ):
     """Fit and measure the returns of the traces that the table does not do.
 
-    Parameters
-    ----------
-    traces : (n, bins) float32 array
-    pixels : (n,) int64 array
-        Number of the pixel to which each trace belongs.
-    times : (bins,) array
-        Seconds, increasing.
-    moments : (n, 2) array
-        Mean and standard deviation of the bins without a return.
-    least : float
-        Standard deviations that a return's response must exceed.
-    windows : (bins, 4) int64 array
-        See `tofclip.lidar.search.windows.list_windows`.
-    candidates : (room, CANDIDATE_COLUMNS) array
-        Those of one trace side by side; see `tofclip.lidar.search.candidates`.
-    listed : int
-        How many.
-    pulse : (curve, scale)
-        See `tofclip.lidar.pulse_fit`.
-    estimates : (most returns, 5) array
-        Overwritten.
-    profile : (bins, 3) array
-        Overwritten.
-    found : (all pixels, most returns, 3) array
-        Overwritten where `counts` is `NEEDS_EXACT_FIT`: instant, s, sum of the fitted pulse over
-        the bins, standard deviation of the instant, s; nearest first.
-    counts : (all pixels,) int64 array
-        Number of returns of each pixel.
+    `traces` (n, bins); `pixels` (n,): number of the pixel to which each trace belongs; `times`
+    (bins,): seconds, increasing; `moments` (n, 2): mean and standard deviation of the bins without
+    a return; `least`: standard deviations that a return's response must exceed; `windows` (bins,
+    4): see `tofclip.lidar.search.windows.list_windows`; `candidates` (room, CANDIDATE_COLUMNS):
+    those of one trace side by side; see `tofclip.lidar.search.candidates`; `listed`: how many;
+    `pulse` (curve, scale): see `tofclip.lidar.pulse_fit`; `estimates` (most returns, 5):
+    overwritten; `profile` (bins, 3): overwritten; `found` (all pixels, most returns, 3):
+    overwritten where `counts` is `NEEDS_EXACT_FIT`: instant, s, sum of the fitted pulse over the
+    bins, standard deviation of the instant, s; nearest first; `counts` (all pixels,): number of
+    returns of each pixel.
     """
     curve, scale = pulse
     start = 0

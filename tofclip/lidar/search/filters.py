@@ -16,45 +16,25 @@ SHARPENING_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class PulseFilters:
-    """A pulse as the search for returns on a time axis needs it.
+    """A pulse as the search for returns on a time axis needs it."""
 
-    Parameters
-    ----------
-    sharp, matched : (width, bins) float32 array
-        Filter that shows candidates, and the one that judges them. Entry w is the weight of bin
-        ``j + w - width // 2`` for a return at bin j.
-    sums : (bins,) array
-        Of the matched filters.
-    gains : (2,) floats
-        Largest sums of either.
-    table : PhaseTable
-    kernel : (curve, scale)
-        `tofclip.lidar.Pulse.kernel_table`.
-    fwhm : float
-        Of the pulse, s.
-    """
-
+    # (width, bins), filter that shows candidates, and the one that judges them. Entry w is the
+    # weight of bin ``j + w - width // 2`` for a return at bin j
     sharp: NDArray[np.float32]
+    # (width, bins), filter that shows candidates, and the one that judges them. Entry w is the
+    # weight of bin ``j + w - width // 2`` for a return at bin j
     matched: NDArray[np.float32]
-    sums: NDArray[np.float64]
-    gains: tuple[float, float]
+    sums: NDArray[np.float64]  # (bins,), of the matched filters
+    gains: tuple[float, float]  # (2,), largest sums of either
     table: PhaseTable
-    kernel: Table
-    fwhm: float
+    kernel: Table  # (curve, scale), `tofclip.lidar.Pulse.kernel_table`
+    fwhm: float  # of the pulse, s
 
     @classmethod
     def build(cls, pulse: Pulse, times: NDArray[np.float64]) -> PulseFilters:
         """Work them out.
 
-        Parameters
-        ----------
-        pulse : Pulse
-        times : (bins,) array
-            Seconds.
-
-        Returns
-        -------
-        PulseFilters
+        `times` (bins,): seconds.
         """
         sharp, matched = build_filters(pulse, times)
         sums = matched.sum(axis=0)
@@ -74,16 +54,7 @@ def build_filters(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Work out the sharp filter and the matched one of a time axis.
 
-    Parameters
-    ----------
-    pulse : Pulse
-    times : (bins,) array
-        Seconds.
-
-    Returns
-    -------
-    two (width, bins) float32 arrays
-        As for `PulseFilters`.
+    `times` (bins,): seconds. Returns as for `PulseFilters`.
     """
     return _build_filter(pulse.compress(SHARPENING_FACTOR), times), _build_filter(pulse, times)
 

@@ -61,27 +61,13 @@ def take_strongest_peaks(
     Background and noise are those of the bins that no peak claims. Peaks claim their surroundings
     from the strongest down, for as long as half of the bins stay free.
 
-    Parameters
-    ----------
-    trace : (bins,) float32 array
-    times, bin_weights, matched, starts, sums, gains, windows, limits, free
-        As for `tofclip.lidar.search.candidates.find_candidates`.
-    above_centre : (float32, float32, float, float)
-        A brightness, number of bins, and sums over the bins of what is above it and of its square.
-    listed : int
-        Number of maxima.
-    places : (4, bins) int32 array
-        Of `list_maxima`; where a peak is taken its zero becomes 1.
-    responses : (bins,) float32 array
-        Overwritten at these: response of the matched filter.
-    peaks : (returns, 2) array
-        Overwritten: bin, and response less that to the background.
-
-    Returns
-    -------
-    background, noise : float
-    number : int
-        Of peaks.
+    `trace` (bins,); `times, bin_weights, matched, starts, sums, gains, windows, limits, free`: as
+    for `tofclip.lidar.search.candidates.find_candidates`; `above_centre` (float32, float32, float,
+    float): A brightness, number of bins, and sums over the bins of what is above it and of its
+    square; `listed`: number of maxima; `places` (4, bins): of `list_maxima`; where a peak is taken
+    its zero becomes 1; `responses` (bins,): overwritten at these: response of the matched filter;
+    `peaks` (returns, 2): overwritten: bin, and response less that to the background. Returns
+    `number`: of peaks.
     """
     centre, all_bins, sum_left, square_left = above_centre
     bins_left, background, variance = float(all_bins), 0.0, 0.0
@@ -138,15 +124,8 @@ def take_strongest_peaks(
 def sum_about(trace, bin_weights):
     """Sums over the bins, and of squares, of what is above a brightness that is usual there.
 
-    Parameters
-    ----------
-    trace, bin_weights : (bins,) float32 array
-
-    Returns
-    -------
-    float32, float, float
-        That brightness, and the sums: float32 squares about zero would drown a small noise on a high
-        background.
+    `trace, bin_weights` (bins,). Returns that brightness, and the sums: float32 squares about zero
+    would drown a small noise on a high background.
     """
     # what the first bins have
     weights, other = load_vector(bin_weights, np.uintp(0)), load_vector(bin_weights, STEP)
@@ -173,10 +152,7 @@ def sum_about(trace, bin_weights):
 def apply_filter(trace, sharp, runs, edges, score):
     """Filter a trace where `runs` and `edges` say.
 
-    Parameters
-    ----------
-    trace, sharp, runs, edges, score
-        As for `tofclip.lidar.search.candidates.find_candidates`.
+    `trace, sharp, runs, edges, score`: as for `tofclip.lidar.search.candidates.find_candidates`.
     """
     width = np.uintp(sharp.shape[0])
     half = width // np.uintp(2)
@@ -200,16 +176,7 @@ def apply_filter(trace, sharp, runs, edges, score):
 def make_key(height, entry):
     """A whole number that is the larger the higher a maximum, to 2e-6 of it, and holds its lane.
 
-    Parameters
-    ----------
-    height : float32
-        Above zero: such numbers are in the order of their bits.
-    entry : int
-        Place in the list.
-
-    Returns
-    -------
-    int32
+    `height`: above zero: such numbers are in the order of their bits; `entry`: place in the list.
     """
     lane = np.int32(entry) & (LENGTH - 1)
     return np.int32((np.float32(height).view(np.int32) & -LENGTH) | lane)
@@ -221,19 +188,8 @@ def take_highest(bins, keys, listed, low, high):
 
     Every peak waits for the one before it, so that what counts is how soon it is found.
 
-    Parameters
-    ----------
-    bins : (n,) int32 array
-        Of the maxima.
-    keys : (n,) int32 array
-        Of `make_key`; those left out are zero from now on.
-    listed : int
-    low, high : int32
-
-    Returns
-    -------
-    float32, int
-        Height, or 0 where none is left; and place.
+    `bins` (n,): of the maxima; `keys` (n,): of `make_key`; those left out are zero from now on.
+    Returns height, or 0 where none is left; and place.
     """
     highest, entry, zero = np.int32(0), np.uintp(0), fill_vector(np.int32(0))
     first, after = fill_vector(low), fill_vector(high)
@@ -252,18 +208,8 @@ def take_highest(bins, keys, listed, low, high):
 def claim_bins(trace, centre, free, first, after):
     """Take the bins from `first` to before `after`, as far as they are free.
 
-    Parameters
-    ----------
-    trace : (bins,) float32 array
-    centre : float32
-    free : (bins,) float32 array
-        For how many bins each one stands that nothing claims yet; overwritten.
-    first, after : int
-
-    Returns
-    -------
-    three floats
-        Sums over them of what is above `centre`, of its square, and their number.
+    `trace` (bins,); `free` (bins,): for how many bins each one stands that nothing claims yet;
+    overwritten. Returns sums over them of what is above `centre`, of its square, and their number.
     """
     total = square = number = zero = fill_vector(np.float32(0))
     last = np.uintp(trace.size) - STEP
@@ -287,13 +233,7 @@ def claim_bins(trace, centre, free, first, after):
 def sum_weighted(trace, bin_weights):
     """Sum over the bins, each for as many as it stands for.
 
-    Parameters
-    ----------
-    trace, bin_weights : (bins,) float32 array
-
-    Returns
-    -------
-    float32
+    `trace, bin_weights` (bins,).
     """
     total = others = fill_vector(np.float32(0))
     for first in range(np.uintp(0), np.uintp(trace.size), STEP + STEP):
@@ -306,20 +246,10 @@ def sum_weighted(trace, bin_weights):
 def list_maxima(score, of_interest, words, level, places):
     """List bin and height of the local maxima of interest, in the order of time; return how many.
 
-    Parameters
-    ----------
-    score, of_interest, words
-        As for `tofclip.lidar.search.candidates.find_candidates`. Of a level top the last bin
-        counts.
-    places : (4, bins) int32 array
-        Overwritten: bins of the maxima, keys of their scores (`make_key`) with zeros behind the last
-        one, zeros, and what is only needed meanwhile.
-    level : float32
-        Score of the background.
-
-    Returns
-    -------
-    int
+    `score, of_interest, words`: as for `tofclip.lidar.search.candidates.find_candidates`. Of a
+    level top the last bin counts; `places` (4, bins): overwritten: bins of the maxima, keys of
+    their scores (`make_key`) with zeros behind the last one, zeros, and what is only needed
+    meanwhile; `level`: score of the background.
     """
     zero, background, filled, listed = fill_vector(np.float32(0)), fill_vector(level), 0, 0
     for word in range(np.uintp(0), np.uintp(words.size)):
@@ -356,16 +286,7 @@ def list_maxima(score, of_interest, words, level, places):
 def compute_response(trace, weights, start):
     """Response of a filter whose first weight is for bin `start`.
 
-    Parameters
-    ----------
-    trace : (bins,) float32 array
-    weights : (width,) float32 array
-        Of the matched filter.
-    start : int
-
-    Returns
-    -------
-    float32
+    `trace` (bins,); `weights` (width,): of the matched filter.
     """
     total = fill_vector(np.float32(0))
     for w in range(np.uintp(0), np.uintp(weights.size), STEP):

@@ -30,45 +30,31 @@ MAX_UNEVENNESS = 1e-3
 
 @dataclass(frozen=True)
 class PhaseTable:
-    """A pulse in the bins around the one in which it has its peak, at each phase.
+    """A pulse in the bins around the one in which it has its peak, at each phase."""
 
-    Parameters
-    ----------
-    shapes, slopes : (phases, width) float32 array
-        Pulse, and its change from bin to bin; zero where the pulse does not matter and in the bins
-        that fill up a multiple of `VECTOR_BINS`. Bin w lies ``w - half`` bins after the peak's.
-    tails : (phases, 4 * half + width) float32 array
-        Pulse, wherever it ends. Bin w lies ``w - 3 * half`` bins after the peak's.
-    sums : (phases, 7) float64 array
-        Over the bins: of squared pulse, pulse times slope, and squared slope; of the pulse; of the
-        pulse as far as the fit leaves it, and of the pulse times the square of the slope across it
-        (`tofclip.lidar.pulse_fit.estimate_sum_and_deviation`); number of bins.
-    half : int
-        Bins on either side. 0: the axis is uneven, and the table empty.
-    bin_width : float
-        Seconds.
-    """
-
+    # (phases, width), pulse, and its change from bin to bin; zero where the pulse does not matter
+    # and in the bins that fill up a multiple of `VECTOR_BINS`. Bin w lies ``w - half`` bins after
+    # the peak's
     shapes: NDArray[np.float32]
+    # (phases, width), pulse, and its change from bin to bin; zero where the pulse does not matter
+    # and in the bins that fill up a multiple of `VECTOR_BINS`. Bin w lies ``w - half`` bins after
+    # the peak's
     slopes: NDArray[np.float32]
+    # (phases, 4 * half + width), pulse, wherever it ends. Bin w lies ``w - 3 * half`` bins after
+    # the peak's
     tails: NDArray[np.float32]
+    # (phases, 7), over the bins: of squared pulse, pulse times slope, and squared slope; of the
+    # pulse; of the pulse as far as the fit leaves it, and of the pulse times the square of the
+    # slope across it (`tofclip.lidar.pulse_fit.estimate_sum_and_deviation`); number of bins
     sums: NDArray[np.float64]
-    half: int
-    bin_width: float
+    half: int  # bins on either side. 0: the axis is uneven, and the table empty
+    bin_width: float  # seconds
 
     @classmethod
     def tabulate(cls, pulse: Pulse, times: NDArray[np.float64]) -> PhaseTable:
         """Tabulate a pulse for a time axis.
 
-        Parameters
-        ----------
-        pulse : Pulse
-        times : (bins,) array
-            Seconds.
-
-        Returns
-        -------
-        PhaseTable
+        `times` (bins,): seconds.
         """
         width = float(times[-1] - times[0]) / (times.size - 1)
         first, last = pulse.support
@@ -113,13 +99,7 @@ class PhaseTable:
     def find_even_bins(self, bins: TraceBins) -> NDArray[np.bool_]:
         """Say around which bins all those of the table are held.
 
-        Parameters
-        ----------
-        bins : TraceBins
-
-        Returns
-        -------
-        (bins,) bool array
+        Returns (bins,).
         """
         even = np.zeros(bins.numbers.size, bool)
         if self.half > 0:

@@ -46,14 +46,7 @@ from tofclip.vectors import (
 def find_phase(offset):
     """Row of the table nearest to an offset.
 
-    Parameters
-    ----------
-    offset : float
-        Bins, at most `MAX_OFFSET_BINS` either way.
-
-    Returns
-    -------
-    int
+    `offset`: bins, at most `MAX_OFFSET_BINS` either way.
     """
     return np.uintp((offset + MAX_OFFSET_BINS) * PHASES_PER_BIN + 0.5)
 
@@ -68,22 +61,13 @@ def fit_lone_returns(
     A step waits for the one before it. Steps of different returns do not, so that the processor
     works on several at a time.
 
-    Parameters
-    ----------
-    traces, moments, even, half
-        As for `tofclip.lidar.search.candidates.find_candidates`.
-    candidates : (room, CANDIDATE_COLUMNS) array
-        Column `OFFSET` is improved; `HEIGHT` is overwritten: not above zero where there is no
-        pulse, NaN where the return moved to where the exact fit is needed. `PEAK_BIN` follows one
-        that moves further than `MAX_OFFSET_BINS`.
-    rests : (room, width) float32 array
-        Of `tofclip.lidar.search.candidates.find_candidates`; what is around the peak bins.
-    active : (room,) int64 array
-        Numbers of the returns; overwritten.
-    moving : int
-        How many.
-    shapes, slopes, sums
-        See `PhaseTable`.
+    `traces, moments, even, half`: as for `tofclip.lidar.search.candidates.find_candidates`;
+    `candidates` (room, CANDIDATE_COLUMNS): column `OFFSET` is improved; `HEIGHT` is overwritten:
+    not above zero where there is no pulse, NaN where the return moved to where the exact fit is
+    needed. `PEAK_BIN` follows one that moves further than `MAX_OFFSET_BINS`; `rests` (room, width):
+    of `tofclip.lidar.search.candidates.find_candidates`; what is around the peak bins; `active`
+    (room,): numbers of the returns; overwritten; `moving`: how many; `shapes, slopes, sums`: see
+    `PhaseTable`.
     """
     for _ in range(MAX_FIT_ROUNDS):
         still = 0
@@ -109,15 +93,8 @@ def fit_lone_returns(
 def take_table_step(own, phase, pr, dr, sums):
     """Improve one return's offset and height in place by a Gauss-Newton step, of at most a bin.
 
-    Parameters
-    ----------
-    own : (CANDIDATE_COLUMNS,) array
-    phase : int
-        Row of the table nearest to its offset.
-    pr, dr : float32
-        Products of what is left for it with pulse and slope.
-    sums : (phases, 7) array
-        See `PhaseTable`.
+    `own` (CANDIDATE_COLUMNS,); `phase`: row of the table nearest to its offset; `pr, dr`: products
+    of what is left for it with pulse and slope; `sums` (phases, 7): see `PhaseTable`.
     """
     pp, pd, dd = sums[phase, 0], sums[phase, 1], sums[phase, 2]
     across = dd * pr - pd * dr
@@ -138,15 +115,9 @@ def take_table_step(own, phase, pr, dr, sums):
 def follow_return(own, rest, traces, moments, even, half):
     """Cut out the bins around a return again where it has moved away from the bin of its peak.
 
-    Parameters
-    ----------
-    own : (CANDIDATE_COLUMNS,) array
-        The bin and what is relative to it are overwritten. `HEIGHT` becomes NaN where the bins
-        around are not all there.
-    rest : (width,) float32 array
-        Overwritten.
-    traces, moments, even, half
-        As for `tofclip.lidar.search.candidates.find_candidates`.
+    `own` (CANDIDATE_COLUMNS,): the bin and what is relative to it are overwritten. `HEIGHT` becomes
+    NaN where the bins around are not all there; `rest` (width,): overwritten; `traces, moments,
+    even, half`: as for `tofclip.lidar.search.candidates.find_candidates`.
     """
     if math.fabs(own[OFFSET]) <= MAX_OFFSET_BINS:
         return
@@ -171,20 +142,12 @@ def fit_crowded_returns(
     Taking turns, each against what the others leave, undoes the pull of returns on each other. A
     return that moved no more and that no moving one reaches is left alone.
 
-    Parameters
-    ----------
-    traces, moments, even, half
-        As for `tofclip.lidar.search.candidates.find_candidates`.
-    candidates : (room, CANDIDATE_COLUMNS) array
-        Columns `OFFSET`, `HEIGHT`, `MOVED` and `PEAK_BIN` are improved, as by `fit_lone_returns`.
-    rests : (room, width) float32 array
-        Of `tofclip.lidar.search.candidates.find_candidates`; in the end what the others leave of it.
-    crowded : (room,) int64 array
-        Numbers of the returns, increasing.
-    number : int
-        How many.
-    shapes, slopes, tails, sums
-        See `PhaseTable`.
+    `traces, moments, even, half`: as for `tofclip.lidar.search.candidates.find_candidates`;
+    `candidates` (room, CANDIDATE_COLUMNS): columns `OFFSET`, `HEIGHT`, `MOVED` and `PEAK_BIN` are
+    improved, as by `fit_lone_returns`; `rests` (room, width): of
+    `tofclip.lidar.search.candidates.find_candidates`; in the end what the others leave of it;
+    `crowded` (room,): numbers of the returns, increasing; `number`: how many; `shapes, slopes,
+    tails, sums`: see `PhaseTable`.
     """
     start = 0
     while start < number:
@@ -237,18 +200,8 @@ def fit_crowded_returns(
 def find_largest_move(candidates, numbers, own, half):
     """By how many bins a return, or one of those that reach it, moved last.
 
-    Parameters
-    ----------
-    candidates : (room, CANDIDATE_COLUMNS) array
-    numbers : (n,) int64 array
-        Of the returns; that of `own` among them.
-    own : (CANDIDATE_COLUMNS,) array
-    half : int
-        See `PhaseTable`.
-
-    Returns
-    -------
-    float
+    `candidates` (room, CANDIDATE_COLUMNS); `numbers` (n,): of the returns; that of `own` among
+    them; `own` (CANDIDATE_COLUMNS,); `half`: see `PhaseTable`.
     """
     moved = 0.0
     for other in numbers:
@@ -261,22 +214,9 @@ def find_largest_move(candidates, numbers, own, half):
 def subtract_others(rest, w, candidates, numbers, k, half, tails):
     """What the other returns leave of a vector of bins.
 
-    Parameters
-    ----------
-    rest : vector of float32
-        Trace less background, from bin w of those around the peak of return k on.
-    w : int
-    candidates : (room, CANDIDATE_COLUMNS) array
-    numbers : (n,) int64 array
-        Of the returns; that of `own` among them.
-    own : (CANDIDATE_COLUMNS,) array
-    half : int
-    tails
-        See `PhaseTable`.
-
-    Returns
-    -------
-    vector of float32
+    `rest`: trace less background, from bin w of those around the peak of return k on; `candidates`
+    (room, CANDIDATE_COLUMNS); `numbers` (n,): of the returns; that of `own` among them; `own`
+    (CANDIDATE_COLUMNS,); `tails`: see `PhaseTable`.
     """
     for other in numbers:
         away = candidates[k, PEAK_BIN] - candidates[other, PEAK_BIN]
@@ -298,26 +238,13 @@ def measure_returns_by_table(
 ):
     """Write instant, sum and standard deviation of the returns that prove themselves.
 
-    Parameters
-    ----------
-    candidates : (room, CANDIDATE_COLUMNS) array
-        Fitted; those of one trace side by side.
-    listed : int
-        How many.
-    rests : (room, width) float32 array
-        What is left of the trace for each of them.
-    least : float
-        Standard deviations that a return's response must exceed.
-    pixels : (traces,) int64 array
-        Number of the pixel to which each trace belongs.
-    times : (bins,) array
-        Seconds.
-    shapes, slopes, sums
-        See `PhaseTable`.
-    found : (all pixels, most returns, 3) float64 array
-        Overwritten: seconds, sum over the bins, standard deviation in seconds; nearest first.
-    counts : (all pixels,) int64 array
-        Goes up by one for each; `NEEDS_EXACT_FIT` where a return of the pixel does.
+    `candidates` (room, CANDIDATE_COLUMNS): fitted; those of one trace side by side; `listed`: how
+    many; `rests` (room, width): what is left of the trace for each of them; `least`: standard
+    deviations that a return's response must exceed; `pixels` (traces,): number of the pixel to
+    which each trace belongs; `times` (bins,): seconds; `shapes, slopes, sums`: see `PhaseTable`;
+    `found` (all pixels, most returns, 3): overwritten: seconds, sum over the bins, standard
+    deviation in seconds; nearest first; `counts` (all pixels,): goes up by one for each;
+    `NEEDS_EXACT_FIT` where a return of the pixel does.
     """
     zero = fill_vector(np.float32(0))
     for k in range(listed):
@@ -363,15 +290,9 @@ def measure_returns_by_table(
 def list_returns(found, counts, pixel, values):
     """List what was found in all pixels, in their order.
 
-    Parameters
-    ----------
-    found : (all pixels, most returns, 3) float64 array
-    counts : (all pixels,) int64 array
-        Number of returns of each pixel.
-    pixel : (n,) int64 array
-        Overwritten: number of the pixel of each return.
-    values : (3, n) float64 array
-        Overwritten: what is known of each return.
+    `found` (all pixels, most returns, 3); `counts` (all pixels,): number of returns of each pixel;
+    `pixel` (n,): overwritten: number of the pixel of each return; `values` (3, n): overwritten:
+    what is known of each return.
     """
     listed = np.uintp(0)
     for p in range(counts.size):

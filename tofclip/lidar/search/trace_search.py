@@ -35,40 +35,23 @@ NEIGHBOUR_FRACTION = 0.5  # of what is of interest: weaker peaks do not move a r
 
 @dataclass(frozen=True)
 class SearchMemory:
-    """What a thread's search overwrites, for some pixels.
+    """What a thread's search overwrites, for some pixels."""
 
-    Parameters
-    ----------
-    held : (pixels, bins) float32 array
-        As traces are handed out.
-    traces : (pixels, whole vectors of bins) float32 array
-        The same memory, where that is a whole number of vectors.
-    moments : (pixels, 2) array
-    peaks : (returns, 2) array
-    score, responses, free : float32 arrays
-    places : (4, bins) int32 array
-        See `tofclip.lidar.search.candidates.find_candidates`.
-    candidates : (pixels * returns, CANDIDATE_COLUMNS) array
-    rests : (pixels * returns, width) float32 array
-    lone, crowded : (pixels * returns,) int64 array
-    estimates : (returns, 5) array
-    profile : (bins, 3) array
-    """
-
-    held: NDArray[np.float32]
+    held: NDArray[np.float32]  # (pixels, bins), as traces are handed out
+    # (pixels, whole vectors of bins), the same memory, where that is a whole number of vectors
     traces: NDArray[np.float32]
-    moments: FloatArray
-    peaks: FloatArray
+    moments: FloatArray  # (pixels, 2)
+    peaks: FloatArray  # (returns, 2)
     score: NDArray[np.float32]
-    places: NDArray[np.int32]
+    places: NDArray[np.int32]  # (4, bins), see `tofclip.lidar.search.candidates.find_candidates`
     responses: NDArray[np.float32]
     free: NDArray[np.float32]
-    candidates: FloatArray
-    rests: NDArray[np.float32]
-    lone: NDArray[np.int64]
-    crowded: NDArray[np.int64]
-    estimates: FloatArray
-    profile: FloatArray
+    candidates: FloatArray  # (pixels * returns, CANDIDATE_COLUMNS)
+    rests: NDArray[np.float32]  # (pixels * returns, width)
+    lone: NDArray[np.int64]  # (pixels * returns,)
+    crowded: NDArray[np.int64]  # (pixels * returns,)
+    estimates: FloatArray  # (returns, 5)
+    profile: FloatArray  # (bins, 3)
 
 
 class TraceSearch:
@@ -77,16 +60,8 @@ class TraceSearch:
     Compiled loops take a vector of bins at a time. Behind the last bin the axis is filled up with bins that
     weigh nothing and are not searched, to a whole number of vectors that holds the filters.
 
-    Parameters
-    ----------
-    times : (bins,) array
-        Instants of the bins, s, increasing.
-    source : Traces
-    filters : PulseFilters
-        Of the whole axis.
-    detection : Detection
-    pixels : int
-        That are searched together, at most.
+    `times` (bins,): instants of the bins, s, increasing; `filters`: of the whole axis; `pixels`:
+    that are searched together, at most.
     """
 
     def __init__(
@@ -135,11 +110,8 @@ class TraceSearch:
     def set_least(self, least: NDArray[np.float32]) -> None:
         """Say what is of interest.
 
-        Parameters
-        ----------
-        least : (bins,) float32 array
-            Response of the matched filter that a return at each bin must exceed; 0 where nothing is
-            known.
+        `least` (bins,): response of the matched filter that a return at each bin must exceed; 0
+        where nothing is known.
         """
         lowest = float(least.min())
         sharp_gain, matched_gain = self._gains[:2]
@@ -215,11 +187,8 @@ class TraceSearch:
     def find_returns(self, pieces: Iterable[slice]) -> None:
         """Find the returns of some pixels.
 
-        Parameters
-        ----------
-        pieces : iterable of slice
-            Of the source's pixels, which are searched together; at most as many as there is memory
-            for.
+        `pieces`: of the source's pixels, which are searched together; at most as many as there is
+        memory for.
         """
         memory = self._spare.pop() if self._spare else self._allocate_memory()
         for piece in pieces:
@@ -229,12 +198,8 @@ class TraceSearch:
     def list_found(self) -> tuple[NDArray[np.int64], FloatArray]:
         """List all that was found so far, in raster and time order.
 
-        Returns
-        -------
-        pixel : (n,) int64 array
-            Number of the pixel.
-        values : (3, n) array
-            Instant, s, sum of the fitted pulse over the bins, standard deviation of the instant, s.
+        Returns `pixel` (n,): number of the pixel; `values` (3, n): instant, s, sum of the fitted
+        pulse over the bins, standard deviation of the instant, s.
         """
         pixel = np.empty(int(self._counts.sum()), np.int64)
         values = np.empty((3, pixel.size))

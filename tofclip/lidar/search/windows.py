@@ -13,23 +13,10 @@ def list_windows(
 ) -> NDArray[np.int64]:
     """List the bins that a return at each bin reaches, and those too near for another return.
 
-    Parameters
-    ----------
-    times : (bins,) array
-        Seconds, increasing.
-    scale : (4,) tuple
-        Of the pulse; see `tofclip.lidar.Pulse.kernel_table`.
-    distance : float
-        Seconds.
+    `times` (bins,): seconds, increasing; `scale` (4,): of the pulse; see
+    `tofclip.lidar.Pulse.kernel_table`; `distance`: seconds. Returns (bins, 4): first bin reached
+    and the one after the last; first bin nearer than `distance` and the one after the last.
 
-    Returns
-    -------
-    (bins, 4) int64 array
-        First bin reached and the one after the last; first bin nearer than `distance` and the one
-        after the last.
-
-    Notes
-    -----
     Bins are often just `distance` apart; what then is nearer is for the rounding of their
     difference to say, and not for that of a sum with the distance.
     """

@@ -26,19 +26,9 @@ ROUNDING_MARGIN = 1e-4
 class BrightFrameFinder:
     """Says in which frames the matched filter of any pixel reaches a limit.
 
-    Parameters
-    ----------
-    tiles : Tiles
-        The operator's transpose, a row for each pixel; its entries are not negative.
-    measurements : int
-        Columns of it.
-    group_pixels : int
-        Successive rows that are ruled out together: neighbours in a row of the picture.
-
-    Raises
-    ------
-    InputError
-        A negative entry.
+    `tiles`: the operator's transpose, a row for each pixel; its entries are not negative;
+    `measurements`: columns of it; `group_pixels`: successive rows that are ruled out together:
+    neighbours in a row of the picture.
     """
 
     def __init__(self, tiles: Tiles, measurements: int, group_pixels: int) -> None:
@@ -85,20 +75,10 @@ class BrightFrameFinder:
     def find(self, readings: NDArray[np.float32], span: slice, limit: float) -> Mask:
         """Say in which frames a pixel stands out.
 
-        Parameters
-        ----------
-        readings : (measurements, frames) contiguous float32 array
-            In units of their noise. Whole blocks of twice `LANES` frames from the first of the span on
-            lie within it.
-        span : slice
-            Of the frames.
-        limit : float
-            Response of the filter ``a'f / |a|`` from which a pixel stands out, a being its column
-            of the operator.
-
-        Returns
-        -------
-        (frames of the span,) bool array
+        `readings` (measurements, frames): in units of their noise. Whole blocks of twice `LANES`
+        frames from the first of the span on lie within it; `span`: of the frames; `limit`: response
+        of the filter ``a'f / |a|`` from which a pixel stands out, a being its column of the
+        operator. Returns (frames of the span,).
         """
         # the compiler takes as long to import as all else
         from tofclip.lidar.signal_rows.kernels import find_bright_frames
@@ -136,15 +116,8 @@ def _list_pairs(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """List each row's entries two by two, as far as they are neighbours.
 
-    Returns
-    -------
-    row : (pairs,) int array
-    column : (pairs,) int array
-        The first of two.
-    weight : (pairs,) array
-        Sum of both.
-    fraction : (pairs,) array
-        What the second one has of it.
+    Returns `row` (pairs,); `column` (pairs,): the first of two; `weight` (pairs,): sum of both;
+    `fraction` (pairs,): what the second one has of it.
     """
     pixels = tiles.starts.shape[1] - 1
     row = np.repeat(np.tile(np.arange(pixels), len(tiles.starts)), _count_entries(tiles))

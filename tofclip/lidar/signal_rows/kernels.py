@@ -33,11 +33,8 @@ WORD_FRAMES = VECTORS * LENGTH
 def compute_energies(sums, energy):
     """Mean square of each instant's sums; what is exactly zero was never measured.
 
-    Parameters
-    ----------
-    sums : (columns, at least instants) float32 array
-    energy : (2, instants) float32 array
-        The first row is overwritten with the energies, the second is room.
+    `sums` (columns, at least instants); `energy` (2, instants): the first row is overwritten with
+    the energies, the second is room.
     """
     total, number = energy[0], energy[1]
     total[:] = 0
@@ -56,14 +53,8 @@ def standardise_columns(sums, quiet, columns):
     """Take off each column's mean over the quiet instants and divide by its standard deviation
     there, in place.
 
-    Parameters
-    ----------
-    sums : (columns, at least instants) float32 array, changed in these columns
-        What is exactly zero was never measured and stays zero, and so does a column that never
-        changes.
-    quiet : (instants,) float32 array
-        1 for a quiet instant, else 0.
-    columns : (int, int)
+    `sums` (columns, at least instants): what is exactly zero was never measured and stays zero, and
+    so does a column that never changes; `quiet` (instants,): 1 for a quiet instant, else 0.
     """
     for column in range(columns[0], columns[1]):
         here = sums[column]
@@ -104,26 +95,12 @@ def find_bright_frames(
     A frame is done when one row has reached it, so that each frame's most promising group comes
     first.
 
-    Parameters
-    ----------
-    tile_starts, columns, values
-        See `tofclip.operators.sparse.Tiles`; no negative values.
-    scales : (M's rows,) float32 array
-    group_pixels : int
-        Successive rows of a group.
-    group_starts : (groups + 1,) int64 array
-        Where each group's windows begin.
-    windows : (n,) int32 array
-        See `find_window_maxima`: numbers of its rows.
-    weights : (n,) float32 array
-        The most that a window of ones adds to a row of the group, times its scale.
-    block : (M's columns, frames) float32 array
-        Whole words of frames from `begin` on lie within it.
-    begin : int
-        First frame.
-    limit : float32
-        Above zero.
-    bright : (frames to look at,) bool array, overwritten
+    `tile_starts, columns, values`: see `tofclip.operators.sparse.Tiles`; no negative values;
+    `scales` (M's rows,); `group_pixels`: successive rows of a group; `group_starts` (groups + 1,):
+    where each group's windows begin; `windows` (n,): see `find_window_maxima`: numbers of its rows;
+    `weights` (n,): the most that a window of ones adds to a row of the group, times its scale;
+    `block` (M's columns, frames): whole words of frames from `begin` on lie within it; `begin`:
+    first frame; `limit`: above zero; `bright` (frames to look at,).
     """
     groups = group_starts.size - 1
     highest = np.empty((VECTORS, FRACTIONS * block.shape[0], LENGTH), np.float32)
@@ -185,12 +162,8 @@ def find_window_maxima(block, frame, highest):
     the next ``WINDOW - 1``, and the one behind it, at any fraction of that part of the way. Nothing
     is below zero.
 
-    Parameters
-    ----------
-    block : (measurements, frames) float32 array
-    frame : int
-        First of the frames.
-    highest : (VECTORS, FRACTIONS * measurements, LENGTH) float32 array, overwritten
+    `block` (measurements, frames); `frame`: first of the frames; `highest` (VECTORS, FRACTIONS *
+    measurements, LENGTH).
     """
     number, parts, zero = np.uintp(block.shape[0]), np.uintp(FRACTIONS), fill_vector(np.float32(0))
     for vector in range(VECTORS):
@@ -216,20 +189,9 @@ def find_window_maxima(block, frame, highest):
 def mark_promising(highest, group_starts, windows, weights, limit, marks, most_promising):
     """Mark in which frames the bound of each group reaches the limit; return those of any group.
 
-    Parameters
-    ----------
-    highest : (VECTORS, FRACTIONS * measurements, LENGTH) float32 array
-        Of `find_window_maxima`.
-    group_starts, windows, weights, limit
-        As for `find_bright_frames`.
-    marks : (groups,) uint64 array, overwritten
-        A bit for each frame.
-    most_promising : (WORD_FRAMES,) int32 array, overwritten
-        The group with the highest bound in each frame.
-
-    Returns
-    -------
-    uint64
+    `highest` (VECTORS, FRACTIONS * measurements, LENGTH): of `find_window_maxima`; `group_starts,
+    windows, weights, limit`: as for `find_bright_frames`; `marks` (groups,): A bit for each frame;
+    `most_promising` (WORD_FRAMES,): the group with the highest bound in each frame.
     """
     zero, level = fill_vector(np.float32(0)), fill_vector(limit)
     best_a = best_b = best_c = best_d = zero
@@ -271,19 +233,8 @@ def find_reached(
 ):
     """Return in which frames of a vector a row of a group reaches the limit, as bits of a word.
 
-    Parameters
-    ----------
-    tile_starts, columns, values, scales, group_pixels, block, limit
-        As for `find_bright_frames`.
-    group : int
-    frame : int
-        First frame of the word.
-    vector : int
-        Number of the vector in the word.
-
-    Returns
-    -------
-    uint64
+    `tile_starts, columns, values, scales, group_pixels, block, limit`: as for `find_bright_frames`;
+    `frame`: first frame of the word; `vector`: number of the vector in the word.
     """
     at, highest = frame + np.uintp(vector) * STEP, fill_vector(np.float32(0))
     for row in range(group * group_pixels, min((group + 1) * group_pixels, scales.size)):

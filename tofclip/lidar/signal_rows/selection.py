@@ -34,13 +34,7 @@ odd number of cache lines apart, so that neighbours share no place of the cache.
 
 @dataclass(frozen=True)
 class RowBlock:
-    """Successive rows that are recovered alike.
-
-    Parameters
-    ----------
-    rows : slice
-    inverse : InverseTraces
-    """
+    """Successive rows that are recovered alike."""
 
     rows: slice
     inverse: InverseTraces
@@ -64,16 +58,9 @@ class SignalRowFinder:
     15, 43, 78 and 98 of 100 cases; a search of all rows finds 50, 75, 98 and 100. The light of
     several pixels adds up.
 
-    Parameters
-    ----------
-    places : sequence of RowBlock
-        In order and without gaps.
-    pulse_rows : float
-        Full width at half maximum of a return, a symmetric one, in rows.
-    limit : float
-        Signal-to-noise from which a response counts as a return.
-    reach : int
-        Rows on either side of a return that its search and its fit look at.
+    `places`: in order and without gaps; `pulse_rows`: full width at half maximum of a return, a
+    symmetric one, in rows; `limit`: signal-to-noise from which a response counts as a return;
+    `reach`: rows on either side of a return that its search and its fit look at.
     """
 
     def __init__(
@@ -122,11 +109,6 @@ class SignalRowFinder:
     def sum_streak(self, counts: FloatImage, rectifier: Rectifier) -> tuple[FloatImage, float]:
         """Add up the measurements of a raw streak image, (rows, columns), and return its dark level,
         counts, as well. The camera is that of the first shot, and so is its `rectifier`.
-
-        Raises
-        ------
-        CalibrationError, InputError
-            As for `Rectifier.rectify`.
         """
         if self._row_sums is None:
             self._row_sums = RowSums(rectifier, self._starts, self._length)
@@ -146,13 +128,8 @@ class SignalRowFinder:
         All rows, if a quarter of the shot is not nearly as dark as the darkest twentieth, or if not
         much would be left out.
 
-        Parameters
-        ----------
-        sums : (columns, instants and some) float32 array
-            Of `sum_measurements` or `sum_streak`; overwritten.
+        `sums` (columns, instants and some): of `sum_measurements` or `sum_streak`; overwritten.
 
-        Notes
-        -----
         Memory: as much as the measurements, divided by the rows of a pulse width.
         """
         lit = self._find_signal_bins(sums)

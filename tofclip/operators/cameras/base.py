@@ -18,34 +18,14 @@ from tofclip.operators.shear import View
 class LightFieldCamera(ABC):
     """An encoder A_k for each view, and the two models that follow from them.
 
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns of every view's picture.
-    views : sequence of (float, float)
-        (v, u) of every view.
-    sampling_ratio : float
-        Measurements over pixels of one picture.
-    seed : int
-        Of everything random.
-
-    Attributes
-    ----------
-    used_views : tuple of int
-        Numbers of the views that get measurements, in the order of the measurements.
-    measurements : int
-        How many measurements there are.
-    correlation_length : int
-        Consecutive measurements on a detector whose errors are alike; 1 where each stands for itself.
-
-    Raises
-    ------
-    InputError
-        So few measurements are asked for that there would be none.
+    `image_shape`: rows and columns of every view's picture; `views`: (v, u) of every view;
+    `sampling_ratio`: measurements over pixels of one picture; `seed`: of everything random.
+    `used_views`: numbers of the views that get measurements, in the order of the measurements.
     """
 
     name: ClassVar[str]
-    measurements: int
+    measurements: int  # how many measurements there are
+    # consecutive measurements on a detector whose errors are alike; 1 where each stands for itself
     correlation_length: int = 1
 
     def __init__(
@@ -77,17 +57,9 @@ class LightFieldCamera(ABC):
         """Return F(d): from the picture refocused at `shear`, seen from `reference`, to the
         measurements (Eq. 21).
 
-        Parameters
-        ----------
-        shear : float
-            Pixels by which a point moves from one view to the next; stands for a depth.
-        reference : (float, float)
-            View (v, u) from which the picture is seen, in view steps.
-
-        Returns
-        -------
-        LinearOperator
-            (rows, columns) pictures to (measurements,) vectors.
+        `shear`: pixels by which a point moves from one view to the next; stands for a depth;
+        `reference`: view (v, u) from which the picture is seen, in view steps. Returns (rows,
+        columns) pictures to (measurements,) vectors.
         """
 
     def weighting(self) -> LinearOperator:

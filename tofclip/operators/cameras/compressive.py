@@ -51,17 +51,8 @@ class CompressiveCamera(LightFieldCamera):
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): the light field's model after the shears.
 
-        Parameters
-        ----------
-        shear : float
-            Pixels per view step.
-        reference : (float, float)
-            View (v, u) from which the picture is seen, in view steps.
-
-        Returns
-        -------
-        LinearOperator
-            (rows, columns) pictures to (measurements,) vectors.
+        `shear`: pixels per view step; `reference`: view (v, u) from which the picture is seen, in
+        view steps. Returns (rows, columns) pictures to (measurements,) vectors.
         """
         return self.light_field_model() @ ShearedViews(
             self.image_shape, self.views, shear, reference
@@ -187,16 +178,8 @@ class SinglePixelCamera(LightFieldCamera):
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): every view's codes after its shear, stacked.
 
-        Parameters
-        ----------
-        shear : float
-            Pixels per view step.
-        reference : (float, float)
-            View (v, u) from which the picture is seen, in view steps.
-
-        Returns
-        -------
-        Stack
+        `shear`: pixels per view step; `reference`: view (v, u) from which the picture is seen, in
+        view steps.
         """
         return Stack(
             [

@@ -35,24 +35,8 @@ AngleAssignment = tuple[tuple[int, ...], list[NDArray[np.float64]]]
 def count_lines(image_shape: tuple[int, int], detector_px: int, sampling_ratio: float) -> int:
     """Return how many line detectors make up the sampling ratio.
 
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns of a view's picture.
-    detector_px : int
-        Pixels of one line detector.
-    sampling_ratio : float
-        Measurements over pixels of one picture.
-
-    Returns
-    -------
-    int
-        At least 1.
-
-    Raises
-    ------
-    InputError
-        The ratio is too small for a single line.
+    `image_shape`: rows and columns of a view's picture; `detector_px`: pixels of one line detector;
+    `sampling_ratio`: measurements over pixels of one picture. Returns at least 1.
     """
     count = round(sampling_ratio * image_shape[0] * image_shape[1] / detector_px)
     if count < 1:
@@ -68,16 +52,7 @@ def assign_randomly(
     """Permute the directions and deal them one by one to the views in random order (supplement Note
     6).
 
-    Parameters
-    ----------
-    directions : (lines,) array
-    views : int
-        If there are fewer directions than views, some views get none.
-    random : numpy Generator
-
-    Returns
-    -------
-    Deal
+    `directions` (lines,); `views`: if there are fewer directions than views, some views get none.
     """
     shuffled = random.permutation(directions)
     return _group_by_view(shuffled, np.resize(random.permutation(views), directions.size))
@@ -97,20 +72,9 @@ def assign_evenly(
     middle; no view gets two directions more than another. Which views that are is an assignment
     problem.
 
-    Parameters
-    ----------
-    directions : (lines,) array
-        Ascending, rad.
-    views : sequence of (float, float)
-        (v, u) of every view.
-    cycle : int
-        Neighbouring directions that together stand for the aperture, a power of two from 2 on.
-    random : numpy Generator
-        Of where the cycle starts and of the order of views with the same t.
-
-    Returns
-    -------
-    Deal
+    `directions` (lines,): ascending, rad; `views`: (v, u) of every view; `cycle`: neighbouring
+    directions that together stand for the aperture, a power of two from 2 on; `random`: of where
+    the cycle starts and of the order of views with the same t.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -184,22 +148,8 @@ class LineCamera(LightFieldCamera):
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d) as one sparse matrix: a sheared view is one whose detector is offset.
 
-        Parameters
-        ----------
-        shear : float
-            Pixels per view step.
-        reference : (float, float)
-            View (v, u) from which the picture is seen, in view steps.
-
-        Returns
-        -------
-        LinearOperator
-            (rows, columns) pictures to (measurements,) vectors.
-
-        Raises
-        ------
-        InputError
-            The shear moves a view by more than the detector's length.
+        `shear`: pixels per view step; `reference`: view (v, u) from which the picture is seen, in
+        view steps. Returns (rows, columns) pictures to (measurements,) vectors.
         """
         offsets = []
         for view, angles in zip(self.used_views, self.angles, strict=True):
@@ -272,16 +222,8 @@ class CodedLineCamera(LightFieldCamera):
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): the lines of each view moved as its picture would be.
 
-        Parameters
-        ----------
-        shear : float
-            Pixels per view step.
-        reference : (float, float)
-            View (v, u) from which the picture is seen, in view steps.
-
-        Returns
-        -------
-        SliceConvolution
+        `shear`: pixels per view step; `reference`: view (v, u) from which the picture is seen, in
+        view steps.
         """
         moved: list[NDArray[np.float64]] = []
         for view, spreads in zip(self.used_views, self._spreads, strict=True):

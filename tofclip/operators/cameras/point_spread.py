@@ -56,17 +56,8 @@ class PointSpreadCamera(LightFieldCamera):
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): one convolution with the depth's PSF, read by the sensor.
 
-        Parameters
-        ----------
-        shear : float
-            Pixels per view step.
-        reference : (float, float)
-            View (v, u) from which the picture is seen, in view steps.
-
-        Returns
-        -------
-        LinearOperator
-            (rows, columns) pictures to (measurements,) vectors.
+        `shear`: pixels per view step; `reference`: view (v, u) from which the picture is seen, in
+        view steps. Returns (rows, columns) pictures to (measurements,) vectors.
         """
         views = [self.views[view] for view in self.used_views]
         # views are moved by the shear and add up on the sensor: one convolution (Eq. 5)
@@ -124,14 +115,8 @@ class MeasuredCamera:
     """A camera known by its PSFs only, measured with a point source at several depths (supplement
     Note 4).
 
-    Parameters
-    ----------
-    image_shape : (int, int)
-    point_spreads : MeasuredPointSpreads
-    sensor : LinearOperator, optional
-        From the light on the sensor's plane to the measurements, any of `tofclip.operators.sensors`;
-        its plane may be smaller than the picture. The default reads every pixel of a plane as large
-        as the picture.
+    `sensor`: from the light on the sensor's plane to the measurements, any of
+    `tofclip.operators.sensors`; its plane may be smaller than the picture.
     """
 
     def __init__(
@@ -155,21 +140,8 @@ class MeasuredCamera:
 def make_sparse_sensor(image_shape: tuple[int, int], sampling_ratio: float) -> PitchedSensor:
     """Spread as many pixels evenly over the picture as the sampling ratio asks for.
 
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns of a view's picture.
-    sampling_ratio : float
-        Sensor pixels over picture pixels, above 0 up to 1.
-
-    Returns
-    -------
-    PitchedSensor
-
-    Raises
-    ------
-    InputError
-        There would be none, or more than the picture has.
+    `image_shape`: rows and columns of a view's picture; `sampling_ratio`: sensor pixels over
+    picture pixels, above 0 up to 1.
     """
     rows, columns = image_shape
     if not 0 < sampling_ratio <= 1:

@@ -22,9 +22,7 @@ second-level cache."""
 class PanelMatrix:
     """A matrix in panels: a few rows at a time, all their entries in a column side by side.
 
-    Parameters
-    ----------
-    matrix : (rows, columns) float32 array
+    `matrix` (rows, columns).
     """
 
     def __init__(self, matrix: FloatImage) -> None:
@@ -42,20 +40,10 @@ class PanelMatrix:
     def multiply(self, operand: FloatImage, stretches: NDArray[np.int64], width: int) -> FloatImage:
         """Multiply with some rows of an operand.
 
-        Parameters
-        ----------
-        operand : (all rows, frames) float32 array
-            Cheapest where a frame's numbers lie side by side.
-        stretches : (n, 2) int64 array
-            First row, and the one after the last, of neighbours that are taken; as many rows in all
-            as the matrix has columns.
-        width : int
-            Of the result, not less than the frames and a multiple of 16.
-
-        Returns
-        -------
-        (matrix's rows, width) array
-            Aligned, with zeros behind the frames.
+        `operand` (all rows, frames): cheapest where a frame's numbers lie side by side; `stretches`
+        (n, 2): first row, and the one after the last, of neighbours that are taken; as many rows in
+        all as the matrix has columns; `width`: of the result, not less than the frames and a
+        multiple of 16. Returns (matrix's rows, width): aligned, with zeros behind the frames.
         """
         from tofclip.operators.panels.kernels import multiply_panels, pack_lanes
         from tofclip.vectors import LENGTH

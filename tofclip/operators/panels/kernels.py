@@ -34,18 +34,11 @@ SUM_LENGTH = 320
 def _make_panel_product(vectors: int) -> Any:
     """Make the product of a panel with some vectors of a packed block.
 
-    Parameters
-    ----------
-    vectors : int
-
-    Returns
-    -------
-    callable
-        ``(panel, first, block, start, plane, result, place, stride, count)``, for compiled loops:
-        adds to `PANEL_ROWS` rows of `result`, `stride` apart, from entry `place` on, the products of
-        `count` columns of the panel, from entry `first` on, with as many rows of the block. Of the
-        block a vector's rows lie side by side from entry `start` on, the next vector's `plane`
-        entries behind them. All arrays are flat float32.
+    Returns ``(panel, first, block, start, plane, result, place, stride, count)``, for compiled
+    loops: adds to `PANEL_ROWS` rows of `result`, `stride` apart, from entry `place` on, the
+    products of `count` columns of the panel, from entry `first` on, with as many rows of the block.
+    Of the block a vector's rows lie side by side from entry `start` on, the next vector's `plane`
+    entries behind them. All arrays are flat float32.
     """
     vector = ir.VectorType(ir.FloatType(), LENGTH)
     undefined, zero = ir.Constant(vector, ir.Undefined), ir.Constant(vector, [0.0] * LENGTH)
@@ -119,13 +112,9 @@ _emit_panel_product = _make_panel_product(1)
 def pack_lanes(rows, stretches, block):
     """Write some columns of the rows of an array as vectors of lanes, a row for each lane.
 
-    Parameters
-    ----------
-    rows : (lanes, columns) C-contiguous float32 array
-    stretches : (n, 2) int64 array
-        First column, and the one after the last, of neighbours that are taken.
-    block : (vectors, columns that are taken, LENGTH) C-contiguous float32 array, overwritten
-        Lanes beyond the last row are zero.
+    `rows` (lanes, columns); `stretches` (n, 2): first column, and the one after the last, of
+    neighbours that are taken; `block` (vectors, columns that are taken, LENGTH): lanes beyond the
+    last row are zero.
     """
     source, target = rows.reshape(rows.size), block.reshape(block.size)
     width, taken = np.uintp(rows.shape[1]), np.uintp(block.shape[1])
@@ -152,16 +141,10 @@ def pack_lanes(rows, stretches, block):
 def multiply_panels(panels, block, before, result):
     """``result[PANEL_ROWS * p + r, LENGTH * (before + v) + j] = sum_k panels[p, k, r] * block[v, k, j]``.
 
-    Parameters
-    ----------
-    panels : (panels, columns, PANEL_ROWS) C-contiguous float32 array
-        A matrix, some rows at a time.
-    block : (vectors, columns, LENGTH) C-contiguous float32 array
-        At most so many vectors that it stays in the second-level cache.
-    before : int
-        Vectors of the result before those of the block.
-    result : (PANEL_ROWS * panels, lanes) C-contiguous float32 array
-        Overwritten in the lanes of these vectors.
+    `panels` (panels, columns, PANEL_ROWS): A matrix, some rows at a time; `block` (vectors,
+    columns, LENGTH): at most so many vectors that it stays in the second-level cache; `before`:
+    vectors of the result before those of the block; `result` (PANEL_ROWS * panels, lanes):
+    overwritten in the lanes of these vectors.
     """
     columns, stride, vectors = panels.shape[1], result.shape[1], block.shape[0]
     matrix, lanes = panels.reshape(panels.size), block.reshape(block.size)

@@ -21,15 +21,9 @@ class AmplitudeSolver:
     Different surfaces hardly share measurements, so that a step for each is as safe as one for all and
     does not hold the bright ones back.
 
-    Parameters
-    ----------
-    model : SurfaceModel
-    amplitude : (points,) float32 array
-        Start.
-    weight : float
-        Of total variation, in standard deviations of the noise in the misfit's gradient.
-    earlier : AmplitudeSolver, optional
-        Of the same surfaces, seen by another shot: what it found saves work.
+    `amplitude` (points,): start; `weight`: of total variation, in standard deviations of the noise
+    in the misfit's gradient; `earlier`: of the same surfaces, seen by another shot: what it found
+    saves work.
     """
 
     def __init__(
@@ -130,10 +124,7 @@ def find_box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
 def estimate_excess_variance(model: SurfaceModel, amplitude: Image) -> float:
     """Return the misfit's variance in units of what the weights expect, over lit measurements.
 
-    Parameters
-    ----------
-    model : SurfaceModel
-    amplitude : (points,) float32 array
+    `amplitude` (points,).
     """
     predicted = model.render(amplitude)
     lit = (predicted > 0) & (model.weights > 0)
@@ -145,10 +136,7 @@ def estimate_excess_variance(model: SurfaceModel, amplitude: Image) -> float:
 def scale_amplitude(model: SurfaceModel, lit: NDArray[np.bool_]) -> Image:
     """Return scales in which lit amplitudes count alike for the data; 0 for all others, which stay.
 
-    Parameters
-    ----------
-    model : SurfaceModel
-    lit : (points,) bool array
+    `lit` (points,).
     """
     diagonal = model.gather(model.weights, squared=True)
     scale = 1 / np.sqrt(np.maximum(diagonal, TINY))
@@ -158,13 +146,7 @@ def scale_amplitude(model: SurfaceModel, lit: NDArray[np.bool_]) -> Image:
 def explain_by_amplitude(model: SurfaceModel, image: Image, scale: Image, iterations: int) -> Image:
     """Return the change of amplitude x that lowers ``|image - A x|_w`` most, by conjugate gradients.
 
-    Parameters
-    ----------
-    model : SurfaceModel
-    image : (rows, columns) float32 array
-    scale : (points,) float32 array
-        Of `scale_amplitude`.
-    iterations : int
+    `image` (rows, columns); `scale` (points,): of `scale_amplitude`.
     """
     change = np.zeros_like(scale)
     residual = scale * model.gather(model.weights * image)

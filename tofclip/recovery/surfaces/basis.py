@@ -21,23 +21,15 @@ SPLINE_DEGREE = 3
 
 @dataclass(frozen=True)
 class SmoothBasis:
-    """Smooth functions over the picture, of which a surface's inverse depth is a sum.
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-    box : (int, int, int, int)
-        First row and column, and those after the last, over which splines run.
-    pieces : (int, int)
-        Of the splines along rows and columns; without any it is the six monomials of a quadratic.
-    bending : (n, n) float array
-        Half of ``c' bending c`` is added to the objective: what is known of coefficients c without
-        the shot. By default nothing is.
-    """
+    """Smooth functions over the picture, of which a surface's inverse depth is a sum."""
 
     image_shape: tuple[int, int]
+    # first row and column, and those after the last, over which splines run
     box: tuple[int, int, int, int] = (0, 0, 0, 0)
+    # of the splines along rows and columns; without any it is the six monomials of a quadratic
     pieces: tuple[int, int] = (0, 0)
+    # (n, n), half of ``c' bending c`` is added to the objective: what is known of coefficients c
+    # without the shot. By default nothing is
     bending: FloatArray = field(default_factory=lambda: np.zeros((COEFFICIENTS, COEFFICIENTS)))
 
     @property
@@ -94,11 +86,7 @@ def make_second_differences(pieces: tuple[int, int]) -> FloatArray:
 def evaluate_monomials(pixels: Pixels, image_shape: tuple[int, int]) -> FloatArray:
     """Return 1, x, y, x^2, xy and y^2 of pixels, (n, 6), in halves of the picture from its middle.
 
-    Parameters
-    ----------
-    pixels : (n,) int array
-        Raster numbers.
-    image_shape : (int, int)
+    `pixels` (n,): raster numbers.
     """
     rows, columns = image_shape
     y, x = np.divmod(pixels, columns)

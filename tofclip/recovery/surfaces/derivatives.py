@@ -21,21 +21,13 @@ MAX_LEVERAGE = 0.9  # of a cluster: what it alone determines, its misfit says no
 
 
 class Derivatives(NamedTuple):
-    """Derivatives of the streak image by some unknowns, on the part of it that they change.
+    """Derivatives of the streak image by some unknowns, on the part of it that they change."""
 
-    Attributes
-    ----------
-    names : list of (str, int, int)
-        Field of `SurfaceState`, number of the surface or 0, number of the entry.
-    row, column : int
-        Of the part's corner.
-    images : (unknowns, rows, columns) float32 array
-    """
-
+    # field of `SurfaceState`, number of the surface or 0, number of the entry
     names: list[tuple[str, int, int]]
-    row: int
-    column: int
-    images: Image
+    row: int  # of the part's corner
+    column: int  # of the part's corner
+    images: Image  # (unknowns, rows, columns)
 
 
 def iterate_derivatives(model: SurfaceModel, amplitude: Image) -> Iterator[Derivatives]:
@@ -44,10 +36,7 @@ def iterate_derivatives(model: SurfaceModel, amplitude: Image) -> Iterator[Deriv
     The reference view keeps its delay and stretch: time zero is its own. Derivatives by gains
     and widths are by their logarithms.
 
-    Parameters
-    ----------
-    model : SurfaceModel
-    amplitude : (points,) float32 array
+    `amplitude` (points,).
     """
     views = range(model.camera.views)
     yield from map_parallel(lambda view: _differentiate_view(model, view, amplitude), views)
@@ -127,39 +116,19 @@ def _differentiate_surface(model: SurfaceModel, surface: int, amplitude: Image) 
 
 
 class ClusterProducts(NamedTuple):
-    """What a part of the image says of the unknowns that change it.
+    """What a part of the image says of the unknowns that change it."""
 
-    Attributes
-    ----------
-    own : (n,) int array
-        Numbers of these unknowns.
-    normal : (n, n) float32 array
-        J'WJ of the part.
-    score : (n,) float32 array
-        J'W of its misfit.
-    """
-
-    own: NDArray[np.intp]
-    normal: Image
-    score: Image
+    own: NDArray[np.intp]  # (n,), numbers of these unknowns
+    normal: Image  # (n, n), j'WJ of the part
+    score: Image  # (n,), j'W of its misfit
 
 
 class NormalEquations(NamedTuple):
-    """What a Gauss-Newton step is made of.
+    """What a Gauss-Newton step is made of."""
 
-    Attributes
-    ----------
-    normal : (unknowns, unknowns) float array
-        J'WJ.
-    slope : (unknowns,) float array
-        J' of what is to be explained.
-    clusters : list of ClusterProducts
-        What each part of the image adds to them.
-    """
-
-    normal: FloatArray
-    slope: FloatArray
-    clusters: list[ClusterProducts]
+    normal: FloatArray  # (unknowns, unknowns), j'WJ
+    slope: FloatArray  # (unknowns,), j' of what is to be explained
+    clusters: list[ClusterProducts]  # what each part of the image adds to them
 
     def sum_squared_scores(self, inverse: FloatArray) -> FloatArray:
         """Return the sum of squares of the clusters' scores, as they were before the step.
@@ -168,14 +137,7 @@ class NormalEquations(NamedTuple):
         is left is too little. With the leverage h of a cluster, ``1 - h`` of its variance is left
         (R. Bell and D. McCaffrey, Surv. Methodol. 28, 169, 2002).
 
-        Parameters
-        ----------
-        inverse : (unknowns, unknowns) float array
-            Of the normal matrix.
-
-        Returns
-        -------
-        (unknowns, unknowns) float array
+        `inverse` (unknowns, unknowns): of the normal matrix. Returns (unknowns, unknowns).
         """
         scores = np.zeros((len(self.clusters), self.slope.size))
         for score, (own, normal, pull) in zip(scores, self.clusters, strict=True):
@@ -206,18 +168,8 @@ def multiply_derivatives(
 
     Cluster by cluster: what is on one stays in cache, and most derivatives are on few.
 
-    Parameters
-    ----------
-    groups : list of Derivatives
-    weights : (rows, columns) float32 array
-    rest : (rows, columns) float32 array
-        Misfit that a step is to explain.
-    error : (rows, columns) float32 array
-        Misfit of the clusters' scores.
-
-    Returns
-    -------
-    NormalEquations
+    `weights` (rows, columns); `rest` (rows, columns): misfit that a step is to explain; `error`
+    (rows, columns): misfit of the clusters' scores.
     """
     ends = np.cumsum([0] + [len(group.names) for group in groups])
     normal, slope = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])

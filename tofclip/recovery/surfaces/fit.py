@@ -42,24 +42,14 @@ CHANGED_RATIO, CHANGED_EXCESS = 1.25, 0.02
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """Surfaces as they were fitted to a shot.
-
-    Parameters
-    ----------
-    model : SurfaceModel
-    solver : AmplitudeSolver
-    refinement : Refinement
-        The last one.
-    remainder : (surfaces,) float array
-        What further steps would still change of each surface's range, m.
-    reference : float
-        What the surfaces left unexplained when they were found, as a fraction of the signal.
-    """
+    """Surfaces as they were fitted to a shot."""
 
     model: SurfaceModel
     solver: AmplitudeSolver
-    refinement: Refinement
+    refinement: Refinement  # the last one
+    # (surfaces,), what further steps would still change of each surface's range, m
     remainder: FloatArray
+    # what the surfaces left unexplained when they were found, as a fraction of the signal
     reference: float
 
     def count_iterations(self) -> int:
@@ -77,26 +67,9 @@ def fit_surfaces(
 ) -> SurfaceFit:
     """Find and fit the surfaces of a shot.
 
-    Parameters
-    ----------
-    streak : Streak
-    frames : Frames
-        A fast recovery of the same shot, with the camera to use.
-    weight : float
-        Of total variation; see `tofclip.recovery.SurfaceRecovery`.
-    iterations : int
-        After the ranges are known.
-    progress : callable
-        Called with the number of frame iterations just done.
-
-    Returns
-    -------
-    SurfaceFit
-
-    Raises
-    ------
-    InputError
-        Most of the light does not come from surfaces.
+    `frames`: A fast recovery of the same shot, with the camera to use; `weight`: of total
+    variation; see `tofclip.recovery.SurfaceRecovery`; `iterations`: after the ranges are known;
+    `progress`: called with the number of frame iterations just done.
     """
     camera, count = frames.camera, frames.times.size
     # The model explains what was measured: corrections come when its returns are listed.
@@ -142,14 +115,7 @@ def straighten_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
     Splines follow the returns of frames, also where these are displaced, as behind gauze; the shot
     itself says whether the surface is bent.
 
-    Parameters
-    ----------
-    solver : AmplitudeSolver
-
-    Returns
-    -------
-    AmplitudeSolver
-        Of the model with those quadratics; the same where all splines are needed.
+    Returns of the model with those quadratics; the same where all splines are needed.
     """
     bent = [surface for surface, basis in enumerate(solver.model.bases) if not basis.is_quadratic]
     if not bent:
@@ -171,19 +137,9 @@ def straighten_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
 def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFit | None:
     """Fit the surfaces of the shot before to the next one of the same camera.
 
-    Parameters
-    ----------
-    fit : SurfaceFit
-        Of the shot before.
-    streak : Streak
-    weight : float
-        Of total variation; see `tofclip.recovery.SurfaceRecovery`.
-
-    Returns
-    -------
-    SurfaceFit or None
-        None where these surfaces no longer explain what they did: the scene has changed, and
-        surfaces have to be found anew.
+    `fit`: of the shot before; `weight`: of total variation; see `tofclip.recovery.SurfaceRecovery`.
+    Returns none where these surfaces no longer explain what they did: the scene has changed, and
+    surfaces have to be found anew.
     """
     model = fit.model.see(streak)
     solver = AmplitudeSolver(model, fit.solver.amplitude, weight, fit.solver)
@@ -224,15 +180,8 @@ def _refine(
 def extrapolate_steps(lengths: FloatArray) -> FloatArray:
     """Return how far steps that shrink as the last two did would still go.
 
-    Parameters
-    ----------
-    lengths : (steps, n) float array
-        Two steps or more.
-
-    Returns
-    -------
-    (n,) float array
-        The sum of a geometric series; steps that do not shrink count as if they halved.
+    `lengths` (steps, n): two steps or more. Returns (n,): the sum of a geometric series; steps that
+    do not shrink count as if they halved.
     """
     tiny = np.finfo(np.float64).tiny
     ratio = np.minimum(lengths[-1] / np.maximum(lengths[-2], tiny), 0.5)

@@ -28,16 +28,8 @@ SPLINE_VARIANCE = 0.25  # rows^2, of the samples' spread
 def split_between_rows(row: NDArray[np.float64]) -> tuple[NDArray[np.int32], Image]:
     """Put positions between rows: samples of the quadratic B-spline.
 
-    Parameters
-    ----------
-    row : (points,) array
-        Position of each point; row i reaches from i - 1/2 to i + 1/2.
-
-    Returns
-    -------
-    first : (points,) int32 array
-        First of the three rows.
-    shares : (points, 3) float32 array
+    `row` (points,): position of each point; row i reaches from i - 1/2 to i + 1/2. Returns `first`
+    (points,): first of the three rows; `shares` (points, 3).
     """
     middle = np.floor(row + 0.5)
     off = row - middle
@@ -55,15 +47,8 @@ def split_over_slit(position, tangent, subrows, first, shares):
     A pixel is a square of side 1: its width and the slit pixel's make a triangle, and its height
     spreads it by the tangent of the line's angle, for which `subrows` lines stand.
 
-    Parameters
-    ----------
-    position : (points,) float64 array
-        Slit position of the pixel's middle.
-    tangent : float
-        Of the view's line angle.
-    subrows : int
-    first : (points,) int32 array, overwritten
-    shares : (points, reach) float32 array, overwritten
+    `position` (points,): slit position of the pixel's middle; `tangent`: of the view's line angle;
+    `first` (points,); `shares` (points, reach).
     """
     reach = shares.shape[1]
     # a row of the picture is projected to tan(angle) slit pixels
@@ -87,14 +72,8 @@ def split_over_slit(position, tangent, subrows, first, shares):
 def add_light(amplitude, row, row_shares, column, slit_shares, image):
     """Add the light of surface points to the image of a view; all of it must fall inside.
 
-    Parameters
-    ----------
-    amplitude : (points,) float32 array
-    row, column : (points,) int32 array
-        First of those that a point reaches.
-    row_shares : (points, 3) float32 array
-    slit_shares : (points, 4) float32 array
-    image : (rows, columns) float32 array, added to
+    `amplitude` (points,); `row, column` (points,): first of those that a point reaches;
+    `row_shares` (points, 3); `slit_shares` (points, 4); `image` (rows, columns).
     """
     for point in range(amplitude.size):
         # most points of a volume are dark
@@ -112,14 +91,8 @@ def add_light(amplitude, row, row_shares, column, slit_shares, image):
 def gather_light(image, gain, row, row_shares, column, slit_shares, amplitude):
     """The adjoint of `add_light`: what each point's light would find in an image.
 
-    Parameters
-    ----------
-    image : (rows, columns) float32 array
-    gain : float
-    row, column : (points,) int32 array
-    row_shares : (points, 3) float32 array
-    slit_shares : (points, 4) float32 array
-    amplitude : (points,) float32 array, added to
+    `image` (rows, columns); `row, column` (points,); `row_shares` (points, 3); `slit_shares`
+    (points, 4); `amplitude` (points,).
     """
     for point in range(amplitude.size):
         top, left = row[point], column[point]
@@ -136,15 +109,9 @@ def gather_light(image, gain, row, row_shares, column, slit_shares, amplitude):
 def smooth_rows(image, kernel, rows, margin, result):
     """Convolve an image with a kernel along its rows, for some of the rows.
 
-    Parameters
-    ----------
-    image : (rows, columns) float32 array
-    kernel : (2 half + 1,) float32 array
-    rows : (n,) int64 array
-        Of the result.
-    margin : int
-        Row 0 of the result is this row of the image; what lies outside the image counts as dark.
-    result : (rows, columns) float32 array, overwritten in those rows
+    `image` (rows, columns); `kernel` (2 half + 1,); `rows` (n,): of the result; `margin`: row 0 of
+    the result is this row of the image; what lies outside the image counts as dark; `result` (rows,
+    columns).
     """
     half = kernel.size // 2
     for number in range(rows.size):
@@ -184,16 +151,8 @@ def prox_masked_tv(
     Fast gradient projection on the dual (A. Beck and M. Teboulle, IEEE Trans. Image Process. 18,
     2419, 2009); neighbours of which one lies outside the mask do not count.
 
-    Parameters
-    ----------
-    picture : (rows, columns) float32 array
-    mask : (rows, columns) bool array
-    weight : float
-    iterations : int
-    dual : (2, rows, columns) float32 array, overwritten
-        Start, and what to start from the next time.
-    result : (rows, columns) float32 array, overwritten
-        0 outside the mask.
+    `picture` (rows, columns); `mask` (rows, columns); `dual` (2, rows, columns): start, and what to
+    start from the next time; `result` (rows, columns): 0 outside the mask.
     """
     ahead, age, weight = dual.copy(), 1.0, float(weight)
     apply_dual(picture, mask, weight, ahead, result)

@@ -49,21 +49,9 @@ FRONT_FRACTION = 0.5  # of a surface's usual brightness: it ends where its rim i
 class SurfaceModel:
     """A(r) for one shot.
 
-    Parameters
-    ----------
-    streak : Streak
-    camera : Camera
-        With its sweep.
-    masks : (surfaces, rows, columns) bool array
-        Where each surface may be.
-    bases : sequence of SmoothBasis
-        Of the surfaces' inverse depths.
-    state : SurfaceState
-    pulse : ShotPulse, optional
-        A Gaussian of the camera's width by default.
+    `camera`: with its sweep; `masks` (surfaces, rows, columns): where each surface may be; `bases`:
+    of the surfaces' inverse depths; `pulse`: A Gaussian of the camera's width by default.
 
-    Notes
-    -----
     Memory: 40 bytes for each point and view, and the raw image some four times.
     """
 
@@ -118,13 +106,7 @@ class SurfaceModel:
     ) -> Image:
         """Return the pulse with which light between rows is smoothed.
 
-        Parameters
-        ----------
-        view : int
-        relative_width : float
-            In widths of the view's own pulse.
-        variance : float
-            Already there, rows^2.
+        `relative_width`: in widths of the view's own pulse; `variance`: already there, rows^2.
         """
         rows_per_instant = self.footprints[view].rows_per_instant
         sigma = self.pulse.sigma * rows_per_instant * self.state.widths[view] * relative_width
@@ -133,9 +115,7 @@ class SurfaceModel:
     def find_behind(self, amplitude: Image) -> None:
         """Find the points that lie behind another surface and are seen through it.
 
-        Parameters
-        ----------
-        amplitude : (points,) float32 array
+        `amplitude` (points,).
         """
         brightness = np.zeros(amplitude.size)
         for part in self.parts:
@@ -162,11 +142,7 @@ class SurfaceModel:
     def straighten(self, surface: int, amplitude: Image) -> SurfaceModel:
         """Return the same surfaces, one of splines replaced by the quadratic that is nearest to it.
 
-        Parameters
-        ----------
-        surface : int
-        amplitude : (points,) float32 array
-            The quadratic follows the points that are lit.
+        `amplitude` (points,): the quadratic follows the points that are lit.
         """
         other, part = copy.copy(self), self.parts[surface]
         basis = SmoothBasis(self.bases[surface].image_shape)
@@ -183,10 +159,7 @@ class SurfaceModel:
     def estimate_deviation(self, covariances: Sequence[FloatArray]) -> FloatArray:
         """Return the standard deviations of all ranges, (points,), m.
 
-        Parameters
-        ----------
-        covariances : sequence of (n, n) float arrays
-            Of each surface's coefficients.
+        `covariances`: of each surface's coefficients.
         """
         variance = np.concatenate(
             [
@@ -238,17 +211,8 @@ class SurfaceModel:
     ) -> Image:
         """Return what a view of gain 1 receives from some points, (rows, its columns).
 
-        Parameters
-        ----------
-        view : int
-        amplitude : (points,) float32 array
-            Of the points in `part`.
-        kernel : (taps,) float32 array
-            Of the pulse.
-        part : slice
-            Of the points; all by default.
-        rows : (int, int), optional
-            First row and the one after the last; all by default.
+        `amplitude` (points,): of the points in `part`; `kernel` (taps,): of the pulse; `part`: of
+        the points; all by default; `rows`: first row and the one after the last; all by default.
         """
         from tofclip.recovery.surfaces.kernels import add_light, smooth_rows
 
@@ -285,13 +249,8 @@ class SurfaceModel:
     def render_part(self, amplitude: Image, part: slice, rows: tuple[int, int]) -> Image:
         """Return the light of some points, on some rows.
 
-        Parameters
-        ----------
-        amplitude : (points,) float32 array
-            Of the points in `part`.
-        part : slice
-        rows : (int, int)
-            First row and the one after the last; they must hold all light of the points.
+        `amplitude` (points,): of the points in `part`; `rows`: first row and the one after the
+        last; they must hold all light of the points.
         """
         total = np.zeros((rows[1] - rows[0], self.image.shape[1]), np.float32)
         for view, kernel in enumerate(self.kernels):
@@ -334,13 +293,7 @@ class SurfaceModel:
     def shade(self, view: int, amplitude: Image, part: slice = slice(None)) -> Image:
         """Return amplitudes as a view sees them.
 
-        Parameters
-        ----------
-        view : int
-        amplitude : (points,) float32 array
-            Of the points in `part`.
-        part : slice
-            Of the points; all by default.
+        `amplitude` (points,): of the points in `part`; `part`: of the points; all by default.
         """
         behind = self.behind[part]
         if not behind.any():

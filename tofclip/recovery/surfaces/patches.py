@@ -47,37 +47,20 @@ CORRELATED_PX = 30  # returns of a frame recovery that share their errors, about
 
 @dataclass(frozen=True)
 class Patch:
-    """Returns that lie on one smooth surface.
+    """Returns that lie on one smooth surface."""
 
-    Parameters
-    ----------
-    pixels : (n,) int array
-        Raster numbers.
-    distance : (n,) float array
-        Ranges of the returns there, m.
-    basis : SmoothBasis
-    coefficients : (size,) float array
-        Inverse depth, 1/m, over the basis.
-    """
-
-    pixels: Pixels
-    distance: FloatArray
+    pixels: Pixels  # (n,), raster numbers
+    distance: FloatArray  # (n,), ranges of the returns there, m
     basis: SmoothBasis
-    coefficients: FloatArray
+    coefficients: FloatArray  # (size,), inverse depth, 1/m, over the basis
 
     def compute_ranges(
         self, pixels: Pixels, ray_length: FloatArray, coefficients: FloatArray | None = None
     ) -> FloatArray:
         """Return the ranges of the surface at some pixels, (n,), m.
 
-        Parameters
-        ----------
-        pixels : (n,) int array
-            Raster numbers.
-        ray_length : (rows, columns) float array
-            Range over depth of each pixel.
-        coefficients : (size,) float array, optional
-            Of another surface over the same basis.
+        `pixels` (n,): raster numbers; `ray_length` (rows, columns): range over depth of each pixel;
+        `coefficients` (size,): of another surface over the same basis.
         """
         chosen = self.coefficients if coefficients is None else coefficients
         found: FloatArray = ray_length.ravel()[pixels] / (self.basis.evaluate(pixels) @ chosen)
@@ -89,20 +72,9 @@ def find_patches(
 ) -> list[Patch]:
     """Find the smooth surfaces in a picture's returns, the largest first.
 
-    Parameters
-    ----------
-    pixels : (n,) int array
-        Raster number of each return; a pixel may have several.
-    distance : (n,) float array
-        Their ranges, m.
-    ray_length : (rows, columns) float array
-        Range over depth of each pixel.
-    bin_m : float
-        Range of a bin, m.
-
-    Returns
-    -------
-    list of Patch
+    `pixels` (n,): raster number of each return; a pixel may have several; `distance` (n,): their
+    ranges, m; `ray_length` (rows, columns): range over depth of each pixel; `bin_m`: range of a
+    bin, m.
     """
     patches = [
         _fit_quadratic(pixels[own], distance[own], ray_length)
@@ -135,19 +107,8 @@ def find_dimmer_patches(
     Recoveries make weak returns of their own, here and there; those of a surface lie side by side and
     hold a part of the light.
 
-    Parameters
-    ----------
-    patches : list of Patch
-        Of the strongest returns.
-    returns : Returns
-        All of the shot.
-    ray_length : (rows, columns) float array
-    bin_m : float
-        Range of a bin, m.
-
-    Returns
-    -------
-    list of Patch
+    `patches`: of the strongest returns; `returns`: all of the shot; `ray_length` (rows, columns);
+    `bin_m`: range of a bin, m.
     """
     pixel = returns.y.astype(np.intp) * ray_length.shape[1] + returns.x
     free = np.ones(pixel.size, bool)
@@ -185,18 +146,8 @@ def reach_further(
     A weaker return of a pixel is often the recovery's own. It counts where it lies on a surface that
     other pixels see alone, nearly as bright as there, and with neighbours that do so as well.
 
-    Parameters
-    ----------
-    patch : Patch
-    returns : Returns
-        All of the shot.
-    ray_length : (rows, columns) float array
-    bin_m : float
-        Range of a bin, m.
-
-    Returns
-    -------
-    (rows, columns) bool array
+    `returns`: all of the shot; `ray_length` (rows, columns); `bin_m`: range of a bin, m. Returns
+    (rows, columns).
     """
     own = np.zeros(ray_length.shape, bool)
     own.ravel()[patch.pixels] = True

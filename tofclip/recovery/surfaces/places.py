@@ -20,28 +20,18 @@ SLIT_PIXELS, SUBROWS = 4, 3
 
 
 class BetweenCentres(NamedTuple):
-    """Between which two views' centres points fall on the slit.
+    """Between which two views' centres points fall on the slit."""
 
-    Attributes
-    ----------
-    before : (points,) int array
-        The centre before each.
-    fraction : (points,) float array
-        The way from there to the next centre, 0 to 1; outside the outer centres below or beyond, as
-        the sweep goes on linearly there.
-    """
-
-    before: NDArray[np.intp]
+    before: NDArray[np.intp]  # (points,), the centre before each
+    # (points,), the way from there to the next centre, 0 to 1; outside the outer centres below or
+    # beyond, as the sweep goes on linearly there
     fraction: FloatArray
 
     @classmethod
     def find(cls, centres: FloatArray, column: FloatArray) -> BetweenCentres:
         """Return where places on the slit lie between the centres.
 
-        Parameters
-        ----------
-        centres : (views,) float array
-        column : (points,) float array
+        `centres` (views,); `column` (points,).
         """
         if centres.size == 1:
             return cls(np.zeros(column.size, np.intp), np.zeros(column.size))
@@ -63,47 +53,27 @@ class BetweenCentres(NamedTuple):
 
 
 class PointPlaces(NamedTuple):
-    """Where points fall in one view.
+    """Where points fall in one view."""
 
-    Attributes
-    ----------
-    row, column : (points,) float array
-        Of the raw streak image; row i reaches from i - 1/2 to i + 1/2.
-    between : BetweenCentres
-    rows_per_instant : float
-        Raw rows in the time of one, on average.
-    """
-
-    row: FloatArray
-    column: FloatArray
+    row: FloatArray  # (points,), of the raw streak image; row i reaches from i - 1/2 to i + 1/2
+    column: FloatArray  # (points,), of the raw streak image; row i reaches from i - 1/2 to i + 1/2
     between: BetweenCentres
-    rows_per_instant: float
+    rows_per_instant: float  # raw rows in the time of one, on average
 
 
 @dataclass(frozen=True)
 class PointRays:
-    """The rays on which surface points lie.
+    """The rays on which surface points lie."""
 
-    Parameters
-    ----------
-    directions : (points, 3) float array
-        Of length 1.
-    x, y : (points,) int or float array
-        Pixels from the optical axis.
-    """
-
-    directions: FloatArray
-    x: NDArray[Any]
-    y: NDArray[Any]
+    directions: FloatArray  # (points, 3), of length 1
+    x: NDArray[Any]  # (points,), pixels from the optical axis
+    y: NDArray[Any]  # (points,), pixels from the optical axis
 
     @classmethod
     def of_pixels(cls, camera: Camera, y: NDArray[np.intp], x: NDArray[np.intp]) -> PointRays:
         """Return the rays of some pixels.
 
-        Parameters
-        ----------
-        camera : Camera
-        y, x : (points,) int array
+        `y, x` (points,).
         """
         axis_row, axis_column = camera.optical_axis_px
         return cls(compute_ray_directions(camera, y, x), x - axis_column, y - axis_row)
@@ -118,16 +88,8 @@ class PointRays:
     ) -> PointPlaces:
         """Return where the points fall in a view.
 
-        Parameters
-        ----------
-        view : int
-        distance : (points,) float array
-            Range of each point, m.
-        camera : Camera
-        state : SurfaceState
-            With the delays and stretches of the views.
-        times : (rows,) float array
-            Time axis of the streak image, s.
+        `distance` (points,): range of each point, m; `state`: with the delays and stretches of the
+        views; `times` (rows,): time axis of the streak image, s.
         """
         points, position = self.directions * distance[:, np.newaxis], camera.view_positions[view]
         viewpoint = np.array([camera.lenslet_pitch * position, 0.0, 0.0])
@@ -154,11 +116,7 @@ class PointRays:
 def measure_height(row: NDArray[Any], rows: int) -> FloatArray:
     """Return rows as fractions of the streak image from its middle.
 
-    Parameters
-    ----------
-    row : array
-    rows : int
-        Of the streak image.
+    `rows`: of the streak image.
     """
     height: FloatArray = row / rows - 0.5
     return height
@@ -167,12 +125,7 @@ def measure_height(row: NDArray[Any], rows: int) -> FloatArray:
 def find_rows(times: FloatArray, time: FloatArray) -> FloatArray:
     """Return where instants lie on a time axis, which need not be even, in rows.
 
-    Parameters
-    ----------
-    times : (rows,) float array
-        Rising, s; beyond its ends the axis goes on as there.
-    time : float array
-        s.
+    `times` (rows,): rising, s; beyond its ends the axis goes on as there; `time`: s.
     """
     first, last = times[1] - times[0], times[-1] - times[-2]
     before, after = np.minimum(time - times[0], 0) / first, np.maximum(time - times[-1], 0) / last
@@ -181,36 +134,22 @@ def find_rows(times: FloatArray, time: FloatArray) -> FloatArray:
 
 
 class Footprint(NamedTuple):
-    """The rows and columns of a view on which points have light, and in which fractions.
+    """The rows and columns of a view on which points have light, and in which fractions."""
 
-    Attributes
-    ----------
-    row, column : (points,) int32 array
-        First of those that a point reaches; columns count from `first_column`.
-    row_shares : (points, 3) float32 array
-        Before the pulse smooths them.
-    slit_shares : (points, 4) float32 array
-    first_column, columns : int
-        Of the slit, of which the view has a part.
-    lit_rows : (n,) int64 array
-        Of the streak image, which smoothed light reaches.
-    reached_rows : (n,) int64 array
-        Those that light reaches before it is smoothed, counted from `margin` above the first one.
-    between : BetweenCentres
-    rows_per_instant : float
-        As of `PointPlaces`.
-    """
-
+    # (points,), first of those that a point reaches; columns count from `first_column`
     row: NDArray[np.int32]
-    row_shares: Image
+    row_shares: Image  # (points, 3), before the pulse smooths them
+    # (points,), first of those that a point reaches; columns count from `first_column`
     column: NDArray[np.int32]
-    slit_shares: Image
-    first_column: int
-    columns: int
-    lit_rows: NDArray[np.int64]
+    slit_shares: Image  # (points, 4)
+    first_column: int  # of the slit, of which the view has a part
+    columns: int  # of the slit, of which the view has a part
+    lit_rows: NDArray[np.int64]  # (n,), of the streak image, which smoothed light reaches
+    # (n,), those that light reaches before it is smoothed, counted from `margin` above the first
+    # one
     reached_rows: NDArray[np.int64]
     between: BetweenCentres
-    rows_per_instant: float
+    rows_per_instant: float  # as of `PointPlaces`
 
     def overlap(self, slit_width: int) -> tuple[slice, slice]:
         """Return the part of the view's columns that lies on the slit, and where."""
@@ -227,17 +166,9 @@ def spread_points(
     Nothing of what misses the streak image is kept: a surface may run off without end, and one that
     comes close is spread over all of the slit's plane.
 
-    Parameters
-    ----------
-    places : PointPlaces
-    tangent : float
-        Of the view's line angle.
-    shape : (int, int)
-        Rows and columns of the streak image.
-    margin : int
-        Rows above and below it that may hold light.
-    half : int
-        Rows to either side over which the pulse smooths it.
+    `tangent`: of the view's line angle; `shape`: rows and columns of the streak image; `margin`:
+    rows above and below it that may hold light; `half`: rows to either side over which the pulse
+    smooths it.
     """
     from tofclip.recovery.surfaces.kernels import (
         SPLINE_SAMPLES,

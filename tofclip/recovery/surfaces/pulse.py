@@ -37,27 +37,17 @@ MIN_VARIANCE = 0.02  # rows^2, of the smoothing that is left of a pulse shorter 
 
 @dataclass(frozen=True)
 class ShotPulse:
-    """A Gaussian core and what follows it.
+    """A Gaussian core and what follows it."""
 
-    Parameters
-    ----------
-    sigma : float
-        Of the core, rows.
-    lags : (n,) int array
-        Rows after the return at which the core appears.
-    shares : (n,) float array
-        Its light there; the sum is 1.
-    width_ratio : float
-        Full width at half maximum, as the shot shows it, over the camera's; 1 where nothing was
-        measured.
-    tail_share : float
-        Of its light, what comes more than one and a half of the camera's widths after the peak.
-    """
-
-    sigma: float
+    sigma: float  # of the core, rows
+    # (n,), rows after the return at which the core appears
     lags: NDArray[np.intp] = field(default_factory=lambda: np.zeros(1, np.intp))
+    # (n,), its light there; the sum is 1
     shares: FloatArray = field(default_factory=lambda: np.ones(1))
+    # full width at half maximum, as the shot shows it, over the camera's; 1 where nothing was
+    # measured
     width_ratio: float = 1.0
+    # of its light, what comes more than one and a half of the camera's widths after the peak
     tail_share: float = 0.0
 
     @property
@@ -79,17 +69,8 @@ class ShotPulse:
 def measure_pulse(frames: Frames, pixels: NDArray[np.intp], distance: FloatArray) -> ShotPulse:
     """Measure the pulse of a shot in its frames; the camera's where it is as short as that.
 
-    Parameters
-    ----------
-    frames : Frames
-    pixels : (n,) int array
-        Raster numbers of pixels that lie on surfaces.
-    distance : (n,) float array
-        Range of the strongest return of each, m.
-
-    Returns
-    -------
-    ShotPulse
+    `pixels` (n,): raster numbers of pixels that lie on surfaces; `distance` (n,): range of the
+    strongest return of each, m.
     """
     width = frames.camera.pulse_fwhm / frames.bin_width
     usual = ShotPulse(width / FWHM_PER_SIGMA)
@@ -118,20 +99,8 @@ def find_usual_course(
 ) -> FloatArray:
     """Return the median course of light about the returns of bright pixels, its peak 1.
 
-    Parameters
-    ----------
-    frames : Frames
-    pixels : (n,) int array
-    distance : (n,) float array
-        m.
-    lags : (m,) int array
-        Rows after the return.
-    width : float
-        Of the camera's pulse, rows.
-
-    Returns
-    -------
-    (m,) float array
+    `pixels` (n,); `distance` (n,): m; `lags` (m,): rows after the return; `width`: of the camera's
+    pulse, rows. Returns (m,).
     """
     traces = frames.values.reshape(frames.values.shape[0], -1)
     row = np.interp(2 * distance / SPEED_OF_LIGHT, frames.times, np.arange(frames.times.size))
@@ -168,20 +137,9 @@ def split_core(
 ) -> tuple[float, FloatArray]:
     """Explain a pulse as a Gaussian core at some lags, by non-negative least squares.
 
-    Parameters
-    ----------
-    shape : (m,) float array
-    lags : (m,) int array
-        Rows after the return.
-    width : float
-        Of the camera's pulse, rows.
-
-    Returns
-    -------
-    sigma : float
-        Of the core, rows: the widest that explains the pulse as well as any.
-    shares : (m,) float array
-        Of the core at each lag.
+    `shape` (m,); `lags` (m,): rows after the return; `width`: of the camera's pulse, rows. Returns
+    `sigma`: of the core, rows: the widest that explains the pulse as well as any; `shares` (m,): of
+    the core at each lag.
     """
     allowed = np.flatnonzero(lags >= -LAGS_BEFORE * width)
     found = []
@@ -200,14 +158,8 @@ def split_core(
 def make_pulse(sigma: float, half: int, variance: float = SPLINE_LEFT_VARIANCE) -> Image:
     """Return the samples of a Gaussian pulse that are left to smooth with.
 
-    Parameters
-    ----------
-    sigma : float
-        Standard deviation of the pulse, rows.
-    half : int
-        Samples to either side.
-    variance : float
-        Already there, rows^2.
+    `sigma`: standard deviation of the pulse, rows; `half`: samples to either side; `variance`:
+    already there, rows^2.
     """
     rest = max(sigma**2 - variance, MIN_VARIANCE)
     taps = np.arange(-half, half + 1)

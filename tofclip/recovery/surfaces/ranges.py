@@ -38,30 +38,18 @@ RIDGE = 1e-6  # of each unknown's own information: for what the shot says nothin
 
 @dataclass(frozen=True)
 class Refinement:
-    """What a Gauss-Newton step knows.
+    """What a Gauss-Newton step knows."""
 
-    Parameters
-    ----------
-    covariances : list of (n, n) float arrays
-        Of each surface's coefficients; everything else that was solved for is unknown.
-    amplitude : (points,) float32 array
-        After the step.
-    explained : (6, points) float32 array
-        Changes of amplitude that look like a change of each coefficient of a quadratic.
-    steps : int
-        Taken, with this one.
-    objective : float
-        After the step: half the weighted squared misfit that amplitudes cannot explain, and what is
-        known of surfaces and sweep beforehand.
-    free : (points,) float32 array, optional
-        Amplitudes that explain this shot best without the prior, if it is this shot's step.
-    """
-
+    # of each surface's coefficients; everything else that was solved for is unknown
     covariances: list[FloatArray]
-    amplitude: Image
+    amplitude: Image  # (points,), after the step
+    # (6, points), changes of amplitude that look like a change of each coefficient of a quadratic
     explained: Image
-    steps: int
+    steps: int  # taken, with this one
+    # after the step: half the weighted squared misfit that amplitudes cannot explain, and what is
+    # known of surfaces and sweep beforehand
     objective: float
+    # (points,), amplitudes that explain this shot best without the prior, if it is this shot's step
     free: Image | None
 
 
@@ -79,17 +67,8 @@ def refine_state(
     the misfit has, also where misfits of neighbouring measurements depend on each other, and what the
     step itself takes from them (`NormalEquations.sum_squared_scores`).
 
-    Parameters
-    ----------
-    model : SurfaceModel
-        Moved in place. The mean gain stays, and so does the mean brightness behind a surface.
-    amplitude : (points,) float32 array
-    earlier : Refinement, optional
-        The step before this one, which saves work.
-
-    Returns
-    -------
-    Refinement
+    `model`: moved in place. The mean gain stays, and so does the mean brightness behind a surface;
+    `amplitude` (points,); `earlier`: the step before this one, which saves work.
     """
     state = model.state
     error = model.image - model.render(amplitude)
@@ -224,13 +203,9 @@ def _eliminate_amplitude(
     surfaces, which hardly share measurements, the derivatives of one number are treated at once.
     Splines bend less than amplitudes could follow, but what of them is a quadratic does not.
 
-    Returns
-    -------
-    changes : (6, points) float32 array
-        x for each coefficient of a quadratic.
-    patterns : list of Derivatives
-        By the first of these changes of each surface's amplitude: it is what amplitudes can explain
-        of views that are all late.
+    Returns `changes` (6, points): x for each coefficient of a quadratic; `patterns`: by the first
+    of these changes of each surface's amplitude: it is what amplitudes can explain of views that
+    are all late.
     """
     own = [group for group in groups if group.names[0][0] == "coefficients"]
     parts = [model.parts[group.names[0][1]] for group in own]

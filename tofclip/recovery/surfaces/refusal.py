@@ -36,17 +36,7 @@ SLOPE_WINDOW_PX = 7
 def require_gentle_slopes(found: Returns, bin_m: float) -> None:
     """Refuse a shot most of whose light is on surfaces seen nearly edge-on.
 
-    Parameters
-    ----------
-    found : Returns
-    bin_m : float
-        Range of a bin, m.
-
-    Raises
-    ------
-    InputError
-        More than `MAX_STEEP_SHARE` of the returns' light lies where a pixel spans `STEEP_BINS` or
-        more.
+    `bin_m`: range of a bin, m.
     """
     slope, scatter = measure_slopes(found.image("range"))
     steep = (slope > STEEP_BINS * bin_m) & (scatter < slope)
@@ -64,17 +54,9 @@ def measure_slopes(distance: Image) -> tuple[FloatArray, FloatArray]:
     """Return how far ranges change from pixel to pixel, by a plane through each pixel's
     surroundings.
 
-    Parameters
-    ----------
-    distance : (rows, columns) float32 array
-        Ranges, m; NaN where there is none.
-
-    Returns
-    -------
-    slope : (rows, columns) float array
-        m per pixel; 0 where less than half of the surroundings has a range.
-    scatter : (rows, columns) float array
-        Root mean square distance of the ranges from the plane, m.
+    `distance` (rows, columns): ranges, m; NaN where there is none. Returns `slope` (rows, columns):
+    m per pixel; 0 where less than half of the surroundings has a range; `scatter` (rows, columns):
+    root mean square distance of the ranges from the plane, m.
     """
     known = np.isfinite(distance)
     place = np.indices(distance.shape).astype(np.float64)
@@ -107,16 +89,7 @@ def measure_slopes(distance: Image) -> tuple[FloatArray, FloatArray]:
 def require_surfaces(found: Returns, patches: list[Patch]) -> None:
     """Refuse a shot whose returns do not lie side by side on surfaces.
 
-    Parameters
-    ----------
-    found : Returns
-    patches : list of Patch
-        Surfaces through them.
-
-    Raises
-    ------
-    InputError
-        Less than `MIN_SURFACE_SHARE` of their light lies on surfaces.
+    `patches`: surfaces through them.
     """
     on_surface = np.zeros(found.camera.image_shape, bool)
     for patch in patches:
@@ -128,17 +101,7 @@ def require_surfaces(found: Returns, patches: list[Patch]) -> None:
 
 
 def require_short_pulse(pulse: ShotPulse) -> None:
-    """Refuse a shot whose pixels go on receiving light long after the return.
-
-    Parameters
-    ----------
-    pulse : ShotPulse
-
-    Raises
-    ------
-    InputError
-        More than `MAX_TAIL_SHARE` of its light comes long after its peak.
-    """
+    """Refuse a shot whose pixels go on receiving light long after the return."""
     if pulse.tail_share > MAX_TAIL_SHARE:
         raise _refuse(
             f"{100 * pulse.tail_share:.0f} % of each pixel's light comes long after its peak"
@@ -150,18 +113,7 @@ def require_explained(
 ) -> None:
     """Refuse a shot that surfaces explain neither well nor as well as its frames do.
 
-    Parameters
-    ----------
-    model : SurfaceModel
-    amplitude : (points,) float32 array
-    frames : Frames
-        A fast recovery of the same shot.
-    streak : Streak
-
-    Raises
-    ------
-    InputError
-        Surfaces leave more than `MAX_UNEXPLAINED` of the signal, and more than the frames do.
+    `amplitude` (points,); `frames`: A fast recovery of the same shot.
     """
     unexplained = model.unexplained(amplitude)
     if unexplained <= MAX_UNEXPLAINED:

@@ -25,17 +25,8 @@ NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a p
 def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float = 0.0) -> Returns:
     """List the points that stand out of the noise and of their neighbourhood, pixel by pixel.
 
-    Parameters
-    ----------
-    fit : SurfaceFit
-    detection : Detection
-        Which points are returned.
-    centre_error_px : float
-        How far off the calibration had each slit centre, as for `tofclip.recovery.Shot`.
-
-    Returns
-    -------
-    tofclip.shots.Returns
+    `detection`: which points are returned; `centre_error_px`: how far off the calibration had each
+    slit centre, as for `tofclip.recovery.Shot`.
     """
     model, solver = fit.model, fit.solver
     camera = model.camera.replace(gains=model.state.gains)
@@ -95,15 +86,8 @@ def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
     tan(angle_v)``. That part is taken to be that of errors which alternate, as of neighbouring
     lenslets measured in turns; independent ones would leave sqrt(views) as much.
 
-    Parameters
-    ----------
-    camera : Camera
-    centre_error_px : float
-        How far off the calibration had each slit centre, as for `tofclip.recovery.Shot`.
-
-    Returns
-    -------
-    (2,) float array
+    `centre_error_px`: how far off the calibration had each slit centre, as for
+    `tofclip.recovery.Shot`. Returns (2,).
     """
     in_turns = (-1.0) ** np.arange(camera.views)
     looks = np.stack([np.ones(camera.views), -np.tan(camera.angles)], axis=1)
@@ -117,16 +101,8 @@ def pool_information(information: Image, picture: Image) -> Image:
     These are the nearest ones, and those further off that the prior has made as bright: where little
     is known of each pixel it leaves large even pieces, whose amplitude all their pixels determine.
 
-    Parameters
-    ----------
-    information : (rows, columns) float32 array
-        Of each pixel alone, one over the variance of its amplitude.
-    picture : (rows, columns) float32 array
-        Amplitudes.
-
-    Returns
-    -------
-    (rows, columns) float32 array
+    `information` (rows, columns): of each pixel alone, one over the variance of its amplitude;
+    `picture` (rows, columns): amplitudes. Returns (rows, columns).
     """
 
     def add_up(values: Image, side: int) -> Image:
@@ -149,17 +125,9 @@ def pool_information(information: Image, picture: Image) -> Image:
 def find_usual_brightness(amplitude: Image, significance: Image, limit: float) -> float:
     """Return the usual amplitude of the points of which a surface certainly consists.
 
-    Parameters
-    ----------
-    amplitude, significance : (points,) float32 arrays
-        Of the surface; significance in standard deviations.
-    limit : float
-        Standard deviations below which there is no point.
-
-    Returns
-    -------
-    float
-        Infinite if no point is sure.
+    `amplitude, significance` (points,): of the surface; significance in standard deviations;
+    `limit`: standard deviations below which there is no point. Returns infinite if no point is
+    sure.
     """
     if amplitude.size == 0:
         return float("inf")

@@ -19,15 +19,7 @@ SMOOTHING_PX = 2.0
 def weigh_measurements(streak: Streak, camera: Camera) -> tuple[Image, Image]:
     """Return the measurements above the dark level, and one over their variance.
 
-    Parameters
-    ----------
-    streak : Streak
-    camera : Camera
-
-    Returns
-    -------
-    image, weights : (rows, columns) float32 array
-        Weights are 0 where a measurement is not valid.
+    Returns `image, weights` (rows, columns): weights are 0 where a measurement is not valid.
     """
     dark = estimate_dark_level(streak.counts)
     image = (streak.counts - np.float32(dark)).astype(np.float32)
@@ -43,14 +35,7 @@ def weigh_measurements(streak: Streak, camera: Camera) -> tuple[Image, Image]:
 def compare_smoothed(predicted: Image, measured: Image, valid: NDArray[np.bool_]) -> float:
     """Return the norm of what is left over that of the measurements, both smoothed.
 
-    Parameters
-    ----------
-    predicted, measured : (rows, columns) float32 array
-    valid : (rows, columns) bool array
-
-    Returns
-    -------
-    float
+    `predicted, measured` (rows, columns); `valid` (rows, columns).
     """
     error, image = (
         scipy.ndimage.gaussian_filter(one * valid, SMOOTHING_PX)

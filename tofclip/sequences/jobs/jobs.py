@@ -181,11 +181,7 @@ class JobPool:
     The scheduler knows only as many jobs as there are threads, twice: a sequence of millions costs
     it no memory, and few are blamed for a worker's death.
 
-    Parameters
-    ----------
-    client : distributed.Client
-    on_killed : callable, optional
-        Called with a job whose workers died too often, in place of a report of failure.
+    `on_killed`: called with a job whose workers died too often, in place of a report of failure.
     """
 
     def __init__(self, client: Client, on_killed: Callable[[Job], object] | None = None) -> None:
@@ -193,13 +189,7 @@ class JobPool:
         self._slots, self._counted_at_s = 1, 0.0
 
     def run_all(self, jobs: Sequence[Job]) -> Iterator[Report]:
-        """Do all jobs, and yield the reports as they come.
-
-        Raises
-        ------
-        InputError
-            For `MAX_WORKERLESS_S` there was no worker that could do the rest.
-        """
+        """Do all jobs, and yield the reports as they come."""
         from distributed import as_completed
 
         waiting = iter(jobs)

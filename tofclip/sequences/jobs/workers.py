@@ -27,20 +27,10 @@ WAIT_SECONDS = 30.0
 def connect_workers(where: str) -> Iterator[Client]:
     """Yield a client of the workers that `where` names.
 
-    Parameters
-    ----------
-    where : str
-        ``local``: one worker for each core of this machine; ``local:N``: N workers, which share the
-        cores; ``tcp://HOST:PORT`` or ``tls://HOST:PORT``: a scheduler (``dask scheduler``), whose
-        workers (``dask worker``) have this version of this program and see the files under the same
-        names.
-
-    Raises
-    ------
-    InputError
-        `where` is none of these, or nothing usable answers there.
-    MissingDependencyError
-        dask.distributed is not installed.
+    `where`: ``local``: one worker for each core of this machine; ``local:N``: N workers, which
+    share the cores; ``tcp://HOST:PORT`` or ``tls://HOST:PORT``: a scheduler (``dask scheduler``),
+    whose workers (``dask worker``) have this version of this program and see the files under the
+    same names.
     """
     number = count_local_workers(where)
     try:

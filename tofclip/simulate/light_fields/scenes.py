@@ -46,19 +46,8 @@ class _SceneBuilder:
     ) -> Body:
         """Return a flat plate that faces the cameras.
 
-        Parameters
-        ----------
-        place : (float, float)
-            Pixels right and down of the centre of the reference view.
-        size : (float, float)
-            Width and height as the reference view sees them, pixels.
-        shear : float
-            Depth, as pixels per view step.
-        material : Material
-
-        Returns
-        -------
-        Body
+        `place`: pixels right and down of the centre of the reference view; `size`: width and height
+        as the reference view sees them, pixels; `shear`: depth, as pixels per view step.
         """
         width, height = (self._length(side, shear) for side in size)
         return Body(Rectangle(width, height), material, self._point(place, shear))
@@ -68,19 +57,8 @@ class _SceneBuilder:
     ) -> Body:
         """Return a ball whose centre lies at a shear.
 
-        Parameters
-        ----------
-        place : (float, float)
-            Pixels right and down of the centre of the reference view.
-        radius : float
-            Pixels of the reference view.
-        shear : float
-            Depth, as pixels per view step.
-        material : Material
-
-        Returns
-        -------
-        Body
+        `place`: pixels right and down of the centre of the reference view; `radius`: pixels of the
+        reference view; `shear`: depth, as pixels per view step.
         """
         return Body(Sphere(self._length(radius, shear)), material, self._point(place, shear))
 
@@ -93,19 +71,8 @@ class _SceneBuilder:
     ) -> Body:
         """Return a block as thick as it is wide.
 
-        Parameters
-        ----------
-        place : (float, float)
-            Pixels right and down of the centre of the reference view.
-        size : (float, float)
-            Width and height, pixels of the reference view.
-        shear : float
-            Depth, as pixels per view step.
-        material : Material
-
-        Returns
-        -------
-        Body
+        `place`: pixels right and down of the centre of the reference view; `size`: width and
+        height, pixels of the reference view; `shear`: depth, as pixels per view step.
         """
         width, height = (self._length(side, shear) for side in size)
         return Body(Box(width, height, width), material, self._point(place, shear))
@@ -113,15 +80,7 @@ class _SceneBuilder:
     def backdrop(self, shear: float, material: Material) -> Body:
         """Return a plate that fills every view.
 
-        Parameters
-        ----------
-        shear : float
-            Depth, as pixels per view step.
-        material : Material
-
-        Returns
-        -------
-        Body
+        `shear`: depth, as pixels per view step.
         """
         return self.plate((0, 0), (2.2 * DESIGN_WIDTH_PX,) * 2, shear, material)
 
@@ -162,20 +121,7 @@ def make_scene(name: str, array: CameraArray) -> Scene:
 def edit_scene(scene: Scene, edit: str) -> Scene:
     """Change what stands before the backdrop, in 3D (generalised flip test, supplement Note 6).
 
-    Parameters
-    ----------
-    scene : Scene
-    edit : str
-        ``original``, ``shift``, ``flip`` or ``rotate``.
-
-    Returns
-    -------
-    Scene
-
-    Raises
-    ------
-    InputError
-        There is no such edit.
+    `edit`: ``original``, ``shift``, ``flip`` or ``rotate``.
     """
     if edit not in EDITS:
         raise InputError(f"unknown edit '{edit}'; take one of {', '.join(EDITS)}")

@@ -35,10 +35,7 @@ def request_tile_registers() -> bool:
     """Ask for the processor's matrix registers; Linux gives them to processes that do, and to all
     threads of theirs.
 
-    Returns
-    -------
-    bool
-        Whether compiled loops may use them.
+    Returns whether compiled loops may use them.
     """
     # the compiler takes as long to import as all else
     from tofclip.operators.panels.kernels import CPU_FEATURES
@@ -59,18 +56,8 @@ def arrange_matrix(matrix: FloatImage) -> PanelMatrix | TileMatrix:
 class TileMatrix:
     """A matrix in tiles of three parts, whose numbers have 8 digits each.
 
-    Parameters
-    ----------
-    matrix : (rows, columns) float32 array
-        Finite.
+    `matrix` (rows, columns): finite.
 
-    Raises
-    ------
-    RuntimeError
-        The processor's matrix registers may not be used; see `arrange_matrix`.
-
-    Notes
-    -----
     Memory: one and a half times the matrix, which is held on to as well.
     """
 

@@ -49,11 +49,7 @@ second-level cache."""
 class _Registers:
     """Writes down what is done with the registers: four sums, two tiles of a panel, two of a block.
 
-    Parameters
-    ----------
-    builder : llvmlite.ir.IRBuilder
-    vectors : int
-        One or two.
+    `vectors`: one or two.
     """
 
     def __init__(self, builder: Any, vectors: int) -> None:
@@ -109,20 +105,12 @@ class _Registers:
 def _make_tile_product(vectors: int) -> Any:
     """Make the product of a panel with some vectors of a packed block.
 
-    Parameters
-    ----------
-    vectors : int
-        One or two.
-
-    Returns
-    -------
-    callable
-        ``(shapes, panel, first, block, start, plane, result, place, stride, count, onto)``, for
-        compiled loops: writes to `PANEL_ROWS` rows of `result`, `stride` apart, from entry `place`
-        on, the products of `count` depths of the panel, from entry `first` on, with as many of the
-        block; where `onto` says so they are added to what stands there. Of the block a vector's
-        depths lie one behind the other from entry `start` on, the next vector's `plane` entries
-        behind them. `shapes` is `TILE_SHAPES`. All arrays are flat.
+    `vectors`: one or two. Returns ``(shapes, panel, first, block, start, plane, result, place,
+    stride, count, onto)``, for compiled loops: writes to `PANEL_ROWS` rows of `result`, `stride`
+    apart, from entry `place` on, the products of `count` depths of the panel, from entry `first`
+    on, with as many of the block; where `onto` says so they are added to what stands there. Of the
+    block a vector's depths lie one behind the other from entry `start` on, the next vector's
+    `plane` entries behind them. `shapes` is `TILE_SHAPES`. All arrays are flat.
     """
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
@@ -189,13 +177,9 @@ _emit_tile_product = _make_tile_product(1)
 def split_lanes(lanes, parts):
     """Split numbers into parts of 8 digits, and put two rows' side by side.
 
-    Parameters
-    ----------
-    lanes : (vectors, rows, LENGTH) C-contiguous float32 array
-        An even number of rows.
-    parts : (vectors, depths, PARTS, TILE_ROWS, LENGTH) C-contiguous uint32 array, overwritten
-        As far as there are rows. The even row's part is the lower half of a number, and the odd
-        row's the upper one.
+    `lanes` (vectors, rows, LENGTH): an even number of rows; `parts` (vectors, depths, PARTS,
+    TILE_ROWS, LENGTH): as far as there are rows. The even row's part is the lower half of a number,
+    and the odd row's the upper one.
     """
     for vector in range(lanes.shape[0]):
         for pair in range(np.uintp(lanes.shape[1] // 2)):
@@ -235,16 +219,10 @@ def round_number(value):
 def multiply_tiles(panels, block, before, result):
     """Multiply a matrix in panels of tiles with the vectors of a block.
 
-    Parameters
-    ----------
-    panels : (panels, depths, PARTS, PANEL_TILES, TILE_ROWS, TILE_DEPTH // 2) C-contiguous uint32 array
-        Each number holds two columns' parts, the even one's in its lower half.
-    block : (vectors, depths, PARTS, TILE_ROWS, LENGTH) C-contiguous uint32 array
-        Of `split_lanes`.
-    before : int
-        Vectors of the result before those of the block.
-    result : (PANEL_ROWS * panels, lanes) C-contiguous float32 array
-        Overwritten in the lanes of the vectors.
+    `panels` (panels, depths, PARTS, PANEL_TILES, TILE_ROWS, TILE_DEPTH // 2): each number holds two
+    columns' parts, the even one's in its lower half; `block` (vectors, depths, PARTS, TILE_ROWS,
+    LENGTH): of `split_lanes`; `before`: vectors of the result before those of the block; `result`
+    (PANEL_ROWS * panels, lanes): overwritten in the lanes of the vectors.
     """
     depths, stride, vectors = panels.shape[1], result.shape[1], block.shape[0]
     matrix, target = panels.reshape(panels.size), result.reshape(result.size)
