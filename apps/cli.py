@@ -33,8 +33,8 @@ from apps.help import (
     make_lazy_group,
 )
 from apps.verb_help import HELP_OPTION, show_verb_help
-from tofclip.dependencies import describe_missing_package
 from tofclip.errors import InputError, TofclipError
+from tofclip.files import describe_missing_package
 from tofclip.version import __version__
 
 ARGUMENT_IN_MESSAGE = re.compile(r"`(?P<name>[a-z_]+)(?:=\"?(?P<value>[^`\"]*)\"?)?`")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from devices.linospad2.source import LinoSpad2File
-from devices.photons import STAMPS_SUFFIX
+from devices.counted_photons import STAMPS_SUFFIX
+from devices.linospad2 import LinoSpad2File
 from tofclip.errors import FileFormatError
 from tofclip.lidar.photons.files import describe_photons
 from tofclip.loading import outline

@@ -19,22 +19,19 @@ from typing import Any
 
 import numpy as np
 
-from devices.clock import InstrumentClock
-from devices.frames import FrameCodec
-from devices.gate_scan import GATE_OPTIONS, GateScan
-from devices.ledger import Ledger
+from devices.address import Uri
+from devices.frames import GATE_OPTIONS, FrameCodec, GateScan
 from devices.registry import DiscoveredInstrument
-from devices.ring import Gap
-from devices.source import Info
+from devices.source import Gap, Info, Ledger
 from devices.stream import (
     STREAM_OPTIONS,
+    InstrumentClock,
     StreamSource,
     Transfer,
     parse_buffer_settings,
     parse_seconds,
     retry_connect,
 )
-from devices.uri import Uri
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceError,

@@ -12,48 +12,47 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from devices.codec import Codec
-from devices.source import Source
-from devices.uri import Uri
+from devices.address import Uri
+from devices.source import Codec, Source
 from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
 OPENERS: dict[str, str] = {
     "aravis": "devices.aravis:open_aravis",
-    "linospad2": "devices.linospad2.source:open_recording",
-    "remoteex": "devices.remoteex.source:open_remoteex",
-    "spad512": "devices.spad512.source:open_spad512",
+    "linospad2": "devices.linospad2:open_recording",
+    "remoteex": "devices.remoteex:open_remoteex",
+    "spad512": "devices.spad512:open_spad512",
     "sim+aravis": "devices.emulation.aravis:open_emulated",
-    "sim+linospad2": "devices.linospad2.simulation:open_simulated",
-    "sim+remoteex": "devices.remoteex.simulation:open_emulated",
-    "sim+spad512": "devices.spad512.emulator:open_emulated",
-    "timetag": "devices.timetag.source:open_timetag",
-    "sim+tmf8828": "devices.histogram_kits.emulator:open_tmf8828",
-    "sim+vl53l8": "devices.histogram_kits.emulator:open_vl53l8",
-    "tmf8828": "devices.histogram_kits.source:open_tmf8828",
-    "vl53l8": "devices.histogram_kits.source:open_vl53l8",
-    "sim+timetag": "devices.timetag.simulation:open_timetag",
+    "sim+linospad2": "devices.emulation.linospad2:open_simulated",
+    "sim+remoteex": "devices.emulation.remoteex:open_emulated",
+    "sim+spad512": "devices.emulation.spad512:open_emulated",
+    "timetag": "devices.timetag.driver:open_timetag",
+    "sim+tmf8828": "devices.emulation.histogram_kits:open_tmf8828",
+    "sim+vl53l8": "devices.emulation.histogram_kits:open_vl53l8",
+    "tmf8828": "devices.histogram_kits:open_tmf8828",
+    "vl53l8": "devices.histogram_kits:open_vl53l8",
+    "sim+timetag": "devices.emulation.timetag:open_timetag",
 }
 """Scheme of an address -> function ``(Uri) -> Source``."""
 
 FILE_OPENERS: dict[str, str] = {
-    ".dat": "devices.linospad2.source:open_recording",
-    ".img": "devices.streak_file:open_streak_file",
-    ".tif": "devices.streak_file:open_streak_file",
-    ".tiff": "devices.streak_file:open_streak_file",
-    ".phu": "devices.tcspc:open_phu",
-    ".ptu": "devices.tcspc:open_ptu",
-    ".sdt": "devices.tcspc:open_sdt",
-    ".ttbin": "devices.tcspc:open_ttbin",
-    ".h5": "devices.replay:open_recording",
-    ".hdf5": "devices.replay:open_recording",
+    ".dat": "devices.linospad2:open_recording",
+    ".img": "devices.files:open_streak_file",
+    ".tif": "devices.files:open_streak_file",
+    ".tiff": "devices.files:open_streak_file",
+    ".phu": "devices.files:open_phu",
+    ".ptu": "devices.files:open_ptu",
+    ".sdt": "devices.files:open_sdt",
+    ".ttbin": "devices.files:open_ttbin",
+    ".h5": "devices.recording.read:open_recording",
+    ".hdf5": "devices.recording.read:open_recording",
 }
 """Ending of a file's name, lower case -> function ``(Uri) -> Source``, for addresses
 ``file://PATH``.
 """
 
 FINDERS: tuple[str, ...] = (
-    "devices.timetag.source:find_timetaggers",
+    "devices.timetag.driver:find_timetaggers",
     "devices.aravis:find_cameras",
 )
 """Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail,
@@ -62,7 +61,7 @@ without hardware.
 
 CODECS: dict[str, str] = {
     "frames": "devices.frames:FrameCodec",
-    "linospad2": "devices.linospad2.codec:LinoSpad2Codec",
+    "linospad2": "devices.linospad2:LinoSpad2Codec",
     "timetag": "devices.timetag.codec:TimeTagCodec",
 }
 """Name of a codec -> its class; a recording names the codec that its bytes need."""

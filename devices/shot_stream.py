@@ -18,11 +18,10 @@ from operator import itemgetter
 from sys import maxsize
 from time import monotonic
 
-from devices.clock import InstrumentClock
-from devices.ledger import Stats
+from devices.address import Uri
 from devices.registry import open as open_source
-from devices.source import Batch, Source
-from devices.stream import StreamSource
+from devices.source import Batch, Source, Stats
+from devices.stream import InstrumentClock, StreamSource
 from devices.transients import (
     AccumulationSettings,
     accumulate_streak,
@@ -30,7 +29,6 @@ from devices.transients import (
     read_camera,
     strip_options,
 )
-from devices.uri import Uri
 from tofclip.errors import TofclipError
 from tofclip.shots import Streak
 

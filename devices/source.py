@@ -1,20 +1,348 @@
-"""One interface for instruments that are connected, recorded or simulated, and what sources share
+"""What a codec is: an instrument's bytes to records and back, with no instrument in sight.
+
+A codec never reads from anywhere and keeps nothing between calls. What a decoder has to remember
+from one piece of the stream to the next (how often a counter has wrapped) is an explicit *state*
+that goes in and comes out; bytes of a record that is not complete yet stay with the caller, which
+asks `Codec.count_complete_bytes` how far the complete ones reach.
+
+Book-keeping of records: every change moves records from one account to another, so the accounts
+always balance.
+
+The bounded buffer between the thread that empties an instrument and the reader of records.
+
+One interface for instruments that are connected, recorded or simulated, and what sources share
 whose records come out of bytes, which can be tapped before they are decoded.
 """
 
 from __future__ import annotations
 
 import abc
+import enum
+import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from types import TracebackType
-from typing import Self
+from typing import Any, ClassVar, Literal, Protocol, Self
 
-from devices.codec import Codec, Records, as_bytes
-from devices.ledger import Ledger, Stats
-from devices.ring import Gap, Piece
-from tofclip.errors import InputError
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import BufferOverflowError, DeviceTimeoutError, InputError
 from tofclip.storage import Record, Scalar
+
+Records = NDArray[Any]
+"""One-dimensional NumPy structured array, one row per record."""
+
+ByteView = NDArray[np.uint8]
+"""One-dimensional bytes. `as_bytes` makes one of anything that holds bytes, without a copy."""
+
+
+def as_bytes(data: bytes | bytearray | memoryview | ByteView) -> ByteView:
+    """View anything that holds bytes as an array of them, without a copy."""
+    return data if isinstance(data, np.ndarray) else np.frombuffer(data, np.uint8)
+
+
+@dataclass(frozen=True)
+class DecodeResult:
+    """What became of a piece of the stream.
+
+    Parameters
+    ----------
+    records : (n,) structured array
+    malformed : int
+        Records in the piece that cannot be; they are left out of `records`.
+    state : object
+        What the next call needs to know. Opaque, immutable.
+    """
+
+    records: Records
+    malformed: int
+    state: Any
+
+
+class Codec(Protocol):
+    """Bytes to records and back, both vectorised.
+
+    ``decode(encode(x), start).records`` equals ``x`` for every array of valid records. A codec
+    raises only exceptions of `tofclip.errors`, whatever the bytes; it allocates no more than a
+    stated multiple of the bytes that it was given.
+    """
+
+    name: ClassVar[str]
+    """Name in `devices.registry.CODECS`; a recording keeps it together with `settings`."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of a record; `encode` takes and `decode` gives arrays of it."""
+
+    @property
+    def settings(self) -> Mapping[str, Scalar]:
+        """Arguments that build this codec again."""
+
+    @property
+    def start(self) -> Any:
+        """State before the first byte, and after the instrument began anew."""
+
+    def count_complete_bytes(self, data: ByteView) -> int:
+        """Return how many bytes at the front of `data` form whole records."""
+
+    def count_records(self, data: ByteView) -> int:
+        """Return how many records, malformed ones included, are in `data`, of which
+        `count_complete_bytes` is all.
+        """
+
+    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
+        """Decode whole records; `after_loss` says that some are missing right before them.
+
+        ``len(decoded.records) + decoded.malformed == count(data)``.
+
+        Parameters
+        ----------
+        data : bytes-like
+            Whole records.
+        state : object
+            What the decoder remembers, from the call before or `start`.
+        after_loss : bool
+
+        Returns
+        -------
+        DecodeResult
+            Records, number of malformed ones, and the state for the next call.
+        """
+
+    def encode(self, records: Records) -> bytes:
+        """Return the bytes that the instrument would have sent."""
+
+
+@dataclass(frozen=True)
+class Stats:
+    """A snapshot of a source's accounts, in records.
+
+    Every record that the instrument acquired is in exactly one of the five that follow; see
+    `is_balanced`.
+
+    Parameters
+    ----------
+    acquired : int
+        What the instrument registered, as far as it reported or sent.
+    delivered : int
+        What `Source.read` returned.
+    unread : int
+        What arrived and still waits in this program's buffer.
+    dropped_host : int
+        What arrived and was dropped because it was not read in time.
+    lost_device : int
+        What the instrument registered but never handed over, or the wire swallowed.
+    malformed : int
+        What arrived and cannot be a record.
+    timeouts, reconnects : int
+        How often nothing came in time, and how often the instrument had to be found anew.
+    """
+
+    acquired: int = 0
+    delivered: int = 0
+    unread: int = 0
+    dropped_host: int = 0
+    lost_device: int = 0
+    malformed: int = 0
+    timeouts: int = 0
+    reconnects: int = 0
+
+    @property
+    def total_records(self) -> int:
+        """Records whose fate is known."""
+        return self.delivered + self.unread + self.dropped_host + self.lost_device + self.malformed
+
+    @property
+    def is_balanced(self) -> bool:
+        """Whether acquired = delivered + unread + dropped_host + lost_device + malformed."""
+        return self.acquired == self.total_records
+
+    def as_dict(self) -> dict[str, int]:
+        """Return the accounts by name."""
+        return asdict(self)
+
+
+class Ledger:
+    """The accounts of a running source; safe to use from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._stats = Stats()
+
+    @property
+    def stats(self) -> Stats:
+        """The accounts as they stand."""
+        # No lock: the snapshot is immutable and replaced as a whole.
+        return self._stats
+
+    def receive(self, records: int) -> None:
+        """Enter records that arrived and wait to be read."""
+        self._add(acquired=records, unread=records)
+
+    def deliver(self, delivered: int, malformed: int) -> None:
+        """Move records that waited to those that were read.
+
+        `delivered`: records that were sound; `malformed`: records that were not.
+        """
+        self._add(unread=-delivered - malformed, delivered=delivered, malformed=malformed)
+
+    def drop(self, records: int) -> None:
+        """Move records that waited to those that were not read in time."""
+        self._add(unread=-records, dropped_host=records)
+
+    def truncate(self, records: int = 1) -> None:
+        """Enter records of which only a part arrived."""
+        self._add(acquired=records, malformed=records)
+
+    def lose(self, records: int) -> None:
+        """Enter records that the instrument registered and that never arrived."""
+        self._add(acquired=records, lost_device=records)
+
+    def time_out(self) -> None:
+        """Count a time that nothing came."""
+        self._add(timeouts=1)
+
+    def reconnect(self) -> None:
+        """Count a time that the instrument was found anew."""
+        self._add(reconnects=1)
+
+    def _add(self, **changes: int) -> None:
+        with self._lock:
+            now = self._stats
+            self._stats = replace(
+                now, **{name: getattr(now, name) + change for name, change in changes.items()}
+            )
+
+
+OverflowPolicy = Literal["block", "drop_oldest", "fail"]
+OVERFLOW_POLICIES: tuple[OverflowPolicy, ...] = ("block", "drop_oldest", "fail")
+
+
+class Gap(enum.IntEnum):
+    """What is missing right before a piece of a stream."""
+
+    NONE = 0
+    LOSS = 1
+    """Records; the instrument's clock went on."""
+    RESTART = 2
+    """The instrument itself: it was away and may have begun anew."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Whole records as they came, not decoded yet."""
+
+    data: bytes
+    records: int  # how many, by the codec's count
+    gap: Gap = Gap.NONE
+    received_at: float = 0.0  # when it came, s of `time.monotonic`; 0 where that is not known
+    # when the instrument took the last of it by its own clock, s of `time.monotonic` (see
+    # `devices.stream.InstrumentClock`); 0 where the instrument does not say
+    taken_at: float = 0.0
+
+
+class RingBuffer:
+    """A queue of pieces that never holds more than `capacity` bytes (but always at least one
+    piece).
+
+    `capacity`: bytes; `policy`: what happens when it is full: the writer waits (and the
+    instrument's own memory fills up), the oldest piece goes, or measurement ends with
+    `BufferOverflowError` after what is in the queue; `ledger`: where arrivals and drops are
+    entered.
+    """
+
+    def __init__(self, capacity: int, policy: OverflowPolicy, ledger: Ledger) -> None:
+        self._capacity, self._policy, self._ledger = capacity, policy, ledger
+        self._pieces: deque[Piece] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
+        self._ended = False
+        self._fault: BaseException | None = None
+        self._lost_before_next = Gap.NONE
+
+    def put(self, piece: Piece) -> None:
+        """Append a piece. With policy ``"block"`` this waits until there is room or the ring has
+        ended.
+        """
+        with self._changed:
+            self._ledger.receive(piece.records)
+            if self._policy == "block":
+                self._changed.wait_for(lambda: self._has_room(piece) or self._ended)
+            elif self._policy == "fail" and not self._has_room(piece):
+                self._ledger.drop(piece.records)
+                self._fault = BufferOverflowError(
+                    f"records came faster than they were read and the buffer of {self._capacity} bytes is full; "
+                    "read faster, or choose policy=block or policy=drop_oldest"
+                )
+                raise self._fault
+            while not self._has_room(piece) and self._policy == "drop_oldest":
+                self._drop_oldest()
+            # What was dropped while the ring was empty is marked at the next piece.
+            self._pieces.append(replace(piece, gap=max(piece.gap, self._lost_before_next)))
+            self._bytes += len(piece.data)
+            self._lost_before_next = Gap.NONE
+            self._changed.notify_all()
+
+    def get(self, timeout: float) -> Piece | None:
+        """Take the oldest piece; None at the end of the stream."""
+        with self._changed:
+            if not self._changed.wait_for(
+                lambda: self._pieces or self._ended or self._fault, timeout
+            ):
+                raise DeviceTimeoutError(
+                    f"the instrument sent nothing for {timeout:g} s; is there light on the detector?"
+                )
+            if self._pieces:
+                piece = self._pieces.popleft()
+                self._bytes -= len(piece.data)
+                self._changed.notify_all()
+                return piece
+            if self._fault is not None:
+                raise self._fault
+            return None
+
+    def keep_newest(self) -> None:
+        """From now on, keep only the newest piece, and count the others as dropped."""
+        with self._changed:
+            self._policy = "drop_oldest"
+            self._capacity = 1
+            while len(self._pieces) > 1:
+                self._drop_oldest()
+            self._changed.notify_all()
+
+    def fail(self, fault: BaseException) -> None:
+        """End the stream with an exception; the first one counts."""
+        with self._changed:
+            # Later faults are mostly consequences of the first.
+            self._fault = self._fault or fault
+            self._changed.notify_all()
+
+    def end(self) -> None:
+        """End the stream; what is in it can still be taken, and a writer that waits for room waits
+        no more.
+        """
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def _has_room(self, piece: Piece) -> bool:
+        # A piece larger than the ring is taken when the ring is empty; it could never enter
+        # otherwise.
+        return not self._pieces or self._bytes + len(piece.data) <= self._capacity
+
+    def _drop_oldest(self) -> None:
+        """Take out the oldest piece and remember, at the next one, that something is missing."""
+        oldest = self._pieces.popleft()
+        self._bytes -= len(oldest.data)
+        self._ledger.drop(oldest.records)
+        gap = max(oldest.gap, Gap.LOSS)
+        if self._pieces:
+            self._pieces[0] = replace(self._pieces[0], gap=max(self._pieces[0].gap, gap))
+        else:
+            self._lost_before_next = max(self._lost_before_next, gap)
+
 
 READ_TIMEOUT_S = 5.0
 """Seconds that an iteration waits for the next batch of a live instrument."""
@@ -62,7 +390,7 @@ class Batch:
         When they came from a live instrument, s of `time.monotonic`; 0 otherwise.
     taken_at : float
         When the instrument took the last of them by its own clock, s of `time.monotonic` (see
-        `devices.clock.InstrumentClock`); 0 where the instrument does not say.
+        `devices.stream.InstrumentClock`); 0 where the instrument does not say.
     """
 
     records: Records

@@ -25,12 +25,12 @@ from urllib.parse import quote, urlencode
 import numpy as np
 from numpy.typing import NDArray
 
+from devices.address import Uri
+from devices.files import compute_photon_times
 from devices.histogram import BinAxis, StampHistogram, TagHistogram, TimeHistogram
-from devices.linospad2.calibration import BoardCalibration
+from devices.linospad2 import BoardCalibration
 from devices.registry import open as open_source
 from devices.source import READ_TIMEOUT_S, Batch, Source
-from devices.tcspc import compute_photon_times
-from devices.uri import Uri
 from tofclip.camera import Camera
 from tofclip.errors import DeviceTimeoutError, InputError
 from tofclip.shots import Streak

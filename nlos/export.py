@@ -18,8 +18,7 @@ from tofclip.errors import InputError
 from tofclip.files import atomic_path, require_suffix
 
 if TYPE_CHECKING:
-    from nlos.geometry import FloatArray
-    from nlos.volume import Volume
+    from nlos.volume import FloatArray, Volume
 
 FLAT_VOXEL_M = 1e-3
 """m; thickness given to a volume that is a single voxel deep."""
@@ -114,8 +113,7 @@ def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
 
 
 def _write_points(volume: Volume, path: str | Path, fraction: float) -> None:
-    from tofclip.lidar.column import Column
-    from tofclip.lidar.export import write_table
+    from tofclip.lidar.export import Column, write_table
 
     xyz, brightness = extract_points(volume, fraction)
     columns = [Column(name, "m", np.ascontiguousarray(xyz[:, i])) for i, name in enumerate("xyz")]

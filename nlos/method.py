@@ -14,8 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from nlos.capture import Capture
-from nlos.geometry import Grid
-from nlos.volume import Volume
+from nlos.volume import Grid, Volume
 from tofclip.arrays import is_numpy
 from tofclip.errors import InputError, require_type
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError, ShapeError
 
 if TYPE_CHECKING:
-    from nlos.geometry import Grid
-    from nlos.rsd.transfer import SphericalWaves
+    from nlos.phasor.transfer import SphericalWaves
+    from nlos.volume import Grid
 
 
 from functools import cached_property

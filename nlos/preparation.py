@@ -2,15 +2,33 @@
 the wall's glare.
 
 All of it where the capture's signal lives.
+
+Pairs of a laser spot and a wall point as confocal ones at their midpoint.
+
+Light by way of a hidden point at distance R from the midpoint of a pair, in direction u, takes the
+path L of an ellipse with foci h before and behind the midpoint,
+
+    R = sqrt((L^2 / 4 - h^2) / (1 - 4 (h.u)^2 / L^2)),
+
+and by way of a confocal pair 2 R. What seismology calls normal moveout reads every record at L
+instead of 2 R. The direction is not known; its mean over the space before the wall takes its place.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from nlos.capture import Capture
-from tofclip.arrays import namespace
+from nlos.illumination import is_confocal
+from nlos.method import PhasorMethod, PhasorPlan, PlannedGeometry, Progress
+from nlos.volume import FloatArray, Grid, Volume
+from tofclip.arrays import is_numpy, namespace
 from tofclip.errors import InputError
+from tofclip.threads import split_blocks
 
 
 def crop_capture(capture: Capture, nearest: float, farthest: float) -> Capture:
@@ -121,3 +139,212 @@ def _select_bins(capture: Capture, bins: slice) -> Capture:
     return Capture(
         signal, capture.wall, capture.laser, capture.bin_width, start, capture.provenance
     )
+
+
+NEAR_LASER_FRACTION = 0.03
+"""Of the wall's width: a laser spot so near to its wall point makes a confocal pair as it is."""
+
+NEAR_LASER_M, MAX_NEAR_LASER_FRACTION = 0.02, 0.1
+"""So does one as near as this, if that is less than this fraction of the wall's width."""
+
+MAX_OFFSET_FRACTION = 0.3
+"""Of the wall's width: pairs farther apart are no confocal ones, whatever is done."""
+
+MAX_PATH_ERROR_FRACTION = 0.1
+"""Of the distance of neighbouring pairs, the root mean square error of the path. The shortest wave
+that a confocal scan carries is six of these distances: a phase of 0.1 rad."""
+
+SAMPLED_DEPTHS = (0.4, 0.7, 1.0)
+"""Wall widths before the wall, where hidden things may be."""
+
+SAMPLED_PLACES = (-0.4, 0.0, 0.4)
+"""Wall widths beside the wall's middle."""
+
+MAX_SAMPLED_PAIRS = 500
+"""Pairs whose errors are looked at."""
+
+PAIRS_PER_BLOCK = 256
+"""Pairs whose signals are read together."""
+
+BYTES_PER_READING, MAX_KEPT_BYTES = 12, 1 << 28
+"""A bin and a weight; where they take more than this together, they are found again every time."""
+
+
+def join_near_lasers(capture: Capture) -> Capture:
+    """Take pairs of a laser spot and a wall point close by for confocal ones at their midpoint.
+
+    The path by way of a point at distance R then errs by at most ``d^2 / (4 R)``, d the distance of
+    the two: 0.1 mm for 15 mm and half a metre. Where pairs are farther apart, signals are read at
+    the path that leads by way of the same points; see the module.
+
+    Returns the same one where pairs are so far apart that the path would err too much, or all are
+    confocal already.
+    """
+    return MidpointJoin(capture).join(capture)
+
+
+class MidpointJoin:
+    """What `join_near_lasers` does, made ready for captures of one geometry.
+
+    `capture`: one of them.
+    """
+
+    def __init__(self, capture: Capture) -> None:
+        self._geometry = PlannedGeometry(capture)
+        self._middle: FloatArray | None = None
+        self._moveout: _Moveout | None = None
+        if capture.laser.ndim == 1 or is_confocal(capture) or len(capture.points) == 1:
+            return
+        extent = float(np.ptp(capture.points, axis=0).max())
+        apart = float(np.linalg.norm(capture.lasers - capture.points, axis=1).max())
+        near = min(NEAR_LASER_M, MAX_NEAR_LASER_FRACTION * extent)
+        middle = (capture.wall + capture.laser) / 2
+        if apart <= max(NEAR_LASER_FRACTION * extent, near):
+            self._middle = middle
+        elif apart <= MAX_OFFSET_FRACTION * extent and is_numpy(capture.signal):
+            spacing = replace(capture, wall=middle, laser=middle).spacing
+            if _find_path_error(capture) <= MAX_PATH_ERROR_FRACTION * spacing:
+                self._middle, self._moveout = middle, _Moveout(capture)
+
+    def join(self, capture: Capture) -> Capture:
+        """Return a capture with its pairs at their midpoints, or itself; see `join_near_lasers`."""
+        self._geometry.require_same(capture)
+        if self._middle is None:
+            return capture
+        signal = capture.signal if self._moveout is None else self._moveout.read(capture.signal)
+        return replace(capture, wall=self._middle, laser=self._middle, signal=signal)
+
+
+class MidpointImaging(PhasorMethod):
+    """A method that images captures whose pairs are joined by `join_near_lasers`, for captures as
+    they come.
+    """
+
+    def __init__(self, method: PhasorMethod) -> None:
+        self.method = method
+
+    def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
+        """Make the method ready for captures like `capture` on `grid`; see `Method.plan`."""
+        join = MidpointJoin(capture)
+        joined = join.join(capture)
+        plan = self.method.plan(joined, grid)
+        return plan if joined is capture else _MidpointPlan(capture, grid, join, plan)
+
+
+class _MidpointPlan(PhasorPlan):
+    """A plan for joined pairs, for captures as they come."""
+
+    def __init__(
+        self, capture: Capture, grid: Grid, join: MidpointJoin, joined: PhasorPlan
+    ) -> None:
+        super().__init__(capture, grid)
+        self.join, self.joined = join, joined
+
+    @property
+    def cost(self) -> int:
+        return self.joined.cost
+
+    @property
+    def memory_bytes(self) -> int:
+        return self.joined.memory_bytes
+
+    def _field(self, capture: Capture, progress: Progress) -> Volume:
+        return self.joined.field(self.join.join(capture), progress)
+
+
+def _sample_space(points: FloatArray) -> FloatArray:
+    """Places (n, 3) before a wall where hidden things may be, m."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, extent = (low + high) / 2, float((high - low).max())
+    z, y, x = np.meshgrid(
+        high[2] + extent * np.array(SAMPLED_DEPTHS),
+        middle[1] + extent * np.array(SAMPLED_PLACES),
+        middle[0] + extent * np.array(SAMPLED_PLACES),
+        indexing="ij",
+    )
+    return np.stack([x, y, z], axis=-1).reshape(-1, 3)
+
+
+def _find_offsets(capture: Capture, some: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Midpoints (n, 3) of some pairs, and of each the squares of half its laser's offset and of
+    that offset's part along the directions to hidden things, on average, m^2.
+    """
+    middle = (capture.points[some] + capture.lasers[some]) / 2
+    half = capture.lasers[some] - middle
+    along = np.zeros(len(middle))
+    places = _sample_space(capture.points)
+    for place in places:
+        direction = place - middle
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        along += np.sum(half * direction, axis=1) ** 2 / len(places)
+    return middle, np.sum(half**2, axis=1), along
+
+
+def _find_path_error(capture: Capture) -> float:
+    """Root mean square error of the path of joined pairs, m."""
+    step = -(-len(capture.points) // MAX_SAMPLED_PAIRS)
+    some = slice(step // 2, None, step)
+    middle, squared, along = _find_offsets(capture, some)
+    errors = []
+    for place in _sample_space(capture.points):
+        outward, back, way = (
+            np.linalg.norm(place - spots, axis=1)
+            for spots in (capture.lasers[some], capture.points[some], middle)
+        )
+        errors.append(_path_of(2 * way, squared, along) - outward - back)
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def _path_of(confocal: FloatArray, squared: Any, along: Any) -> FloatArray:
+    """Path by way of a pair of the points that a confocal pair sees at a path, m."""
+    total = 4 * squared + confocal**2
+    root = np.sqrt(np.maximum(total**2 - 16 * along * confocal**2, 0))
+    return np.asarray(np.sqrt((total + root) / 2))
+
+
+class _Moveout:
+    """Where between the bins every valid signal is read: at the path of its pair.
+
+    `capture`: for its geometry; NumPy's arrays.
+    """
+
+    def __init__(self, capture: Capture) -> None:
+        self._axis, self._places = capture.axis, np.flatnonzero(capture.valid)
+        _, self._squared, self._along = _find_offsets(capture, slice(None))
+        self._blocks = list(split_blocks(len(self._places), PAIRS_PER_BLOCK))
+        values = len(self._places) * capture.axis.bins
+        self._kept = (
+            [self._find_bins(some) for some in self._blocks]
+            if values * BYTES_PER_READING <= MAX_KEPT_BYTES
+            else None
+        )
+
+    def read(self, signal: NDArray[Any]) -> NDArray[np.float32]:
+        """Return signals (t, ...) read at their pairs' paths, linear between bins; 0 outside.
+
+        `signal` (t, ...). Returns (t, ...).
+        """
+        read = np.zeros(signal.shape, np.float32)
+        flat, recorded = (one.reshape(self._axis.bins, -1) for one in (read, signal))
+        for number, some in enumerate(self._blocks):
+            before, weight = self._kept[number] if self._kept else self._find_bins(some)
+            own = self._places[some]
+            # Two bins of silence for what lies outside.
+            block = np.concatenate([recorded[:, own], np.zeros((2, own.size), recorded.dtype)])
+            first, second = block.take(before), block.take(before + own.size)
+            flat[:, own] = first + weight * (second - first)
+        return read
+
+    def _find_bins(self, some: slice) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """Find the bin before each reading of some pairs, as a place in their (t, n) signals, and
+        the weight of the bin after it, both (t, n).
+        """
+        axis = self._axis
+        confocal = np.maximum(axis.paths, 0)[:, np.newaxis]
+        paths = _path_of(confocal, self._squared[some], self._along[some])
+        bins = (paths - axis.start) / axis.spacing
+        before = np.clip(bins.astype(np.intp), 0, axis.bins - 2)
+        weight = (bins - before).astype(np.float32)
+        # What was not recorded is read from a row of zeros behind the last bin.
+        before[(bins < 0) | (bins > axis.bins - 1)] = axis.bins
+        return before * before.shape[1] + np.arange(before.shape[1]), weight

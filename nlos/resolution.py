@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from nlos.band import VirtualPulse
 from nlos.capture import Capture
-from nlos.geometry import FloatArray
-from nlos.volume import Volume
+from nlos.volume import FloatArray, Volume
 from tofclip.errors import InputError
 
 PROFILE_SAMPLES = 401

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.geometry import Grid
-from nlos.volume import Volume
+from nlos.volume import Grid, Volume
 from tofclip.errors import InputError, ShapeError
 
 SCORE_RADIUS_M = 0.04

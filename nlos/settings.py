@@ -14,18 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from nlos.capture import Capture
-from nlos.geometry import Grid
-from nlos.illumination_groups import choose_roles
-from nlos.method import Method, Plan
-from nlos.moveout import join_near_lasers
-from nlos.preparation import (
-    fade_record_end,
-    flip_capture,
-    rebin_capture,
-    remove_first_bounce,
-)
-from nlos.signal_analysis import (
+from nlos.analysis import (
     choose_wavelength,
     find_first_bounce,
     find_lit_end,
@@ -34,7 +23,17 @@ from nlos.signal_analysis import (
     require_usable_cycles,
     require_usable_wavelength,
 )
-from nlos.volume import Volume
+from nlos.capture import Capture
+from nlos.illumination import choose_roles
+from nlos.method import Method, Plan
+from nlos.preparation import (
+    fade_record_end,
+    flip_capture,
+    join_near_lasers,
+    rebin_capture,
+    remove_first_bounce,
+)
+from nlos.volume import Grid, Volume
 from tofclip.errors import InputError
 
 Limits = tuple[float, float]
@@ -173,7 +172,7 @@ class Settings:
         ----------
         capture : Capture
         join : callable
-            Brings pairs to their midpoints; `nlos.moveout.MidpointJoin.join` for many captures of
+            Brings pairs to their midpoints; `nlos.preparation.MidpointJoin.join` for many captures of
             one geometry.
 
         Returns

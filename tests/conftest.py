@@ -25,8 +25,8 @@ if threading.current_thread() is threading.main_thread():
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tofclip.dependencies import import_open3d
 from tofclip.errors import MissingDependencyError
+from tofclip.files import import_open3d
 
 # How long an example takes says nothing where the first one compiles, or where other programs run.
 settings.register_profile("anywhere", deadline=None, suppress_health_check=[HealthCheck.too_slow])

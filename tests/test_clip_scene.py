@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tofclip import Camera, Frames, Streak, read_streak, recover
-from tofclip.camera.calibration import calibrate_views
+from tofclip.camera.focus_pictures import calibrate_views
 from tofclip.solvers import Sparse
 
 TIME_ZERO = -10.784e-9

@@ -14,8 +14,8 @@ import pytest
 
 import nlos
 from nlos.backprojection import Weighting
+from nlos.refinement.l1 import build_total_variation
 from nlos.refinement.photons import PhotonRefinement
-from nlos.refinement.refine import build_total_variation
 from tofclip.lidar import Detection
 from tofclip.lidar.photons import PhotonDetector, Smoothness
 from tofclip.recovery import DepthLockedFocus, FixedFocus, SurfaceRecovery
@@ -29,8 +29,8 @@ from tofclip.solvers import (
     TotalVariation,
     Wavelets,
 )
-from tofclip.solvers.denoisers import CollaborativeWiener, NonlocalMeans
-from tofclip.solvers.light_field_variation import LightFieldVariation
+from tofclip.solvers.denoising import CollaborativeWiener, NonlocalMeans
+from tofclip.solvers.priors import LightFieldVariation
 
 FISTA = "docs/recovery_algorithm.md: ## 4. Frames from f, with a prior: FISTA"
 LINEAR = "docs/recovery_algorithm.md: ## 5. Frames from f, without: the linear inverse"

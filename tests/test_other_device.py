@@ -40,7 +40,7 @@ from tofclip.solvers import (
 )
 from tofclip.solvers import direct as direct_module
 from tofclip.solvers import fista as fista_module
-from tofclip.solvers import method as loop_module
+from tofclip.solvers import fista as loop_module
 
 strict = pytest.importorskip("array_api_strict")
 OTHER_DEVICE = ComputeDevice("array_api_strict", strict.Device("device1"))

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from tofclip.errors import FileFormatError
-from tofclip.records import (
+from tofclip.storage import (
+    Field,
+    Record,
     Storable,
     stored_array,
     stored_attachments,
@@ -21,7 +23,6 @@ from tofclip.records import (
     stored_texts,
     stored_value,
 )
-from tofclip.storage import Field, Record
 
 
 @dataclass(frozen=True)

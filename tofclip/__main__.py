@@ -21,7 +21,7 @@ def main() -> int:
         _put_own_packages_first()
         status: int = importlib.import_module(f"{PROGRAM_PACKAGE}.cli").main()
     except ImportError as fault:  # typer and rich are needed before any verb
-        from tofclip.dependencies import describe_missing_package
+        from tofclip.files import describe_missing_package
 
         missing = describe_missing_package(fault)
         if missing is None:

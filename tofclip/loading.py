@@ -10,7 +10,7 @@ from tofclip.errors import require_path
 from tofclip.files import translate_read_errors
 from tofclip.io import read_streak
 from tofclip.io.archive import Archive
-from tofclip.io.exr import read_exr_parts
+from tofclip.io.light_fields import read_exr_parts
 from tofclip.io.streaks import outline_streak_file
 from tofclip.lidar import PointCloud
 from tofclip.storage import HDF5_SIGNATURE, Field, Record, make_stand_in, read_outline
@@ -86,7 +86,7 @@ def _open(path: str | Path, values: bool) -> tuple[Record, Any]:
     file = Path(path)
     with translate_read_errors(file), open(file, "rb") as opened:
         start = opened.read(len(HDF5_SIGNATURE))
-    head = import_module("devices.recording.reader").read_head_if_recording(file)
+    head = import_module("devices.recording.read").read_head_if_recording(file)
     if head is not None:
         return head, None
     if start == HDF5_SIGNATURE:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.dependencies import describe_missing_package
 from tofclip.errors import MissingDependencyError
+from tofclip.files import describe_missing_package
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

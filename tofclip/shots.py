@@ -18,8 +18,12 @@ from tofclip.errors import (
     require_type,
 )
 from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
-from tofclip.records import (
+from tofclip.storage import (
+    Field,
+    Record,
+    Scalar,
     Storable,
+    make_stand_in,
     stored_array,
     stored_attachments,
     stored_attributes,
@@ -28,7 +32,6 @@ from tofclip.records import (
     stored_provenance,
     stored_texts,
 )
-from tofclip.storage import Field, Record, Scalar, make_stand_in
 from tofclip.units import SPEED_OF_LIGHT, require_credible_bin_width
 
 __all__ = ["Frames", "Returns", "Streak"]

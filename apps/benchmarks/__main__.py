@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 
-from apps.benchmarks.measure import measure_case
+from apps.benchmarks.harness import measure_case
 from apps.benchmarks.registry import find_cases
 
 

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.benchmarks.case import Case, PreparedCase
+from apps.benchmarks.harness import Case, PreparedCase
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
-from nlos.illumination_groups import AliasingWarning
+from nlos.illumination import AliasingWarning
 from nlos.method import Method
 from nlos.simulate import PointScene, build_relay_wall
 from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy

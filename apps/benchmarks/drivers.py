@@ -8,13 +8,11 @@ import tempfile
 from pathlib import Path
 
 import devices
-from apps.benchmarks.case import Action, Case, PreparedCase
-from devices.codec import as_bytes
+from apps.benchmarks.harness import Action, Case, PreparedCase
+from devices.emulation.timetag import CLOCK_HZ, MAX_TICK, PoissonStream
 from devices.recorder import record_source
-from devices.source import Source
+from devices.source import Source, as_bytes
 from devices.timetag.codec import RECORD_BYTES, TimeTagCodec
-from devices.timetag.emulator import CLOCK_HZ
-from devices.timetag.light import MAX_TICK, PoissonStream
 
 MEGA = 10**6
 ADDRESS = "sim+timetag://?seed=1"

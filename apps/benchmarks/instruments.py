@@ -7,11 +7,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.benchmarks.case import Case, PreparedCase
-from devices.codec import Records, as_bytes
+from apps.benchmarks.harness import Case, PreparedCase
+from devices.emulation.linospad2 import LASER_PERIOD_S, draw_uneven_calibration
 from devices.histogram import BinAxis, StampHistogram, TagHistogram
-from devices.linospad2.codec import STAMP_DTYPE, LinoSpad2Codec
-from devices.linospad2.simulation import LASER_PERIOD_S, draw_uneven_calibration
+from devices.linospad2 import STAMP_DTYPE, LinoSpad2Codec
+from devices.source import Records, as_bytes
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
 
 MEGA = 10**6

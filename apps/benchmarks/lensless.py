@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from apps.benchmarks.case import Case, PeerUnavailableError, PreparedCase
-from apps.benchmarks.peers import LenslessPeer
+from apps.benchmarks.harness import Case, LenslessPeer, PeerUnavailableError, PreparedCase
 from tofclip.metrics import nmse
 from tofclip.operators import DenseSensor, PointSpreadConvolution
 from tofclip.solvers import Sparse

@@ -10,9 +10,9 @@ import numpy as np
 import scipy.fft
 import scipy.linalg
 
-from apps.benchmarks.case import Action, Case, PreparedCase
+from apps.benchmarks.harness import Action, Case, PreparedCase
 from apps.benchmarks.light_fields import SHEAR, VIEW_POSITIONS
-from tofclip.operators.light_field_camera import CAMERAS, LineCamera
+from tofclip.operators.cameras import CAMERAS, LineCamera
 
 SAMPLING_RATIO = 0.5
 SIDES_PX = (64, 128)

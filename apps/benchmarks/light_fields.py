@@ -10,12 +10,13 @@ from functools import cache, partial
 
 import numpy as np
 
-from apps.benchmarks.case import Case, PreparedCase
+from apps.benchmarks.harness import Case, PreparedCase
 from tofclip.light_field import LightField
 from tofclip.light_field.measurement import CameraSetup, measure
 from tofclip.metrics import nmse
 from tofclip.recovery.light_field import ClipRecovery
-from tofclip.simulate.light_fields import CameraArray, make_scene, render_light_field
+from tofclip.simulate.light_fields import CameraArray, render_light_field
+from tofclip.simulate.scenes import make_scene
 
 SIDES_PX = (96, 128)
 """From 96 on single pixels make so many measurements that the choice of a weight takes one fold."""

@@ -10,12 +10,11 @@ import numpy as np
 import pyfftw
 import scipy.fft
 
-from apps.benchmarks.case import Action, Case, PreparedCase
-from apps.benchmarks.peers import time_ytal
+from apps.benchmarks.harness import Action, Case, PreparedCase, time_ytal
 from nlos import Backprojection, Capture, FKMigration, Grid, Hybrid, LightCone, PlanarRSD, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
-from nlos.illumination_groups import AliasingWarning
+from nlos.illumination import AliasingWarning
 from nlos.method import Method
 from nlos.plane import Plane
 from nlos.simulate import PointScene, build_relay_wall

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from apps.benchmarks.case import Case, PreparedCase
+from apps.benchmarks.harness import Case, PreparedCase
 from apps.benchmarks.nlos import CYCLES, HIDDEN_POINTS_M, LASER_M, RELIEF_M, make_scene
 from nlos import Capture, Grid, Hybrid, PlanarRSD, propagate
 from nlos.band import VirtualPulse

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.benchmarks.case import Case, PreparedCase
+from apps.benchmarks.harness import Case, PreparedCase
 from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field.measurement import CameraSetup, corrupt_measurement, measure

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from apps.benchmarks.case import Case, PreparedCase
+from apps.benchmarks.harness import Case, PreparedCase
 from tofclip.lidar import Pulse
 from tofclip.lidar.photons import PhotonDetector, measure_accuracy
 

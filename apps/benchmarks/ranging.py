@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from apps.benchmarks.case import Case, PreparedCase
+from apps.benchmarks.harness import Case, PreparedCase
 from apps.benchmarks.recovery import make_operator, measurements, run_dense_products
 from tofclip.lidar import depth
 from tofclip.sequences.ranger import RangingPipeline

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.benchmarks.case import Case, PreparedCase
-from apps.benchmarks.peers import time_astra
+from apps.benchmarks.harness import Case, PreparedCase, time_astra
 from tofclip.camera import Camera
 from tofclip.operators import LineProjection
 from tofclip.solvers import Backprojection, LinearInverse, Method, Sparse, TotalVariation

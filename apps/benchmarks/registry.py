@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 
 from apps.benchmarks import instruments, lensless, light_fields, nlos, ranging, recovery
-from apps.benchmarks.case import Case
+from apps.benchmarks.harness import Case
 from tofclip.errors import InputError
 
 CASES: tuple[Case, ...] = (

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from distributed import LocalCluster
 
-from apps.benchmarks.case import Case, PreparedCase
+from apps.benchmarks.harness import Case, PreparedCase
 from apps.benchmarks.ranging import bring_shots, make_instrument
 from tofclip.sequences import RangingSettings, list_shots
 from tofclip.sequences.jobs import Summary, run_jobs

@@ -23,13 +23,13 @@ import numpy as np
 from playwright.sync_api import sync_playwright
 from viser import _messages
 
-from apps.benchmarks.case import Case, PreparedCase
-from apps.viewer.clouds import make_cloud
+from apps.benchmarks.harness import Case, PreparedCase
 from apps.viewer.drawing import DetailChooser
 from apps.viewer.page import Page
 from apps.viewer.session import Session
 from apps.viewer.source import Source, View
 from apps.viewer.source_factory import open_source
+from apps.viewer.sources import make_cloud
 
 FLAGS = (
     "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "

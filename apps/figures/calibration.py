@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tofclip.camera.calibration import FocusCalibration
+    from tofclip.camera.focus_pictures import FocusCalibration
 
 ZOOM_HALF_WIDTH_PX = 20
 MARGIN_ROWS = 25

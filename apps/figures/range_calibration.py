@@ -12,7 +12,7 @@ from tofclip.units import MILLIMETRE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tofclip.lidar.range_fit import RangeFit
+    from tofclip.lidar.range_calibration import RangeFit
 
 MAX_DRAWN_POINTS = 20_000
 SHOWN_PERCENTILES = (1.0, 99.0)

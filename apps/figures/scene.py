@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tofclip.lidar import PointCloud
-    from tofclip.lidar.objects import DetectedObject
+    from tofclip.lidar.processing import DetectedObject
     from tofclip.shots import Frames
 
 WHITE_PERCENTILE = 99.5  # percent: a glint does not darken the rest

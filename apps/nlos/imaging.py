@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Generic
 from apps.progress import show_progress
 from nlos import Refinement
 from nlos.band import Band, VirtualPulse
-from nlos.illumination_groups import describe_aliasing
-from nlos.moveout import MidpointImaging
+from nlos.illumination import describe_aliasing
+from nlos.preparation import MidpointImaging
+from nlos.refinement.l1 import build_total_variation
 from nlos.refinement.photons import PhotonRefinement
-from nlos.refinement.refine import build_total_variation
 from nlos.settings import METHOD_CLASSES, Settings, complete_settings, find_bright_box, find_scout
 from tofclip.arrays import ComputeDevice, parse_device
 from tofclip.solvers import Sparse

@@ -31,8 +31,8 @@ from tofclip.units import MILLIMETRE, PICOSECOND, SPEED_OF_LIGHT
 if TYPE_CHECKING:
     from nlos import Capture
     from nlos.capture import TimeAxis
-    from nlos.geometry import FloatArray
     from nlos.simulate import HiddenScene, PointScene, Surface
+    from nlos.volume import FloatArray
 
 SCANS = ("single", "confocal")
 WALLS = ("planar", "cylinder", "wavy", "relief", "plates")

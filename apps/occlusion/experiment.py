@@ -20,10 +20,16 @@ from apps.occlusion.scenes import OcclusionScene
 from tofclip.errors import InputError
 from tofclip.light_field import LightField
 from tofclip.light_field.measurement import CameraSetup
-from tofclip.occlusion.measurements import Rig, TimedMeasurements, add_poisson_noise, measure_views
-from tofclip.occlusion.recovery import SeparatedImages, separate_occluder
+from tofclip.occlusion import (
+    Rig,
+    SeparatedImages,
+    TimedMeasurements,
+    add_poisson_noise,
+    measure_views,
+    separate_occluder,
+)
+from tofclip.simulate.bodies import Body
 from tofclip.simulate.light_fields import (
-    Body,
     CameraArray,
     PulsedScene,
     TimeAxis,
@@ -53,7 +59,7 @@ class ExperimentSettings:
     """How the scene is lit and measured."""
 
     side_px: int = 128  # rows and columns of the picture
-    encoder: str = "line"  # A name of `tofclip.operators.light_field_camera.CAMERAS`
+    encoder: str = "line"  # A name of `tofclip.operators.cameras.CAMERAS`
     sampling_ratio: float = 0.5  # measurements over pixels of one picture
     # ``diodes``: one beside each view; ``oblique``: one far to the side; ``co-located``: one beside
     # the middle view, whose light the occluder keeps from everything that view cannot see

@@ -17,15 +17,12 @@ from numpy.typing import NDArray
 
 from apps.occlusion.experiment import Experiment, ExperimentSettings
 from apps.occlusion.scenes import BASELINE_M, OCCLUDER_DISTANCE_M, OcclusionScene
-from apps.viewer.clouds import make_cloud
-from apps.viewer.shots import ShotSource
 from apps.viewer.source import Capabilities, Gate, Setting, Source, View
-from apps.viewer.transient import TransientSource
+from apps.viewer.sources import ShotSource, TransientSource, make_cloud
 from tofclip.errors import InputError
 from tofclip.files import format_error_line
 from tofclip.lidar.processing import select_points
-from tofclip.occlusion.measurements import TimedMeasurements
-from tofclip.occlusion.recovery import separate_occluder
+from tofclip.occlusion import TimedMeasurements, separate_occluder
 from tofclip.shots import Frames
 from tofclip.simulate.light_fields import CameraArray
 from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT

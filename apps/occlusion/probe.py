@@ -18,16 +18,19 @@ from numpy.typing import NDArray
 
 from tofclip.light_field.measurement import CameraSetup
 from tofclip.metrics import correlation_coefficient
-from tofclip.occlusion import InactiveRegion
-from tofclip.occlusion.measurements import Rig, add_poisson_noise, measure_views
-from tofclip.occlusion.recovery import TV_WEIGHT, separate_occluder
+from tofclip.occlusion import (
+    TV_WEIGHT,
+    InactiveRegion,
+    Rig,
+    add_poisson_noise,
+    measure_views,
+    separate_occluder,
+)
 from tofclip.recovery.light_field import MAX_ITERATIONS, OBJECTIVE_TOLERANCE
+from tofclip.simulate.bodies import Body, Lambertian, Rectangle
 from tofclip.simulate.light_fields import (
-    Body,
     CameraArray,
-    Lambertian,
     PulsedScene,
-    Rectangle,
     TimeAxis,
     render_flash,
     render_flash_view,

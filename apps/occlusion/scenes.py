@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError
 from tofclip.occlusion import InactiveRegion
-from tofclip.simulate.light_fields import Body, Lambertian, Rectangle, Sphere
+from tofclip.simulate.bodies import Body, Lambertian, Rectangle, Sphere
 from tofclip.simulate.patterns import (
     cut_pattern,
     make_letter,

@@ -15,7 +15,7 @@ from apps.studies.cases import BORDER_PX, Case, Library, measure_case
 from apps.studies.outcome import Advance
 from tofclip.light_field.measurement import ClipMeasurement
 from tofclip.metrics import nmse
-from tofclip.operators.light_field_camera import EvenAngleLineCamera
+from tofclip.operators.cameras import EvenAngleLineCamera
 from tofclip.recovery.all_in_focus import make_shear_range, recover_all_in_focus
 from tofclip.recovery.light_field import PRESETS, ClipRecovery
 from tofclip.threads import map_parallel

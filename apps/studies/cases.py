@@ -24,8 +24,8 @@ from tofclip.light_field.measurement import (
 )
 from tofclip.metrics import nmse
 from tofclip.recovery.light_field import ClipRecovery
-from tofclip.simulate.light_fields import CameraArray, make_scene, render_light_field, render_view
-from tofclip.simulate.light_fields.scenes import EDITS, edit_scene, remove_occluder
+from tofclip.simulate.light_fields import CameraArray, render_light_field, render_view
+from tofclip.simulate.scenes import EDITS, edit_scene, make_scene, remove_occluder
 from tofclip.threads import map_parallel
 
 

@@ -17,7 +17,7 @@ from apps.studies.outcome import CROSS_VALIDATED, Advance, Outcome, Panel, Row, 
 from tofclip.errors import InputError
 from tofclip.light_field import LightField
 from tofclip.operators import LinearShear, SliceConvolution, SparseMatrix
-from tofclip.operators.coded_lines import make_coded_line
+from tofclip.operators.convolution import make_coded_line
 from tofclip.solvers import TotalVariation
 from tofclip.solvers.cross_validation import choose_weight
 from tofclip.threads import map_parallel

@@ -15,7 +15,7 @@ from apps.studies.outcome import CROSS_VALIDATED, Advance, Outcome, Panel, Row, 
 from tofclip.errors import InputError, ShapeError
 from tofclip.io.archive import Archive
 from tofclip.operators import LinearOperator, PitchedSensor
-from tofclip.operators.light_field_camera import MeasuredCamera
+from tofclip.operators.cameras import MeasuredCamera
 from tofclip.operators.point_spreads import MeasuredPointSpreads
 from tofclip.solvers import TotalVariation, relative_residual
 

@@ -14,13 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nlos.adjoint import AdjointImaging, CompressedCapture
 from nlos.capture import Capture, TimeAxis
-from nlos.geometry import Grid
+from nlos.compressed import AdjointImaging, CompressedCapture
 from nlos.method import Method
-from nlos.rsd.planar import PlanarRSD
+from nlos.phasor.plan import PlanarRSD
 from nlos.simulate import HiddenScene, Lambert, Surface, add_poisson_noise, build_relay_wall
-from nlos.volume import Volume
+from nlos.volume import Grid, Volume
 from tofclip.errors import InputError
 from tofclip.operators import RadonProjection
 from tofclip.solvers import Backprojection, LinearInverse

@@ -14,7 +14,7 @@ from apps.studies.cases import Library
 from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
 from tofclip.light_field import LightField
 from tofclip.operators import LinearOperator, Reshape, estimate_squared_norm
-from tofclip.operators.light_field_camera import CAMERAS, COMPRESSIVE_CAMERAS, LightFieldCamera
+from tofclip.operators.cameras import CAMERAS, COMPRESSIVE_CAMERAS, LightFieldCamera
 from tofclip.operators.shear import View
 from tofclip.solvers import Fista, LeastSquares, NonnegativeTotalVariation
 from tofclip.threads import limit_blas_threads

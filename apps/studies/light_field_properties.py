@@ -19,18 +19,10 @@ from tofclip.light_field.measurement import CameraSetup, measure
 from tofclip.metrics import nmse
 from tofclip.operators import LinearShear
 from tofclip.recovery.light_field import ClipRecovery
-from tofclip.simulate.bodies import Body
-from tofclip.simulate.light_fields import (
-    Lambertian,
-    Rectangle,
-    Scene,
-    Specular,
-    make_scene,
-    render_light_field,
-    render_shear_map,
-    render_view,
-)
+from tofclip.simulate.bodies import Body, Lambertian, Rectangle, Specular
+from tofclip.simulate.light_fields import Scene, render_light_field, render_shear_map, render_view
 from tofclip.simulate.patterns import Pattern, make_plain_pattern, make_text_pattern
+from tofclip.simulate.scenes import make_scene
 from tofclip.threads import map_parallel
 
 FOCUS_SCENES = ("letters", "blocks", "still-life", "slanted-text")

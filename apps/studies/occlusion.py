@@ -20,8 +20,7 @@ from apps.studies.best import choose_settings
 from apps.studies.cases import BORDER_PX, CAMERA_NAMES, Case, Library, solve_cases
 from apps.studies.outcome import CROSS_VALIDATED, Advance, Outcome, Panel, Row, Study
 from tofclip.metrics import nmse
-from tofclip.occlusion import InactiveRegion
-from tofclip.occlusion.recovery import TV_WEIGHT, SeparatedImages
+from tofclip.occlusion import TV_WEIGHT, InactiveRegion, SeparatedImages
 from tofclip.threads import map_parallel
 from tofclip.units import MILLIMETRE
 

@@ -9,7 +9,7 @@ from itertools import groupby
 from apps.studies.best import choose_settings
 from apps.studies.cases import CAMERA_NAMES, Case, Library, SolvedCase, solve_cases
 from apps.studies.outcome import CROSS_VALIDATED, Advance, Outcome, Panel, Row, Study
-from tofclip.simulate.light_fields.scenes import EDITS
+from tofclip.simulate.scenes import EDITS
 
 SAMPLING_RATIO = 0.5
 TABLE2_PERCENT = {  # NMSE in per cent: original, shift, flip, rotate

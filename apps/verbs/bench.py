@@ -48,9 +48,9 @@ def bench(
 
     Example: tofclip bench --page benchmarks.md --json
     """
+    from apps.benchmarks.harness import count_processes, run_cases
     from apps.benchmarks.page import render_page
     from apps.benchmarks.registry import find_cases
-    from apps.benchmarks.run import count_processes, run_cases
 
     cases = find_cases(name)
     if page is not None:

@@ -12,12 +12,12 @@ from apps.conventions import JsonOption, PreviewOption, choose_preview, report
 from apps.figures.calibration import make_calibration_figure
 from apps.figures.style import save_figure
 from apps.progress import show_activity
-from tofclip.camera.calibration import calibrate_views as fit
+from tofclip.camera.focus_pictures import calibrate_views as fit
 from tofclip.io import read_streak
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.camera.calibration import FocusCalibration
+    from tofclip.camera.focus_pictures import FocusCalibration
 
 
 def calibrate(

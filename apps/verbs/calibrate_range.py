@@ -19,14 +19,14 @@ from apps.verbs.photons import (
     read_any_photons,
     require_view,
 )
-from devices.photons import find_address
+from devices.counted_photons import find_address
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import translate_read_errors
 from tofclip.io import read_streak
 from tofclip.lidar import Pulse, depth
 from tofclip.lidar.photons import estimate_pixels
-from tofclip.lidar.range_fit import RangeFit, TargetShot, fit_range_calibration
+from tofclip.lidar.range_calibration import RangeFit, TargetShot, fit_range_calibration
 from tofclip.recovery import make_method, open_shot, parse_focus, plan_recovery
 from tofclip.shots import Frames
 from tofclip.storage import HDF5_SIGNATURE, read_outline

@@ -20,7 +20,7 @@ from apps.conventions import (
 from apps.sequences import report_summary, resolve_device, run_with_progress
 from tofclip.errors import InputError
 from tofclip.files import require_apart
-from tofclip.lidar.organised import ORGANISED_SUFFIXES
+from tofclip.lidar.cloud import ORGANISED_SUFFIXES
 from tofclip.sequences import CloudSettings, is_sequence, list_files
 from tofclip.sequences.clouds import save_cloud
 from tofclip.shots import Frames

@@ -12,9 +12,9 @@ import devices
 from apps.conventions import RECORD_SUFFIXES, JsonOption, report, require_writable
 from apps.verbs.record import show_time_progress
 from devices import discover, registry
+from devices.recorder import measure_throughput
 from devices.recording.check import repair as repaired
 from devices.recording.check import verify as verified
-from devices.throughput import measure_throughput
 
 EXIT_DAMAGED = 2
 

@@ -27,8 +27,7 @@ from apps.occlusion.scenes import make_occlusion_scene, make_walking_scene
 from apps.progress import show_activity, show_progress
 from tofclip.errors import InputError
 from tofclip.metrics import correlation_coefficient, nmse
-from tofclip.occlusion import InactiveRegion
-from tofclip.occlusion.recovery import SeparatedImages
+from tofclip.occlusion import InactiveRegion, SeparatedImages
 from tofclip.units import MILLIMETRE, NANOSECOND
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from apps.figures.photons import make_range_figure
 from apps.figures.style import save_figure
 from apps.progress import show_progress
 from apps.verbs.cloud import CLOUD_SUFFIXES, DEPTH_SUFFIX
-from devices.photons import find_address
-from devices.photons import read_photons as read_counted_photons
+from devices.counted_photons import find_address
+from devices.counted_photons import read_photons as read_counted_photons
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.files import atomic_path

@@ -23,9 +23,9 @@ from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
 from tofclip.recovery import SharpestFocus, SurfaceRecovery, parse_focus
 from tofclip.sequences import list_shots
+from tofclip.sequences.following import SurfacePipeline
 from tofclip.sequences.ranger import CloudPipeline, RangingPipeline, build_cloud_path
 from tofclip.sequences.streaming import stream_clouds
-from tofclip.sequences.surface_following import SurfacePipeline
 from tofclip.solvers import LinearInverse, ProximalMethod, Sparse, TotalVariation
 from tofclip.units import NANOSECOND, PICOSECOND
 

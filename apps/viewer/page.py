@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.viewer.controls import Controls
 from apps.viewer.drawing import POINT_STYLE, FramePacer, Points, RateCounter
-from apps.viewer.export_panel import ExportPanel
 from apps.viewer.furniture import draw_furniture
 from apps.viewer.page_text import Status, format_page_title, render_page_html, render_waiting_html
-from apps.viewer.selection_panel import NO_SHADOWS, SelectionPanel
+from apps.viewer.panels import NO_SHADOWS, Controls, ExportPanel, SelectionPanel
 from apps.viewer.server import LOOPBACK, start_server, stop_server
 from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.side_pictures import render_pictures

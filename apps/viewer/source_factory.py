@@ -11,13 +11,17 @@ from typing import TYPE_CHECKING, cast
 
 import h5py
 
-from apps.viewer.clouds import CLOUD_SUFFIXES, CloudSource, find_clouds
-from apps.viewer.live import LiveShotSource
-from apps.viewer.shot_recovery import ShotRecovery
-from apps.viewer.shots import StoredShotSource
 from apps.viewer.source import Gate
-from apps.viewer.transient import TransientSource
-from devices.recording.reader import read_head_if_recording
+from apps.viewer.sources import (
+    CLOUD_SUFFIXES,
+    CloudSource,
+    LiveShotSource,
+    ShotRecovery,
+    StoredShotSource,
+    TransientSource,
+    find_clouds,
+)
+from devices.recording.read import read_head_if_recording
 from devices.shot_stream import TrackedShots, read_transients
 from devices.transients import read_transient
 from tofclip.camera import Camera, measure
@@ -124,7 +128,7 @@ def _open_hdf5(path: Path, options: ShotOptions, announce: Announce) -> Source:
             path.name, Frames.from_record(record), method=_make_method(options.method)
         )
     if record.kind == "volume":
-        from apps.viewer.volume import VolumeSource
+        from apps.viewer.sources import VolumeSource
         from nlos import Volume
 
         return VolumeSource(path.name, Volume.from_record(record))

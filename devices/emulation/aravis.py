@@ -8,12 +8,15 @@ import ctypes
 from dataclasses import replace
 from typing import Any
 
+from devices.address import Uri
 from devices.aravis import OPTIONS, AravisFeed, CameraSettings, load_aravis
-from devices.ledger import Ledger
-from devices.scenes import EmulatedLight, simulate_demonstration_light, simulate_line_light
-from devices.source import Info
+from devices.emulation.scenes import (
+    EmulatedLight,
+    simulate_demonstration_light,
+    simulate_line_light,
+)
+from devices.source import Info, Ledger
 from devices.stream import StreamSource, parse_buffer_settings
-from devices.uri import Uri
 from tofclip.camera import Camera
 from tofclip.errors import DeviceNotFoundError, InputError, MissingDependencyError
 from tofclip.storage import Field, Record

@@ -1,6 +1,6 @@
 """Recordings: an instrument's bytes as they came, in a file that stays readable whatever happens.
 
-A recording is a plain sequence of blocks (`devices.recording.blocks`). Each block carries its own
+A recording is a plain sequence of blocks (`devices.recording.read`). Each block carries its own
 length, number and checksums, and is written once and never changed. So a program that is killed
 loses nothing that it had written, and a damaged byte costs the one block that it lies in.
 

@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from devices.codec import Codec, as_bytes
-from devices.ledger import Stats
-from devices.recording.blocks import BlockKind
-from devices.recording.reader import Block, BlockReader, Damage, Ending, Recording
-from devices.recording.writer import RecordingWriter
-from devices.ring import Gap, Piece
+from devices.recording.read import Block, BlockKind, BlockReader, Damage, Ending, Recording
+from devices.recording.write import RecordingWriter
+from devices.source import Codec, Gap, Piece, Stats, as_bytes
 from tofclip.errors import FileFormatError
 
 

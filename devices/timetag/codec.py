@@ -1,4 +1,8 @@
-"""The record stream of the FX2 time tagger (S. V. Polyakov, B. Gamari; gateware and format are
+"""Layout of the words of the time tagger's stream; see `devices.timetag.codec` for what the bits mean.
+
+Apart from the compiled loops that read them, so that their names do not load a compiler.
+
+The record stream of the FX2 time tagger (S. V. Polyakov, B. Gamari; gateware and format are
 public).
 
 A record is 6 bytes, the highest first::
@@ -22,8 +26,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from devices.codec import ByteView, DecodeResult, Records, as_bytes
-from devices.timetag.words import DELTA, LOST, RECORD_BYTES, TIME_BITS, TIME_MASK, WRAP
+from devices.source import ByteView, DecodeResult, Records, as_bytes
 from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
@@ -37,6 +40,14 @@ __all__ = [
     "TimeTagCodec",
     "mark_wraps",
 ]
+
+
+RECORD_BYTES = 6
+TIME_BITS = 36
+TIME_MASK = (1 << TIME_BITS) - 1
+HALF_RANGE = 1 << (TIME_BITS - 1)
+DELTA, WRAP, LOST = 1, 2, 4
+
 
 COUNTER_RANGE = 1 << TIME_BITS
 """Ticks after which the counter begins at zero again."""

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from devices.timetag.words import (
+from devices.timetag.codec import (
     DELTA,
     HALF_RANGE,
     LOST,

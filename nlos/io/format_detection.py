@@ -7,19 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 
 from nlos.capture import Capture
-from nlos.io.archives import (
+from nlos.io.arrays import NamedArrays, read_hdf5, read_matlab
+from nlos.io.labs import (
+    read_curvelet_data,
     read_general_data,
     read_lift_archive,
+    read_light_cone_data,
+    read_migration_data,
     read_numpy_archive,
+    read_phasor_field_data,
+    read_rectified_data,
     read_surface_optimisation_data,
+    read_tal,
+    read_zaragoza,
 )
-from nlos.io.curvelet import read_curvelet_data
-from nlos.io.fields import NamedArrays, read_hdf5, read_matlab
-from nlos.io.renderings import read_streak_folder
-from nlos.io.stanford import read_light_cone_data, read_migration_data
-from nlos.io.tal import read_tal
-from nlos.io.wisconsin import read_phasor_field_data, read_rectified_data
-from nlos.io.zaragoza import read_zaragoza
+from nlos.io.pictures import read_streak_folder
 from tofclip.errors import FileFormatError
 from tofclip.files import translate_read_errors
 from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance

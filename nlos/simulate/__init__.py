@@ -4,11 +4,8 @@
 that hide one another.
 """
 
-from nlos.simulate.materials import Lambert, Material, Retroreflector
-from nlos.simulate.noise import add_poisson_noise
-from nlos.simulate.points import PointScene
-from nlos.simulate.scene import HiddenScene
-from nlos.simulate.surfaces import Surface
+from nlos.simulate.points import PointScene, add_poisson_noise
+from nlos.simulate.scene import HiddenScene, Lambert, Material, Retroreflector, Surface
 from nlos.simulate.walls import WALLS, build_relay_wall
 
 __all__ = [

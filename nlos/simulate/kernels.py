@@ -143,10 +143,10 @@ def distance_between(one, other):
 
 @compiled
 def evaluate_reflectance(material, position, laser, observer, to_laser, to_observer):
-    """Reflectance per steradian; see `nlos.simulate.materials.Material`.
+    """Reflectance per steradian; see `nlos.simulate.scene.Material`.
 
     `material` (3,): diffuse fraction, retroreflected fraction, and the latter's standard deviation
-    in rad; see `nlos.simulate.materials.Material`; `position` (3,): the facet, m; `laser, observer`
+    in rad; see `nlos.simulate.scene.Material`; `position` (3,): the facet, m; `laser, observer`
     (3,): wall points that light comes from and goes to, m; `to_laser, to_observer`: their distances
     from the facet, m. Returns per steradian.
     """

@@ -1,21 +1,375 @@
-"""Hidden scenes of surfaces that hide one another, lit and seen by way of a wall."""
+"""How hidden surfaces scatter light: bidirectional reflectance for an incoming and an outgoing
+direction.
+
+Hidden surfaces: small flat facets of known place, direction and material, and the triangles that
+hide others.
+
+Hidden scenes of surfaces that hide one another, lit and seen by way of a wall.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import Capture, TimeAxis
 from nlos.simulate.kernels import add_facet_light
-from nlos.simulate.surfaces import FloatArray, Surface
 from nlos.simulate.walls import compute_wall_normals
-from tofclip.errors import InputError
+from tofclip.errors import FileFormatError, InputError, ShapeError
+from tofclip.files import format_error_line, translate_read_errors
 from tofclip.threads import run_blocks
 from tofclip.units import SPEED_OF_LIGHT
+
+
+class Material(Protocol):
+    """Reflectance ``diffuse / pi + retro * exp(-angle^2 / (2 * spread^2)) / (2 * pi * spread^2)``
+    per steradian.
+
+    `angle` is that between the directions towards the light and towards the observer.
+    """
+
+    @property
+    def diffuse(self) -> float:
+        """Share of light that is scattered evenly (Lambert's law)."""
+        ...
+
+    @property
+    def retro(self) -> float:
+        """Share that goes back to where it came from."""
+        ...
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the latter about the way back, rad."""
+        ...
+
+
+@dataclass(frozen=True)
+class Lambert:
+    """Scatters evenly: paper, plaster, cloth.
+
+    Parameters
+    ----------
+    albedo : float
+        Share of light that comes back, 0 to 1.
+    """
+
+    albedo: float = 1.0
+
+    def __post_init__(self) -> None:
+        _require_albedo(self.albedo)
+
+    @property
+    def diffuse(self) -> float:
+        return self.albedo
+
+    @property
+    def retro(self) -> float:
+        return 0.0
+
+    @property
+    def spread(self) -> float:
+        return 1.0
+
+
+@dataclass(frozen=True)
+class Retroreflector:
+    """Sends light back to where it came from: traffic signs, safety vests.
+
+    Parameters
+    ----------
+    albedo : float
+        Share of light that comes back, 0 to 1.
+    spread : float
+        Standard deviation about the way back, rad.
+    """
+
+    albedo: float = 1.0
+    spread: float = 0.1
+
+    def __post_init__(self) -> None:
+        _require_albedo(self.albedo)
+        if not (np.isfinite(self.spread) and self.spread > 0):
+            raise InputError(
+                f"the spread of a retroreflector must be a positive angle, got {self.spread}"
+            )
+
+    @property
+    def diffuse(self) -> float:
+        return 0.0
+
+    @property
+    def retro(self) -> float:
+        return self.albedo
+
+
+def _require_albedo(albedo: float) -> None:
+    if not 0 <= albedo <= 1:
+        raise InputError(f"an albedo is a share between 0 and 1, got {albedo}")
+
+
+FloatArray = NDArray[np.float64]
+
+TOWARDS_WALL = (0.0, 0.0, -1.0)
+MAX_FACETS = 200_000
+"""A surface is refused rather than cut into more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Facets of one material.
+
+    Parameters
+    ----------
+    positions, normals : (n, 3) array
+        Centres in m, and unit normals; light is scattered on the normal's side only.
+    areas : (n,) array
+        m^2.
+    material : Material
+    triangles : (m, 3, 3) array, optional
+        Corners of the triangles that hide what lies behind them, m; none by default.
+    """
+
+    positions: FloatArray
+    normals: FloatArray
+    areas: FloatArray
+    material: Material
+    triangles: FloatArray
+
+    @classmethod
+    def mesh(
+        cls, vertices: Any, faces: Any, spacing: float, material: Material | None = None
+    ) -> Surface:
+        """Cut a triangle mesh into facets.
+
+        Parameters
+        ----------
+        vertices : (v, 3) array
+            m.
+        faces : (m, 3) int array
+            Corners of each triangle, counter-clockwise as seen from the side that scatters.
+        spacing : float
+            Largest distance of neighbouring facets, m: a quarter of what the capture resolves is
+            enough.
+        material : Material, optional
+            Defaults to white Lambert.
+
+        Returns
+        -------
+        Surface
+
+        Raises
+        ------
+        ShapeError
+            Vertices are not (v, 3), or faces not (m, 3).
+        InputError
+            A face names a vertex that does not exist, a vertex is not finite, or the spacing is not
+            positive.
+        """
+        vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+            raise ShapeError(
+                "vertices and faces", "(v, 3) and (m, 3)", (vertices.shape, faces.shape)
+            )
+        if (
+            faces.dtype.kind not in "ui"
+            or faces.size == 0
+            or faces.min() < 0
+            or faces.max() >= len(vertices)
+        ):
+            raise InputError(
+                "faces must name vertices by their index, and there must be one at least"
+            )
+        if not (np.isfinite(spacing) and spacing > 0 and np.all(np.isfinite(vertices))):
+            raise InputError(f"a mesh needs finite vertices and a positive spacing, got {spacing}")
+        triangles = vertices[faces]
+        positions, crosses, areas = _subdivide_triangles(triangles, spacing)
+        normals = crosses / np.linalg.norm(crosses, axis=1, keepdims=True)
+        return cls(positions, normals, areas, material or Lambert(), triangles)
+
+    @classmethod
+    def load(cls, path: str | Path, spacing: float, material: Material | None = None) -> Surface:
+        """Read a mesh in m (PLY, OBJ, STL, VTP) by PyVista and cut it into facets; arguments as of
+        `mesh`.
+
+        Parameters
+        ----------
+        path : str or Path
+        spacing : float
+            Side of the facets, m.
+        material : Material, optional
+
+        Returns
+        -------
+        Surface
+
+        Raises
+        ------
+        FileFormatError
+            The file is not a triangle mesh, or holds no triangle.
+        """
+        import pyvista
+
+        with translate_read_errors(path), open(path, "rb"):
+            try:
+                mesh = pyvista.read(path).triangulate()
+                vertices, faces = np.asarray(mesh.points), np.asarray(mesh.regular_faces)
+            except Exception as fault:  # whatever the decoder stumbles over, the file is not a mesh
+                raise FileFormatError(
+                    path, f"is not a triangle mesh ({format_error_line(fault)})"
+                ) from fault
+        if not len(faces):
+            raise FileFormatError(path, "holds no triangles")
+        return cls.mesh(vertices, faces, spacing, material)
+
+    @classmethod
+    def rectangle(
+        cls,
+        centre: Any,
+        size: tuple[float, float],
+        spacing: float,
+        material: Material | None = None,
+    ) -> Surface:
+        """Build a rectangle that faces the wall, (width, height) in m about its centre (x, y, z).
+
+        Parameters
+        ----------
+        centre : (3,) array_like
+            Metres.
+        size : (float, float)
+            Width and height, m.
+        spacing : float
+            Side of the facets, m.
+        material : Material, optional
+
+        Returns
+        -------
+        Surface
+        """
+        x, y = size[0] / 2, size[1] / 2
+        # Counter-clockwise from the wall, which looks along +z with y down.
+        corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]]) + np.asarray(
+            centre, dtype=np.float64
+        )
+        return cls.mesh(corners, [[0, 1, 2], [0, 2, 3]], spacing, material)
+
+    @classmethod
+    def letters(
+        cls, text: str, centre: Any, height: float, spacing: float, material: Material | None = None
+    ) -> Surface:
+        """Cut flat letters out of square facets that face the wall.
+
+        Parameters
+        ----------
+        text : str
+            Read from the wall, looking along +z.
+        centre : (3,) array
+            Middle of the text, m.
+        height : float
+            Height of a capital, m.
+        spacing : float
+            Side of a facet, m.
+        material : Material, optional
+            Defaults to white Lambert.
+
+        Returns
+        -------
+        Surface
+
+        Raises
+        ------
+        InputError
+            The letters have no facet at this spacing, or more than `MAX_FACETS`; or the height is
+            not positive.
+        """
+        if not 0 < height < np.inf:
+            raise InputError(f"letters need a positive height, got {height:g} m")
+        x, y = _rasterize_letters(text, height, spacing)
+        if x.size == 0:
+            raise InputError(f"'{text}' has no ink at a spacing of {spacing} m")
+        positions = np.stack([x, y, np.zeros_like(x)], axis=-1) + np.asarray(
+            centre, dtype=np.float64
+        )
+        normals = np.tile(TOWARDS_WALL, (x.size, 1))
+        half = spacing / 2 * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])
+        corners = positions[:, np.newaxis] + half
+        triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+        return cls(
+            positions, normals, np.full(x.size, spacing**2), material or Lambert(), triangles
+        )
+
+
+def _subdivide_triangles(
+    triangles: FloatArray, spacing: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Halve triangles at their longest side until none is longer than `spacing`: centres, normals,
+    areas.
+    """
+    finished: list[FloatArray] = []
+    count, pending = 0, triangles
+    while len(pending):
+        sides = np.linalg.norm(np.roll(pending, -1, axis=1) - pending, axis=2)
+        longest = sides.argmax(axis=1)
+        small = sides.max(axis=1) <= spacing
+        finished.append(pending[small])
+        count += int(small.sum())
+        if count + len(pending) > MAX_FACETS:
+            raise InputError(
+                f"the mesh needs more than {MAX_FACETS} facets at a spacing of {spacing} m; use a larger one"
+            )
+        # Corners are renamed so that the longest side is from a to b, in the same sense of turning:
+        # normals keep their side.
+        turn = (longest[~small, np.newaxis] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(
+            np.take_along_axis(pending[~small], turn[..., np.newaxis], axis=1), 1, 0
+        )
+        middle = (a + b) / 2
+        pending = np.concatenate(
+            [np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)]
+        )
+    small_triangles = np.concatenate(finished)
+    crosses = np.cross(
+        small_triangles[:, 1] - small_triangles[:, 0], small_triangles[:, 2] - small_triangles[:, 0]
+    )
+    areas = np.linalg.norm(crosses, axis=1) / 2
+    # Facets without area, of meshes with repeated corners, have no normal.
+    flat = areas > 0
+    return small_triangles[flat].mean(axis=1), crosses[flat], areas[flat]
+
+
+def _rasterize_letters(text: str, height: float, spacing: float) -> tuple[FloatArray, FloatArray]:
+    """Centres of the squares inside the letters' outlines, about the text's middle; y down."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.path import Path as Outline
+    from matplotlib.textpath import TextPath
+
+    font = FontProperties(family="DejaVu Sans", weight="bold")
+    if not text.strip():
+        return np.empty(0), np.empty(0)
+    capital = TextPath((0, 0), "H", size=1, prop=font).get_extents().height
+    outline: Outline = TextPath((0, 0), text, size=height / capital, prop=font)
+    box = outline.get_extents()
+    halves = [int(side / spacing / 2) + 1 for side in box.size]
+    # Before any memory is taken: of a letter's box about a third is ink.
+    if (2 * halves[0] + 1) * (2 * halves[1] + 1) > 4 * MAX_FACETS:
+        raise InputError(
+            f"the letters need more than {MAX_FACETS} facets at a spacing of {spacing:g} m; use a larger one"
+        )
+    columns, rows = (np.arange(-n, n + 1) * spacing for n in halves)
+    x, y = (grid.ravel() for grid in np.meshgrid(columns, rows))
+    middle = (box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2
+    # Fonts have y up. Holes run the other way round, which the even-odd rule of a polygon test
+    # needs no word of.
+    inside = np.zeros(x.size, dtype=bool)
+    for polygon in outline.to_polygons():
+        inside ^= Outline(polygon).contains_points(np.stack([x + middle[0], middle[1] - y], axis=1))
+    return x[inside], y[inside]
+
 
 BIN_OVERSAMPLING = 4
 """Fine bins per time bin: light shared between two of them spreads by less than a tenth of a bin."""

@@ -13,13 +13,19 @@ import pytest
 from small_instrument import Run
 
 from apps.benchmarks import registry
-from apps.benchmarks.case import Case, PeerUnavailableError, PreparedCase
+from apps.benchmarks.harness import (
+    CASE_TIMEOUT_S,
+    PEER_TIMEOUT_S,
+    Case,
+    PeerUnavailableError,
+    PreparedCase,
+    describe_machine,
+    measure_case,
+    run_cases,
+    run_peer,
+)
 from apps.benchmarks.light_fields import render_scene
-from apps.benchmarks.machine import describe_machine
-from apps.benchmarks.measure import measure_case
 from apps.benchmarks.page import GROUP_TITLES, STUDY_TITLES, render_page
-from apps.benchmarks.peers import PEER_TIMEOUT_S, run_peer
-from apps.benchmarks.run import CASE_TIMEOUT_S, run_cases
 from apps.verbs.bench import bench
 from tofclip.errors import InputError
 from tofclip.solvers.cross_validation import WeightChoice
@@ -86,8 +92,8 @@ def test_the_time_of_other_programs_does_not_count(monkeypatch: pytest.MonkeyPat
         time.sleep(0.02)
         raise subprocess.TimeoutExpired("", timeout)
 
-    monkeypatch.setattr("apps.benchmarks.run.subprocess.run", slow)
-    monkeypatch.setattr("apps.benchmarks.run.TOTAL_TIMEOUT_S", 0.01)
+    monkeypatch.setattr("apps.benchmarks.harness.subprocess.run", slow)
+    monkeypatch.setattr("apps.benchmarks.harness.TOTAL_TIMEOUT_S", 0.01)
     monkeypatch.setenv("TOFCLIP_THREADS", "1")
     run_cases([MADE_UP], "python", lambda _: None)
     assert limits == [PEER_TIMEOUT_S + CASE_TIMEOUT_S] * 2
@@ -104,7 +110,7 @@ def test_runs_that_ask_no_other_program_say_nothing_of_it(monkeypatch: pytest.Mo
     def measure(case: Case, extent: tuple[int, int], peers: str | None, clock: object) -> object:
         return {"peers": {"other": {"seconds": 1.0} if peers else {"absent": "no Python"}}}
 
-    monkeypatch.setattr("apps.benchmarks.run._run_process", measure)
+    monkeypatch.setattr("apps.benchmarks.harness._run_process", measure)
     monkeypatch.setenv("TOFCLIP_THREADS", "2")
     runs = run_cases([MADE_UP], "python", lambda _: None)["entries"][0]["runs"]
     assert {run["threads"]: list(run["peers"]) for run in runs[-2:]} == {1: [], 2: ["other"]}
@@ -178,10 +184,10 @@ def test_a_case_that_fails_is_told_and_stops_nothing(monkeypatch: pytest.MonkeyP
     assert "ValueError" in found["problem"]
     assert figures["entries"][0]["growth"] is None
     assert found["problem"] in render_page(figures, "tofclip bench")
-    monkeypatch.setattr("apps.benchmarks.run.CASE_TIMEOUT_S", 0.01)
+    monkeypatch.setattr("apps.benchmarks.harness.CASE_TIMEOUT_S", 0.01)
     figures = run_cases([broken], None, lambda _: None)
     assert "took more than" in figures["entries"][0]["runs"][0]["problem"]
-    monkeypatch.setattr("apps.benchmarks.run.TOTAL_TIMEOUT_S", 0)
+    monkeypatch.setattr("apps.benchmarks.harness.TOTAL_TIMEOUT_S", 0)
     figures = run_cases([broken], None, lambda _: None)
     assert "left out" in figures["entries"][0]["runs"][0]["problem"]
 
@@ -243,7 +249,7 @@ def test_peers_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(PeerUnavailableError, match="No module named 'no_such_peer'"):
         run_peer("import no_such_peer", "other")
     assert run_peer("print('seconds', 0.25)", "other") == 0.25
-    monkeypatch.setattr("apps.benchmarks.peers.PEER_TIMEOUT_S", 0.01)
+    monkeypatch.setattr("apps.benchmarks.harness.PEER_TIMEOUT_S", 0.01)
     with pytest.raises(PeerUnavailableError, match="takes more than"):
         run_peer("import time; time.sleep(5)", "other")
 
@@ -310,8 +316,8 @@ def test_the_load_is_that_before_anything_is_measured(monkeypatch: pytest.Monkey
         events.append("case")
         return {"problem": "made up"}
 
-    monkeypatch.setattr("apps.benchmarks.run.describe_machine", describe)
-    monkeypatch.setattr("apps.benchmarks.run._run_process", measure)
+    monkeypatch.setattr("apps.benchmarks.harness.describe_machine", describe)
+    monkeypatch.setattr("apps.benchmarks.harness._run_process", measure)
     run_cases([MADE_UP], None, lambda _: None)
     assert events[0] == "load"
     assert events.count("case") >= 2

@@ -17,7 +17,7 @@ from scipy.io import loadmat
 
 from nlos import Capture, settings_for
 from tofclip import Camera, depth, read_streak, recover
-from tofclip.camera.calibration import calibrate_views
+from tofclip.camera.focus_pictures import calibrate_views
 from tofclip.lidar.photons import PhotonImage, estimate_surface
 from tofclip.recovery import open_shot
 from tofclip.units import SPEED_OF_LIGHT

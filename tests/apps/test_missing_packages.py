@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import tofclip
-from tofclip.dependencies import describe_missing_package
+from tofclip.files import describe_missing_package
 
 ROOT = Path(tofclip.__file__).parents[1]
 LONGEST_WAIT_S = 120.0

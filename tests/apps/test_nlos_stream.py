@@ -12,9 +12,10 @@ import pytest
 from hidden_point import object_of
 from small_instrument import Run
 
-import nlos.rsd.planar
+import nlos.phasor.plan
 from apps.verbs.nlos.stream import _VolumeStream
-from nlos import Capture, Volume, moveout
+from nlos import Capture, Volume
+from nlos import preparation as moveout
 from nlos.capture import TimeAxis
 from nlos.simulate import PointScene, build_relay_wall
 
@@ -35,9 +36,9 @@ def test_every_capture_becomes_a_volume_by_one_plan(
     (tmp_path / "in").mkdir()
     for number in range(4):
         moving(number).save(tmp_path / "in" / f"{number}.h5")
-    grids, plan = [], nlos.rsd.planar.PlanarRSD.plan
+    grids, plan = [], nlos.phasor.plan.PlanarRSD.plan
     monkeypatch.setattr(
-        nlos.rsd.planar.PlanarRSD,
+        nlos.phasor.plan.PlanarRSD,
         "plan",
         lambda self, capture, grid: grids.append(grid.size) or plan(self, capture, grid),
     )

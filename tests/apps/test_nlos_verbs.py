@@ -23,7 +23,7 @@ from apps.nlos.truth import HiddenTruth
 from apps.verbs.nlos import VERBS
 from nlos import Capture, Volume
 from nlos.export import Mesh
-from nlos.illumination_groups import AliasingWarning
+from nlos.illumination import AliasingWarning
 
 PNG = b"\x89PNG"
 
@@ -153,7 +153,7 @@ class TestInfo:
         assert shorter.err.count("\n") == 1
 
     def test_one_wall_point_and_many_lasers_are_sampled_by_the_lasers(self, confocal: Path) -> None:
-        from nlos.signal_analysis import find_sampling_step
+        from nlos.analysis import find_sampling_step
 
         capture = Capture.load(confocal)
         alone = np.broadcast_to(capture.wall[3, 4], capture.wall.shape)
@@ -376,10 +376,10 @@ def _one_voxel() -> Any:
 def test_a_recording_under_its_default_settings_warns_of_nothing(shared_data: Path) -> None:
     import warnings
 
+    from nlos.analysis import find_shortest_wavelength
     from nlos.band import Band, VirtualPulse
-    from nlos.illumination_groups import warn_of_aliasing
+    from nlos.illumination import warn_of_aliasing
     from nlos.io import read_capture
-    from nlos.signal_analysis import find_shortest_wavelength
 
     capture = read_capture(shared_data / "nlos" / "otoole2018_diffuse_s.npz")
     wavelength = find_shortest_wavelength(capture, 3.0)

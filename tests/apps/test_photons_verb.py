@@ -10,11 +10,10 @@ import pytest
 from small_instrument import Run
 
 from apps.cli import main
-from devices.linospad2.calibration import BoardCalibration
-from devices.linospad2.codec import LinoSpad2Codec
-from devices.linospad2.simulation import LASER_PERIOD_S, SimulatedBoard
-from devices.photons import find_address, read_photons
-from devices.scenes import render_array_delays, simulate_line_light
+from devices.counted_photons import find_address, read_photons
+from devices.emulation.linospad2 import LASER_PERIOD_S, SimulatedBoard
+from devices.emulation.scenes import render_array_delays, simulate_line_light
+from devices.linospad2 import BoardCalibration, LinoSpad2Codec
 from tofclip.lidar import PointCloud
 from tofclip.units import SPEED_OF_LIGHT
 

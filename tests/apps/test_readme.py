@@ -15,8 +15,9 @@ from small_instrument import Run
 import tofclip
 from devices import aravis
 from nlos import backprojection
-from nlos.portable import diffraction, library
-from tofclip.lidar.search import array_api
+from nlos.phasor import arrays as library
+from nlos.phasor import to_depths as diffraction
+from tofclip.lidar import search_array as array_api
 from tofclip.solvers import loops
 
 ROOT = Path(tofclip.__file__).parents[1]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from small_instrument import Run
 
-from devices.scenes import LineLight, simulate_line_light
+from devices.emulation.scenes import LineLight, simulate_line_light
 from tofclip.lidar import PointCloud, depth
 from tofclip.shots import Frames
 from tofclip.simulate import score_returns

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 from apps.cli import main
-from devices.remoteex.emulator import EmulatedStreakCamera
-from devices.scenes import EmulatedLight, draw_exposure, simulate_line_light
+from devices.emulation.remoteex import EmulatedStreakCamera
+from devices.emulation.scenes import EmulatedLight, draw_exposure, simulate_line_light
 from devices.shot_stream import read_transients
 from devices.transients import read_transient
 from tofclip.camera import Camera, SkewSweep
 from tofclip.io.streaks import save_stack
 from tofclip.lidar import PointCloud
+from tofclip.sequences.following import SurfacePipeline
 from tofclip.sequences.streaming import stream_clouds
-from tofclip.sequences.surface_following import SurfacePipeline
 from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_plain_pattern
@@ -127,7 +127,7 @@ def test_a_slow_consumer_gets_the_newest_shot_and_the_truth_about_the_others(
         def note_taken(self, number: int) -> None:
             self.taken_at[number] = monotonic()
 
-    monkeypatch.setattr("devices.remoteex.simulation.EmulatedStreakCamera", WatchedCamera)
+    monkeypatch.setattr("devices.emulation.remoteex.EmulatedStreakCamera", WatchedCamera)
     ages = []
 
     def save_slowly(self: PointCloud, path: Path) -> None:

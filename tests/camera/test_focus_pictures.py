@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofclip.camera.calibration import calibrate_views, focus_pictures
+from tofclip.camera import focus_pictures
+from tofclip.camera.focus_pictures import calibrate_views
 from tofclip.errors import CalibrationError, InputError, ShapeError
 
 CENTRES = np.array([95.3, 250.8, 405.1, 560.6])

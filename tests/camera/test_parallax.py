@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tofclip.camera import Camera, Measurement
-from tofclip.camera.calibration import (
+from tofclip.camera.parallax import (
     find_sharpest_shears,
     fit_parallax_to_centres,
     fit_parallax_to_shears,

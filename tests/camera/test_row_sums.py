@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tofclip.camera import Camera, ProjectiveSweep, Rectifier, SkewSweep, estimate_dark_level
-from tofclip.camera.row_sums import RowSums
+from tofclip.camera.rectifier import RowSums
 from tofclip.errors import InputError
 from tofclip.threads import LANES
 

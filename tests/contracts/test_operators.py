@@ -13,7 +13,7 @@ import pytest
 from array_places import DEVICE_NAMES, find_device
 
 from nlos import Capture, Grid, Hybrid
-from nlos.refinement.model import WallModel
+from nlos.refinement.l1 import WallModel
 from tofclip.arrays import ComputeDevice, is_numpy, to_numpy
 from tofclip.errors import InputError, ShapeError, TofclipError
 from tofclip.operators import (

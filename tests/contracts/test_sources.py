@@ -15,14 +15,13 @@ import numpy as np
 import pytest
 
 import devices
-from devices.codec import Records, as_bytes
-from devices.linospad2.codec import LinoSpad2Codec
-from devices.linospad2.simulation import SimulatedBoard, draw_uneven_calibration
+from devices.emulation.linospad2 import SimulatedBoard, draw_uneven_calibration
+from devices.emulation.scenes import simulate_line_light
+from devices.linospad2 import LinoSpad2Codec
 from devices.recorder import record_source
 from devices.recording.check import verify
-from devices.scenes import simulate_line_light
-from devices.source import Batch, DecodedSource, Source
-from devices.timetag.feed import SendWindow
+from devices.source import Batch, DecodedSource, Records, Source, as_bytes
+from devices.timetag.driver import SendWindow
 from tofclip.errors import DeviceTimeoutError, InputError
 
 RECORDS = 4000

@@ -7,14 +7,18 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from devices.address import Uri
 from devices.emulation.faults import PERMANENT_ENUMERATIONS, Fault
+from devices.emulation.timetag import (
+    CLOCK_HZ,
+    EmulatedTimeTagger,
+    EmulatorSettings,
+    GroundTruth,
+    PoissonStream,
+)
 from devices.emulation.usb import VirtualUsb
-from devices.ledger import Stats
-from devices.source import Batch, Source
-from devices.timetag.emulator import CLOCK_HZ, EmulatedTimeTagger, EmulatorSettings, GroundTruth
-from devices.timetag.light import PoissonStream
-from devices.timetag.source import open_on_backend
-from devices.uri import Uri
+from devices.source import Batch, Source, Stats
+from devices.timetag.driver import open_on_backend
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceError,

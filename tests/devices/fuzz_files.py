@@ -21,7 +21,8 @@ from devices.transients import read_transient
 from nlos import Capture
 from nlos.io import read_capture
 from tofclip import PointCloud
-from tofclip.io import itex, read_streak
+from tofclip.io import hamamatsu as itex
+from tofclip.io import read_streak
 from tofclip.io.light_fields import read_light_field, write_light_field
 from tofclip.io.streaks import outline_streak_file
 from tofclip.lidar.photons.files import describe_photons, read_photons

@@ -11,23 +11,26 @@ from unittest import mock
 import numpy as np
 from fuzz_files import FORMATS, FileFormat
 
-from devices.codec import Codec, as_bytes
+from devices.address import Uri
 from devices.frames import FrameCodec
-from devices.ledger import Ledger
-from devices.linospad2.codec import LinoSpad2Codec
-from devices.linospad2.sidecar import read_sidecar
-from devices.recording.blocks import BlockHeader, BlockKind
-from devices.recording.reader import Block, BlockReader
-from devices.remoteex.client import RemoteExClient, parse_data_length
-from devices.remoteex.protocol import Answer, AnswerCode, Command, parse_integer
-from devices.remoteex.source import LiveSettings, RemoteExFeed
-from devices.ring import Gap
-from devices.spad512.protocol import ExposureRequest
-from devices.spad512.source import Spad512Feed
+from devices.linospad2 import LinoSpad2Codec, read_sidecar
+from devices.recording.read import Block, BlockHeader, BlockKind, BlockReader
+from devices.remoteex import (
+    Answer,
+    AnswerCode,
+    Command,
+    LiveSettings,
+    RemoteExClient,
+    RemoteExFeed,
+    parse_data_length,
+    parse_integer,
+)
+from devices.source import Codec, Gap, Ledger, as_bytes
+from devices.spad512 import ExposureRequest, Spad512Feed
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec, mark_wraps
-from devices.uri import Uri
 from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError, ProtocolError
-from tofclip.io import hpdta, itex
+from tofclip.io import hamamatsu as hpdta
+from tofclip.io import hamamatsu as itex
 
 FILE_SLOWNESS = 20
 Decode = Callable[[bytes], object]
@@ -180,7 +183,7 @@ def _remoteex_session() -> Target:
 
     def decode(both: bytes) -> None:
         links = [Replayed(part) for part in both.partition(border)[::2]]
-        with mock.patch("devices.remoteex.client.TcpLink", side_effect=lambda *_: links.pop(0)):
+        with mock.patch("devices.remoteex.TcpLink", side_effect=lambda *_: links.pop(0)):
             feed = RemoteExFeed(
                 lambda: RemoteExClient("replayed", 1, 2, 0.01), Ledger(), LiveSettings(reconnect=0)
             )
@@ -212,7 +215,7 @@ def _spad512_session() -> Target:
                     raise DeviceTimeoutError("it is quiet")
                 return text
 
-        with mock.patch("devices.spad512.source._SILENCE_S", 0):
+        with mock.patch("devices.spad512._SILENCE_S", 0):
             feed = Spad512Feed(lambda: Server(data), Ledger(), exposure, 0.0, 0.0)  # type: ignore[arg-type,return-value]
         with mock.patch.object(
             feed, "_reconnect", side_effect=DeviceDisconnectedError("it stays away")

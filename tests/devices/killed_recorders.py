@@ -16,8 +16,8 @@ from pathlib import Path
 
 import devices
 from devices import recorder
-from devices.recording import writer
-from devices.ring import Piece
+from devices.recording import write as writer
+from devices.source import Piece
 
 ADDRESS = "sim+timetag://?seed={seed}&pace=realtime&rate=5e5&transfer_kib=2&faults=lost@20:50,corrupt@30:3"
 LONGEST_LIFE = 0.3

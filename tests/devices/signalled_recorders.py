@@ -15,7 +15,8 @@ import time
 from pathlib import Path
 
 from apps.cli import main as run_program
-from devices.remoteex import client, source
+from devices import remoteex as client
+from devices import remoteex as source
 
 SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 LONGEST_LIFE_S = 0.5

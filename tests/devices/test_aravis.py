@@ -15,9 +15,9 @@ import pytest
 
 import devices
 from devices.aravis import UNNUMBERED, find_cameras, load_aravis
+from devices.counted_photons import read_photons
 from devices.emulation.aravis import EmulatedFeed
-from devices.photons import read_photons
-from devices.scenes import EmulatedLight, draw_exposure, simulate_line_light
+from devices.emulation.scenes import EmulatedLight, draw_exposure, simulate_line_light
 from devices.shot_stream import read_transients
 from devices.source import Source
 from devices.transients import read_transient

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hypothesis.strategies as st
 from hypothesis import given
 
-from devices.codec import as_bytes
-from devices.emulation.byte_queue import ByteQueue
+from devices.emulation.timetag import ByteQueue
+from devices.source import as_bytes
 
 MOVES = st.lists(st.one_of(st.binary(max_size=20), st.integers(0, 30)), max_size=30)
 

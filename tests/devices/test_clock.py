@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from devices.clock import WINDOW_S, InstrumentClock
+from devices.stream import WINDOW_S, InstrumentClock
 
 
 def test_the_least_delay_remains_in_the_estimate_and_nothing_else() -> None:

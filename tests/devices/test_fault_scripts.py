@@ -15,11 +15,11 @@ import pytest
 from fault_scripts import RECORDS, TRANSFERS, Outcome, expected_fault, light, run
 from numpy.typing import NDArray
 
-from devices.codec import Records, as_bytes
 from devices.emulation.faults import PERMANENT_ENUMERATIONS, Fault, draw_fault_script
+from devices.emulation.timetag import MAX_TICK
+from devices.source import Records, as_bytes
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
-from devices.timetag.feed import SendWindow
-from devices.timetag.light import MAX_TICK
+from devices.timetag.driver import SendWindow
 from tofclip.errors import DeviceDisconnectedError, DeviceStalledError, InputError
 
 SCRIPTS, NIGHTLY_SCRIPTS = 300, 1000

@@ -14,9 +14,7 @@ import numpy as np
 import pytest
 
 from devices.frames import FrameCodec
-from devices.ledger import Ledger
-from devices.ring import OverflowPolicy
-from devices.source import Info
+from devices.source import Info, Ledger, OverflowPolicy
 from devices.stream import BufferSettings, StreamSource, Transfer
 from tofclip.errors import BufferOverflowError
 

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from numpy.typing import NDArray
 
-from devices.codec import as_bytes
 from devices.frames import FrameCodec
 from devices.registry import build_codec
-from devices.spad512.protocol import ExposureRequest
+from devices.source import as_bytes
+from devices.spad512 import ExposureRequest
 from tofclip.errors import InputError
 
 

@@ -11,8 +11,13 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 
 from devices.histogram import Accumulator, BinAxis, StampHistogram, TagHistogram, TimeHistogram
-from devices.linospad2.calibration import CLOCK_PERIOD_S, CODES_PER_PERIOD, BoardCalibration
-from devices.linospad2.codec import STAMP_DTYPE, STAMP_WITH_COUNTER_DTYPE
+from devices.linospad2 import (
+    CLOCK_PERIOD_S,
+    CODES_PER_PERIOD,
+    STAMP_DTYPE,
+    STAMP_WITH_COUNTER_DTYPE,
+    BoardCalibration,
+)
 from devices.timetag.codec import DELTA, RECORD_DTYPE
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError

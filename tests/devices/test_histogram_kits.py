@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given, settings
 
 import devices
-from devices.histogram_kits.emulator import compute_zone_ranges
-from devices.histogram_kits.protocol import (
+from devices.counted_photons import read_photons
+from devices.emulation.histogram_kits import compute_zone_ranges
+from devices.histogram_kits import (
     KitFrame,
     Parser,
     Tmf8828Parser,
@@ -22,7 +23,6 @@ from devices.histogram_kits.protocol import (
     format_tmf8828,
     format_vl53l8,
 )
-from devices.photons import read_photons
 from devices.source import Source
 from devices.transients import read_transient
 from tofclip.errors import (

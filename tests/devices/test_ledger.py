@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from devices.ledger import Ledger, Stats
+from devices.source import Ledger, Stats
 
 
 def test_every_change_moves_records_between_accounts() -> None:
@@ -41,7 +41,7 @@ def test_changes_at_the_same_time_all_count(monkeypatch: pytest.MonkeyPatch) -> 
         time.sleep(1e-3)
         return dataclasses.replace(stats, **changes)
 
-    monkeypatch.setattr("devices.ledger.replace", replace_slowly)
+    monkeypatch.setattr("devices.source.replace", replace_slowly)
     ledger = Ledger()
     started = threading.Barrier(4)
 

@@ -11,11 +11,17 @@ import pytest
 from hypothesis import given, settings
 from numpy.typing import NDArray
 
-from devices.codec import Records, as_bytes
-from devices.linospad2.calibration import CODES_PER_PERIOD, BoardCalibration, load_calibration
-from devices.linospad2.codec import FIRMWARES, MAX_TIMESTAMPS, LinoSpad2Codec
-from devices.linospad2.sidecar import read_sidecar
+from devices.linospad2 import (
+    CODES_PER_PERIOD,
+    FIRMWARES,
+    MAX_TIMESTAMPS,
+    BoardCalibration,
+    LinoSpad2Codec,
+    load_calibration,
+    read_sidecar,
+)
 from devices.registry import build_codec
+from devices.source import Records, as_bytes
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
 from tofclip.threads import THREADS_VARIABLE
 

@@ -12,12 +12,11 @@ import pytest
 from numpy.typing import NDArray
 
 import devices
+from devices import linospad2 as recordings
+from devices.emulation.linospad2 import SimulatedBoard, draw_uneven_calibration
+from devices.emulation.scenes import LineLight, make_line_instrument, simulate_line_light
 from devices.histogram import BinAxis, StampHistogram
-from devices.linospad2 import source as recordings
-from devices.linospad2.calibration import BoardCalibration
-from devices.linospad2.codec import LinoSpad2Codec
-from devices.linospad2.simulation import SimulatedBoard, draw_uneven_calibration
-from devices.scenes import LineLight, make_line_instrument, simulate_line_light
+from devices.linospad2 import BoardCalibration, LinoSpad2Codec
 from devices.source import Source
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError

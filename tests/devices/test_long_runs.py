@@ -14,12 +14,10 @@ import numpy as np
 import pytest
 
 import devices
-from devices.codec import as_bytes
-from devices.ledger import Ledger
-from devices.linospad2.codec import LinoSpad2Codec
-from devices.source import Info
+from devices.linospad2 import LinoSpad2Codec
+from devices.recorder import measure_throughput
+from devices.source import Info, Ledger, as_bytes
 from devices.stream import BufferSettings, StreamSource, Transfer
-from devices.throughput import measure_throughput
 from devices.timetag.codec import RECORD_BYTES
 from tofclip.storage import Record
 

@@ -11,7 +11,7 @@ import tifffile
 import devices
 from devices.transients import read_transient
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.io.itex import ItexImage, write_itex
+from tofclip.io.hamamatsu import ItexImage, write_itex
 
 TEXT = (
     '[Application],Date="1/2/2023",Software="HPD-TA"[Camera],CameraName="C1",SerialNumber="S/N: 5"'

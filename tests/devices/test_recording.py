@@ -16,17 +16,20 @@ import pytest
 from hypothesis import given, settings
 
 import devices
-from devices.codec import Records, as_bytes
 from devices.emulation.faults import draw_fault_script
-from devices.ledger import Stats
 from devices.recorder import record_source
-from devices.recording.blocks import HEADER_BYTES, BlockHeader, BlockKind
 from devices.recording.check import repair, verify
-from devices.recording.reader import SEARCH_BYTES, Block, Recording
-from devices.recording.writer import RecordingWriter, make_head
-from devices.replay import ReplaySource
-from devices.ring import Gap, Piece
-from devices.source import Batch, DecodedSource, Info, Source
+from devices.recording.read import (
+    HEADER_BYTES,
+    SEARCH_BYTES,
+    Block,
+    BlockHeader,
+    BlockKind,
+    Recording,
+    ReplaySource,
+)
+from devices.recording.write import RecordingWriter, make_head
+from devices.source import Batch, DecodedSource, Gap, Info, Piece, Records, Source, Stats, as_bytes
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
 from tofclip.errors import (
     DeviceDisconnectedError,
@@ -215,8 +218,7 @@ def test_a_killed_recorder_of_a_stream_that_pauses_has_all_that_came(tmp_path: P
 
 def require_true_records(path: Path, seed: int) -> None:
     """Compare a recording with the photons that there were: all come in order, none is made up."""
-    from devices.timetag.emulator import CLOCK_HZ
-    from devices.timetag.light import MAX_TICK, PoissonStream
+    from devices.emulation.timetag import CLOCK_HZ, MAX_TICK, PoissonStream
 
     ticks = joined(replayed(path))["time_ticks"]
     words = PoissonStream(5e5, CLOCK_HZ, seed).next_words(len(ticks) + 200, MAX_TICK)
@@ -334,7 +336,7 @@ def test_a_paced_replay_waits_as_long_as_the_recorder_did(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = {"ns": 10**18, "s": 0.0, "slept": 0.0}
-    monkeypatch.setattr("devices.recording.writer.monotonic_ns", lambda: clock["ns"])
+    monkeypatch.setattr("devices.recording.write.monotonic_ns", lambda: clock["ns"])
     writer = RecordingWriter(tmp_path / "run.h5", make_head(CODEC, Info("x"), None, {}))
     one = np.array([(5, 1, 0)], RECORD_DTYPE)
     for _ in range(2):
@@ -346,8 +348,8 @@ def test_a_paced_replay_waits_as_long_as_the_recorder_did(
         clock["s"] += seconds
         clock["slept"] += seconds
 
-    monkeypatch.setattr("devices.replay.monotonic", lambda: clock["s"])
-    monkeypatch.setattr("devices.replay.sleep", sleep)
+    monkeypatch.setattr("devices.recording.read.monotonic", lambda: clock["s"])
+    monkeypatch.setattr("devices.recording.read.sleep", sleep)
     with devices.open(f"file://{tmp_path / 'run.h5'}?pace=realtime") as source:
         source.read()
         assert clock["slept"] == 0
@@ -583,7 +585,7 @@ def test_a_clock_that_is_set_does_not_stop_a_replay(
         writer.add(Piece(CODEC.encode(one), 1))
     writer.close()
     slept: list[float] = []
-    monkeypatch.setattr("devices.replay.sleep", slept.append)
+    monkeypatch.setattr("devices.recording.read.sleep", slept.append)
     with ReplaySource(tmp_path / "run.h5", is_paced=True) as source:
         for _ in range(4):
             assert source.read(60.0) is not None
@@ -614,7 +616,7 @@ def test_a_reader_thread_never_dies_silently(monkeypatch: pytest.MonkeyPatch) ->
 
     for method in ("pull", "close"):
         with monkeypatch.context() as patch:
-            patch.setattr(f"devices.timetag.feed.TimeTaggerFeed.{method}", fail)
+            patch.setattr(f"devices.timetag.driver.TimeTaggerFeed.{method}", fail)
             source = devices.open(SIM)
             source.stop()
             with pytest.raises(BrokenError):

@@ -8,9 +8,8 @@ import pytest
 
 import devices
 from devices import registry
-from devices.ledger import Stats
-from devices.source import Batch, Info, Source
-from devices.uri import Uri
+from devices.address import Uri
+from devices.source import Batch, Info, Source, Stats
 from tofclip.errors import InputError
 
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 import devices
-from devices.emulation.faults import Fault
-from devices.loopback import HOST, Connection, LoopbackServer
-from devices.remoteex.client import RemoteExClient
-from devices.remoteex.emulator import Circumstances, EmulatedStreakCamera
-from devices.remoteex.protocol import TERMINATOR
-from devices.remoteex.source import LiveSettings
-from devices.scenes import EmulatedLight, simulate_demonstration_light, simulate_line_light
+from devices.emulation.faults import HOST, Connection, Fault, LoopbackServer
+from devices.emulation.remoteex import Circumstances, EmulatedStreakCamera
+from devices.emulation.scenes import (
+    EmulatedLight,
+    simulate_demonstration_light,
+    simulate_line_light,
+)
+from devices.remoteex import TERMINATOR, LiveSettings, RemoteExClient
 from devices.source import Source
 from tofclip.camera import Camera
 from tofclip.errors import (

@@ -6,7 +6,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from devices.remoteex.protocol import REFUSAL_REASONS, TERMINATOR, Answer, AnswerCode, Command
+from devices.remoteex import REFUSAL_REASONS, TERMINATOR, Answer, AnswerCode, Command
 from tofclip.errors import DeviceBusyError, DeviceError, InputError, ProtocolError
 
 names = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,20}", fullmatch=True)

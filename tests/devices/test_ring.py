@@ -6,8 +6,7 @@ import threading
 
 import pytest
 
-from devices.ledger import Ledger, Stats
-from devices.ring import Gap, OverflowPolicy, Piece, RingBuffer
+from devices.source import Gap, Ledger, OverflowPolicy, Piece, RingBuffer, Stats
 from tofclip.errors import BufferOverflowError, DeviceDisconnectedError, DeviceTimeoutError
 
 SOON = 0.02

@@ -13,7 +13,7 @@ import tcspc_files
 from tcspc_files import T2_TICK
 
 from tofclip.errors import FileFormatError
-from tofclip.io.picoquant import Checkpoint, PtuEvents
+from tofclip.io.tcspc import Checkpoint, PtuEvents
 from tofclip.lidar.photons.files import describe_photons, read_photons
 
 ptufile = pytest.importorskip("ptufile")
@@ -83,7 +83,7 @@ def test_markers_make_a_picture_of_a_file_in_t2_mode(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Pixels by the markers where lines begin and end, or by the dwell time that the file gives."""
-    monkeypatch.setattr("tofclip.io.picoquant.CHUNK_EVENTS", chunk)
+    monkeypatch.setattr("tofclip.io.tcspc.CHUNK_EVENTS", chunk)
     write_scan(tmp_path / "scan.ptu", scan, ImgHdr_TimePerPixel=dwell_ms)
     found = read_photons(tmp_path / "scan.ptu")
     assert found.image_shape == (ROWS, COLUMNS)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from devices.loopback import HOST
+from devices.emulation.faults import HOST
+from devices.emulation.remoteex import EmulatedStreakCamera
+from devices.emulation.scenes import EmulatedLight, simulate_line_light
 from devices.recording.check import verify
-from devices.remoteex.emulator import EmulatedStreakCamera
-from devices.scenes import EmulatedLight, simulate_line_light
 
 SCRIPT = Path(__file__).with_name("signalled_recorders.py")
 INTERRUPTED = 130

@@ -11,15 +11,14 @@ import pytest
 from hypothesis import given
 
 import devices
-from devices import photons
-from devices.emulation.faults import Fault
-from devices.gate_scan import GateScan
-from devices.loopback import HOST, Connection, LoopbackServer
-from devices.photons import read_photons
-from devices.scenes import render_array_delays, render_array_light
+from devices import counted_photons as photons
+from devices.counted_photons import read_photons
+from devices.emulation.faults import HOST, Connection, Fault, LoopbackServer
+from devices.emulation.scenes import render_array_delays, render_array_light
+from devices.emulation.spad512 import EmulatedSpadArray
+from devices.frames import GateScan
 from devices.source import Batch, Source
-from devices.spad512.emulator import EmulatedSpadArray
-from devices.spad512.protocol import (
+from devices.spad512 import (
     BIT_DEPTHS,
     IMAGE_WIDTHS_PX,
     ROWS,

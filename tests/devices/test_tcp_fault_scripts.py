@@ -16,13 +16,11 @@ import numpy as np
 import pytest
 
 import devices
-from devices.emulation.faults import Fault, FaultKind
-from devices.ledger import Stats
-from devices.loopback import HOST
-from devices.remoteex.emulator import EmulatedStreakCamera
-from devices.scenes import EmulatedLight
-from devices.source import Source
-from devices.spad512.emulator import EmulatedSpadArray
+from devices.emulation.faults import HOST, Fault, FaultKind
+from devices.emulation.remoteex import EmulatedStreakCamera
+from devices.emulation.scenes import EmulatedLight
+from devices.emulation.spad512 import EmulatedSpadArray
+from devices.source import Source, Stats
 from tofclip.errors import DeviceError
 
 SUITE_SCRIPTS = 48

@@ -17,8 +17,8 @@ import tcspc_files
 from tcspc_files import PERIOD, RESOLUTION, make_decays
 
 import devices
-from devices import tcspc
-from devices.tcspc import PHOTON_DTYPE
+from devices import files as tcspc
+from devices.files import PHOTON_DTYPE
 from devices.transients import read_transient
 from tofclip.errors import (
     FileFormatError,
@@ -161,7 +161,7 @@ def test_a_ptu_is_the_same_in_pieces(
 ) -> None:
     """Photons that are read a piece at a time, as of a file that does not fit into memory."""
     whole = read_all(f"file://{ptu}")
-    monkeypatch.setattr("tofclip.io.picoquant.CHUNK_EVENTS", -(-len(whole) // pieces))
+    monkeypatch.setattr("tofclip.io.tcspc.CHUNK_EVENTS", -(-len(whole) // pieces))
     np.testing.assert_array_equal(read_all(f"file://{ptu}"), whole)
     with devices.open(f"file://{ptu}") as source:
         source.seek(len(whole) // 2)
@@ -176,7 +176,7 @@ def test_photons_of_a_file_in_t2_mode(
     tmp_path: Path, chunk: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Times from the last pulse before each photon, over overflows and pieces."""
-    monkeypatch.setattr("tofclip.io.picoquant.CHUNK_EVENTS", chunk)
+    monkeypatch.setattr("tofclip.io.tcspc.CHUNK_EVENTS", chunk)
     random = np.random.default_rng(3)
     pulses = 500 + 400_000 * np.arange(300)  # 120 us: over three overflows of 34 us
     own = np.sort(random.integers(0, 300, 200))

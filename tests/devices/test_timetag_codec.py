@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from devices.codec import Records, as_bytes
+from devices.source import Records, as_bytes
 from devices.timetag.codec import (
     COUNTER_RANGE,
     DELTA,

@@ -13,25 +13,29 @@ import numpy as np
 import pytest
 
 import devices
-from devices.codec import as_bytes
+from devices.address import Uri
 from devices.emulation.faults import Fault
+from devices.emulation.timetag import (
+    CLOCK_HZ,
+    MAX_TICK,
+    EmulatedTimeTagger,
+    EmulatorSettings,
+    PoissonStream,
+)
 from devices.emulation.usb import VirtualUsb, make_usb_error
-from devices.ledger import Ledger
-from devices.source import Source
+from devices.source import Ledger, Source, as_bytes
 from devices.timetag.codec import COUNTER_RANGE, WRAP, TimeTagCodec
-from devices.timetag.emulator import CLOCK_HZ, EmulatedTimeTagger, EmulatorSettings
-from devices.timetag.feed import AcquisitionSettings, TimeTaggerFeed
-from devices.timetag.light import MAX_TICK, PoissonStream
-from devices.timetag.registers import (
+from devices.timetag.driver import (
     COMMAND_ENDPOINT,
     REPLY_ENDPOINT,
     USB_IDENTITY,
+    AcquisitionSettings,
     Capture,
     Register,
     TimeTagger,
+    TimeTaggerFeed,
+    open_on_backend,
 )
-from devices.timetag.source import open_on_backend
-from devices.uri import Uri
 from devices.usb import UsbLink
 from tofclip.errors import (
     BufferOverflowError,

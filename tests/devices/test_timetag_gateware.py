@@ -13,12 +13,17 @@ from pathlib import Path
 
 import pytest
 
-from devices.codec import as_bytes
+from devices.emulation.timetag import (
+    CLOCK_HZ,
+    COMMAND,
+    EmulatedTimeTagger,
+    EmulatorSettings,
+    PoissonStream,
+)
 from devices.emulation.usb import VirtualUsb
+from devices.source import as_bytes
 from devices.timetag.codec import TimeTagCodec
-from devices.timetag.emulator import CLOCK_HZ, COMMAND, EmulatedTimeTagger, EmulatorSettings
-from devices.timetag.light import PoissonStream
-from devices.timetag.registers import USB_IDENTITY, Capture, Register, TimeTagger
+from devices.timetag.driver import USB_IDENTITY, Capture, Register, TimeTagger
 from devices.usb import UsbLink
 
 BENCH = Path(__file__).with_name("timetag_bench.v")

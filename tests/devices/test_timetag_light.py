@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from devices.codec import Records, as_bytes
-from devices.scenes import LineLight, simulate_line_light
-from devices.timetag.codec import COUNTER_RANGE, WRAP, TimeTagCodec
-from devices.timetag.emulator import CLOCK_HZ
-from devices.timetag.light import (
+from devices.emulation.scenes import LineLight, simulate_line_light
+from devices.emulation.timetag import (
     BLOCK_TICKS,
+    CLOCK_HZ,
     MAX_TICK,
     PERIOD_TICKS,
     SCENE_SCALE,
     SYNC_MASK,
     PulsedSceneStream,
 )
+from devices.source import Records, as_bytes
+from devices.timetag.codec import COUNTER_RANGE, WRAP, TimeTagCodec
 from devices.transients import read_transient
 from tofclip.errors import InputError
 

@@ -12,30 +12,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devices.codec import Records
+from devices.address import Uri
 from devices.emulation.faults import Fault
-from devices.emulation.usb import VirtualUsb, make_usb_error
-from devices.source import Source
-from devices.timetag import feed
-from devices.timetag.emulator import (
+from devices.emulation.timetag import (
     BOARD_MEMORY_BYTES,
     CLOCK_HZ,
     COMMAND,
     MAGIC,
     EmulatedTimeTagger,
     EmulatorSettings,
+    PoissonStream,
 )
-from devices.timetag.light import PoissonStream
-from devices.timetag.registers import (
+from devices.emulation.usb import VirtualUsb, make_usb_error
+from devices.source import Records, Source
+from devices.timetag import driver as feed
+from devices.timetag.driver import (
     COMMAND_ENDPOINT,
     DATA_ENDPOINT,
     USB_IDENTITY,
     Capture,
     Register,
     TimeTagger,
+    open_on_backend,
 )
-from devices.timetag.source import open_on_backend
-from devices.uri import Uri
 from devices.usb import UsbLink
 from tofclip.errors import DeviceError, DeviceTimeoutError, ProtocolError
 

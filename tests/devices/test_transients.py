@@ -9,15 +9,12 @@ import numpy as np
 import pytest
 
 from devices import registry, transients
-from devices.codec import Records
+from devices.emulation.linospad2 import SimulatedBoard, draw_uneven_calibration
+from devices.emulation.scenes import simulate_line_light
 from devices.histogram import BinAxis, StampHistogram
-from devices.ledger import Stats
-from devices.linospad2.calibration import BoardCalibration, load_calibration
-from devices.linospad2.codec import LinoSpad2Codec
-from devices.linospad2.simulation import SimulatedBoard, draw_uneven_calibration
-from devices.scenes import simulate_line_light
+from devices.linospad2 import BoardCalibration, LinoSpad2Codec, load_calibration
 from devices.shot_stream import read_transients
-from devices.source import Batch, Info, Source
+from devices.source import Batch, Info, Records, Source, Stats
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
 from devices.transients import read_transient
 from tofclip.errors import InputError, MissingTimeAxisError

@@ -11,11 +11,10 @@ import pytest
 import usb.backend.libusb1
 import usb.core
 
+from devices.address import Uri
 from devices.emulation.usb import VirtualDevice, VirtualUsb, make_usb_error
-from devices.timetag import source as timetag
-from devices.timetag.registers import BARE_CHIP_IDENTITY
-from devices.timetag.source import find_timetaggers, open_timetag
-from devices.uri import Uri
+from devices.timetag import driver as timetag
+from devices.timetag.driver import BARE_CHIP_IDENTITY, find_timetaggers, open_timetag
 from devices.usb import UsbIdentity, UsbLink, system_backend, translate_errors
 from tofclip.errors import (
     DeviceBusyError,

@@ -7,13 +7,11 @@ from pathlib import Path
 import pytest
 
 import tofclip
-from devices import aravis
-from devices.histogram_kits import source as kits
-from devices.linospad2 import simulation as linospad2
+from devices import aravis, remoteex, spad512
+from devices import histogram_kits as kits
+from devices.emulation import linospad2
 from devices.registry import FILE_OPENERS, OPENERS
-from devices.remoteex import source as remoteex
-from devices.spad512 import source as spad512
-from devices.timetag import source as timetag
+from devices.timetag import driver as timetag
 
 DOCS = Path(tofclip.__file__).parents[1] / "docs"
 PAGES = {

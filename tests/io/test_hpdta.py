@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tofclip.errors import FileFormatError, MissingTimeAxisError
 from tofclip.io import read_streak
-from tofclip.io.hpdta import is_hpdta, parse_full_scale, parse_text, read_row_times
+from tofclip.io.hamamatsu import is_hpdta, parse_full_scale, parse_text, read_row_times
 
 # Times in ns of a sweep that slows down, as real ones do; exact in float32.
 SWEEP_NS = np.arange(24) * 0.5 + np.arange(24) ** 2 / 64

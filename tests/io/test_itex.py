@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError, MissingTimeAxisError, ShapeError
 from tofclip.io import read_streak
-from tofclip.io.itex import ItexImage, decode_itex, encode_itex, read_itex, write_itex
+from tofclip.io.hamamatsu import ItexImage, decode_itex, encode_itex, read_itex, write_itex
 
 TEXT = (
     '[Application],Software="HPD-TA"\r\n[Acquisition],NrExposure=1\r\n'

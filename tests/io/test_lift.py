@@ -18,7 +18,7 @@ from tofclip.errors import (
 )
 from tofclip.io import read_streak
 from tofclip.io.archive import Archive
-from tofclip.io.relay_wall import RelayWall, read_relay_wall
+from tofclip.io.lift import RelayWall, read_relay_wall
 
 ROW, COLUMN = np.meshgrid([0.0, 4.0, 11.0], [0.0, 17.5, 59.0], indexing="ij")
 

@@ -8,10 +8,10 @@ import scipy.sparse
 
 from tofclip.camera import Camera
 from tofclip.errors import InputError
-from tofclip.lidar.signal_rows.bright_frames import BrightFrameFinder
+from tofclip.lidar.signal_rows import BrightFrameFinder
 from tofclip.operators.sparse import Tiles
 from tofclip.solvers import LinearInverse
-from tofclip.solvers.traces import GROUP_PIXELS, InverseTraces, order_by_patch
+from tofclip.solvers.direct import GROUP_PIXELS, InverseTraces, order_by_patch
 from tofclip.threads import LANES
 
 SHAPE = (21, 37)

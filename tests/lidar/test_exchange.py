@@ -14,7 +14,7 @@ import pytest
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, StorageError
 from tofclip.lidar import PointCloud, Returns, point_cloud
-from tofclip.lidar.organised import save_organised
+from tofclip.lidar.cloud import save_organised
 from tofclip.lidar.ros import StampedCloud, write_bag
 
 

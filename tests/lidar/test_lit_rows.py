@@ -11,14 +11,14 @@ import pytest
 from tofclip.camera import Camera, SkewSweep
 from tofclip.camera.kernels import sum_boxes
 from tofclip.lidar import Detection, depth
-from tofclip.lidar.signal_rows.selection import RowBlock, SignalRowFinder
-from tofclip.lidar.traces import TraceBins
+from tofclip.lidar.pulse_tables import TraceBins
+from tofclip.lidar.signal_rows import RowBlock, SignalRowFinder
 from tofclip.recovery import DepthLockedFocus, FixedFocus, recover
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_checkerboard
 from tofclip.solvers import LinearInverse
-from tofclip.solvers.traces import InverseTraces, order_by_patch
+from tofclip.solvers.direct import InverseTraces, order_by_patch
 from tofclip.threads import LANES
 
 CENTRES = 30.0 + 45 * np.arange(5)

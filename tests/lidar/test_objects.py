@@ -7,7 +7,7 @@ import pytest
 
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
-from tofclip.lidar.objects import find_objects
+from tofclip.lidar.processing import find_objects
 
 
 def cloud(xyz: np.ndarray) -> PointCloud:

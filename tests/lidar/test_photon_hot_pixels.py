@@ -7,7 +7,7 @@ import pytest
 
 from tofclip.errors import InputError
 from tofclip.lidar.photons import PhotonImage
-from tofclip.lidar.photons.hot_pixels import find_hot_pixels, leave_out_pixels
+from tofclip.lidar.photons.image import find_hot_pixels, leave_out_pixels
 from tofclip.lidar.photons.response import measure_pulse_width
 
 BIN = 50e-12

@@ -431,7 +431,7 @@ def test_unusable_smoothness_is_refused(detector):
 def test_many_trials_are_simulated_in_batches(detector, monkeypatch):
     """Memory does not grow with the number of trials, and every trial counts."""
     whole = measure_accuracy(detector, 100, 0.1, trials=300, seed=3)
-    monkeypatch.setattr("tofclip.lidar.photons.accuracy.BINS_PER_BATCH", 128 * detector.bins)
+    monkeypatch.setattr("tofclip.lidar.photons.limits.BINS_PER_BATCH", 128 * detector.bins)
     done = []
     largest = []
     locate = type(detector).locate

@@ -17,10 +17,9 @@ from tofclip.lidar.photons import (
     make_pinhole,
     matching,
 )
-from tofclip.lidar.photons.layers import keep_significant
 from tofclip.lidar.photons.planes import estimate_bias
-from tofclip.lidar.photons.response import BinnedResponse, measure_pulse_width
-from tofclip.lidar.photons.scene import Scene
+from tofclip.lidar.photons.response import BinnedResponse, Scene, measure_pulse_width
+from tofclip.lidar.photons.surface import keep_significant
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN = 80e-12

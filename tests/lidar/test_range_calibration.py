@@ -11,8 +11,7 @@ import pytest
 from tofclip.camera import Camera, RangeCalibration
 from tofclip.errors import CalibrationError, InputError
 from tofclip.lidar import Returns, compute_ray_directions, depth, point_cloud
-from tofclip.lidar.range_correction import correct_returns
-from tofclip.lidar.range_fit import TargetShot, fit_range_calibration
+from tofclip.lidar.range_calibration import TargetShot, correct_returns, fit_range_calibration
 from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Detection, Pulse, Returns, depth
-from tofclip.lidar.pulse_fit import take_gauss_newton_step
+from tofclip.lidar.fit_kernels import take_gauss_newton_step
 from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 

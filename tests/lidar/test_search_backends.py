@@ -12,7 +12,7 @@ from tofclip.arrays import ComputeDevice, to_numpy
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Detection, Pulse, Returns, depth
-from tofclip.lidar.search import array_api as search
+from tofclip.lidar import search_array as search
 from tofclip.shots import Frames
 from tofclip.solvers import LinearInverse
 from tofclip.units import SPEED_OF_LIGHT

@@ -9,15 +9,14 @@ import pytest
 
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, Pulse, depth
-from tofclip.lidar.search.candidates import (
+from tofclip.lidar.fit_kernels import fit_lone_returns
+from tofclip.lidar.peak_kernels import (
     CANDIDATE_COLUMNS,
     HEIGHT,
     OFFSET,
     PEAK_BIN,
 )
-from tofclip.lidar.search.phase_table import MAX_OFFSET_BINS, PHASES_PER_BIN, PhaseTable
-from tofclip.lidar.search.table_fit import fit_lone_returns
-from tofclip.lidar.traces import TraceBins
+from tofclip.lidar.pulse_tables import MAX_OFFSET_BINS, PHASES_PER_BIN, PhaseTable, TraceBins
 from tofclip.shots import Frames
 
 BIN, FWHM = 20e-12, 60e-12

@@ -17,7 +17,8 @@ from tofclip.light_field import (
     make_focal_stack,
 )
 from tofclip.metrics import nmse
-from tofclip.simulate.light_fields import CameraArray, make_scene, render_light_field, render_view
+from tofclip.simulate.light_fields import CameraArray, render_light_field, render_view
+from tofclip.simulate.scenes import make_scene
 
 SHEARS = np.arange(-1.4, 1.01, 0.2)
 ARRAY = CameraArray((64, 64), 8, focal_length_px=80.0, view_step=0.025)

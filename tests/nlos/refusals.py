@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from nlos.geometry import Grid
+from nlos.volume import Grid
 from tofclip.errors import InputError
 
 

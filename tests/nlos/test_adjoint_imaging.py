@@ -15,14 +15,14 @@ from apps.studies.hidden_scene_adjoint import (
     run_study,
 )
 from nlos import Backprojection, Capture, Grid, PlanarRSD, Volume
-from nlos.adjoint import AdjointImaging, CompressedCapture
 from nlos.capture import TimeAxis
+from nlos.compressed import AdjointImaging, CompressedCapture
 from nlos.simulate import PointScene, build_relay_wall
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import SparseMatrix
 from tofclip.solvers import LinearInverse
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 
 HIDDEN = (0.15, -0.2, 0.65)
 WALL = build_relay_wall("planar", 24, 1.2)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from nlos import Capture, Grid, PlanarRSD
-from nlos.averaging import DepthAverage
 from nlos.capture import TimeAxis
 from nlos.simulate import PointScene
+from nlos.video import DepthAverage
 from tofclip.errors import InputError
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 AXIS, FAR, CAPTURES = TimeAxis(320, 40e-12), (0.1, -0.1, 1.4), 9
 GRID = Grid.box((-0.4, 0.4), (-0.4, 0.4), (0.3, 1.5), 0.1)
 

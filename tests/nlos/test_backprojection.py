@@ -19,7 +19,7 @@ from nlos.simulate import PointScene
 from tofclip.errors import InputError
 
 # The walls here are coarser than the shortest of the pulse's waves wants; see test_sampling.py.
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 
 METHOD = Backprojection(wavelength=0.125, cycles=3)
 # Odd sizes, none of them a multiple of the brick, and HIDDEN among the voxels.

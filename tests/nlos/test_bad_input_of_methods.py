@@ -23,7 +23,7 @@ from nlos import (
     Refinement,
     TransientImaging,
 )
-from nlos.illumination_groups import AliasingWarning
+from nlos.illumination import AliasingWarning
 from tofclip.errors import InputError
 
 LONGEST_LINE = 260

@@ -11,7 +11,7 @@ from refusals import find_refusal
 
 from nlos import Capture, FKMigration, Grid, LightCone
 from nlos.capture import TimeAxis
-from nlos.confocal.light_cone import build_rebinning_matrix
+from nlos.confocal import build_rebinning_matrix
 from nlos.preparation import rebin_capture, remove_first_bounce
 from nlos.simulate import PointScene
 from tofclip.errors import InputError

@@ -9,14 +9,14 @@ import pytest
 from exact_phasor_field import compute_exact_phasor_field
 from relay_walls import AXIS, HIDDEN, JITTER, planar_wall
 
-import nlos.rsd.diffraction
+import nlos.phasor.depth_steps
 from nlos import Capture, Grid, PlanarRSD
 from nlos.capture import TimeAxis
-from nlos.rsd.diffraction import AxialSpectrum, choose_depths
-from nlos.rsd.image_planes import DEPTH_ERROR_FRACTION
+from nlos.phasor.depth_steps import AxialSpectrum, choose_depths
+from nlos.phasor.to_depths_compiled import DEPTH_ERROR_FRACTION
 from nlos.simulate import PointScene
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 WAVENUMBERS = np.linspace(20.0, 80.0, 31)
 STRENGTH = np.exp(-(((WAVENUMBERS - 50) / 14) ** 2))
 SPECTRUM = AxialSpectrum.of(WAVENUMBERS, STRENGTH, 50.0, (0.0, 1.0))
@@ -98,7 +98,7 @@ def test_interpolated_depths_are_those_that_are_computed(
     """Signals of noise: light from everywhere at any time."""
     capture, method = capture_of(laser), replace(METHOD, tolerance=tolerance)
     found = method.phasor_field(capture, FINE).values
-    monkeypatch.setattr(nlos.rsd.diffraction, "SPACING_RATIOS", ())
+    monkeypatch.setattr(nlos.phasor.depth_steps, "SPACING_RATIOS", ())
     expected = method.phasor_field(capture, FINE).values
     assert 0 < relative_error(found, expected) < DEPTH_ERROR_FRACTION * tolerance
 

@@ -6,9 +6,8 @@ from refusals import find_refusal
 from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, lasers_for
 
 from nlos import Capture, FilteredBackprojection, Grid
-from nlos.backprojection import Weighting, backproject_signals
+from nlos.backprojection import Weighting, _apply_laplacian, backproject_signals
 from nlos.band import Waveforms
-from nlos.filtered import _apply_laplacian
 from nlos.method import ignore_progress
 from nlos.simulate import PointScene
 from tofclip.errors import InputError

@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from nlos import Capture, Grid, PlanarRSD, fourier_plans
+from nlos import Capture, Grid, PlanarRSD
+from nlos.phasor import fourier as fourier_plans
 
 pytest.importorskip("pyfftw")
 
@@ -48,7 +49,7 @@ def test_an_image_without_fftw(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_transforms_load_neither_dask_nor_pandas() -> None:
     code = (
-        "import sys, nlos.fourier_plans as plans;"
+        "import sys, nlos.phasor.fourier as plans;"
         "assert plans.pyfftw is not None; assert not {'dask', 'pandas'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -11,12 +11,11 @@ from relay_walls import planar_wall
 
 from nlos import Capture, Grid, PlanarRSD, Volume
 from nlos.capture import TimeAxis
-from nlos.confocal.directional import DirectionalLightCone
-from nlos.front_surface import FrontSurface, find_front_surface
+from nlos.normals import DirectionalLightCone, FrontSurface, find_front_surface
 from nlos.simulate import HiddenScene, Surface
 from tofclip.errors import InputError
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 WALL = planar_wall(32, 32)
 CENTRE = np.array([0.05, -0.05, 0.7])
 GRID = Grid.box((-0.25, 0.35), (-0.35, 0.25), (0.5, 0.9), 0.02)

@@ -180,7 +180,7 @@ def test_letters_read_from_left_to_right_and_from_top_to_bottom() -> None:
         Surface.letters(" ", [0, 0, 0.5], 0.4, 0.01)
 
 
-@pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+@pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 def test_a_letter_comes_back_the_right_way_round() -> None:
     wall = build_relay_wall("planar", 24, 1.2)
     scene = HiddenScene([Surface.letters("L", [0, 0, 0.6], 0.5, 0.02)])

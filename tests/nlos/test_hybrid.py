@@ -17,7 +17,7 @@ from tofclip.errors import InputError
 COUNT = 25  # wall points along a side, 8 cm apart
 GRID = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.85, 12), [0.62, 0.8, 1.0, 1.1, 1.45])
 METHOD = Hybrid(wavelength=0.25, cycles=4.24)
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 
 
 def scaled_error(found: np.ndarray, expected: np.ndarray) -> float:

@@ -10,15 +10,19 @@ from scene_shapes import SHAPES, shaped_wall
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
-from nlos.plane import Plane
-from nlos.propagation.compiled import estimate_strength, propagate_direct, propagate_low_rank
-from nlos.propagation.wall_to_plane_plan import (
+from nlos.phasor.depth_steps import find_fast_length
+from nlos.phasor.transfer import SphericalWaves
+from nlos.phasor.wall_to_plane import (
     WallBeforePlane,
     WallToPlanePlan,
     find_common_period,
 )
-from nlos.rsd.diffraction import find_fast_length
-from nlos.rsd.transfer import SphericalWaves
+from nlos.phasor.wall_to_plane_compiled import (
+    estimate_strength,
+    propagate_direct,
+    propagate_low_rank,
+)
+from nlos.plane import Plane
 
 BAND = Band(VirtualPulse(0.25, 4.24), TimeAxis(512, 32e-12))
 K = BAND.wavenumbers

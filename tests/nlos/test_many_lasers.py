@@ -9,25 +9,17 @@ from functools import cache
 import numpy as np
 import pytest
 
-from nlos import (
-    Backprojection,
-    Capture,
-    Grid,
-    Hybrid,
-    PlanarRSD,
-    Refinement,
-    moveout,
-    settings_for,
-)
+from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD, Refinement, settings_for
+from nlos import preparation as moveout
 from nlos.capture import TimeAxis
-from nlos.illumination_groups import choose_roles
-from nlos.moveout import MidpointImaging, MidpointJoin, join_near_lasers
+from nlos.illumination import choose_roles
+from nlos.preparation import MidpointImaging, MidpointJoin, join_near_lasers
 from nlos.refinement.photons import PhotonRefinement
 from nlos.simulate import PointScene, add_poisson_noise
 from tofclip.errors import InputError
 from tofclip.solvers import Sparse
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 AXIS, JITTER, WAVELENGTH = TimeAxis(320, 32e-12), 40e-12, 0.2
 HIDDEN = [[0.1, -0.2, 0.7], [-0.2, 0.1, 0.9]]
 SCENE = PointScene(HIDDEN, [400.0, 500.0])

@@ -13,10 +13,10 @@ from scene_shapes import JITTER, POINTS, SPOT, shaped_wall
 
 from nlos import Capture, Grid, Hybrid, PlanarRSD, Volume
 from nlos.capture import TimeAxis
-from nlos.rsd.transfer import SphericalWaves, TransferFunction, Window, find_lateral_limits
+from nlos.phasor.transfer import SphericalWaves, TransferFunction, Window, find_lateral_limits
 from nlos.simulate import PointScene
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 # As wide as the wall, so that voxels and points stand in opposite corners; so many depths that some
 # are interpolated.
 GRID = Grid(np.linspace(-1, 1, 6), np.linspace(-1, 1, 4), np.linspace(0.6, 1.6, 16))

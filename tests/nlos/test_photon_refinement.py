@@ -9,14 +9,19 @@ import pytest
 
 from nlos import Capture, Grid, Hybrid
 from nlos.capture import TimeAxis
-from nlos.refinement.counts import CountedPhotons, LikelihoodGain, fit_brightness
-from nlos.refinement.photons import LINEAR_SHOWN, PhotonRefinement
+from nlos.refinement.photons import (
+    LINEAR_SHOWN,
+    CountedPhotons,
+    LikelihoodGain,
+    PhotonRefinement,
+    fit_brightness,
+)
 from nlos.refinement.time_of_flight import TimeOfFlight
 from nlos.score import find_near_voxels, score_brightest
 from nlos.simulate import HiddenScene, PointScene, Surface, add_poisson_noise, build_relay_wall
 from tofclip.errors import InputError
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 POINTS = np.array(
     [[0.0, 0.05, 0.7], [0.3, -0.25, 0.8], [-0.35, 0.2, 0.85], [0.2, 0.4, 0.95], [-0.3, -0.4, 1.05]]
 )

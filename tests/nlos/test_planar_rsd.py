@@ -11,11 +11,11 @@ from refusals import find_refusal
 from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, planar_wall
 from sampled_diffraction import diffract_by_convolution
 
-import nlos.rsd.diffraction
-import nlos.rsd.inverse
+import nlos.phasor.depth_steps
+import nlos.phasor.to_depths_compiled
 from nlos import Backprojection, Capture, Grid, PlanarRSD
 from nlos.capture import TimeAxis
-from nlos.illumination_groups import build_waves, choose_unaliased_band, group_by_illumination
+from nlos.illumination import build_waves, choose_unaliased_band, group_by_illumination
 from nlos.plane import Plane
 from nlos.simulate import PointScene
 from tofclip.errors import InputError, ShapeError
@@ -25,7 +25,7 @@ from tofclip.errors import InputError, ShapeError
 LONG = TimeAxis(560, AXIS.bin_width, 0.4)
 GRID = Grid(np.arange(-0.3, 0.42, 0.05), np.arange(-0.4, 0.25, 0.06), [0.45, 0.5, 0.56, 0.65, 0.8])
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.illumination_groups.AliasingWarning"
+    "ignore::nlos.illumination.AliasingWarning"
 )  # small walls are coarse ones
 METHOD = PlanarRSD(wavelength=0.125, cycles=3)
 SPOTS = np.array([[0.12, 0.05, 0.0], [-0.3, 0.2, 0.0]])
@@ -161,7 +161,7 @@ def test_both_ways_back_from_the_spectrum_agree(monkeypatch: pytest.MonkeyPatch)
     ):
         fields = []
         for rate in (0, np.inf):
-            monkeypatch.setattr(nlos.rsd.inverse, "PRODUCT_SPEEDUP", rate)
+            monkeypatch.setattr(nlos.phasor.to_depths_compiled, "PRODUCT_SPEEDUP", rate)
             fields.append(METHOD.phasor_field(capture, grid).values)
         assert relative_error(*fields) < 1e-5
 
@@ -231,7 +231,7 @@ def test_what_cannot_be_imaged_is_refused(capture: Capture, grid: Grid, reason: 
 
 
 def test_too_many_plane_waves_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nlos.rsd.diffraction, "MEMORY_LIMIT_BYTES", 1 << 16)
+    monkeypatch.setattr(nlos.phasor.depth_steps, "MEMORY_LIMIT_BYTES", 1 << 16)
     assert "plane waves" in find_refusal(METHOD, scene("single"), GRID)
 
 

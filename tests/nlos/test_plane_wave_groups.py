@@ -9,12 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import nlos.rsd.inverse
-from nlos.plane import Plane
-from nlos.rsd.diffraction import PlaneWaves
-from nlos.rsd.groups import WaveGroups
-from nlos.rsd.inverse import choose_inverse
-from nlos.rsd.kernels import (
+import nlos.phasor.to_depths_compiled
+from nlos.phasor.depth_steps import PlaneWaves
+from nlos.phasor.to_depths_compiled import WaveGroups, choose_inverse
+from nlos.phasor.to_depths_kernels import (
     FREQUENCY_STEPS,
     LANES,
     MIRROR_IMAGES,
@@ -22,7 +20,8 @@ from nlos.rsd.kernels import (
     scatter_terms,
     transpose,
 )
-from nlos.rsd.transfer import SphericalWaves, TransferFunction, Window
+from nlos.phasor.transfer import SphericalWaves, TransferFunction, Window
+from nlos.plane import Plane
 
 PLANE = Plane(np.linspace(-0.4, 0.5, 12), np.linspace(-0.3, 0.6, 11), 0.0)
 WAVES = SphericalWaves(40.0, 1.5, 13, continued=False)  # 13 frequencies: not a multiple of STEPS
@@ -147,7 +146,7 @@ def test_images_are_sums_of_plane_waves(
     lattice: tuple[float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A few of them at a time, and waves that repeat each other on coarse voxels added up."""
-    monkeypatch.setattr(nlos.rsd.inverse, "CACHE_BYTES", 12_000)
+    monkeypatch.setattr(nlos.phasor.to_depths_compiled, "CACHE_BYTES", 12_000)
     wanted, terms, random = (7, 9), 5, np.random.default_rng(2)
     plan = choose_inverse(GROUPS.indices, lattice, wanted, terms)
     assert 0 < len(plan.spectra) < terms

@@ -7,16 +7,16 @@ import pytest
 from portable_libraries import LIBRARIES, find_device, relative_error
 from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, lasers_for
 
-import nlos.portable.backprojection
+import nlos.backprojection_arrays
 from nlos import Backprojection, Capture, Grid
 from nlos.backprojection import Weighting
-from nlos.portable.backprojection import BYTES_PER_PAIR
-from nlos.portable.library import ArrayLibrary
+from nlos.backprojection_arrays import BYTES_PER_PAIR
+from nlos.phasor.arrays import ArrayLibrary
 from nlos.simulate import PointScene
 from tofclip.arrays import to_numpy
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.illumination_groups.AliasingWarning"
+    "ignore::nlos.illumination.AliasingWarning"
 )  # small walls are coarse ones
 
 # Odd sizes, unevenly spaced; the record (paths up to 1.63 m) ends before the farthest voxels.
@@ -85,7 +85,7 @@ def test_pieces_make_up_the_whole_and_progress_counts_them(
     whole = to_numpy(METHOD.phasor_field(capture, GRID).values)
     counted: list[int] = []
     for table, pairs in ((1 << 20, 40), (1, 1 << 20), (1 << 20, 1)):
-        monkeypatch.setattr(nlos.portable.backprojection, "TABLE_BYTES", table)
+        monkeypatch.setattr(nlos.backprojection_arrays, "TABLE_BYTES", table)
         monkeypatch.setattr(ArrayLibrary, "chunk_bytes", pairs * BYTES_PER_PAIR)
         counted.clear()
         found = METHOD.phasor_field(

@@ -13,16 +13,16 @@ import pytest
 from portable_libraries import relative_error
 from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, planar_wall
 
-import nlos.portable.propagation
+import nlos.phasor.wall_to_plane_arrays
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
 from nlos.backprojection import Weighting
+from nlos.phasor.wall_to_plane import WallToPlanePlan
 from nlos.preparation import rebin_capture, remove_first_bounce
-from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
 from nlos.simulate import PointScene
 from tofclip.arrays import ComputeDevice
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.illumination_groups.AliasingWarning"
+    "ignore::nlos.illumination.AliasingWarning"
 )  # small walls are coarse ones
 
 GRID = Grid(np.arange(-0.3, 0.3, 0.1), np.arange(-0.2, 0.3, 0.1), [0.5, 0.6, 0.75])
@@ -45,7 +45,7 @@ def fetched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         sizes.append(array.size)
         return brought_here(array)
 
-    monkeypatch.setattr(nlos.portable.propagation, "to_numpy", fetch)
+    monkeypatch.setattr(nlos.phasor.wall_to_plane_arrays, "to_numpy", fetch)
     return sizes
 
 

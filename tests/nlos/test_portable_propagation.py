@@ -9,13 +9,13 @@ from refusals import find_refusal
 from scene_shapes import shaped_capture, shaped_wall
 
 from nlos import Capture, Grid, Hybrid, propagate
-from nlos.portable.library import ArrayLibrary
-from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
+from nlos.phasor.arrays import ArrayLibrary
+from nlos.phasor.wall_to_plane import WallToPlanePlan
 from tofclip.arrays import ComputeDevice, to_numpy
 from tofclip.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.illumination_groups.AliasingWarning"
+    "ignore::nlos.illumination.AliasingWarning"
 )  # small walls are coarse ones
 
 GRID = Grid.box((-0.7, 0.6), (-0.5, 0.5), (0.7, 1.1), (0.13, 0.11, 0.1))

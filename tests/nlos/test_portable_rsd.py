@@ -9,7 +9,7 @@ from portable_libraries import LIBRARIES, find_device, relative_error
 from refusals import find_refusal
 from relay_walls import AXIS, HIDDEN, JITTER, planar_wall
 
-import nlos.portable.diffraction
+import nlos.phasor.to_depths
 from nlos import (
     Backprojection,
     Capture,
@@ -24,13 +24,13 @@ from nlos import (
     Volume,
 )
 from nlos.capture import TimeAxis
-from nlos.portable.library import ArrayLibrary
+from nlos.phasor.arrays import ArrayLibrary
 from nlos.simulate import PointScene
 from tofclip.arrays import ComputeDevice
 from tofclip.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.illumination_groups.AliasingWarning"
+    "ignore::nlos.illumination.AliasingWarning"
 )  # small walls are coarse ones
 
 LONG = TimeAxis(560, AXIS.bin_width, 0.4)
@@ -132,7 +132,7 @@ def test_depths_may_be_treated_one_by_one_and_planned_anew(
     capture = scene("single").on(find_device("array_api_strict"))
     whole = METHOD.reconstruct(capture, GRID)
     monkeypatch.setattr(ArrayLibrary, "chunk_bytes", 1)
-    monkeypatch.setattr(nlos.portable.diffraction, "MAX_CACHE_BYTES", kept)
+    monkeypatch.setattr(nlos.phasor.to_depths, "MAX_CACHE_BYTES", kept)
     counted: list[int] = []
     plan = METHOD.plan(capture, GRID)
     for _ in range(2):

@@ -5,10 +5,10 @@ import pytest
 from portable_libraries import LIBRARIES, find_device
 
 from nlos import Capture
-from nlos.adjoint import CompressedCapture
+from nlos.capture import remove_device_legs
+from nlos.compressed import CompressedCapture
 from nlos.preparation import crop_capture, rebin_capture, remove_first_bounce
 from nlos.simulate import add_poisson_noise
-from nlos.unwarp import remove_device_legs
 from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
 from tofclip.units import SPEED_OF_LIGHT

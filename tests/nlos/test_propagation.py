@@ -9,9 +9,9 @@ from scene_shapes import SHAPES, SPOT, shaped_capture, shaped_wall
 from nlos import Capture, Grid, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
+from nlos.phasor.transfer import SphericalWaves
+from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan
 from nlos.plane import Plane, WallLattice, choose_virtual_plane
-from nlos.propagation.wall_to_plane_plan import WallBeforePlane, WallToPlanePlan
-from nlos.rsd.transfer import SphericalWaves
 from nlos.simulate import PointScene
 from tofclip.errors import InputError
 

@@ -16,12 +16,12 @@ from relay_walls import HIDDEN, JITTER, planar_wall
 from nlos import Backprojection, Capture, Grid
 from nlos.capture import TimeAxis
 from nlos.io import read_capture
-from nlos.io.orientation import rotate_to_scene
+from nlos.io.labs import rotate_to_scene
 from nlos.simulate import PointScene
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.units import SPEED_OF_LIGHT
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 
 AXIS = TimeAxis(bins=220, bin_width=16e-12, start=0.5)
 WALL = planar_wall(9, 12)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from nlos import Backprojection, Capture, Grid
-from nlos.unwarp import unwarp_signal
+from nlos.capture import unwarp_signal
 from tofclip.units import SPEED_OF_LIGHT
 
 # The walls here are coarser than the shortest of the pulse's waves wants; see test_sampling.py.
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 
 FIRST_BOUNCE_BINS = 600
 

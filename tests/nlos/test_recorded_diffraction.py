@@ -8,7 +8,7 @@ import pytest
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
 
 # The wall is coarser than the shortest of the pulse's waves wants; see test_sampling.py.
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 
 FIRST_BOUNCE_BINS = 600
 

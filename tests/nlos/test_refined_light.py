@@ -10,14 +10,19 @@ from relay_walls import planar_wall
 
 from nlos import Capture, Grid, Hybrid, Refinement
 from nlos.capture import TimeAxis
-from nlos.refinement.counts import CountedPhotons
-from nlos.refinement.photon_fit import PhotonFit, build_response, compute_beam
-from nlos.refinement.photons import HELD_OUT_FRACTION, judge
+from nlos.refinement.photons import (
+    HELD_OUT_FRACTION,
+    CountedPhotons,
+    PhotonFit,
+    build_response,
+    compute_beam,
+    judge,
+)
 from nlos.refinement.time_of_flight import TimeOfFlight
 from nlos.simulate import PointScene
 from tofclip.solvers import Sparse
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 AXIS = TimeAxis(256, 32e-12)
 WALL = planar_wall(8, 8)
 SIDE = np.linspace(-0.4, 0.4, 9)

@@ -10,16 +10,14 @@ from relay_walls import curved_wall, planar_wall
 
 from nlos import Capture, Grid, Hybrid, Refinement, Volume
 from nlos.capture import TimeAxis
-from nlos.illumination_groups import choose_unaliased_band
-from nlos.refinement.model import WallModel
-from nlos.refinement.refine import build_total_variation
-from nlos.refinement.spherical import propagate_spherical_waves
+from nlos.illumination import choose_unaliased_band
+from nlos.refinement.l1 import WallModel, build_total_variation, propagate_spherical_waves
 from nlos.simulate import HiddenScene, PointScene, Surface, add_poisson_noise
 from tofclip.errors import InputError
 from tofclip.solvers import Sparse
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.illumination_groups.AliasingWarning"
+    "ignore::nlos.illumination.AliasingWarning"
 )  # small walls are coarse ones
 HYBRID = Hybrid(0.2, 4.0)
 SPOT = np.array([0.12, 0.05, 0.02])

@@ -10,7 +10,7 @@ from relay_walls import planar_wall
 
 from nlos import Backprojection, Capture, Grid
 from nlos.band import Band
-from nlos.illumination_groups import AliasingWarning, warn_of_aliasing
+from nlos.illumination import AliasingWarning, warn_of_aliasing
 from tofclip.errors import InputError
 
 METHOD = Backprojection(0.2, 5)

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 from scene_shapes import POINTS, SPOT
 
-import nlos.propagation.compiled
+import nlos.phasor.wall_to_plane_compiled
 from nlos import propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
+from nlos.phasor.transfer import SphericalWaves
+from nlos.phasor.wall_to_plane import ScatteredWallToPlanePlan, WallBeforePlane
+from nlos.phasor.wall_to_plane_compiled import propagate_direct, propagate_low_rank
 from nlos.plane import Plane
-from nlos.propagation.compiled import propagate_direct, propagate_low_rank
-from nlos.propagation.scattered import ScatteredWallToPlanePlan
-from nlos.propagation.wall_to_plane_plan import WallBeforePlane
-from nlos.rsd.transfer import SphericalWaves
 from nlos.simulate import PointScene
 
 pytest.importorskip("finufft", reason="finufft is optional")
@@ -84,7 +83,9 @@ def test_it_is_taken_where_it_is_quicker_and_installed(monkeypatch: pytest.Monke
     exact = propagate(capture, FINE, BAND.pulse, tolerance=1e-4).values
     for quicker, installed in ((True, True), (True, False), (False, True)):
         monkeypatch.setattr(ScatteredWallToPlanePlan, "is_faster_than_direct", quicker)
-        monkeypatch.setattr(nlos.propagation.compiled, "has_finufft", lambda there=installed: there)
+        monkeypatch.setattr(
+            nlos.phasor.wall_to_plane_compiled, "has_finufft", lambda there=installed: there
+        )
         found = propagate(capture, FINE, BAND.pulse).values
         errors[quicker, installed] = np.linalg.norm(found - exact) / np.linalg.norm(exact)
     assert 1e-5 < errors[True, True] < 1e-2

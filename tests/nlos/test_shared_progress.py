@@ -10,11 +10,11 @@ from scene_shapes import shaped_capture
 
 from nlos import Grid, Hybrid
 from nlos.method import SubProgress
-from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
-from nlos.rsd.image_planes import CompiledDiffraction
+from nlos.phasor.to_depths_compiled import CompiledDiffraction
+from nlos.phasor.wall_to_plane import WallToPlanePlan
 
 GRID = Grid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.5, 0.5, 7), [0.7, 0.9, 1.0])
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 
 
 @given(pieces=st.lists(st.integers(0, 1000), min_size=1), portion=st.integers(0, 10**6))

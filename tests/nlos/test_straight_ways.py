@@ -11,17 +11,17 @@ from scene_shapes import JITTER, SPOT, shaped_wall
 
 from nlos import Grid, Hybrid
 from nlos.capture import TimeAxis
-from nlos.geometry import StraightWays
-from nlos.illumination_groups import build_waves, group_by_illumination
+from nlos.illumination import build_waves, group_by_illumination
+from nlos.phasor.transfer import Offsets, find_min_periods
+from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan
 from nlos.plane import VirtualPlane
-from nlos.propagation.wall_to_plane_plan import WallBeforePlane, WallToPlanePlan
-from nlos.rsd.transfer import Offsets, find_min_periods
 from nlos.simulate import PointScene
+from nlos.volume import StraightWays
 
 METHOD = Hybrid(wavelength=0.25, cycles=4.24)
 NEAR = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.8, 9), [0.6, 0.7, 0.9])
 FAR = Grid(np.linspace(-0.5, 0.7, 9), np.linspace(-0.6, 0.4, 7), [2.0, 2.3])
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 
 
 def test_no_straight_way_leads_farther() -> None:

@@ -18,7 +18,7 @@ from tofclip.errors import InputError, ShapeError
 from tofclip.units import SPEED_OF_LIGHT
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.illumination_groups.AliasingWarning"
+    "ignore::nlos.illumination.AliasingWarning"
 )  # small walls are coarse ones
 LASER = np.array([0.12, 0.05, 0.0])
 POINTS = np.array([[0.15, -0.2, 0.6], [-0.2, 0.15, 0.95]])

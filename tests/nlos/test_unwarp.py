@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nlos import Backprojection, Capture, Grid
-from nlos.unwarp import remove_device_legs, unwarp_signal
+from nlos.capture import remove_device_legs, unwarp_signal
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.shots import Frames
@@ -17,7 +17,7 @@ from tofclip.storage import Field, Record
 from tofclip.units import SPEED_OF_LIGHT
 
 # These walls are coarser than the shortest of the pulse's waves wants; see test_sampling.py.
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 
 BIN_WIDTH = 5e-12
 LASER = np.array([0.1, -0.05, 0.02])

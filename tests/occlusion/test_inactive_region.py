@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tofclip.errors import InputError
 from tofclip.occlusion import InactiveRegion
-from tofclip.simulate.light_fields import Body, Lambertian, Rectangle
+from tofclip.simulate.bodies import Body, Lambertian, Rectangle
 from tofclip.simulate.patterns import make_plain_pattern
 
 MILLIMETRE = 1e-3

@@ -18,13 +18,15 @@ from apps.occlusion.scenes import (
 )
 from tofclip.errors import InputError, ShapeError
 from tofclip.metrics import correlation_coefficient, nmse
-from tofclip.occlusion.measurements import (
+from tofclip.occlusion import (
+    InactiveRegion,
     TimedMeasurements,
     add_poisson_noise,
+    build_occluded_model,
+    find_occlusion_mask,
     measure_views,
+    separate_occluder,
 )
-from tofclip.occlusion.recovery import build_occluded_model, find_occlusion_mask, separate_occluder
-from tofclip.occlusion.region import InactiveRegion
 from tofclip.units import SPEED_OF_LIGHT
 
 SMALL = ExperimentSettings(side_px=48, sampling_ratio=1.0)

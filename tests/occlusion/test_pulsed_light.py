@@ -9,12 +9,10 @@ from hypothesis import strategies as st
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.occlusion import InactiveRegion
+from tofclip.simulate.bodies import Body, Lambertian, Rectangle
 from tofclip.simulate.light_fields import (
-    Body,
     CameraArray,
-    Lambertian,
     PulsedScene,
-    Rectangle,
     TimeAxis,
     render_flash,
     render_flash_view,

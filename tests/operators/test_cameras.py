@@ -15,7 +15,7 @@ from tofclip.operators import (
     PointSpreadConvolution,
     SparseMatrix,
 )
-from tofclip.operators.light_field_camera import CAMERAS, CodedApertureCamera, MeasuredCamera
+from tofclip.operators.cameras import CAMERAS, CodedApertureCamera, MeasuredCamera
 from tofclip.operators.point_spreads import MeasuredPointSpreads
 
 VIEWS = [(float(v), float(u)) for v in range(-2, 2) for u in range(-1, 2)]

@@ -7,7 +7,7 @@ import pytest
 
 from tofclip.errors import InputError
 from tofclip.operators import PointSpreadConvolution, SliceConvolution
-from tofclip.operators.coded_lines import make_coded_line
+from tofclip.operators.convolution import make_coded_line
 
 
 @pytest.mark.parametrize("sensor", [5, 14, 31])

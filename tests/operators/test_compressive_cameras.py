@@ -9,13 +9,13 @@ import pytest
 
 from tofclip.errors import InputError
 from tofclip.operators import Integration
-from tofclip.operators.coded_views import make_sheared_mask
-from tofclip.operators.light_field_camera import (
+from tofclip.operators.cameras import (
     COMPRESSIVE_CAMERAS,
     AshokCamera,
     BabacanCamera,
     MarwahCamera,
 )
+from tofclip.operators.codes import make_sheared_mask
 
 VIEWS = [(float(v), float(u)) for v in range(-1, 2) for u in range(-2, 2)]
 SHAPE = (9, 11)

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from tofclip.errors import InputError
-from tofclip.operators.cameras.lines import assign_evenly, assign_randomly, count_lines
-from tofclip.operators.light_field_camera import EvenAngleLineCamera, LineCamera
+from tofclip.operators.cameras import (
+    EvenAngleLineCamera,
+    LineCamera,
+    assign_evenly,
+    assign_randomly,
+    count_lines,
+)
 
 VIEWS = [(float(v), float(u)) for v in range(-4, 4) for u in range(-4, 4)]
 

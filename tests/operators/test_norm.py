@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofclip.operators.light_field_camera import CAMERAS
+from tofclip.operators.cameras import CAMERAS
 from tofclip.solvers.fista import NORM_MARGIN
 
 VIEWS = [(v, u) for v in range(-1, 2) for u in range(-1, 2)]

@@ -11,8 +11,8 @@ import pytest
 import scipy.sparse
 
 from tofclip.arrays import ComputeDevice, to_numpy
-from tofclip.operators import portable
-from tofclip.operators.portable import CupyProduct, GatheredProduct, make_portable_product
+from tofclip.operators import sparse as portable
+from tofclip.operators.sparse import CupyProduct, GatheredProduct, make_portable_product
 
 MATRIX = scipy.sparse.random_array((31, 17), density=0.2, rng=np.random.default_rng(1)).tocsr()
 BLOCK = np.random.default_rng(2).random((17, 6))

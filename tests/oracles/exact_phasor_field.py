@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
-from nlos.geometry import Grid
 from nlos.method import require_imageable
-from nlos.volume import Volume
+from nlos.volume import Grid, Volume
 
 TERMS_PER_BLOCK = 1 << 20
 """Distances held at a time, 8 MB of each kind, whatever the sizes of wall and volume."""

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.geometry import Grid
+from nlos.phasor.transfer import SphericalWaves
 from nlos.plane import Plane, axis_step
-from nlos.rsd.transfer import SphericalWaves
+from nlos.volume import Grid
 from tofclip.errors import InputError
 
 

@@ -12,7 +12,7 @@ import pytest
 from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import LightField
 from tofclip.light_field.measurement import CameraSetup, ClipMeasurement, measure
-from tofclip.light_field.warp import find_view_labels, make_view_warp
+from tofclip.light_field.views import find_view_labels, make_view_warp
 from tofclip.metrics import nmse
 from tofclip.recovery.all_in_focus import (
     count_recoveries,

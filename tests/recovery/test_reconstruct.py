@@ -10,7 +10,7 @@ import pytest
 
 from tofclip import Frames, Streak, depth, recover
 from tofclip.camera import Camera, ProjectiveSweep, measure
-from tofclip.camera.calibration import estimate_skew, register_views
+from tofclip.camera.registration import estimate_skew, register_views
 from tofclip.errors import CalibrationError, InputError, MissingTimeAxisError
 from tofclip.recovery import compute_view_delays_bins, make_method, open_shot, plan_recovery
 from tofclip.simulate import (

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 from surface_scene import BIN, CAMERA, INSTRUMENT, SCENE, SHAPE, make_model
 
-from tofclip.recovery.surfaces.basis import SmoothBasis
-from tofclip.recovery.surfaces.derivatives import iterate_derivatives
-from tofclip.recovery.surfaces.model import SurfaceModel
-from tofclip.recovery.surfaces.places import SUBROWS
+from tofclip.recovery.surfaces.model import SUBROWS, SurfaceModel, SurfaceState, weigh_measurements
+from tofclip.recovery.surfaces.patches import SmoothBasis
 from tofclip.recovery.surfaces.pulse import make_pulse
-from tofclip.recovery.surfaces.state import SurfaceState
-from tofclip.recovery.surfaces.weights import weigh_measurements
+from tofclip.recovery.surfaces.ranges import iterate_derivatives
 from tofclip.simulate import simulate_shot
 
 

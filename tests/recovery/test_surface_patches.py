@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from surface_scene import BIN_M
 
-from tofclip.recovery.surfaces.basis import SmoothBasis, evaluate_monomials
-from tofclip.recovery.surfaces.patches import find_patches
+from tofclip.recovery.surfaces.patches import SmoothBasis, evaluate_monomials, find_patches
 
 
 def find_patches_in(distance: np.ndarray, ray_length: np.ndarray):

@@ -9,19 +9,18 @@ import pytest
 from surface_scene import BIN_M, CAMERA, INSTRUMENT, SCENE, SHAPE, make_model
 
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
-from tofclip.recovery.surfaces.basis import SmoothBasis
-from tofclip.recovery.surfaces.derivatives import (
+from tofclip.recovery.surfaces.fit import extrapolate_steps, straighten_surfaces
+from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState
+from tofclip.recovery.surfaces.patches import SmoothBasis
+from tofclip.recovery.surfaces.ranges import (
     CLUSTER_COLUMNS,
     CLUSTER_ROWS,
     ClusterProducts,
     Derivatives,
     NormalEquations,
     multiply_derivatives,
+    refine_state,
 )
-from tofclip.recovery.surfaces.fit import extrapolate_steps, straighten_surfaces
-from tofclip.recovery.surfaces.model import SurfaceModel
-from tofclip.recovery.surfaces.ranges import refine_state
-from tofclip.recovery.surfaces.state import SurfaceState
 from tofclip.simulate import simulate_shot
 
 

@@ -11,8 +11,8 @@ from tofclip import depth
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
 from tofclip.recovery import SurfaceRecovery, open_shot, plan_recovery
+from tofclip.recovery.surfaces.fit import measure_slopes
 from tofclip.recovery.surfaces.pulse import measure_pulse
-from tofclip.recovery.surfaces.refusal import measure_slopes
 from tofclip.shots import Streak
 from tofclip.solvers import Sparse
 from tofclip.units import SPEED_OF_LIGHT

@@ -8,13 +8,13 @@ from surface_scene import CAMERA, INSTRUMENT, SCENE, SHAPE, make_model
 
 from tofclip.lidar import Detection
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
-from tofclip.recovery.surfaces.fit import SurfaceFit
-from tofclip.recovery.surfaces.ranges import Refinement
-from tofclip.recovery.surfaces.returns import (
+from tofclip.recovery.surfaces.fit import (
+    SurfaceFit,
     estimate_displacement,
     find_usual_brightness,
     list_returns,
 )
+from tofclip.recovery.surfaces.ranges import Refinement
 from tofclip.simulate import simulate_shot
 
 

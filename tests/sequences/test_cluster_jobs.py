@@ -12,16 +12,17 @@ from odd_jobs import die, meet, refuse, squares, stumble
 
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, StorageError
 from tofclip.files import MAX_HASHED_BYTES
+from tofclip.sequences import jobs as jobs_module
 from tofclip.sequences.jobs import (
     Failure,
     Job,
     Report,
+    connect_workers,
+    count_local_workers,
     lock_output_folder,
     run_jobs,
     select_unfinished,
 )
-from tofclip.sequences.jobs import jobs as jobs_module
-from tofclip.sequences.jobs.workers import connect_workers, count_local_workers
 
 pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them
 
@@ -123,7 +124,7 @@ def test_other_names_are_refused(where):
 
 
 def test_a_cluster_that_is_not_there(monkeypatch):
-    monkeypatch.setattr("tofclip.sequences.jobs.workers.WAIT_SECONDS", 0.3)
+    monkeypatch.setattr("tofclip.sequences.jobs.WAIT_SECONDS", 0.3)
     with (
         pytest.raises(InputError, match="no scheduler answers"),
         connect_workers("tcp://127.0.0.1:9"),
@@ -138,7 +139,7 @@ def test_without_the_library_it_says_what_to_install(monkeypatch, tmp_path):
 
 
 def test_workers_of_another_version_are_refused(scheduler, monkeypatch):
-    monkeypatch.setattr("tofclip.sequences.jobs.workers.__version__", "0.0.0-of-the-test")
+    monkeypatch.setattr("tofclip.sequences.jobs.__version__", "0.0.0-of-the-test")
     with pytest.raises(InputError, match="install the same"), connect_workers(scheduler):
         pass
 
@@ -147,14 +148,14 @@ def test_workers_without_this_program_are_refused(scheduler, monkeypatch):
     def missing() -> str:
         raise ModuleNotFoundError("No module named 'tofclip'")
 
-    monkeypatch.setattr("tofclip.sequences.jobs.workers._version", missing)
+    monkeypatch.setattr("tofclip.sequences.jobs._version", missing)
     with pytest.raises(InputError, match="have no tofclip"), connect_workers(scheduler):
         pass
 
 
 def test_a_scheduler_without_workers_is_refused(monkeypatch):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is an extra")
-    monkeypatch.setattr("tofclip.sequences.jobs.workers.WAIT_SECONDS", 0.3)
+    monkeypatch.setattr("tofclip.sequences.jobs.WAIT_SECONDS", 0.3)
     nobody = distributed.LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", silence_logs=50)
     with (
         nobody,

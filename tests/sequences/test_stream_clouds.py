@@ -14,9 +14,9 @@ from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.lidar import depth, point_cloud
 from tofclip.recovery import DepthLockedFocus, recover
+from tofclip.sequences.following import SurfacePipeline
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
-from tofclip.sequences.surface_following import SurfacePipeline
 from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_plain_pattern

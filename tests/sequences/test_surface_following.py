@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from tofclip.camera import Camera
-from tofclip.sequences.surface_following import SurfacePipeline
+from tofclip.sequences.following import SurfacePipeline
 from tofclip.shots import Returns, Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_plain_pattern

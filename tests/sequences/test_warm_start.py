@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from tofclip.camera import Camera
-from tofclip.lidar.traces import TraceBins
-from tofclip.sequences.warm_start import WarmStartedRecovery
+from tofclip.lidar.pulse_tables import TraceBins
+from tofclip.sequences.following import WarmStartedRecovery
 from tofclip.solvers import Sparse
 
 CAMERA = Camera([16.0, 40.0, 64.0], [-0.6, 0.1, 0.7], (12, 12), 80)

@@ -6,22 +6,14 @@ import numpy as np
 import pytest
 
 from tofclip.errors import InputError
+from tofclip.simulate.bodies import Body, Box, Lambertian, Rectangle, Specular, Sphere
 from tofclip.simulate.light_fields import (
-    SCENES,
-    Body,
-    Box,
     CameraArray,
-    Lambertian,
-    Rectangle,
     Scene,
-    Specular,
-    Sphere,
-    make_scene,
     render_light_field,
     render_shear_map,
     render_view,
 )
-from tofclip.simulate.light_fields.scenes import edit_scene, remove_occluder
 from tofclip.simulate.patterns import (
     cut_pattern,
     make_checkerboard,
@@ -30,6 +22,7 @@ from tofclip.simulate.patterns import (
     make_plain_pattern,
     make_text_pattern,
 )
+from tofclip.simulate.scenes import SCENES, edit_scene, make_scene, remove_occluder
 
 ARRAY = CameraArray((40, 48), 4, focal_length_px=60.0, view_step=0.05, samples=2)
 HEAD_ON = (0.0, 0.0, -1.0)

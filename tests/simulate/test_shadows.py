@@ -15,7 +15,7 @@ from tofclip.simulate import make_default_instrument, simulate_shot
 from tofclip.simulate.bodies import Body, Vector
 from tofclip.simulate.demo import FOCAL_LENGTH_PX
 from tofclip.simulate.patterns import TEXELS, Pattern, cut_pattern, make_letter, make_plain_pattern
-from tofclip.simulate.scene import Scene, make_plate
+from tofclip.simulate.streak import Scene, make_plate
 from tofclip.solvers import TotalVariation
 from tofclip.units import SPEED_OF_LIGHT
 

@@ -21,7 +21,7 @@ from tofclip.simulate import (
 )
 from tofclip.simulate.bodies import Body
 from tofclip.simulate.patterns import cut_pattern, make_letter, make_plain_pattern, make_stripes
-from tofclip.simulate.render import cast_view_rays, render_streak
+from tofclip.simulate.streak import cast_view_rays, render_streak
 from tofclip.units import SPEED_OF_LIGHT
 
 CENTRES = np.array([60.0, 170.3, 280.8])

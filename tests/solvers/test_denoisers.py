@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
-from tofclip.solvers.denoisers import BlockMatching, CollaborativeWiener, NonlocalMeans
+from tofclip.solvers.denoising import BlockMatching, CollaborativeWiener, NonlocalMeans
 
 DEVIATION = 0.1
 

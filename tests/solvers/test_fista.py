@@ -24,12 +24,12 @@ from tofclip.solvers import (
     ignore_progress,
     iterate,
 )
-from tofclip.solvers.fista import ProximalStep
-from tofclip.solvers.method import (
+from tofclip.solvers.fista import (
     GAP_INTERVAL,
     MIN_FURTHER_FALL,
     NOISE_FRACTION,
     IterationHistory,
+    ProximalStep,
     Result,
 )
 from tofclip.threads import LANES

@@ -10,7 +10,7 @@ import pytest
 from tofclip.errors import InputError, ShapeError
 from tofclip.solvers import NonnegativeTotalVariation
 from tofclip.solvers.fista import Regulariser
-from tofclip.solvers.light_field_variation import NonnegativeLightFieldVariation
+from tofclip.solvers.priors import NonnegativeLightFieldVariation
 
 
 def denoised(

@@ -20,7 +20,7 @@ from tofclip.solvers import (
     RegularisationByDenoising,
     TotalVariation,
 )
-from tofclip.solvers.plug_and_play import solve_data_step
+from tofclip.solvers.denoising import solve_data_step
 
 SHAPE = (48, 45)
 

@@ -33,8 +33,8 @@ from tofclip.solvers import (
     relative_residual,
 )
 from tofclip.solvers.cross_validation import choose_weight
-from tofclip.solvers.light_field_variation import LightFieldVariation
 from tofclip.solvers.loops import CompiledLoops, PortableLoops
+from tofclip.solvers.priors import LightFieldVariation
 
 METHODS = [Sparse(iterations=40), TotalVariation(iterations=40), LinearInverse(), Backprojection()]
 # What is promised is 1e-4. Float32 sums in another order differ by 1e-6 or so, which the linear

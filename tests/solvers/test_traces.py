@@ -9,7 +9,7 @@ from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.operators import Identity
 from tofclip.solvers import LinearInverse, PreparedInverse
-from tofclip.solvers.traces import PATCH_COLUMNS, PATCH_ROWS, InverseTraces, order_by_patch
+from tofclip.solvers.direct import PATCH_COLUMNS, PATCH_ROWS, InverseTraces, order_by_patch
 from tofclip.threads import LANES
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from tofclip.operators import RadonProjection
 from tofclip.solvers import Wavelets
-from tofclip.solvers.wavelets import NonnegativeWavelets
+from tofclip.solvers.priors import NonnegativeWavelets
 
 
 def step(picture: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:

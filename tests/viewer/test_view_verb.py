@@ -19,7 +19,7 @@ from apps.viewer import render
 from apps.viewer.desktop import DesktopWindow, open_window
 from apps.viewer.page import Page
 from apps.viewer.session import Session
-from apps.viewer.transient import TransientSource
+from apps.viewer.sources import TransientSource
 from tofclip.errors import InputError, MissingDependencyError
 from tofclip.recovery import Shot
 

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from viewer_scenes import plane
 
-from apps.viewer.clouds import make_cloud
 from apps.viewer.colouring import (
     PALETTE_SIZE,
     PALETTES,
@@ -22,10 +21,11 @@ from apps.viewer.colouring import (
     load_palette,
     make_scale,
 )
-from apps.viewer.controls import mark_times
+from apps.viewer.panels import mark_times
 from apps.viewer.picking import find_point_on_ray, make_pick, measure_distance
 from apps.viewer.session import Filters
 from apps.viewer.source import make_empty_cloud
+from apps.viewer.sources import make_cloud
 from apps.viewer.viewpoint import (
     SCALE_BAR_DEPTH,
     SCALE_BAR_FRACTION,

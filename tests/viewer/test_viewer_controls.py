@@ -8,7 +8,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-from apps.viewer.controls import bind_user_input
+from apps.viewer.panels import bind_user_input
 
 
 class Slider:

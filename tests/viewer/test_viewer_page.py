@@ -19,9 +19,8 @@ from viewer_scenes import PlaneSource, frames, volume
 
 from apps.viewer.page import Page, WaitingPage
 from apps.viewer.session import GATE_AROUND_FRAME, Session
-from apps.viewer.transient import TransientSource
+from apps.viewer.sources import SLICE_MODE, SURFACE_MODE, TransientSource, VolumeSource
 from apps.viewer.viewpoint import Viewpoint
-from apps.viewer.volume import SLICE_MODE, SURFACE_MODE, VolumeSource
 from tofclip.lidar import PointCloud
 
 playwright = pytest.importorskip(

@@ -12,7 +12,6 @@ from matplotlib.image import imread
 from viewer_scenes import PlaneSource, plane, volume
 
 from apps.viewer import render
-from apps.viewer.clouds import make_cloud
 from apps.viewer.render import (
     BACKGROUND,
     PyvistaRenderer,
@@ -23,8 +22,8 @@ from apps.viewer.render import (
 from apps.viewer.scene_figure import PICTURE_SHAPE_PX, SceneFigure, save_film, save_picture
 from apps.viewer.session import Session
 from apps.viewer.source import make_empty_cloud
+from apps.viewer.sources import SURFACE_MODE, VolumeSource, make_cloud
 from apps.viewer.viewpoint import MAX_FIELD_OF_VIEW_RAD, Viewpoint, place_viewpoint
-from apps.viewer.volume import SURFACE_MODE, VolumeSource
 from tofclip.errors import InputError, MissingDependencyError
 
 AHEAD = Viewpoint(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.deg2rad(90.0))

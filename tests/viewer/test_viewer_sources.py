@@ -27,8 +27,6 @@ from viewer_scenes import (
     volume,
 )
 
-from apps.viewer.clouds import make_cloud
-from apps.viewer.live import LiveShotSource
 from apps.viewer.page_text import Status
 from apps.viewer.render import RasterRenderer
 from apps.viewer.scene_figure import SceneFigure
@@ -40,14 +38,21 @@ from apps.viewer.session import (
     Filters,
     Session,
 )
-from apps.viewer.shot_recovery import leave_out_rays
 from apps.viewer.side_pictures import project_front, render_pictures
 from apps.viewer.source import LINEAR_NOTE, NO_TIME_ZERO_NOTE, Gate, Source, View
 from apps.viewer.source_factory import FIRST_LOOK_NOTE, ShotOptions, open_source
-from apps.viewer.transient import render_depth
+from apps.viewer.sources import (
+    PROJECTION_MODE,
+    SLICE_MODE,
+    SURFACE_MODE,
+    LiveShotSource,
+    VolumeSource,
+    leave_out_rays,
+    make_cloud,
+    render_depth,
+)
 from apps.viewer.viewpoint import Box, measure_point_spacing, place_viewpoint
-from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE, VolumeSource
-from tofclip.camera.calibration import registration
+from tofclip.camera import registration
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.io.streaks import save_stack
 from tofclip.sequences.ranger import RangingPipeline, SummedShot

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from apps.viewer.clouds import make_cloud
 from apps.viewer.source import Gate, Source, View
+from apps.viewer.sources import make_cloud
 from nlos import Grid, Volume
 from tofclip.camera import Camera, SkewSweep
 from tofclip.lidar import PointCloud

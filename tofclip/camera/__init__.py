@@ -1,26 +1,7 @@
-"""The camera: where each view lies on the slit, how its lenslet projects, how the sweep bends time."""
+"""The camera: where each view lies on the slit, how its lenslet projects, how the sweep bends time,
+and how all of this is found from pictures and shots.
+"""
 
-from tofclip.camera.measurement import (
-    Measurement,
-    Rectifier,
-    estimate_dark_level,
-    measure,
-    require_width,
-)
-from tofclip.camera.model import Camera
-from tofclip.camera.range_calibration import RangeCalibration
-from tofclip.camera.sweep import PolynomialSweep, ProjectiveSweep, SkewSweep, Sweep
+import lazy_loader as lazy
 
-__all__ = [
-    "Camera",
-    "Measurement",
-    "PolynomialSweep",
-    "ProjectiveSweep",
-    "RangeCalibration",
-    "Rectifier",
-    "SkewSweep",
-    "Sweep",
-    "estimate_dark_level",
-    "measure",
-    "require_width",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

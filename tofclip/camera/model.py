@@ -14,8 +14,7 @@ from tofclip.camera.sweep import FloatArray, Sweep, sweep_from_record
 from tofclip.errors import CalibrationError
 from tofclip.notebook import render_html
 from tofclip.operators import LineProjection
-from tofclip.records import Storable, stored_array, stored_child, stored_value
-from tofclip.storage import Record
+from tofclip.storage import Record, Storable, stored_array, stored_child, stored_value
 
 DEFAULT_FOCAL_LENGTH_PX = 265.0
 """Mean over three set-ups of the same family of instruments (244, 271 and 282 px), fitted to the measured positions of

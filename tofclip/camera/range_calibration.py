@@ -2,7 +2,7 @@
 
 A detector reports a strong return earlier than a weak one (range walk), every pixel has a delay and
 a gain of its own, and counts become a reflectance only beside a target whose reflectance is known.
-The corrections are made where returns are listed, see `tofclip.lidar.range_correction`; time zero is
+The corrections are made where returns are listed, see `tofclip.lidar.range_calibration`; time zero is
 the camera's own.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.errors import CalibrationError
-from tofclip.records import Storable, stored_array, stored_value
+from tofclip.storage import Storable, stored_array, stored_value
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]

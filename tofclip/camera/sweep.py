@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import CalibrationError, FileFormatError, ShapeError
-from tofclip.records import Storable, stored_array
-from tofclip.storage import Record
+from tofclip.storage import Record, Storable, stored_array
 
 FloatArray = NDArray[np.float64]
 

@@ -18,10 +18,9 @@ from tofclip.files import (
     require_own_member,
     translate_read_errors,
 )
-from tofclip.io.itex import SIGNATURE as ITEX_SIGNATURE
-from tofclip.io.itex import outline_itex, read_itex
+from tofclip.io.hamamatsu import SIGNATURE as ITEX_SIGNATURE
+from tofclip.io.hamamatsu import outline_itex, outline_tiff, read_itex, read_tiff
 from tofclip.io.lift import outline_lift, read_lift
-from tofclip.io.tiff import outline_tiff, read_tiff
 from tofclip.shots import Streak
 from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance, read_outline
 

@@ -1,9 +1,8 @@
 """Flash LiDAR: from a transient cube to returns, and from returns to a point cloud."""
 
 from tofclip.lidar.cloud import PointCloud, point_cloud
-from tofclip.lidar.column import Column
-from tofclip.lidar.depth_exr import save_depth
 from tofclip.lidar.detection import Detection
+from tofclip.lidar.export import Column, save_depth
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.search import depth

@@ -1,4 +1,9 @@
-"""Point clouds: where in space each return came from."""
+"""Point clouds: where in space each return came from.
+
+Organised clouds: one point for each pixel of the picture, row by row, NaN where nothing came back.
+
+Programs that work on neighbours take these from the rows and columns, without a search in space.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +15,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.dependencies import import_open3d
 from tofclip.errors import FileFormatError, InputError, ShapeError, require_type
-from tofclip.files import require_suffix
+from tofclip.files import import_open3d, require_suffix
 from tofclip.io.archive import ArchiveEntry
 from tofclip.lidar import export
-from tofclip.lidar.column import Column
+from tofclip.lidar.export import Column
 from tofclip.lidar.geometry import compute_slopes
 from tofclip.notebook import plot_points, render_html, require_package
-from tofclip.records import Storable, stored_array, stored_provenance
 from tofclip.shots import Returns
-from tofclip.storage import Field, Record, make_stand_in, read_outline
+from tofclip.storage import (
+    Field,
+    Record,
+    Storable,
+    make_stand_in,
+    read_outline,
+    stored_array,
+    stored_provenance,
+)
 
 COLUMN_UNITS = {
     "x": "m",
@@ -342,3 +353,34 @@ def _list_columns(path: str | Path) -> dict[str, ArchiveEntry]:
         if name not in columns and name not in OPTIONAL_COLUMNS:
             raise FileFormatError(path, f"has no column '{name}': it was not written by tofclip")
     return {name: columns[name] for name in COLUMN_UNITS if name in columns}
+
+
+ORGANISED_SUFFIXES = (".pcd", ".ply", ".npz", ".csv")
+"""Formats that can say what is missing; PCD says rows and columns as well."""
+
+
+def save_organised(returns: Returns, path: str | Path) -> int:
+    """Write a point for every pixel, whole or not at all; return how many there are.
+
+    `returns`: at most one for each pixel, see `Returns.select`; `path`: ends in ``.pcd`` (WIDTH and
+    HEIGHT are the picture's), ``.ply``, ``.npz`` (pictures, (rows, columns)) or ``.csv``. Returns
+    pixels with a point.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in ORGANISED_SUFFIXES:
+        raise InputError(
+            f"{path}: a file of this kind cannot hold an organised cloud; use one of "
+            f"{', '.join(ORGANISED_SUFFIXES)}"
+        )
+    shape = returns.camera.image_shape
+    pixel = returns.y.astype(np.int64) * shape[1] + returns.x
+    if np.unique(pixel).size < pixel.size:
+        raise InputError("an organised cloud has one point for a pixel: first, strongest or last")
+    columns = []
+    for column in point_cloud(returns).columns:
+        whole = column.values.dtype.kind == "u"
+        values = np.full(shape[0] * shape[1], 0 if whole else np.nan, column.values.dtype)
+        values[pixel] = column.values
+        columns.append(Column(column.name, column.unit, values))
+    export.write_table(path, columns, shape)
+    return len(returns)

@@ -33,7 +33,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import to_numpy
-from tofclip.camera.measurement import MeasurementNoise
+from tofclip.camera.rectifier import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.pulse import Pulse

@@ -2,12 +2,12 @@
 everything in focus.
 """
 
-from tofclip.light_field.belief_propagation import find_smooth_labels
-from tofclip.light_field.focus import (
+from tofclip.light_field.depth import (
     FocalStack,
     compute_image_energy,
     compute_modified_laplacian,
     estimate_depth_from_focus,
+    find_smooth_labels,
     make_focal_stack,
 )
 from tofclip.light_field.views import LightField

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import LightField
-from tofclip.operators.light_field_camera import CAMERAS, EvenAngleLineCamera, LightFieldCamera
-from tofclip.records import (
+from tofclip.operators.cameras import CAMERAS, EvenAngleLineCamera, LightFieldCamera
+from tofclip.storage import (
     Storable,
     stored_array,
     stored_part,
@@ -27,7 +27,7 @@ from tofclip.records import (
 class CameraSetup:
     """Which camera measures."""
 
-    # A name in `tofclip.operators.light_field_camera.CAMERAS`
+    # A name in `tofclip.operators.cameras.CAMERAS`
     encoder: str = field(metadata=stored_value(dtype=str))
     # measurements over pixels of one picture
     sampling_ratio: float = field(metadata=stored_value())

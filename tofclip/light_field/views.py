@@ -1,4 +1,8 @@
-"""The pictures of all views, and the picture that refocusing makes of them."""
+"""The pictures of all views, and the picture that refocusing makes of them.
+
+What every view sees of a picture whose pixels lie at shears of their own: nearer surfaces hide
+farther ones, and what only that view sees continues the farther surface.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy.ndimage
+import scipy.sparse
 from numpy.typing import NDArray
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearShear
-from tofclip.records import Storable, stored_array
+from tofclip.operators.shear import View
+from tofclip.operators.sparse import SparseMatrix
+from tofclip.storage import Storable, stored_array
 
 
 @dataclass(frozen=True)
@@ -72,3 +80,99 @@ class LightField(Storable):
             total += back(picture)
             seen += back(inside)
         return total / np.maximum(seen, 1e-6)
+
+
+Labels = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+
+SAME_SURFACE_PX = 1.0  # by which neighbours drift apart in the outermost view at most
+SEEN_FRACTION = 0.5  # of a pixel, from which on a surface covers it
+MIN_WEIGHT = 0.05  # of a surface's own pixels around a point; below, the point was hidden
+
+
+def make_view_warp(labels: Labels, shears: FloatArray, views: list[View]) -> SparseMatrix:
+    """Return the map from the reference view's picture to the pictures of all views.
+
+    A view's pixel takes the light of the reference pixels that its own surface has there, ``h(x - s
+    u, y - s v)`` with the shear s of what the view sees, between pixels linearly.
+
+    `labels` (rows, columns): which of the shears each pixel of the reference view has; `shears`
+    (depths,): pixels per view step, ascending: the farther, the larger; `views`: (v, u) from the
+    reference view. Returns (rows, columns) pictures to (views, rows, columns).
+    """
+    if labels.ndim != 2 or min(labels.shape) < 2:
+        raise ShapeError("a map of depths", "(rows, columns), two or more of either", labels.shape)
+    if not (np.all(np.diff(shears) > 0) and labels.min() >= 0 and labels.max() < shears.size):
+        raise InputError("a map of depths needs ascending shears and a number for each pixel")
+    reach = max(float(np.max(np.abs(views))), 1.0)
+    same = SAME_SURFACE_PX / reach
+    nearest = {
+        int(label): scipy.ndimage.distance_transform_edt(
+            np.abs(shears[labels] - shears[label]) > same,
+            return_distances=False,
+            return_indices=True,
+        )
+        for label in np.unique(labels)
+    }
+    parts = [_make_view(labels, shears, view, same, nearest) for view in views]
+    whole = scipy.sparse.csr_array(scipy.sparse.vstack(parts))
+    return SparseMatrix(whole, labels.shape, (len(views), *labels.shape))
+
+
+def find_view_labels(labels: Labels, shears: FloatArray, view: View) -> Labels:
+    """Return which shear each pixel of another view has, (rows, columns).
+
+    `labels, shears`: as for `make_view_warp`; `view`: (v, u) from the reference view. Returns
+    (rows, columns).
+    """
+    seen = np.full(labels.shape, -1, np.int64)
+    for label in np.unique(labels)[::-1]:  # nearer surfaces are painted over farther ones
+        shift = (shears[label] * view[0], shears[label] * view[1])
+        cover = scipy.ndimage.shift((labels == label).astype(np.float32), shift, order=1)
+        seen[cover >= SEEN_FRACTION] = label
+    if np.all(seen < 0):
+        return labels
+    # What the reference view does not see is the farther surface's, as wide as both drift apart.
+    drift = (shears[labels.max()] - shears[labels.min()]) * float(np.max(np.abs(view)))
+    width = 2 * int(np.ceil(drift)) + 3
+    while np.any(seen < 0):
+        seen = np.where(seen < 0, scipy.ndimage.maximum_filter(seen, width), seen)
+    return seen
+
+
+def _make_view(
+    labels: Labels,
+    shears: FloatArray,
+    view: View,
+    same: float,
+    nearest: dict[int, NDArray[np.int32]],
+) -> scipy.sparse.csr_array:
+    """One view's matrix, (pixels, pixels)."""
+    rows, columns = labels.shape
+    seen = find_view_labels(labels, shears, view)
+    down, right = np.indices(labels.shape)
+    # beyond the picture it is taken to go on as at its border
+    y = np.clip(down - shears[seen] * view[0], 0, rows - 1)
+    x = np.clip(right - shears[seen] * view[1], 0, columns - 1)
+    top, left = np.minimum(y.astype(int), rows - 2), np.minimum(x.astype(int), columns - 2)
+    below, beside = y - top, x - left
+    pixels, weights = np.zeros((2, 4, rows, columns))
+    for corner in range(4):
+        one, other = divmod(corner, 2)
+        weight = (below if one else 1 - below) * (beside if other else 1 - beside)
+        own = np.abs(shears[labels[top + one, left + other]] - shears[seen]) <= same
+        weights[corner], pixels[corner] = weight * own, (top + one) * columns + left + other
+    total = weights.sum(axis=0)
+    hidden = total < MIN_WEIGHT
+    weights /= np.where(hidden, 1, total)
+    weights[:, hidden] = 0
+    weights[0, hidden] = 1
+    for label in np.unique(seen[hidden]):
+        own = hidden & (seen == label)
+        at = nearest[int(label)][:, np.rint(y[own]).astype(int), np.rint(x[own]).astype(int)]
+        pixels[0, own] = at[0] * columns + at[1]
+    target = np.broadcast_to(np.arange(labels.size), (4, labels.size)).ravel()
+    entries = weights.reshape(-1).astype(np.float32), (target, pixels.reshape(-1).astype(np.int64))
+    matrix = scipy.sparse.csr_array(entries, shape=(labels.size, labels.size))
+    matrix.eliminate_zeros()  # points on pixels need one of four
+    return matrix

@@ -4,27 +4,31 @@ camera.
 
 from tofclip.operators.base import (
     Adjoint,
+    BlockDiagonal,
     Composition,
     Diagonal,
     Identity,
-    LinearOperator,
-    Reshape,
-    estimate_squared_norm,
-)
-from tofclip.operators.coded_lines import SliceConvolution
-from tofclip.operators.coded_views import MaskedViews, ShearedViews, WeightedViews
-from tofclip.operators.composition import (
-    BlockDiagonal,
     Integration,
+    LinearOperator,
     MeanWeighting,
+    Reshape,
     Stack,
     ViewSelection,
+    estimate_squared_norm,
 )
-from tofclip.operators.convolution import PointSpreadConvolution
+from tofclip.operators.codes import (
+    DenseSensor,
+    HadamardCodes,
+    MaskedSensor,
+    MaskedViews,
+    PitchedSensor,
+    RandomCodes,
+    ShearedViews,
+    WeightedViews,
+)
+from tofclip.operators.convolution import PointSpreadConvolution, SliceConvolution
 from tofclip.operators.radon import RadonProjection
-from tofclip.operators.sensors import DenseSensor, MaskedSensor, PitchedSensor
 from tofclip.operators.shear import FourierShear, LinearShear
-from tofclip.operators.single_pixel import HadamardCodes, RandomCodes
 from tofclip.operators.sparse import LineProjection, SparseMatrix
 
 __all__ = [

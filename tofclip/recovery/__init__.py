@@ -6,9 +6,11 @@ from tofclip.recovery.focus import (
     Focus,
     FrameSegment,
     SharpestFocus,
+    ShotParallax,
+    count_parallax_work,
+    fit_parallax_to_shot,
     parse_focus,
 )
-from tofclip.recovery.parallax import ShotParallax, count_parallax_work, fit_parallax_to_shot
 from tofclip.recovery.plan import RecoveryPlan, make_method, plan_recovery, recover
 from tofclip.recovery.shot import (
     Shot,

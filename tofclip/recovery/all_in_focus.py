@@ -1,7 +1,7 @@
 """A picture that is sharp at all depths, and the depths, from one shot of a light-field camera.
 
 Refocusing explains the measurements by one picture at one depth, and everything else blurs it. Here
-each pixel lies at a shear of its own (`tofclip.light_field.warp`), so that one picture h explains all
+each pixel lies at a shear of its own (`tofclip.light_field.views`), so that one picture h explains all
 measurements:
 
     minimise over h >= 0:  ``1/2 |A W h - f|^2 + weight TV(h)``,
@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import FocalStack, LightField, estimate_depth_from_focus
 from tofclip.light_field.measurement import ClipMeasurement
-from tofclip.light_field.warp import make_view_warp
+from tofclip.light_field.views import make_view_warp
 from tofclip.recovery.light_field import ClipRecovery, WeightSearch
 from tofclip.solvers import Progress, ignore_progress
 

@@ -17,7 +17,7 @@ from tofclip.errors import InputError
 from tofclip.light_field import LightField
 from tofclip.light_field.measurement import ClipMeasurement
 from tofclip.operators import Diagonal, Identity, LinearOperator, ViewSelection
-from tofclip.operators.light_field_camera import LightFieldCamera
+from tofclip.operators.cameras import LightFieldCamera
 from tofclip.solvers import (
     DataTermMaker,
     Huber,
@@ -38,8 +38,8 @@ from tofclip.solvers.cross_validation import (
     choose_weight,
 )
 from tofclip.solvers.data_terms import estimate_robust_deviation
-from tofclip.solvers.denoisers import BlockMatching, CollaborativeWiener, Denoiser, NonlocalMeans
-from tofclip.solvers.light_field_variation import LightFieldVariation
+from tofclip.solvers.denoising import BlockMatching, CollaborativeWiener, Denoiser, NonlocalMeans
+from tofclip.solvers.priors import LightFieldVariation
 
 VARIATIONAL_PRIORS: dict[str, type[ProximalMethod]] = {
     kind.name: kind for kind in (TotalVariation, Wavelets, Sparse)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera
-from tofclip.camera.calibration import estimate_skew, register_views
-from tofclip.camera.calibration.registration import MAX_ROUND_COUNT
+from tofclip.camera.registration import MAX_ROUND_COUNT, estimate_skew, register_views
 from tofclip.errors import InputError
 from tofclip.io import read_streak
 from tofclip.recovery.defects import mask_defects
@@ -55,7 +54,7 @@ class Shot:
         ----------
         progress : callable
         max_rounds : int
-            Refinements at most, see `tofclip.camera.calibration.register_views`.
+            Refinements at most, see `tofclip.camera.register_views`.
 
         Returns
         -------
@@ -175,7 +174,7 @@ def fit_camera_to_shot(
     progress : callable
         Called as the search for the views goes on.
     max_rounds : int
-        Refinements at most, see `tofclip.camera.calibration.register_views`.
+        Refinements at most, see `tofclip.camera.register_views`.
 
     Returns
     -------

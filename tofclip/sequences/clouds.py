@@ -11,7 +11,7 @@ from tofclip.arrays import parse_device
 from tofclip.errors import InputError
 from tofclip.files import require_apart
 from tofclip.lidar import PointCloud, Returns, depth, point_cloud
-from tofclip.lidar.organised import save_organised
+from tofclip.lidar.cloud import save_organised
 from tofclip.sequences.inputs import make_result_paths
 from tofclip.sequences.jobs import Job, lock_output_folder
 from tofclip.sequences.recovering import normalise_device
@@ -36,7 +36,7 @@ class CloudSettings:
     returns : str
         Which return of a pixel: ``"first"``, ``"strongest"``, ``"last"`` or ``"all"``.
     organised : bool
-        Files have a place for every pixel of the picture, see `tofclip.lidar.organised`.
+        Files have a place for every pixel of the picture, see `tofclip.lidar.cloud`.
     false_alarm : float, optional
         See `tofclip.depth`.
 

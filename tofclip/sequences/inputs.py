@@ -12,7 +12,7 @@ from tofclip.errors import InputError, StorageError
 from tofclip.files import translate_read_errors
 from tofclip.io import read_streak
 from tofclip.io.streaks import StreakStack
-from tofclip.sequences.jobs.output_folder import SETTINGS_NAME
+from tofclip.sequences.jobs import SETTINGS_NAME
 from tofclip.shots import Streak
 from tofclip.storage import HDF5_SIGNATURE
 

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Detection, PointCloud, point_cloud
+from tofclip.lidar.pulse_tables import TraceBins, Traces
 from tofclip.lidar.search import ReturnSearch
-from tofclip.lidar.signal_rows.selection import RowBlock, SignalRowFinder
-from tofclip.lidar.traces import TraceBins, Traces
+from tofclip.lidar.signal_rows import RowBlock, SignalRowFinder
 from tofclip.recovery import Focus, open_shot
 from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
-from tofclip.sequences.warm_start import WarmStartedRecovery
+from tofclip.sequences.following import WarmStartedRecovery
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse, ProximalMethod
-from tofclip.solvers.traces import InverseTraces, order_by_patch
+from tofclip.solvers.direct import InverseTraces, order_by_patch
 
 FloatArray = NDArray[np.float64]
 Shot = Callable[[], Streak]
@@ -34,7 +34,7 @@ MAX_JITTER_BINS = 32
 
 class CloudPipeline(Protocol):
     """What makes clouds of shots of one camera: `RangingPipeline`, or
-    `tofclip.sequences.surface_following.SurfacePipeline`.
+    `tofclip.sequences.following.SurfacePipeline`.
     """
 
     rectifier: Rectifier
@@ -56,7 +56,7 @@ class CloudPipeline(Protocol):
 class SummedShot(NamedTuple):
     """What a look at all rows of a shot brings."""
 
-    # (columns, instants and some), see `tofclip.lidar.signal_rows.selection.SignalRowFinder.bins`
+    # (columns, instants and some), see `tofclip.lidar.signal_rows.SignalRowFinder.bins`
     sums: NDArray[np.float32]
     dark: float  # dark level, counts
 
@@ -66,11 +66,11 @@ class RangingPipeline:
 
     The linear inverse needs no iterations and knows nothing of the shots before; it draws streaks
     ("rays") around bright objects. A prior (l1) leaves these out. It begins at the pictures of the
-    shot before and takes its shots in order (`tofclip.sequences.warm_start`).
+    shot before and takes its shots in order (`tofclip.sequences.following`).
 
     Sweep, operators, inverted Gram matrices and filters are worked out once. No transient cube is
     made: pixels are recovered a few at a time, and their returns are sought at once
-    (`tofclip.solvers.traces`). Rows that hold no light are left out, but for a sample that tells
+    (`tofclip.solvers.direct`). Rows that hold no light are left out, but for a sample that tells
     background and noise (`tofclip.lidar.signal_rows`).
 
     `camera`: with its sweep; one that has to be found from a shot is found from the first
@@ -196,7 +196,7 @@ class RangingPipeline:
 
 
 class _ShotTraces:
-    """Traces of a shot, recovered as they are asked for; see `tofclip.lidar.traces.Traces`."""
+    """Traces of a shot, recovered as they are asked for; see `tofclip.lidar.pulse_tables.Traces`."""
 
     def __init__(
         self, pipeline: RangingPipeline, measurements: NDArray[np.float32], bins: TraceBins
@@ -211,7 +211,7 @@ class _ShotTraces:
                 self._parts.append((place.inverse, held, weights))
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
-        """Write the traces of some pixels, recovered now; see `tofclip.lidar.traces.Traces`.
+        """Write the traces of some pixels, recovered now; see `tofclip.lidar.pulse_tables.Traces`.
 
         `piece`: of the pixels; `traces` (n, bins): overwritten.
         """

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.files import compute_sha256, require_apart
-from tofclip.records import Storable, stored_array, stored_child, stored_value
 from tofclip.recovery import SharpestFocus, open_shot, parse_focus
 from tofclip.sequences.inputs import Shot
 from tofclip.sequences.jobs import Job, lock_output_folder
@@ -26,6 +25,7 @@ from tofclip.sequences.ranger import (
     make_average_cloud,
 )
 from tofclip.shots import Streak
+from tofclip.storage import Storable, stored_array, stored_child, stored_value
 
 PLAN_NAME = "plan.h5"
 

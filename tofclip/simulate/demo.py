@@ -11,7 +11,6 @@ import numpy as np
 
 from tofclip.camera import Camera, SkewSweep
 from tofclip.simulate.bodies import Body, Vector
-from tofclip.simulate.instrument import Instrument, StreakDetector
 from tofclip.simulate.patterns import (
     Pattern,
     cut_pattern,
@@ -21,7 +20,7 @@ from tofclip.simulate.patterns import (
     make_rings,
     make_stripes,
 )
-from tofclip.simulate.scene import Scene, make_plate
+from tofclip.simulate.streak import Instrument, Scene, StreakDetector, make_plate
 
 CENTRES_PX = (147.7, 320.0, 490.2, 664.1, 835.5, 1011.5, 1192.3)
 ANGLES_DEG = (-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0)

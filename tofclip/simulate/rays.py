@@ -1,6 +1,6 @@
 """The ray caster: bodies and rays in, first hits, light from lamps, and bins of time out.
 
-Both simulators use it: streak images of lenslets behind a slit (`tofclip.simulate.render`) and
+Both simulators use it: streak images of lenslets behind a slit (`tofclip.simulate.streak`) and
 light fields of camera arrays (`tofclip.simulate.light_fields`). Light goes from a lamp to a
 surface and on to a view; interreflections are left out.
 """

@@ -8,31 +8,28 @@ from tofclip.solvers.data_terms import (
     LeastSquares,
     Poisson,
 )
-from tofclip.solvers.denoisers import Denoiser
+from tofclip.solvers.denoising import Denoiser, PlugAndPlay, RegularisationByDenoising
 from tofclip.solvers.direct import Backprojection, LinearInverse, PreparedInverse
 from tofclip.solvers.fista import (
     Fista,
-    NonnegativeSparsity,
-    NonnegativeTotalVariation,
-    ProximalMethod,
-    ProximalStep,
-    Regulariser,
-    Sparse,
-    TotalVariation,
-    Wavelets,
-)
-from tofclip.solvers.method import (
     IterationHistory,
     IterativeSolver,
     Method,
+    NonnegativeSparsity,
+    NonnegativeTotalVariation,
     Progress,
+    ProximalMethod,
+    ProximalStep,
+    Regulariser,
     Result,
+    Sparse,
     StoppingRule,
+    TotalVariation,
+    Wavelets,
     ignore_progress,
     iterate,
     relative_residual,
 )
-from tofclip.solvers.plug_and_play import PlugAndPlay, RegularisationByDenoising
 
 __all__ = [
     "Backprojection",

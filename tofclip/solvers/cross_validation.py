@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator
-from tofclip.solvers.fista import ProximalMethod
-from tofclip.solvers.method import Progress, ignore_progress
+from tofclip.solvers.fista import Progress, ProximalMethod, ignore_progress
 from tofclip.threads import map_parallel
 
 INITIAL_WEIGHT = 10**-1.75

@@ -28,15 +28,15 @@ from apps.settings import (
     settings_to_dict,
 )
 from nlos import TransientImaging
-from nlos.film import render_frames
-from nlos.illumination_groups import find_leg_bounds
+from nlos.illumination import find_leg_bounds
 from nlos.io import read_capture
+from nlos.picture import render_frames
 from tofclip.errors import InputError
 from tofclip.units import SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid, TransientVideo
-    from nlos.geometry import FloatArray
+    from nlos.volume import FloatArray
 
 FILM_METHODS = ("rsd", "hybrid")
 """They keep the band's frequencies apart from the laser's wave, the quicker one first."""

@@ -12,13 +12,13 @@ from apps.conventions import JsonOption, report
 from apps.nlos.imaging import METHODS, ImagingSettings, from_library, to_library
 from apps.nlos.truth import HiddenTruth
 from apps.settings import SettingsOption, add_setting_flags, load_settings
+from nlos.analysis import find_sampling_step, find_shortest_wavelength
 from nlos.band import VirtualPulse
-from nlos.illumination_groups import group_by_illumination
+from nlos.illumination import group_by_illumination
 from nlos.io import read_capture
 from nlos.plane import PlanarWall
 from nlos.resolution import compute_diffraction_limit
 from nlos.settings import settings_for
-from nlos.signal_analysis import find_sampling_step, find_shortest_wavelength
 from tofclip.errors import InputError
 from tofclip.units import MILLIMETRE, PICOSECOND
 

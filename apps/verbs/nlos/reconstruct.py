@@ -53,8 +53,8 @@ from apps.settings import (
     setting_field,
     settings_to_dict,
 )
-from nlos.confocal.directional import find_imaged_surface
 from nlos.io import read_capture
+from nlos.normals import find_imaged_surface
 from nlos.settings import is_brightest_on_wall
 from tofclip.arrays import ComputeDevice
 from tofclip.errors import InputError

@@ -35,10 +35,10 @@ from apps.settings import (
     save_settings,
     setting_field,
 )
-from nlos.averaging import DepthAverage
 from nlos.io import read_capture
 from nlos.method import PhasorPlan
-from nlos.moveout import MidpointJoin
+from nlos.preparation import MidpointJoin
+from nlos.video import DepthAverage
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
 from tofclip.sequences.streaming import run_in_order
@@ -318,7 +318,7 @@ def _run_with_page(made: _VolumeStream, source: Path) -> dict[str, Any]:
     """Image on a thread of its own while the page shows the newest volume; ends with Ctrl-C."""
     from apps.viewer.page import Page
     from apps.viewer.session import Session
-    from apps.viewer.volume import VolumeStreamSource
+    from apps.viewer.sources import VolumeStreamSource
 
     figures: dict[str, Any] = {}
     thread = threading.Thread(target=lambda: figures.update(made.run()), daemon=True)

@@ -16,7 +16,7 @@ from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.light_field import LightField
 from tofclip.metrics import nmse
 from tofclip.operators import LinearShear
-from tofclip.operators.light_field_camera import MarwahCamera
+from tofclip.operators.cameras import MarwahCamera
 
 VIEWS = [(float(v), float(u)) for v in range(-1, 2) for u in range(-1, 2)]
 SHAPE = (40, 44)

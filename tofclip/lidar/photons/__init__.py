@@ -8,16 +8,17 @@ are found by the same compiled steps. `PhotonDetector` takes every pixel alone, 
 lets neighbours lend each other their photons.
 """
 
-from tofclip.lidar.photons.accuracy import Accuracy, measure_accuracy
 from tofclip.lidar.photons.background import learn_background
-from tofclip.lidar.photons.detector import Arrivals, PhotonDetector
-from tofclip.lidar.photons.limits import compute_range_bound
-from tofclip.lidar.photons.photon_image import PhotonImage
-from tofclip.lidar.photons.pile_up import correct_pile_up
-from tofclip.lidar.photons.pixels import estimate_pixels
+from tofclip.lidar.photons.detector import (
+    Arrivals,
+    PhotonDetector,
+    correct_pile_up,
+    estimate_pixels,
+)
+from tofclip.lidar.photons.image import PhotonImage
+from tofclip.lidar.photons.limits import Accuracy, compute_range_bound, measure_accuracy
 from tofclip.lidar.photons.smoothing import Smoothness, locate_with_smoothness
-from tofclip.lidar.photons.surface import estimate_surface
-from tofclip.lidar.photons.surface_image import SurfaceImage, make_pinhole
+from tofclip.lidar.photons.surface import SurfaceImage, estimate_surface, make_pinhole
 
 __all__ = [
     "Accuracy",

@@ -1,4 +1,9 @@
-"""Find returns in histograms of photons, at a stated rate of false alarms."""
+"""Pile-up: what a detector that goes blind after each photon would have counted without.
+
+Find returns in histograms of photons, at a stated rate of false alarms.
+
+The return of every pixel by its own photons alone.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +16,88 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.photons.background import learn_background
-from tofclip.lidar.photons.pile_up import count_live_cycles
+from tofclip.lidar.photons.image import PhotonImage, find_hot_pixels, leave_out_pixels
+from tofclip.lidar.photons.response import (
+    find_time_step,
+    measure_pulse_width,
+    require_plausible_pulse,
+)
+from tofclip.lidar.photons.surface import SurfaceImage
 from tofclip.lidar.pulse import Pulse, Table
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
+
+
+def correct_pile_up(
+    counts: NDArray[np.integer] | NDArray[np.floating], cycles: int, dead_bins: int | None = None
+) -> NDArray[np.float64]:
+    """Turn a histogram of a detector with dead time into the photons that arrived (Coates 1968).
+
+    A bin counts only in the cycles in which no photon shortly before has blinded the detector. The
+    fraction of these live cycles with a count is ``1 - exp(-rate)``, which is solved for the rate.
+    Bins that few cycles reach become noisier than Poisson.
+
+    Parameters
+    ----------
+    counts : (..., bins) array
+        Photons counted in each bin; at most one a cycle and bin.
+    cycles : int
+        Laser cycles that made the histogram; every cycle starts with a ready detector.
+    dead_bins : int, optional
+        Bins after a count during which nothing is counted. By default the rest of the cycle: the
+        detector counts only the first photon of a cycle.
+
+    Returns
+    -------
+    (..., bins) float64 array
+        Expected photons in each bin over all cycles; NaN in bins that no live cycle reached, and
+        where every live cycle counted, which leaves the rate without a bound.
+
+    Raises
+    ------
+    InputError
+        Negative counts, no cycle, a dead time that is not positive, or more counts than live
+        cycles.
+
+    Notes
+    -----
+    P. B. Coates, "The correction for photon pile-up in the measurement of radiative lifetimes", J.
+    Phys. E 1, 878 (1968), Eq. 4; for a dead time shorter than the cycle the sum runs over the dead
+    time only (S. Isbaner et al., Opt. Express 24, 9429, 2016).
+    """
+    seen, live = count_live_cycles(counts, cycles, dead_bins)
+    fraction = np.divide(seen, live, out=np.ones_like(seen), where=live > 0)
+    arrived = np.full_like(seen, np.nan)
+    np.log1p(-fraction, out=arrived, where=fraction < 1)
+    return -cycles * arrived
+
+
+def count_live_cycles(
+    counts: NDArray[np.integer] | NDArray[np.floating], cycles: int, dead_bins: int | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Count the cycles in which the detector was ready, bin by bin.
+
+    `counts, cycles, dead_bins`: as for `correct_pile_up`. Returns `counts, live` (..., bins):
+    photons counted, and cycles that no photon before had blinded.
+    """
+    seen = np.asarray(counts, dtype=np.float64)
+    if cycles < 1 or not np.all(np.isfinite(seen) & (seen >= 0)):
+        raise InputError(
+            "pile-up needs at least one cycle and counts that are finite and not negative"
+        )
+    dead = seen.shape[-1] if dead_bins is None else dead_bins
+    if dead < 1:
+        raise InputError(f"a dead time lasts at least one bin, got {dead}")
+    before = np.cumsum(seen, axis=-1) - seen
+    blind = before.copy()
+    blind[..., dead:] -= before[..., :-dead]
+    live = cycles - blind
+    if np.any(seen > live):
+        raise InputError(
+            f"more photons were counted than {cycles} cycles with this dead time allow"
+        )
+    return seen, live
+
 
 FloatArray = NDArray[np.float64]
 
@@ -414,3 +497,89 @@ def _quantise_photons(photons: FloatArray) -> NDArray[np.int64]:
     )
     coarse = MAX_EXACT_PHOTONS * PHOTON_LEVEL_RATIO ** np.rint(steps)
     return np.rint(np.where(photons <= MAX_EXACT_PHOTONS, photons, coarse)).astype(np.int64)
+
+
+SAMPLED_PIXELS = 8192
+"""That say what the pixels' background has in common."""
+
+DETECTED_PIXELS_PER_BLOCK = 1 << 10
+
+
+def estimate_pixels(
+    photons: PhotonImage,
+    pulse: Pulse | None = None,
+    false_alarm_rate: float = 0.01,
+    background: ArrayLike | None = None,
+    cycles: int | None = None,
+    max_returns: int = 1,
+) -> SurfaceImage:
+    """Find the strongest returns of every pixel by its own photons alone.
+
+    Parameters
+    ----------
+    photons : PhotonImage
+    pulse : Pulse, optional
+        Shape of a return; by default as wide as pairs of photons say.
+    false_alarm_rate : float
+        Share of the pixels without a return in which one is announced; see `PhotonDetector`.
+    background : (bins,) array, optional
+        Shape of the background over the bins, as of a dark frame; by default what the pixels have
+        in common.
+    cycles : int, optional
+        Laser cycles of each pixel, of a detector that counts the first photon of a cycle only.
+    max_returns : int
+        Returns looked for in every pixel.
+
+    Returns
+    -------
+    SurfaceImage
+        NaN where no return stands out, and in hot pixels. The probability of an outlier is that of a false alarm.
+
+    Raises
+    ------
+    InputError
+        No pulse is given and none can be recognised, or the time axis is shorter than two pulses.
+    """
+    hot = find_hot_pixels(photons)
+    photons = leave_out_pixels(photons, hot)
+    if background is None:  # which has the photons' own bins
+        photons = photons.join_bins(find_time_step(photons))
+    shape = Pulse.gaussian(measure_pulse_width(photons)) if pulse is None else pulse
+    require_plausible_pulse(photons, shape)
+    detector = PhotonDetector(
+        shape,
+        photons.bin_width,
+        photons.bins,
+        false_alarm_rate,
+        max_returns,
+        background=background,
+    )
+    pixels = photons.offsets.size - 1
+    if background is None:
+        # once for the whole picture, from pixels all over it
+        some = photons.histograms(slice(0, pixels, -(-pixels // SAMPLED_PIXELS)))
+        learnt = detector.adapt(some).relative_background
+        detector = replace(detector, background=learnt)
+    found = np.full((max_returns, 3, pixels), np.nan)
+    for piece in split_blocks(pixels, DETECTED_PIXELS_PER_BLOCK):
+        arrivals = detector.locate(photons.histograms(piece), piece.start, cycles)
+        located = np.stack([arrivals.range, arrivals.confidence, arrivals.photons])
+        found[..., piece] = np.moveaxis(located, -1, 0)
+    settings: dict[str, float | str] = {
+        "response": "learnt" if pulse is None else "given",
+        "pulse_fwhm_ps": detector.shape.fwhm * 1e12,
+        "false_alarm_rate": false_alarm_rate,
+        "background": "given"
+        if background is not None
+        else "learnt"
+        if np.ptp(detector.relative_background)
+        else "even",
+        "hot_pixels": int(hot.sum()),
+    }
+    images = []
+    for distance, sigma, signal in found.reshape(max_returns, 3, *photons.image_shape):
+        seen = np.isfinite(distance)
+        false_share = min(false_alarm_rate * pixels / max(int(seen.sum()), 1), 1.0)
+        doubt = np.where(seen, false_share, np.nan)
+        images.append(SurfaceImage(distance, sigma, signal, doubt, detector.shape, settings))
+    return replace(images[0], further=tuple(images[1:]), hot_pixels=hot)

@@ -17,21 +17,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.dependencies import import_file_reader
 from tofclip.errors import FileFormatError, InputError, TofclipError
 from tofclip.files import (
     BoundedFile,
     format_error_line,
+    import_file_reader,
     iterate_members,
     require_bounded_size,
     translate_read_errors,
 )
 from tofclip.io.archive import list_npz_entries, read_npy_header
-from tofclip.io.becker_hickl import read_sdt_blocks
+from tofclip.io.hamamatsu import require_whole_chain
 from tofclip.io.mat import list_mat_variables
-from tofclip.io.picoquant import TCSPC, PtuEvents, get_scan_shape, read_scan
-from tofclip.io.tiff import require_whole_chain
-from tofclip.lidar.photons.photon_image import PhotonImage
+from tofclip.io.tcspc import TCSPC, PtuEvents, get_scan_shape, read_scan, read_sdt_blocks
+from tofclip.lidar.photons.image import PhotonImage
 from tofclip.storage import HDF5_SIGNATURE
 
 MAX_IMAGE_BYTES = 1 << 32

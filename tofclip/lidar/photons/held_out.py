@@ -12,10 +12,9 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.errors import InputError
-from tofclip.lidar.photons.photon_image import FloatArray, PhotonImage
+from tofclip.lidar.photons.image import FloatArray, PhotonImage
 from tofclip.lidar.photons.planes import PLANE_ROUNDS, TRIAL_ROUNDS, fit_surface
-from tofclip.lidar.photons.response import BinnedResponse, learn_response
-from tofclip.lidar.photons.scene import Scene
+from tofclip.lidar.photons.response import BinnedResponse, Scene, learn_response
 
 REACHES_PX = (1, 2, 3, 4, 6, 8)
 

@@ -1,7 +1,7 @@
 """The compiled search for returns in histograms of photons.
 
 Positions below a bin and overlapping returns are treated by the steps of
-`tofclip.lidar.pulse_fit`; here is what Poisson statistics add.
+`tofclip.lidar.fit_kernels`; here is what Poisson statistics add.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofclip.compiling import compile_and_keep
-from tofclip.lidar.pulse_fit import (
+from tofclip.lidar.fit_kernels import (
     find_pulse_window,
     get_variance,
     interpolate_pulse,
@@ -136,7 +136,7 @@ def extract_strongest_returns(
     decide ties; `level` (n,): row of the table for each histogram; negative: nothing is sought;
     `table` (levels,): threshold and filter weights; `background` (bins,): relative brightness of
     each bin, and its row of the filter; `first`: bin of the first weight relative to the return's;
-    `scale, times`: as in `tofclip.lidar.pulse_fit`; `peaks` (n, most returns); `numbers` (n,).
+    `scale, times`: as in `tofclip.lidar.fit_kernels`; `peaks` (n, most returns); `numbers` (n,).
     """
     (thresholds, weights), (relative, shade) = table, background
     for row in range(rest.shape[0]):
@@ -161,7 +161,7 @@ def fit_histograms(
     `histograms` (n, bins): photons counted; `arrived` (n, bins): photons with pile-up corrected;
     `live` (n, bins): fraction of the cycles in which the detector was ready; `peaks, numbers`: as
     `extract_strongest_returns` left them; `relative` (bins,): background of each bin, relative to
-    that of a usual one; `curve, scale, times`: as in `tofclip.lidar.pulse_fit`; `found` (n, most
+    that of a usual one; `curve, scale, times`: as in `tofclip.lidar.fit_kernels`; `found` (n, most
     returns, 3): overwritten with arrival, photons and standard deviation of the arrival where there
     is a return.
     """
@@ -207,7 +207,7 @@ def estimate_background(trace, relative, times, peaks, scale):
 
     `trace` (bins,): photons; `relative` (bins,): background of each bin, relative to that of a
     usual one; `times` (bins,): seconds, increasing; `peaks`: bins of the returns; `scale` (4,): the
-    pulse's; see `tofclip.lidar.pulse_fit`. Returns photons per bin, above zero.
+    pulse's; see `tofclip.lidar.fit_kernels`. Returns photons per bin, above zero.
     """
     free = np.ones(trace.size, np.bool_)
     for peak in peaks:
@@ -228,7 +228,7 @@ def estimate_height(trace, times, background, curve, scale, peak):
 
     `trace` (bins,): photons; `times` (bins,): seconds, increasing; `background` (bins,): photons
     per bin; `curve` (samples, 2): pulse and slope; `scale` (4,): the pulse's; see
-    `tofclip.lidar.pulse_fit`; `peak`: bin of the return. Returns photons per bin at the pulse's
+    `tofclip.lidar.fit_kernels`; `peak`: bin of the return. Returns photons per bin at the pulse's
     peak.
     """
     arrival = times[peak]
@@ -246,9 +246,9 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, varian
 
     `trace` (bins,): photons; `times` (bins,): seconds, increasing; `background` (bins,): photons
     per bin; `curve` (samples, 2): pulse and slope; `scale` (4,): the pulse's; see
-    `tofclip.lidar.pulse_fit`; `estimate` (returns, 5): see
-    `tofclip.lidar.pulse_fit.refine_returns`; `k`: number of the return; `variance`: see
-    `tofclip.lidar.pulse_fit.get_variance`; `found` (3,): overwritten: arrival in seconds, photons,
+    `tofclip.lidar.fit_kernels`; `estimate` (returns, 5): see
+    `tofclip.lidar.fit_kernels.refine_returns`; `k`: number of the return; `variance`: see
+    `tofclip.lidar.fit_kernels.get_variance`; `found` (3,): overwritten: arrival in seconds, photons,
     standard deviation in seconds (infinite where the fit says nothing).
     """
     arrival, height = estimate[k, 0], estimate[k, 1]

@@ -12,8 +12,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tofclip.lidar.photons.photon_image import FloatArray, PhotonImage
-from tofclip.lidar.photons.scene import Scene
+from tofclip.lidar.photons.image import FloatArray, PhotonImage
+from tofclip.lidar.photons.response import Scene
 from tofclip.threads import run_blocks
 
 LABELS_PER_WIDTH = 2

@@ -7,9 +7,9 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
+from tofclip.lidar.photons.image import FloatArray, PhotonImage
 from tofclip.lidar.photons.matching import PIXELS_PER_BLOCK
-from tofclip.lidar.photons.photon_image import FloatArray, PhotonImage
-from tofclip.lidar.photons.scene import MIN_SIGNAL_PHOTONS, Scene
+from tofclip.lidar.photons.response import MIN_SIGNAL_PHOTONS, Scene
 from tofclip.threads import run_blocks
 
 PLANE_ROUNDS = 5

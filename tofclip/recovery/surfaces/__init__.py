@@ -26,6 +26,6 @@ The modules in the order of the work:
 docs/recovery_algorithm.md derives it.
 """
 
-from tofclip.recovery.surfaces.recovery import SurfaceRecovery
+from tofclip.recovery.surfaces.fit import SurfaceRecovery
 
 __all__ = ["SurfaceRecovery"]

@@ -1,35 +1,176 @@
-"""Finding the surfaces of a shot and fitting them, or those of the shot before, to what it shows."""
+"""Which shots are not of surfaces: smoke, light in flight, relay walls. They are refused.
+
+Finding the surfaces of a shot and fitting them, or those of the shot before, to what it shows.
+
+The returns of fitted surfaces: which points there are, and how far off each may be.
+
+The method "surfaces": surfaces of a whole shot, and frames as their rendering.
+"""
 
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
-from tofclip.lidar import compute_ray_directions, depth
+from tofclip.camera import Camera, measure
+from tofclip.errors import InputError
+from tofclip.lidar import Detection, compute_ray_directions, depth
+from tofclip.lidar.range_calibration import correct_returns
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
-from tofclip.recovery.surfaces.model import FloatArray, SurfaceModel
+from tofclip.recovery.surfaces.model import (
+    FloatArray,
+    Image,
+    SurfaceModel,
+    SurfaceState,
+    compare_smoothed,
+    find_rows,
+)
 from tofclip.recovery.surfaces.patches import (
     MARGIN_PX,
+    Patch,
     find_dimmer_patches,
     find_patches,
     reach_further,
 )
-from tofclip.recovery.surfaces.pulse import measure_pulse
+from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, ShotPulse, measure_pulse
 from tofclip.recovery.surfaces.ranges import Refinement, refine_state
-from tofclip.recovery.surfaces.refusal import (
-    require_explained,
-    require_gentle_slopes,
-    require_short_pulse,
-    require_surfaces,
-)
-from tofclip.recovery.surfaces.state import SurfaceState
-from tofclip.shots import Frames, Streak
-from tofclip.solvers import Progress, ignore_progress
+from tofclip.shots import Frames, Returns, Streak
+from tofclip.solvers import Method, Progress, Sparse, ignore_progress
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
+
+FloatArray_refusal = NDArray[np.float64]
+
+# Of the returns' light: below, the shot is not one of surfaces. Simulated shots of surfaces have 0.93
+# or more, recorded ones 0.97; recorded relay walls have 0.50 to 0.79.
+MIN_SURFACE_SHARE = 0.7
+# Of the measurements, both smoothed so that photons' noise hardly counts: above, much of the light is
+# not where the surfaces are. Surfaces leave 0.02 to 0.22, recorded relay walls 0.2 to 0.5. Smoke's
+# first light looks like one surface, but only the first.
+MAX_UNEXPLAINED = 0.3
+# Of a pulse's light, that long after its peak: more is not an instrument's afterglow (0.18), but light
+# that comes from many depths to each pixel.
+MAX_TAIL_SHARE = 0.3
+# Bins of range that a pixel spans where a surface is seen nearly edge-on, and the share of the
+# returns' light there: returns scatter by several bins about it, and a fit to them would be as far
+# off. Plates that are turned by 1.3 rad have 0.01 of it, by 1.4 rad 0.43, other scenes up to 0.011.
+STEEP_BINS, MAX_STEEP_SHARE = 10.0, 0.3
+SLOPE_WINDOW_PX = 7
+
+
+def require_gentle_slopes(found: Returns, bin_m: float) -> None:
+    """Refuse a shot most of whose light is on surfaces seen nearly edge-on.
+
+    `bin_m`: range of a bin, m.
+    """
+    slope, scatter = measure_slopes(found.image("range"))
+    steep = (slope > STEEP_BINS * bin_m) & (scatter < slope)
+    light = float(found.intensity.sum())
+    share = float(found.intensity[steep[found.y, found.x]].sum()) / light if light else 0.0
+    if share > MAX_STEEP_SHARE:
+        raise InputError(
+            f"{100 * share:.0f} % of the returns' light lies on surfaces that are turned so far that a "
+            f"pixel spans more than {STEEP_BINS:.0f} bins of range, which has no one range: choose "
+            '`method="tv"`, or turn them towards the camera'
+        )
+
+
+def measure_slopes(distance: Image) -> tuple[FloatArray_refusal, FloatArray_refusal]:
+    """Return how far ranges change from pixel to pixel, by a plane through each pixel's
+    surroundings.
+
+    `distance` (rows, columns): ranges, m; NaN where there is none. Returns `slope` (rows, columns):
+    m per pixel; 0 where less than half of the surroundings has a range; `scatter` (rows, columns):
+    root mean square distance of the ranges from the plane, m.
+    """
+    known = np.isfinite(distance)
+    place = np.indices(distance.shape).astype(np.float64)
+    y, x = place[0], place[1]
+    # differences of large numbers follow: the middle of all is taken off first
+    middle = float(np.median(distance[known])) if known.any() else 0.0
+    values: FloatArray_refusal = np.where(known, distance - middle, 0.0).astype(np.float64)
+
+    def average(image: FloatArray_refusal) -> FloatArray_refusal:
+        found: FloatArray_refusal = scipy.ndimage.uniform_filter(
+            np.where(known, image, 0.0), SLOPE_WINDOW_PX, mode="constant"
+        )
+        return found
+
+    share = average(np.ones(distance.shape))
+    whole = np.maximum(share, SLOPE_WINDOW_PX**-2)
+    columns = (x, y, values)
+    mean = [average(one) / whole for one in columns]
+    xx, xy, xr, yy, yr, rr = (
+        average(columns[i] * columns[j]) / whole - mean[i] * mean[j]
+        for i in range(3)
+        for j in range(i, 3)
+    )
+    determinant = np.maximum(xx * yy - xy**2, np.finfo(np.float32).eps)
+    across, down = (xr * yy - yr * xy) / determinant, (yr * xx - xr * xy) / determinant
+    scatter = np.sqrt(np.maximum(rr - across * xr - down * yr, 0))
+    return np.where(share > 0.5, np.hypot(across, down), 0.0), scatter
+
+
+def require_surfaces(found: Returns, patches: list[Patch]) -> None:
+    """Refuse a shot whose returns do not lie side by side on surfaces.
+
+    `patches`: surfaces through them.
+    """
+    on_surface = np.zeros(found.camera.image_shape, bool)
+    for patch in patches:
+        on_surface.ravel()[patch.pixels] = True
+    light = float(found.intensity.sum())
+    share = float(found.intensity[on_surface[found.y, found.x]].sum()) / light if light else 0.0
+    if share < MIN_SURFACE_SHARE:
+        raise _refuse(f"only {100 * share:.0f} % of the returns' light lies on smooth surfaces")
+
+
+def require_short_pulse(pulse: ShotPulse) -> None:
+    """Refuse a shot whose pixels go on receiving light long after the return."""
+    if pulse.tail_share > MAX_TAIL_SHARE:
+        raise _refuse(
+            f"{100 * pulse.tail_share:.0f} % of each pixel's light comes long after its peak"
+        )
+
+
+def require_explained(
+    model: SurfaceModel, amplitude: Image, frames: Frames, streak: Streak
+) -> None:
+    """Refuse a shot that surfaces explain neither well nor as well as its frames do.
+
+    `amplitude` (points,); `frames`: A fast recovery of the same shot.
+    """
+    unexplained = model.unexplained(amplitude)
+    if unexplained <= MAX_UNEXPLAINED:
+        return
+    # In little light noise is left over however right the surfaces are, and by frames as well.
+    camera = frames.camera
+    seen = measure(streak.counts, streak.saturated, camera)
+    predicted = np.zeros_like(seen.values)
+    for shear in np.unique(frames.shears):
+        own = np.flatnonzero(frames.shears == shear)
+        pictures = np.ascontiguousarray(np.moveaxis(frames.values[own], 0, -1))
+        predicted[:, own] = camera.operator(float(shear))(pictures)
+    by_frames = compare_smoothed(predicted, seen.values, seen.valid)
+    if unexplained > by_frames:
+        raise _refuse(
+            f"surfaces leave {100 * unexplained:.0f} % of the signal unexplained, and frames "
+            f"{100 * by_frames:.0f} %"
+        )
+
+
+def _refuse(fault: str) -> InputError:
+    """The error of a shot that is not one of surfaces."""
+    return InputError(
+        f"{fault}: this shot's light is not on surfaces (smoke, light in flight, a relay wall); "
+        'choose `method="tv"`'
+    )
+
 
 START_ITERATIONS = 25
 MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 4, 10
@@ -187,3 +328,251 @@ def extrapolate_steps(lengths: FloatArray) -> FloatArray:
     ratio = np.minimum(lengths[-1] / np.maximum(lengths[-2], tiny), 0.5)
     left: FloatArray = lengths[-1] * ratio / (1 - ratio)
     return left
+
+
+SURE_SIGMAS = 20.0  # points of which a surface certainly consists
+UPPER_QUANTILE = 0.9
+MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
+EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
+NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
+
+
+@limit_blas_threads()
+def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float = 0.0) -> Returns:
+    """List the points that stand out of the noise and of their neighbourhood, pixel by pixel.
+
+    `detection`: which points are returned; `centre_error_px`: how far off the calibration had each
+    slit centre, as for `tofclip.recovery.Shot`.
+    """
+    model, solver = fit.model, fit.solver
+    camera = model.camera.replace(gains=model.state.gains)
+    distance, amplitude = model.distance, solver.amplitude
+    # A pixel alone is hardly above the photons' noise: its neighbours on the surface, which the
+    # prior ties to it, count as well.
+    pictures, information = np.zeros((2, *model.masks.shape), np.float32)
+    information[model.masks] = model.gather(model.weights, squared=True)
+    pictures[model.masks] = amplitude
+    pooled = np.stack([pool_information(*one) for one in zip(information, pictures, strict=True)])
+    # running sums may leave a rounding error below nothing
+    pooled = np.maximum(pooled, 0)
+    significance = amplitude * np.sqrt(pooled[model.masks] / solver.variance)
+    deviation = model.estimate_deviation(fit.refinement.covariances)
+    deviation = np.hypot(deviation, fit.remainder[model.surface])
+    displacement = estimate_displacement(camera, centre_error_px)
+    deviation = np.hypot(deviation, np.hypot(*(displacement * model.compute_slopes().T).T))
+    # brightness is told as the reference view sees it
+    intensity = model.shade(model.reference, amplitude) * distance**2
+    limit = detection.signal_to_noise
+    usual = np.zeros(len(model.masks))
+    for one in range(usual.size):
+        own = model.surface == one
+        usual[one] = find_usual_brightness(amplitude[own], significance[own], limit)
+    bright = np.flatnonzero(
+        (significance > limit) & (amplitude > MIN_BRIGHTNESS_FRACTION * usual[model.surface])
+    )
+    strong = detection.find_significant(
+        model.pixel[bright],
+        2 * distance[bright] / SPEED_OF_LIGHT,
+        intensity[bright],
+        camera.pulse_fwhm,
+    )
+    chosen = bright[strong]
+    chosen = chosen[np.lexsort((distance[chosen], model.pixel[chosen]))]
+    y, x = np.divmod(model.pixel[chosen], camera.image_shape[1])
+    starts = np.flatnonzero(np.diff(model.pixel[chosen], prepend=-1))
+    rank = np.arange(chosen.size) - np.repeat(starts, np.diff(starts, append=chosen.size)) + 1
+    measured = Returns(
+        y=y.astype(np.int32),
+        x=x.astype(np.int32),
+        range=distance[chosen],
+        intensity=intensity[chosen].astype(np.float32),
+        confidence=deviation[chosen].astype(np.float32),
+        return_number=rank.astype(np.uint8),
+        time=2 * distance[chosen] / SPEED_OF_LIGHT,
+        camera=camera,
+        shear=np.asarray(camera.shear_at(distance[chosen])),
+    )
+    return correct_returns(measured)
+
+
+def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
+    """Return how far errors of the slit centres displace the picture to the right and down, px.
+
+    Of errors e_v a shot shows all but what looks like a displaced picture, ``e_v = dx - dy
+    tan(angle_v)``. That part is taken to be that of errors which alternate, as of neighbouring
+    lenslets measured in turns; independent ones would leave sqrt(views) as much.
+
+    `centre_error_px`: how far off the calibration had each slit centre, as for
+    `tofclip.recovery.Shot`. Returns (2,).
+    """
+    in_turns = (-1.0) ** np.arange(camera.views)
+    looks = np.stack([np.ones(camera.views), -np.tan(camera.angles)], axis=1)
+    found: FloatArray = np.abs(np.linalg.pinv(looks) @ in_turns) * centre_error_px
+    return found
+
+
+def pool_information(information: Image, picture: Image) -> Image:
+    """Return the information about each pixel's amplitude, with that of pixels tied to it.
+
+    These are the nearest ones, and those further off that the prior has made as bright: where little
+    is known of each pixel it leaves large even pieces, whose amplitude all their pixels determine.
+
+    `information` (rows, columns): of each pixel alone, one over the variance of its amplitude;
+    `picture` (rows, columns): amplitudes. Returns (rows, columns).
+    """
+
+    def add_up(values: Image, side: int) -> Image:
+        mean: Image = scipy.ndimage.uniform_filter(values, side, mode="constant")
+        return side**2 * mean
+
+    pooled = add_up(information, NEIGHBOURHOOD_PX)
+    level = np.zeros(picture.shape, np.intp)
+    lit = picture > 0
+    level[lit] = np.floor(np.log(picture[lit]) / np.log(EVEN_RATIO)).astype(np.intp)
+    for one in np.unique(level[lit]):
+        even = lit & (np.abs(level - one) <= 1)
+        own = lit & (level == one)
+        wide = add_up(np.where(even, information, 0), EVEN_PX)
+        pooled[own] = np.maximum(pooled[own], wide[own])
+    found: Image = pooled
+    return found
+
+
+def find_usual_brightness(amplitude: Image, significance: Image, limit: float) -> float:
+    """Return the usual amplitude of the points of which a surface certainly consists.
+
+    `amplitude, significance` (points,): of the surface; significance in standard deviations;
+    `limit`: standard deviations below which there is no point. Returns infinite if no point is
+    sure.
+    """
+    if amplitude.size == 0:
+        return float("inf")
+    # In little light no point is that far out of the noise, but some are further than others.
+    upper = float(np.quantile(significance, UPPER_QUANTILE))
+    sure = amplitude[significance > min(SURE_SIGMAS, max(limit, upper / 2))]
+    return float(np.median(sure)) if sure.size else float("inf")
+
+
+@dataclass(frozen=True)
+class SurfaceRecovery:
+    """Surfaces from a whole shot, and frames as their rendering.
+
+    Parameters
+    ----------
+    weight : float
+        Of total variation of the amplitudes, in standard deviations of what photon noise makes of
+        the misfit's gradient. It needs no knowledge of the scene or of the light's amount.
+    iterations : int
+        Of FISTA after the ranges are known; before that there are 45 to 65 more.
+    start : Method
+        Recovers the frames in whose returns the surfaces are looked for.
+    detection : Detection
+        Which points of the surfaces are returned.
+
+    Notes
+    -----
+    Right for shots of surfaces: smoke, light in flight and relay walls stay with frames. Views are
+    taken to see the same surfaces: what one hides from a view but not from another is not modelled.
+    """
+
+    weight: float = 2.0
+    iterations: int = 60
+    start: Method = field(default_factory=lambda: Sparse(iterations=40))
+    detection: Detection = field(default_factory=Detection)
+    name = "surfaces"
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.weight) and self.weight > 0 and self.iterations >= 1):
+            raise InputError("surfaces need a positive weight and at least one iteration")
+
+    @property
+    def steps(self) -> int:
+        """Iterations of FISTA at most."""
+        return START_ITERATIONS + MAX_REFINEMENTS * REFINEMENT_ITERATIONS + self.iterations
+
+    def work(self, frames: int) -> int:
+        """Frame iterations that are reported at most: the start's, and one per frame and iteration."""
+        return self.start.work(frames) + self.steps * frames
+
+    def recover_surfaces(
+        self,
+        streak: Streak,
+        frames: Frames,
+        progress: Progress = ignore_progress,
+        centre_error_px: float = 0.0,
+    ) -> Frames:
+        """Recover the surfaces of a shot.
+
+        Parameters
+        ----------
+        streak : Streak
+        frames : Frames
+            A fast recovery of the same shot, with the camera to use.
+        progress : callable
+            Called with the number of frame iterations just done.
+        centre_error_px : float
+            How far off the calibration had each slit centre, as for `tofclip.recovery.Shot`.
+
+        Returns
+        -------
+        Frames
+            With ``.returns``.
+
+        Raises
+        ------
+        InputError
+            Most of the light does not come from surfaces.
+        """
+        fit = fit_surfaces(streak, frames, self.weight, self.iterations, progress)
+        returns = list_returns(fit, self.detection, centre_error_px)
+        return self._make_frames(frames, fit, returns)
+
+    def _make_frames(self, start: Frames, fit: SurfaceFit, returns: Returns) -> Frames:
+        model, amplitude, camera = fit.model, fit.solver.amplitude, returns.camera
+        # Rectified like every other method's: its residual is of measurements, not of raw pixels.
+        rendered = model.render(amplitude)
+        predicted, measured = (
+            measure(image, model.weights == 0, model.camera, 0.0)
+            for image in (rendered, model.image)
+        )
+        error = (predicted.values - measured.values)[measured.valid]
+        residual = float(np.linalg.norm(error) / np.linalg.norm(measured.values[measured.valid]))
+        distance = np.maximum(SPEED_OF_LIGHT * start.times / 2, start.bin_width * SPEED_OF_LIGHT)
+        figures: dict[str, Any] = {
+            "method": self.name,
+            "focus": "depth-locked",
+            "iterations": fit.count_iterations() + self.iterations,
+            "stopped_because": "iteration limit",
+            "relative_residual": residual,
+            "surfaces": len(model.masks),
+        }
+        return replace(
+            start,
+            values=_render_frames(start, model, model.shade(model.reference, amplitude)),
+            camera=camera,
+            figures={**start.figures, **figures},
+            shears=np.asarray(camera.shear_at(distance)),
+            returns=returns,
+        )
+
+
+def _render_frames(start: Frames, model: SurfaceModel, amplitude: Image) -> Image:
+    """The surfaces as a reference view without blur would see them over time."""
+    from scipy.special import ndtr
+
+    lit = np.flatnonzero(amplitude)
+    row = find_rows(start.times, 2 * model.distance[lit] / SPEED_OF_LIGHT)
+    sigma = model.pulse.sigma
+    half = int(np.ceil(EXTENT_SIGMAS * sigma + 0.5))
+    rows = np.round(row).astype(np.intp)[:, np.newaxis] + np.arange(-half, half + 2)
+    upto = ndtr((rows - 0.5 - row[:, np.newaxis]) / sigma)
+    light = amplitude[lit][:, np.newaxis] * np.diff(upto, axis=1)
+    rows = rows[:, :-1]
+    values = np.zeros(start.values.shape, np.float32)
+    inside = (rows >= 0) & (rows < len(values))
+    pixel = np.broadcast_to(model.pixel[lit][:, np.newaxis], rows.shape)
+    np.add.at(values.reshape(len(values), -1), (rows[inside], pixel[inside]), light[inside])
+    if model.pulse.reach:
+        tail = model.pulse.extend(np.ones(1, np.float32))
+        values = scipy.ndimage.convolve1d(values, tail, axis=0, mode="constant")
+    return values

@@ -1,0 +1,221 @@
+"""LinoSPAD2 made of software: photons of a simulated scene, as the words that a board with uneven
+codes would send.
+
+There is no wire to emulate, because the board's USB commands are not public; the stream begins
+where the words do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from time import monotonic, sleep
+
+import numpy as np
+from numpy.typing import NDArray
+
+from devices.address import Uri
+from devices.emulation.scenes import LineLight, simulate_line_light
+from devices.linospad2 import (
+    CLOCK_PERIOD_S,
+    CODES_PER_PERIOD,
+    FIRMWARES,
+    PIXELS,
+    BoardCalibration,
+    LinoSpad2Codec,
+    make_calibration_record,
+)
+from devices.linospad2_kernels import ADDRESSES
+from devices.source import Info, Ledger, Records
+from devices.stream import STREAM_OPTIONS, StreamSource, Transfer, parse_buffer_settings
+from tofclip.errors import InputError, ShapeError
+from tofclip.storage import Record
+
+INSTRUMENT = "simulated LinoSPAD2"
+LASER_PERIOD_S = 25e-9
+CYCLE_TIME_S = 4e-3
+"""A cycle lasts as long, s; a code has room for 4.8 ms."""
+
+COUNTER_TICK_S = 7.5e-9
+OPTIONS = (
+    "seed",
+    "cycles",
+    "photons",
+    "firmware",
+    "timestamps",
+    "counter",
+    "pace",
+    *STREAM_OPTIONS,
+)
+
+
+@dataclass(frozen=True)
+class SimulatedBoard:
+    """A board before which a scene is lit by a pulsed laser."""
+
+    light: LineLight  # of 256 pixels, and shorter than the laser's period
+    calibration: BoardCalibration
+    codec: LinoSpad2Codec
+    photons_per_cycle: float  # expected photons on all pixels together
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.light.photons.shape[1] != PIXELS:
+            raise ShapeError("LinoSPAD2's light", ("rows", PIXELS), self.light.photons.shape)
+        most = PIXELS // ADDRESSES * self.codec.timestamps
+        if not 0 < self.photons_per_cycle <= most:
+            raise InputError(
+                f"photons per cycle must be above 0 and at most {most}, got {self.photons_per_cycle:g}"
+            )
+
+    @cached_property
+    def _cumulative_photons(self) -> NDArray[np.float64]:
+        """Photons up to each cell of the light, in raster order."""
+        return np.cumsum(self.light.photons)
+
+    @cached_property
+    def _table_offsets(self) -> NDArray[np.float64]:
+        """Where each pixel's codes begin in `_code_ends`: a little more than a period apart, s."""
+        return 2 * CLOCK_PERIOD_S * np.arange(PIXELS, dtype=np.float64)
+
+    @cached_property
+    def _code_ends(self) -> NDArray[np.float64]:
+        """Ends of all pixels' codes in one table that rises throughout, s."""
+        return (self.calibration.code_ends + self._table_offsets[:, np.newaxis]).ravel()
+
+    def encode_cycle(self, number: int) -> bytes:
+        """Return the words of one cycle; the same number gives the same words.
+
+        Photons that find their converter's memory full are not stamped.
+        """
+        random = np.random.default_rng([self.seed, number])
+        pixel, time = self._draw_photons(random)
+        records = np.zeros(len(pixel), self.codec.dtype)
+        records["pixel"], records["code"] = pixel, self._encode_times(pixel, time)
+        if self.codec.counter:
+            records["counter"] = round(number * CYCLE_TIME_S / COUNTER_TICK_S)
+        cycle = self.codec.encode(self._drop_overflow(records))
+        return cycle or bytes(self.codec.cycle_bytes)
+
+    def _draw_photons(
+        self, random: np.random.Generator
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Draw pixel and time since the cycle began of each photon of a cycle."""
+        columns = self.light.photons.shape[1]
+        total = random.poisson(self.photons_per_cycle)
+        row, pixel = np.divmod(
+            np.searchsorted(
+                self._cumulative_photons,
+                random.uniform(0, self._cumulative_photons[-1], total),
+                side="right",
+            ),
+            columns,
+        )
+        # The last pulses of a cycle are left out, so that the board's offsets cannot carry a photon
+        # beyond it.
+        pulse = random.integers(1, round(CYCLE_TIME_S / LASER_PERIOD_S) - 1, total) * LASER_PERIOD_S
+        width = self.light.row_times[1] - self.light.row_times[0]
+        return pixel, pulse + self.light.row_times[row] + (random.uniform(-0.5, 0.5, total) * width)
+
+    def _encode_times(
+        self, pixel: NDArray[np.intp], time: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        """Return the code in which each time lies, for its own pixel's converter."""
+        periods, phase = np.divmod(time - self.calibration.offsets[pixel], CLOCK_PERIOD_S)
+        code = (
+            np.searchsorted(self._code_ends, phase + self._table_offsets[pixel], side="right")
+            - pixel * CODES_PER_PERIOD
+        )
+        codes: NDArray[np.int64] = periods.astype(np.int64) * CODES_PER_PERIOD + np.clip(
+            code, 0, CODES_PER_PERIOD - 1
+        )
+        return codes
+
+    def _drop_overflow(self, records: Records) -> Records:
+        # A converter keeps its first photons in time; later ones find its memory full.
+        records = self.codec.sort_stamps(records[np.argsort(records["code"], kind="stable")])
+        converter = self.codec.address_of[records["pixel"]] // ADDRESSES
+        place_in_queue = np.arange(len(records)) - np.searchsorted(converter, converter)
+        fitting: Records = records[place_in_queue < self.codec.timestamps]
+        return fitting
+
+
+def draw_uneven_calibration(seed: int) -> BoardCalibration:
+    """Return a board as uneven as real ones: codes from a tenth to twice their width, pixels out of
+    step by 10 ns.
+    """
+    random = np.random.default_rng([seed, 1])
+    ends = np.cumsum(random.uniform(0.1, 1.9, (PIXELS, CODES_PER_PERIOD)), axis=1)
+    return BoardCalibration(
+        ends * (CLOCK_PERIOD_S / ends[:, -1:]), random.uniform(-6e-9, 4e-9, PIXELS)
+    )
+
+
+class SimulatedFeed:
+    """A board's cycles, one after the other; see `devices.stream.Feed`.
+
+    `cycles`: until the stream ends; `cycle_time`: seconds that a cycle takes at least; 0: as fast
+    as they are read.
+    """
+
+    def __init__(self, board: SimulatedBoard, cycles: int, cycle_time: float) -> None:
+        self._board, self._left, self._cycle_time = board, cycles, cycle_time
+        self._number = 0
+
+    @property
+    def info(self) -> Info:
+        limits = "LinoSPAD2's USB commands are not public: recordings are read, and boards simulated, not driven"
+        codec = self._board.codec
+        return Info(INSTRUMENT, f"SIM{self._board.seed}", {"limits": limits, **codec.settings})
+
+    @property
+    def calibration(self) -> Record:
+        return make_calibration_record(
+            self._board.calibration, LASER_PERIOD_S, self._board.light.camera.to_record()
+        )
+
+    def start(self) -> None:
+        self._began = monotonic()
+
+    def pull(self, timeout: float) -> Transfer | None:
+        if self._left <= 0:
+            return None
+        self._left -= 1
+        data = self._board.encode_cycle(self._number)
+        self._number += 1
+        sleep(max(0.0, self._began + self._number * self._cycle_time - monotonic()))
+        return Transfer(memoryview(data))
+
+    def stop(self) -> None:
+        self._left = 0
+
+    def close(self) -> None:
+        """Do nothing: nothing is held."""
+
+
+def open_simulated(uri: Uri) -> StreamSource:
+    """Open
+    ``sim+linospad2://?seed=1&cycles=250&photons=6000&firmware=2212b&timestamps=512&counter=0&pace=fast``.
+
+    `photons` is the expected number in a cycle; ``pace=realtime`` lets a cycle take its 4 ms.
+    """
+    uri.reject_unknown(*OPTIONS)
+    seed, cycles = uri.value("seed", int, 0), uri.value("cycles", int, 250)
+    if seed < 0 or cycles < 0:
+        raise InputError(f"'{uri.text}': seed and cycles must not be negative")
+    codec = LinoSpad2Codec(
+        uri.choice("firmware", *FIRMWARES),
+        uri.value("timestamps", int, 512),
+        uri.choice("counter", "0", "1") == "1",
+    )
+    board = SimulatedBoard(
+        simulate_line_light(),
+        draw_uneven_calibration(seed),
+        codec,
+        uri.value("photons", float, 6000.0),
+        seed,
+    )
+    cycle_time = CYCLE_TIME_S if uri.choice("pace", "fast", "realtime") == "realtime" else 0.0
+    return StreamSource(
+        SimulatedFeed(board, cycles, cycle_time), codec, Ledger(), parse_buffer_settings(uri)
+    )

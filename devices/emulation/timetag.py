@@ -1,0 +1,775 @@
+"""A queue of bytes whose cost does not grow with its length.
+
+Light that falls on an emulated time tagger, as its words: even, or of a pulsed scene.
+
+An emulated FX2 time tagger on the virtual USB, as unkind as the real one, with faults to order.
+`devices.timetag` drives it unchanged.
+
+Written from the gateware and the firmware (bgamari/timetag-fpga, bgamari/timetag-fx2), not from the
+driver::
+
+    photons -> memory of 2048 records -> USB chip: three packets -> host
+               held empty by CLEAR       unfinished packets wait
+
+When it is opened it is as a killed program left it: a reply that was never fetched waits, records
+of the last session are in the USB chip, and the register manager waits for the end of a command.
+
+Addresses of emulated instruments on the virtual USB.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import struct
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from time import monotonic, sleep
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from usb.core import USBError
+
+from devices.address import Uri
+from devices.emulation.faults import REPLY_FAULTS, Fault
+from devices.emulation.scenes import LineLight, simulate_line_light
+from devices.emulation.usb import PACKET_BYTES, VirtualDevice, VirtualUsb, make_usb_error
+from devices.source import ByteView, Records
+from devices.stream import StreamSource
+from devices.timetag.codec import COUNTER_RANGE, LOST, RECORD_BYTES, RECORD_DTYPE, WRAP
+from devices.timetag.driver import (
+    COMMAND_ENDPOINT,
+    DATA_ENDPOINT,
+    INSTRUMENT,
+    OPTIONS,
+    REPLY_ENDPOINT,
+    USB_IDENTITY,
+    Capture,
+    Register,
+    open_on_backend,
+)
+from tofclip.errors import InputError
+
+
+class ByteQueue:
+    """Bytes in the order in which they came, kept in the pieces in which they came."""
+
+    def __init__(self) -> None:
+        self._pieces: deque[memoryview] = deque()
+        self._length = 0
+
+    def __len__(self) -> int:
+        return self._length
+
+    def append(self, piece: ByteView) -> None:
+        """Add bytes at the end; they are not copied."""
+        if len(piece):
+            self._pieces.append(piece.data)
+            self._length += len(piece)
+
+    def read_into(self, buffer: memoryview) -> int:
+        """Move bytes from the front into `buffer`, as many as fit, and return how many."""
+        taken = 0
+        while self._pieces and taken < len(buffer):
+            piece = self._pieces.popleft()
+            part = piece[: len(buffer) - taken]
+            buffer[taken : taken + len(part)] = part
+            taken += len(part)
+            if len(part) < len(piece):
+                # A view of the rest: no bytes are copied.
+                self._pieces.appendleft(piece[len(part) :])
+        self._length -= taken
+        return taken
+
+    def truncate(self, length: int) -> None:
+        """Forget everything behind the first `length` bytes."""
+        while self._length > length:
+            piece = self._pieces.pop()
+            self._length -= len(piece)
+            if self._length < length:
+                kept = piece[: length - self._length]
+                self._pieces.append(kept)
+                self._length += len(kept)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._pieces.clear()
+        self._length = 0
+
+
+MAX_TICK = (1 << 62) - 1
+"""A tick that never comes."""
+
+
+class TagStream(Protocol):
+    """What falls on a time tagger, as the words that it makes of it."""
+
+    def next_words(self, limit: int, last: int) -> ByteView:
+        """Return the next words: `limit` at most, none of them later than tick `last`; fewer is for
+        good.
+
+        Wraps of the counter are among them. How a stream is cut into calls does not change it.
+
+        `limit`: words; `last`: tick. Returns (6 * words,).
+        """
+
+
+class PoissonStream:
+    """Photons at random, at a constant rate.
+
+    `rate`: photons per second on all channels together; `clock_hz`: ticks per second. There is one
+    record at most per tick; `weights`: how the photons are shared among the channels; any positive
+    scale.
+    """
+
+    def __init__(
+        self,
+        rate: float,
+        clock_hz: int,
+        seed: int,
+        weights: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0),
+    ) -> None:
+        if not 0 < rate < clock_hz:
+            raise InputError(
+                f"a rate must be above 0 and below the clock's {clock_hz} per second, got {rate:g}"
+            )
+        # The whole part of an exponential variable is geometric, here with mean (ticks per photon)
+        # - 1.
+        self._scale = 1 / math.log1p(1 / (clock_hz / rate - 1))
+        self._weights = np.cumsum(weights) / np.sum(weights)
+        self._state = np.array([seed], np.uint64)
+        self._now = np.zeros(1, np.int64)
+
+    def next_words(self, limit: int, last: int) -> ByteView:
+        """Return the next words; see `TagStream`.
+
+        Arguments and result are those of `TagStream.next_words`.
+        """
+        from devices.timetag.kernels import fill_poisson_words
+
+        words = np.empty(limit * RECORD_BYTES, np.uint8)
+        written = fill_poisson_words(
+            self._state, self._now, self._scale, self._weights, last, words
+        )
+        return words[: written * RECORD_BYTES]
+
+
+SYNC_MASK = 1
+"""Channel 0 sees the laser."""
+
+PIXEL_MASKS = np.array([2, 4, 8], np.uint32)
+PERIOD_TICKS = 1 << 7
+PULSES_PER_BLOCK = 1 << 13
+SCENE_SCALE = 64
+"""The scene is this many times as large as a table-top one, and its light takes as many times as long: the counter's
+ticks are 1.2 m of range."""
+
+BLOCK_TICKS = (
+    PERIOD_TICKS * PULSES_PER_BLOCK
+)  # a divisor of the counter's range: it wraps where a block begins
+
+
+class PulsedSceneStream:
+    """Photons of a line of pixels after each pulse of a laser; see
+    `devices.emulation.timetag.TagStream`.
+
+    Three detectors stand at a sixth, a half and five sixths of the line. Photons that one of them
+    sees within a tick count as one; what several channels see within a tick is one record. Memory:
+    one block of 8192 pulses.
+
+    `light`: of the scene before it is enlarged; after that, all within the laser's period of 128
+    ticks; `rate`: photons per second on the three pixels together.
+    """
+
+    def __init__(self, light: LineLight, rate: float, clock_hz: int, seed: int) -> None:
+        columns = light.photons.shape[1] * np.array([1, 3, 5]) // 6
+        self._cumulative_photons = np.cumsum(light.photons[:, columns])
+        times = light.row_times * SCENE_SCALE
+        self._row_ticks = (times[1] - times[0]) * clock_hz
+        self._delays = times * clock_hz - self._row_ticks / 2
+        if not 0 < rate <= clock_hz:
+            raise InputError(
+                f"a rate must be above 0 and at most {clock_hz} per second, got {rate:g}"
+            )
+        if self._delays[0] < -self._row_ticks or self._delays[-1] + self._row_ticks >= PERIOD_TICKS:
+            raise InputError(
+                f"the light must come within the laser's period of {PERIOD_TICKS / clock_hz:.3g} s"
+            )
+        self._photons_per_block = rate * BLOCK_TICKS / clock_hz
+        self._seed, self._block = seed, 0
+        self._ticks: NDArray[np.int64] = np.empty(0, np.int64)
+        self._words: ByteView = np.empty(0, np.uint8)
+
+    def next_words(self, limit: int, last: int) -> ByteView:
+        """Return the next words; see `TagStream`.
+
+        Arguments and result are those of `TagStream.next_words`.
+        """
+        taken, left = [], limit
+        while left:
+            if not len(self._ticks):
+                self._fill_block()
+            ready = min(left, int(np.searchsorted(self._ticks, last, side="right")))
+            taken.append(self._words[: ready * RECORD_BYTES])
+            left -= ready
+            self._ticks, self._words = self._ticks[ready:], self._words[ready * RECORD_BYTES :]
+            if len(self._ticks):
+                break
+        return np.concatenate(taken) if taken else np.empty(0, np.uint8)
+
+    def _fill_block(self) -> None:
+        """Make the records of the next pulses; the same number of a block gives the same records."""
+        from devices.timetag.kernels import encode_timetags
+
+        records = self._draw_records(np.random.default_rng([self._seed, self._block]))
+        first = self._block * BLOCK_TICKS
+        self._block += 1
+        if first == 0:
+            records = records[records["time_ticks"] > 0]  # a zero would be taken for a wrap
+        elif first % COUNTER_RANGE == 0:
+            records["flags"][0] = WRAP
+        self._ticks = records["time_ticks"] + first
+        self._words = np.empty(len(records) * RECORD_BYTES, np.uint8)
+        encode_timetags(self._ticks, records["channels"], records["flags"], self._words)
+
+    def _draw_records(self, random: np.random.Generator) -> Records:
+        """Draw a block's pulses and photons, in ticks since the block began."""
+        total = random.poisson(self._photons_per_block)
+        row, pixel = np.divmod(
+            np.searchsorted(
+                self._cumulative_photons,
+                random.uniform(0, self._cumulative_photons[-1], total),
+                "right",
+            ),
+            3,
+        )
+        delay = self._delays[row] + random.uniform(0, self._row_ticks, total)
+        # The half of the first row that lies before its pulse belongs to the pulse before, in
+        # blocks as in the counter.
+        ticks = (
+            random.integers(0, PULSES_PER_BLOCK, total) * PERIOD_TICKS + np.floor(delay).astype(int)
+        ) % BLOCK_TICKS
+        pulses = np.arange(PULSES_PER_BLOCK) * PERIOD_TICKS
+        all_ticks = np.concatenate([pulses, ticks])
+        channels = np.concatenate(
+            [np.full(PULSES_PER_BLOCK, SYNC_MASK, np.uint32), PIXEL_MASKS[pixel]]
+        )
+        order = np.argsort(all_ticks, kind="stable")
+        distinct, begins = np.unique(all_ticks[order], return_index=True)
+        records = np.zeros(len(distinct), RECORD_DTYPE)
+        records["time_ticks"] = distinct
+        records["channels"] = np.bitwise_or.reduceat(channels[order], begins)
+        return records
+
+
+MAGIC = 0xAA
+COMMAND = struct.Struct("<BBHI")
+CLOCK_HZ = 128_000_000
+VERSION = 6
+SHORT_PACKET_BYTES = 510
+CHIP_PACKETS = 3
+MAX_REPLIES = 3
+"""Two in the USB chip, one in the register manager, which then hears no commands."""
+
+SET_SEND_WINDOW, FLUSH = 1, 2
+NO_SUCH_REGISTER = 0xFFFFFFFF
+BOARD_MEMORY_BYTES = 2048 * RECORD_BYTES
+"""What the gateware has: with the USB chip's packets, 3.4 ms at 680,000 records a second."""
+
+UNUSED_BITS = 0x1F
+MAX_BATCH_RECORDS = 1 << 14
+DARK_WAIT_S = 5e-3
+"""Seconds after which an instrument whose time is not the clock's says that nothing comes."""
+POLL_INTERVAL_S = 4e-3
+
+
+@dataclass
+class GroundTruth:
+    """What really happened, for comparison with what the driver says. All in records."""
+
+    registered: int = 0  # photons that the instrument saw
+    lost_memory_full: int = 0  # of these, found its memory full
+    # of these, were in the memory of an instrument that lost its power, and all of
+    # `lost_memory_full` before that
+    lost_power_off: int = 0
+    corrupted: int = 0  # of these, were handed over as something that cannot be a record
+
+
+@dataclass(frozen=True)
+class EmulatorSettings:
+    """How the emulated instrument behaves."""
+
+    # photons come when they are due, and are lost while the memory is full. Otherwise time runs as
+    # fast as the host reads
+    is_paced: bool = False
+    records: int = MAX_TICK  # photons after which it is dark
+    # size of a packet when it is switched on: 510 bytes, as of the public firmware, each of which
+    # ends a transfer, or 512
+    packet_bytes: int = SHORT_PACKET_BYTES
+    # what fits into the instrument besides the USB chip. By default far more than into a real one
+    # (`BOARD_MEMORY_BYTES`), because it shares the processor with the host, which is not always
+    # given its turn in time
+    memory_bytes: int = 64 << 20
+    # register CLEAR holds the memory empty until it is set to 0 again; otherwise any write clears
+    # once
+    clear_is_level: bool = True
+    # the USB chip sends a packet when it is full, or when asked to; otherwise whenever asked
+    holds_packets: bool = True
+    # the request to flush throws an unfinished packet away; otherwise it sends it
+    flush_discards: bool = True
+    # what a killed program left: replies that it never fetched, records in the USB chip and the
+    # memory, and bytes of a command that was cut short
+    stale_replies: int = 1
+    # what a killed program left: replies that it never fetched, records in the USB chip and the
+    # memory, and bytes of a command that was cut short
+    old_records: int = 40
+    # what a killed program left: replies that it never fetched, records in the USB chip and the
+    # memory, and bytes of a command that was cut short
+    jammed_bytes: int = 3
+
+    def __post_init__(self) -> None:
+        if self.packet_bytes not in (SHORT_PACKET_BYTES, PACKET_BYTES):
+            raise InputError(
+                f"a packet has {SHORT_PACKET_BYTES} or {PACKET_BYTES} bytes, got {self.packet_bytes}"
+            )
+        if self.records < 0 or not PACKET_BYTES <= self.memory_bytes <= 1 << 32:
+            raise InputError(
+                "an emulated time tagger needs records >= 0 and a memory of 512 bytes to 4 GiB"
+            )
+
+
+class EmulatedTimeTagger(VirtualDevice):
+    """The instrument.
+
+    Memory: the larger of its own memory and one transfer.
+
+    `light`: makes the light that falls on it from a moment at which its counter is reset; takes how
+    often it was before.
+    """
+
+    def __init__(
+        self,
+        light: Callable[[int], TagStream],
+        serial: str,
+        setting: EmulatorSettings,
+        faults: Iterable[Fault] = (),
+    ) -> None:
+        super().__init__(
+            USB_IDENTITY,
+            ("tofclip", INSTRUMENT, serial),
+            (COMMAND_ENDPOINT, DATA_ENDPOINT, REPLY_ENDPOINT),
+        )
+        self.truth = GroundTruth()
+        self.setting = setting
+        self._make_light = light
+        self._light = light(0)
+        self._resets = 0
+        self._registered_before_reset = 0
+        self._faults = {one.transfer: one for one in faults if one.kind not in REPLY_FAULTS}
+        self._reply_faults = {one.transfer: one for one in faults if one.kind in REPLY_FAULTS}
+        self._has_started = False
+        self._transfers = 0
+        self._replies_asked = 0
+        self._reply_delay = 0
+        self._stalls = 0
+        self._records_to_corrupt = 0
+        self._registers = _make_registers()
+        self._command = COMMAND.pack(MAGIC, 0, Register.VERSION, 0)[: setting.jammed_bytes]
+        self._replies = [b"\x2a\0\0\0"] * setting.stale_replies
+        self._stream = ByteQueue()  # what is in the memory and, before that, in the USB chip
+        self._window = setting.packet_bytes
+        self._unfinished: deque[int] = deque()  # sizes of packets that were finished by request
+        self._started = monotonic()
+        self._mark_lost = False
+        self._segment_bytes = 0
+        self._reported = 0
+        self._leave_old_records()
+
+    def receive(self, endpoint: int, data: bytes) -> None:
+        """Take a command of the host, byte by byte as the gateware does, and queue its reply; what is
+        not a command is passed over.
+
+        `endpoint`: address.
+        """
+        if endpoint != COMMAND_ENDPOINT:
+            raise make_usb_error(errno.EPIPE)
+        # Replies that are not fetched block the register manager.
+        if len(self._replies) >= MAX_REPLIES:
+            return  # swallowed
+        for byte in data:
+            if not self._command and byte != MAGIC:
+                continue
+            self._command += bytes([byte])
+            if len(self._command) == COMMAND.size:
+                self._execute(self._command)
+                self._command = b""
+                return  # what comes with it finds the register manager replying
+
+    def control(self, request: int, value: int) -> None:
+        """Set how many bytes make a packet, or send or discard what is unfinished.
+
+        `request`: `SET_SEND_WINDOW` or `FLUSH`; `value`: bytes of a packet.
+        """
+        chip, rest = self._unsent_bytes()
+        if request == SET_SEND_WINDOW:
+            self._unfinished.extend([self._window] * (chip // self._window))
+            self._unfinished.append(rest)
+            self._window = min(max(value, 1), PACKET_BYTES)
+        # What firmware does with a flush differs; the driver must live with both.
+        elif request == FLUSH and self.setting.flush_discards:
+            self._stream.truncate(len(self._stream) - rest)
+        elif request == FLUSH:
+            self._unfinished.extend([self._window] * (chip // self._window))
+            self._unfinished.append(rest)
+        else:
+            raise make_usb_error(errno.EPIPE)
+
+    def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
+        """Write a reply or time tags into `buffer`, with the faults that were ordered for this
+        transfer.
+
+        `endpoint`: address; `buffer`: overwritten; `timeout`: seconds. Returns bytes.
+        """
+        if endpoint == REPLY_ENDPOINT:
+            return self._send_reply(buffer)
+        if not self._has_started or self._is_held_empty:
+            return self._send_data(buffer, timeout)  # what comes is thrown away
+        fault = self._faults.get(self._transfers)
+        self._transfers += 1
+        return (
+            self._send_data(buffer, timeout)
+            if fault is None
+            else self._apply_fault(fault, buffer, timeout)
+        )
+
+    def clear_halt(self, endpoint: int) -> None:
+        """End a stall, unless it is to come again."""
+        if endpoint == DATA_ENDPOINT:
+            self._stalls -= 1
+        if endpoint != DATA_ENDPOINT or self._stalls <= 0:
+            super().clear_halt(endpoint)
+
+    def _leave_old_records(self) -> None:
+        """Leave what a session before this one did not read."""
+        old = PoissonStream(1e6, CLOCK_HZ, 12345).next_words(self.setting.old_records, MAX_TICK)
+        self._stream.append(old)
+
+    def _execute(self, command: bytes) -> None:
+        _, what, number, value = COMMAND.unpack(command)
+        answer = NO_SUCH_REGISTER
+        if number in set(Register):
+            register = Register(number)
+            if what & 1:
+                self._write_register(register, value)
+            answer = self._registers[register] % (1 << 32)
+        self._replies.append(struct.pack("<I", answer))
+
+    def _send_reply(self, buffer: memoryview) -> int:
+        if not self._replies:
+            raise make_usb_error(errno.ETIMEDOUT)
+        if not self._reply_delay:
+            fault = self._reply_faults.pop(self._replies_asked, None)
+            self._replies_asked += 1
+            if fault is not None and fault.kind == "reply_stall":
+                self.halted.add(REPLY_ENDPOINT)
+                raise make_usb_error(errno.EPIPE)
+            if fault is not None and fault.kind == "reply_lost":
+                self._replies.pop(0)
+                raise make_usb_error(errno.ETIMEDOUT)
+            if fault is not None:
+                self._reply_delay = 1 + fault.amount
+        if self._reply_delay:
+            self._reply_delay -= 1
+            if self._reply_delay:
+                raise make_usb_error(errno.ETIMEDOUT)
+        reply = self._replies.pop(0)
+        buffer[: len(reply)] = reply
+        return len(reply)
+
+    def _write_register(self, register: Register, value: int) -> None:
+        # Read-only.
+        if register in (Register.VERSION, Register.CLOCK):
+            return
+        is_level = register is Register.CLEAR and self.setting.clear_is_level
+        if register in (Register.RECORDS, Register.LOST, Register.CLEAR) and not is_level:
+            value = 0
+        if register is Register.RECORDS:
+            self._reported = self._segment_bytes = 0
+        if register is Register.CLEAR and (value & 1 or not is_level):
+            self._clear_memory()
+        if register is Register.CAPTURE:
+            self._switch_capture(Capture(value & 7))
+        self._registers[register] = value
+
+    def _switch_capture(self, to: Capture) -> None:
+        if Capture.REGISTER not in to:
+            self._register_until_now()
+        elif not self._has_started and self._capture is Capture.OFF and Capture.COUNT in to:
+            self._store_zero()
+        if Capture.RESET in to and self.truth.registered > self._registered_before_reset:
+            self._registered_before_reset = self.truth.registered
+            self._resets += 1
+            self._light = self._make_light(self._resets)
+        if Capture.COUNT in to and Capture.COUNT not in self._capture:
+            self._started = monotonic()
+        self._has_started |= Capture.REGISTER in to
+
+    @property
+    def _capture(self) -> Capture:
+        return Capture(self._registers[Register.CAPTURE] & 7)
+
+    def _store_zero(self) -> None:
+        """Registration that begins together with the counter sees the counter's zero as a wrap."""
+        self.truth.registered += 1
+        words = np.zeros(RECORD_BYTES, np.uint8)
+        words[0] = WRAP << 5
+        self._store(words)
+
+    def _unsent_bytes(self) -> tuple[int, int]:
+        """Return the bytes in the USB chip that belong to no packet which was finished by request,
+        and how many of them make no full packet.
+        """
+        chip = min(len(self._stream), CHIP_PACKETS * self._window)
+        unsent = max(0, chip - sum(self._unfinished))
+        return unsent, unsent % self._window
+
+    def _clear_memory(self) -> None:
+        """Forget the memory. The USB chip keeps what it has, and the rest of a record of which it
+        has the beginning follows.
+        """
+        self._reported += -(-self._segment_bytes // RECORD_BYTES)
+        self._segment_bytes = 0
+        chip = 0
+        if self.setting.holds_packets:
+            chip = min(len(self._stream), CHIP_PACKETS * self._window)
+        self._stream.truncate(chip + (len(self._stream) - chip) % RECORD_BYTES)
+        if not self._stream:
+            self._unfinished.clear()
+
+    def _register_until_now(self, in_flight: int = 0) -> None:
+        """Register what fell on the instrument up to now, where that depends on the time.
+
+        `in_flight`: bytes that a transfer under way takes besides what the instrument holds.
+        """
+        if not self.setting.is_paced or Capture.REGISTER not in self._capture:
+            return
+        tick = int((monotonic() - self._started) * CLOCK_HZ)
+        # Photons beyond memory, chip and the transfer under way have nowhere to go.
+        capacity = self.setting.memory_bytes + CHIP_PACKETS * self._window + in_flight
+        found = MAX_BATCH_RECORDS
+        while found == MAX_BATCH_RECORDS:
+            words = self._register_photons(MAX_BATCH_RECORDS, tick)
+            found = len(words) // RECORD_BYTES
+            room = max(0, capacity - len(self._stream)) // RECORD_BYTES * RECORD_BYTES
+            self._store(words[:room])
+            self._discard(words[room:])
+
+    def _register_photons(self, limit: int, last: int = MAX_TICK) -> ByteView:
+        """Return the words of the next photons, at most `limit`."""
+        words = self._light.next_words(
+            max(0, min(limit, self.setting.records - self.truth.registered)), last
+        )
+        self.truth.registered += len(words) // RECORD_BYTES
+        return words
+
+    def _store(self, words: ByteView) -> None:
+        if len(words) == 0:
+            return
+        if self._mark_lost:
+            words[0] |= LOST << 5
+            self._mark_lost = False
+        # Bits that have to be zero are set, by which a decoder can recognise them.
+        garbled = min(self._records_to_corrupt, len(words) // RECORD_BYTES)
+        words[: garbled * RECORD_BYTES] |= UNUSED_BITS
+        self.truth.corrupted += garbled
+        self._records_to_corrupt = 0
+        self._registers[Register.RECORDS] += len(words) // RECORD_BYTES
+        if not self._is_held_empty:
+            self._stream.append(words)
+
+    def _discard(self, words: ByteView) -> None:
+        lost = len(words) // RECORD_BYTES
+        self.truth.lost_memory_full += lost
+        self._registers[Register.LOST] += lost
+        self._mark_lost |= lost > 0
+
+    @property
+    def _is_held_empty(self) -> bool:
+        return self.setting.clear_is_level and bool(self._registers[Register.CLEAR] & 1)
+
+    def _send_data(self, buffer: memoryview, timeout: float) -> int:
+        """Send packets until the host's buffer is full, a short one ends the transfer, or
+        `timeout` seconds have passed.
+        """
+        deadline = monotonic() + timeout
+        self._register_until_now()  # until now no transfer was under way
+        length = 0
+        while True:
+            taken, is_over = self._take_packets(buffer[length:])
+            length += taken
+            if is_over or length == len(buffer):
+                break
+            if not self._wait_for_photons(len(buffer) - length, deadline):
+                if not self.setting.holds_packets:
+                    length += self._stream.read_into(buffer[length:])
+                if not length:
+                    raise make_usb_error(errno.ETIMEDOUT)
+                break
+        if not self._is_held_empty:  # what is thrown away was not handed over
+            self._segment_bytes += length
+        return length
+
+    def _take_packets(self, buffer: memoryview) -> tuple[int, bool]:
+        """Move packets into the host's buffer; return their bytes, and whether the last was short
+        and ended the transfer.
+        """
+        taken = 0
+        while self._unfinished:
+            size = self._unfinished[0]
+            if size > len(buffer) - taken:
+                return taken, True
+            self._unfinished.popleft()
+            taken += self._stream.read_into(buffer[taken : taken + size])
+            if size < PACKET_BYTES:
+                return taken, True
+        if self._window == PACKET_BYTES:
+            whole = min(len(self._stream), len(buffer) - taken) // PACKET_BYTES * PACKET_BYTES
+            return taken + self._stream.read_into(buffer[taken : taken + whole]), False
+        if len(self._stream) < self._window:
+            return taken, False
+        size = min(self._window, len(buffer) - taken)
+        return taken + self._stream.read_into(buffer[taken : taken + size]), True
+
+    def _wait_for_photons(self, room: int, deadline: float) -> bool:
+        """Wait for more; False when nothing more comes in time."""
+        if self.setting.is_paced:
+            if Capture.REGISTER not in self._capture or monotonic() >= deadline:
+                return False
+            sleep(min(POLL_INTERVAL_S, max(deadline - monotonic(), 0)))
+            self._register_until_now(room)
+            return True
+        wanted = room if self._window == PACKET_BYTES else min(self._window, room)
+        before = len(self._stream)
+        if Capture.REGISTER in self._capture:
+            missing = max(wanted - len(self._stream), 1)
+            self._store(self._register_photons(-(-missing // RECORD_BYTES)))
+        if len(self._stream) > before:
+            return True
+        sleep(max(0.0, min(deadline - monotonic(), DARK_WAIT_S)))
+        return False
+
+    def _send_cut(self, buffer: memoryview, timeout: float) -> int:
+        """Fill a small buffer with the beginning of what there is."""
+        while len(self._stream) < len(buffer):
+            if not self._wait_for_photons(len(buffer), monotonic() + timeout):
+                break
+        length = self._stream.read_into(buffer)
+        rest = length
+        while rest and self._unfinished:
+            part = min(rest, self._unfinished[0])
+            self._unfinished[0] -= part
+            rest -= part
+            if not self._unfinished[0]:
+                self._unfinished.popleft()
+        if not length:
+            raise make_usb_error(errno.ETIMEDOUT)
+        if not self._is_held_empty:
+            self._segment_bytes += length
+        return length
+
+    def _apply_fault(self, fault: Fault, buffer: memoryview, timeout: float) -> int:
+        """Do what a fault orders: some are an exception, some a smaller or stranger transfer."""
+        # Faults of the transfer itself come first, then those of its contents.
+        if fault.kind == "timeout":
+            raise make_usb_error(errno.ETIMEDOUT)
+        if fault.kind in ("stall", "unplug", "powerloss"):
+            raise self._interrupt(fault)
+        if fault.kind == "overflow":
+            lost_on_the_wire = self._send_data(buffer, timeout)
+            if not self._is_held_empty:
+                self._segment_bytes -= lost_on_the_wire
+            raise make_usb_error(errno.EOVERFLOW)
+        if fault.kind == "short":
+            return self._send_cut(buffer[: max(1, min(fault.amount, len(buffer)))], timeout)
+        if fault.kind == "lost":
+            self._discard(self._register_photons(fault.amount))
+        else:
+            self._records_to_corrupt = fault.amount
+        return self._send_data(buffer, timeout)
+
+    def _interrupt(self, fault: Fault) -> USBError:
+        if fault.kind == "stall":
+            self.halted.add(DATA_ENDPOINT)
+            self._stalls = fault.amount
+            return make_usb_error(errno.EPIPE)
+        if fault.kind == "powerloss":
+            self._reported += -(-self._segment_bytes // RECORD_BYTES)
+            self._segment_bytes = 0
+            self._stream.clear()
+            self._unfinished.clear()
+            self._window = self.setting.packet_bytes
+            self._replies.clear()
+            self._command = b""
+            self.truth.lost_power_off += (
+                self._registers[Register.RECORDS] + self._registers[Register.LOST] - self._reported
+            )
+            self._registers = _make_registers()
+            self._reported = 0
+            self._mark_lost = False
+        self.unplug(fault.amount)
+        return make_usb_error(errno.ENODEV)
+
+
+def _make_registers() -> dict[Register, int]:
+    return {**dict.fromkeys(Register, 0), Register.VERSION: VERSION, Register.CLOCK: CLOCK_HZ}
+
+
+POISSON_RATE_HZ = 12_800_000.0
+SCENE_RATE_HZ = 1_000_000.0
+EMULATOR_OPTIONS = (
+    "seed",
+    "light",
+    "rate",
+    "pace",
+    "records",
+    "packet_bytes",
+    "memory_mib",
+    "faults",
+)
+
+
+def open_timetag(uri: Uri) -> StreamSource:
+    """Open ``sim+timetag://?seed=1``: an emulated time tagger behind the real driver.
+
+    Besides the driver's own (`devices.timetag.driver.OPTIONS`) it takes ``light=poisson|scene``
+    (`PoissonStream` on all channels, or a `PulsedSceneStream`), ``rate`` (photons per second of its
+    clock), ``pace=fast|realtime``, ``records`` (then it is dark), ``packet_bytes=510|512``,
+    ``memory_mib`` and ``faults`` (as `Fault.parse` reads them). The board's own memory, with which
+    it loses what a loaded computer does not fetch within 3 ms, is ``memory_mib=0.01172``.
+    """
+    uri.reject_unknown(*OPTIONS, *EMULATOR_OPTIONS)
+    seed = uri.value("seed", int, 0)
+    if not 0 <= seed < 1 << 63:
+        raise InputError(f"'{uri.text}': a seed must be within 0 and 2**63")
+    standard = EmulatorSettings()
+    setting = EmulatorSettings(
+        uri.choice("pace", "fast", "realtime") == "realtime",
+        uri.value("records", int, standard.records),
+        uri.value("packet_bytes", int, standard.packet_bytes),
+        int(uri.value("memory_mib", float, standard.memory_bytes / (1 << 20)) * (1 << 20)),
+    )
+    serial = uri.location  # the real ones have none
+    instrument = EmulatedTimeTagger(
+        _make_stream(uri, seed), serial, setting, Fault.parse(uri.value("faults", str, ""))
+    )
+    return open_on_backend(uri, serial, VirtualUsb(instrument))
+
+
+def _make_stream(uri: Uri, seed: int) -> Callable[[int], TagStream]:
+    if uri.choice("light", "poisson", "scene") == "poisson":
+        rate = uri.value("rate", float, POISSON_RATE_HZ)
+        return lambda resets: PoissonStream(rate, CLOCK_HZ, seed + resets)
+    scene, scene_rate = simulate_line_light(), uri.value("rate", float, SCENE_RATE_HZ)
+    return lambda resets: PulsedSceneStream(scene, scene_rate, CLOCK_HZ, seed + resets)

@@ -1,0 +1,451 @@
+"""Files of time-correlated single-photon counting: photons one by one (PicoQuant's PTU, Swabian
+Instruments' TTBIN) and whole histograms (PicoQuant's PHU, Becker & Hickl's SDT).
+
+::
+
+    file -> reader: pieces of records -> TcspcFile, a source
+
+The libraries `ptufile` and `sdtfile` (extra ``tcspc``) and Swabian Instruments' own read them.
+
+Streak images in files (ITEX, HPD-TA's TIFF) as sources of one frame, next to the cameras that
+took them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from devices.address import Uri
+from devices.source import READ_TIMEOUT_S, Batch, Info, Ledger, Records, Source, Stats
+from tofclip.errors import FileFormatError, InputError, TofclipError
+from tofclip.files import (
+    BoundedFile,
+    format_error_line,
+    import_file_reader,
+    require_bounded_size,
+    translate_read_errors,
+)
+from tofclip.io import read_streak
+from tofclip.io.tcspc import (
+    TCSPC,
+    Checkpoint,
+    PtuEvents,
+    PulseCount,
+    read_sdt_blocks,
+    require_pulses,
+)
+from tofclip.shots import Streak
+from tofclip.storage import Field, Record, Scalar
+
+HISTOGRAM_BYTES = 4
+"""Of one bin in a PHU file."""
+
+PHOTON_DTYPE = np.dtype([("sync", "<u8"), ("bin", "<u4"), ("channel", "<u4")])
+"""`sync`: number of the laser's pulse. `bin`: time after it, in the file's resolution. `channel`:
+from 0.
+"""
+
+BATCH_RECORDS = 1 << 16
+MAX_HISTOGRAM_FILE_BYTES = 1 << 31
+"""Larger files of histograms are not read: they would not fit into memory four times over."""
+
+MAX_BINS = 1 << 20
+SWABIAN_CHUNK_TAGS = 1 << 20
+SWABIAN_TAG, SWABIAN_MISSED = 0, 4
+"""Types of Swabian Instruments' events: a time tag, and a number of tags that were lost."""
+
+PICOSECOND_S = 1e-12
+
+
+class Reader(Protocol):
+    """A file as pieces of records."""
+
+    info: Info
+    attributes: dict[str, Scalar]
+    """Of the calibration."""
+    sizes: list[int]
+    """Records of each piece."""
+    lost: int
+    """Records that the electronics say they lost."""
+
+    def decode(self, piece: int) -> Records:
+        """Return the records of a piece."""
+
+
+class TcspcFile(Source):
+    """A file's records. Memory: one piece of it, decoded.
+
+    The calibration has ``resolution_s``, the width of a bin, and ``channels``; of photons also
+    ``laser_period_s``, of images ``rows`` and ``columns``.
+
+    `open_file`: makes the file's reader.
+    """
+
+    def __init__(self, path: str | Path, open_file: Callable[[Path], Reader]) -> None:
+        try:
+            with translate_read_errors(path):
+                Path(path).stat()  # some libraries say of an absent file that it is damaged
+                self._reader = open_file(Path(path))
+        except TofclipError:
+            raise
+        except Exception as fault:  # whatever the library stumbles over, the file is damaged
+            raise FileFormatError(
+                path, f"is a damaged or unsupported file ({format_error_line(fault)})"
+            ) from fault
+        self._begins = [0, *accumulate(self._reader.sizes)]
+        self._closed = False
+        self._decoded: tuple[int, Records] | None = None
+        self.seek(0)
+
+    @property
+    def info(self) -> Info:
+        return self._reader.info
+
+    @property
+    def calibration(self) -> Record:
+        return Record("tcspc_calibration", attributes=self._reader.attributes)
+
+    @property
+    def stats(self) -> Stats:
+        return self._ledger.stats
+
+    @property
+    def is_seekable(self) -> bool:
+        return True
+
+    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
+        """Return the next batch at once; `timeout` does not matter."""
+        first = self._next
+        if self._closed or first == self._begins[-1]:
+            return None
+        piece = int(np.searchsorted(self._begins, first, "right")) - 1
+        if self._decoded is None or self._decoded[0] != piece:
+            self._decoded = None  # one at a time
+            self._decoded = piece, self._reader.decode(piece)
+        start = first - self._begins[piece]
+        records = self._decoded[1][start : start + BATCH_RECORDS]
+        self._next += len(records)
+        self._ledger.deliver(len(records), 0)
+        return Batch(records, first)
+
+    def seek(self, record: int) -> None:
+        if not 0 <= record <= self._begins[-1]:
+            raise InputError(
+                f"the file has {self._begins[-1]} records, there is no number {record}"
+            )
+        self._next, self._ledger = record, Ledger()
+        self._ledger.receive(self._begins[-1])
+        self._ledger.deliver(record, 0)
+        self._ledger.lose(self._reader.lost)
+
+    def close(self) -> None:
+        self._closed = True
+
+
+@dataclass
+class Histograms:
+    """Whole histograms as one piece; see `Reader`."""
+
+    records: Records
+    info: Info
+    attributes: dict[str, Scalar]
+    sizes: list[int] = field(init=False)
+    lost: int = 0
+
+    def __post_init__(self) -> None:
+        self.sizes = [len(self.records)]
+
+    def decode(self, piece: int) -> Records:
+        """Return all of them."""
+        return self.records
+
+
+class PtuPhotons:
+    """Photons of a PTU file; see `Reader`. Opening reads the file once, to know its channels and
+    where each piece begins. Markers are passed over; pictures are read by `tofclip.lidar.photons`.
+
+    `sync`: channel of the laser's pulses in T2 mode; by default the electronics' own input for
+    them.
+    """
+
+    lost = 0
+
+    def __init__(self, path: Path, sync: int | None = None) -> None:
+        self._events = events = PtuEvents(path, sync)
+        self._checkpoints, self.sizes, channels = [Checkpoint()], [], 1
+        for found, behind in events:
+            self._checkpoints.append(behind)
+            self.sizes.append(int(found.is_photon.sum()))
+            channels = max(channels, int(found.channel.max(initial=0, where=found.is_photon)) + 1)
+        period = events.period
+        if not events.is_t3:
+            count = self._checkpoints[-1].count
+            require_pulses(path, count)
+            period = count.period_ticks * events.tick
+        self.attributes = _describe_photons(events.resolution, channels, period, path)
+        self.info = Info(f"TCSPC file ({events.kind})", "", dict(self.attributes))
+
+    def decode(self, piece: int) -> Records:
+        """Return the photons of a million events."""
+        found = self._events.decode(piece, self._checkpoints[piece])[0]
+        columns = (found.pulse, found.delay, found.channel)
+        return _make_photons(*(column[found.is_photon] for column in columns))
+
+
+class SwabianPhotons:
+    """Photons of Swabian Instruments' files; see `Reader`. Their library reads forwards only, so
+    that stepping back begins anew.
+
+    `sync`: channel of the laser's pulses, as the instrument numbers it: negative for falling edges.
+    All others become channels from 0, in the order of their numbers.
+    """
+
+    def __init__(self, path: Path, sync: int) -> None:
+        self._library = import_file_reader("Swabian.TimeTagger", "swabian-timetagger")
+        self._path, self._sync = path, sync
+        self._inputs: list[int] = []
+        self._rewind()
+        self.sizes, self.lost = [], 0
+        inputs: set[int] = set()
+        count = PulseCount()
+        while self._file.hasData():
+            (_, _, channel), lost = self._read_next()
+            inputs |= set(np.unique(channel).tolist())
+            self.sizes.append(len(channel))
+            self.lost += lost
+            count = self._count
+        if count.pulses < 2:
+            raise InputError(
+                f"{path}: has no laser's pulses on channel {sync}; name theirs: sync=..., other "
+                f"channels are {', '.join(map(str, sorted(inputs))) or 'none'}"
+            )
+        self._inputs = sorted(inputs)
+        self._rewind()
+        self.attributes = _describe_photons(
+            PICOSECOND_S, max(1, len(inputs)), count.period_ticks * PICOSECOND_S, path
+        )
+        details = {**self.attributes, "inputs": ",".join(map(str, self._inputs))}
+        self.info = Info("time tags (Swabian Instruments)", "", details)
+
+    def decode(self, piece: int) -> Records:
+        """Return the photons of a million tags."""
+        if piece < self._next:
+            self._rewind()
+        while True:
+            (pulse, delay, channel), _ = self._read_next()
+            if self._next == piece + 1:
+                return _make_photons(pulse, delay, np.searchsorted(self._inputs, channel))
+
+    def _rewind(self) -> None:
+        said: list[str] = []  # in lines of its own otherwise
+        self._library.setLogger(lambda level, message: said.append(message))
+        try:
+            self._file = self._library.FileReader(str(self._path))
+            self._file.getConfiguration()  # which fails for a damaged file; opening it does not
+        except Exception as fault:  # its own, which are not known before it is imported
+            why = said[0] if said else format_error_line(fault)
+            raise FileFormatError(
+                self._path, f"is a damaged or unsupported file ({why})"
+            ) from fault
+        finally:
+            self._library.setLogger(None)
+        self._count, self._next = PulseCount(), 0
+
+    def _read_next(
+        self,
+    ) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], int]:
+        """Return number of the pulse, time after it and channel of the next photons, and how many
+        tags the instrument lost among them.
+        """
+        tags = self._file.getData(SWABIAN_CHUNK_TAGS)
+        kind, channel = np.asarray(tags.getEventTypes()), np.asarray(tags.getChannels(), np.int64)
+        time = np.asarray(tags.getTimestamps(), np.int64)
+        is_tag = kind == SWABIAN_TAG
+        is_pulse = is_tag & (channel == self._sync)
+        pulse, delay, self._count = self._count.find_pulses(time, is_pulse)
+        is_photon = is_tag & ~is_pulse & (pulse >= 0)
+        lost = int(np.asarray(tags.getMissedEvents())[kind == SWABIAN_MISSED].sum())
+        self._next += 1
+        return (pulse[is_photon], delay[is_photon], channel[is_photon]), lost
+
+
+def open_ptu(uri: Uri) -> TcspcFile:
+    """Open ``file://run.ptu``; ``sync=N`` where a file in T2 mode has the laser's pulses on an input
+    for photons.
+    """
+    uri.reject_unknown("sync")
+    sync = uri.value("sync", int, 0) if "sync" in uri.values else None
+    return TcspcFile(uri.location, lambda path: PtuPhotons(path, sync))
+
+
+def open_ttbin(uri: Uri) -> TcspcFile:
+    """Open ``file://run.ttbin?sync=1``; ``sync`` is the channel of the laser's pulses."""
+    uri.reject_unknown("sync")
+    if "sync" not in uri.values:
+        raise InputError(f"'{uri.text}': name the channel of the laser's pulses: sync=1")
+    sync = uri.value("sync", int, 0)
+    return TcspcFile(uri.location, lambda path: SwabianPhotons(path, sync))
+
+
+def open_phu(uri: Uri) -> TcspcFile:
+    """Open ``file://run.phu``."""
+    uri.reject_unknown()
+    return TcspcFile(uri.location, _read_picoquant_histograms)
+
+
+def open_sdt(uri: Uri) -> TcspcFile:
+    """Open ``file://run.sdt``; an image's pixels are its channels, row by row."""
+    uri.reject_unknown()
+    return TcspcFile(uri.location, _read_becker_hickl_histograms)
+
+
+def compute_photon_times(photons: Records, calibration: Record) -> NDArray[np.float64]:
+    """Return when each photon came, s after the laser's pulse: the beginning of its bin.
+
+    `photons` (n,): with a field ``bin``; `calibration`: gives the resolution, s. Returns (n,).
+    """
+    times: NDArray[np.float64] = photons["bin"] * calibration.number("resolution_s")
+    return times
+
+
+def _make_photons(pulse: Any, delay: Any, channel: Any) -> Records:
+    photons = np.empty(len(pulse), PHOTON_DTYPE)
+    photons["sync"], photons["bin"], photons["channel"] = pulse, delay, channel
+    return photons
+
+
+def _describe_photons(
+    resolution: float, channels: int, period: float, path: Path
+) -> dict[str, Scalar]:
+    found: dict[str, Scalar] = {
+        "resolution_s": _require_positive(resolution, path),
+        "channels": channels,
+    }
+    return {**found, "laser_period_s": period} if period else found
+
+
+def _read_picoquant_histograms(path: Path) -> Histograms:
+    _require_moderate_size(path)
+    ptufile = import_file_reader("ptufile", TCSPC)
+    with BoundedFile(path) as opened, ptufile.PhuFile(opened) as file:
+        bins = np.ravel(file.tags["HistResDscr_HistogramBins"]).tolist()
+        require_bounded_size(
+            path, "histograms", sum(map(abs, bins)) * HISTOGRAM_BYTES, path.stat().st_size
+        )
+        return _make_histograms(
+            file.histograms(), float(file.tcspc_resolution), "PicoQuant histograms", path
+        )
+
+
+def _read_becker_hickl_histograms(path: Path) -> Histograms:
+    _require_moderate_size(path)
+    blocks, resolution = read_sdt_blocks(path)
+    curves = [curve for block in blocks for curve in block.reshape(-1, block.shape[-1])]
+    found = _make_histograms(curves, resolution, "Becker & Hickl histograms", path)
+    if len({block.shape for block in blocks}) == 1 and blocks[0].ndim == 3:
+        rows, columns, _ = blocks[0].shape
+        found.attributes |= {"rows": rows, "columns": columns}
+        found.info = Info(found.info.instrument, "", dict(found.attributes))
+    return found
+
+
+def _require_moderate_size(path: Path) -> None:
+    if path.stat().st_size > MAX_HISTOGRAM_FILE_BYTES:
+        raise FileFormatError(
+            path, f"is larger than {MAX_HISTOGRAM_FILE_BYTES} bytes; export a part of it"
+        )
+
+
+def _make_histograms(curves: Any, resolution: float, instrument: str, path: Path) -> Histograms:
+    lengths = {len(curve) for curve in curves}
+    if len(lengths) != 1 or not 0 < max(lengths) <= MAX_BINS:
+        raise FileFormatError(
+            path, f"has histograms of {sorted(lengths) or 'no'} bins, expected one length"
+        )
+    counts = np.stack(list(curves))
+    records = np.zeros(len(counts), [("channel", "<u4"), ("histogram", "<u4", counts.shape[1:])])
+    records["channel"], records["histogram"] = np.arange(len(counts)), counts
+    attributes: dict[str, Scalar] = {
+        "resolution_s": _require_positive(resolution, path),
+        "channels": len(counts),
+    }
+    return Histograms(records, Info(instrument, "", dict(attributes)), attributes)
+
+
+def _require_positive(resolution: float, path: Path) -> float:
+    """Return a bin's duration, s, if it can be one."""
+    if not (np.isfinite(resolution) and resolution > 0):
+        raise FileFormatError(path, f"says that its bins last {resolution} s")
+    return resolution
+
+
+class StreakFile(Source):
+    """One frame, and the time axis that its file brings."""
+
+    def __init__(self, streak: Streak) -> None:
+        self._streak = streak
+        frame = np.zeros(1, [("number", "<i8"), ("counts", "<f4", streak.counts.shape)])
+        frame["counts"] = streak.counts
+        self._frame = frame
+        self._closed = False
+        self.seek(0)
+
+    @property
+    def info(self) -> Info:
+        rows, columns = self._streak.counts.shape
+        known = self._streak.metadata
+        name = known.get("Camera/CameraName", "")
+        details = {
+            "rows": rows,
+            "columns": columns,
+            "camera": name,
+            "date": known.get("Application/Date", ""),
+        }
+        return Info("streak image in a file", known.get("Camera/SerialNumber", ""), details)
+
+    @property
+    def calibration(self) -> Record | None:
+        """Time of each row in s, where the file has one."""
+        if self._streak.row_times is None:
+            return None
+        return Record(
+            "streak_calibration", {"row_times": Field(self._streak.row_times, "s", ("row",))}
+        )
+
+    @property
+    def stats(self) -> Stats:
+        return self._ledger.stats
+
+    @property
+    def is_seekable(self) -> bool:
+        return True
+
+    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
+        """Return the frame, then None; `timeout` does not matter."""
+        if self._closed or self._ledger.stats.unread == 0:
+            return None
+        self._ledger.deliver(1, 0)
+        return Batch(self._frame)
+
+    def seek(self, record: int) -> None:
+        if record not in (0, 1):
+            raise InputError(f"a picture is one record, there is no number {record}")
+        self._ledger = Ledger()
+        self._ledger.receive(1)
+        self._ledger.deliver(record, 0)
+
+    def close(self) -> None:
+        self._closed = True
+
+
+def open_streak_file(uri: Uri) -> StreakFile:
+    """Open ``file://shot.img`` or ``file://shot.tif``."""
+    uri.reject_unknown()
+    return StreakFile(read_streak(uri.location))

@@ -1,0 +1,348 @@
+"""Bins of time, and the sum over everything that was put into them.
+
+One histogram for each kind of photon record.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from devices.linospad2 import CLOCK_PERIOD_S, PIXELS, BoardCalibration
+from devices.source import Records
+from devices.timetag.codec import DELTA
+from tofclip.camera import Camera
+from tofclip.errors import InputError, ShapeError
+from tofclip.shots import Streak
+from tofclip.threads import run_blocks, thread_count
+
+__all__ = [
+    "Accumulator",
+    "BinAxis",
+    "StampHistogram",
+    "TagHistogram",
+    "TimeHistogram",
+]
+
+
+MAX_CELLS = 1 << 26
+"""Bins of all pixels together: half a gigabyte for each thread."""
+
+MIN_WIDTH_BINS = 1e-3
+"""Bins over which a photon is shared out at least; a step of no width would be infinitely high."""
+
+ROUNDING_PHOTONS = 1e-6
+"""Photons in a bin that are rounding errors of adding up steps, not photons."""
+
+_MIN_PIECE = 1 << 16
+
+
+@dataclass(frozen=True)
+class BinAxis:
+    """Bins of equal width; bin k lies around ``start + k * bin_width``.
+
+    Parameters
+    ----------
+    bin_width : float
+        s.
+    bins : int
+    start : float
+        Middle of the first bin, s after the laser's pulse.
+    period : float or None
+        Time between two pulses of the laser, s: photons of all periods add up. None: there is one
+        pulse only, or every photon is already counted from its own pulse.
+
+    Raises
+    ------
+    InputError
+        A number is not positive and finite, or the bins are longer than the period.
+    """
+
+    bin_width: float
+    bins: int
+    start: float = 0.0
+    period: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (
+            math.isfinite(self.bin_width)
+            and self.bin_width > 0
+            and math.isfinite(self.start)
+            and self.bins >= 1
+        ):
+            raise InputError(f"bins need a positive width, a number and a start, got {self}")
+        if self.period is None:
+            return
+        if not (math.isfinite(self.period) and self.period > 0):
+            raise InputError(
+                f"the laser's period must be a positive number of seconds, got {self.period}"
+            )
+        # A relative tolerance, because a width is often computed as period / bins.
+        if self.bins * self.bin_width > self.period * (1 + 1e-9):
+            raise InputError(
+                f"{self.bins} bins of {self.bin_width:.4g} s are longer than the laser's period of {self.period:.4g} s"
+            )
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Middle of each bin, s."""
+        times: NDArray[np.float64] = self.start + np.arange(self.bins) * np.float64(self.bin_width)
+        return times
+
+    @property
+    def shift_bins(self) -> float:
+        """Where the laser's pulse lies, bins."""
+        return 0.5 - self.start / self.bin_width
+
+    @property
+    def period_bins(self) -> float:
+        """Bins in the laser's period, 0 for none."""
+        return 0.0 if self.period is None else self.period / self.bin_width
+
+
+class Accumulator:
+    """Photons of a line of pixels, added up over any number of batches.
+
+    Memory: 8 bytes for each bin, pixel and thread, however many photons come.
+
+    Parameters
+    ----------
+    pixels : int
+    axis : BinAxis
+    hot_pixels : sequence of int
+        Pixels of which nothing can be believed.
+    """
+
+    def __init__(
+        self, pixels: int, axis: BinAxis, hot_pixels: NDArray[np.int64] | tuple[int, ...] = ()
+    ) -> None:
+        if pixels < 1 or pixels * axis.bins > MAX_CELLS:
+            raise InputError(
+                f"{pixels} pixels of {axis.bins} bins are none, or more than {MAX_CELLS} cells"
+            )
+        self.pixels, self.axis = pixels, axis
+        self._hot = np.asarray(hot_pixels, np.int64)
+        self._parts: list[NDArray[np.float64]] = []
+
+    @property
+    def counts(self) -> NDArray[np.float64]:
+        """Photons in each bin of each pixel so far, (bins, pixels); right to a millionth of a
+        photon.
+        """
+        total = np.zeros((self.pixels, self.axis.bins + 2))
+        for part in self._parts:
+            total += part
+        # steps add up to the density; the last two bins hold what lies beyond the axis
+        photons = np.cumsum(total[:, : self.axis.bins], axis=1).T
+        # steps up and down cancel to rounding only
+        photons[photons < ROUNDING_PHOTONS] = 0
+        return photons
+
+    def to_streak(self, camera: Camera | None = None, source: str = "photon histogram") -> Streak:
+        """Return the sum so far as a streak image: rows are instants after the laser's pulse,
+        columns are pixels.
+
+        Hot pixels are marked in ``Streak.saturated``, so that recovery does not rely on them.
+
+        Parameters
+        ----------
+        camera : Camera, optional
+        source : str
+            What the streak image calls its source.
+
+        Returns
+        -------
+        Streak
+            Counts (bins, pixels) float32.
+
+        Raises
+        ------
+        InputError
+            No photon came.
+        """
+        counts = self.counts.astype(np.float32)
+        untrusted = np.zeros(counts.shape, bool)
+        untrusted[:, self._hot] = True
+        return Streak(counts, self.axis.times, untrusted, camera=camera, source=source)
+
+    def _add_in_parallel(self, add: Callable[[slice, NDArray[Any]], None], total: int) -> None:
+        """Call `add` on pieces of ``range(total)``, each with an array of steps that no other
+        thread uses.
+        """
+        size = max(_MIN_PIECE, -(-total // thread_count()))
+        # a sum for each piece, so that threads never write to the same one
+        while len(self._parts) * size < total:
+            self._parts.append(np.zeros((self.pixels, self.axis.bins + 2)))
+        run_blocks(lambda piece: add(piece, self._parts[piece.start // size]), total, size)
+
+
+_WORD_DTYPE = np.dtype("<u4")
+
+
+class StampHistogram(Accumulator):
+    """Time stamps of LinoSPAD2.
+
+    The laser's pulses are locked to the board's clock and a cycle begins with one of them, so that
+    a stamp's time since its cycle began, modulo the laser's period, is its time after a pulse. A
+    photon is shared out evenly over the instants that its code covers.
+
+    Parameters
+    ----------
+    axis : BinAxis
+    calibration : BoardCalibration
+    """
+
+    def __init__(self, axis: BinAxis, calibration: BoardCalibration) -> None:
+        super().__init__(PIXELS, axis, calibration.hot_pixels)
+        begins = (
+            calibration.code_begins + calibration.offsets[:, np.newaxis]
+        ) / axis.bin_width + axis.shift_bins
+        widths = np.maximum(
+            (calibration.code_ends - calibration.code_begins) / axis.bin_width, MIN_WIDTH_BINS
+        )
+        if axis.period is not None:
+            begins %= axis.period_bins  # small numbers keep their digits in float32
+        self._codes = np.stack([begins, widths], axis=-1).astype(np.float32)
+
+    def add(self, records: Records) -> None:
+        """Add time stamps, an array of `devices.linospad2.STAMP_DTYPE` (with or without
+        counter).
+        """
+        if records.dtype.names is None or records.dtype.names[-2:] != ("code", "pixel"):
+            raise InputError(f"LinoSPAD2's time stamps end in code and pixel, got {records.dtype}")
+        from devices.histogram_kernels import add_stamps
+
+        rows = np.ascontiguousarray(records).view(_WORD_DTYPE).reshape(len(records), -1)
+        clock, period = CLOCK_PERIOD_S / self.axis.bin_width, self.axis.period_bins
+
+        strays: list[int] = []  # appending is safe on several threads
+
+        def add(piece: slice, steps: NDArray[Any]) -> None:
+            strays.append(add_stamps(rows[piece], clock, self._codes, period, steps))
+
+        self._add_in_parallel(add, len(records))
+        if any(strays):
+            raise InputError(
+                f"LinoSPAD2 has {PIXELS} pixels; {sum(strays)} time stamps are of others"
+            )
+
+
+class TagHistogram(Accumulator):
+    """Time tags of a counter with a few channels, one of which sees the laser.
+
+    A photon's time is counted from the last pulse before it; after a gap, photons are left out
+    until the next pulse.
+
+    Parameters
+    ----------
+    axis : BinAxis
+    sync_channel : int
+        Where the laser's pulses arrive.
+    pixel_channels : tuple of int
+        The channel of each pixel of the line.
+    tick : float
+        Duration of a tick of the counter, s.
+    """
+
+    def __init__(
+        self, axis: BinAxis, sync_channel: int, pixel_channels: tuple[int, ...], tick: float
+    ) -> None:
+        super().__init__(len(pixel_channels), axis)
+        channels = [sync_channel, *pixel_channels]
+        if len(set(channels)) < len(channels) or not all(0 <= channel < 8 for channel in channels):
+            raise InputError(
+                f"sync and pixels need channels of their own within 0..7, got {channels}"
+            )
+        if not (np.isfinite(tick) and tick > 0):
+            raise InputError(f"a tick must be a positive number of seconds, got {tick}")
+        self._sync = 1 << sync_channel
+        self._pixel_of = np.full(max(channels) + 1, -1, np.int64)
+        self._pixel_of[list(pixel_channels)] = np.arange(len(pixel_channels))
+        self._tick_bins = tick / axis.bin_width
+        self._known = -1
+
+    def add(self, records: Records, after_gap: bool = False) -> None:
+        """Add time tags, an array of `devices.timetag.codec.RECORD_DTYPE`; `after_gap`: some are
+        missing before them.
+
+        Parameters
+        ----------
+        records : (n,) array of `devices.timetag.codec.RECORD_DTYPE`
+        after_gap : bool
+        """
+        from devices.histogram_kernels import add_tags, find_last_sync
+
+        # Sync pulses may be among the missing records, so that the last known one may be of an
+        # earlier period.
+        if after_gap:
+            self._known = -1
+        known, columns = (
+            self._known,
+            [records[name] for name in ("time_ticks", "channels", "flags")],
+        )
+
+        def add(piece: slice, steps: NDArray[Any]) -> None:
+            # Each thread begins in the middle of the batch and looks back for the pulse that counts
+            # there.
+            start = find_last_sync(*columns, DELTA, self._sync, piece.start, known)
+            place = (self._pixel_of, self._tick_bins, self.axis.shift_bins, self.axis.period_bins)
+            add_tags(
+                *(column[piece] for column in columns), DELTA, self._sync, start, *place, steps
+            )
+
+        self._add_in_parallel(add, len(records))
+        self._known = find_last_sync(*columns, DELTA, self._sync, len(records), known)
+
+
+class TimeHistogram(Accumulator):
+    """Photons of which pixel and time are known, as files of photon-counting electronics hold them.
+
+    Parameters
+    ----------
+    pixels : int
+    axis : BinAxis
+    resolution : float
+        Width of the electronics' own bins, s, over which a photon is shared out.
+    """
+
+    def __init__(self, pixels: int, axis: BinAxis, resolution: float = 0.0) -> None:
+        super().__init__(pixels, axis)
+        if not (np.isfinite(resolution) and resolution >= 0):
+            raise InputError(f"a resolution must be a number of seconds from 0, got {resolution}")
+        self._width = max(resolution / axis.bin_width, MIN_WIDTH_BINS)
+
+    def add(self, pixels: NDArray[Any], times: NDArray[Any]) -> None:
+        """Add photons.
+
+        Parameters
+        ----------
+        pixels : (n,) int array
+        times : (n,) array
+            Beginning of the electronics' bin, s after the laser's pulse.
+
+        Raises
+        ------
+        ShapeError
+            Pixels and times differ in number.
+        InputError
+            There is no such pixel, or a time is not finite.
+        """
+        if pixels.ndim != 1 or pixels.shape != times.shape:
+            raise ShapeError("pixels and times", "(photons,) both", (pixels.shape, times.shape))
+        if len(pixels) and not (pixels.min() >= 0 and pixels.max() < self.pixels):
+            raise InputError(f"there are {self.pixels} pixels, got {pixels.min()}..{pixels.max()}")
+        if not np.all(np.isfinite(times)):
+            raise InputError("a photon's time must be finite")
+        from devices.histogram_kernels import add_times
+
+        scale, shift, period = 1 / self.axis.bin_width, self.axis.shift_bins, self.axis.period_bins
+
+        def add(piece: slice, steps: NDArray[Any]) -> None:
+            add_times(pixels[piece], times[piece], scale, shift, self._width, period, steps)
+
+        self._add_in_parallel(add, len(pixels))

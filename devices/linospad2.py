@@ -1,0 +1,616 @@
+"""LinoSPAD2's stream (S. Burri et al., Instruments 2018, 2, 28; layout as the authors' and daplis'
+readers have it).
+
+A stream is a row of *cycles*, little-endian words of 32 bits: where the option is on, two words of
+an absolute counter (low word first, ticks of 7.5 ns), then N words of each of 65 time-to-digital
+converters, of which the last serves no pixels. A word::
+
+    bit 31      it holds a time stamp
+    bits 29-28  which of the converter's four pixels
+    bits 27-0   code: 140 codes for each 2500 ps since the cycle began
+
+The stream says neither N, nor which firmware numbered the pixels, nor whether there is a counter.
+
+What a LinoSPAD2 board's calibration knows: how wide each code is, how late each pixel, and which
+pixels are hot.
+
+What LinoSPAD2's recordings do not say themselves, in a small TOML file beside each of them.
+
+LinoSPAD2's recordings as a source of time stamps.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from bisect import bisect_right
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from devices.address import Uri
+from devices.linospad2_kernels import (
+    ADDRESSES,
+    CODE_MASK,
+    CONVERTERS,
+    COUNTERS_DIFFER,
+    OUT_OF_ORDER,
+    OVERFULL,
+    PIXEL_CONVERTERS,
+)
+from devices.source import (
+    READ_TIMEOUT_S,
+    Batch,
+    ByteView,
+    DecodedSource,
+    DecodeResult,
+    Info,
+    Ledger,
+    Piece,
+    Records,
+    as_bytes,
+)
+from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
+from tofclip.files import format_error_line, translate_read_errors
+from tofclip.storage import Record, Scalar, Storable, stored_array
+from tofclip.threads import run_blocks
+
+PIXELS = PIXEL_CONVERTERS * ADDRESSES
+FIRMWARES = ("2212b", "2212s")
+MAX_TIMESTAMPS = 1 << 14
+"""Time stamps per converter and cycle at most; the boards' memory ends far below."""
+
+STAMP_DTYPE = np.dtype([("cycle", "<u4"), ("code", "<u4"), ("pixel", "<u4")])
+"""`cycle`: from 0. `code`: time since the cycle began, 140 for each 2500 ps. `pixel`: place
+on the line, 0..255.
+"""
+
+STAMP_WITH_COUNTER_DTYPE = np.dtype([("counter", "<u8"), *STAMP_DTYPE.descr])
+"""As `STAMP_DTYPE`, with the absolute time at which the cycle began, in ticks of 7.5 ns."""
+
+COUNTER_WORDS = 2
+_WORD_DTYPE = np.dtype("<u4")
+_MAX_ENCODED_BYTES = 1 << 30
+_BLOCK_BYTES = 1 << 21
+_ENCODE_ERRORS = {
+    OUT_OF_ORDER: "time stamps must be in order of cycle and converter; sort_stamps brings them there",
+    OVERFULL: "a converter has more time stamps in a cycle than it can hold",
+    COUNTERS_DIFFER: "all time stamps of a cycle must have the same counter",
+}
+
+
+@dataclass(frozen=True)
+class LinoSpad2Codec:
+    """Bytes of LinoSPAD2 to time stamps and back.
+
+    A valid word of the converter that serves no pixels is malformed. Decoding allocates at most 5
+    bytes for each byte of the stream: rows for the valid words only.
+    """
+
+    # ``"2212b"`` (blocks: pixel = 4 * converter + address) or ``"2212s"`` (skipping: converter + 64
+    # * address)
+    firmware: str = "2212b"
+    timestamps: int = 512  # words per converter and cycle
+    counter: bool = False  # whether every cycle begins with the absolute counter
+
+    name: ClassVar[str] = "linospad2"
+    start: ClassVar[int] = 0
+    """Cycles decoded so far."""
+
+    def __post_init__(self) -> None:
+        if self.firmware not in FIRMWARES:
+            raise InputError(
+                f"LinoSPAD2's firmware must be {' or '.join(FIRMWARES)}, got '{self.firmware}'"
+            )
+        if not 1 <= self.timestamps <= MAX_TIMESTAMPS:
+            raise InputError(
+                f"time stamps per cycle must be within 1..{MAX_TIMESTAMPS}, got {self.timestamps}"
+            )
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of a time stamp."""
+        return STAMP_WITH_COUNTER_DTYPE if self.counter else STAMP_DTYPE
+
+    @property
+    def settings(self) -> Mapping[str, Scalar]:
+        """Arguments that build this codec again."""
+        return {"firmware": self.firmware, "timestamps": self.timestamps, "counter": self.counter}
+
+    @property
+    def header(self) -> int:
+        """Words of a cycle before the first converter's."""
+        return COUNTER_WORDS if self.counter else 0
+
+    @property
+    def cycle_words(self) -> int:
+        """Words of a cycle."""
+        return self.header + CONVERTERS * self.timestamps
+
+    @property
+    def cycle_bytes(self) -> int:
+        """Bytes of a cycle."""
+        return self.cycle_words * _WORD_DTYPE.itemsize
+
+    @cached_property
+    def pixel_of(self) -> NDArray[np.uint32]:
+        """Pixel of each converter's addresses, (64, 4)."""
+        converter, address = np.indices((PIXEL_CONVERTERS, ADDRESSES), np.uint32)
+        # 2212b puts four neighbours on a converter, 2212s every 64th pixel.
+        if self.firmware == "2212b":
+            return ADDRESSES * converter + address
+        return converter + PIXEL_CONVERTERS * address
+
+    @cached_property
+    def address_of(self) -> NDArray[np.uint32]:
+        """Converter * 4 + address of each pixel, (256,)."""
+        return np.argsort(self.pixel_of, axis=None).astype(np.uint32)
+
+    def count_complete_bytes(self, data: ByteView) -> int:
+        """Return how many bytes at the front of `data` form whole cycles."""
+        return len(data) - len(data) % self.cycle_bytes
+
+    def count_records(self, data: ByteView) -> int:
+        """Return how many words of `data` are valid."""
+        kept, malformed = self._count_per_cycle(self._view_cycles(data))
+        return int(kept.sum()) + malformed
+
+    def count_valid(self, data: ByteView) -> int:
+        """Return how many records `decode` would make of `data`."""
+        kept, _ = self._count_per_cycle(self._view_cycles(data))
+        return int(kept.sum())
+
+    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
+        """Decode whole cycles; `state` is how many came before. Cycles that were lost are not
+        counted.
+
+        `data`: whole cycles; `after_loss`: not needed: cycles do not depend on each other.
+        """
+        from devices.linospad2_kernels import decode_stamps
+
+        cycles = self._view_cycles(data)
+        kept, malformed = self._count_per_cycle(cycles)
+        # Counted first: each block then knows which rows of the result are its own, and threads
+        # need no lock.
+        ends = np.cumsum(kept)
+        total = int(ends[-1]) if len(ends) else 0
+        records = np.empty(total, self.dtype)
+        # Records are whole words, so that the kernel sees them as rows of words.
+        rows = records.view(_WORD_DTYPE).reshape(total, self.dtype.itemsize // _WORD_DTYPE.itemsize)
+
+        def work(block: slice) -> None:
+            first, last = (
+                (int(ends[block.start - 1]) if block.start else 0),
+                int(ends[block.stop - 1]),
+            )
+            decode_stamps(
+                cycles[block], self.header, state + block.start, self.pixel_of, rows[first:last]
+            )
+
+        run_blocks(work, len(cycles), max(1, _BLOCK_BYTES // self.cycle_bytes))
+        return DecodeResult(records, malformed, state + len(cycles))
+
+    def encode(self, records: Records) -> bytes:
+        """Return the bytes of all cycles from 0 up to that of the last time stamp."""
+        from devices.linospad2_kernels import encode_stamps
+
+        self._require_valid(records)
+        if len(records) == 0:
+            return b""
+        cycles = np.zeros((int(records["cycle"].max()) + 1, self.cycle_words), _WORD_DTYPE)
+        rows = np.ascontiguousarray(records).view(_WORD_DTYPE).reshape(len(records), -1)
+        outcome = encode_stamps(rows, self.header, self.address_of, cycles)
+        if outcome in _ENCODE_ERRORS:
+            raise InputError(_ENCODE_ERRORS[outcome])
+        return cycles.tobytes()
+
+    def sort_stamps(self, records: Records) -> Records:
+        """Return time stamps in the order of the stream: by cycle, then converter, else as they
+        were.
+        """
+        converter = self.address_of[records["pixel"]] // ADDRESSES
+        return records[np.lexsort([converter, records["cycle"]])]
+
+    def _view_cycles(self, data: ByteView) -> NDArray[np.uint32]:
+        words = as_bytes(data)
+        if words.size % self.cycle_bytes:
+            raise InputError(
+                f"{words.size} bytes are not a whole number of {self.cycle_bytes}-byte cycles"
+            )
+        return np.ascontiguousarray(words).view(_WORD_DTYPE).reshape(-1, self.cycle_words)
+
+    def _count_per_cycle(self, cycles: NDArray[np.uint32]) -> tuple[NDArray[np.int64], int]:
+        """Count the time stamps of each cycle, and all malformed words."""
+        from devices.linospad2_kernels import count_stamps
+
+        kept = np.empty(len(cycles), np.int64)
+        strays: list[int] = []  # appending is safe on several threads
+
+        def work(block: slice) -> None:
+            strays.append(count_stamps(cycles[block], self.header, kept[block]))
+
+        run_blocks(work, len(cycles), max(1, _BLOCK_BYTES // self.cycle_bytes))
+        return kept, sum(strays)
+
+    def _require_valid(self, records: Records) -> None:
+        if records.dtype != self.dtype or records.ndim != 1:
+            raise InputError(f"time stamps must be a one-dimensional array of {self.dtype}")
+        if np.any(records["pixel"] >= PIXELS) or np.any(records["code"] > CODE_MASK):
+            raise InputError(f"a time stamp has a pixel below {PIXELS} and a code below 2**28")
+        cycles = int(records["cycle"].max(initial=0)) + 1
+        if cycles * self.cycle_bytes > _MAX_ENCODED_BYTES:
+            raise InputError(
+                f"{cycles} cycles take more than {_MAX_ENCODED_BYTES} bytes; encode them in pieces"
+            )
+
+
+CODES_PER_PERIOD = 140
+"""Codes in one period of the board's clock."""
+
+CLOCK_PERIOD_S = 2500e-12
+"""Period of the board's clock, s."""
+
+_MAX_FILE_BYTES = 1 << 23
+_ROUNDING_S = 1e-6 * CLOCK_PERIOD_S
+
+
+@dataclass(frozen=True)
+class BoardCalibration(Storable):
+    """Tables that turn a pixel's codes into seconds.
+
+    Parameters
+    ----------
+    code_ends : (256, 140) array
+        Instant at which each code ends, s since the clock's tick, for each pixel; the converters'
+        steps are uneven.
+    offsets : (256,) array
+        Added to a pixel's times, s.
+    hot_pixels : (k,) int array
+        Pixels that count without light.
+
+    Raises
+    ------
+    ShapeError, InputError
+        A table has another shape, is not finite, goes back, or leaves the clock's period; or there
+        is no such pixel.
+    """
+
+    RECORD_KIND = "linospad2_calibration"
+
+    code_ends: NDArray[np.float64] = field(metadata=stored_array("s", "pixel", "code"))
+    offsets: NDArray[np.float64] = field(metadata=stored_array("s", "pixel"))
+    hot_pixels: NDArray[np.int64] = field(
+        default_factory=lambda: np.empty(0, np.int64),
+        metadata=stored_array("px", "hot", dtype=np.int64, optional=True, skip_empty=True),
+    )
+
+    def __post_init__(self) -> None:
+        for name, shape in (("code_ends", (PIXELS, CODES_PER_PERIOD)), ("offsets", (PIXELS,))):
+            table = np.ascontiguousarray(getattr(self, name), np.float64)
+            object.__setattr__(self, name, table)
+            if table.shape != shape:
+                raise ShapeError(f"LinoSPAD2's {name}", shape, table.shape)
+            if not np.all(np.isfinite(table)):
+                raise InputError(f"LinoSPAD2's {name} must be finite")
+        ends = self.code_ends
+        if (
+            np.any(np.diff(ends, axis=1) < 0)
+            or ends.min() < -_ROUNDING_S
+            or ends.max() > CLOCK_PERIOD_S + _ROUNDING_S
+        ):
+            raise InputError(
+                "LinoSPAD2's code_ends must not go back, and stay within the clock's 2.5 ns"
+            )
+        if np.any((self.hot_pixels < 0) | (self.hot_pixels >= PIXELS)):
+            raise InputError(f"LinoSPAD2's hot pixels must lie within 0..{PIXELS - 1}")
+
+    @classmethod
+    def ideal(cls) -> BoardCalibration:
+        """Return a board of even codes and pixels that are all in step."""
+        ends = np.arange(1, CODES_PER_PERIOD + 1) * (CLOCK_PERIOD_S / CODES_PER_PERIOD)
+        return cls(np.tile(ends, (PIXELS, 1)), np.zeros(PIXELS))
+
+    @property
+    def code_begins(self) -> NDArray[np.float64]:
+        """Instant at which each code begins, s since the clock's tick, (256, 140)."""
+        begins: NDArray[np.float64] = np.pad(self.code_ends[:, :-1], ((0, 0), (1, 0)))
+        return begins
+
+    def times(self, records: Records) -> NDArray[np.float64]:
+        """Return when each photon came, s since its cycle began: the end of its code.
+
+        ``time = (code - code % 140) * 2500 ps / 140 + code_ends[pixel, code % 140] +
+        offsets[pixel]``
+        """
+        periods, code = np.divmod(records["code"], CODES_PER_PERIOD)
+        found: NDArray[np.float64] = periods * CLOCK_PERIOD_S
+        found += self.code_ends[records["pixel"], code]
+        found += self.offsets[records["pixel"]]
+        return found
+
+
+def load_calibration(
+    code_table: str | Path, offset_table: str | Path, hot_pixels: str | Path | None = None
+) -> BoardCalibration:
+    """Read tables as the board's makers and daplis write them.
+
+    `code_table`: CSV, ps: a line of code numbers, then for each pixel its number and 140 ends of
+    codes; `offset_table`: NPY with 256 numbers, ps; `hot_pixels`: text with one pixel number in
+    each line.
+    """
+    picosecond = 1e-12
+    table = _read_numbers(
+        code_table, lambda path: np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+    )
+    # Mapped, not read: a header that claims more than the file holds is refused before memory is
+    # taken.
+    offsets = _read_numbers(
+        offset_table, lambda path: np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+    )
+    hot = np.empty(0)
+    if hot_pixels is not None:
+        hot = _read_numbers(
+            hot_pixels, lambda path: [int(word) for word in path.read_text("ascii").split()]
+        )
+        if np.any((hot < 0) | (hot >= PIXELS)):
+            raise FileFormatError(hot_pixels, f"names pixels beyond 0..{PIXELS - 1}")
+    if table.ndim != 2 or table.shape[1] != CODES_PER_PERIOD + 1:
+        raise FileFormatError(
+            code_table, f"must have {CODES_PER_PERIOD + 1} columns, found shape {table.shape}"
+        )
+    return BoardCalibration(table[:, 1:] * picosecond, offsets * picosecond, hot.astype(np.int64))
+
+
+def _read_numbers(path: str | Path, reader: Callable[[Path], Any]) -> NDArray[np.float64]:
+    with translate_read_errors(path):
+        size = Path(path).stat().st_size
+        if size > _MAX_FILE_BYTES:
+            raise FileFormatError(path, f"is larger than any table of LinoSPAD2: {size} bytes")
+        try:
+            return np.asarray(reader(Path(path)), np.float64)
+        except Exception as fault:  # whatever NumPy stumbles over, it is the file that is damaged
+            raise FileFormatError(
+                path, f"holds no table of numbers ({format_error_line(fault)})"
+            ) from fault
+
+
+def make_calibration_record(
+    board: BoardCalibration, laser_period: float | None, camera: Record | None
+) -> Record:
+    """Return what turns time stamps into a scene: the board's tables, the laser's period, the
+    camera.
+
+    `laser_period`: seconds.
+    """
+    record = board.to_record()
+    attributes = {} if laser_period is None else {"laser_period_s": laser_period}
+    children = {} if camera is None else {"camera": camera}
+    return Record(record.kind, record.fields, attributes, children)
+
+
+_MAX_FILE_BYTES_SIDECAR = 1 << 16
+_KEY_TYPES: dict[str, type] = {
+    "firmware": str,
+    "timestamps_per_cycle": int,
+    "absolute_counter": bool,
+    "board": str,
+    "code_table": str,
+    "offset_table": str,
+    "hot_pixels": str,
+    "laser_period_ps": float,
+    "camera": str,
+}
+_REQUIRED_KEYS = ("firmware", "timestamps_per_cycle", "absolute_counter")
+
+
+@dataclass(frozen=True)
+class Sidecar:
+    """How to read a recording."""
+
+    codec: LinoSpad2Codec
+    # the board's tables; `BoardCalibration.ideal` where none are named
+    calibration: BoardCalibration
+    board: str = ""  # which board it was; may be empty
+    # time between two laser pulses, s, where pulses were locked to the board's clock
+    laser_period: float | None = None
+    camera: Path | None = None  # file of the camera in front of the line
+
+
+def read_sidecar(recording: str | Path) -> Sidecar:
+    """Read the TOML file that lies beside `recording` and has its name.
+
+    Its keys are ``firmware`` ("2212b" or "2212s"), ``timestamps_per_cycle`` and
+    ``absolute_counter`` (true or false), and optionally ``board``, ``code_table`` with
+    ``offset_table``, ``hot_pixels``, ``laser_period_ps`` and ``camera``. Names of files are
+    relative to the TOML file.
+    """
+    path = Path(recording).with_suffix(".toml")
+    values = _check_keys(_parse_toml(path, recording), path)
+    if ("code_table" in values) != ("offset_table" in values):
+        raise FileFormatError(
+            path, "code_table and offset_table belong together: give both or neither"
+        )
+    try:
+        codec = LinoSpad2Codec(
+            values["firmware"], values["timestamps_per_cycle"], values["absolute_counter"]
+        )
+        calibration = _read_calibration(values, path.parent)
+    except InputError as fault:
+        raise FileFormatError(path, str(fault)) from fault
+    period = values.get("laser_period_ps")
+    if period is not None and not 0 < period < float("inf"):
+        raise FileFormatError(path, f"laser_period_ps must be a positive number, found {period}")
+    return Sidecar(
+        codec,
+        calibration,
+        values.get("board", ""),
+        None if period is None else period * 1e-12,
+        path.parent / values["camera"] if "camera" in values else None,
+    )
+
+
+def _parse_toml(path: Path, recording: str | Path) -> dict[str, Any]:
+    if not path.exists():
+        keys = ", ".join(_REQUIRED_KEYS)
+        raise StorageError(
+            f"{recording}: its format is not in the file itself; write {keys} into {path.name} beside it"
+        )
+    with translate_read_errors(path), open(path, "rb") as file:
+        # One byte more than allowed shows that there is more, without reading all of it.
+        data = file.read(_MAX_FILE_BYTES_SIDECAR + 1)
+    if len(data) > _MAX_FILE_BYTES_SIDECAR:
+        raise FileFormatError(
+            path,
+            f"is larger than any description of a recording: more than {_MAX_FILE_BYTES_SIDECAR} bytes",
+        )
+    try:
+        return tomllib.loads(data.decode())
+    except ValueError as fault:
+        raise FileFormatError(path, f"is not TOML ({fault})") from fault
+
+
+def _check_keys(found: dict[str, Any], path: Path) -> dict[str, Any]:
+    for key in _REQUIRED_KEYS:
+        if key not in found:
+            raise FileFormatError(path, f"lacks the key '{key}'")
+    for key, value in found.items():
+        if key not in _KEY_TYPES:
+            raise FileFormatError(
+                path, f"has the unknown key '{key}'; known are {', '.join(_KEY_TYPES)}"
+            )
+        kind = _KEY_TYPES[key]
+        # TOML distinguishes 50000 from 50000.0, which people do not. By exact type, because bool is an int in
+        # Python.
+        is_number = kind is float and type(value) is int
+        if type(value) is not kind and not is_number:
+            raise FileFormatError(path, f"{key} must be a {kind.__name__}, found {value!r}")
+    return found
+
+
+def _read_calibration(values: dict[str, Any], folder: Path) -> BoardCalibration:
+    hot = folder / values["hot_pixels"] if "hot_pixels" in values else None
+    if "code_table" in values:
+        return load_calibration(folder / values["code_table"], folder / values["offset_table"], hot)
+    if hot is not None:
+        raise InputError("hot_pixels needs code_table and offset_table as well")
+    return BoardCalibration.ideal()
+
+
+LIMITATION = "LinoSPAD2's USB commands are not public: its recordings are read, no board is driven"
+PIECE_BYTES = 1 << 20
+"""Bytes that are read and decoded at once, or one cycle where that is longer."""
+
+
+class LinoSpad2File(DecodedSource):
+    """A recording, with the TOML file beside it that says how to read it
+    (`devices.linospad2`).
+
+    Opening counts the time stamps of the whole recording, which takes about a second for two
+    gigabytes. After `seek` the accounts are as if everything before had been read.
+
+    Memory: one piece of 1 MiB, or one cycle, and what it decodes to; 16 bytes for each piece of the
+    recording.
+    """
+
+    codec: LinoSpad2Codec
+
+    def __init__(self, path: str | Path) -> None:
+        self._path, self._sidecar = Path(path), read_sidecar(path)
+        codec = self._sidecar.codec
+        super().__init__(codec, Ledger())
+        with translate_read_errors(path):
+            self._file = open(path, "rb")  # noqa: SIM115 - closed by `close`
+        size = os.fstat(self._file.fileno()).st_size
+        if size < codec.cycle_bytes:
+            self._file.close()
+            raise FileFormatError(path, f"holds {size} bytes; one cycle takes {codec.cycle_bytes}")
+        self._is_cut_off = size % codec.cycle_bytes > 0
+        self._cycles = max(1, PIECE_BYTES // codec.cycle_bytes)
+        self._pieces = -(-(size // codec.cycle_bytes) // self._cycles)
+        # The file has no index: one pass at the start lets the accounts and seek know every number.
+        self._good, self._malformed = self._count_records()
+        self._next = self._skip = 0
+        self._seek_to(0)
+
+    @property
+    def info(self) -> Info:
+        return Info(
+            "LinoSPAD2 recording",
+            self._sidecar.board,
+            {"limits": LIMITATION, **self.codec.settings},
+        )
+
+    @property
+    def calibration(self) -> Record:
+        camera = (
+            None if self._sidecar.camera is None else Record.load(self._sidecar.camera, "camera")
+        )
+        return make_calibration_record(
+            self._sidecar.calibration, self._sidecar.laser_period, camera
+        )
+
+    @property
+    def is_seekable(self) -> bool:
+        return True
+
+    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
+        """Return the next batch at once; `timeout` does not matter."""
+        if self._file.closed or self._next == self._pieces:
+            return None
+        data = self._read_piece(self._next)
+        batch = self._decode_piece(Piece(data, self.codec.count_records(as_bytes(data))))
+        self._next += 1
+        skipped, self._skip = self._skip, 0
+        return Batch(batch.records[skipped:], batch.first + skipped)
+
+    def seek(self, record: int) -> None:
+        if not 0 <= record <= self._good[-1]:
+            raise InputError(
+                f"{self._path} holds {self._good[-1]} records, there is no number {record}"
+            )
+        self._seek_to(min(bisect_right(self._good, record) - 1, self._pieces))
+        self._skip = record - self._good[self._next]
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _read_piece(self, number: int) -> bytes:
+        length = self._cycles * self.codec.cycle_bytes
+        self._file.seek(number * length)
+        data = self._file.read(length)
+        return data[: self.codec.count_complete_bytes(as_bytes(data))]
+
+    def _count_records(self) -> tuple[list[int], list[int]]:
+        """Return how many good and malformed time stamps there are before each piece, and
+        altogether.
+        """
+        good, malformed = [0], [0]
+        for number in range(self._pieces):
+            data = as_bytes(self._read_piece(number))
+            kept = self.codec.count_valid(data)
+            good.append(good[-1] + kept)
+            malformed.append(malformed[-1] + self.codec.count_records(data) - kept)
+        return good, malformed
+
+    def _seek_to(self, number: int) -> None:
+        """Make the next piece the one with that number, as if all before it had been read."""
+        self._next, self._skip, self._state = number, 0, number * self._cycles
+        self._ledger = Ledger()
+        self._ledger.receive(self._good[-1] + self._malformed[-1])
+        self._ledger.deliver(self._good[number], self._malformed[number])
+        # The last cycle is incomplete; it counts as one record that cannot be read.
+        if self._is_cut_off:
+            self._ledger.truncate()
+
+
+def open_recording(uri: Uri) -> LinoSpad2File:
+    """Open ``linospad2://run.dat`` or ``file://run.dat``."""
+    uri.reject_unknown()
+    if not uri.location:
+        raise InputError(f"'{uri.text}': name a recording; {LIMITATION}")
+    return LinoSpad2File(uri.location)

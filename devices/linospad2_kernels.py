@@ -1,0 +1,116 @@
+"""Layout of the words of LinoSPAD2's stream; see `devices.linospad2` for what the bits mean.
+
+Apart from the compiled loops that read them, so that their names do not load a compiler.
+
+Compiled loops over the words of LinoSPAD2's stream; see `devices.linospad2` for what the
+bits mean.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofclip.compiling import compile_and_keep
+
+CONVERTERS = 65
+PIXEL_CONVERTERS = 64
+ADDRESSES = 4
+CODE_MASK = np.uint32(0x0FFFFFFF)
+VALID_BIT = np.uint32(0x80000000)
+
+ENCODED_OK, OUT_OF_ORDER, OVERFULL, COUNTERS_DIFFER = 0, 1, 2, 3
+"""Outcomes of encoding."""
+
+
+compiled = compile_and_keep(error_model="numpy")
+
+
+@compiled
+def count_stamps(cycles, header, kept_of_cycle):
+    """Count the valid words of each cycle.
+
+    `cycles` (cycles, words); `header`: words before the first converter's; `kept_of_cycle`
+    (cycles,): gets the number of valid words of the converters that have pixels. Returns valid
+    words of the converter that has none.
+    """
+    words = cycles.shape[1]
+    # the last converter serves no pixels
+    stray = words - (words - header) // CONVERTERS
+    strays = 0
+    for cycle in range(cycles.shape[0]):
+        kept = 0
+        for word in range(header, stray):
+            # bit 31 says that the word holds a time stamp
+            kept += cycles[cycle, word] >> np.uint32(31)
+        kept_of_cycle[cycle] = kept
+        for word in range(stray, words):
+            strays += cycles[cycle, word] >> np.uint32(31)
+    return strays
+
+
+@compiled
+def decode_stamps(cycles, header, first_cycle, pixel_of, records):
+    """Write the valid words of all converters that have pixels, as rows of `records`.
+
+    Every word is written to the next free row, and only a valid one moves on to the row behind it:
+    no branch that the processor could guess wrong. It ends with the last row, behind which there
+    are not valid words.
+
+    `cycles` (cycles, words); `header`: words before the first converter's; they are repeated at the
+    front of each row; `first_cycle`: number of the first cycle; `pixel_of` (converters, addresses);
+    `records` (rows, header + 3): one row for each valid word; gets header, cycle, code and pixel.
+    """
+    depth = (cycles.shape[1] - header) // CONVERTERS
+    row = 0
+    for cycle in range(cycles.shape[0]):
+        words = cycles[cycle]
+        number = np.uint32(first_cycle + cycle)
+        for converter in range(PIXEL_CONVERTERS):
+            pixels = pixel_of[converter]
+            begin = header + converter * depth
+            for place in range(begin, begin + depth):
+                if row == records.shape[0]:
+                    return
+                word = words[place]
+                for column in range(header):
+                    records[row, column] = words[column]
+                records[row, header] = number
+                records[row, header + 1] = word & CODE_MASK
+                records[row, header + 2] = pixels[(word >> np.uint32(28)) & np.uint32(3)]
+                # every word is written, and the next one overwrites it if it was not valid: no
+                # branch
+                row += word >> np.uint32(31)
+
+
+@compiled
+def encode_stamps(records, header, address_of, cycles):
+    """Put records into the words of empty cycles.
+
+    `records` (rows, header + 3): as `decode_stamps` writes them, in order of cycle and converter;
+    `address_of` (pixels,): converter * 4 + address; `cycles` (cycles, words): zeros; gets the
+    words. Returns `ENCODED_OK`, or what keeps the records from being encoded.
+    """
+    depth = (cycles.shape[1] - header) // CONVERTERS
+    previous, slot = np.int64(-1), 0
+    for row in range(records.shape[0]):
+        cycle, place = np.int64(records[row, header]), address_of[records[row, header + 2]]
+        converter = np.int64(place) // ADDRESSES
+        # time stamps must come converter by converter, cycle by cycle
+        queue = cycle * CONVERTERS + converter
+        if queue < previous:
+            return OUT_OF_ORDER
+        if previous < 0 or cycle != previous // CONVERTERS:
+            for column in range(header):
+                cycles[cycle, column] = records[row, column]
+        slot = slot + 1 if queue == previous else 0
+        if slot == depth:
+            return OVERFULL
+        previous = queue
+        for column in range(header):
+            if cycles[cycle, column] != records[row, column]:
+                return COUNTERS_DIFFER
+        address = place % np.uint32(ADDRESSES)
+        cycles[cycle, header + converter * depth + slot] = (
+            VALID_BIT | (address << np.uint32(28)) | records[row, header + 1]
+        )
+    return ENCODED_OK

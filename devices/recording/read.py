@@ -1,0 +1,600 @@
+"""Blocks: pieces of a stream that carry their own length, number and checksums.
+
+All numbers are little-endian::
+
+    magic  recording  number  kind  gap  time_ns  records  length  payload's  header's  payload
+                                                                   CRC-32     CRC-32
+    8 B    8 B        8 B     2 B   2 B  8 B      8 B      8 B     4 B        4 B       length B
+
+``recording`` is a random number that all blocks of a file share, so that a block of one recording
+inside a piece of another is not mistaken. ``number`` counts the blocks from 0.
+
+Version 0.1.0 wrote a shorter header without these two (`LEGACY_MAGIC`).
+
+Reading recordings, sound and damaged ones, of this version and of 0.1.0.
+
+Recordings as sources: the same pieces through the same codec, so the same records, bit for bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import json
+import os
+import struct
+import tempfile
+import zlib
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any, NamedTuple, Self
+
+import h5py
+
+from devices.address import Uri
+from devices.registry import build_codec
+from devices.source import READ_TIMEOUT_S, Batch, Codec, DecodedSource, Gap, Info, Ledger, Piece
+from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
+from tofclip.files import format_error_line, translate_read_errors
+from tofclip.storage import HDF5_SIGNATURE, Record
+
+MAGIC = b"\x89ToFrec\n"
+LEGACY_MAGIC = b"TFcB"
+MAX_PAYLOAD_BYTES = 1 << 28
+"""No block is larger; a length beyond it is damage."""
+
+_LAYOUT = struct.Struct("<8sQQHHqQQI")
+_LEGACY_LAYOUT = struct.Struct("<4sHHqQQI")
+_CHECKSUM_BYTES = 4
+HEADER_BYTES = _LAYOUT.size + _CHECKSUM_BYTES
+LEGACY_HEADER_BYTES = _LEGACY_LAYOUT.size + _CHECKSUM_BYTES
+
+
+class BlockKind(enum.IntEnum):
+    """What a block's payload is."""
+
+    HEAD = 1
+    """An HDF5 record: all that was known before the first piece."""
+    PIECE = 2
+    """Whole records as they came from the instrument."""
+    END = 3
+    """JSON: the accounts, written when the recording was ended in order."""
+
+
+@dataclass(frozen=True)
+class BlockHeader:
+    """What stands before a payload."""
+
+    kind: BlockKind
+    gap: Gap  # what is missing before it
+    time_ns: int  # when it was recorded, in ns since 1970, by this computer's clock
+    records: int
+    length: int  # bytes of the payload
+    checksum: int  # CRC-32 of the payload
+    # number of the block in its recording, from 0; -1 in recordings of version 0.1.0
+    number: int = 0
+    recording: int = 0  # the random number that the blocks of a recording share
+
+    @classmethod
+    def of(
+        cls,
+        kind: BlockKind,
+        payload: bytes,
+        time_ns: int,
+        records: int = 0,
+        gap: Gap = Gap.NONE,
+        number: int = 0,
+        recording: int = 0,
+    ) -> BlockHeader:
+        """Describe a payload; the parameters are those of the class.
+
+        `time_ns`: ns since 1970; `number`: of the block; `recording`: of the recording, a random
+        number.
+        """
+        checksum = zlib.crc32(payload)
+        return cls(kind, gap, time_ns, records, len(payload), checksum, number, recording)
+
+    @property
+    def is_legacy(self) -> bool:
+        """Whether version 0.1.0 wrote it."""
+        return self.number < 0
+
+    @property
+    def header_bytes(self) -> int:
+        """Bytes of the header itself."""
+        return LEGACY_HEADER_BYTES if self.is_legacy else HEADER_BYTES
+
+    def pack(self) -> bytes:
+        """Return the header as it lies in the file."""
+        front = _LAYOUT.pack(
+            MAGIC,
+            self.recording,
+            self.number,
+            self.kind,
+            self.gap,
+            self.time_ns,
+            self.records,
+            self.length,
+            self.checksum,
+        )
+        return front + struct.pack("<I", zlib.crc32(front))
+
+    @classmethod
+    def unpack(cls, data: bytes) -> BlockHeader | None:
+        """Read a header from the first bytes of `data`; None if they are not a sound one."""
+        is_legacy = data[: len(LEGACY_MAGIC)] == LEGACY_MAGIC
+        layout = _LEGACY_LAYOUT if is_legacy else _LAYOUT
+        front = data[: layout.size]
+        own = data[layout.size : layout.size + _CHECKSUM_BYTES]
+        if len(own) != _CHECKSUM_BYTES or not (is_legacy or data.startswith(MAGIC)):
+            return None
+        # a header that passes by chance is one in 2^32: the search for blocks may rely on it
+        if zlib.crc32(front) != int.from_bytes(own, "little"):
+            return None
+        recording, number = 0, -1
+        if is_legacy:
+            _, kind, gap, time_ns, records, length, checksum = layout.unpack(front)
+        else:
+            _, recording, number, kind, gap, time_ns, records, length, checksum = layout.unpack(
+                front
+            )
+        if kind not in set(BlockKind) or gap not in set(Gap) or length > MAX_PAYLOAD_BYTES:
+            return None
+        return cls(BlockKind(kind), Gap(gap), time_ns, records, length, checksum, number, recording)
+
+    def matches(self, payload: bytes) -> bool:
+        """Whether a payload is the one that was described."""
+        return len(payload) == self.length and zlib.crc32(payload) == self.checksum
+
+
+RECORD_KIND = "recording"
+RECORDING_SUFFIXES = (".h5", ".hdf5")
+SEARCH_BYTES = 1 << 20
+"""Bytes in which the next sound block is searched at once."""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A stretch of a recording that is not what was written."""
+
+    position: int  # bytes of the file
+    length: int  # bytes of the file
+    # it is the beginning of a last block that was never finished: a program was killed in the
+    # middle of writing it, or the file was truncated
+    is_cut: bool = False
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block with a sound header."""
+
+    position: int  # of its header, in the file
+    header: BlockHeader
+
+    @property
+    def payload_position(self) -> int:
+        """Position of its payload."""
+        return self.position + self.header.header_bytes
+
+    @property
+    def end(self) -> int:
+        """Position behind it."""
+        return self.payload_position + self.header.length
+
+
+class BlockReader:
+    """Blocks in anything that holds bytes; damage between them is stepped over and reported.
+
+    The first sound header decides which recording, and which version of the format, this is;
+    blocks of any other are not looked at. Memory: one block.
+
+    `path`: for messages; `fetch`: takes position and length, returns these bytes, fewer at the end;
+    `length`: bytes there are.
+    """
+
+    def __init__(self, path: Path, fetch: Callable[[int, int], bytes], length: int) -> None:
+        self.path = path
+        self.length = length
+        self._fetch = fetch
+
+    def __iter__(self) -> Iterator[Block | Damage]:
+        """Yield every block with a sound header, and the damage between them; payloads are not
+        looked at.
+        """
+        first = self._first_header
+        position = 0
+        if first is not None and first.is_legacy:
+            position = self._find_header(0)  # version 0.1.0 put an HDF5 file's beginning before
+        while position < self.length:
+            header = self._read_header(position)
+            if header is None:
+                found = self._find_header(position + 1)
+                is_cut = found == self.length and self._is_cut(position)
+                yield Damage(position, found - position, is_cut)
+                position = found
+            else:
+                block = Block(position, header)
+                yield block
+                position = block.end
+
+    def read_payload(self, block: Block) -> bytes:
+        """Return a block's payload."""
+        data = self._fetch(block.payload_position, block.header.length)
+        if not block.header.matches(data):
+            raise FileFormatError(
+                self.path,
+                f"the block at byte {block.position} is damaged; tofclip devices repair leaves it out",
+            )
+        return data
+
+    def read_piece(self, block: Block) -> Piece:
+        """Return the piece of the stream that a block holds; raises as `read_payload`."""
+        return Piece(self.read_payload(block), block.header.records, block.header.gap)
+
+    def find_head(self) -> Block | None:
+        """Return the first undamaged description of the instrument, None if there is none."""
+        for entry in self:
+            if isinstance(entry, Block) and entry.header.kind is BlockKind.HEAD:
+                with contextlib.suppress(FileFormatError):
+                    self.read_payload(entry)
+                    return entry
+        return None
+
+    @cached_property
+    def _first_header(self) -> BlockHeader | None:
+        """The first sound header of either version."""
+        found = [self._search(0, magic, lambda header: True) for magic in (MAGIC, LEGACY_MAGIC)]
+        first = min(found)
+        return self._parse_header(first) if first < self.length else None
+
+    def _parse_header(self, position: int) -> BlockHeader | None:
+        """Read a header, or None if there is none or its payload would not lie within the file."""
+        header = BlockHeader.unpack(self._fetch(position, HEADER_BYTES))
+        if header is None or position + header.header_bytes + header.length > self.length:
+            return None
+        return header
+
+    def _read_header(self, position: int) -> BlockHeader | None:
+        """Read a header of this recording, None where there is none."""
+        header = self._parse_header(position)
+        return header if header is not None and self._belongs(header) else None
+
+    def _is_cut(self, position: int) -> bool:
+        """Whether what is left of the file is the beginning of a block."""
+        data = self._fetch(position, HEADER_BYTES)
+        if self.length - position < HEADER_BYTES:
+            return data.startswith(MAGIC[: len(data)])
+        header = BlockHeader.unpack(data)
+        return header is not None and self._belongs(header)
+
+    def _belongs(self, header: BlockHeader) -> bool:
+        first = self._first_header
+        return (
+            first is not None
+            and header.recording == first.recording
+            and header.is_legacy == first.is_legacy
+        )
+
+    def _find_header(self, position: int) -> int:
+        """Return where the next sound header of this recording begins, or the end."""
+        first = self._first_header
+        magic = LEGACY_MAGIC if first is not None and first.is_legacy else MAGIC
+        return self._search(position, magic, self._belongs)
+
+    def _search(self, position: int, magic: bytes, accept: Callable[[BlockHeader], bool]) -> int:
+        while position < self.length:
+            # Overlaps the next stretch, so that a magic across the border is found.
+            stretch = self._fetch(position, SEARCH_BYTES + len(magic) - 1)
+            at = stretch.find(magic)
+            while at >= 0:
+                header = self._parse_header(position + at)
+                if header is not None and accept(header):
+                    return position + at
+                at = stretch.find(magic, at + 1)
+            position += SEARCH_BYTES
+        return self.length
+
+
+@dataclass(frozen=True)
+class Ending:
+    """What a recording says at its end."""
+
+    stats: dict[str, int]  # the accounts, by name
+    fault: str  # what ended it if it was not meant to end
+    # nothing of what was recorded is missing. False for ever in a copy of a damaged or truncated
+    # recording
+    is_complete: bool
+
+    def to_json(self) -> bytes:
+        """Return the payload of an END block."""
+        known = {"stats": self.stats, "fault": self.fault, "complete": self.is_complete}
+        return json.dumps(known).encode()
+
+    @classmethod
+    def from_json(cls, payload: bytes, path: Path) -> Ending:
+        """Read the payload of an END block.
+
+        `path`: for the message.
+        """
+        try:
+            known = json.loads(payload)
+            stats = {str(name): int(value) for name, value in known["stats"].items()}
+            return cls(stats, str(known["fault"]), bool(known.get("complete", True)))
+        except (ValueError, TypeError, KeyError, AttributeError) as fault:
+            raise FileFormatError(path, "has accounts that cannot be read") from fault
+
+
+class Recording:
+    """A recording, open for reading; also one that is still being written, or whose program was
+    killed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with translate_read_errors(path):
+            self._file = open(path, "rb", buffering=0)  # noqa: SIM115 - closed by `close`
+        self.blocks = BlockReader(path, self._read_bytes, os.fstat(self._file.fileno()).st_size)
+        try:
+            self.head = self._read_head()
+            """What was known before the first piece."""
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def codec(self) -> Codec:
+        """The codec that its bytes need."""
+        return build_codec_from_head(self.head, self.path)
+
+    @property
+    def info(self) -> Info:
+        """What was known about the instrument."""
+        try:
+            known = json.loads(str(self.head.attribute("info")))
+            return Info(known.pop("instrument"), known.pop("serial"), known)
+        except (KeyError, TypeError, AttributeError, json.JSONDecodeError) as fault:
+            raise FileFormatError(self.path, "does not describe its instrument") from fault
+
+    def close(self) -> None:
+        """Close the file; closing twice is fine."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _read_head(self) -> Record:
+        head = self.blocks.find_head()
+        if head is None:
+            raise FileFormatError(
+                self.path, "is not a recording, or every copy of its head is damaged"
+            )
+        return parse_head(self.blocks.read_payload(head), self.path)
+
+    def _read_bytes(self, position: int, length: int) -> bytes:
+        return read_at(self._file.fileno(), position, length, self.path)
+
+
+def read_at(file: int, position: int, length: int, path: Path) -> bytes:
+    """Read `length` bytes from `position` on, fewer at the end of the file.
+
+    `file`: descriptor; `position, length`: bytes; `path`: for the message.
+    """
+    pieces: list[bytes] = []
+    while length > 0:
+        try:
+            piece = os.pread(file, length, position)
+        except OSError as fault:
+            raise StorageError(f"{path}: cannot be read: {fault.strerror}") from fault
+        if not piece:
+            break
+        pieces.append(piece)
+        position += len(piece)
+        length -= len(piece)
+    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+
+def read_head_if_recording(path: Path) -> Record | None:
+    """Return what a recording says about its instrument, None for any other file; its pieces are
+    not read.
+    """
+    with translate_read_errors(path), open(path, "rb") as file:
+        start = file.read(len(HDF5_SIGNATURE))
+    if start == HDF5_SIGNATURE:
+        kind: Any = b""
+        with contextlib.suppress(OSError), h5py.File(path, "r", locking=False) as opened:
+            kind = opened.attrs.get("kind", b"")
+        if not isinstance(kind, bytes) or kind != RECORD_KIND.encode():
+            return None
+    elif path.suffix.lower() not in RECORDING_SUFFIXES:
+        return None
+    with contextlib.suppress(FileFormatError), Recording(path) as recording:
+        return recording.head
+    return None
+
+
+def parse_head(image: bytes, path: Path) -> Record:
+    """Read the record that the payload of a HEAD block, an HDF5 file, holds.
+
+    `path`: of the recording.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, path.name)
+        # HDF5 reads files rather than bytes.
+        copy.write_bytes(image)
+        head = Record.load(copy, RECORD_KIND)
+    return Record(head.kind, {}, head.attributes, head.children, head.provenance, str(path))
+
+
+def build_codec_from_head(head: Record, path: Path) -> Codec:
+    """Build the codec that a recording's head names.
+
+    `path`: for the message.
+    """
+    try:
+        settings = json.loads(str(head.attribute("codec_settings")))
+        return build_codec(str(head.attribute("codec")), settings)
+    except (InputError, json.JSONDecodeError, TypeError) as fault:
+        raise FileFormatError(
+            path, f"names a codec that this program does not know ({format_error_line(fault)})"
+        ) from fault
+
+
+NS_PER_S = 1_000_000_000
+MAX_PAUSE_S = 10.0
+"""Longest pause between two pieces that is replayed: where the computer's clock was set while it
+recorded, the times of the pieces may be years apart.
+"""
+
+
+class _Checkpoint(NamedTuple):
+    """What the decoder and the accounts were when a block began."""
+
+    state: Any
+    delivered: int
+    malformed: int
+
+
+class ReplaySource(DecodedSource):
+    """A recording played back. It never drops anything: the reader sets the pace, unless the
+    recording does.
+
+    The accounts are those of the playback. After `seek` they are as if everything before had been
+    read.
+
+    Memory: one piece and its records; 100 bytes for each piece of the recording.
+
+    `is_paced`: let as much time pass between two pieces as there was when they were recorded, but
+    at most `MAX_PAUSE_S`.
+    """
+
+    def __init__(self, path: Path, is_paced: bool = False) -> None:
+        self._recording = Recording(path)
+        super().__init__(self._recording.codec, Ledger())
+        self._info = self._recording.info
+        self._is_paced = is_paced
+        self._is_complete = False
+        self._blocks = list(self._list_blocks())
+        self._next = self._skip = 0
+        self._last_due: tuple[float, int] | None = None
+        self._checkpoints = [
+            _Checkpoint(self.codec.start, 0, 0)
+        ]  # of every block up to the furthest that was read
+        self._seek_to(0)
+
+    @property
+    def info(self) -> Info:
+        return self._info
+
+    @property
+    def calibration(self) -> Record | None:
+        return self._recording.head.children.get("calibration")
+
+    @property
+    def is_complete(self) -> bool:
+        return self._is_complete
+
+    @property
+    def is_seekable(self) -> bool:
+        return True
+
+    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
+        if self._next >= len(self._blocks):
+            return None
+        block = self._blocks[self._next]
+        if self._is_paced:
+            self._wait_until_due(block, timeout)
+        batch = self._decode_next()
+        if not self._skip:
+            return batch
+        skipped, self._skip = self._skip, 0
+        return Batch(batch.records[skipped:], batch.first + skipped)
+
+    def seek(self, record: int) -> None:
+        if record < 0:
+            raise InputError(f"records are numbered from 0, got {record}")
+        tap = self.tap
+        self.tap = None  # what is stepped over is not read
+        try:
+            nearest = bisect_right(self._checkpoints, record, key=lambda mark: mark.delivered) - 1
+            self._seek_to(nearest)
+            while (
+                self._next < len(self._blocks) and self._checkpoints[self._next].delivered <= record
+            ):
+                self._decode_next()
+        finally:
+            self.tap = tap
+        reached = self._checkpoints[self._next].delivered
+        if record > reached:
+            raise InputError(
+                f"{self._recording.path} has only {reached} records, no record {record}"
+            )
+        if record < reached:
+            self._seek_to(self._next - 1)
+            self._skip = record - self._checkpoints[self._next].delivered
+
+    def close(self) -> None:
+        self._next = len(self._blocks)
+        self._recording.close()
+
+    def _decode_next(self) -> Batch:
+        """Decode the next block and note how things are behind it."""
+        batch = self._decode_piece(self._recording.blocks.read_piece(self._blocks[self._next]))
+        self._next += 1
+        if self._next == len(self._checkpoints):
+            self._checkpoints.append(
+                _Checkpoint(self._state, self.stats.delivered, self.stats.malformed)
+            )
+        return batch
+
+    def _seek_to(self, number: int) -> None:
+        """Make the next block the one with that number, as if all before it had been read."""
+        self._next, self._skip = number, 0
+        self._state, delivered, malformed = self._checkpoints[number]
+        self._ledger = Ledger()
+        self._ledger.receive(sum(block.header.records for block in self._blocks))
+        self._ledger.deliver(delivered, malformed)
+        self._last_due = None
+
+    def _list_blocks(self) -> Iterator[Block]:
+        for entry in self._recording.blocks:
+            if isinstance(entry, Damage):
+                if entry.is_cut:
+                    return  # the program that recorded was killed; all before it is whole
+                raise FileFormatError(
+                    self._recording.path,
+                    f"is damaged at byte {entry.position}; tofclip devices repair makes a sound copy",
+                )
+            if entry.header.kind is BlockKind.PIECE:
+                yield entry
+            elif entry.header.kind is BlockKind.END:
+                payload = self._recording.blocks.read_payload(entry)
+                self._is_complete = Ending.from_json(payload, self._recording.path).is_complete
+
+    def _wait_until_due(self, block: Block, timeout: float) -> None:
+        """Wait until a block is due, `timeout` seconds at most; DeviceTimeoutError if it is not
+        then.
+        """
+        now = monotonic()
+        due = now
+        if self._last_due is not None:
+            pause = (block.header.time_ns - self._last_due[1]) / NS_PER_S
+            due = self._last_due[0] + min(max(pause, 0.0), MAX_PAUSE_S)
+        sleep(max(0.0, min(due - now, timeout)))
+        if due - now > timeout:
+            raise DeviceTimeoutError(
+                f"the next piece of {self._recording.path} is due in {due - now - timeout:.3g} s"
+            )
+        self._last_due = due, block.header.time_ns
+
+
+def open_recording(uri: Uri) -> ReplaySource:
+    """Open ``file://PATH?pace=fast``, or ``pace=realtime``."""
+    uri.reject_unknown("pace")
+    return ReplaySource(Path(uri.location), uri.choice("pace", "fast", "realtime") == "realtime")

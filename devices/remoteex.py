@@ -1,0 +1,820 @@
+"""RemoteEx's messages as text, after Hamamatsu's RemoteEx Programmers Handbook (HPD-TA 9.5).
+
+A command is ``Name(argument,argument)`` and a carriage return, its answer
+``code,Name,argument,argument`` and another. Answers of code 4 come unasked, when something
+happened. Pictures and tables travel on a second connection, as long as the answer says; both
+connections begin with a greeting.
+
+What the handbook does not say is taken from a client that is proven on hardware (the driver
+``hamamatsurx`` of delmic/odemis): text is Latin-1, names are not case-sensitive, a line of an
+answer may begin with a line feed, and texts of errors may hold bare carriage returns.
+
+A client of RemoteEx: one question at a time, and never the same one twice.
+
+Hamamatsu's streak cameras as a source of frames.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import re
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from time import monotonic, sleep
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from devices.address import Uri
+from devices.frames import MAX_FRAME_BYTES, FrameCodec
+from devices.source import Gap, Info, Ledger
+from devices.stream import (
+    STREAM_OPTIONS,
+    InstrumentClock,
+    StreamSource,
+    Transfer,
+    parse_buffer_settings,
+    retry_connect,
+)
+from devices.tcp import TcpLink
+from tofclip.errors import (
+    DeviceBusyError,
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceTimeoutError,
+    InputError,
+    ProtocolError,
+)
+from tofclip.io.hamamatsu import TIME_UNITS
+from tofclip.storage import Field, Record, Scalar
+
+COMMAND_PORT, DATA_PORT = 1001, 1002
+TERMINATOR = b"\r"
+ENCODING = "latin-1"
+"""Of all text: HPD-TA writes "µ" as one byte."""
+
+GREETING, DATA_GREETING = "RemoteEx Ready", "RemoteEx Data Ready"
+ANNOUNCEMENT = "Livemonitor"
+"""What a message about a new picture is called."""
+
+MAX_MESSAGE_BYTES = 1 << 16
+
+_COMMAND = re.compile(r"([A-Za-z]\w*)\((.*)\)", re.ASCII)
+_NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
+_ARGUMENT = re.compile(r"[^,()\x00-\x1f\x7f-\x9f\u0100-\U0010ffff]*")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+
+
+class AnswerCode(enum.IntEnum):
+    """What became of a command."""
+
+    DONE = 0
+    SYNTAX = 1
+    UNKNOWN = 2
+    NOT_NOW = 3
+    MESSAGE = 4
+    NOTICE = 5
+    MISSING = 6
+    IMPOSSIBLE = 7
+    FAILED = 8
+    NO_DATA_LINK = 9
+    OUT_OF_RANGE = 10
+
+
+REFUSAL_REASONS = {
+    AnswerCode.SYNTAX: "its syntax is wrong",
+    AnswerCode.UNKNOWN: "it, or one of its parameters, is unknown",
+    AnswerCode.NOT_NOW: "it is not possible now",
+    AnswerCode.MISSING: "a parameter is missing",
+    AnswerCode.IMPOSSIBLE: "it cannot be executed",
+    AnswerCode.FAILED: "it failed",
+    AnswerCode.NO_DATA_LINK: "its data cannot be sent",
+    AnswerCode.OUT_OF_RANGE: "a value is out of range",
+}
+_ERRORS: dict[AnswerCode, type[DeviceError]] = {
+    AnswerCode.NOT_NOW: DeviceBusyError,
+    AnswerCode.IMPOSSIBLE: DeviceError,
+    AnswerCode.FAILED: DeviceError,
+    AnswerCode.NO_DATA_LINK: DeviceError,
+}
+
+
+@dataclass(frozen=True)
+class Command:
+    """Something to do."""
+
+    name: str
+    # without commas, parentheses and control characters; the protocol has no way to quote them
+    arguments: tuple[str, ...] = ()
+
+    def encode(self) -> bytes:
+        """Return the bytes to send."""
+        _require_valid(self.name, self.arguments)
+        return f"{self.name}({','.join(self.arguments)})".encode(ENCODING) + TERMINATOR
+
+    @classmethod
+    def decode(cls, message: bytes) -> Command:
+        """Read a command, its end taken off."""
+        text = _decode_text(message)
+        found = _COMMAND.fullmatch(text)
+        if found is None:
+            raise ProtocolError(f"{text[:80]!r} is not a command Name(argument,...)")
+        return cls(found[1], tuple(found[2].split(",")) if found[2] else ())
+
+    def __str__(self) -> str:
+        return f"{self.name}({','.join(self.arguments)})"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What RemoteEx says."""
+
+    code: AnswerCode
+    name: str  # the command's, or what a message is about
+    arguments: tuple[str, ...] = ()
+    received_at: float = field(default=0.0, compare=False)  # when it came, s of `time.monotonic`
+
+    @property
+    def is_message(self) -> bool:
+        """Whether it came unasked."""
+        return self.code in (AnswerCode.MESSAGE, AnswerCode.NOTICE)
+
+    def encode(self) -> bytes:
+        """Return the bytes to send."""
+        _require_valid(self.name, self.arguments)
+        return (
+            ",".join([str(int(self.code)), self.name, *self.arguments]).encode(ENCODING)
+            + TERMINATOR
+        )
+
+    @classmethod
+    def decode(cls, message: bytes) -> Answer:
+        """Read an answer, its end taken off."""
+        text = _decode_text(message)
+        code, _, rest = text.partition(",")
+        name, *arguments = rest.split(",")
+        if not (
+            code.isascii()
+            and code.isdecimal()
+            and len(code) < 4
+            and int(code) in list(AnswerCode)
+            and name
+        ):
+            raise ProtocolError(f"{text[:80]!r} is not an answer of RemoteEx")
+        return cls(AnswerCode(int(code)), name, tuple(arguments))
+
+    def require_done(self, command: Command) -> tuple[str, ...]:
+        """Return the arguments, or raise what the code means."""
+        if self.code is AnswerCode.DONE:
+            return self.arguments
+        said = f" ({', '.join(self.arguments)[:120]})" if self.arguments else ""
+        error = _ERRORS.get(self.code, ProtocolError)
+        raise error(
+            f"RemoteEx refused {command}: {REFUSAL_REASONS.get(self.code, 'no reason given')}{said}"
+        )
+
+
+def parse_integer(text: str, what: str) -> int:
+    """Return a whole number that RemoteEx sent.
+
+    `what`: what the number means, for the message.
+    """
+    # Python would convert digits of any length, at a cost that grows with their square
+    if not (text.isascii() and text.isdecimal() and len(text) < 16):
+        raise ProtocolError(f"RemoteEx sent {text[:40]!r} as {what}, expected a whole number")
+    return int(text)
+
+
+def _require_valid(name: str, arguments: tuple[str, ...]) -> None:
+    if not _NAME.fullmatch(name):
+        raise InputError(f"'{name}' is not the name of a RemoteEx command")
+    for argument in arguments:
+        if not _ARGUMENT.fullmatch(argument):
+            raise InputError(f"RemoteEx cannot carry the argument {argument!r}")
+    if arguments == ("",):
+        raise InputError("RemoteEx cannot carry a single argument that is empty")
+
+
+def _decode_text(message: bytes) -> str:
+    text = message.decode(ENCODING).strip("\n")
+    if _CONTROL.search(text):
+        raise ProtocolError(f"RemoteEx sent {message[:40]!r}, which holds control characters")
+    return text
+
+
+MAX_TABLE_BYTES = 1 << 20
+_COMMANDS_WITH_DATA = ("ImgRingBufferGet", "ImgDataGet")
+MAX_MESSAGES = 4096
+"""Messages that are kept until they are asked for; the oldest go first."""
+
+
+@dataclass(frozen=True)
+class CameraFrame:
+    """A picture as it came."""
+
+    rows: int
+    columns: int
+    pixel_bytes: int  # 1, 2 or 4
+    pixels: bytes  # row by row, little-endian
+    number: int  # in the ring buffer
+
+
+class RemoteExClient:
+    """A connection to HPD-TA or HiPic. Not for two threads at once.
+
+    A command that found no answer in time may still be carried out, so it is never sent again:
+    the next command first waits for the answer that is owed.
+
+    `timeout`: seconds to wait for an answer.
+    """
+
+    def __init__(self, host: str, port: int, data_port: int, timeout: float = 5.0) -> None:
+        self._timeout = timeout
+        self._messages: deque[Answer] = deque(maxlen=MAX_MESSAGES)
+        # Commands sent and not answered yet, oldest first: RemoteEx answers in order.
+        self._owed: deque[Command] = deque()
+        self._unread = 0
+        self._may_continue = False
+        self._commands = TcpLink(host, port, timeout)
+        try:
+            self._expect_greeting(self._commands, GREETING)
+            self._data = TcpLink(host, data_port, timeout)
+        except BaseException:
+            self._commands.close()
+            raise
+        try:
+            self._expect_greeting(self._data, DATA_GREETING)
+        except BaseException:
+            self.close()
+            raise
+
+    def ask(self, name: str, *arguments: str) -> tuple[str, ...]:
+        """Send a command and return its answer's arguments."""
+        answer, command = self._exchange(name, arguments)
+        return answer.require_done(command)
+
+    def is_done(self, name: str, *arguments: str) -> bool:
+        """Send a command that may be refused.
+
+        Returns false where RemoteEx refused.
+        """
+        return self._exchange(name, arguments)[0].code is AnswerCode.DONE
+
+    def start_application(self, timeout: float) -> bool:
+        """Start HPD-TA where it is not up, which takes a while; False where that is refused.
+
+        `timeout`: seconds to wait.
+        """
+        usual = self._timeout
+        self._timeout = timeout
+        try:
+            return self.is_done("AppStart", "1")
+        finally:
+            self._timeout = usual
+
+    def _exchange(self, name: str, arguments: tuple[str, ...]) -> tuple[Answer, Command]:
+        # After a timeout the late answer would be taken for that of the next command.
+        self._wait_for_owed()
+        if name in _COMMANDS_WITH_DATA:
+            self._data.discard_available()  # of a client before this one
+        command = self.send_command(name, *arguments)
+        answer = self._read_answer()
+        if answer.name.casefold() != command.name.casefold():
+            raise ProtocolError(f"RemoteEx answered {answer.name} when asked {command}")
+        return answer, command
+
+    def send_command(self, name: str, *arguments: str) -> Command:
+        """Send a command without waiting, neither for its answer nor for those that are owed."""
+        command = Command(name, arguments)
+        self._commands.send(command.encode(), self._timeout)
+        self._owed.append(command)
+        return command
+
+    def send_and_wait(self, *commands: tuple[str, ...]) -> None:
+        """Send commands at once, whatever is still owed, and wait until each has been answered.
+
+        Closing without waiting could make the network drop the commands.
+        """
+        last_words = [self.send_command(*words) for words in commands]
+        fault: DeviceError | None = None
+        while self._owed:
+            command = self._owed[0]
+            try:
+                self._discard_late_data()
+                answer = self._read_answer()
+                if command in last_words:
+                    answer.require_done(command)
+                elif command.name in _COMMANDS_WITH_DATA:
+                    self._unread = parse_data_length(answer)
+            except (DeviceTimeoutError, DeviceDisconnectedError) as failure:
+                raise fault or failure from None
+            except DeviceError as failure:
+                fault = fault or failure
+        if fault is not None:
+            raise fault
+
+    def read_message(self, timeout: float) -> Answer:
+        """Return the next message that came unasked; `DeviceTimeoutError` if there is none."""
+        if self._messages:
+            return self._messages.popleft()
+        answer = self._receive(timeout)
+        if not answer.is_message:
+            raise ProtocolError(f"RemoteEx answered {answer.name}, unasked")
+        return answer
+
+    def read_frame(self, number: int) -> CameraFrame:
+        """Return picture `number` of the ring buffer, or the oldest one where that is gone already."""
+        shape = self.ask("ImgRingBufferGet", "Data", str(number))
+        if len(shape) < 5:
+            raise ProtocolError(
+                f"RemoteEx described a picture by {len(shape)} words, expected 5 at least"
+            )
+        columns, rows, depth = (parse_integer(text, "a picture's size") for text in shape[:3])
+        if depth not in (1, 2, 4):
+            raise ProtocolError(f"RemoteEx sent pixels of {depth} bytes, expected 1, 2 or 4")
+        pixels = self._read_data(rows * columns * depth, MAX_FRAME_BYTES)
+        return CameraFrame(
+            rows, columns, depth, pixels, parse_integer(shape[4], "a picture's number")
+        )
+
+    def read_scaling_table(self) -> NDArray[np.float32]:
+        """Return the vertical scaling of the current picture, one number for each row, in the time
+        range's unit.
+        """
+        shape = self.ask("ImgDataGet", "current", "ScalingTable", "Vertical")
+        if not shape:
+            raise ProtocolError("RemoteEx did not say how long its scaling table is")
+        length = parse_integer(shape[0], "a table's length") * np.dtype("<f4").itemsize
+        return np.frombuffer(self._read_data(length, MAX_TABLE_BYTES), "<f4")
+
+    def close(self) -> None:
+        """Close both connections; closing twice is fine."""
+        self._commands.close()
+        if hasattr(self, "_data"):
+            self._data.close()
+
+    def _expect_greeting(self, link: TcpLink, greeting: str) -> None:
+        said = link.read_until(TERMINATOR, MAX_MESSAGE_BYTES, self._timeout)
+        if said.strip() != greeting.encode():
+            raise ProtocolError(
+                f"{link.name} greeted with {said[:40]!r}, expected '{greeting}'; is RemoteEx there?"
+            )
+
+    def _wait_for_owed(self) -> None:
+        """Wait for the answers that are owed, with their data, and forget them."""
+        while self._unread or self._owed:
+            self._discard_late_data()
+            if self._owed:
+                command = self._owed[0]
+                answer = self._read_answer()
+                self._unread = (
+                    parse_data_length(answer) if command.name in _COMMANDS_WITH_DATA else 0
+                )
+
+    def _discard_late_data(self) -> None:
+        """Take the rest of a picture that is late; more than any picture has is given up."""
+        length, self._unread = self._unread, 0
+        if length:
+            self._read_data(length, MAX_FRAME_BYTES)
+
+    def _read_answer(self) -> Answer:
+        """Return the answer to the first command that is owed one; keep the messages that come
+        before.
+        """
+        deadline = monotonic() + self._timeout
+        while True:
+            try:
+                answer = self._receive(max(deadline - monotonic(), 0))
+            except DeviceTimeoutError as fault:
+                raise DeviceTimeoutError(
+                    f"RemoteEx did not answer {self._owed[0]} for {self._timeout:g} s; it is not asked again"
+                ) from fault
+            except ProtocolError:
+                self._owed.popleft()  # it was an answer, if one that cannot be understood
+                raise
+            if not answer.is_message:
+                self._owed.popleft()
+                return answer
+            self._messages.append(answer)
+
+    def _receive(self, timeout: float) -> Answer:
+        """Return the next answer or message.
+
+        Answers of several lines, and errors whose text holds carriage returns, fall apart at these;
+        what is not the beginning of an answer is passed over.
+        """
+        deadline = monotonic() + timeout
+        while True:
+            left = max(deadline - monotonic(), 0)
+            message = self._commands.read_until(TERMINATOR, MAX_MESSAGE_BYTES, left)
+            try:
+                answer = replace(Answer.decode(message), received_at=monotonic())
+            except ProtocolError:
+                # Rest of a text that held a bare carriage return, which looks like the end of a
+                # message.
+                if self._may_continue or message.startswith(b"\n"):
+                    continue
+                raise
+            is_announcement = answer.name.casefold() == ANNOUNCEMENT.casefold()
+            self._may_continue = answer.code is not AnswerCode.DONE and not is_announcement
+            return answer
+
+    def _read_data(self, length: int, limit: int) -> bytes:
+        """Return data that an answer has announced; what is missing at a timeout stays owed."""
+        try:
+            return self._data.read_exactly(length, limit, self._timeout)
+        except DeviceTimeoutError:
+            self._unread = length
+            raise
+
+
+def parse_data_length(answer: Answer) -> int:
+    """How much data follows an answer that came too late: a picture's size, or a table's length."""
+    if answer.code != 0:
+        return 0
+    numbers = [parse_integer(text, "a size") for text in answer.arguments[:3] if text.isdecimal()]
+    return (
+        numbers[0] * numbers[1] * numbers[2]
+        if len(numbers) == 3
+        else numbers[0] * 4
+        if numbers
+        else 0
+    )
+
+
+INSTRUMENT = "Hamamatsu streak camera (RemoteEx)"
+STREAK_TUBE = "TD"
+GAIN_PARAMETER = "MCP Gain"
+OPTIONS = (
+    "data_port",
+    "buffers",
+    "mcp_gain",
+    "time_range",
+    "time_ranges_ps",
+    "timeout_s",
+    "reconnect_s",
+    *STREAM_OPTIONS,
+)
+APPLICATION_START_S = 30.0
+POLL_INTERVAL_S = 0.05
+SYNCHROSCAN_UNIT_S = 1e-12
+"""Of the scaling table where the time range is a mere number, as of synchroscan units."""
+
+_PARAMETERS = {"time_range": "Time Range", "mode": "Mode", "mcp_gain": GAIN_PARAMETER}
+
+ConnectFunction = Callable[[], RemoteExClient]
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """How to acquire."""
+
+    buffers: int = 16  # pictures that HPD-TA keeps for a client that is late
+    # of the micro-channel plate, set before the start; None leaves it as it is. It is 0 after the
+    # stop in any case: an intensified tube that is not watched must not age in strong light
+    gain: int | None = None
+    timeout: float = 5.0  # seconds to wait for an answer
+    reconnect: float = 5.0  # seconds to wait for HPD-TA to come back when the connection broke
+    # set before the start, as HPD-TA writes it: ``20 ns``, or ``3`` for a synchroscan unit; empty
+    # leaves it as it is
+    time_range: str = ""
+    # how long ranges 1, 2, ... of a synchroscan unit last, ps, for cameras that give no scaling
+    # table
+    time_ranges_ps: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.buffers <= 4096:
+            raise InputError(f"the number of buffers must be within 1..4096, got {self.buffers}")
+        if self.gain is not None and not 0 <= self.gain <= 63:
+            raise InputError(
+                f"the gain of the micro-channel plate must be within 0..63, got {self.gain}"
+            )
+        if any(not 0 < one < 1e15 for one in self.time_ranges_ps):
+            raise InputError("time ranges must be positive numbers of ps, such as 165,500,1000")
+        if not (0 < self.timeout <= 600 and 0 <= self.reconnect <= 600):
+            raise InputError("times to wait must be within 0 s and 600 s")
+
+
+class _Announcement(NamedTuple):
+    """A message that a picture was taken."""
+
+    number: int
+    stamp: float | None  # its time by the camera's computer, s since live mode was started
+    received_at: float  # s of `time.monotonic`
+
+
+class RemoteExFeed:
+    """Live pictures in the order of their numbers; see `devices.stream.Feed`.
+
+    Pictures that fell out of the ring buffer before they were asked for are lost by the instrument.
+    When the connection breaks, so are those that had been announced.
+
+    `connect`: returns a new connection.
+    """
+
+    def __init__(self, connect: ConnectFunction, ledger: Ledger, settings: LiveSettings) -> None:
+        self._connect, self._ledger, self._settings = connect, ledger, settings
+        self._gap = Gap.NONE
+        self._clock = InstrumentClock()
+        self._stamps: dict[int, float] = {}
+        self._start_camera()
+        try:
+            first = self._first
+            self.codec = FrameCodec(first.rows, first.columns, 8 * first.pixel_bytes)
+            self._parameters = self._read_parameters()
+            self._row_times = self._read_row_times()
+        except BaseException:
+            # Also a signal to end: nothing else could turn the gain down now.
+            with contextlib.suppress(DeviceError):
+                self.close()
+            raise
+
+    @property
+    def info(self) -> Info:
+        details: dict[str, Scalar] = {
+            **self._parameters,
+            "rows": self.codec.rows,
+            "columns": self.codec.columns,
+        }
+        return Info(INSTRUMENT, "", details)
+
+    @property
+    def calibration(self) -> Record | None:
+        """Time of each row in s, where the camera sweeps."""
+        if self._row_times is None:
+            return None
+        return Record("streak_calibration", {"row_times": Field(self._row_times, "s", ("row",))})
+
+    def start(self) -> None:
+        """Do nothing: the camera runs since the connection was made, which is how the pictures'
+        size is known.
+        """
+
+    def pull(self, timeout: float) -> Transfer | None:
+        while True:
+            try:
+                picture = self._read_next_frame(timeout)
+            except DeviceDisconnectedError:
+                self._reconnect()
+                continue
+            if (picture.rows, picture.columns, 8 * picture.pixel_bytes) != (
+                self.codec.rows,
+                self.codec.columns,
+                self.codec.bits,
+            ):
+                raise ProtocolError("the pictures' size has changed; open the camera anew")
+            gap, self._gap = self._gap, Gap.NONE
+            data = memoryview(self.codec.pack_frame(picture.number, picture.pixels))
+            return Transfer(data, gap, self._estimate_time(picture.number))
+
+    def stop(self) -> None:
+        """Turn the gain down first, whatever the state of the connection, and stop the acquisition.
+
+        Live mode that another program had started goes on, with the gain that it had.
+        """
+        self._stopped = True
+        # Live mode of an operator goes on with the operator's gain; otherwise 0 protects the tube.
+        gain = self._gain_before if self._has_joined else "0"
+        commands: list[tuple[str, ...]] = [("AcqLiveMonitor", "Off")]
+        if not self._has_joined:
+            commands.insert(0, ("AcqStop",))
+        if gain is not None:
+            commands.insert(0, ("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, gain))
+        self._link.send_and_wait(*commands)
+
+    def close(self) -> None:
+        try:
+            if not self._stopped:
+                self.stop()
+            # What was announced before the stop, and not read by now, is lost.
+            with contextlib.suppress(DeviceError):
+                while True:
+                    self._note_announcement(self._wait_for_announcement(0))
+        finally:
+            self._count_announced_lost()
+            self._link.close()
+
+    def _start_camera(self) -> None:
+        """Connect, start the camera and wait for its first picture."""
+        self._link = link = self._connect()
+        self._stopped = False
+        self._has_joined = False
+        self._gain_before: str | None = None
+        try:
+            try:
+                self._prepare_live(link)
+            # These say nothing about HPD-TA, so that starting it would not help.
+            except (DeviceDisconnectedError, DeviceTimeoutError):
+                raise
+            except DeviceError:
+                if not link.start_application(APPLICATION_START_S):
+                    raise
+                self._prepare_live(link)
+            if not link.is_done("AcqStart", "Live"):
+                self._join_or_restart(link)
+            announced = self._wait_for_announcement(self._settings.timeout)
+            self._clock.reset()
+            self._stamps.clear()
+            self._note_stamp(announced)
+            self._first = link.read_frame(announced.number)
+        except BaseException:
+            with contextlib.suppress(DeviceError):
+                self.stop()
+            link.close()
+            raise
+        # The first picture was read for its size, and is delivered as well. Where it has fallen out
+        # of the ring buffer already, it is an older one's successor.
+        self._unread_frame: CameraFrame | None = self._first
+        self._next = self._announced = announced.number
+        self._newest = max(announced.number, self._first.number)
+
+    def _prepare_live(self, link: RemoteExClient) -> None:
+        """Set what has to be set before live mode, and ask to be notified of every picture."""
+        settings = self._settings
+        if settings.gain is not None:
+            with contextlib.suppress(ProtocolError):
+                (self._gain_before,) = link.ask("DevParamGet", STREAK_TUBE, GAIN_PARAMETER)[:1]
+            link.ask("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, str(settings.gain))
+        if settings.time_range:
+            link.ask("DevParamSet", STREAK_TUBE, "Time Range", settings.time_range)
+        link.ask("AcqLiveMonitor", "RingBuffer", str(settings.buffers))
+
+    def _join_or_restart(self, link: RemoteExClient) -> None:
+        """Join live mode that runs already, or wait until what else keeps the camera busy is over;
+        in the end, stop that.
+        """
+        with contextlib.suppress(ProtocolError):  # not every version knows the question
+            state = [word.strip().casefold() for word in link.ask("AcqStatus")]
+            if "live" in state:
+                self._has_joined = True
+                return
+        for is_last in (False, True):
+            deadline = monotonic() + self._settings.timeout
+            while link.ask("AsyncCommandStatus")[:1] != ("0",) and monotonic() < deadline:
+                sleep(POLL_INTERVAL_S)
+            if link.is_done("AcqStart", "Live"):
+                return
+            if not is_last:
+                link.ask("AcqStop")
+        raise DeviceBusyError("the streak camera is busy; end what HPD-TA is doing")
+
+    def _read_next_frame(self, timeout: float) -> CameraFrame:
+        deadline = monotonic() + timeout
+        picture = self._unread_frame
+        while picture is None:
+            with contextlib.suppress(DeviceTimeoutError):
+                while self._newest >= self._next:  # all that has been announced meanwhile
+                    self._note_announcement(self._wait_for_announcement(0))
+            while self._newest < self._next:
+                left = max(deadline - monotonic(), 0)
+                self._note_announcement(self._wait_for_announcement(left))
+            try:
+                picture = self._link.read_frame(self._next)
+            except (DeviceDisconnectedError, DeviceTimeoutError, ProtocolError):
+                raise
+            except DeviceError:
+                # Refused, as no such picture is there: the numbers begin anew when live mode does.
+                if not self._have_numbers_restarted():
+                    raise
+        lost = picture.number - self._next
+        if lost < 0:
+            raise ProtocolError(f"RemoteEx sent picture {picture.number}, asked for {self._next}")
+        if lost:
+            self._ledger.lose(lost)
+            self._gap = max(self._gap, Gap.LOSS)
+        self._unread_frame, self._next = None, picture.number + 1
+        self._newest = max(self._newest, picture.number)
+        return picture
+
+    def _note_announcement(self, announced: _Announcement) -> None:
+        """Note the newest picture; where its number went back, live mode was started anew."""
+        number = announced.number
+        if number <= self._announced:
+            self._count_announced_lost()
+            self._next = number
+            self._gap = Gap.RESTART
+            self._clock.reset()
+            self._stamps.clear()
+        self._announced = number
+        self._newest = max(number, self._next - 1)
+        self._note_stamp(announced)
+
+    def _note_stamp(self, announced: _Announcement) -> None:
+        if announced.stamp is not None:
+            self._clock.observe(announced.stamp, announced.received_at)
+            self._stamps[announced.number] = announced.stamp
+
+    def _estimate_time(self, number: int) -> float:
+        """Return when a picture was taken, s of `time.monotonic`; 0 where its announcement has not
+        come, or had no time.
+        """
+        # A picture that was sent for one that is gone may be announced right before the answer.
+        with contextlib.suppress(DeviceTimeoutError):
+            while number not in self._stamps and self._announced < number:
+                self._note_announcement(self._wait_for_announcement(0))
+        stamp = self._stamps.get(number)
+        self._stamps = {later: one for later, one in self._stamps.items() if later > number}
+        return 0.0 if stamp is None else self._clock.to_host(stamp)
+
+    def _have_numbers_restarted(self) -> bool:
+        """Wait for the next announcement, and say whether it goes back."""
+        expected = self._next
+        self._note_announcement(self._wait_for_announcement(self._settings.timeout))
+        return self._next != expected
+
+    def _wait_for_announcement(self, timeout: float) -> _Announcement:
+        """Return the next message that announces a picture."""
+        while True:
+            message = self._link.read_message(timeout)
+            words = message.arguments
+            if len(words) >= 2 and words[0].casefold() == "ringbuffer":
+                number = parse_integer(words[1], "a picture's number")
+                is_stamped = len(words) > 2 and words[2].isdecimal() and len(words[2]) < 16
+                return _Announcement(
+                    number, int(words[2]) * 1e-3 if is_stamped else None, message.received_at
+                )
+
+    def _reconnect(self) -> None:
+        self._count_announced_lost()
+        self._link.close()
+        retry_connect(self._start_camera, self._settings.reconnect)
+        self._ledger.reconnect()
+        self._gap = Gap.RESTART
+
+    def _count_announced_lost(self) -> None:
+        """Enter pictures that were announced and will not come."""
+        self._ledger.lose(max(0, self._newest - self._next + 1))
+        self._newest, self._unread_frame = self._next - 1, None
+
+    def _read_parameters(self) -> dict[str, Scalar]:
+        found: dict[str, Scalar] = {}
+        for name, parameter in _PARAMETERS.items():
+            with contextlib.suppress(ProtocolError):  # HiPic has no streak tube to ask
+                found[name] = ",".join(self._link.ask("DevParamGet", STREAK_TUBE, parameter))
+        return found
+
+    def _read_row_times(self) -> NDArray[np.float64] | None:
+        """Return the rows' times, s; the table is in the unit of the time range, as the files show."""
+        time_range = str(self._parameters.get("time_range", "")).strip()
+        is_numbered = time_range.isdecimal() and len(time_range) < 4
+        unit = SYNCHROSCAN_UNIT_S if is_numbered else TIME_UNITS.get(time_range.rpartition(" ")[2])
+        if unit is None or self._parameters.get("mode") == "Focus":
+            return None
+        try:
+            table = self._link.read_scaling_table().astype(np.float64)
+        except ProtocolError:
+            ranges = self._settings.time_ranges_ps
+            if not is_numbered or not 1 <= int(time_range) <= len(ranges):
+                raise
+            rows = self.codec.rows
+            sweep = ranges[int(time_range) - 1] * unit
+            return np.linspace(0, sweep, rows, endpoint=False) + sweep / (2 * rows)
+        if (
+            table.shape != (self.codec.rows,)
+            or not np.all(np.isfinite(table))
+            or np.any(np.diff(table) <= 0)
+        ):
+            raise ProtocolError("RemoteEx's scaling table does not rise row by row of the picture")
+        return table * unit
+
+
+def open_remoteex(uri: Uri) -> StreamSource:
+    """Open
+    ``remoteex://HOST:1001?data_port=1002&buffers=16&mcp_gain=N&timeout_s=5&reconnect_s=5&buffer_mib=64``.
+
+    ``time_range=20 ns`` (or ``3`` for a synchroscan unit) sets the sweep before the start;
+    ``time_ranges_ps=165,500,1000`` says how long a synchroscan unit's ranges last, for one that
+    gives no scaling table.
+    """
+    uri.reject_unknown(*OPTIONS)
+    host, port = uri.host_and_port(COMMAND_PORT)
+    data_port, settings, held = (
+        uri.value("data_port", int, port + 1),
+        parse_live_settings(uri),
+        parse_buffer_settings(uri),
+    )
+    ledger = Ledger()
+    feed = RemoteExFeed(
+        lambda: RemoteExClient(host, port, data_port, settings.timeout), ledger, settings
+    )
+    return StreamSource(feed, feed.codec, ledger, held)
+
+
+def parse_live_settings(uri: Uri) -> LiveSettings:
+    """Read the values of an address (`OPTIONS`) that say how to acquire."""
+    standard = LiveSettings()
+    return LiveSettings(
+        uri.value("buffers", int, standard.buffers),
+        uri.value("mcp_gain", int, 0) if "mcp_gain" in uri.values else None,
+        uri.value("timeout_s", float, standard.timeout),
+        uri.value("reconnect_s", float, standard.reconnect),
+        uri.value("time_range", str, ""),
+        uri.value("time_ranges_ps", _parse_numbers, ()),
+    )
+
+
+def _parse_numbers(text: str) -> tuple[float, ...]:
+    return tuple(float(word) for word in text.split(","))

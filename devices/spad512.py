@@ -1,0 +1,421 @@
+"""Commands of the SPAD512S server, and how long its answers are.
+
+A command is ASCII without an end: what comes at once is one command. The answers to ``I`` (pictures
+of all the light) and ``G`` (pictures behind a gate that moves from step to step) are all pictures
+and then the four letters `DONE_MARK`. Pixels may hold those letters as well, so that only the
+computed length tells where an answer ends. Instead of pictures, or behind the first of them, may
+come a text that ends in `ERROR_MARK`, or begins with it and ends in `DONE_MARK`. Other answers are
+texts of no known length, which some versions end with `DONE_MARK`.
+
+Single bits come turned by a quarter, as the vendor's own class knows: ``rot90`` of what came is the
+picture that the other depths show.
+
+A SPAD array over TCP as a source of frames.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import monotonic
+
+from devices.address import Uri
+from devices.frames import GATE_OPTIONS, FrameCodec, GateScan
+from devices.source import Gap, Info, Ledger
+from devices.stream import (
+    STREAM_OPTIONS,
+    StreamSource,
+    Transfer,
+    parse_buffer_settings,
+    parse_seconds,
+    retry_connect,
+)
+from devices.tcp import TcpLink
+from tofclip.errors import (
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceTimeoutError,
+    InputError,
+    ProtocolError,
+)
+from tofclip.storage import Record
+
+DEFAULT_PORT = 9999
+DONE_MARK, ERROR_MARK = b"DONE", b"ERROR"
+ROWS = 512
+BIT_DEPTHS = (1, 4, 6, 7, 8, 9, 10, 11, 12)
+GATED_BIT_DEPTHS = BIT_DEPTHS[2:]
+IMAGE_WIDTHS_PX = (4, 8, 16, 32, 64, 128, 256, 512)
+SINGLE_BIT_QUARTER_TURNS = 1
+MAX_TEXT_BYTES = 1 << 13
+MAX_IMAGES = 1 << 16
+GATE_STEP_PS = 18
+"""ps by which the gate moves at least."""
+
+INFORMATION_COMMAND = b"D"
+BREAKDOWN_BEGINS, BREAKDOWN_ENDS = "The breakdown calibration process", "The breakdown is around"
+
+_NUMBER = rb"\d+(?:\.\d+)?(?:e[+-]?\d{1,2})?"
+_INTENSITY = re.compile(
+    rb"I,(?P<bits>\d{1,2}),(?P<time>"
+    + _NUMBER
+    + rb"),(?P<images>\d{1,6}),0,[01],0,1(?:,(?P<width>\d{1,3}))?"
+)
+_GATED = re.compile(
+    rb"G,(?P<bits>\d{1,2}),(?P<time>"
+    + _NUMBER
+    + rb"),(?P<images>\d{1,6}),(?P<steps>\d{1,5}),(?P<step>"
+    + _NUMBER
+    + rb"),0,(?P<gate>"
+    + _NUMBER
+    + rb"),(?P<offset>"
+    + _NUMBER
+    + rb"),[01],[01],[01],[01]"
+)
+_ERROR_TEXT = re.compile(rb"[\t\n\r -~]{0,240}\Z")
+_MICROSECOND_DEPTHS = (1, 4)  # the others take milliseconds
+
+
+@dataclass(frozen=True)
+class ExposureRequest:
+    """A request for pictures."""
+
+    bits: int = 8  # depth of a picture; 1, 4, 6..12, behind a gate 6..12
+    seconds: float = 1e-3  # integration time of a picture
+    images: int = 1  # pictures of one request, or scans of a gate
+    # columns, a power of two within 4..512; 512 for single bits and behind a gate
+    width: int = ROWS
+    # whether the server corrects counts for photons that came in a pixel's dead time; they have 16
+    # bits then
+    pile_up: bool = False
+    gate: GateScan | None = None
+
+    def __post_init__(self) -> None:
+        if self.bits not in BIT_DEPTHS or self.width not in IMAGE_WIDTHS_PX:
+            raise InputError(
+                f"a SPAD512 has depths of {BIT_DEPTHS} and widths of {IMAGE_WIDTHS_PX}, not {self.bits}, {self.width}"
+            )
+        if self.bits == 1 and (self.width != ROWS or self.pile_up):
+            raise InputError("single bits come at full width and without correction of pile-up")
+        if self.gate is not None and (self.bits not in GATED_BIT_DEPTHS or self.width != ROWS):
+            raise InputError("pictures behind a gate have full width and 6 to 12 bits")
+        if self.gate is not None and self.gate.step_ps < GATE_STEP_PS:
+            raise InputError(
+                f"a SPAD512's gate moves by at least {GATE_STEP_PS} ps, got {self.gate.step_ps:g}"
+            )
+        if not (0 < self.seconds <= 3600 and self.images >= 1 and self.frames <= MAX_IMAGES):
+            raise InputError(
+                f"pictures need an exposure within 0..3600 s, and 1..{MAX_IMAGES} of them, got {self}"
+            )
+
+    @property
+    def frames(self) -> int:
+        """Pictures in the answer: behind a gate all steps of the first scan, then of the second."""
+        return self.images * (1 if self.gate is None else self.gate.steps)
+
+    @property
+    def codec(self) -> FrameCodec:
+        """What the pictures look like: single bits are packed and turned, more than 8 bits take two
+        bytes.
+        """
+        if self.bits == 1:
+            return FrameCodec(ROWS, self.width, 1, SINGLE_BIT_QUARTER_TURNS)
+        return FrameCodec(ROWS, self.width, 16 if self.bits > 8 or self.pile_up else 8)
+
+    def encode(self) -> bytes:
+        """Return the command."""
+        unit = 1e-6 if self.bits in _MICROSECOND_DEPTHS else 1e-3
+        amount = f"{self.bits},{self.seconds / unit:.9g},{self.images}"
+        if self.gate is None:
+            return f"I,{amount},0,1,0,1,{self.width}".encode()
+        gate = self.gate
+        # Even steps; forwards; the laser's own trigger; no reading during exposure; streamed.
+        return (
+            f"G,{amount},{gate.steps},{gate.step_ps:.9g},0,{gate.width_ns:.9g},{gate.offset_ps:.9g},0,1,0,1"
+        ).encode()
+
+    def encode_pile_up(self) -> bytes:
+        """Return the command that has to be sent before."""
+        return f"PU,{int(self.pile_up)}".encode()
+
+    @classmethod
+    def decode(cls, line: bytes, pile_up: bool = False) -> ExposureRequest:
+        """Read a command.
+
+        `pile_up`: as in the class.
+        """
+        found = _INTENSITY.fullmatch(line) or _GATED.fullmatch(line)
+        if found is None:
+            raise ProtocolError(f"{line[:60]!r} is not a request for pictures")
+        said = found.groupdict()
+        bits, images = int(said["bits"]), int(said["images"])
+        unit = 1e-6 if bits in _MICROSECOND_DEPTHS else 1e-3
+        try:
+            gate = None
+            if "steps" in said:
+                numbers = [float(said[name]) for name in ("step", "gate", "offset")]
+                gate = GateScan(int(said["steps"]), *numbers)
+            width = int(said.get("width") or ROWS)
+            return cls(bits, float(said["time"]) * unit, images, width, pile_up, gate)
+        except InputError as fault:
+            raise ProtocolError(f"{line[:60]!r} requests pictures that cannot be") from fault
+
+
+def find_error_text(data: bytes | bytearray) -> str | None:
+    """Return what the server says instead of the rest of its pictures, None where it says nothing.
+
+    To be asked when nothing more comes although pictures are due: pixels may spell anything.
+
+    `data`: what came for the present picture.
+    """
+    tail = bytes(data[-256:])
+    if tail.endswith(ERROR_MARK):
+        begin = 0
+    elif tail.rstrip().endswith(DONE_MARK) and ERROR_MARK in tail:
+        begin = tail.rindex(ERROR_MARK)
+    else:
+        return None
+    text = _ERROR_TEXT.search(tail, begin)
+    return None if text is None else " ".join(text.group().decode("ascii").split())
+
+
+INSTRUMENT = "SPAD512 array"
+OPTIONS = (
+    "mode",
+    *GATE_OPTIONS,
+    "bits",
+    "exposure_us",
+    "images",
+    "width",
+    "pile_up",
+    "timeout_s",
+    "reconnect_s",
+    *STREAM_OPTIONS,
+)
+
+_SILENCE_S = 0.2
+"""Seconds after which a text of unknown length has ended."""
+
+BREAKDOWN_CALIBRATION_S = 60.0
+"""Seconds that the server may calibrate itself when it is first asked."""
+
+ConnectFunction = Callable[[], TcpLink]
+
+
+class Spad512Feed:
+    """One picture after the other; see `devices.stream.Feed`.
+
+    Pictures are asked for a request at a time, and a request that finds no answer in time is not
+    sent again. Behind a gate a picture's number modulo the gate's steps is its step: a scan that
+    was cut is never finished, and the next one's numbers begin behind it.
+
+    `connect`: returns a new connection; `patience, reconnect`: seconds to wait for an answer beyond
+    the exposure, and for a server that went away.
+    """
+
+    def __init__(
+        self,
+        connect: ConnectFunction,
+        ledger: Ledger,
+        exposure: ExposureRequest,
+        patience: float,
+        reconnect: float,
+    ) -> None:
+        self._connect, self._ledger, self._exposure = connect, ledger, exposure
+        self._patience, self._reconnect_time = patience, reconnect
+        self.codec = exposure.codec
+        self._number, self._frames_due, self._gap = 0, 0, Gap.NONE
+        self._received = bytearray()
+        self._stopped = False
+        self._open_link()
+
+    @property
+    def info(self) -> Info:
+        return Info(
+            INSTRUMENT,
+            self._facts[0].rpartition(":")[2].strip() if self._facts else "",
+            {
+                "greeting": self._greeting,
+                "system": "; ".join(self._facts),
+                "bits": self._exposure.bits,
+                "exposure_s": self._exposure.seconds,
+                "rows": self.codec.rows,
+                "columns": self.codec.columns,
+            },
+        )
+
+    @property
+    def calibration(self) -> Record | None:
+        """When the gate opens in each picture of a scan, s, and for how long; nothing where there is
+        no gate, and so no time axis.
+        """
+        gate = self._exposure.gate
+        return None if gate is None else gate.to_record()
+
+    def start(self) -> None:
+        """Do nothing: the first request starts the instrument."""
+
+    def pull(self, timeout: float) -> Transfer | None:
+        while True:
+            if self._frames_due == 0:
+                if self._stopped:
+                    return None
+                self._request_frames()
+            try:
+                return self._read_frame(timeout)
+            except DeviceDisconnectedError:
+                self._reconnect()
+
+    def stop(self) -> None:
+        self._stopped = True
+
+    def close(self) -> None:
+        self._count_truncated()
+        self._link.close()
+
+    def _open_link(self) -> None:
+        self._link = link = self._connect()
+        try:
+            self._greeting = self._read_text(self._patience)
+            self._facts = self._ask_system()
+            link.send(self._exposure.encode_pile_up(), self._patience)
+            self._read_text(self._patience)
+        except BaseException:
+            link.close()
+            raise
+
+    def _ask_system(self) -> list[str]:
+        """Ask what the system is, as the vendor's clients do first; where the first question lets it
+        calibrate itself, wait for the end of that and ask again.
+        """
+        self._link.send(INFORMATION_COMMAND, self._patience)
+        text = self._read_text(self._patience)
+        if BREAKDOWN_BEGINS in text:
+            deadline = monotonic() + BREAKDOWN_CALIBRATION_S
+            while BREAKDOWN_ENDS not in text:
+                if monotonic() > deadline:
+                    raise DeviceTimeoutError("the SPAD array does not end its calibration")
+                text = self._read_text(BREAKDOWN_CALIBRATION_S)
+            self._link.send(INFORMATION_COMMAND, self._patience)
+            text = self._read_text(self._patience)
+        return [line.strip() for line in text.splitlines() if line.strip()]
+
+    def _read_text(self, patience: float) -> str:
+        """Return a text of unknown length: what comes up to its mark, or until it is quiet."""
+        text = self._link.read_available(MAX_TEXT_BYTES, patience)
+        with contextlib.suppress(DeviceTimeoutError):
+            while len(text) < MAX_TEXT_BYTES and not text.endswith(DONE_MARK):
+                text += self._link.read_available(MAX_TEXT_BYTES - len(text), _SILENCE_S)
+        return text.removesuffix(DONE_MARK).decode("ascii", "replace").strip()
+
+    def _request_frames(self) -> None:
+        self._link.send(self._exposure.encode(), self._patience)
+        self._frames_due = self._exposure.frames
+        self._deadline = monotonic() + self._exposure.seconds + self._patience
+
+    def _read_frame(self, timeout: float) -> Transfer:
+        """Return the next picture; with the last one of a request comes the end of the answer."""
+        is_last = self._frames_due == 1
+        # Pixels may spell DONE: only the computed length tells where an answer ends.
+        length = self.codec.pixel_bytes + (len(DONE_MARK) if is_last else 0)
+        self._fill_buffer(length, timeout)
+        pixels, end = (
+            bytes(self._received[: self.codec.pixel_bytes]),
+            bytes(self._received[self.codec.pixel_bytes :]),
+        )
+        if is_last and end != DONE_MARK:
+            raise ProtocolError(
+                f"the SPAD array's answer ended in {end!r}, expected {DONE_MARK!r}; is its width another?"
+            )
+        self._received.clear()
+        self._frames_due -= 1
+        self._deadline = monotonic() + self._exposure.seconds + self._patience
+        self._number += 1
+        gap, self._gap = self._gap, Gap.NONE
+        return Transfer(memoryview(self.codec.pack_frame(self._number - 1, pixels)), gap)
+
+    def _fill_buffer(self, length: int, timeout: float) -> None:
+        """Wait until `length` bytes came, a length that was computed, not reported; what came in
+        time is kept.
+        """
+        deadline = monotonic() + timeout
+        while len(self._received) < length:
+            try:
+                self._received += self._link.read_available(
+                    length - len(self._received), max(deadline - monotonic(), 0)
+                )
+            except DeviceTimeoutError:
+                self._raise_server_error()
+                raise
+
+    def _raise_server_error(self) -> None:
+        """Raise what the server says instead of a picture, or that it says nothing at all."""
+        said = find_error_text(self._received)
+        if said is not None:
+            raise DeviceError(f"the SPAD array could not take pictures: {said}")
+        if monotonic() > self._deadline:
+            raise DeviceDisconnectedError(
+                f"the SPAD array sent nothing for {self._patience:g} s beyond the exposure"
+            )
+
+    def _reconnect(self) -> None:
+        self._count_truncated()
+        self._link.close()
+        retry_connect(self._open_link, self._reconnect_time)
+        self._ledger.reconnect()
+        self._gap = Gap.RESTART
+
+    def _count_truncated(self) -> None:
+        """Enter a picture of which only a part came; of those that never began it is not known whether
+        they were taken.
+        """
+        if self._received:
+            self._ledger.truncate()
+            self._number += 1
+        gate = self._exposure.gate
+        if gate is not None:
+            self._number += -self._number % gate.steps  # the scan is not finished
+        self._frames_due = 0
+        self._received.clear()
+
+
+def open_spad512(uri: Uri) -> StreamSource:
+    """Open
+    ``spad512://HOST:9999?bits=8&exposure_us=1000&images=1&width=512&pile_up=0&timeout_s=5&reconnect_s=5``.
+
+    ``mode=gated&gate_steps=72&gate_step_ps=252&gate_width_ns=5&gate_offset_ps=5000`` moves a gate
+    from picture to picture; ``images`` are whole scans then.
+    """
+    uri.reject_unknown(*OPTIONS)
+    host, port = uri.host_and_port(DEFAULT_PORT)
+    patience, back = parse_timeouts(uri)
+    held, ledger = parse_buffer_settings(uri), Ledger()
+    feed = Spad512Feed(
+        lambda: TcpLink(host, port, patience), ledger, parse_exposure(uri), patience, back
+    )
+    return StreamSource(feed, feed.codec, ledger, held)
+
+
+def parse_exposure(uri: Uri) -> ExposureRequest:
+    """Read the values of an address that say what pictures to take."""
+    standard = ExposureRequest()
+    gate = None
+    if uri.choice("mode", "intensity", "gated") == "gated":
+        gate = GateScan.from_uri(uri)
+    elif set(uri.values) & set(GATE_OPTIONS):
+        raise InputError(f"'{uri.text}': a gate needs mode=gated")
+    return ExposureRequest(
+        uri.value("bits", int, standard.bits),
+        uri.value("exposure_us", float, standard.seconds * 1e6) * 1e-6,
+        uri.value("images", int, standard.images),
+        uri.value("width", int, standard.width),
+        uri.choice("pile_up", "0", "1") == "1",
+        gate,
+    )
+
+
+def parse_timeouts(uri: Uri) -> tuple[float, float]:
+    """Read how long to wait for an answer and for a server that went away, s."""
+    return parse_seconds(uri, "timeout_s", 5.0), parse_seconds(uri, "reconnect_s", 5.0)

@@ -1,1 +1,0 @@
-"""SPAD arrays that are read over TCP, with the commands of Pi Imaging's SPAD512S."""

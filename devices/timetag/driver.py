@@ -1,0 +1,574 @@
+"""The FX2 time tagger's registers: commands on one endpoint, replies on another.
+
+Sources: the gateware (bgamari/timetag-fpga: ``docs/registers``, ``reg_manager.v``), the firmware of
+its USB chip (bgamari/timetag-fx2) and the makers' own client (bgamari/timetag-tools).
+
+The FX2 time tagger as a feed: acquisition, and recovery from faults.
+
+Open time taggers by their addresses, and list those that are connected.
+"""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import enum
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from time import monotonic
+from typing import Any
+
+from devices.address import Uri
+from devices.registry import DiscoveredInstrument
+from devices.source import Gap, Info, Ledger
+from devices.stream import STREAM_OPTIONS, StreamSource, Transfer, parse_buffer_settings
+from devices.timetag.codec import RECORD_BYTES, TimeTagCodec
+from devices.usb import UsbIdentity, UsbLink, find_devices, read_serial, system_backend
+from tofclip.errors import (
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceNotFoundError,
+    DeviceStalledError,
+    DeviceTimeoutError,
+    InputError,
+    ProtocolError,
+    TransferOverflowError,
+)
+from tofclip.storage import Record, Scalar
+
+USB_IDENTITY = UsbIdentity(0x04B4, 0x1004)
+BARE_CHIP_IDENTITY = UsbIdentity(0x04B4, 0x8613)
+"""The same chip before its firmware was loaded."""
+
+INSTRUMENT = "FX2 time tagger"
+COMMAND_ENDPOINT, DATA_ENDPOINT, REPLY_ENDPOINT = 0x02, 0x86, 0x88
+PACKET_BYTES = 512
+REPLY_TIMEOUT_S = 0.5
+DRAIN_TIMEOUT_S = 0.02
+"""Seconds after which an endpoint that sent nothing is taken to be empty."""
+
+MAX_DRAINED = 16
+"""Transfers that are thrown away at once; one that sends more has another defect."""
+
+ATTEMPTS = 4
+
+_MAGIC, _READ, _WRITE = 0xAA, 0, 1
+_SET_SEND_WINDOW, _FLUSH = 1, 2
+_UNJAM = 0
+"""A register that is not there: writing it completes a command that was cut short."""
+
+
+class Register(enum.IntEnum):
+    """Addresses of the registers."""
+
+    VERSION = 1
+    CLOCK = 2
+    CAPTURE = 3
+    STROBE = 4
+    DELTA = 5
+    RECORDS = 6
+    """Records that went into the memory; any write sets it to zero."""
+    LOST = 7
+    """Records that found the memory full; any write sets it to zero."""
+    CLEAR = 8
+    """1 holds the memory empty, 0 lets it fill."""
+
+
+class Capture(enum.IntFlag):
+    """Bits of register `CAPTURE`."""
+
+    OFF = 0
+    REGISTER = 1
+    COUNT = 2
+    RESET = 4
+
+
+class TimeTagger:
+    """The instrument's registers, and the requests to its USB chip.
+
+    A reply is four bytes that do not say which request they answer. One that a killed program never
+    fetched would shift all later answers by one. So every exchange is followed by a reading of the
+    version, which must be what it always is; where it is not, the replies are thrown away, and the
+    exchange is tried again.
+
+    Making one of these synchronises.
+    """
+
+    def __init__(self, link: UsbLink) -> None:
+        self._link = link
+        self._buffer = array.array("B", bytes(64 * PACKET_BYTES))
+        self._has_requests = True
+        self.version = 0
+        self.synchronize()
+
+    def synchronize(self) -> None:
+        """Throw away replies to requests of the past, and end a command that was cut short."""
+        for _ in range(ATTEMPTS):
+            self._drain(REPLY_ENDPOINT)
+            with contextlib.suppress(DeviceTimeoutError, DeviceStalledError):
+                self._send(_WRITE, _UNJAM, 0)
+            self._drain(REPLY_ENDPOINT)
+            with contextlib.suppress(DeviceTimeoutError, DeviceStalledError):
+                first = self._exchange(_READ, Register.VERSION, 0)
+                if first == self._exchange(_READ, Register.VERSION, 0):
+                    self.version = first
+                    return
+        raise ProtocolError(
+            "the time tagger does not answer, or not what it is asked; unplug it and plug it in again"
+        )
+
+    def read(self, register: Register) -> int:
+        """Return a register's value; ProtocolError if it cannot be had."""
+        return self._transact(_READ, register, 0)
+
+    def write(self, register: Register, value: int) -> None:
+        """Set a register.
+
+        `value`: 32 bits.
+        """
+        self._transact(_WRITE, register, value)
+
+    def reset(self) -> None:
+        """Stop, and forget records, counts and time, also those of an earlier session."""
+        self.write(Register.STROBE, 0)
+        self.write(Register.DELTA, 0)
+        self.write(Register.CAPTURE, Capture.RESET)
+        self.write(Register.CAPTURE, Capture.OFF)
+        self.clear_memory()
+        self.write(Register.RECORDS, 0)
+        self.write(Register.LOST, 0)
+
+    def clear_memory(self) -> None:
+        """Throw away every record that waits in the memory and in the USB chip, which makes packets
+        of 512 bytes then. Nothing may be registered meanwhile.
+        """
+        self.write(Register.CLEAR, 1)
+        self.set_send_window(PACKET_BYTES)
+        # The chip still holds packets, and a last one that is not full. Once they have left, a
+        # record follows that had been taken out of the memory before. An endpoint that sends
+        # nothing once may only have been slow.
+        quiet = 0
+        for _ in range(MAX_DRAINED):
+            self.flush()
+            quiet = 0 if self._drain(DATA_ENDPOINT) else quiet + 1
+            if quiet == 2:
+                break
+        self.write(Register.CLEAR, 0)
+
+    def run(
+        self, channels: int, delta: int, capture: Capture = Capture.COUNT | Capture.REGISTER
+    ) -> None:
+        """Start the counter, then the registration, so that the first zero of the counter is not
+        taken for a wrap.
+
+        `channels, delta`: one bit for each channel whose edges are recorded as strobes, or whose
+        levels; `capture`: what to switch on in the end.
+        """
+        self.write(Register.STROBE, channels)
+        self.write(Register.DELTA, delta)
+        self.write(Register.CAPTURE, Capture.COUNT)
+        self.write(Register.CAPTURE, capture)
+
+    def set_send_window(self, size: int) -> bool:
+        """Set how many bytes make a packet, and let the chip send what it holds now, however
+        little.
+
+        `size`: at most 512. Packets of 512 bytes do not end a transfer, smaller ones do. Returns
+        false where the firmware has no such request.
+        """
+        return self._request(_SET_SEND_WINDOW, size)
+
+    def flush(self) -> bool:
+        """Let the chip get rid of an unfinished packet: send it or, by other firmware, forget it.
+
+        Returns false where the firmware has no such request.
+        """
+        return self._request(_FLUSH, 0)
+
+    def _request(self, number: int, value: int) -> bool:
+        """Send a request to the USB chip's firmware; False where there is no such request."""
+        if self._has_requests:
+            try:
+                self._link.request(number, value, REPLY_TIMEOUT_S)
+            except (DeviceStalledError, DeviceTimeoutError):
+                self._has_requests = False
+        return self._has_requests
+
+    def _drain(self, endpoint: int) -> int:
+        """Throw away what waits at an endpoint, and return how many bytes that were."""
+        thrown = 0
+        for _ in range(MAX_DRAINED):
+            try:
+                thrown += self._link.read(endpoint, self._buffer, DRAIN_TIMEOUT_S)
+            except DeviceTimeoutError:
+                break
+            except TransferOverflowError:
+                thrown += 1
+        return thrown
+
+    def _transact(self, what: int, register: Register, value: int) -> int:
+        """Do an exchange and make sure that the reply is the one to this request."""
+        for attempt in range(ATTEMPTS):
+            if attempt:
+                self.synchronize()
+            with contextlib.suppress(DeviceTimeoutError, DeviceStalledError):
+                answer = self._exchange(what, register, value)
+                if self._exchange(_READ, Register.VERSION, 0) == self.version:
+                    return answer
+        raise ProtocolError(
+            f"the time tagger does not answer about register {register}; unplug it and plug it in "
+            "again"
+        )
+
+    def _send(self, what: int, register: int, value: int) -> None:
+        command = struct.pack("<BBHI", _MAGIC, what, register, value)
+        self._link.write(COMMAND_ENDPOINT, command, REPLY_TIMEOUT_S)
+
+    def _exchange(self, what: int, register: Register, value: int) -> int:
+        self._send(what, register, value)
+        length = self._link.read(REPLY_ENDPOINT, self._buffer, REPLY_TIMEOUT_S)
+        if length != 4:
+            raise ProtocolError(
+                f"the time tagger answered {length} bytes about register {register}, expected 4"
+            )
+        return int.from_bytes(self._buffer[:4].tobytes(), "little")
+
+
+_COUNTER_MODULUS = 1 << 32
+
+MIN_CLOCK_HZ, MAX_CLOCK_HZ = 1_000_000, 1_000_000_000
+"""Whatever the gateware was built for, its clock is within these."""
+
+PACKET_INTERVAL_S = 0.015
+LATENCY_S = 0.02
+"""Seconds after which a transfer is ended, and a chip that holds part of a packet is asked to send."""
+
+FULL_STREAM_BYTES_PER_S = 500_000
+
+
+@dataclass(frozen=True)
+class AcquisitionSettings:
+    """How to acquire."""
+
+    channels: int = 0xF  # one bit for each channel that registers edges, or levels
+    delta: int = 0  # one bit for each channel that registers edges, or levels
+    # most that one transfer asks for: whole packets of 512 bytes, or a device may send more than
+    # fits
+    transfer_bytes: int = 1 << 19
+    reconnect: float = 5.0  # seconds to wait for an instrument that was unplugged
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.channels <= 0xF and 0 <= self.delta <= 0xF):
+            raise InputError("channels and delta are masks of four bits: 0 to 15")
+        if not 0 < self.transfer_bytes <= 1 << 24 or self.transfer_bytes % PACKET_BYTES:
+            raise InputError(
+                f"a transfer must be a multiple of {PACKET_BYTES} bytes, at most 16 MiB"
+            )
+        if not 0 <= self.reconnect <= 600:
+            raise InputError(
+                "the time to wait for an unplugged instrument must be within 0 s and 600 s"
+            )
+
+
+class TimeTaggerFeed:
+    """The time tagger's words, one transfer after the other; see `devices.stream.Feed`.
+
+    What the instrument registered but never handed over is found by comparing its own counts with
+    what arrived, when it closes and after it was unplugged; an instrument that lost its power has
+    forgotten them.
+
+    The firmware makes packets of 510 bytes, each of which ends a transfer because it is shorter than
+    the endpoint's 512: 8,000 a second of a full stream, while the board holds no more than 3 ms.
+    Packets of 512 bytes do not end a transfer, and so the system goes on reading by itself. At low
+    rates, where a photon would wait for 84 others, packets are made small; see `SendWindow`.
+    """
+
+    def __init__(self, link: UsbLink, ledger: Ledger, acquisition: AcquisitionSettings) -> None:
+        self._link = link
+        self._ledger = ledger
+        self._acquisition = acquisition
+        self._tagger = TimeTagger(link)
+        self._buffer = array.array("B", bytes(acquisition.transfer_bytes))
+        self._view = memoryview(self._buffer)
+        self._window = SendWindow()
+        self._gap = Gap.NONE
+        self._capture_mode = Capture.COUNT | Capture.REGISTER
+        self._disconnected_at: float | None = None
+        self._must_clear = False
+        self._is_flushed = False
+        self._records_received = 0
+        self._bytes_since_gap = 0
+        self._clock_hz = self._tagger.read(Register.CLOCK)
+        # Ticks become seconds by this number, so that a wrong one is refused before any record.
+        if not self._clock_hz:
+            raise ProtocolError(
+                "the time tagger says that its clock has 0 Hz; is its gateware loaded?"
+            )
+        if not MIN_CLOCK_HZ <= self._clock_hz <= MAX_CLOCK_HZ:
+            raise ProtocolError(
+                f"the time tagger says that its clock has {self._clock_hz} Hz, which cannot be; "
+                "unplug it and plug it in again"
+            )
+
+    @property
+    def info(self) -> Info:
+        details: dict[str, Scalar] = {
+            "version": self._tagger.version,
+            "clock_hz": self._clock_hz,
+            "usb": str(self._link.identity),
+        }
+        return Info(INSTRUMENT, self._link.serial, details)
+
+    @property
+    def calibration(self) -> Record:
+        return Record("calibration", attributes={"tick_s": 1 / self._clock_hz})
+
+    def start(self) -> None:
+        self._tagger.reset()
+        self._window.size = PACKET_BYTES
+        self._records_received = 0
+        self._bytes_since_gap = 0
+        self._tagger.run(self._acquisition.channels, self._acquisition.delta, self._capture_mode)
+
+    def pull(self, timeout: float) -> Transfer | None:
+        while True:
+            try:
+                self._prepare_read(timeout)
+                begin = self._window.clock()
+                wait = min(timeout, self._window.read_timeout)
+                length = self._link.read(DATA_ENDPOINT, self._buffer, wait)
+            except TransferOverflowError:
+                self._must_clear = True
+            except DeviceDisconnectedError as fault:
+                self._note_disconnect(fault)
+            except DeviceTimeoutError:
+                if self._disconnected_at is not None or not self._send_rest():
+                    raise
+                self._ledger.time_out()
+            else:
+                self._set_window(self._window.choose(length, self._window.clock() - begin))
+                if not length:
+                    continue  # an empty packet: the chip was asked to send, and had nothing
+                self._bytes_since_gap += length
+                gap = self._gap
+                self._gap = Gap.NONE
+                return Transfer(self._view[:length], gap)
+
+    def stop(self) -> None:
+        self._capture_mode = Capture.COUNT
+        self._tagger.write(Register.CAPTURE, self._capture_mode)
+
+    def close(self) -> None:
+        try:
+            self.stop()
+            self._count_losses()
+        finally:
+            self._link.close()
+
+    def _send_rest(self) -> bool:
+        """Get hold of records that wait for others in the chip; False where there are none left."""
+        if self._window.size > RECORD_BYTES:
+            return self._set_window(RECORD_BYTES)
+        if Capture.REGISTER in self._capture_mode or self._is_flushed:
+            return False
+        # The last resort, after everything was stopped: some firmware sends only on this request.
+        self._is_flushed = True
+        received = self._records_received + -(-self._bytes_since_gap // RECORD_BYTES)
+        with contextlib.suppress(DeviceDisconnectedError):  # the next transfer notices
+            return self._tagger.read(Register.RECORDS) != received and self._tagger.flush()
+        return False
+
+    def _set_window(self, size: int) -> bool:
+        """Set how many bytes make a packet; False where that cannot be set."""
+        if size == self._window.size:
+            return True
+        self._window.size = size
+        with contextlib.suppress(DeviceDisconnectedError):  # the next transfer notices
+            return self._tagger.set_send_window(size)
+        return False
+
+    def _prepare_read(self, timeout: float) -> None:
+        """Do what has to be done before reading can go on."""
+        if self._disconnected_at is not None:
+            self._reconnect(timeout)
+        if self._must_clear:
+            self._clear_memory()
+
+    def _clear_memory(self) -> None:
+        """Empty the instrument's memory, so that the stream begins with a whole record again."""
+        self._gap = max(self._gap, Gap.LOSS)
+        self._end_segment()
+        self._tagger.write(Register.CAPTURE, Capture.COUNT)
+        self._tagger.clear_memory()
+        self._window.size = PACKET_BYTES
+        self._tagger.write(Register.CAPTURE, self._capture_mode)
+        self._must_clear = False
+
+    def _reconnect(self, timeout: float) -> None:
+        """Look for the unplugged instrument, but return in time for a caller that wants to stop."""
+        try:
+            self._link.reconnect(min(timeout, self._reconnect_time_left))
+        except DeviceDisconnectedError as fault:
+            if self._reconnect_time_left > 0:
+                raise DeviceTimeoutError("the time tagger is unplugged") from fault
+            raise
+        self._tagger.synchronize()
+        # After a loss of power the register is zero.
+        if self._tagger.read(Register.CAPTURE) & Capture.COUNT:
+            self._must_clear = True  # it kept its power and went on
+        else:
+            self._gap = Gap.RESTART
+            self.start()
+        self._disconnected_at = None
+        self._ledger.reconnect()
+
+    def _note_disconnect(self, fault: DeviceDisconnectedError) -> None:
+        """Note that the instrument is gone; raise if it has been for too long."""
+        if self._disconnected_at is None:
+            self._disconnected_at = monotonic()
+        if self._reconnect_time_left <= 0:
+            raise DeviceDisconnectedError(
+                f"the time tagger {self._link.serial} was unplugged and did not come back within "
+                f"{self._acquisition.reconnect:g} s"
+            ) from fault
+
+    @property
+    def _reconnect_time_left(self) -> float:
+        begin = monotonic() if self._disconnected_at is None else self._disconnected_at
+        return begin + self._acquisition.reconnect - monotonic()
+
+    def _count_losses(self) -> None:
+        """Enter what the instrument counted and this program never saw."""
+        self._end_segment()
+        missing = (
+            self._tagger.read(Register.RECORDS) - self._records_received
+        ) % _COUNTER_MODULUS  # the counts have 32 bits
+        if missing >= _COUNTER_MODULUS // 2:
+            raise ProtocolError("the time tagger sent more records than it counted")
+        self._ledger.lose(missing + self._tagger.read(Register.LOST))
+
+    def _end_segment(self) -> None:
+        """Count what arrived without a gap; a record of which only the beginning arrived counts as
+        well.
+        """
+        self._records_received += -(-self._bytes_since_gap // RECORD_BYTES)
+        self._bytes_since_gap = 0
+
+
+class SendWindow:
+    """How many bytes make a packet, so that no record waits long and a full stream is not cut up.
+
+    The aim is one packet in `PACKET_INTERVAL_S`: the rate is measured while reading, over eight
+    transfers or that time. A rate for which 512 bytes come sooner is read in packets of 512 bytes,
+    which do not end a transfer.
+    """
+
+    clock = staticmethod(monotonic)
+    """By which rates are measured, s."""
+
+    def __init__(self) -> None:
+        self.size = PACKET_BYTES
+        """Bytes of a packet."""
+        self._bytes = 0
+        self._transfers = 0
+        self._seconds = 0.0
+        self._rate = 0.0
+
+    @property
+    def read_timeout(self) -> float:
+        """Seconds that one transfer may take: long for a full stream, which is not cut then, and
+        for packets of single records, which end a transfer at once.
+        """
+        is_full = self._rate > FULL_STREAM_BYTES_PER_S
+        return 10.0 if is_full or self.size == RECORD_BYTES else LATENCY_S
+
+    def choose(self, length: int, seconds: float) -> int:
+        """Return how many bytes should make a packet from now on.
+
+        `length`: bytes that the last transfer brought; `seconds`: how long it took. Returns bytes.
+        """
+        self._bytes += length
+        self._transfers += 1
+        self._seconds += seconds
+        if self._transfers < 8 and self._seconds < PACKET_INTERVAL_S:
+            return self.size
+        self._rate = self._bytes / max(self._seconds, 1e-6)
+        self._bytes = 0
+        self._transfers = 0
+        self._seconds = 0.0
+        wanted = self._rate * PACKET_INTERVAL_S
+        if wanted >= PACKET_BYTES:
+            return PACKET_BYTES
+        size = max(1, int(wanted / RECORD_BYTES)) * RECORD_BYTES
+        is_near = self.size / 2 <= size <= 2 * self.size and self.size < PACKET_BYTES
+        return self.size if is_near else size
+
+
+OPTIONS = ("channels", "delta", "transfer_kib", "reconnect_s", *STREAM_OPTIONS)
+
+
+def open_timetag(uri: Uri) -> StreamSource:
+    """Open
+    ``timetag://SERIAL?channels=15&delta=0&transfer_kib=512&buffer_mib=64&policy=block&reconnect_s=5``.
+    """
+    uri.reject_unknown(*OPTIONS)
+    backend = system_backend()
+    try:
+        return open_on_backend(uri, uri.location, backend)
+    except DeviceNotFoundError as fault:
+        if any(find_devices(BARE_CHIP_IDENTITY, backend)):
+            raise DeviceNotFoundError(
+                f"a USB device {BARE_CHIP_IDENTITY} is connected, a chip without firmware; "
+                "load the time tagger's into it first"
+            ) from fault
+        raise
+
+
+def open_on_backend(uri: Uri, serial: str, backend: Any) -> StreamSource:
+    """Open the time tagger behind a backend of pyusb, with the values of an address (`OPTIONS`).
+
+    `serial`: of the instrument; empty: any; `backend`: of pyusb.
+    """
+    standard = AcquisitionSettings()
+    acquisition = AcquisitionSettings(
+        uri.value("channels", int, standard.channels),
+        uri.value("delta", int, standard.delta),
+        int(uri.value("transfer_kib", float, standard.transfer_bytes / 1024) * 1024),
+        uri.value("reconnect_s", float, standard.reconnect),
+    )
+    held, ledger = parse_buffer_settings(uri), Ledger()
+    link = UsbLink(USB_IDENTITY, serial, backend)
+    try:
+        feed = TimeTaggerFeed(link, ledger, acquisition)
+        return StreamSource(feed, TimeTagCodec(), ledger, held)
+    except BaseException:
+        link.close()
+        raise
+
+
+def find_timetaggers() -> list[DiscoveredInstrument]:
+    """Look for connected time taggers; an empty list where there is no USB to look at."""
+    try:
+        backend = system_backend()
+        return [*_list_timetaggers(backend), *_list_bare_chips(backend)]
+    except DeviceError:
+        return []
+
+
+def _list_timetaggers(backend: Any) -> Iterator[DiscoveredInstrument]:
+    for device in find_devices(USB_IDENTITY, backend):
+        try:
+            serial, note = read_serial(device, USB_IDENTITY), ""
+        except DeviceError as fault:
+            serial, note = "", str(fault)
+        yield DiscoveredInstrument(f"timetag://{serial}", INSTRUMENT, note)
+
+
+def _list_bare_chips(backend: Any) -> Iterator[DiscoveredInstrument]:
+    for _ in find_devices(BARE_CHIP_IDENTITY, backend):
+        yield DiscoveredInstrument(
+            "timetag://",
+            INSTRUMENT,
+            "a chip without firmware; load the time tagger's into it first",
+        )

@@ -1,0 +1,401 @@
+"""What a capture says about itself before it is imaged: whether a picture can come of it, which light
+is the wall's own, which waves its points and its noise leave to see.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.band import BAND_EDGE_LEVEL, VirtualPulse
+from nlos.capture import Capture
+from nlos.illumination import is_confocal
+from tofclip.arrays import to_numpy
+from tofclip.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+PROFILE_STEPS_PER_WALL = 50
+"""Steps of the mean signal's profile per width of the wall."""
+
+FIRST_BOUNCE_WALL_FRACTION = 0.1
+"""The wall's own light arrives within this fraction of the wall's width of its own path."""
+
+MIN_BOUNCE_RATIO = 3.0
+"""The wall's own light falls at least by this factor before anything else arrives."""
+
+FADED_FRACTION = 0.1
+"""The wall's own light has faded when it is this fraction of the brightest light that follows."""
+
+
+MIN_EARLY_FRACTION = 0.02
+"""Of the samples, before any light can have come, that tell the noise."""
+
+NOISE_BAND_FRACTION = 0.25
+"""Of all frequencies, the highest are taken for noise."""
+
+MAX_ANALYSED_POINTS = 1024
+"""Wall points whose signals are looked at."""
+
+MIN_FLOOR_RATIO = 1e-5
+"""Of the strongest wave's energy, the least that is noise and not the tail of a pulse."""
+
+MAX_FLOOR_SLOPE = 0.15
+"""What noise's energy may change from the lower to the upper half of the highest frequencies."""
+
+LIT_END_FRACTION = 0.01
+"""Of the brightest light, what the last bins hold if light still comes."""
+
+MIN_COHERENT_SIGNAL = 800.0
+"""Signal over noise of all wall points together that a wavelength needs: with it a letter of some
+hundred resolved voxels stands out. Measured on recorded letters and a mannequin."""
+
+MIN_BAND_OVER_EARLY = 3.0
+"""Energy that a wavelength has in the record, relative to before any light can have come."""
+
+MAX_ALIASED_FRACTION = 0.2
+"""Of a pulse's signal, what may be of waves finer than the wall samples."""
+
+WAVELENGTH_STEP_RATIO = 1.05
+"""From one wavelength that is tried to the next."""
+
+WAVELENGTH_DIGITS = 2
+"""Of the default wavelength in mm, rounded up."""
+
+MAX_LASER_WALL_WIDTHS = 5.0
+"""A laser spot farther from the wall than this number of its widths is a mistake."""
+
+MAX_LASER_OFF_WALL_M, LASER_OFF_WALL_SLOPE = 0.05, 0.5
+"""A laser spot may stand so far before the foremost or behind the hindmost wall point, and farther
+by this part of how far aside it is, where the wall is not known."""
+
+MAX_START_M = 1e3
+"""A record that begins after a longer path, m, still holds the ways to the devices."""
+
+MAX_SATURATED_FRACTION = 0.5
+"""Of the samples, what may have the largest value: light comes during a part of the record."""
+
+MAX_SIGNAL = 1e30
+"""Larger samples overflow once they are squared."""
+
+
+@dataclass(frozen=True)
+class FirstBounce:
+    """Light that came straight from the laser spot, by way of no hidden thing."""
+
+    end: float  # m of path after its arrival by which it has faded
+    ratio: float  # its peak, relative to the brightest light that follows
+
+
+def find_first_bounce(capture: Capture) -> FirstBounce | None:
+    """Recognise the light that the wall returns at once, and how long it lasts.
+
+    It arrives at every wall point after the path from the laser spot, and falls from there on until
+    hidden things' light rises.
+
+    Returns none where no such light is in the record.
+    """
+    late, level = _compute_profile(capture)
+    extent = float(np.ptp(capture.points, axis=0).max())
+    if late.size < 4:
+        return None
+    early = late <= FIRST_BOUNCE_WALL_FRACTION * extent
+    if not early.any() or early.all():
+        return None
+    peak = int(np.argmax(np.where(early, level, -np.inf)))
+    # From the peak on, the lowest level before the highest that rises from it again.
+    fall = np.minimum.accumulate(level[peak:])
+    rise = level[peak:] - fall
+    top = peak + int(np.argmax(rise))
+    valley = peak + int(np.argmin(level[peak : top + 1])) if rise.max() > 0 else level.size - 1
+    lowest = float(level[valley])
+    follows = float(level[valley:].max()) - lowest
+    if level[peak] < MIN_BOUNCE_RATIO * max(lowest, 0.0) or level[peak] <= 0:
+        return None
+    if follows <= 0:
+        follows = float(level[peak]) * FADED_FRACTION
+    faded = np.flatnonzero(level[peak : valley + 1] - lowest <= FADED_FRACTION * follows)
+    if faded.size and faded[0] == 0:
+        return None  # a few counts of the background before anything else
+    end = float(late[peak + int(faded[0])]) if faded.size else float(late[valley])
+    return FirstBounce(max(end, 0.0), (float(level[peak]) - lowest) / follows)
+
+
+@dataclass(frozen=True, eq=False)
+class SignalSpectrum:
+    """How much of each wave a capture's signals hold, and how much of it is noise.
+
+    Photons' noise is white: what the highest frequencies hold, all frequencies hold. Other noise is
+    known where the record begins before light can have come.
+    """
+
+    power: FloatArray  # (frequencies,), mean over the wall points
+    floor: float  # of the noise
+    wavenumbers: FloatArray  # (frequencies,), rad/m of path
+    spectrum: NDArray[np.complex128]  # (n, frequencies), of some wall points
+    # (n, t), samples before any light can have come; none where there are too few
+    early: NDArray[np.bool_]
+    points: int  # all wall points
+
+    @classmethod
+    def of(cls, capture: Capture, margin: float) -> SignalSpectrum:
+        """Analyse a capture without the wall's own light.
+
+        `margin`: m of path before light may come that a wave reaches ahead.
+        """
+        traces, direct = _select_traces(capture)
+        # Waves would see an edge where the record ends while light still comes.
+        spectrum = np.fft.rfft(traces * np.hanning(traces.shape[1]), axis=1)
+        power = np.mean(np.abs(spectrum) ** 2, axis=0)
+        floor = float(np.mean(power[-max(1, int(NOISE_BAND_FRACTION * power.size)) :]))
+        early = capture.axis.paths < (direct - margin)[:, np.newaxis]
+        if early.mean() < MIN_EARLY_FRACTION or not traces[early].any():
+            early = np.zeros_like(early)
+        frequencies = np.fft.rfftfreq(traces.shape[1], capture.axis.spacing)
+        wavenumbers = np.asarray(2 * np.pi * frequencies, np.float64)
+        unwindowed = np.fft.rfft(traces, axis=1)
+        return cls(power, floor, wavenumbers, unwindowed, early, len(capture.points))
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether white noise is seen in the spectrum, as in all that was recorded.
+
+        It is flat at the highest frequencies, where the tail of a pulse falls.
+        """
+        count = max(1, int(NOISE_BAND_FRACTION * self.power.size) // 2)
+        below = float(np.mean(self.power[-2 * count : -count]))
+        above = float(np.mean(self.power[-count:]))
+        seen = self.floor > MIN_FLOOR_RATIO * float(self.power.max(initial=0.0))
+        return seen and abs(below / above - 1) < MAX_FLOOR_SLOPE
+
+    def coherent_signal(self, pulse: VirtualPulse) -> float:
+        """Signal over noise of all wall points together in a pulse's band."""
+        if not self.is_noisy:
+            return np.inf
+        weight = pulse.spectrum(self.wavenumbers) ** 2
+        return self.points * float(np.sum(weight * self.power) / np.sum(weight) / self.floor - 1)
+
+    def fraction_shorter(self, pulse: VirtualPulse, wavelength: float) -> float:
+        """Fraction of a pulse's signal, noise taken off, in waves shorter than `wavelength` m.
+
+        `wavelength`: metres. Returns 0 to 1.
+        """
+        signal = pulse.spectrum(self.wavenumbers) ** 2 * np.maximum(self.power - self.floor, 0)
+        shorter = self.wavenumbers > 2 * np.pi / wavelength
+        total = float(signal.sum())
+        return float(signal[shorter].sum()) / total if total > 0 else 0.0
+
+    def band_over_early(self, pulse: VirtualPulse) -> float:
+        """Energy in a pulse's band where light may have come, over that before; infinite where the
+        record does not begin so early.
+        """
+        if not self.early.any():
+            return np.inf
+        # The waves of negative frequencies are left out, so that the magnitude is the envelope.
+        padded = np.zeros(self.early.shape, np.complex128)
+        padded[:, : self.spectrum.shape[1]] = self.spectrum * pulse.spectrum(self.wavenumbers)
+        energy = np.abs(np.fft.ifft(padded, axis=1)) ** 2
+        before = float(energy[self.early].mean())
+        return float(energy[~self.early].mean()) / before if before > 0 else np.inf
+
+
+def find_brightest_path(capture: Capture) -> float:
+    """Path, beyond that of the wall's own light, at which most light arrives, m."""
+    late, level = _compute_profile(capture)
+    return float(late[np.argmax(level)])
+
+
+def find_lit_end(capture: Capture) -> bool:
+    """Whether light still comes when the record ends, so that its end shows as an edge."""
+    traces, _ = _select_traces(capture)
+    level = np.abs(traces.mean(axis=0))
+    last = level[-max(1, level.size // 50) :].mean()
+    return bool(last > LIT_END_FRACTION * level.max())
+
+
+def require_plausible(capture: Capture) -> None:
+    """Refuse what no picture can come of, before any work is done."""
+    low, high = capture.points.min(axis=0), capture.points.max(axis=0)
+    extent = float((high - low).max())
+    if len(capture.points) > 1 and extent == 0 and capture.laser.ndim == 1:
+        raise InputError("all wall points stand in one place: a capture needs several places")
+    beyond = np.maximum(np.maximum(low - capture.lasers, capture.lasers - high), 0)
+    away = float(np.linalg.norm(beyond, axis=1).max())
+    if extent > 0 and away > MAX_LASER_WALL_WIDTHS * extent:
+        raise InputError(
+            f"the laser spot lies {away:.3g} m from the wall, which is {extent:.3g} m wide: give the spot on the wall"
+        )
+    outside = np.linalg.norm(beyond[:, :2], axis=1)
+    off = beyond[:, 2] - MAX_LASER_OFF_WALL_M - LASER_OFF_WALL_SLOPE * outside
+    if extent > 0 and off.max() > 0:
+        worst = int(np.argmax(off))
+        side = "behind" if capture.lasers[worst, 2] < low[2] else "in front of"
+        raise InputError(
+            f"the laser spot lies {beyond[worst, 2]:.3g} m {side} the wall: give the spot on the wall"
+        )
+    if capture.start > MAX_START_M:
+        raise InputError(
+            f"the record begins at a path of {capture.start:.4g} m: take the ways to and from the devices off"
+        )
+    largest = float(abs(capture.signal).max())
+    if not largest < MAX_SIGNAL:
+        raise InputError(f"signals of {largest:.3g} overflow in single precision; scale them down")
+    if largest == 0:
+        raise InputError("every signal is 0: there is nothing to image")
+    if float(capture.signal.max()) == float(capture.signal.min()):
+        raise InputError(f"every signal is {largest:.4g}, constant or saturated: nothing to image")
+    brightest = float(capture.signal.max())
+    saturated = float((capture.signal == brightest).sum()) / math.prod(capture.signal.shape)
+    if brightest > 0 and saturated > MAX_SATURATED_FRACTION:
+        raise InputError(
+            f"{100 * saturated:.0f} % of the samples are {brightest:.4g}, saturated: record less light"
+        )
+
+
+def require_usable_wavelength(capture: Capture, wavelength: float, cycles: float) -> None:
+    """Refuse a given wavelength that shows nothing.
+
+    `wavelength`: carrier of the virtual pulse, m of path; `cycles`: length of the pulse in
+    wavelengths.
+    """
+    extent = float(np.ptp(capture.points, axis=0).max())
+    record = float(np.ptp(capture.axis.paths))
+    longest = min(limit for limit in (extent, record / cycles) if limit > 0)
+    if wavelength > longest * (1 + 1e-6):
+        raise InputError(
+            f"a wavelength of {wavelength:.3g} m shows nothing of this capture, with a wall {extent:.3g} m wide and a "
+            f"record of {record:.3g} m: use at most {longest / 2:.2g} m"
+        )
+
+
+def require_usable_cycles(capture: Capture, cycles: float) -> None:
+    """Refuse a virtual pulse that even at the shortest wavelength of the time bins is longer than
+    the record: its band would be computed over that length.
+    """
+    record, shortest = float(np.ptp(capture.axis.paths)), 2 * capture.axis.spacing
+    if cycles * shortest > record:
+        raise InputError(
+            f"a pulse of {cycles:.4g} cycles is longer than the record of {record:.3g} m: use at most "
+            f"{record / shortest:.2g} cycles; about 3 are usual"
+        )
+
+
+def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str]:
+    """Choose the carrier of a virtual pulse for a capture without the wall's own light.
+
+    It is the shortest that wall points and time bins carry, and that the signal has more of than
+    noise. In a noisy record only waves that stand out of the noise can make false images: the wall
+    has to sample these, at the steepest angle at which they arrive.
+
+    Returns m of path, and the reason.
+    """
+    sampled = find_shortest_wavelength(capture, cycles)
+    reason = "the shortest that wall points and time bins carry"
+    longest = max(sampled * WAVELENGTH_STEP_RATIO, find_longest_wavelength(capture))
+    spectrum = SignalSpectrum.of(capture, sampled)
+    wavelength, aliased = sampled, 0.0
+    if spectrum.is_noisy:
+        aliased = _sampling_limit(capture, _steepest_angle(capture))
+        wavelength = max(min(aliased, sampled), 4 * capture.axis.spacing)
+        reason = "the shortest above the noise that the wall points carry"
+    while wavelength < longest:
+        pulse = VirtualPulse(wavelength, cycles)
+        if spectrum.coherent_signal(pulse) < MIN_COHERENT_SIGNAL:
+            reason = "shorter waves are weaker than the photons' noise"
+        elif spectrum.fraction_shorter(pulse, aliased or np.inf) > MAX_ALIASED_FRACTION and aliased:
+            reason = "shorter waves are finer than the wall points sample"
+        elif spectrum.band_over_early(pulse) < MIN_BAND_OVER_EARLY:
+            reason = "shorter waves are as strong before any light can have come"
+        else:
+            break
+        wavelength *= WAVELENGTH_STEP_RATIO
+    else:
+        return round_wavelength_up(sampled), "no wave stands out of the noise: the shortest sampled"
+    return round_wavelength_up(wavelength), reason
+
+
+def round_wavelength_up(wavelength: float) -> float:
+    """Round a wavelength in m up to two digits in mm."""
+    value = wavelength * 1e3
+    step = math.floor(math.log10(value)) - WAVELENGTH_DIGITS + 1
+    # A value that is round already stays, whatever its last bit.
+    rounded = math.ceil(value / 10**step - 1e-9) * 10**step
+    return float(round(rounded, max(0, -step))) * 1e-3
+
+
+def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
+    """Carrier of the shortest virtual pulse whose whole band a capture carries, m.
+
+    The band's shortest wave is sampled twice along the wall (four times in a confocal scan, where
+    the path grows on both legs) and twice along the record.
+
+    `cycles`: length of the pulse in wavelengths. Returns metres.
+    """
+    return _band_reach(cycles) * max(_sampling_limit(capture), 2 * capture.axis.spacing)
+
+
+def find_longest_wavelength(capture: Capture) -> float:
+    """Carrier above which a point's image at a wall's width is wider than half the wall, m."""
+    extent = float(np.ptp(capture.points[:, :2], axis=0).max())
+    return extent / 2
+
+
+def find_sampling_step(capture: Capture) -> float:
+    """Distance of neighbouring wall points, or of the laser spots where one wall point sees them
+    all, m; else 0.
+    """
+    if math.isfinite(capture.spacing):
+        return capture.spacing
+    if capture.laser.ndim == 1:
+        return 0.0
+    # Light runs either way: the spots sample the scene as wall points would.
+    swapped = replace(capture, wall=capture.laser, laser=capture.wall).spacing
+    return swapped if math.isfinite(swapped) else 0.0
+
+
+def _band_reach(cycles: float) -> float:
+    """Highest wavenumber of a virtual pulse's band, relative to its carrier."""
+    pulse = VirtualPulse(1.0, cycles)
+    return 1 + math.sqrt(-2 * math.log(BAND_EDGE_LEVEL)) / (pulse.sigma * pulse.wavenumber)
+
+
+def _sampling_limit(capture: Capture, sine: float = 1.0) -> float:
+    """Shortest wave that the wall samples twice where it arrives under an angle of that sine, m."""
+    return sine * find_sampling_step(capture) * (4 if is_confocal(capture) else 2)
+
+
+def _steepest_angle(capture: Capture) -> float:
+    """Sine of the angle between the wall's normal and the way from one end of the wall to what is
+    brightest before the other.
+    """
+    extent = float(np.ptp(capture.points[:, :2], axis=0).max())
+    depth = max(find_brightest_path(capture) / 2, 0.0)
+    return extent / math.hypot(extent, depth) if extent > 0 else 1.0
+
+
+def _compute_profile(capture: Capture) -> tuple[FloatArray, FloatArray]:
+    """Mean signal by path beyond that of the wall's own light: paths, m, and levels."""
+    traces, direct = _select_traces(capture)
+    extent = float(np.ptp(capture.points, axis=0).max())
+    step = max(capture.axis.spacing, extent / PROFILE_STEPS_PER_WALL)
+    number = np.floor((capture.axis.paths - direct[:, np.newaxis]) / step).astype(np.intp)
+    first = int(number.min())
+    count = np.bincount((number - first).ravel())
+    total = np.bincount((number - first).ravel(), traces.ravel())
+    # Steps that few wall points reach tell little of the wall.
+    kept = count > count.max() / 10
+    paths = step * (first + np.arange(count.size) + 0.5)
+    return paths[kept], total[kept] / count[kept]
+
+
+def _select_traces(capture: Capture) -> tuple[FloatArray, FloatArray]:
+    """Signals (n, t) of some wall points, evenly picked, and the path to each from its laser, m."""
+    some = np.arange(len(capture.points))[:: len(capture.points) // MAX_ANALYSED_POINTS + 1]
+    flat = to_numpy(capture.signal).reshape(capture.axis.bins, -1)
+    traces = flat[:, np.flatnonzero(capture.valid)[some]].T.astype(np.float64)
+    lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[some]
+    direct: FloatArray = np.linalg.norm(capture.points[some] - lasers, axis=1)
+    return traces, direct

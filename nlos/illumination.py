@@ -1,0 +1,213 @@
+"""The parts of a capture that one illumination made, which of laser spots and wall points to take for
+lasers, a band in which no voxel sees an echo of the record, and whether the wall is sampled finely
+enough for it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.band import Band, VirtualPulse
+from nlos.capture import Capture, TimeAxis
+from nlos.phasor.to_depths_compiled import LaserSource
+from nlos.phasor.transfer import SphericalWaves
+from nlos.volume import Grid
+from tofclip.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+SAME_SPOT_FRACTION = 1e-6
+"""Of the wall's width: nearer to each other, a laser spot and a wall point are one."""
+
+MIN_POINTS_PER_SPOT = 4
+"""With fewer wall points per laser spot, a wave from each spot is not worth its own field."""
+
+
+@dataclass(frozen=True, eq=False)
+class IlluminationGroup:
+    """Wall points whose light started at one laser spot, or at each point itself."""
+
+    # (3,), m; None for a confocal scan, in which the way out is the way back
+    laser: FloatArray | None
+    indices: NDArray[np.intp]  # (n,), which of the capture's valid points
+
+    @property
+    def legs(self) -> int:
+        """How often the field's wave runs between wall and voxel: 1, or 2 if confocal."""
+        return 2 if self.laser is None else 1
+
+    def compute_phasors(self, capture: Capture, band: Band) -> NDArray[np.complex64]:
+        """Return the phasors of the group's wall points.
+
+        `band`: frequencies of the virtual pulse. Returns (n, frequencies).
+        """
+        traces = capture.traces()
+        return np.asarray(
+            band.compute_phasors(
+                traces if len(self.indices) == len(traces) else traces[self.indices]
+            ),
+            np.complex64,
+        )
+
+
+def is_confocal(capture: Capture) -> bool:
+    """Whether every wall point is its own laser spot, but for rounding."""
+    if len(capture.lasers) != len(capture.points) or len(capture.points) == 1:
+        return False
+    extent = float(np.ptp(capture.points, axis=0).max())
+    apart = float(np.abs(capture.lasers - capture.points).max())
+    return apart <= SAME_SPOT_FRACTION * extent
+
+
+def swap_roles(capture: Capture) -> Capture:
+    """Take laser spots for wall points and wall points for laser spots."""
+    lasers = np.broadcast_to(capture.laser, capture.wall.shape)
+    return replace(capture, wall=lasers, laser=capture.wall)
+
+
+def choose_roles(capture: Capture) -> Capture:
+    """Return the capture with fewer laser spots than wall points: itself, or its roles swapped.
+
+    A wave has to be imaged for every laser spot, whatever the number of wall points: a scan by a
+    laser in front of few detectors is quicker the other way round.
+
+    Returns the same one unless swapping helps.
+    """
+    if len(capture.lasers) == 1 or is_confocal(capture):
+        return capture
+    fewer = _count_places(capture.points) < _count_places(capture.lasers)
+    return swap_roles(capture) if fewer else capture
+
+
+def _count_places(spots: FloatArray) -> int:
+    """Count the different spots among those given (n, 3), but for chance: by one number each."""
+    return int(np.unique(spots @ np.array([1.0, np.sqrt(2), np.pi])).size)
+
+
+def group_by_illumination(capture: Capture) -> list[IlluminationGroup]:
+    """Sort the valid wall points of a capture by laser spot."""
+    everyone = np.arange(len(capture.points))
+    if len(capture.lasers) == 1:
+        return [IlluminationGroup(capture.lasers[0], everyone)]
+    if is_confocal(capture):
+        return [IlluminationGroup(None, everyone)]
+    # Sorted by columns: rows as a whole take ten times as long.
+    order = np.lexsort(capture.lasers.T[::-1])
+    sorted_spots = capture.lasers[order]
+    begins = np.flatnonzero(np.any(np.diff(sorted_spots, axis=0, prepend=np.nan) != 0, axis=1))
+    return [
+        IlluminationGroup(sorted_spots[begin], np.sort(members))
+        for begin, members in zip(begins, np.split(order, begins[1:]), strict=True)
+    ]
+
+
+def gather_by_points(
+    capture: Capture, groups: Sequence[IlluminationGroup]
+) -> list[list[IlluminationGroup]]:
+    """Gather the groups that share their wall points: one plan serves them all."""
+    found: dict[bytes, list[IlluminationGroup]] = {}
+    for group in groups:
+        found.setdefault(capture.points[group.indices].tobytes(), []).append(group)
+    return list(found.values())
+
+
+def require_few_spots(capture: Capture, groups: Sequence[IlluminationGroup]) -> None:
+    """Refuse a capture whose laser spots each lit too few points for a field of their own."""
+    if len(groups) * MIN_POINTS_PER_SPOT > len(capture.points):
+        raise InputError(
+            f"{len(groups)} laser spots for {len(capture.points)} wall points: a field per spot needs at least "
+            f"{MIN_POINTS_PER_SPOT} points each; image such pairs by back-projection"
+        )
+
+
+def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> SphericalWaves:
+    """Return the waves between wall and voxels in one illumination group.
+
+    `continued`: whether they go on from a plane, or start at points; see `SphericalWaves`.
+    """
+    k = group.legs * band.wavenumbers
+    step = float(k[1] - k[0]) if k.size > 1 else 1.0
+    return SphericalWaves(float(k[0]), step, k.size, continued)
+
+
+def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
+    """Return what shines on the scene in one illumination group.
+
+    `group`: its laser spot, m; `band`: wavenumbers and weights of the virtual pulse.
+    """
+    return LaserSource(group.laser, band.wavenumbers, band.strength)
+
+
+def choose_unaliased_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Band:
+    """Return the pulse's band over a period so long that every voxel sees the record once, or
+    silence.
+
+    Evenly spaced frequencies repeat a signal with their period; where the paths of the grid go
+    beyond the record, the record is continued with silence.
+    """
+    outward, back = find_leg_bounds(capture.lasers, grid), find_leg_bounds(capture.points, grid)
+    return choose_band_for_paths(capture.axis, pulse, outward[0] + back[0], outward[1] + back[1])
+
+
+def choose_band_for_paths(
+    axis: TimeAxis, pulse: VirtualPulse, shortest: float, longest: float
+) -> Band:
+    """Return the pulse's band over a period in which paths from `shortest` to `longest` (m) meet
+    the record once.
+
+    `axis`: of the record; `shortest, longest`: metres.
+    """
+    tail = Band(pulse, axis).tail_bins * axis.spacing
+    # no image of the record, a period earlier or later, may be reached by a path of the grid
+    period = max(longest - (axis.start - tail), axis.paths[-1] + tail - shortest)
+    bins = max(axis.bins, int(np.ceil(period / axis.spacing)) - 2 * Band(pulse, axis).tail_bins)
+    return Band(pulse, TimeAxis(bins, axis.bin_width, axis.start))
+
+
+def find_leg_bounds(ends: FloatArray, grid: Grid) -> tuple[float, float]:
+    """Bounds of the distance between any of some points and any voxel.
+
+    `ends` (n, 3): metres. Returns shortest and longest, m.
+    """
+    axes = (grid.x, grid.y, grid.z)
+    low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
+    # distance from a point to the box: zero along axes within it
+    outside = np.maximum(np.maximum(low - ends, ends - high), 0)
+    # the farthest corner lies at the farther end of every axis
+    across = np.maximum(np.abs(ends - low), np.abs(high - ends))
+    return float(np.linalg.norm(outside, axis=1).min()), float(np.linalg.norm(across, axis=1).max())
+
+
+class AliasingWarning(UserWarning):
+    """Wall points lie so far apart that false images of bright things may appear beside them."""
+
+
+def describe_aliasing(capture: Capture, band: Band) -> str | None:
+    """Say why false images may appear; None where none will.
+
+    They do if neighbouring wall points lie more than half the band's shortest wavelength apart. In
+    a confocal scan the path grows on both legs from point to point, so that a quarter is the limit.
+
+    `band`: wavenumbers of the virtual pulse.
+    """
+    shortest = 2 * np.pi / float(band.wavenumbers[-1])
+    finest = shortest / 4 if is_confocal(capture) else shortest / 2
+    # A wall drawn exactly at the limit must not be warned of for a rounding error.
+    if not (np.isfinite(capture.spacing) and capture.spacing > finest * (1 + 1e-6)):
+        return None
+    return (
+        f"wall points {capture.spacing:.3g} m apart are too coarse for waves of {shortest:.3g} m, the shortest of "
+        f"the virtual pulse: false images may appear; use points at most {finest:.3g} m apart, or a wavelength "
+        f"{capture.spacing / finest:.2g} times longer"
+    )
+
+
+def warn_of_aliasing(capture: Capture, band: Band) -> None:
+    """Give what `describe_aliasing` says as an `AliasingWarning`."""
+    if text := describe_aliasing(capture, band):
+        warnings.warn(text, AliasingWarning, stacklevel=2)

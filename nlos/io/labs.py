@@ -1,0 +1,588 @@
+"""Turning a capture so that the hidden scene lies at larger z.
+
+Pairs of CC-SOCR, whose points are numbers of a lattice that a MATLAB script beside them scales.
+
+Liu et al., "Non-line-of-sight imaging with arbitrary illumination and detection pattern", Nat.
+Commun. 14, 3230 (2023): ``sub_Sig`` (pairs, t), with laser spots and wall points in ``C_i.mat`` and
+``C_d.mat`` beside it, (pairs, 3), counted in steps (depth, to the left, up) of ``bx``, ``by`` and
+``bz`` metres; ``experimental_setup.m``, in the same folder or the one above, sets these steps and
+``c * delta_t``, the path of a bin. Seen from their wall the second number grows to the left and the
+third upwards: their letters N T read as N T only so.
+
+MATLAB files of the two confocal data sets of Stanford.
+
+* Light-cone transform (O'Toole, Lindell, Wetzstein, Nature 555, 338, 2018): ``rect_data`` (x, y, t)
+  with the light's way to the wall taken off, in bins of 4 ps, and ``width``, half the side of the
+  wall in m; as ``cnlos_reconstruction.m`` of that paper's code takes them. x falls along the first
+  axis: that code reverses x before it shows a volume, and only so their letter S reads as an S.
+* f-k migration (Lindell, Wetzstein, O'Toole, ACM Trans. Graph. 38, 116, 2019): ``meas`` (y, x, t)
+  in bins of 32 ps on a wall of 2 m x 2 m, and in a file beside it ``tofgrid`` (y, x), the arrival
+  of the wall's own light in ps; as ``demo.m`` and ``cnlos_reconstruction.m`` of
+  https://github.com/computational-imaging/nlos-fk take them.
+
+Whether x or y run as in a photograph f-k migration's data set does not say.
+
+HDF5 files of y-tal, the toolkit of the University of Zaragoza.
+
+Field names, meanings and units are those of the class ``NLOSCaptureData`` in
+``tal/io/capture_data.py`` of https://github.com/diegoroyo/tal, version 0.20: lengths and times in m
+(optical path), the relay wall at z = 0 and the hidden scene at z > 0, as here.
+
+NumPy archives, streak images of the LIFT camera, and MATLAB files of lone data sets.
+
+MATLAB files of the two phasor-field data sets of the University of Wisconsin.
+
+Field names, units and the order of axes are those that y-tal 0.20 converts (``tal/io/format.py`` of
+https://github.com/diegoroyo/tal):
+
+* Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572, 620
+  (2019): a struct ``dataset`` with ``data`` (laser spot, camera spot, t), ``deltat`` and ``t0`` in
+  m of path, positions of the spots and of the devices in m. One camera spot and many laser spots:
+  their roles are exchanged here, which changes no path.
+* Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
+  imaging systems", Nat. Commun. 11, 1645 (2020): ``rect_data`` (y, x, t) with the ways to and from
+  the devices taken off, ``ts`` in s, ``sampling_spacing`` in m, and ``SPAD_index``, column and row
+  of the one spot.
+
+HDF5 files of the Zaragoza NLOS data set.
+
+Galindo, Marco, O'Toole, Wetzstein, Gutierrez, Jarabo, "A dataset for benchmarking time-resolved
+non-line-of-sight imaging", SIGGRAPH 2019 posters; https://graphics.unizar.es/nlos_dataset. Field
+names and the two orders of axes that occur are those that y-tal 0.20 converts (``tal/io/format.py``
+of https://github.com/diegoroyo/tal).
+"""
+
+from __future__ import annotations
+
+import ast
+import operator
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.capture import Capture, remove_device_legs
+from nlos.io.arrays import NamedArrays, read_matlab
+from nlos.kernels import shift_signals
+from tofclip.errors import FileFormatError, InputError
+from tofclip.files import translate_read_errors
+from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
+
+MIN_Z_COSINE = 1 - 1e-6
+"""Cosine beyond which a direction counts as z."""
+
+
+def rotate_to_scene(capture: Capture, towards_scene: NDArray[np.float64]) -> Capture:
+    """Turn all coordinates so that a direction becomes +z.
+
+    A direction of +z leaves them as they are; of -z, they turn half around y. Otherwise the old z,
+    upright in most programs, becomes -y, because y points down here.
+
+    `towards_scene` (3,): from the wall into the hidden scene; of any length but 0.
+    """
+    turn = _build_rotation(towards_scene)
+    laser, wall = capture.laser @ turn.T, capture.wall @ turn.T
+    return Capture(
+        capture.signal, wall, laser, capture.bin_width, capture.start, capture.provenance
+    )
+
+
+def _build_rotation(towards_scene: NDArray[np.float64]) -> NDArray[np.float64]:
+    length = float(np.linalg.norm(towards_scene))
+    if not (np.isfinite(length) and length > 0):
+        raise InputError(f"the direction towards the scene must not be 0, got {towards_scene}")
+    forward = np.asarray(towards_scene, dtype=np.float64) / length
+    if abs(forward[2]) > MIN_Z_COSINE:
+        return np.diag([np.sign(forward[2]), 1.0, np.sign(forward[2])])
+    down = forward * forward[2] - [0.0, 0.0, 1.0]
+    down /= np.linalg.norm(down)
+    return np.stack([np.cross(down, forward), down, forward])
+
+
+SETUP_FILE = "experimental_setup.m"
+STEP_NAMES = ("bx", "by", "bz")
+SETUP_NAMES = ("c", "delta_t", *STEP_NAMES)
+
+BIN_WIDTH_S = 32e-12
+"""Where no script says otherwise."""
+
+MIN_SPEED_IN_SECONDS = 1e8
+"""Where the script's c is larger, its delta_t is in s; else c is 1 and delta_t is a path, m."""
+
+MIN_LATTICE_EXTENT = 8
+"""Whole numbers that reach over less than this may be metres."""
+
+TO_SCENE = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""Turns (depth, to the left, up) into (x to the right, y down, z into the scene)."""
+
+MAX_SCRIPT_BYTES = 1 << 20
+
+OPERATIONS: Mapping[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+}
+
+
+def read_curvelet_data(fields: NamedArrays) -> Capture:
+    """Read ``sub_Sig`` with the pairs' points, and the script that scales them, beside the file.
+
+    Without the script points are metres: (depth, to the left, up) where the first does not vary,
+    else (x, y, z).
+    """
+    counts = fields.array("sub_Sig", None, None)
+    laser, wall = (_read_points(fields, name, len(counts)) for name in ("C_i.mat", "C_d.mat"))
+    script = _find_script(fields.path)
+    if script is not None:
+        found = parse_setup(script)
+        steps = np.array([found[name] for name in STEP_NAMES])
+        laser, wall = ((points * steps) @ TO_SCENE.T for points in (laser, wall))
+        speed, bin_width = found["c"], found["delta_t"]
+        if speed < MIN_SPEED_IN_SECONDS:
+            bin_width *= speed / SPEED_OF_LIGHT
+        return Capture(counts.T, wall, laser, bin_width)
+    if _are_lattice_numbers(wall):
+        raise FileFormatError(
+            fields.path,
+            f"has pairs counted in steps of a lattice; it needs {SETUP_FILE} beside it or in the "
+            "folder above, which sets c, delta_t, bx, by and bz; see docs/own_wall.md",
+        )
+    if np.ptp(wall[:, 0]) == 0 and np.ptp(laser[:, 0]) == 0:
+        laser, wall = laser @ TO_SCENE.T, wall @ TO_SCENE.T
+    return Capture(counts.T, wall, laser, BIN_WIDTH_S)
+
+
+def parse_setup(path: str | Path) -> Mapping[str, float]:
+    """Read the first value of each of `SETUP_NAMES` in a MATLAB script.
+
+    `path`: assignments of sums and products of numbers, and of names set before.
+    """
+    with translate_read_errors(path), open(path, "rb") as file:
+        text = file.read(MAX_SCRIPT_BYTES).decode(errors="replace")
+    found: dict[str, float] = {}
+    for line in text.splitlines():
+        for name, value in re.findall(r"\b([a-z]\w*)\s*=([^=;]+);", line.split("%")[0]):
+            if name in SETUP_NAMES and name not in found:
+                found[name] = _evaluate(value.strip(), found)
+    for name in SETUP_NAMES:
+        if not found.get(name, 0.0) > 0 or not np.isfinite(found[name]):
+            raise FileFormatError(path, f"does not set {name} to a positive number")
+    return found
+
+
+def _evaluate(text: str, known: Mapping[str, float]) -> float:
+    """Evaluate a sum or product of numbers and known names; NaN for anything else."""
+
+    def value_of(node: ast.expr) -> float:
+        if isinstance(node, ast.BinOp) and type(node.op) in OPERATIONS:
+            return OPERATIONS[type(node.op)](value_of(node.left), value_of(node.right))
+        if isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+            return float(node.value)
+        return known.get(node.id, np.nan) if isinstance(node, ast.Name) else np.nan
+
+    try:
+        return value_of(ast.parse(text, mode="eval").body)
+    except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError):
+        return np.nan
+
+
+def _find_script(path: Path) -> Path | None:
+    folders = (path.parent, path.resolve().parent.parent)
+    return next((f / SETUP_FILE for f in folders if (f / SETUP_FILE).is_file()), None)
+
+
+def _are_lattice_numbers(points: NDArray[np.float64]) -> bool:
+    whole = bool(np.all(points == np.round(points)))
+    return whole and float(np.ptp(points, axis=0).max()) >= MIN_LATTICE_EXTENT
+
+
+def _read_points(fields: NamedArrays, name: str, pairs: int) -> NDArray[np.float64]:
+    """Points (pairs, 3), as they stand in the file of that name beside the signals."""
+    path = fields.path.with_name(name)
+    if not path.is_file():
+        raise FileFormatError(
+            fields.path,
+            f"holds sub_Sig of {pairs} pairs; it needs C_i.mat (laser spots) and C_d.mat (wall points) beside it, "
+            "see docs/own_wall.md",
+        )
+    beside = read_matlab(path)
+    for one in sorted(beside.names):
+        points = beside.read_numbers(one).astype(np.float64)
+        if points.shape == (pairs, 3):
+            return points
+    raise FileFormatError(path, f"holds no points of shape ({pairs}, 3)")
+
+
+LIGHT_CONE_BIN_WIDTH_S = 4e-12
+MIGRATION_BIN_WIDTH_S = 32e-12
+MIGRATION_WALL_WIDTH_M = 2.0
+"""m"""
+
+
+def read_light_cone_data(fields: NamedArrays) -> Capture:
+    """Read a scene of the light-cone transform's data set."""
+    counts = fields.read_time_last("rect_data")
+    wall = np.swapaxes(_build_wall(counts.shape[1], counts.shape[0], fields.number("width")), 0, 1)
+    wall = wall[::-1]
+    return Capture(np.moveaxis(counts, 2, 0), wall, wall, LIGHT_CONE_BIN_WIDTH_S)
+
+
+def read_migration_data(fields: NamedArrays) -> Capture:
+    """Read a scene of f-k migration's data set; ``tofgrid`` from the same file or from a
+    ``tof*.mat`` beside it.
+    """
+    counts = fields.read_time_last("meas")
+    arrival = _read_arrival_bins(fields, counts.shape[:2])
+    delay_bins = arrival * PICOSECOND / MIGRATION_BIN_WIDTH_S
+    by_bin = np.ascontiguousarray(
+        np.moveaxis(counts, 2, 0).reshape(counts.shape[2], -1), dtype=np.float32
+    )
+    signal = shift_signals(by_bin, delay_bins.ravel()).reshape(counts.shape[2], *counts.shape[:2])
+    wall = _build_wall(counts.shape[0], counts.shape[1], MIGRATION_WALL_WIDTH_M / 2)
+    return Capture(signal, wall, wall, MIGRATION_BIN_WIDTH_S)
+
+
+def _build_wall(rows: int, columns: int, half_width: float) -> NDArray[np.float64]:
+    x, y = np.meshgrid(
+        np.linspace(-half_width, half_width, columns), np.linspace(-half_width, half_width, rows)
+    )
+    return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+
+def _read_arrival_bins(fields: NamedArrays, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    if "tofgrid" in fields:
+        return fields.finite_array("tofgrid", *shape)
+    name = fields.path.name
+    beside = [fields.path.with_name(other) for other in (name.replace("meas", "tof"), "tof.mat")]
+    found = next((path for path in beside if path != fields.path and path.is_file()), None)
+    if found is None:
+        raise FileFormatError(
+            fields.path,
+            f"has no 'tofgrid', and there is no {Path(beside[1]).name} beside it to tell when the wall lit up",
+        )
+    return read_matlab(found).finite_array("tofgrid", *shape)
+
+
+def read_tal(fields: NamedArrays) -> Capture:
+    """Read ``H`` of the formats T_Sx_Sy, T_Lx_Ly_Sx_Sy, T_Si and T_Li_Si.
+
+    A lone laser point is a spot that stands still; as many as sensor points are paired with them,
+    or confocal; other numbers are combined with all. Where ``t_accounts_first_and_last_bounces`` is
+    true the ways to and from the devices are taken off.
+    """
+    sensor, laser = (fields.read_coordinates(f"{name}_grid_xyz") for name in ("sensor", "laser"))
+    start = fields.number("t_start") if "t_start" in fields else 0.0
+    bin_width = fields.number("delta_t") / SPEED_OF_LIGHT
+    capture = match_lasers_to_sensors(
+        fields, fields.read_numbers("H"), sensor, laser, bin_width, start
+    )
+    if not fields.flag("t_accounts_first_and_last_bounces"):
+        return capture
+    source, camera = (fields.finite_array(f"{name}_xyz", 3) for name in ("laser", "sensor"))
+    return remove_device_legs(capture, source, camera)
+
+
+def match_lasers_to_sensors(
+    fields: NamedArrays,
+    signal: NDArray[Any],
+    sensor: NDArray[np.float64],
+    laser: NDArray[np.float64],
+    bin_width: float,
+    start: float,
+) -> Capture:
+    """Find out by the shapes which laser points belong to which sensor points.
+
+    `fields`: for the error message; `signal` (t, sensors...); `sensor, laser` (..., 3): m;
+    `bin_width, start`: s and m.
+    """
+    sensors, lasers = sensor.shape[:-1], laser.shape[:-1]
+    if not signal.ndim:
+        raise FileFormatError(fields.path, "holds a signal without a time axis")
+    if signal.shape[1:] == sensors and laser.size == 3:
+        return Capture(signal, sensor, laser.reshape(3), bin_width, start)
+    if signal.shape[1:] == sensors == lasers:
+        spots = sensor if np.allclose(sensor, laser) else laser
+        return Capture(signal, sensor, spots, bin_width, start)
+    if signal.shape[1:] == (*lasers, *sensors):
+        return Capture.exhaustive(signal, sensor, laser, bin_width, start)
+    raise FileFormatError(
+        fields.path,
+        f"a signal of shape {signal.shape} belongs neither to {sensors} wall points nor to {lasers} lasers",
+    )
+
+
+SURFACE_OPTIMISATION_BIN_M = 1.2e-3
+"""Path per bin, m."""
+
+PAIR_BIN_WIDTH_S = 32e-12
+
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+"""About z: from x to the left and y up to x to the right and y down."""
+
+EVEN_BINS_TOLERANCE = 1e-3
+"""Of a bin's width, what even bins may differ by: times are often rounded."""
+
+MAX_EVEN_BINS_RATIO = 8
+"""Uneven bins become at most this number of times as many even ones."""
+
+
+def read_numpy_archive(fields: NamedArrays) -> Capture:
+    """Read ``H`` (t, ...), ``wall_xyz`` (..., 3), ``laser_xyz`` ((3,) or (..., 3)), and of the
+    time axis either ``delta_t_s`` or ``delta_t_m`` and ``t_start_m``, 0 where it is absent, or the
+    middle of every bin in ``t_s`` or ``t_m``.
+
+    Lengths in m, durations in s; bin 0 holds the path ``t_start_m`` from the laser spot to the wall
+    point. Bins of different widths are put into even ones. Lasers (lasers..., 3) of which each was
+    combined with all wall points come with ``H`` (t, lasers..., points...).
+    """
+    signal = fields.read_numbers("H")
+    wall, laser = (fields.read_coordinates(f"{name}_xyz") for name in ("wall", "laser"))
+    points = wall.shape[:-1]
+    if signal.shape[:-1] == points and signal.shape[1:] != points:
+        raise FileFormatError(
+            fields.path,
+            f"H of shape {signal.shape} ends with time; put time first: np.moveaxis(H, -1, 0)",
+        )
+    times = next((name for name in ("t_m", "t_s") if name in fields), None)
+    if times is not None:
+        paths = fields.finite_array(times, len(signal)) * (1 if times == "t_m" else SPEED_OF_LIGHT)
+        signal, start, spacing = resample_evenly(fields, signal, paths)
+        return match_lasers_to_sensors(fields, signal, wall, laser, spacing / SPEED_OF_LIGHT, start)
+    start = fields.number("t_start_m") if "t_start_m" in fields else 0.0
+    bin_width = (
+        fields.number("delta_t_s")
+        if "delta_t_s" in fields
+        else fields.number("delta_t_m") / SPEED_OF_LIGHT
+    )
+    return match_lasers_to_sensors(fields, signal, wall, laser, bin_width, start)
+
+
+def resample_evenly(
+    fields: NamedArrays, signal: NDArray[Any], paths: NDArray[np.float64]
+) -> tuple[NDArray[Any], float, float]:
+    """Put counts of time bins that need not be even into even ones; no photon is lost or doubled.
+
+    The light of a bin is taken to be spread evenly over it; an even bin is as wide as the median.
+
+    `fields`: for the error message; `signal` (t, ...); `paths` (t,): path at the middle of every
+    bin, m. Returns `signal` (t, ...): the same one where bins are even; `start, spacing`: path of
+    the first bin and from one to the next, m.
+    """
+    widths = np.diff(paths)
+    if len(paths) < 2 or not widths.min() > 0:
+        raise FileFormatError(fields.path, "has times that do not grow from bin to bin")
+    spacing = float(widths.mean())
+    if np.abs(widths - spacing).max() <= EVEN_BINS_TOLERANCE * spacing:
+        return signal, float(paths[0]), spacing
+    spacing = float(np.median(widths))
+    middles = (paths[1:] + paths[:-1]) / 2
+    edges = np.concatenate([[paths[0] - widths[0] / 2], middles, [paths[-1] + widths[-1] / 2]])
+    bins = max(2, int(np.ceil((edges[-1] - edges[0]) / spacing)))
+    if bins > MAX_EVEN_BINS_RATIO * len(paths):
+        raise FileFormatError(
+            fields.path, f"has time bins so uneven that {bins} even ones would be needed"
+        )
+    even = edges[0] + spacing * np.arange(bins + 1)
+    flat = signal.reshape(len(signal), -1)
+    # The running sum is interpolated, not the counts: differences of it keep every photon.
+    arrived = np.concatenate([np.zeros((1, flat.shape[1])), np.cumsum(flat, axis=0, dtype=float)])
+    before = np.clip(np.searchsorted(edges, even, side="right") - 1, 0, len(signal) - 1)
+    part = np.clip((even - edges[before]) / (edges[before + 1] - edges[before]), 0, 1)
+    light = arrived[before] + part[:, np.newaxis] * (arrived[before + 1] - arrived[before])
+    resampled = np.diff(light, axis=0).astype(np.float32).reshape(bins, *signal.shape[1:])
+    return resampled, float(even[0]) + spacing / 2, spacing
+
+
+def read_surface_optimisation_data(fields: NamedArrays) -> Capture:
+    """Read ``transient`` (points, t) and ``lighting`` (points, 3), m, of a confocal scan.
+
+    A bin is 1.2 mm of path, and bin 0 is path 0. x runs to the right and y down as in the authors'
+    order of points: their mannequin stands upright.
+
+    Tsai, Sankaranarayanan, Gkioulekas, "Beyond volumetric albedo: a surface optimization framework
+    for non-line-of-sight imaging", CVPR 2019.
+    """
+    wall = fields.read_coordinates("lighting")
+    counts = fields.array("transient", len(wall), None)
+    return Capture(counts.T, wall, wall, SURFACE_OPTIMISATION_BIN_M / SPEED_OF_LIGHT)
+
+
+def read_general_data(fields: NamedArrays) -> Capture:
+    """Read ``data`` (rows, columns, t) of irregular pairs, with ``laserpoints`` and
+    ``detectpoints`` (rows, columns, 3), m, in ``setup.mat`` beside the file.
+
+    Bins are 32 ps, or ``timeRes`` s where that number stands in either file: the authors keep it in
+    a file of settings instead, and it is another one for the data sets of others. Seen from the
+    wall x runs to the left and y up: their script reverses both before it shows a volume, and only
+    so the letter and the number of "tuan" read as in the photograph of them.
+
+    Field names, units and bins are those of https://github.com/hy520484/general-NLOS; of
+    ``data_NAME.mat``, ``setup_NAME.mat`` is taken where there is one.
+    """
+    counts = fields.read_time_last("data")
+    own = fields.path.with_name(fields.path.name.replace("data", "setup", 1))
+    setup = own if own != fields.path and own.is_file() else fields.path.with_name("setup.mat")
+    if not setup.is_file():
+        raise FileFormatError(
+            fields.path,
+            "holds data; it needs setup.mat beside it, with laserpoints and detectpoints; see docs/own_wall.md",
+        )
+    beside = read_matlab(setup)
+    laser, wall = (
+        beside.finite_array(name, *counts.shape[:2], 3) for name in ("laserpoints", "detectpoints")
+    )
+    stated = next((one for one in (fields, beside) if "timeRes" in one), None)
+    bin_width = PAIR_BIN_WIDTH_S if stated is None else stated.number("timeRes")
+    return Capture(np.moveaxis(counts, 2, 0), wall @ HALF_TURN, laser @ HALF_TURN, bin_width)
+
+
+def read_lift_archive(path: str | Path) -> Capture:
+    """Recover a LIFT streak image of a relay wall by the linear inverse, and take its wall out."""
+    from tofclip.io import read_streak
+    from tofclip.recovery import recover
+
+    return Capture.from_frames(recover(read_streak(path), method="linear"))
+
+
+def read_phasor_field_data(fields: NamedArrays) -> Capture:
+    """Read a scene of the data set of 2019; coordinates are turned so that the wall's normal
+    becomes +z.
+    """
+    wall, spots = (
+        _read_points_wisconsin(fields, f"dataset.{name}Pos") for name in ("laser", "camera")
+    )
+    signal = np.ascontiguousarray(_read_signal(fields))
+    bin_width = fields.number("dataset.deltat") / SPEED_OF_LIGHT
+    start = fields.number("dataset.t0") if "dataset.t0" in fields else 0.0
+    capture = match_lasers_to_sensors(fields, signal, wall, spots, bin_width, start)
+    # The wall points' device is the laser here, and the lone spot's the camera.
+    source, eye = (fields.finite_array(f"dataset.{name}Origin", 3) for name in ("camera", "laser"))
+    capture = remove_device_legs(capture, source, eye)
+    if "dataset.laserNorm" not in fields:
+        return capture
+    return rotate_to_scene(
+        capture, _read_points_wisconsin(fields, "dataset.laserNorm").mean(axis=0)
+    )
+
+
+def read_rectified_data(fields: NamedArrays) -> Capture:
+    """Read a scene of the data set of 2020."""
+    counts = fields.read_time_last("rect_data")
+    rows, columns, _ = counts.shape
+    spacing = fields.number("sampling_spacing")
+    x, y = ((np.arange(n) - n / 2) * spacing for n in (columns, rows))
+    wall = np.stack([*np.meshgrid(x, y), np.zeros((rows, columns))], axis=-1)
+    column, row = fields.finite_array("SPAD_index", 2).astype(int)
+    if not (0 <= column < columns and 0 <= row < rows):
+        raise FileFormatError(
+            fields.path,
+            f"'SPAD_index' names column {column}, row {row} of {columns} x {rows} points",
+        )
+    return Capture(np.moveaxis(counts, 2, 0), wall, wall[row, column], fields.number("ts"))
+
+
+def _read_signal(fields: NamedArrays) -> NDArray[np.float32]:
+    data = fields.read_numbers("dataset.data").T
+    if "dataset.t" in fields and data.shape[0] != fields.number("dataset.t"):
+        raise FileFormatError(
+            fields.path,
+            f"'dataset.data' must end with {fields.number('dataset.t'):g} bins, found {data.T.shape}",
+        )
+    return data.astype(np.float32)
+
+
+def _read_points_wisconsin(fields: NamedArrays, name: str) -> NDArray[np.float64]:
+    """Points (n, 3), whichever way round they are stored."""
+    points = np.atleast_2d(fields.read_numbers(name)).astype(np.float64)
+    points = points.T if points.shape[0] == 3 and points.shape[1] != 3 else points
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise FileFormatError(
+            fields.path,
+            f"field '{name}' must hold points in three dimensions, found {points.shape}",
+        )
+    return points
+
+
+CONFOCAL_AXES, EXHAUSTIVE_AXES = 5, 7
+
+
+def read_zaragoza(fields: NamedArrays) -> Capture:
+    """Read a rendering; colours and bounces are added up, and the ways to and from the devices
+    taken off.
+
+    ``data`` is (colour, t, bounce, camera grid, laser grid) where positions are (3, ...), and the
+    reverse where they are (..., 3); a confocal file has no laser grid. ``deltaT`` and ``t0`` are in
+    m of path. The wall's normals, and the hidden volume where it is given, tell which way the scene
+    lies; coordinates are turned so that it lies at larger z.
+    """
+    first = fields.read_numbers("cameraGridPositions").shape[0] == 3
+    signal = _read_signal_zaragoza(fields, first)
+    camera, laser = (
+        _read_point_grid(fields, f"{name}GridPositions", first) for name in ("camera", "laser")
+    )
+    bin_width, start = (
+        fields.number("deltaT") / SPEED_OF_LIGHT,
+        fields.number("t0") if "t0" in fields else 0.0,
+    )
+    capture = match_lasers_to_sensors(fields, signal, camera, laser, bin_width, start)
+    source, eye = (
+        fields.read_numbers(f"{name}Position").astype(np.float64).reshape(3)
+        for name in ("laser", "camera")
+    )
+    return rotate_to_scene(
+        remove_device_legs(capture, source, eye), _find_scene_direction(fields, camera, first)
+    )
+
+
+def _read_signal_zaragoza(fields: NamedArrays, first: bool) -> NDArray[np.float32]:
+    """Signal (t, lasers..., points...) summed over colours and bounces; a lone laser's axes are
+    left out.
+    """
+    data = fields.read_numbers("data")
+    if data.ndim not in (CONFOCAL_AXES, EXHAUSTIVE_AXES):
+        raise FileFormatError(
+            fields.path, f"field 'data' must have 5 or 7 axes, found shape {data.shape}"
+        )
+    if first:
+        # (colour, t, bounce, camera..., laser...)
+        signal = data.sum(axis=(0, 2), dtype=np.float32)
+        lasers_last = signal.ndim == 1 + 4
+        signal = np.moveaxis(signal, (3, 4), (1, 2)) if lasers_last else signal
+    else:
+        # (laser..., camera..., bounce, t, colour)
+        signal = np.moveaxis(data.sum(axis=(-1, -3), dtype=np.float32), -1, 0)
+    lone = signal.ndim == 1 + 4 and signal.shape[1:3] == (1, 1)
+    return np.ascontiguousarray(signal[:, 0, 0] if lone else signal)
+
+
+def _read_point_grid(fields: NamedArrays, name: str, first: bool) -> NDArray[np.float64]:
+    grid = fields.read_numbers(name).astype(np.float64)
+    grid = np.moveaxis(grid, 0, -1) if first else grid
+    if grid.shape[-1] != 3:
+        raise FileFormatError(
+            fields.path, f"field '{name}' must hold points in three dimensions, found {grid.shape}"
+        )
+    return grid
+
+
+def _find_scene_direction(
+    fields: NamedArrays, camera: NDArray[np.float64], first: bool
+) -> NDArray[np.float64]:
+    """Direction of the wall's normal that points to the hidden scene; +z where the file says
+    nothing.
+    """
+    if "cameraGridNormals" not in fields:
+        return np.array([0.0, 0.0, 1.0])
+    normal: NDArray[np.float64] = (
+        _read_point_grid(fields, "cameraGridNormals", first).reshape(-1, 3).mean(axis=0)
+    )
+    if "hiddenVolumePosition" in fields:
+        hidden = fields.read_numbers("hiddenVolumePosition").reshape(3) - camera.reshape(
+            -1, 3
+        ).mean(axis=0)
+        normal = normal * (np.sign(hidden @ normal) or 1.0)
+    return normal

@@ -1,0 +1,298 @@
+"""What stands first on every line of sight from the wall: its depth, albedo and normal.
+
+The directional light-cone transform: albedo and normals of a confocal scan by one deconvolution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.capture import Capture
+from nlos.confocal import (
+    ConfocalScan,
+    LightCone,
+    resample_to_grid,
+    tabulate_powers,
+    transform_squared_distances,
+)
+from nlos.plane import axis_step
+from nlos.volume import FloatArray, Grid, Volume
+from tofclip.arrays import ComputeDevice
+from tofclip.errors import InputError
+from tofclip.files import atomic_path, require_suffix
+from tofclip.threads import run_blocks, thread_count
+
+GRADIENT_VOXELS = 2.0
+"""Standard deviation of the neighbourhood whose gradients give a normal, voxels."""
+
+MAX_STEP_VOXELS = 3.0
+"""Neighbouring pixels whose depths differ by more, in voxels, are of different things."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrontSurface:
+    """The hidden surface that is seen from the wall, one point per pixel of the front view."""
+
+    x: FloatArray  # (n,), pixels, m
+    y: FloatArray  # (n,), pixels, m
+    depth: NDArray[np.float32]  # (y, x), m; NaN where nothing is seen
+    albedo: NDArray[np.float32]  # (y, x), brightness, 0 where nothing is seen
+    # (y, x, 3), unit vectors that point to the wall's side (z < 0); NaN where nothing is seen
+    normals: NDArray[np.float32]
+    source: str = "gradient of the volume"  # what depth and normals were found from
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Pixels with a surface, (y, x)."""
+        return np.isfinite(self.depth)
+
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """Places of the pixels with a surface, (n, 3), m."""
+        rows, columns = np.nonzero(self.seen)
+        places: list[NDArray[Any]] = [self.x[columns], self.y[rows], self.depth[rows, columns]]
+        return np.stack(places, axis=-1).astype(np.float32)
+
+    @property
+    def faces(self) -> NDArray[np.int32]:
+        """Triangles between neighbouring pixels of one thing: (m, 3) indices into `points`,
+        counter-clockwise as seen from the wall.
+        """
+        index = np.full(self.depth.shape, -1, np.int32)
+        index[self.seen] = np.arange(int(self.seen.sum()))
+        corners = [part.ravel() for part in _list_corners(index)]
+        depths = np.stack([part.ravel() for part in _list_corners(self.depth)])
+        step = max(axis_step(axis) for axis in (self.x, self.y) if axis.size > 1)
+        # NaN, where a corner is not seen, is not near.
+        near = np.ptp(depths, axis=0) < MAX_STEP_VOXELS * step
+        a, b, c, d = (corner[near] for corner in corners)
+        return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).astype(np.int32)
+
+    def save(self, path: str | Path) -> None:
+        """Write an oriented cloud that is a mesh as well, as binary PLY, whole or not at all.
+
+        `path`: ends in .ply.
+        """
+        require_suffix(path, ".ply")
+        points, faces = self.points, self.faces if min(self.depth.shape) > 1 else np.empty((0, 3))
+        names = ("x", "y", "z", "nx", "ny", "nz", "brightness")
+        header = [
+            "ply",
+            "format binary_little_endian 1.0",
+            "comment units: m",
+            f"comment normals: {self.source}",
+            f"element vertex {len(points)}",
+            *(f"property float {name}" for name in names),
+            f"element face {len(faces)}",
+            "property list uchar int vertex_indices",
+            "end_header",
+        ]
+        columns = [points, self.normals[self.seen], self.albedo[self.seen][:, np.newaxis]]
+        rows = np.empty(len(faces), np.dtype([("corners", "u1"), ("faces", "<i4", 3)]))
+        rows["corners"], rows["faces"] = 3, faces
+        with atomic_path(path) as temporary, open(temporary, "wb") as file:
+            file.write(("\n".join(header) + "\n").encode())
+            file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
+            file.write(rows.tobytes())
+
+
+def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
+    """Find the front surface of a volume; its normals are the directions in which brightness
+    changes most.
+
+    `volume`: at least 3 voxels along every axis; `fraction`: A line of sight shows a surface where
+    its brightest voxel has this fraction of the brightest of all.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    grid, magnitude = volume.grid, volume.magnitude.astype(np.float64)
+    require_surface(magnitude, fraction)
+    gradients = np.gradient(magnitude, grid.z, grid.y, grid.x)
+    rows, columns = np.indices(magnitude.shape[1:])
+    peak = magnitude.argmax(axis=0)
+    tensor = np.empty((*peak.shape, 3, 3))
+    for i in range(3):
+        for j in range(i, 3):
+            # z, y, x of the gradients are 2, 1, 0 of the normal.
+            mean = gaussian_filter(gradients[2 - i] * gradients[2 - j], GRADIENT_VOXELS)
+            tensor[..., i, j] = tensor[..., j, i] = mean[peak, rows, columns]
+    _, directions = np.linalg.eigh(tensor)
+    return build_front_surface(volume, directions[..., 2], fraction)
+
+
+def build_front_surface(volume: Volume, normals: NDArray[Any], fraction: float) -> FrontSurface:
+    """Put together the surface of the brightest voxel on every line of sight.
+
+    `normals` (y, x, 3): of that voxel, of any length and on either side; `fraction`: as of
+    `find_front_surface`.
+    """
+    grid, magnitude = volume.grid, volume.magnitude
+    albedo = magnitude.max(axis=0)
+    seen = albedo >= fraction * albedo.max()
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    towards = np.where(normals[..., 2:] > 0, -1.0, 1.0) / np.maximum(length, 1e-30)
+    return FrontSurface(
+        grid.x,
+        grid.y,
+        np.where(seen, _refine_peaks(magnitude, grid.z), np.nan).astype(np.float32),
+        np.where(seen, albedo, 0).astype(np.float32),
+        np.where(seen[..., np.newaxis], normals * towards, np.nan).astype(np.float32),
+    )
+
+
+def require_surface(magnitude: NDArray[np.floating], fraction: float) -> None:
+    """Refuse volumes that hold no surface, and fractions that are none.
+
+    `magnitude` (z, y, x).
+    """
+    if not 0 < fraction < 1:
+        raise InputError(
+            f"a surface lies where brightness is a fraction from 0 to 1, got {fraction}"
+        )
+    if min(magnitude.shape) < 3 or not magnitude.any():
+        raise InputError("a surface needs at least 3 voxels along every axis, and light")
+
+
+def _refine_peaks(magnitude: NDArray[np.floating], z: FloatArray) -> FloatArray:
+    """Depth (y, x) of the brightest voxel, between voxels by a parabola."""
+    peak = magnitude.argmax(axis=0)
+    inner = np.clip(peak, 1, z.size - 2)
+    below, middle, above = (
+        np.take_along_axis(magnitude, (inner + i)[np.newaxis], axis=0)[0].astype(np.float64)
+        for i in (-1, 0, 1)
+    )
+    curvature = below - 2 * middle + above
+    # Where the three do not bend downwards there is no vertex: dividing by -inf moves nothing.
+    safe = np.where(curvature < 0, curvature, -np.inf)
+    offset = np.where(peak == inner, (below - above) / (2 * safe), 0.0)
+    step = float(np.median(np.diff(z)))
+    return np.asarray(z[peak] + np.clip(offset, -0.5, 0.5) * step)
+
+
+def _list_corners(values: NDArray[Any]) -> list[NDArray[Any]]:
+    """Upper left, upper right, lower left and lower right of every square of four pixels."""
+    return [values[:-1, :-1], values[:-1, 1:], values[1:, :-1], values[1:, 1:]]
+
+
+FREQUENCIES_PER_BLOCK = 8
+
+
+@dataclass(frozen=True)
+class DirectionalLightCone:
+    """Surfaces with normals from a confocal scan.
+
+    A matte facet of albedo times normal v at x returns ``<x' - x, v> / d^(falloff + 1)`` to the
+    wall point x'. With u = z^2 and w = d^2 (see `LightCone`) the signals, multiplied by d^(falloff
+    + 1), are the sum of three convolutions over x, y and u: of v_x with ``x * h``, of v_y with ``y
+    * h``, of ``-z * v_z`` with h, the paraboloid. All three follow from one Wiener filter.
+
+    Young, Lindell, Girod, Taubman, Wetzstein, "Non-line-of-sight surface reconstruction using the
+    directional light-cone transform", CVPR 2020.
+    """
+
+    transform: LightCone = field(default_factory=LightCone)  # its Wiener filter and falloff
+
+    def find_front_surface(
+        self, capture: Capture, grid: Grid, fraction: float = 0.3
+    ) -> FrontSurface:
+        """Find depth, albedo and normal on every line of sight.
+
+        `capture`: as of `LightCone`; `grid`: at least 3 voxels along every axis; `fraction`: A line
+        of sight shows a surface where its brightest voxel has this fraction of the brightest of
+        all.
+        """
+        # Refuses what the transform cannot image.
+        self.transform.plan(capture, grid)
+        scan = ConfocalScan.of(capture, grid)
+        vectors = self._deconvolve(scan, grid)
+        volume = Volume(np.linalg.norm(vectors, axis=0).astype(np.float32), grid)
+        require_surface(volume.magnitude, fraction)
+        peak = volume.magnitude.argmax(axis=0)
+        rows, columns = np.indices(peak.shape)
+        normals = np.moveaxis(vectors[:, peak, rows, columns], 0, -1)
+        found = build_front_surface(volume, normals, fraction)
+        return replace(found, source="directional light-cone transform")
+
+    def _deconvolve(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
+        """Return albedo times normal, (3, z, y, x)."""
+        from scipy.fft import ifft2, irfft
+
+        bins, workers = scan.signal.shape[2], thread_count()
+        squares = bins * scan.spacing**2
+        # By one power more than the transform without directions.
+        falloff = self.transform.falloff + 1
+        spectrum, shape = transform_squared_distances(scan, squares, falloff)
+        unit = float(grid.z.mean() - scan.plane.z)
+        parts = _separate(spectrum, scan, squares, shape, unit, 1 / self.transform.signal_to_noise)
+        depth = grid.z - scan.plane.z
+        position = np.clip(depth**2 / squares - 0.5, 0, bins - 1)
+        vectors = np.empty((3, *grid.shape), np.float32)
+        for number, part in enumerate(parts):
+            image = irfft(ifft2(part, axes=(0, 1), workers=workers), shape[2], workers=workers)
+            vectors[number] = resample_to_grid(image[..., :bins], scan, grid, position)
+        vectors[2] *= (-unit / np.maximum(depth, scan.spacing))[:, np.newaxis, np.newaxis]
+        return vectors
+
+
+def _separate(
+    spectrum: NDArray[np.complex64],
+    scan: ConfocalScan,
+    squares: float,
+    shape: tuple[int, int, int],
+    unit: float,
+    floor: float,
+) -> NDArray[np.complex64]:
+    """Spectra (3, ky, kx, w) of v_x, v_y and ``-z * v_z / unit``, by a Wiener filter; lengths in
+    the kernels are in multiples of `unit`.
+    """
+    from scipy.fft import fft2
+
+    y, x = (
+        length * np.fft.fftfreq(n, 1 / n)
+        for length, n in zip(scan.plane.steps, shape[:2], strict=True)
+    )
+    # In coordinates of squared time a point's light is a paraboloid, late by the square of the
+    # distance across: the same at every depth, hence one convolution for all.
+    late = (y[:, np.newaxis] ** 2 + x**2) / squares
+    whole = np.floor(late)
+    weight = (late - whole)[..., np.newaxis]
+    height = (whole < shape[2] - 1) / np.sqrt(shape[0] * shape[1])
+    sides = np.stack(np.broadcast_arrays(x / unit, y[:, np.newaxis] / unit, 1.0))
+    parts = np.empty((3, *spectrum.shape), np.complex64)
+
+    def process_block(some: slice) -> None:
+        # A delay of a whole number of bins is a power of one phase; the fraction is shared between
+        # two bins, as in time.
+        turn = np.exp(-2j * np.pi * np.arange(some.start, some.stop) / shape[2])
+        column = tabulate_powers(turn, whole.astype(np.intp), shape[2], some.start)
+        column = column * ((1 - weight + weight * turn) * height[..., np.newaxis])
+        kernels = fft2(sides[..., np.newaxis] * column, axes=(1, 2)).astype(np.complex64)
+        # Wiener: the floor is the noise over the signal; the three components are what explains the
+        # signal with the least power.
+        gain = spectrum[..., some] / (np.sum(np.abs(kernels) ** 2, axis=0) + np.float32(floor))
+        parts[..., some] = kernels.conj() * gain
+
+    run_blocks(process_block, spectrum.shape[2], FREQUENCIES_PER_BLOCK)
+    return parts
+
+
+def find_imaged_surface(capture: Capture, volume: Volume, fraction: float = 0.3) -> FrontSurface:
+    """Find the front surface of a capture that has been imaged: by the directional light-cone
+    transform where it takes the capture, else from the volume's gradients.
+
+    `capture`: that the volume was made of; `volume`: whose voxels are taken; `fraction`: A line of
+    sight shows a surface where its brightest voxel has this fraction of the brightest of all.
+    """
+    here = volume.on(ComputeDevice())
+    require_surface(here.magnitude, fraction)
+    try:
+        return DirectionalLightCone().find_front_surface(
+            capture.on(ComputeDevice()), volume.grid, fraction
+        )
+    except InputError:
+        return find_front_surface(here, fraction)

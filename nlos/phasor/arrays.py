@@ -1,0 +1,145 @@
+"""The few things that portable code needs beyond the array API standard.
+
+Signals of a capture as arrays of any library, and their phasors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.band import Band
+from nlos.capture import Capture
+from nlos.illumination import IlluminationGroup
+from nlos.plane import WallLattice
+from tofclip.arrays import Array, ComputeDevice, namespace
+
+CPU_CHUNK_BYTES, GPU_CHUNK_BYTES = 8 << 20, 256 << 20
+"""Bytes of the largest array that is made at a time: on a processor, with its caches, and on a GPU,
+with its thousands of lanes.
+"""
+
+SINGLE_PRECISION_DTYPES = {"f": np.float32, "c": np.complex64}
+
+
+@dataclass(frozen=True)
+class ArrayLibrary:
+    """A library at one place, computing in single precision."""
+
+    device: ComputeDevice
+
+    @classmethod
+    def of(cls, array: Array) -> ArrayLibrary:
+        """Return the library of `array`, where that lives."""
+        return cls(ComputeDevice.of(array))
+
+    @cached_property
+    def xp(self) -> Any:
+        """The functions of the array API standard."""
+        return namespace(self.device.put(np.zeros(1, np.float32)))
+
+    @property
+    def chunk_bytes(self) -> int:
+        """The largest array that should be made at a time; some four of its size are alive
+        together.
+        """
+        return CPU_CHUNK_BYTES if "cpu" in str(self.device.device).lower() else GPU_CHUNK_BYTES
+
+    def put(self, values: NDArray[Any]) -> Array:
+        """Bring a NumPy array here, in single precision if it holds real or complex numbers."""
+        return self.device.put(np.asarray(values, SINGLE_PRECISION_DTYPES.get(values.dtype.kind)))
+
+    def zeros(self, shape: tuple[int, ...]) -> Array:
+        """Make complex64 zeros."""
+        return self.xp.zeros(shape, dtype=self.xp.complex64, device=self.device.device)
+
+    def exp_turns(self, turns: Array) -> Array:
+        """Return ``exp(2j * pi * turns)``, accurate however large the turns are."""
+        angle = 2 * np.pi * (turns - self.xp.round(turns))
+        return self.xp.exp(1j * self.xp.astype(angle, self.xp.complex64))
+
+    def make_complex(self, real: Array, imaginary: Array) -> Array:
+        """Make complex numbers of real and imaginary parts.
+
+        `real, imaginary`: of one shape.
+        """
+        xp = self.xp
+        return xp.astype(real, xp.complex64) + 1j * xp.astype(imaginary, xp.complex64)
+
+
+def remove_whole_turns(turns: Any) -> NDArray[np.float64]:
+    """Leave out whole turns while there are digits for it: what is left goes well into single
+    precision.
+    """
+    values = np.asarray(turns, np.float64)
+    return np.asarray(values - np.round(values))
+
+
+class BandTransform:
+    """The Fourier transform of signals at a band's frequencies, as a matrix that is kept where the
+    signals live.
+
+    `bins`: of the signals; a band may have been made for a longer record.
+    """
+
+    def __init__(self, band: Band, bins: int, library: ArrayLibrary) -> None:
+        paths = band.axis.start + band.axis.spacing * np.arange(bins)
+        waves = band.weights * np.exp(-1j * np.outer(paths, band.wavenumbers))
+        self._library, self._real, self._imaginary = (
+            library,
+            library.put(waves.real),
+            library.put(waves.imag),
+        )
+
+    def of(self, traces: Array) -> Array:
+        """Return the phasors (points, frequencies) of signals (points, t); see
+        `nlos.band.Band.compute_phasors`.
+        """
+        return self._library.make_complex(traces @ self._real, traces @ self._imaginary)
+
+
+def get_group_traces(capture: Capture, group: IlluminationGroup) -> Array:
+    """Return the signals of one illumination group.
+
+    Returns (points, t): in the capture's own library.
+    """
+    return ArrayLibrary.of(capture.signal).xp.permute_dims(
+        _select_signals(capture, group.indices), (1, 0)
+    )
+
+
+def get_traces(capture: Capture, some: slice) -> Array:
+    """Return the signals (points, t) of some valid wall points.
+
+    `some`: of the valid wall points. Returns (points, t): in the capture's own library.
+    """
+    xp = ArrayLibrary.of(capture.signal).xp
+    indices = np.arange(len(capture.points))[some]
+    return xp.permute_dims(_select_signals(capture, indices), (1, 0))
+
+
+def arrange_on_lattice(values: Array, wall: WallLattice, library: ArrayLibrary) -> Array:
+    """Put values (..., points) into their places on a lattice, (..., rows, columns); the others are
+    0.
+
+    `values` (..., points). Returns (..., rows, columns).
+    """
+    xp = library.xp
+    if not wall.is_complete:
+        padded = xp.concat([values, library.zeros((*values.shape[:-1], 1))], axis=-1)
+        values = xp.take(padded, library.put(wall.point_numbers), axis=-1)
+    return xp.reshape(values, (*values.shape[:-1], *wall.shape))
+
+
+def _select_signals(capture: Capture, indices: NDArray[Any]) -> Array:
+    """Signals (t, points) of some of the valid wall points."""
+    library = ArrayLibrary.of(capture.signal)
+    flat = library.xp.reshape(capture.signal, (capture.axis.bins, -1))
+    places = np.flatnonzero(capture.valid)[indices]
+    if places.size == flat.shape[1] and np.array_equal(places, np.arange(places.size)):
+        return flat
+    return library.xp.take(flat, library.put(places), axis=1)

@@ -1,0 +1,690 @@
+"""Plane waves in groups of a size that vector instructions like.
+
+From plane waves to the voxels of a plane: inverse Fourier transforms without the parts that are
+0 or unwanted.
+
+Plane waves carried to every depth, where they meet the laser's wave.
+
+The laser's wave on a depth plane is a short sum over its frequencies' common part, so that few
+inverse transforms per depth replace one per frequency.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.kernels import add_illuminated_terms, add_with_carrier
+from nlos.method import Progress, ignore_progress
+from nlos.phasor.depth_steps import (
+    AxialSpectrum,
+    DepthInterpolation,
+    DiffractionPlan,
+    Illumination,
+    InterpolatedBlock,
+    PlaneWaves,
+    build_constant_illumination,
+    choose_depths,
+    split_illumination,
+)
+from nlos.phasor.fourier import FourierPlan, allocate_zeros, plan_transform
+from nlos.phasor.to_depths_kernels import (
+    FREQUENCY_STEPS,
+    LANES,
+    MIRROR_IMAGES,
+    TAPS,
+    assemble_groups,
+    propagate_spectrum,
+    scatter_terms,
+    transpose,
+)
+from nlos.phasor.transfer import VECTOR_LENGTH, TransferFunction
+from nlos.plane import Plane
+from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+FREQUENCIES_PER_BLOCK = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Interpolation:
+    """How every group finds a transfer function between its nodes."""
+
+    begin: IntArray  # (groups,), first node
+    # (groups + 1,), where a group's weights begin, one row of `weights` for each node from `begin`
+    # on
+    offset: IntArray
+    weights: NDArray[np.float32]  # (some, LANES)
+
+
+@dataclass(frozen=True, eq=False)
+class WaveGroups:
+    """Plane waves of neighbouring lateral wavenumbers, with those mirrored in the axes.
+
+    A group is `LANES` waves whose indices are not negative, and their `MIRROR_IMAGES` images. Waves
+    on an axis are images of themselves; a fraction of 0 marks repeated ones, and those that fill up
+    the last group.
+    """
+
+    waves: PlaneWaves
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Of the real and imaginary parts of all waves: (groups, 2, MIRRORED, LANES)."""
+        return len(self.first_frequency), 2, MIRROR_IMAGES, LANES
+
+    @cached_property
+    def _quadrant(self) -> tuple[IntArray, IntArray, FloatArray, int]:
+        """Indices and lateral wavenumbers (groups, LANES) of waves without a negative index, and
+        how many there are.
+        """
+        row, column, lateral = self.waves.quadrant
+        count = row.size
+        filled = np.minimum(np.arange(count + -count % LANES), count - 1).reshape(-1, LANES)
+        return row[filled], column[filled], lateral[filled], count
+
+    @cached_property
+    def indices(self) -> tuple[IntArray, IntArray]:
+        """Indices along y and along x, (groups, MIRRORED, LANES)."""
+        row, column, _, _ = self._quadrant
+        return np.stack([row, -row, row, -row], axis=1), np.stack(
+            [column, column, -column, -column], axis=1
+        )
+
+    @cached_property
+    def is_distinct(self) -> NDArray[np.bool_]:
+        """Whether a wave stands there for the first time, (groups, MIRRORED, LANES)."""
+        row, column, _, count = self._quadrant
+        once = np.arange(row.size).reshape(row.shape) < count
+        return np.stack(
+            [once, once & (row > 0), once & (column > 0), once & (row > 0) & (column > 0)], axis=1
+        )
+
+    @property
+    def leading_zeros(self) -> int:
+        """Zeros before the lowest frequency that make their number a multiple of `FREQUENCY_STEPS`."""
+        return -self.waves.lateral_limits.size % FREQUENCY_STEPS
+
+    @cached_property
+    def first_frequency(self) -> IntArray:
+        """Where every group's frequencies begin, zeros included."""
+        nearest = self._quadrant[2][:, 0]
+        frequency = np.searchsorted(self.waves.lateral_limits, nearest) + self.leading_zeros
+        # whole steps, as the kernel takes them
+        return frequency // FREQUENCY_STEPS * FREQUENCY_STEPS
+
+    def interpolation(self, transfer: TransferFunction) -> Interpolation:
+        """Find the groups between the nodes of a transfer function."""
+        lateral = self._quadrant[2]
+        node, weight = (
+            found.reshape(*lateral.shape, -1) for found in transfer.interpolation(lateral.ravel())
+        )
+        begin, end = node.min(axis=(1, 2)), node.max(axis=(1, 2)) + TAPS
+        count = end - begin
+        offset = np.concatenate([[0], np.cumsum(count)])
+        shares = np.zeros((offset[-1], LANES), np.float32)
+        place = (offset[:-1] - begin)[:, np.newaxis, np.newaxis] + node + np.arange(TAPS)
+        shares[place, np.arange(LANES)[:, np.newaxis]] = weight
+        return Interpolation(begin, offset, shares)
+
+    def to_plane_waves(
+        self, values: NDArray[np.complex64], plane: Plane, origin: tuple[float, float]
+    ) -> NDArray[np.float32]:
+        """Return ``sum_p values(p) * exp(-1j * q (r_p - origin)) / area`` of every wave q, area
+        that of a period.
+
+        By matrix products: the plane's spacing need not fit the lattice, and a coarse one repeats
+        itself in q as it should. Waves beyond their limit are 0.
+
+        `values` (y, x, frequencies); `origin`: y and x of the point whose phase is 0, m. Returns
+        (groups, ahead + frequencies, 2, MIRRORED, LANES): real and imaginary parts.
+        """
+        waves, count = self.waves, values.shape[-1]
+        row, column, lateral, distinct = self._quadrant
+        weight = (self.is_distinct / np.prod(waves.period)).astype(np.float32)
+        lanes = np.searchsorted(lateral.ravel()[:distinct], waves.lateral_limits, side="right")
+        y, x = (
+            _AxisTransform.of(axis, start, 2 * np.pi / side, reach)
+            for axis, start, side, reach in zip(
+                (plane.y, plane.x), origin, waves.period, waves.max_indices, strict=True
+            )
+        )
+        spectrum = np.zeros(
+            (len(row), self.leading_zeros + count, 2, MIRROR_IMAGES, LANES), np.float32
+        )
+
+        def analyse(some: slice) -> None:
+            high, wide = (
+                reach + 1
+                for reach in waves.max_indices_within(float(waves.lateral_limits[some][-1]))
+            )
+            lines = y.project(np.ascontiguousarray(np.swapaxes(values[..., some], 1, 2)), high)
+            parts = [
+                part
+                for line in lines
+                for part in x.project(np.ascontiguousarray(np.swapaxes(line, 0, 2)), wide)
+            ]
+            at = self.leading_zeros + some.start
+            assemble_groups(
+                np.stack(parts), row, column, y.turns, x.turns, weight, lanes[some], at, spectrum
+            )
+
+        run_blocks(analyse, count, size=FREQUENCIES_PER_BLOCK)
+        return spectrum
+
+
+@dataclass(frozen=True, eq=False)
+class _AxisTransform:
+    """Waves along an axis of evenly spaced points, about its middle: real, and half as many points."""
+
+    cosines: NDArray[np.float32]  # (waves, half the points)
+    sines: NDArray[np.float32]  # (waves, half the points)
+    turns: NDArray[np.complex64]  # (waves,), waves at the middle
+
+    @classmethod
+    def of(cls, axis: FloatArray, origin: float, step: float, reach: int) -> _AxisTransform:
+        """Return the transform of an axis for the plane waves of index 0 to `reach`.
+
+        `axis` (points,): evenly spaced, m; `origin`: where all waves have phase 0, m; `step`:
+        lateral wavenumber of index 1, rad/m; `reach`: largest index.
+        """
+        numbers = step * np.arange(reach + 1)
+        half = (axis.size + 1) // 2
+        # about the middle a real point's wave and its mirror point's are conjugate: cosines and
+        # sines of half the points suffice
+        phases = np.outer(numbers, (axis[::-1] - axis)[:half] / 2)
+        turns = np.exp(-1j * numbers * ((axis[0] + axis[-1]) / 2 - origin))
+        return cls(
+            np.cos(phases).astype(np.float32),
+            np.sin(phases).astype(np.float32),
+            turns.astype(np.complex64),
+        )
+
+    def project(self, values: NDArray[np.complex64], count: int) -> list[NDArray[np.complex64]]:
+        """Sums of complex values (points, ...) with the first cosines and with the first sines,
+        (count, ...).
+
+        `values` (points, ...); `count`: number of waves, from index 0 on. Returns cosine and sine
+        sums.
+        """
+        half = self.cosines.shape[1]
+        before, after = values[:half], values[::-1][:half]
+        even, odd = after + before, after - before
+        if len(values) % 2:
+            # the middle point of an odd number is its own mirror image and counts once
+            even[-1] = before[-1]
+        return [
+            (waves[:count] @ part.reshape(half, -1).view(np.float32))
+            .view(np.complex64)
+            .reshape(count, *values.shape[1:])
+            for waves, part in ((self.cosines, even), (self.sines, odd))
+        ]
+
+
+CACHE_BYTES = 1 << 19
+"""Spectra that are transformed at a time: they stay in a core's second cache, and calls stay few."""
+
+PRODUCT_SPEEDUP = 3
+"""How many operations of a matrix product take as long as one of a pruned Fourier transform;
+measured.
+"""
+
+
+WaveIndices = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""Of plane waves along y and x, in arrays of one shape; these reach as far below 0 as above."""
+
+
+class Inverse(Protocol):
+    """From the spectra of several terms to their images, with memory of its own; not to be shared
+    between threads.
+    """
+
+    cell_indices: NDArray[np.int64]
+    """Where in a spectrum every plane wave goes, in the shape of its indices."""
+
+    spare: int
+    """A cell that belongs to no wave."""
+
+    carrier: NDArray[np.complex64]
+    """What every column of an image has still to be multiplied by."""
+
+    spectra: NDArray[np.complex64]
+    """Room for some spectra (n, cells), to be transformed at a time; 0 where no plane wave goes."""
+
+    images: NDArray[np.complex64]
+    """Room for the images of all terms, (terms, y, x)."""
+
+    def transform(self, terms: slice) -> None:
+        """Turn the first spectra into the images of these terms."""
+        ...
+
+
+def choose_inverse(
+    waves: WaveIndices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int
+) -> Inverse:
+    """Choose the quicker way: few voxels of a long period by matrix products, many by Fourier
+    transforms.
+
+    Parameters are those of `InverseTransform`; a period that is not a whole number of voxels leaves
+    matrix products only.
+
+    `waves` (rows, columns): indices along y and x; `lattice`: voxels in a period along y and x;
+    `wanted`: voxels wanted along y and x, from the origin on; `terms`: maximum number of spectra.
+    """
+    rows, columns = (2 * int(np.max(index)) + 1 for index in waves)
+    high, wide = (int(length) for length in lattice)
+    if (high, wide) != lattice:
+        return InverseProduct(waves, lattice, wanted, terms)
+    # real operations: 8 of a complex product and sum, 5 n log2 n of a Fourier transform
+    products = 8 * columns * wanted[0] * (rows + wanted[1])
+    transforms = 5 * (
+        columns * lattice[0] * np.log2(lattice[0] + 1)
+        + wanted[0] * lattice[1] * np.log2(lattice[1] + 1)
+    )
+    if products < PRODUCT_SPEEDUP * transforms:
+        return InverseProduct(waves, lattice, wanted, terms)
+    return InverseTransform(waves, (high, wide), wanted, terms)
+
+
+class InverseProduct:
+    """Inverse transforms of several spectra as two matrix products each.
+
+    Parameters are those of `InverseTransform`.
+    """
+
+    def __init__(
+        self, waves: WaveIndices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int
+    ) -> None:
+        reach = rows, columns = tuple(int(np.max(index)) for index in waves)
+        self._shape = (2 * columns + 1, 2 * rows + 1)
+        self.spare = self._shape[0] * self._shape[1]
+        self.cell_indices = (waves[1] + columns) * self._shape[1] + waves[0] + rows
+        self.carrier = np.ones(wanted[1], np.complex64)
+        self.spectra = np.zeros((_count_per_batch(self.spare, terms), self.spare + 1), np.complex64)
+        self.images = np.empty((terms, *wanted), np.complex64)
+        self._along_y, self._along_x = (
+            np.exp(
+                2j * np.pi / length * np.outer(np.arange(-reach, reach + 1), np.arange(count))
+            ).astype(np.complex64)
+            for reach, length, count in zip(reach, lattice, wanted, strict=True)
+        )
+
+    def transform(self, terms: slice) -> None:
+        """Turn the first spectra into the images of these terms."""
+        for spectrum, image in zip(self.spectra, self.images[terms], strict=False):
+            # the transform is separable: y first, for every index along x
+            half = spectrum[: self.spare].reshape(self._shape) @ self._along_y
+            np.matmul(half.T, self._along_x, out=image)
+
+
+class InverseTransform:
+    """Inverse transforms of several spectra by pruned Fourier transforms.
+
+    Along y only the columns that plane waves fall into are transformed, along x only the rows that
+    voxels lie in. Where voxels are too coarse for the finest waves, these are folded into the
+    lattice, as the voxels see them.
+
+    `waves` (rows, columns): indices along y and x; `lattice`: voxels in a period along y and x;
+    `wanted`: voxels wanted along y and x, from the origin on; `terms`: spectra at most.
+    """
+
+    def __init__(
+        self, waves: WaveIndices, lattice: tuple[int, int], wanted: tuple[int, int], terms: int
+    ) -> None:
+        self._high, self._wide = high, wide = lattice
+        reach = int(np.max(waves[1]))
+        columns = min(2 * reach + 1, wide)
+        # Unfolded columns are shifted so that none is negative; `carrier` takes the shift back.
+        shift = reach if 2 * reach + 1 < wide else 0
+        self.spare = columns * _pad_to_vector(high)
+        self.cell_indices: NDArray[np.int64] = (waves[1] + shift) % wide * _pad_to_vector(
+            high
+        ) + waves[0] % high
+        self.carrier = np.exp(-2j * np.pi * shift / wide * np.arange(wanted[1])).astype(
+            np.complex64
+        )
+        some = _count_per_batch(self.spare, terms)
+        self.spectra: NDArray[np.complex64] = allocate_zeros((some, self.spare + VECTOR_LENGTH))
+        self._columns = self.spectra[:, : self.spare].reshape(some, columns, _pad_to_vector(high))[
+            ..., :high
+        ]
+        self._lines = allocate_zeros((some, columns, _pad_to_vector(high)))[..., :high]
+        self._middle = allocate_zeros((some, wanted[0], _pad_to_vector(wide)))[..., :wide]
+        self._rows = allocate_zeros((terms, wanted[0], _pad_to_vector(wide)))[..., :wide]
+        self.images: NDArray[np.complex64] = self._rows[..., : wanted[1]]
+        self._plans: dict[int, tuple[FourierPlan, FourierPlan]] = {}
+
+    def transform(self, terms: slice) -> None:
+        """Turn the first spectra into the images of these terms."""
+        count = terms.stop - terms.start
+        along_y, along_x = self._get_plans(count)
+        along_y.execute()
+        # only the rows that voxels lie in are transformed along x
+        wanted, columns = self._middle.shape[1], self._lines.shape[1]
+        lines, middles = self._lines.view(np.float64), self._middle.view(np.float64)
+        for line, middle in zip(lines[:count], middles, strict=False):
+            transpose(line[:, :wanted], middle[:, :columns])
+        along_x.update_arrays(self._middle[:count], self._rows[terms])
+        along_x.execute()
+
+    def _get_plans(self, count: int) -> tuple[FourierPlan, FourierPlan]:
+        if count not in self._plans:
+            arrays = (self._columns, self._lines), (self._middle, self._rows)
+            y, x = (
+                plan_transform(source[:count], target[:count], axis=2, inverse=True)
+                for source, target in arrays
+            )
+            self._plans[count] = y, x
+        return self._plans[count]
+
+
+def _count_per_batch(cells: int, terms: int) -> int:
+    # spectra that stay in cache between the two transforms
+    return max(1, min(terms, CACHE_BYTES // (8 * cells)))
+
+
+def _pad_to_vector(count: int) -> int:
+    return -(-count // VECTOR_LENGTH) * VECTOR_LENGTH
+
+
+Field = NDArray[np.complex64]
+FloatParts = NDArray[np.float32]
+
+PLANES_PER_BLOCK = 2
+"""Depths that a group of plane waves is propagated to while its spectrum is in cache."""
+
+HALF_RANGE_RATIO, MIN_HALF_RANGE_M = 1.05, 1e-3
+"""Half the range of distances from the laser spot to a plane is rounded up to a power of the first, and at least the
+second, m."""
+
+ILLUMINATION_ERROR_FRACTION = 0.25
+"""Of the error allowed, what splitting the illumination may take; where little is hidden it weighs
+more.
+"""
+
+DEPTH_ERROR_FRACTION = 0.35
+"""Of the error allowed, what interpolation between depths may take."""
+
+
+@dataclass(frozen=True, eq=False)
+class LaserSource:
+    """What shines on the hidden scene while the wall is watched."""
+
+    # (3,), A spot, m; None where its way is part of the field already (confocal)
+    laser: FloatArray | None
+    wavenumbers: FloatArray  # (frequencies,), rad/m
+    # (frequencies,), share of each frequency in the pulse; decides what may be neglected
+    strength: FloatArray
+    # illuminations split so far, which spots at other places share
+    splits: dict[tuple[float, float], Illumination] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def centre_wavenumber(self) -> float:
+        """Wavenumber about which the illumination is expanded; 0 without one."""
+        if self.laser is None:
+            return 0.0
+        return float(np.average(self.wavenumbers, weights=self.strength**2))
+
+    def choose_depths(self, plan: DiffractionPlan) -> DepthInterpolation:
+        """Choose which depths are computed, and how the others follow from these without the
+        laser's carrier.
+        """
+        cosines = (0.0, 0.0)
+        if self.laser is not None:
+            # beyond the spot all light goes forward
+            cosines = (0.0 if plan.grid.z[0] >= self.laser[2] else -1.0, 1.0)
+        spectrum = AxialSpectrum.of(
+            plan.waves.wavenumbers, self.strength, self.centre_wavenumber, cosines
+        )
+        return choose_depths(plan.grid.z, spectrum, DEPTH_ERROR_FRACTION * plan.tolerance)
+
+    def illuminate_plane(self, plan: DiffractionPlan, depth: float) -> Illumination:
+        """Split the illumination of the plane at one depth.
+
+        `plan`: its grid and tolerance; `depth`: z of the plane, m. Returns with ``span``, the
+        smallest and largest distance of the spot from the plane's voxels, m.
+        """
+        if self.laser is None:
+            return build_constant_illumination(self.wavenumbers.size)
+        y, x = (
+            (np.clip(spot, axis[0], axis[-1]) - spot, max(spot - axis[0], axis[-1] - spot))
+            for axis, spot in ((plan.grid.y, self.laser[1]), (plan.grid.x, self.laser[0]))
+        )
+        span = np.sqrt(np.array(y) ** 2 + np.array(x) ** 2 + (depth - self.laser[2]) ** 2)
+        # One split serves all depths that differ by little: it takes as long as a small image.
+        # rounded up to a geometric series of half ranges, so that one split serves many depths
+        half = HALF_RANGE_RATIO ** np.ceil(
+            np.log(max(np.ptp(span) / 2, MIN_HALF_RANGE_M)) / np.log(HALF_RANGE_RATIO)
+        )
+        light = self._split_range(float(half), ILLUMINATION_ERROR_FRACTION * plan.tolerance)
+        return replace(light, span=span.mean() + light.span)
+
+    def _split_range(self, half: float, tolerance: float) -> Illumination:
+        key = half, tolerance
+        if found := self.splits.get(key):
+            return found
+        offsets = self.wavenumbers - self.centre_wavenumber
+        made = split_illumination(offsets, self.strength, half, tolerance)
+        return self.splits.setdefault(key, made)  # one step, as threads share the dictionary
+
+
+class CompiledDiffraction:
+    """Fields on one plane carried to all depths of a grid, where they meet the laser's wave.
+
+    The counterpart of `nlos.phasor.to_depths.PortableDiffraction`. Holding one is the cache:
+    illuminations, transforms and each thread's memory stay for the next field.
+
+    Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
+    imaging systems", Nat. Commun. 11, 1645 (2020); the illumination is split per depth, so that few
+    inverse transforms replace one per frequency.
+    """
+
+    def __init__(self, plan: DiffractionPlan, source: LaserSource) -> None:
+        self.plan, self.source = plan, source
+        self.groups = WaveGroups(plan.plane_waves)
+        self.table_bytes = 0
+        self._spare: list[_Workspace] = []
+
+    def for_laser(self, laser: FloatArray | None) -> CompiledDiffraction:
+        """Return the same for the light of another spot; both share tables and threads' memory."""
+        _ = self._interpolation
+        other = copy.copy(self)
+        other.source = replace(self.source, laser=laser)
+        for computed in ("_depths", "_lights"):
+            other.__dict__.pop(computed, None)
+        return other
+
+    def add(
+        self,
+        values: NDArray[np.complex64],
+        total: NDArray[np.complex64],
+        progress: Progress = ignore_progress,
+    ) -> None:
+        """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r, S_k the field carried
+        there from the plane.
+
+        `values` (y, x, frequencies): on the plan's plane; `total` (z, y, x): added to; `progress`:
+        called with the number of voxels just done.
+        """
+        plan = self.plan
+        with limit_blas_threads():
+            spectrum = self.groups.to_plane_waves(
+                values, plan.plane, (float(plan.grid.y[0]), float(plan.grid.x[0]))
+            )
+            # What threads share is made before they start.
+            self.table_bytes = self.table_bytes or plan.transfer.tabulate()
+            lights, interpolation = self._lights, self._interpolation
+            nodes, blocks = self._depths.nodes, self._depths.blocks
+            computed = np.zeros((nodes.size, *total.shape[1:]), np.complex64) if blocks else total
+            shares = len(total) * np.arange(len(lights) + 1) // len(lights)
+
+            def process_block(planes: slice) -> None:
+                workspace = self._take_workspace(interpolation)
+                depths = plan.grid.z[nodes[planes]]
+                workspace.image(
+                    spectrum, self.source, lights[planes], depths, computed[planes], bool(blocks)
+                )
+                self._spare.append(workspace)
+                progress(int(shares[planes.stop] - shares[planes.start]) * total[0].size)
+
+            run_blocks(process_block, len(lights), size=PLANES_PER_BLOCK)
+            run_blocks(
+                lambda some: self._interpolate(blocks[some.start], computed, total), len(blocks), 1
+            )
+
+    def _interpolate(self, block: InterpolatedBlock, computed: Field, total: Field) -> None:
+        """Add some depths that follow from computed ones without the laser's carrier."""
+        grid, shape = self.plan.grid, (-1, *total.shape[1:])
+        known = computed[block.nodes].reshape(block.nodes.stop - block.nodes.start, -1)
+        laser = np.zeros(3) if self.source.laser is None else self.source.laser
+        add_with_carrier(
+            (block.weights @ known).reshape(shape),
+            grid.x,
+            grid.y,
+            grid.z[block.depths],
+            laser,
+            self.source.centre_wavenumber,
+            total[block.depths],
+        )
+
+    @cached_property
+    def _depths(self) -> DepthInterpolation:
+        """Which depths are computed, and how the others follow."""
+        return self.source.choose_depths(self.plan)
+
+    @cached_property
+    def _lights(self) -> list[Illumination]:
+        """The illumination of every computed depth."""
+        depths = self.plan.grid.z[self._depths.nodes]
+        lights: dict[int, Illumination] = {}
+
+        def split(planes: slice) -> None:
+            for i in range(planes.start, planes.stop):
+                lights[i] = self.source.illuminate_plane(self.plan, float(depths[i]))
+
+        run_blocks(split, depths.size, size=PLANES_PER_BLOCK)
+        return [lights[i] for i in range(depths.size)]
+
+    @cached_property
+    def _interpolation(self) -> Interpolation:
+        return self.groups.interpolation(self.plan.transfer)
+
+    def _take_workspace(self, interpolation: Interpolation) -> _Workspace:
+        """Return a workspace that is not in use and holds all terms, or a new one."""
+        max_terms = max(light.coefficients.shape[1] for light in self._lights)
+        if self._spare:
+            found = self._spare.pop()
+            if found.max_terms >= max_terms:
+                return found
+        return _Workspace(self.plan, self.groups, interpolation, max_terms)
+
+
+class _Workspace:
+    """One thread's memory, and what it does there."""
+
+    def __init__(
+        self,
+        plan: DiffractionPlan,
+        groups: WaveGroups,
+        interpolation: Interpolation,
+        terms: int,
+    ) -> None:
+        self.plan, self.groups, self.interpolation = plan, groups, interpolation
+        self.max_terms = terms
+        self.inverse = choose_inverse(groups.indices, plan.lattice, plan.grid.shape[1:], terms)
+        # repeated waves are sent to a spare cell that nothing reads
+        self.cell_indices = np.where(
+            groups.is_distinct, self.inverse.cell_indices, self.inverse.spare
+        )
+        # where several waves fall into one cell they have to be added, not written
+        self.folded = bool(np.bincount(self.inverse.cell_indices[groups.is_distinct]).max() > 1)
+        self._term_buffer = np.empty(
+            PLANES_PER_BLOCK * (terms + 1) * int(np.prod(groups.shape)), np.float32
+        )
+
+    def image(
+        self,
+        spectrum: FloatParts,
+        source: LaserSource,
+        lights: list[Illumination],
+        depths: FloatArray,
+        total: Field,
+        without_carrier: bool,
+    ) -> None:
+        """Add a few depth planes.
+
+        `spectrum`: plane waves of the wall's field at all frequencies; `lights`: one for each
+        plane; `depths` (z,): m; `total` (z, y, x): added to, in place; `without_carrier`: leave out
+        the laser's carrier wave.
+        """
+        wavenumber = 0.0 if without_carrier else source.centre_wavenumber
+        carried = self._propagate_terms(spectrum, source, lights, depths)
+        for terms, light, depth, image in zip(carried, lights, depths, total, strict=True):
+            count = light.coefficients.shape[1]
+            for some in split_blocks(count, len(self.inverse.spectra)):
+                scatter_terms(terms[some], self.cell_indices, self.folded, self.inverse.spectra)
+                self.inverse.transform(some)
+            self._illuminate(self.inverse.images[:count], source, light, depth, wavenumber, image)
+
+    def _propagate_terms(
+        self,
+        spectrum: FloatParts,
+        source: LaserSource,
+        lights: list[Illumination],
+        depths: FloatArray,
+    ) -> FloatParts:
+        """Return the plane waves of all terms, (depths, m, groups, 2, MIRRORED, LANES)."""
+        leading_zeros, between = self.groups.leading_zeros, self.interpolation
+        max_terms = max(light.coefficients.shape[1] for light in lights)
+        # The compiled loop takes two terms at a time.
+        coefficients = np.zeros(
+            (len(lights), max_terms + max_terms % 2, spectrum.shape[1]), np.float32
+        )
+        nodes = []
+        for own, light, depth in zip(coefficients, lights, depths, strict=True):
+            own[: light.coefficients.shape[1], leading_zeros:] = light.coefficients.T
+            delay = np.array([light.span.mean(), source.centre_wavenumber])
+            nodes.append(
+                self.plan.transfer.evaluate(depth - self.plan.plane.z, delay, leading_zeros)
+            )
+        shape = (*coefficients.shape[:2], *self.groups.shape)
+        terms = self._term_buffer[: int(np.prod(shape))].reshape(shape)
+        weights = (between.begin, between.offset, between.weights)
+        propagate_spectrum(
+            spectrum, self.groups.first_frequency, np.stack(nodes), *weights, coefficients, terms
+        )
+        return terms
+
+    def _illuminate(
+        self,
+        images: Field,
+        source: LaserSource,
+        light: Illumination,
+        depth: float,
+        wavenumber: float,
+        field: Field,
+    ) -> None:
+        """Let the laser's wave meet the images of one depth plane."""
+        x, y = self.plan.grid.x, self.plan.grid.y
+        laser = np.zeros(3) if source.laser is None else source.laser
+        table, carrier = np.ascontiguousarray(light.table.T), self.inverse.carrier
+        add_illuminated_terms(
+            images,
+            light.even,
+            x,
+            y,
+            depth,
+            laser,
+            wavenumber,
+            table,
+            light.span,
+            carrier,
+            field,
+        )

@@ -1,0 +1,231 @@
+"""From wall points to a plane by compiled loops: by Fourier transforms, or by direct sums.
+
+The counterpart of `nlos.phasor.wall_to_plane_arrays`. Either way returns
+``S_k(r_v) = sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.method import Progress, ignore_progress
+from nlos.phasor.to_depths_compiled import choose_inverse
+from nlos.phasor.transfer import SphericalWaves
+from nlos.phasor.wall_kernels import (
+    FREQUENCY_STEPS,
+    TARGET_LANES,
+    add_low_rank_terms,
+    add_spherical_waves,
+)
+from nlos.phasor.wall_to_plane import (
+    ScatteredWallToPlanePlan,
+    WallBeforePlane,
+    WallToPlanePlan,
+    has_finufft,
+)
+from nlos.plane import Plane
+from tofclip.threads import limit_blas_threads, run_blocks
+
+FloatArray = NDArray[np.float64]
+
+STRENGTH_POINTS = 1024
+"""Enough wall points to tell the strength of a frequency from."""
+
+LANE_GROUPS_PER_BLOCK = 4
+"""Groups of targets per piece of work."""
+
+
+class CompiledPropagation:
+    """Phasors of wall points, carried onto a plane the faster way that keeps the tolerance.
+
+    The terms of the Fourier transforms are chosen for the spectrum of the first phasors that come;
+    they stay for later ones, so that a sequence of like signals is planned once.
+
+    `waves`: from points; `tolerance`: relative error allowed.
+    """
+
+    def __init__(self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float) -> None:
+        self.geometry, self.waves, self.tolerance = geometry, waves, tolerance
+        self._plan: WallToPlanePlan | None = None
+        self._planned = False
+
+    def field(
+        self, phasors: NDArray[np.complex64], progress: Progress = ignore_progress
+    ) -> NDArray[np.complex64]:
+        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64.
+
+        Progress counts points of the plane times frequencies.
+
+        `phasors` (n, frequencies). Returns (y, x, frequencies).
+        """
+        if not self._planned:
+            self._plan, self._planned = self._choose_plan(phasors), True
+        if self._plan is not None:
+            return propagate_low_rank(self._plan, phasors, progress)
+        points, plane = self.geometry.points, self.geometry.plane
+        return propagate_direct(points, phasors, plane, self.waves.wavenumbers, progress)
+
+    def _choose_plan(self, phasors: NDArray[np.complex64]) -> WallToPlanePlan | None:
+        """Return the plan of Fourier transforms; None where direct sums are faster or needed."""
+        wanted = (self.geometry, self.waves, estimate_strength(phasors), self.tolerance)
+        plan = WallToPlanePlan.of(*wanted)
+        if plan is None and has_finufft():
+            plan = ScatteredWallToPlanePlan.of(*wanted)
+        return plan if plan is not None and plan.is_faster_than_direct else None
+
+
+def estimate_strength(phasors: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Estimate how strong phasors (points, frequencies) are at each frequency, relative to the
+    strongest.
+    """
+    some = np.abs(phasors[:: len(phasors) // STRENGTH_POINTS + 1])
+    energy = np.mean(some.astype(np.float64) ** 2, axis=0)
+    relative: NDArray[np.float64] = (
+        np.sqrt(energy / energy.max()) if energy.any() else np.ones(energy.size)
+    )
+    return relative
+
+
+def propagate_low_rank(
+    plan: WallToPlanePlan, phasors: NDArray[np.complex64], progress: Progress = ignore_progress
+) -> NDArray[np.complex64]:
+    """Return ``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, within the
+    passage's tolerance.
+
+    Per frequency some two to ten Fourier transforms of the wall, weighted by functions of its
+    depth, and one back. Memory for the result, for as many transfer functions as depth nodes (10 to
+    20 MB for 128 x 128 points and 120 frequencies) and, per thread, for the spectra of one
+    frequency's terms.
+
+    `phasors` (n, frequencies); `progress`: called with the number of values just done. Returns (y,
+    x, frequencies): in memory, frequency after frequency.
+    """
+    field = np.empty((phasors.shape[1], *plan.plane.shape), np.complex64)
+    low_rank_transfer = plan.low_rank_transfer
+    with limit_blas_threads():
+        max_terms = max(low_rank_transfer.term_counts)
+        # Made before threads share them.
+        tables = plan.phase_shifts, plan.node_interpolation
+        spare: list[_Workspace] = []
+
+        def process_block(some: slice) -> None:
+            workspace = spare.pop() if spare else _Workspace(plan, max_terms, tables)
+            for number in range(some.start, some.stop):
+                # High frequencies have most waves: with these first, threads end together.
+                group = len(low_rank_transfer.groups) - 1 - number
+                workspace.propagate_group(group, phasors, field)
+                progress(field[low_rank_transfer.groups[group]].size)
+            spare.append(workspace)
+
+        run_blocks(process_block, len(low_rank_transfer.groups), size=1)
+    return np.moveaxis(field, 0, -1)
+
+
+class _Workspace:
+    """One thread's memory, and what it does there."""
+
+    def __init__(self, plan: WallToPlanePlan, terms: int, tables: tuple[Any, Any]) -> None:
+        self.plan = plan
+        self.phase_shifts, self.node_interpolation = tables
+        self.analysis = plan.analysis(terms)
+        column, row = np.meshgrid(
+            *(np.arange(-n, n + 1) for n in plan.max_indices[::-1]), indexing="ij"
+        )
+        self.inverse = choose_inverse((row, column), plan.plane_lattice, plan.plane.shape, 1)
+        self.cells = (
+            self.inverse.cell_indices[:, 0],
+            self.inverse.cell_indices[0] - self.inverse.cell_indices[0, 0],
+        )
+
+    def propagate_group(
+        self, number: int, phasors: NDArray[np.complex64], field: NDArray[np.complex64]
+    ) -> None:
+        """Propagate one group of frequencies.
+
+        `number`: of the group; `phasors` (points, frequencies); `field` (frequencies, y, x):
+        overwritten at the group's frequencies.
+        """
+        plan = self.plan
+        group, terms = plan.low_rank_transfer.groups[number], plan.low_rank_transfer.terms(number)
+        values = np.ascontiguousarray(phasors[:, group].T)
+        shift_y, shift_x = self.phase_shifts
+        spectrum = self.inverse.spectra[0]
+        for i, frequency in enumerate(range(group.start, group.stop)):
+            reach = plan.max_row_indices(frequency)
+            spectra = self.analysis.spectra(values[i], terms.point_factors, reach.size - 1)
+            spectrum[:] = 0
+            parts = spectra.view(np.float32)
+            wave_factors = terms.wave_factors[i], *self.node_interpolation
+            add_low_rank_terms(parts, *wave_factors, reach, shift_x, shift_y, *self.cells, spectrum)
+            self.inverse.transform(slice(0, 1))
+            np.multiply(self.inverse.images[0], self.inverse.carrier, out=field[frequency])
+
+
+def propagate_direct(
+    points: FloatArray,
+    phasors: NDArray[np.complex64],
+    plane: Plane,
+    wavenumbers: FloatArray,
+    progress: Progress = ignore_progress,
+) -> NDArray[np.complex64]:
+    """Return ``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, (y, x,
+    frequencies) complex64.
+
+    See `sum_spherical_waves`.
+
+    `points` (n, 3): wall points, m; `phasors` (n, frequencies); `wavenumbers` (frequencies,):
+    rad/m; `progress`: called with the number of plane points times frequencies just done. Returns
+    (y, x, frequencies).
+    """
+    return sum_spherical_waves(
+        plane.points.reshape(-1, 3), points, phasors, wavenumbers, progress
+    ).reshape(*plane.shape, -1)
+
+
+def sum_spherical_waves(
+    targets: FloatArray,
+    sources: FloatArray,
+    phasors: NDArray[np.complex64],
+    wavenumbers: FloatArray,
+    progress: Progress = ignore_progress,
+) -> NDArray[np.complex64]:
+    """Return ``sum_s P_k(s) * exp(1j * k * |t - s|) / |t - s|`` at every target t, in float32.
+
+    Good to 1e-5 for points of any place and order; one complex product per pair of points and
+    frequency. Memory for the result and a copy of the phasors.
+
+    `targets, sources` (m, 3): m; `phasors` (n, frequencies); `wavenumbers` (frequencies,): evenly
+    spaced, rad/m; `progress`: called with the number of values just done. Returns (m, frequencies).
+    """
+    frequencies = wavenumbers.size
+    padded = -(-frequencies // FREQUENCY_STEPS) * FREQUENCY_STEPS
+    parts = np.zeros((len(sources), 2 * padded), np.float32)
+    parts[:, : 2 * frequencies] = np.ascontiguousarray(phasors, np.complex64).view(np.float32)
+    # Distances are what counts: near the middle of both, float32 coordinates have most digits.
+    middle = (sources.mean(axis=0) + targets.mean(axis=0)) / 2
+    groups = -(-len(targets) // TARGET_LANES)
+    lanes = np.resize((targets - middle).astype(np.float32), (groups * TARGET_LANES, 3)).reshape(
+        groups, TARGET_LANES, 3
+    )
+    emitters = (sources - middle).astype(np.float32)
+    field = np.empty((groups, TARGET_LANES, frequencies), np.complex64)
+    step = wavenumbers[1] - wavenumbers[0] if frequencies > 1 else 0.0
+    turns, turns_on = np.float32(wavenumbers[0] / (2 * np.pi)), np.float32(step / (2 * np.pi))
+
+    def process_block(some: slice) -> None:
+        for group in range(some.start, some.stop):
+            sums = np.zeros(padded * 2 * TARGET_LANES, np.float32)
+            add_spherical_waves(
+                emitters, parts, np.ascontiguousarray(lanes[group].T).ravel(), turns, turns_on, sums
+            )
+            real, imaginary = np.moveaxis(sums.reshape(padded, 2, TARGET_LANES)[:frequencies], 1, 0)
+            field[group].real, field[group].imag = real.T, imaginary.T
+        progress(
+            (min(some.stop * TARGET_LANES, len(targets)) - some.start * TARGET_LANES) * frequencies
+        )
+
+    run_blocks(process_block, groups, size=LANE_GROUPS_PER_BLOCK)
+    return field.reshape(-1, frequencies)[: len(targets)]

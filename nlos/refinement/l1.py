@@ -1,0 +1,340 @@
+"""Spherical waves between two sets of points, the same in both directions.
+
+The wall's phasors as a linear function of the hidden volume, at the hybrid's speed.
+
+`nlos.Refinement`: the hybrid, iterated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from nlos.band import Band
+from nlos.capture import Capture
+from nlos.illumination import IlluminationGroup, build_source, choose_roles, warn_of_aliasing
+from nlos.method import MEMORY_LIMIT_BYTES, Method, Plan, Progress, require_numpy_signal
+from nlos.phasor.depth_steps import DiffractionPlan
+from nlos.phasor.plan import GroupPlan, Hybrid, WavePlan
+from nlos.phasor.to_depths import IlluminatedDepthPropagator
+from nlos.phasor.wall_to_plane_compiled import sum_spherical_waves
+from nlos.plane import axis_step
+from nlos.volume import Grid, Volume
+from tofclip.errors import InputError
+from tofclip.operators import Diagonal, LinearOperator, Stack
+from tofclip.solvers import Method as Prior
+from tofclip.solvers import Sparse
+from tofclip.solvers.priors import LightFieldVariation
+from tofclip.threads import limit_blas_threads, split_blocks
+
+Array = NDArray[Any]
+FloatArray = NDArray[np.float64]
+
+PAIRS_PER_BLOCK = 1 << 20
+"""Distances held at a time in double precision: 16 MB of waves."""
+
+
+def propagate_spherical_waves(
+    sources: FloatArray, values: Array, targets: FloatArray, wavenumbers: FloatArray
+) -> Array:
+    """Return ``sum_s values_k(s) * exp(1j * k * |t - s|) / |t - s|`` at every target t.
+
+    With sources and targets exchanged it is its own transpose. In single precision good to 1e-5 and
+    quick; in double precision plain.
+
+    `sources, targets` (n, 3): m; `values` (n, frequencies); `wavenumbers` (frequencies,): evenly
+    spaced, rad/m. Returns (m, frequencies): of the type of `values`.
+    """
+    if values.dtype == np.complex128:
+        return _propagate_in_double_precision(sources, values, targets, wavenumbers)
+    return sum_spherical_waves(targets, sources, values, wavenumbers)
+
+
+def _propagate_in_double_precision(
+    sources: FloatArray, values: Array, targets: FloatArray, wavenumbers: FloatArray
+) -> Array:
+    field = np.empty((len(targets), wavenumbers.size), np.complex128)
+    for some in split_blocks(len(targets), max(1, PAIRS_PER_BLOCK // len(sources))):
+        distance = np.linalg.norm(targets[some, np.newaxis] - sources, axis=-1)
+        for i, k in enumerate(wavenumbers):
+            field[some, i] = (np.exp(1j * k * distance) / distance) @ values[:, i]
+    return field
+
+
+class HiddenToWall(LinearOperator):
+    """From a hidden volume to the phasors that one exposure of a wall sees, by way of a virtual
+    plane.
+
+    ``P_k(r_p) = sqrt(G_k) * sum_r h(r) * exp(-1j * k * (|r_L - r| + |r - r_p|)) / |r - r_p|``: the
+    phasors of the conventions in `nlos`, weighted so that the adjoint of the phasors divided by
+    ``sqrt(G_k)`` is the real part of the hybrid's field. Result: real and imaginary parts in turns,
+    point by point, each at all frequencies.
+
+    Memory beyond volume and phasors: some 40 bytes per plane wave and frequency and thread.
+
+    `points` (n, 3): wall points, m; `plan`: from a virtual plane to the voxels; `dtype`: float32 or
+    float64.
+    """
+
+    def __init__(
+        self,
+        points: FloatArray,
+        plan: DiffractionPlan,
+        group: IlluminationGroup,
+        band: Band,
+        dtype: DTypeLike = np.float32,
+    ) -> None:
+        super().__init__(plan.grid.shape, (2 * len(points) * plan.waves.count,), dtype)
+        self.points, self.plane = points, plan.plane
+        self.wavenumbers = group.legs * band.wavenumbers
+        self._complex_dtype = np.result_type(self.dtype, np.complex64)
+        self._depths = IlluminatedDepthPropagator(
+            plan, build_source(group, band), self._complex_dtype
+        )
+        area = float(np.prod(plan.plane.steps))
+        # sqrt(G_k) of the class's formula, and the area that a point of the virtual plane stands
+        # for
+        self._strength = (np.sqrt(band.weights) * area).astype(self.dtype)
+
+    def _forward(self, block: Array) -> Array:
+        return self._apply_per_frame(self._to_phasors, block)
+
+    def _adjoint(self, block: Array) -> Array:
+        return self._apply_per_frame(self._to_volume, block)
+
+    def _to_phasors(self, volume: Array) -> Array:
+        # the adjoint of a wave that runs out is one that runs in: conjugate, propagate, conjugate
+        waves = self._depths.to_plane(volume).reshape(-1, self.wavenumbers.size).conj()
+        phasors = propagate_spherical_waves(
+            self.plane.points.reshape(-1, 3), waves, self.points, self.wavenumbers
+        ).conj()
+        return np.asarray(phasors * self._strength).view(self.dtype).ravel()
+
+    def _to_volume(self, measurements: Array) -> Array:
+        phasors = (
+            measurements.view(self._complex_dtype).reshape(len(self.points), -1) * self._strength
+        )
+        # the same sum with points and plane exchanged: a wave from r to s is one from s to r
+        waves = propagate_spherical_waves(
+            self.points, phasors, self.plane.points.reshape(-1, 3), self.wavenumbers
+        )
+        return self._depths.to_volume(waves.reshape(*self.plane.shape, -1))
+
+    def _apply_per_frame(self, work: Callable[[Array], Array], block: Array) -> Array:
+        """Treat every frame alone: each is a volume, too large to gain from company."""
+        # Depths and targets share the cores already: BLAS threads of its own would fight with ours.
+        with limit_blas_threads():
+            return np.stack(
+                [work(np.ascontiguousarray(frame)) for frame in np.moveaxis(block, -1, 0)], axis=-1
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class WallModel:
+    """A capture's phasors and the operator that makes them of a hidden volume.
+
+    A hidden point of albedo a returns ``a / (d_L * d_p)^2`` after the path ``L = d_L + d_p``, while
+    the operator's waves fall as ``1 / d_p``. Signals are therefore multiplied by L^2, or L^3 if
+    confocal: what is left, ``(d_L + d_p)^2 / (d_L^2 * d_p)``, is ``4 / d_L`` for equal legs,
+    changes by less than 8 % up to a ratio of 1.7, and is exactly 8 if confocal. The operator acts
+    on volumes divided by `laser_distance`.
+    """
+
+    plan: WavePlan  # of the hybrid
+    capture: Capture  # of the plan's geometry
+
+    @property
+    def grid(self) -> Grid:
+        """The voxels of the hidden volume."""
+        return self.plan.grid
+
+    @property
+    def _band(self) -> Band:
+        return self.plan.band
+
+    @cached_property
+    def laser_distance(self) -> FloatArray:
+        """Mean distance of every voxel from the laser spots, m, shape (z, y, x); 1 for a confocal
+        scan.
+        """
+        return np.asarray(
+            np.mean([self._compute_laser_distance(one.group) for one in self.plan.groups], axis=0)
+        )
+
+    def operator(self, dtype: DTypeLike = np.float32) -> LinearOperator:
+        """Return the operator from volumes (z, y, x), albedo divided by `laser_distance`, to
+        `measurements`.
+        """
+        return Stack([self._build_group_operator(one, dtype) for one in self.plan.groups])
+
+    def measurements(self) -> Array:
+        """Return the phasors divided by ``sqrt(G_k)``, as the operator gives them, shape (n, 1),
+        float32.
+        """
+        strength = np.sqrt(self._band.weights)
+        parts = []
+        traces = self.capture.traces()
+        for group in (one.group for one in self.plan.groups):
+            path_weight = (self.capture.axis.paths ** (group.legs + 1)).astype(np.float32)
+            phasors = np.ascontiguousarray(
+                self._band.compute_phasors(traces[group.indices] * path_weight) / strength,
+                np.complex64,
+            )
+            parts.append(phasors.view(np.float32).ravel())
+        return np.concatenate(parts)[:, np.newaxis]
+
+    def _build_group_operator(self, one: GroupPlan, dtype: DTypeLike) -> LinearOperator:
+        points = self.capture.points[one.group.indices]
+        bare = HiddenToWall(points, one.plane_to_depths, one.group, self._band, dtype)
+        return bare @ Diagonal(self.laser_distance / self._compute_laser_distance(one.group), dtype)
+
+    def _compute_laser_distance(self, group: IlluminationGroup) -> FloatArray:
+        if group.laser is None:
+            return np.ones(self.grid.shape)
+        z, y, x = np.meshgrid(self.grid.z, self.grid.y, self.grid.x, indexing="ij")
+        return np.asarray(np.linalg.norm(np.stack([x, y, z], axis=-1) - group.laser, axis=-1))
+
+
+SOLVER_VOLUMES = 12
+"""float32 volumes that the solver holds at once, with the duals of total variation."""
+
+MIN_VOXELS_PER_WAVELENGTH = 5.0
+"""Voxels per carrier wavelength in depth: a point between two of them is then off by less than 1.3
+rad.
+"""
+
+
+def build_total_variation(
+    grid: Grid, weight: float = 2e-2, iterations: int = 60
+) -> LightFieldVariation:
+    """Return the prior of even surfaces with sharp borders: total variation along x, y and z alike.
+
+    `grid`: what will be imaged on; evenly spaced; `weight, iterations`: as of
+    `tofclip.solvers.TotalVariation`.
+    """
+    across = axis_step(grid.x) if grid.x.size > 1 else 1.0
+    along = axis_step(grid.z) if grid.z.size > 1 else across
+    # depths take the place of views; differences along z count by their distance in metres
+    return LightFieldVariation(weight, iterations, grid=(grid.z.size, 1), angular=across / along)
+
+
+@dataclass(frozen=True)
+class Refinement(Method):
+    """The hidden albedo that explains a capture best, among those that a prior prefers.
+
+    Minimises ``1/2 |A h - f|^2 + prior(h)`` over h >= 0 by FISTA, with f the wall's phasors and A
+    the hybrid's own way from a volume to the wall; A'f is the real part of the hybrid's field. The
+    albedo is real and not negative, so that the phase of f tells where within a wave a point lies:
+    voxels have to resolve the carrier in depth.
+
+    Every step costs some four hybrid images. Memory: some 40 bytes per plane wave and frequency and
+    thread, and twelve volumes.
+
+    Parameters
+    ----------
+    hybrid : Hybrid
+        Its wavelength, cycles, tolerance and virtual plane.
+    prior : tofclip.solvers.Method
+        A proximal method of `tofclip.solvers`; `Sparse` is l1, `build_total_variation` total
+        variation.
+    """
+
+    hybrid: Hybrid
+    prior: Prior = field(default_factory=lambda: Sparse(weight=2e-2, iterations=60))
+
+    def plan(self, capture: Capture, grid: Grid) -> RefinementPlan:
+        """Make the refinement ready for captures like `capture` on `grid`.
+
+        Parameters
+        ----------
+        capture : Capture
+            A NumPy array, of few laser spots.
+        grid : Grid
+            Evenly spaced along x and y; at least `MIN_VOXELS_PER_WAVELENGTH` voxels per wavelength
+            in depth.
+
+        Returns
+        -------
+        RefinementPlan
+
+        Raises
+        ------
+        InputError
+            The hybrid cannot image such a capture on the grid, the voxels are too coarse in depth,
+            or memory does not suffice.
+        """
+        require_numpy_signal("iterative refinement", capture)
+        hybrid = self.hybrid.plan_waves(choose_roles(capture), grid)
+        _require_fine_depths(grid, self.hybrid.wavelength)
+        _require_memory(grid)
+        return RefinementPlan(capture, grid, self, hybrid)
+
+
+class RefinementPlan(Plan):
+    """An iterative refinement, ready for captures of one geometry.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+    method : Refinement
+    hybrid : WavePlan
+        The plan of the image that is iterated.
+    """
+
+    def __init__(self, capture: Capture, grid: Grid, method: Refinement, hybrid: WavePlan) -> None:
+        super().__init__(capture, grid)
+        self.method, self.hybrid = method, hybrid
+
+    @property
+    def cost(self) -> int:
+        """Voxels in all iterations."""
+        return self.method.prior.work(self.grid.size)
+
+    @property
+    def memory_bytes(self) -> int:
+        return self.hybrid.memory_bytes + 4 * SOLVER_VOLUMES * self.grid.size
+
+    def _image(self, capture: Capture, progress: Progress) -> Volume:
+        warn_of_aliasing(capture, self.hybrid.band)
+        model = WallModel(self.hybrid, choose_roles(capture))
+        prior, size = self.method.prior, self.grid.size
+        result = prior.recover(
+            model.operator(), model.measurements(), progress=lambda done: progress(done * size)
+        )
+        settings = {
+            "method": "refinement",
+            "wavelength_m": self.method.hybrid.wavelength,
+            "cycles": self.method.hybrid.cycles,
+            "prior": prior.name,
+            "iterations": result.iterations,
+            "stopped_because": result.stop_reason,
+        }
+        # the solver's unknown is the albedo over the laser's distance
+        albedo = (result.frames[0] * model.laser_distance).astype(np.float32)
+        return Volume(albedo, self.grid, {**capture.provenance, "imaging": settings})
+
+
+def _require_fine_depths(grid: Grid, wavelength: float) -> None:
+    coarsest = float(np.diff(grid.z).max()) if grid.z.size > 1 else 0.0
+    allowed = wavelength / MIN_VOXELS_PER_WAVELENGTH
+    # Voxels drawn exactly at the limit must not be refused for a rounding error.
+    if coarsest > allowed * (1 + 1e-6):
+        raise InputError(
+            f"voxels {coarsest:.3g} m apart in depth are too coarse to refine with waves of "
+            f"{wavelength:.3g} m: use at most {allowed:.3g} m"
+        )
+
+
+def _require_memory(grid: Grid) -> None:
+    needed = 4 * SOLVER_VOLUMES * grid.size
+    if needed > MEMORY_LIMIT_BYTES:
+        raise InputError(
+            f"{grid.size} voxels need {needed / 2**30:.1f} GiB to refine, more than the {MEMORY_LIMIT_BYTES >> 30} GiB "
+            "allowed: use larger voxels or a smaller box"
+        )

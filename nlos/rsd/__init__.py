@@ -1,1 +1,0 @@
-"""Rayleigh-Sommerfeld diffraction from one plane to many."""

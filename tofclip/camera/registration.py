@@ -1,0 +1,445 @@
+"""Time skew of the views, read off the shot itself.
+
+Every view sees the same scene, so every view receives the same energy at the same instant: where
+the sweep is skewed, its curve of energy versus row is shifted and stretched against the reference
+view's.
+
+Fine calibration from the shot itself: skew, gain and centre of every view, by lowering the data
+residual.
+
+Recovering the pictures and registering the views to them alternate. Given the pictures, a view's
+measurements change to first order with its time offset, time stretch, gain and slit centre, so that
+one small least-squares problem a view yields all four; a few rounds suffice because the coarse
+calibration is within a few pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.camera.model import Camera
+from tofclip.camera.rectifier import Measurement, estimate_dark_level, measure, require_width
+from tofclip.camera.sweep import SkewSweep
+from tofclip.errors import CalibrationError
+from tofclip.operators import LineProjection
+from tofclip.solvers import Progress, Sparse, ignore_progress
+from tofclip.units import SPEED_OF_LIGHT
+
+FloatArray = NDArray[np.float64]
+
+MAX_OFFSET_FRACTION = 0.08  # of the rows; beyond it a picture's start or end would be lost anyway
+TREND_ROWS = (
+    40  # slower changes than this are the scene's fall-off with range, not structure to match
+)
+MIN_CORRELATION = 0.6
+
+
+@dataclass(frozen=True)
+class SkewEstimate:
+    """A sweep found from energy curves.
+
+    Parameters
+    ----------
+    sweep : SkewSweep
+    correlations : (views,) array
+        Agreement of each view's curve with the reference view's; 1 at the reference.
+    """
+
+    sweep: SkewSweep
+    correlations: FloatArray
+
+
+def estimate_skew(counts: NDArray[np.float32], camera: Camera) -> SkewEstimate:
+    """Match each view's energy curve to the reference view's by ``row_k = offset_k + (1 +
+    stretch_k) * row``.
+
+    Parameters
+    ----------
+    counts : (rows, columns) array
+        Raw streak image.
+    camera : Camera
+        Its centres say where the views are; the view whose position is nearest 0 is the reference.
+
+    Returns
+    -------
+    SkewEstimate
+        Offsets in rows and stretches, and each view's correlation with the reference view.
+
+    Raises
+    ------
+    CalibrationError
+        A view's curve does not resemble the reference's, or the picture is not as wide as the
+        camera's slit.
+    """
+    curves = _extract_structure(sum_view_energies(counts, camera))
+    reference = int(np.argmin(np.abs(camera.view_positions)))
+    offsets, stretches, correlations = (
+        np.zeros(camera.views),
+        np.zeros(camera.views),
+        np.ones(camera.views),
+    )
+    for view in range(camera.views):
+        if view != reference:
+            offsets[view], stretches[view], correlations[view] = _match_curves(
+                curves[view], curves[reference]
+            )
+    worst = int(np.argmin(correlations))
+    if not correlations[worst] > MIN_CORRELATION:
+        raise CalibrationError(
+            f"view {worst} does not follow the reference view in time (correlation {correlations[worst]:.2f}): "
+            "check the slit centres, or give the camera a measured sweep"
+        )
+    return SkewEstimate(SkewSweep(camera.centres_px, offsets, stretches), correlations)
+
+
+def sum_view_energies(counts: NDArray[np.float32], camera: Camera) -> FloatArray:
+    """Sum of each row over each view's part of the slit, above the dark level; (views, rows).
+
+    `counts` (rows, columns): raw streak image; `camera`: centres of the views, px. Returns (views,
+    rows): counts above the dark level.
+    """
+    require_width(counts, camera)
+    # Without its dark level, which would swamp the correlation with a constant.
+    signal = counts - np.float32(estimate_dark_level(counts))
+    # No wider than half the way to the neighbour, whose light comes at other rows.
+    half = min(camera.image_shape[1] // 2, _half_pitch_px(camera))
+    edges = [(max(0, round(c) - half), round(c) + half + 1) for c in camera.centres_px]
+    return np.array([signal[:, first:last].sum(axis=1, dtype=np.float64) for first, last in edges])
+
+
+def _half_pitch_px(camera: Camera) -> int:
+    """Half the distance between neighbouring views, so that the windows do not overlap."""
+    if camera.views == 1:
+        return camera.slit_width_px
+    return int(np.min(np.diff(np.sort(camera.centres_px)))) // 2
+
+
+def _extract_structure(energies: FloatArray) -> FloatArray:
+    """Compress the range (near objects outshine far ones by 1/r^2) and take the slow trend away."""
+    from scipy.ndimage import gaussian_filter1d
+
+    # The root gives bright and dim returns the same noise, so that a single bright one does not
+    # decide.
+    compressed = np.sqrt(np.maximum(energies, 0))
+    detail: FloatArray = compressed - gaussian_filter1d(compressed, TREND_ROWS, axis=1)
+    return detail
+
+
+def _match_curves(curve: FloatArray, reference: FloatArray) -> tuple[float, float, float]:
+    """Offset, stretch and correlation that bring `curve` onto `reference`."""
+    from scipy.optimize import minimize
+
+    rows = np.arange(reference.size, dtype=np.float64)
+
+    def disagreement(skew: FloatArray) -> float:
+        shifted = np.interp(skew[0] + (1 + skew[1]) * rows, rows, curve)
+        spread = float(np.std(shifted) * np.std(reference))
+        if spread == 0:
+            return 1.0
+        return -float(np.mean((shifted - shifted.mean()) * (reference - reference.mean()))) / spread
+
+    reach = max(2, round(MAX_OFFSET_FRACTION * rows.size))
+    # The correlation has a maximum wherever two returns meet: whole rows first, or the search would
+    # stay at the nearest one.
+    coarse = min(range(-reach, reach + 1), key=lambda offset: disagreement(np.array([offset, 0.0])))
+    # Small enough to stay on the hill that the coarse search found: 3 rows, 1 % of stretch.
+    simplex = np.array([[coarse, 0.0], [coarse + 3.0, 0.0], [coarse, 0.01]])
+    options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-8}
+    best = minimize(disagreement, simplex[0], method="Nelder-Mead", options=options)
+    return float(best.x[0]), float(best.x[1]), -float(best.fun)
+
+
+Array = NDArray[np.float32]
+
+MIN_ROUND_COUNT, MAX_ROUND_COUNT = 5, 10
+SETTLED_PX = 0.05  # no centre moves further in a round: enough rounds
+# Three cache blocks, spread over the shot's energy. On simulated shots of 1,900, 200 and 50 photons
+# at the brightest, 320 frames find no camera better, and at 50 a worse one: their noise is fitted.
+MAX_FRAMES = 96
+# Too few iterations or too strong a prior pull the centres by some hundredths of a pixel.
+REGISTRATION_METHOD = Sparse(weight=3e-4, iterations=30)
+RELAXATION = (
+    1.5  # alternating steps fall short of the joint minimum; a measured speed-up without overshoot
+)
+# Centres fall shorter than the rest: pictures recovered at wrong centres agree with these in part.
+CENTRE_RELAXATION = 2.5
+CENTRE_PRIOR_PX = 3.0  # how far a slit centre may plausibly be off its calibration
+SHEAR_TOLERANCE_PX = 0.1  # of a view's place on the slit, where frames share an operator
+MIN_RANGE_M = 0.01
+MIN_VIEWS_TO_SHIFT = 3  # of two views, all that the centres say is where the picture lies
+FLOOR_FRACTION = 0.1  # frames dimmer than this share of the brightest count less, lest noise decide
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A refined camera and what the refinement gained.
+
+    Parameters
+    ----------
+    camera : Camera
+        With sweep, gains and centres refined.
+    residuals : (rounds + 1,) array
+        Relative data residual of the frames used, before each round and after the last.
+    """
+
+    camera: Camera
+    residuals: FloatArray
+
+
+def register_views(
+    counts: Array,
+    saturated: NDArray[np.bool_] | None,
+    camera: Camera,
+    progress: Progress = ignore_progress,
+    times: FloatArray | None = None,
+    max_rounds: int = MAX_ROUND_COUNT,
+) -> Registration:
+    """Refine a camera whose sweep is a `SkewSweep`.
+
+    Of a camera that knows its lenslet pitch, every instant is modelled at the shear of its range:
+    surfaces at several ranges then agree about the centres. A shift of all centres alike, or in
+    proportion to tan(angle), only shifts the pictures, and no shot can tell; there the camera's own
+    centres hold.
+
+    Parameters
+    ----------
+    counts : (rows, columns) array
+        Raw streak image.
+    saturated : (rows, columns) bool array or None
+    camera : Camera
+        Coarse calibration: centres within a few pixels, skew within a few rows.
+    progress : callable
+        Called with the number of frame iterations just done.
+    times : (rows,) array, optional
+        Times of flight of the rows, s. Without them, the centres of a camera that knows its lenslet
+        pitch stay as they are.
+    max_rounds : int
+        Refinements at most. Two leave a tenth of the first misfit's excess: enough to read what is
+        written on a surface, not to measure.
+
+    Returns
+    -------
+    Registration
+        The best camera of all rounds, and the residual of each.
+    """
+    start, residuals, best, moved_px = camera, [], (np.inf, camera), np.inf
+    for number in range(max_rounds + 1):
+        measurement = measure(counts, saturated, camera)
+        chosen = _select_frames(measurement)
+        part = Measurement(measurement.values[:, chosen], measurement.valid[:, chosen])
+        groups = _group_by_shear(camera, times, chosen)
+        operators = _make_operators(camera, groups)
+        pictures = _recover_groups(operators, part, groups, progress)
+        model = _predict(operators, pictures, groups)
+        residuals.append(_compute_residual(model, part))
+        best = min(best, (residuals[-1], camera), key=lambda pair: pair[0])
+        if number == max_rounds or (number >= MIN_ROUND_COUNT and moved_px < SETTLED_PX):
+            break
+        evidence = _Evidence(pictures, groups, part.values - model, part.valid, chosen)
+        slope = np.gradient(measurement.values, axis=1)[:, chosen]
+        before = camera.centres_px
+        camera = _refine_camera(camera, start, evidence, slope, times is not None)
+        moved_px = float(np.abs(camera.centres_px - before).max())
+    return Registration(best[1], np.array(residuals))
+
+
+def count_registration_iterations() -> int:
+    """Frame iterations that `register_views` reports at most."""
+    return (MAX_ROUND_COUNT + 1) * REGISTRATION_METHOD.work(MAX_FRAMES)
+
+
+def _select_frames(measurement: Measurement) -> NDArray[np.intp]:
+    """Pick instants evenly in cumulated brightness, so that far and dim objects are represented
+    too.
+    """
+    brightness = np.sqrt(
+        np.maximum((measurement.values * measurement.valid).sum(axis=0, dtype=np.float64), 0)
+    )
+    share = np.cumsum(brightness) / brightness.sum()
+    wanted = (np.arange(MAX_FRAMES) + 0.5) / MAX_FRAMES
+    return np.unique(np.searchsorted(share, wanted).clip(0, brightness.size - 1))
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Consecutive ones of the chosen frames, recovered at one shear, pixels per view step."""
+
+    frames: slice
+    shear: float
+
+
+def _group_by_shear(
+    camera: Camera, times: FloatArray | None, chosen: NDArray[np.intp]
+) -> list[_Group]:
+    """Cut the chosen frames where the shear of their range has changed."""
+    if times is None or camera.lenslet_pitch <= 0:
+        return [_Group(slice(0, chosen.size), 0.0)]
+    distance = np.maximum(SPEED_OF_LIGHT * times[chosen] / 2, MIN_RANGE_M)
+    shears = camera.shear_at(distance)
+    step = 2 * SHEAR_TOLERANCE_PX / np.abs(camera.view_positions).max(initial=1.0)
+    changed = np.diff(np.floor((shears - shears[0]) / step)) != 0
+    cuts = np.flatnonzero(np.concatenate([[True], changed, [True]])).tolist()
+    return [
+        _Group(slice(first, last), float(shears[first:last].mean()))
+        for first, last in pairwise(cuts)
+    ]
+
+
+def _make_operators(camera: Camera, groups: Sequence[_Group]) -> list[LineProjection]:
+    return [camera.operator(group.shear) for group in groups]
+
+
+def _recover_groups(
+    operators: Sequence[LineProjection],
+    part: Measurement,
+    groups: Sequence[_Group],
+    progress: Progress,
+) -> Array:
+    """Recover the chosen frames, (rows, columns, frames)."""
+    pictures = [
+        REGISTRATION_METHOD.recover(
+            operator,
+            np.ascontiguousarray(part.values[:, group.frames]),
+            np.ascontiguousarray(part.valid[:, group.frames]),
+            progress,
+        ).frames
+        for operator, group in zip(operators, groups, strict=True)
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.concatenate(pictures), 0, -1))
+
+
+def _predict(
+    operators: Sequence[LineProjection], pictures: Array, groups: Sequence[_Group]
+) -> Array:
+    """Return what the camera would measure of the pictures, (columns, frames)."""
+    return np.concatenate(
+        [
+            operator(np.ascontiguousarray(pictures[..., group.frames]))
+            for operator, group in zip(operators, groups, strict=True)
+        ],
+        axis=1,
+    )
+
+
+def _compute_residual(model: Array, part: Measurement) -> float:
+    valid = part.valid.astype(bool)
+    return float(np.linalg.norm((part.values - model)[valid]) / np.linalg.norm(part.values[valid]))
+
+
+def _refine_camera(
+    camera: Camera, start: Camera, evidence: _Evidence, slope: Array, knows_times: bool
+) -> Camera:
+    """Solve for every view's corrections and apply them; the reference view keeps its time, gains
+    average 1.
+    """
+    sweep = camera.sweep
+    if not isinstance(sweep, SkewSweep):
+        raise CalibrationError(
+            "only a skew per view can be refined; this camera's sweep was measured as a whole"
+        )
+    drift = camera.centres_px - start.centres_px
+    corrections = np.array(
+        [
+            evidence.solve_corrections(camera, view, drift[view], slope)
+            for view in range(camera.views)
+        ]
+    )
+    offset, stretch, gain, centre = RELAXATION * corrections.T
+    centre = CENTRE_RELAXATION / RELAXATION * centre
+    reference = int(np.argmin(np.abs(camera.view_positions)))
+    gains = np.maximum(camera.gains * (1 + gain), 0.05)
+    centres = camera.centres_px
+    if camera.lenslet_pitch == 0:
+        centres = centres + centre
+    elif knows_times:
+        # Without times, a scene at several ranges would only pull the centres about.
+        centres = centres + _remove_picture_shift(camera, centre)
+    improved = SkewSweep(
+        centres,
+        sweep.offsets_bin + offset - offset[reference],
+        sweep.stretches + stretch - stretch[reference],
+    )
+    return camera.replace(centres_px=centres, gains=gains / gains.mean(), sweep=improved)
+
+
+def _remove_picture_shift(camera: Camera, moves: FloatArray) -> FloatArray:
+    """Leave out what would only shift the pictures: the part along 1 and tan(angle)."""
+    if camera.views < MIN_VIEWS_TO_SHIFT:
+        return moves
+    shifts = np.stack([np.ones(camera.views), np.tan(camera.angles)], axis=1)
+    rest: FloatArray = moves - shifts @ np.linalg.lstsq(shifts, moves, rcond=None)[0]
+    return rest
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What a round knows: pictures, their groups, and the misfit they leave, at the chosen rows."""
+
+    pictures: Array
+    groups: Sequence[_Group]
+    misfit: Array
+    valid: NDArray[np.bool_]
+    rows: NDArray[np.intp]
+
+    def solve_corrections(
+        self, camera: Camera, view: int, drift: float, slope: Array
+    ) -> FloatArray:
+        """Offset (rows), stretch, relative gain and centre (px) that best explain one view's
+        misfit.
+
+        A centre that has drifted far from its calibration is held back by a prior of
+        `CENTRE_PRIOR_PX`.
+
+        `view`: number of the view, from 0; `drift`: how far the centre has moved from its
+        calibration, px; `slope` (columns, frames): of the measurements in time, a row. Returns
+        (4,): offset in rows, stretch, relative gain and centre in px.
+        """
+        operators = _make_operators(_select_view(camera, view), self.groups)
+        predicted = _predict(operators, self.pictures, self.groups)
+        half = camera.image_shape[1] // 2
+        middle = round(camera.centres_px[view])
+        window = slice(max(0, middle - half), middle + half + 1)
+        energy = np.sqrt(np.sum(predicted**2, axis=0, dtype=np.float64))
+        weight = self.valid[window] / (
+            # bright columns count as much as dim ones; the floor keeps columns without light from
+            # counting at all
+            energy + FLOOR_FRACTION * energy.max() + np.finfo(np.float64).tiny
+        )
+        slope, parallax = slope[window], np.gradient(predicted, axis=0)[window]
+        effects = [-slope, -slope * self.rows, predicted[window], -parallax]
+        design = np.stack(
+            [(effect * weight).ravel() for effect in effects], axis=1, dtype=np.float64
+        )
+        return _solve_least_squares(design, (self.misfit[window] * weight).ravel(), drift)
+
+
+def _select_view(camera: Camera, view: int) -> Camera:
+    one = slice(view, view + 1)
+    return camera.replace(
+        centres_px=camera.centres_px[one],
+        angles=camera.angles[one],
+        gains=camera.gains[one],
+        view_positions=camera.view_positions[one],
+        sweep=None,
+        angle_uncertainty=np.empty(0),
+        centre_uncertainty_px=np.empty(0),
+    )
+
+
+def _solve_least_squares(design: FloatArray, target: FloatArray, drift: float) -> FloatArray:
+    """Solve the scaled normal equations, with the prior on the last unknown, the centre."""
+    scale = np.linalg.norm(design, axis=0) + np.finfo(np.float64).tiny
+    scaled = design / scale
+    normal, moment = scaled.T @ scaled, scaled.T @ target
+    strength = float(np.mean(target**2)) / CENTRE_PRIOR_PX**2
+    normal[-1, -1] += strength / scale[-1] ** 2
+    moment[-1] -= strength * drift / scale[-1]
+    # A view without any structure leaves a column of zeros: the ridge keeps its numbers as they
+    # are.
+    solution: FloatArray = np.linalg.solve(normal + 1e-9 * np.eye(normal.shape[0]), moment) / scale
+    return solution

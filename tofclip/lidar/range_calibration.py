@@ -1,0 +1,747 @@
+"""Effects that measurements have in common, with those of their shots and of their pixels apart.
+
+A measurement of pixel p in shot s is ``A theta + b_s + o_p + noise``: fixed effects theta, and shots
+and pixels whose own effects are drawn from normal distributions with unknown variances. These
+variances are estimated with the effects (restricted maximum likelihood by the EM algorithm: Laird
+and Ware, Biometrics 38, 963 (1982)), so that an effect that the measurements do not show is pulled
+to zero and standard deviations hold whatever varies.
+
+Returns with the corrections that their camera's range calibration knows.
+
+Time zero, range walk, the pixels' offsets and response, and reflectance, from shots of a target at
+known distances.
+
+The target is flat, faces the camera and shows in most pixels. A measured range is
+
+    ``R / cos(angle) + time zero + walk(signal) + jitter of the shot + offset of the pixel + noise``
+
+with the distance R along the optical axis. Shots and pixels are effects of their own
+(`tofclip.lidar.range_calibration`), so that standard deviations hold where shots jitter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera, RangeCalibration
+from tofclip.errors import CalibrationError, InputError
+from tofclip.lidar.geometry import compute_ray_directions
+from tofclip.shots import Returns
+from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT
+
+FloatArray = NDArray[np.float64]
+
+EM_ROUNDS = 10, 60
+"""At most: a rough estimate to tell what does not belong, then the one that counts."""
+
+EM_TOLERANCE = 5e-3
+"""Change of the variances below which they are known, relative to themselves or to what the noise
+makes of a shot's or a pixel's mean."""
+
+MAX_FITTED_PIXELS = 4096
+"""That say how large the variances are; all pixels are solved for."""
+
+OUTLIER_SIGMA = 4.5
+"""Standard deviations beyond which a measurement is left out: of normal errors, one in 150,000."""
+
+CORRELATION_BLOCK_PX = 6
+TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Measurements of one quantity in many pixels and several shots."""
+
+    value: FloatArray  # (n,), with one standard deviation, right up to a factor
+    sigma: FloatArray  # (n,), with one standard deviation, right up to a factor
+    design: FloatArray  # (n, effects), fixed effects
+    shot: NDArray[np.int64]  # (n,), numbers from 0
+    pixel: NDArray[np.int64]  # (n,), numbers from 0
+    place: tuple[NDArray[np.int64], NDArray[np.int64]]  # row and column of the pixel
+
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> Measurements:
+        return Measurements(
+            self.value[chosen],
+            self.sigma[chosen],
+            self.design[chosen],
+            self.shot[chosen],
+            self.pixel[chosen],
+            (self.place[0][chosen], self.place[1][chosen]),
+        )
+
+
+@dataclass(frozen=True)
+class Variances:
+    """What varies."""
+
+    noise: float  # factor of the measurements' own variances
+    shots: float  # variances of the shots' and the pixels' effects; 0: none
+    pixels: float  # variances of the shots' and the pixels' effects; 0: none
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What was found."""
+
+    fixed: FloatArray  # (effects,)
+    covariance: FloatArray  # (effects, effects), of the fixed effects
+    shots: FloatArray  # (shots,), each shot's own
+    pixels: FloatArray  # (pixels,), each pixel's own, and its standard deviation
+    pixel_sigma: FloatArray  # (pixels,), each pixel's own, and its standard deviation
+    variances: Variances
+    inliers: NDArray[np.bool_]  # (n,), measurements that were used
+
+
+@dataclass(frozen=True)
+class _Solution:
+    fixed: FloatArray
+    shots: FloatArray
+    pixels: FloatArray
+    covariance: FloatArray
+    pixel_variance: FloatArray
+    residual: FloatArray
+    fitted_variance: FloatArray
+
+
+def fit_effects(data: Measurements, with_shots: bool = True, with_pixels: bool = True) -> Effects:
+    """Estimate all effects and what they vary by.
+
+    `with_shots, with_pixels`: whether shots and pixels have effects of their own.
+    """
+    shots, pixels = int(data.shot.max()) + 1, int(data.pixel.max()) + 1
+    step = -(-pixels // MAX_FITTED_PIXELS)
+    inliers = np.ones(data.value.size, bool)
+    for rounds in EM_ROUNDS:
+        chosen = inliers & (data.pixel % step == 0)
+        variances = _estimate_variances(
+            data[chosen], (shots, pixels), (with_shots, with_pixels), rounds
+        )
+        found = _solve(data[inliers], variances, (shots, pixels))
+        everything = _predict(data, found)
+        distance = np.abs(data.value - everything) / (data.sigma * np.sqrt(variances.noise))
+        inliers = distance < OUTLIER_SIGMA
+    used = data[inliers]
+    found = _solve(used, variances, (shots, pixels))
+    company = measure_correlation(found.residual / (used.sigma * np.sqrt(variances.noise)), used)
+    # Errors that neighbours share do not average out: as many measurements as are independent.
+    fewer = Variances(variances.noise * company, variances.shots, variances.pixels)
+    effects = data.design.shape[1]
+    covariance = _solve(used, fewer, (shots, pixels)).covariance[:effects, :effects]
+    if variances.shots > 0:
+        still = replace(fewer, shots=0.0)
+        without = _solve(used, still, (shots, pixels)).covariance[:effects, :effects]
+        # What a handful of shots say of their own spread is uncertain itself: Student's t.
+        freedom = max(shots - effects, 1)
+        widened = float(scipy.special.stdtrit(freedom, scipy.special.ndtr(1.0))) ** 2
+        covariance = without + widened * (covariance - without)
+    return Effects(
+        found.fixed,
+        covariance,
+        found.shots,
+        found.pixels,
+        np.sqrt(found.pixel_variance),
+        variances,
+        inliers,
+    )
+
+
+def measure_correlation(standardised: FloatArray, data: Measurements) -> float:
+    """Return how many neighbouring pixels share one error: 1 where each has its own.
+
+    `standardised` (n,): residuals in standard deviations. Returns variance of the sums over blocks
+    of pixels, over that of independent errors; 1 where the difference is within chance.
+    """
+    row, column = (place // CORRELATION_BLOCK_PX for place in data.place)
+    blocks = np.stack([data.shot, row, column], axis=1)
+    _, block, number = np.unique(blocks, axis=0, return_inverse=True, return_counts=True)
+    sums = np.bincount(block.ravel(), standardised)
+    large = number > CORRELATION_BLOCK_PX
+    if large.sum() < 2:
+        return 1.0
+    mean_square = float(np.mean(standardised**2))
+    excess = float(np.mean(sums[large] ** 2 / number[large])) / max(mean_square, TINY)
+    # The mean of m squares of normal numbers varies by the root of 2 / m.
+    chance = 3 * np.sqrt(2 / large.sum())
+    return excess if excess > 1 + chance else 1.0
+
+
+def _estimate_variances(
+    data: Measurements, sizes: tuple[int, int], present: tuple[bool, bool], rounds: int
+) -> Variances:
+    """Estimate what varies, from the scatter of the means over shots and over pixels.
+
+    `sizes`: numbers of shots and of pixels; `present`: whether shots and pixels have effects of
+    their own; `rounds`: at most.
+    """
+    start = _solve(data, Variances(1.0, 0.0, 0.0), sizes)
+    if data.value.size <= data.design.shape[1]:
+        # Nothing is left over that would tell the noise: the measurements' own deviations hold.
+        return Variances(1.0, 0.0, 0.0)
+    scatter = float(np.mean(start.residual**2 / data.sigma**2))
+    typical = scatter * float(np.median(data.sigma**2))
+    seen = [np.unique(data.shot), np.unique(data.pixel)]
+    # What the noise alone makes of the means over shots and over pixels.
+    least = [typical * one.size / data.value.size for one in seen]
+    groups = zip((data.shot, data.pixel), sizes, seen, least, strict=True)
+    spread = [
+        max(float(np.var(_average(start.residual, group, size)[which])), floor)
+        for group, size, which, floor in groups
+    ]
+    now = Variances(max(scatter, TINY), present[0] * spread[0], present[1] * spread[1])
+    effects = data.design.shape[1]
+    for _ in range(rounds):
+        found = _solve(data, now, sizes)
+        squares = (found.residual**2 + found.fitted_variance) / data.sigma**2
+        own = np.diagonal(found.covariance)[effects:]
+        later = Variances(
+            max(float(np.mean(squares)), TINY),
+            float(np.mean(found.shots**2 + own)) if present[0] else 0.0,
+            float(np.mean((found.pixels**2 + found.pixel_variance)[seen[1]]))
+            if present[1]
+            else 0.0,
+        )
+        pairs = zip(
+            (later.noise, later.shots, later.pixels),
+            (now.noise, now.shots, now.pixels),
+            strict=True,
+        )
+        settled = all(abs(new - old) <= EM_TOLERANCE * old for new, old in pairs)
+        now = later
+        if settled:
+            break
+    return now
+
+
+def _average(values: FloatArray, group: NDArray[np.int64], size: int) -> FloatArray:
+    """Mean of the values of each group; 0 of empty ones."""
+    means: FloatArray = np.bincount(group, values, size) / np.maximum(
+        np.bincount(group, minlength=size), 1
+    )
+    return means
+
+
+def _solve(data: Measurements, variances: Variances, sizes: tuple[int, int]) -> _Solution:
+    """Solve for all effects at once; those of pixels are eliminated first.
+
+    `sizes`: numbers of shots and of pixels.
+    """
+    shots, pixels = sizes
+    weight = 1 / (variances.noise * data.sigma**2)
+    effects = data.design.shape[1]
+    columns = [data.design]
+    prior = np.zeros(effects)
+    if variances.shots > 0:
+        columns.append((data.shot[:, np.newaxis] == np.arange(shots)).astype(np.float64))
+        prior = np.r_[prior, np.full(shots, 1 / variances.shots)]
+    design = np.concatenate(columns, axis=1)
+    weighted = design * weight[:, np.newaxis]
+    normal, moment = design.T @ weighted + np.diag(prior), weighted.T @ data.value
+    gather = np.zeros((pixels, design.shape[1]))
+    total = np.full(pixels, np.inf)
+    sums = np.zeros(pixels)
+    if variances.pixels > 0:
+        for number, column in enumerate(weighted.T):
+            gather[:, number] = np.bincount(data.pixel, column, pixels)
+        total[:] = np.bincount(data.pixel, weight, pixels) + 1 / variances.pixels
+        sums[:] = np.bincount(data.pixel, weight * data.value, pixels)
+        normal = normal - gather.T @ (gather / total[:, np.newaxis])
+        moment = moment - gather.T @ (sums / total)
+    # Columns of very different units are scaled, so that none is lost in rounding.
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(normal), TINY))
+    inverse = np.linalg.pinv(normal * np.outer(scale, scale), hermitian=True)
+    covariance = inverse * np.outer(scale, scale)
+    theta = covariance @ moment
+    leverage: FloatArray = gather / total[:, np.newaxis]
+    own = (sums / total) - leverage @ theta
+    shot_effects = theta[effects:] if variances.shots > 0 else np.zeros(shots)
+    own_variance = 1 / total + np.einsum("pi,ij,pj->p", leverage, covariance, leverage)
+    # The variance of what is fitted to each measurement: effects as they are seen beside its pixel.
+    beside = design - leverage[data.pixel]
+    fitted = np.einsum("ni,ij,nj->n", beside, covariance, beside) + 1 / total[data.pixel]
+    residual = data.value - design @ theta - own[data.pixel]
+    if variances.shots == 0:
+        covariance = np.pad(covariance, (0, shots))
+    return _Solution(theta[:effects], shot_effects, own, covariance, own_variance, residual, fitted)
+
+
+def _predict(data: Measurements, found: _Solution) -> FloatArray:
+    predicted: FloatArray = (
+        data.design @ found.fixed + found.shots[data.shot] + found.pixels[data.pixel]
+    )
+    return predicted
+
+
+def correct_returns(returns: Returns) -> Returns:
+    """Undo range walk and the pixels' offsets where the camera knows them, where returns are listed.
+
+    Ranges, times and intensities are corrected; deviations get the calibration's.
+    """
+    known = returns.camera.range_calibration
+    if known is None:
+        return returns
+    distance, intensity, sigma = correct_ranges(
+        known,
+        returns.range,
+        returns.intensity / square_range(returns.range),
+        returns.confidence.astype(np.float64),
+        (returns.y, returns.x),
+    )
+    return replace(
+        returns,
+        range=distance,
+        intensity=intensity.astype(np.float32),
+        confidence=sigma.astype(np.float32),
+        time=2 * distance / SPEED_OF_LIGHT,
+    )
+
+
+def correct_ranges(
+    known: RangeCalibration,
+    distance: FloatArray,
+    signal: FloatArray,
+    sigma: FloatArray,
+    pixel: tuple[NDArray[np.integer], NDArray[np.integer]],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Undo range walk and the pixels' offsets.
+
+    `distance` (n,): ranges as they were measured, m; `signal` (n,): counts of the returns; `sigma`
+    (n,): one standard deviation of the ranges, m; `pixel`: rows and columns. Returns `distance`
+    (n,): m; `intensity` (n,): counts, referred to a range of 1 m; `sigma` (n,): m.
+    """
+    excess, further = known.compute_excess(signal, *pixel)
+    corrected = distance - excess
+    return corrected, signal * corrected**2, np.hypot(sigma, further)
+
+
+def square_range(distance: FloatArray) -> FloatArray:
+    """Square of measured ranges, by which their intensities were referred to 1 m; never 0."""
+    return np.maximum(distance**2, np.finfo(np.float64).tiny)
+
+
+MIN_WALK_SHOTS = 3
+MIN_WALK_SPAN_DECADES = 0.3
+"""Of the returns' intensities, a factor of two; a walk from less would be noise drawn out."""
+
+MIN_CURVED_WALK_SHOTS, CURVED_WALK_SPAN_DECADES = 6, 1.0
+"""From here on the walk is a parabola of the decades, below a straight line."""
+
+SPAN_PERCENTILES = (2.0, 98.0)
+
+WINDOW_PULSES = 0.5
+"""Returns of one surface lie within this many pulse widths."""
+
+MIN_TARGET_PIXELS = 3
+"""With the target's return. In the dark a detector announces one in a pixel of a hundred, at any
+range: the camera of such a shot would be wrong by the length of the record."""
+
+MIN_TARGET_FRACTION = 0.005
+"""Of the picture's pixels: rays and false alarms agree by chance in patches of a few pixels across."""
+
+MIN_TARGET_BRIGHTNESS = 0.02
+"""Of the whole picture's brightest returns. What is dimmer may be a trace that a recovery leaves of
+them elsewhere: in the dark corners of a recorded scene these had 0.2 to 0.5 % (method tv)."""
+
+BRIGHTEST_PERCENTILE = 99.0
+SHOW_A_PLATE = "show a flat plate that faces the camera, or cut the picture to it (`region`)"
+
+MIN_TARGET_SHARE = 0.5
+"""Of the returns that are not that dim: a plate is most of what is seen. Cluttered scenes have 0.05 to 0.5."""
+
+MAX_FLANK_RATIO = 0.25
+"""Returns up to a window's width before and behind the target, over the target's: none beside a plate,
+as many as within on a surface that goes on in depth."""
+
+MAX_ROUGHNESS = 0.2
+"""Median distance from the target's plane in half widths of the window. A plate's noise makes 0.11 of
+it at most (the window holds six deviations), depths that fill the window evenly make 0.5."""
+
+MAX_RIVAL_FRACTION = 0.7
+"""Of the target's returns, that another surface may have."""
+
+MAX_SHOT_SPREAD_PULSES = 1.0
+"""By which the shots' time zeros may differ."""
+
+MAX_BRIGHTNESS_RATIO = 1.5
+"""Of shots that are said to show one reflectance."""
+
+
+@dataclass(frozen=True)
+class TargetShot:
+    """What was seen of a target at a known distance."""
+
+    # as they were measured, without a range calibration; ranges from the camera's time zero
+    returns: Returns
+    distance: float  # of the target along the optical axis, m
+    # first and last time of flight of the record, s, from the same time zero
+    record: tuple[float, float]
+    name: str = "the shot"  # for messages
+    reflectance_percent: float = np.nan  # of the target; NaN where it is not known
+    # counts of the brightest returns of the whole picture, where `returns` are those of a part of
+    # it; by default of `returns`
+    brightest: float = np.nan
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.distance) and self.distance > 0):
+            raise InputError(f"a target's distance must be a positive length, got {self.distance}")
+        if not (np.isnan(self.reflectance_percent) or 0 < self.reflectance_percent <= 1000):
+            raise InputError(
+                f"a reflectance must be a positive percentage, got {self.reflectance_percent}"
+            )
+
+    def cut(self, inside: NDArray[np.bool_]) -> TargetShot:
+        """Return the shot with a part of its returns, and what is known of the others.
+
+        `inside` (returns,).
+        """
+        brightest = self.measure_brightest() if np.isnan(self.brightest) else self.brightest
+        return replace(self, returns=self.returns[inside], brightest=brightest)
+
+    def measure_brightest(self) -> float:
+        """Counts of the brightest returns."""
+        if not len(self.returns):
+            return 0.0
+        return float(np.percentile(_count_signal(self.returns), BRIGHTEST_PERCENTILE))
+
+
+@dataclass(frozen=True)
+class RangeFit:
+    """A camera whose ranges are calibrated, and what the fit looked like."""
+
+    camera: Camera  # with its time zero and range calibration
+    jitter: float  # one standard deviation of the shots' own time zeros, s; NaN of a single shot
+    offset_spread: float  # one standard deviation of the pixels' offsets, m; NaN of a single shot
+    signal: FloatArray  # (n,), counts of the returns that were fitted
+    # (n,), what they measured too long, offsets of pixels and shots taken off, m
+    excess: FloatArray
+    target_fraction: float  # of the pixels with a return, those whose return is the target's
+    walk_note: str  # why a part was not fitted; empty where it was
+    offsets_note: str  # why a part was not fitted; empty where it was
+    response_note: str  # why a part was not fitted; empty where it was
+
+    @property
+    def calibration(self) -> RangeCalibration:
+        """The camera's range calibration."""
+        known = self.camera.range_calibration
+        assert known is not None
+        return known
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """The target's returns of all shots, side by side."""
+
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+    shot: NDArray[np.int64]
+    pixel: NDArray[np.int64]
+    excess: FloatArray
+    sigma: FloatArray
+    signal: FloatArray
+    cosine: FloatArray
+    fraction: float
+
+
+def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None) -> RangeFit:
+    """Calibrate ranges by shots of a target at known distances.
+
+    `shots`: from three on, of different brightness, they give the range walk; from two on the
+    pixels' offsets and response; `walk`: whether a range walk must be fitted, or must not; by
+    default where the shots can tell it.
+    """
+    if not shots:
+        raise InputError("a range calibration needs a shot of a target")
+    base = shots[0].returns.camera
+    pulse = SPEED_OF_LIGHT / 2 * base.pulse_fwhm
+    _require_reach(shots)
+    sample = _gather([_select_target(shot, base, pulse) for shot in shots])
+    _require_agreement(shots, sample, pulse)
+    span = np.percentile(np.log10(sample.signal), SPAN_PERCENTILES)
+    walk_note = _explain_missing_walk(len(shots), span, walk)
+    curved = len(shots) >= MIN_CURVED_WALK_SHOTS and np.ptp(span) >= CURVED_WALK_SPAN_DECADES
+    order = 0 if walk_note else 1 + int(curved)
+    reference = float(10 ** np.median(np.log10(sample.signal)))
+    # What shifts a return with its brightness, a threshold on an edge above all, goes by factors of
+    # brightness: hence decades. From the usual brightness, so that the constant is the time zero of
+    # a usual return.
+    decades = np.log10(sample.signal / reference)
+    data = Measurements(
+        sample.excess,
+        sample.sigma,
+        decades[:, np.newaxis] ** np.arange(order + 1),
+        sample.shot,
+        sample.pixel,
+        (sample.y, sample.x),
+    )
+    repeated = len(shots) > 1
+    effects = fit_effects(data, repeated, repeated)
+    once = "one shot does not tell the pixels' own from noise: give two or more"
+    calibration = RangeCalibration(
+        time_zero_sigma=float(np.sqrt(effects.covariance[0, 0]) * 2 / SPEED_OF_LIGHT),
+        walk=effects.fixed[1:],
+        walk_covariance=effects.covariance[1:, 1:],
+        reference_signal=reference,
+        signal_range=10**span,
+    )
+    shape = base.image_shape
+    if repeated:
+        calibration = replace(
+            calibration,
+            offsets=_to_picture(effects.pixels, shape),
+            offset_sigma=_to_picture(
+                effects.pixel_sigma, shape, float(np.sqrt(effects.variances.pixels))
+            ),
+        )
+    calibration = _add_brightness(calibration, shots, sample, effects, base)
+    late = float(effects.fixed[0]) * 2 / SPEED_OF_LIGHT
+    left = (sample.excess - effects.shots[sample.shot] - effects.pixels[sample.pixel])[
+        effects.inliers
+    ]
+    return RangeFit(
+        base.replace(time_zero=late, range_calibration=calibration),
+        float(np.sqrt(effects.variances.shots)) * 2 / SPEED_OF_LIGHT if repeated else np.nan,
+        float(np.sqrt(effects.variances.pixels)) if repeated else np.nan,
+        sample.signal[effects.inliers],
+        left - effects.fixed[0],
+        sample.fraction,
+        walk_note,
+        "" if repeated else once,
+        "" if repeated else once,
+    )
+
+
+def _require_reach(shots: Sequence[TargetShot]) -> None:
+    """Refuse targets that lie further apart than the record is long: one of them is not in it."""
+    distances = np.array([shot.distance for shot in shots])
+    length = min(shot.record[1] - shot.record[0] for shot in shots) * SPEED_OF_LIGHT / 2
+    if np.ptp(distances) > length:
+        raise CalibrationError(
+            f"the targets lie {np.ptp(distances):.3g} m apart, and the record shows {length:.3g} m: "
+            "one of them is out of the record"
+        )
+
+
+def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
+    """Keep the strongest return of each pixel where it is the target's.
+
+    `camera`: says where the pixels look; `pulse`: width of a pulse, m. Returns excess over the
+    target's range, from the start of the time axis rather than any time zero.
+    """
+    if shot.returns.camera.image_shape != camera.image_shape:
+        raise CalibrationError(
+            f"{shot.name}: its picture has {shot.returns.camera.image_shape} pixels, the camera's "
+            f"{camera.image_shape}"
+        )
+    found = shot.returns.select("strongest")
+    pixels = camera.image_shape[0] * camera.image_shape[1]
+    needed = min(max(MIN_TARGET_PIXELS, round(MIN_TARGET_FRACTION * pixels)), pixels)
+    missing = CalibrationError(
+        f"{shot.name}: no return stands out in {needed} or more pixels: is the target in the record "
+        "and in the picture, and large enough?"
+    )
+    if len(found) == 0:
+        raise missing
+    brightest = shot.measure_brightest() if np.isnan(shot.brightest) else shot.brightest
+    clear = _count_signal(found) >= MIN_TARGET_BRIGHTNESS * brightest
+    if not clear.any():
+        raise CalibrationError(
+            f"{shot.name}: no plate: its returns have {np.median(_count_signal(found)):.3g} counts at "
+            f"most places, the picture's brightest {brightest:.3g}: a trace of these; {SHOW_A_PLATE}"
+        )
+    found = found[clear]
+    # A plate across the axis is farther along slanted lines of sight: its distance is over the
+    # cosine.
+    cosine = compute_ray_directions(camera, found.y, found.x)[:, 2]
+    excess = found.range - shot.distance / cosine
+    sigma = np.maximum(found.confidence.astype(np.float64), np.finfo(np.float32).tiny)
+    # In few photons ranges scatter by more than a pulse: six standard deviations hold them.
+    width = max(WINDOW_PULSES * pulse, 6 * float(np.median(sigma)))
+    target = _find_cluster(excess, width, shot.name)
+    if target.sum() < needed:
+        raise missing
+    _require_plate(excess, sigma, target, width, (found.y, found.x), shot.name)
+    arrival = 2 / SPEED_OF_LIGHT * float(np.median(found.range[target]))
+    margin = camera.pulse_fwhm / 2
+    if not shot.record[0] + margin <= arrival <= shot.record[1] - margin:
+        raise CalibrationError(
+            f"{shot.name}: the target's return is cut off by the end of the record; move the "
+            "target or the record"
+        )
+    # Whatever time zero the shot was recovered with is put back: it is what is to be found.
+    zero = SPEED_OF_LIGHT / 2 * shot.returns.camera.time_zero
+    y, x = found.y[target].astype(np.int64), found.x[target].astype(np.int64)
+    return _Sample(
+        y,
+        x,
+        np.zeros(y.size, np.int64),
+        y * camera.image_shape[1] + x,
+        excess[target] + zero,
+        sigma[target],
+        _count_signal(found)[target],
+        cosine[target],
+        float(target.mean()),
+    )
+
+
+def _count_signal(returns: Returns) -> FloatArray:
+    """Counts of returns, which list what they would have at 1 m."""
+    signal = returns.intensity / square_range(returns.range)
+    return np.asarray(np.maximum(signal, np.finfo(np.float32).tiny), dtype=np.float64)
+
+
+def _require_plate(
+    excess: FloatArray,
+    sigma: FloatArray,
+    target: NDArray[np.bool_],
+    width: float,
+    place: tuple[NDArray[Any], NDArray[Any]],
+    name: str,
+) -> None:
+    """Refuse returns that agree by chance, or as those of a slanted or uneven surface do."""
+    share = float(target.mean())
+    middle = float(np.median(excess[target]))
+    flank = np.count_nonzero(~target & (np.abs(excess - middle) <= 3 * width)) / target.sum()
+    y, x = (np.asarray(axis[target], dtype=np.float64) for axis in place)
+    plane = np.stack([np.ones(y.size), y - y.mean(), x - x.mean()], axis=1)
+    slope, *_ = np.linalg.lstsq(plane, excess[target], rcond=None)
+    left = excess[target] - plane @ slope
+    rough = float(np.median(np.abs(left - np.median(left))))
+    if share < MIN_TARGET_SHARE:
+        fault = "clutter"
+    elif flank > MAX_FLANK_RATIO:
+        fault = "a surface that goes on in depth"
+    elif rough > MAX_ROUGHNESS * width:
+        fault = "an uneven surface"
+    else:
+        return
+    raise CalibrationError(
+        f"{name}: no plate but {fault}: {target.sum()} of {target.size} returns ({share:.0%}) agree to "
+        f"{width / MILLIMETRE:.2g} mm, {flank:.0%} as many lie just before and behind, and they scatter by "
+        f"{1.4826 * rough / MILLIMETRE:.2g} mm about a plane where "
+        f"{np.median(sigma[target]) / MILLIMETRE:.2g} mm is stated; {SHOW_A_PLATE}"
+    )
+
+
+def _find_cluster(excess: FloatArray, width: float, name: str) -> NDArray[np.bool_]:
+    """Say which returns lie in the window that holds most of them, and refuse a rival to it."""
+    order = np.sort(excess)
+    # How many returns lie in a window that begins at each one; the fullest window is the target.
+    inside = np.searchsorted(order, order + width, side="right") - np.arange(order.size)
+    first = int(np.argmax(inside))
+    middle = float(np.median(order[first : first + inside[first]]))
+    target: NDArray[np.bool_] = np.abs(excess - middle) <= width
+    others = np.sort(excess[~target])
+    if others.size:
+        rivals = np.searchsorted(others, others + width, side="right") - np.arange(others.size)
+        if rivals.max() > MAX_RIVAL_FRACTION * target.sum():
+            further = float(others[int(np.argmax(rivals))]) - middle
+            raise CalibrationError(
+                f"{name}: two surfaces as large as each other, {abs(further):.3g} m apart: which "
+                "is the target? Cut the picture to it (`region`)"
+            )
+    return target
+
+
+def _gather(samples: Sequence[_Sample]) -> _Sample:
+    """Put the shots' returns side by side, with the shots' numbers."""
+    names = ("y", "x", "pixel", "excess", "sigma", "signal", "cosine")
+    joined = {name: np.concatenate([getattr(one, name) for one in samples]) for name in names}
+    shot = np.repeat(np.arange(len(samples)), [one.y.size for one in samples])
+    fraction = min(one.fraction for one in samples)
+    return _Sample(shot=shot, fraction=fraction, **joined)
+
+
+def _require_agreement(shots: Sequence[TargetShot], sample: _Sample, pulse: float) -> None:
+    """Refuse a shot whose target is not where its distance and the other shots put it."""
+    places = np.array([np.median(sample.excess[sample.shot == n]) for n in range(len(shots))])
+    off = places - np.median(places)
+    worst = int(np.argmax(np.abs(off)))
+    limit = max(MAX_SHOT_SPREAD_PULSES * pulse, 6 * float(np.median(sample.sigma)))
+    if abs(off[worst]) > limit:
+        raise CalibrationError(
+            f"{shots[worst].name}: its target comes {off[worst]:+.3g} m from where the other shots "
+            "put it: check its distance (`target`)"
+        )
+
+
+def _explain_missing_walk(shots: int, span: FloatArray, asked: bool | None) -> str:
+    """Say why no walk can be fitted, if so; refuse where one is asked for."""
+    note = ""
+    if asked is False:
+        return "not asked for"
+    if shots < MIN_WALK_SHOTS:
+        note = f"a range walk needs {MIN_WALK_SHOTS} shots of different brightness, got {shots}"
+    elif np.ptp(span) < MIN_WALK_SPAN_DECADES:
+        note = (
+            f"the returns' intensities span a factor of {10 ** np.ptp(span):.2g}, a range walk needs "
+            f"{10**MIN_WALK_SPAN_DECADES:.2g}: take shots through a grey filter or at other distances"
+        )
+    if note and asked:
+        raise CalibrationError(note)
+    return note
+
+
+def _add_brightness(
+    calibration: RangeCalibration,
+    shots: Sequence[TargetShot],
+    sample: _Sample,
+    effects: Effects,
+    camera: Camera,
+) -> RangeCalibration:
+    """Add the pixels' response and the scale of reflectance, from logarithms of intensities.
+
+    `calibration`: of the ranges; `effects`: of the ranges, which say what belongs to the target.
+    """
+    used = effects.inliers
+    shot, pixel = sample.shot[used], sample.pixel[used]
+    # The range that the calibration gives: that of the target, up to noise.
+    distance = np.array([one.distance for one in shots])[shot] / sample.cosine[used]
+    intensity = sample.signal[used] * distance**2
+    brightness = fit_effects(
+        Measurements(
+            # A surface that faces the camera looks darker at an angle, by Lambert's law.
+            np.log(intensity / sample.cosine[used]),
+            1 / np.sqrt(np.maximum(sample.signal[used], 1.0)),
+            (shot[:, np.newaxis] == np.arange(len(shots))).astype(np.float64),
+            shot,
+            pixel,
+            (sample.y[used], sample.x[used]),
+        ),
+        with_shots=False,
+        with_pixels=len(shots) > 1,
+    )
+    if len(shots) > 1:
+        response = _to_picture(np.exp(brightness.pixels), camera.image_shape, 1.0)
+        calibration = replace(calibration, response=response)
+    percent = np.array([one.reflectance_percent for one in shots])
+    known = np.isfinite(percent)
+    if not known.any():
+        return calibration
+    scales = (np.log(percent) - brightness.fixed)[known]
+    ratio = float(np.exp(np.ptp(scales)))
+    if ratio > MAX_BRIGHTNESS_RATIO:
+        raise CalibrationError(
+            f"the shots' brightness differs by a factor of {ratio:.3g} at the reflectance given: "
+            "give each shot's own, with the transmission of its filter"
+        )
+    own = brightness.covariance[np.ix_(known, known)]
+    sigma = float(np.sqrt(own.mean()))
+    if scales.size > 1:
+        sigma = max(sigma, float(np.std(scales, ddof=1) / np.sqrt(scales.size)))
+    return replace(
+        calibration,
+        reflectance_scale=float(np.exp(scales.mean())),
+        reflectance_scale_sigma=sigma,
+    )
+
+
+def _to_picture(values: FloatArray, shape: tuple[int, int], missing: float = 0.0) -> FloatArray:
+    """Lay the values of pixels out as a picture; those behind the last one were never seen."""
+    picture = np.full(shape[0] * shape[1], missing)
+    picture[: values.size] = values
+    return picture.reshape(shape)

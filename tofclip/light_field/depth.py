@@ -1,0 +1,245 @@
+"""Labels for pixels, each with its own costs, such that neighbours agree: belief propagation on the
+pixel grid.
+
+Depth from focus: refocus on many depths and find, for each pixel, the one where it is sharp
+(supplement Note 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofclip.errors import InputError, ShapeError
+from tofclip.light_field.views import LightField
+
+Array = NDArray[Any]
+
+MAX_ITERATIONS = 40
+MAX_LABEL_STEP = 3
+"""Labels this number of steps apart cost no more: depth may jump at an object's border."""
+
+
+def find_smooth_labels(
+    costs: Array, smoothness: float, iterations: int = MAX_ITERATIONS
+) -> NDArray[np.int64]:
+    """Choose labels of low total cost: each pixel's own, and `smoothness` times the steps between
+    neighbours.
+
+    Damped min-sum belief propagation with a truncated linear price, all pixels at once (P. F.
+    Felzenszwalb, D. P. Huttenlocher, Int. J. Comput. Vis. 70, 41, 2006).
+
+    Parameters
+    ----------
+    costs : (labels, rows, columns) array
+    smoothness : float
+        Zero or more; zero takes each pixel's cheapest label.
+    iterations : int
+        Messages travel one pixel in each.
+
+    Returns
+    -------
+    (rows, columns) array of whole numbers
+
+    Raises
+    ------
+    ShapeError
+        The costs have not three dimensions.
+    InputError
+        A cost is not finite, or the smoothness is negative.
+
+    Notes
+    -----
+    Memory is ten times that of `costs` in float32.
+    """
+    if costs.ndim != 3:
+        raise ShapeError("costs", "(labels, rows, columns)", costs.shape)
+    if not (np.all(np.isfinite(costs)) and smoothness >= 0):
+        raise InputError("costs must be finite and the smoothness zero or more")
+    own = costs.astype(np.float32)
+    messages = np.zeros((4, *own.shape), np.float32)  # from above, below, left, right
+    for _ in range(iterations if smoothness > 0 else 0):
+        belief = own + messages.sum(axis=0)
+        for towards, back, (pixels, neighbours) in zip(
+            range(4), (1, 0, 3, 2), _NEIGHBOUR_SLICES, strict=True
+        ):
+            # what a pixel passes to a neighbour leaves out what came from that neighbour
+            said = _pass_message(belief - messages[back], np.float32(smoothness))
+            # half of the step: undamped messages may oscillate
+            messages[towards][neighbours] += (said[pixels] - messages[towards][neighbours]) / 2
+    chosen: NDArray[np.int64] = (own + messages.sum(axis=0)).argmin(axis=0)
+    return chosen
+
+
+_ALL, _FIRST, _LAST = slice(None), slice(None, -1), slice(1, None)
+_NEIGHBOUR_SLICES = (
+    ((_ALL, _FIRST, _ALL), (_ALL, _LAST, _ALL)),
+    ((_ALL, _LAST, _ALL), (_ALL, _FIRST, _ALL)),
+    ((_ALL, _ALL, _FIRST), (_ALL, _ALL, _LAST)),
+    ((_ALL, _ALL, _LAST), (_ALL, _ALL, _FIRST)),
+)
+
+
+def _pass_message(costs: Array, price: np.float32) -> Array:
+    """Cheapest cost of each label at the neighbour, given the costs here: min over k of costs(k) +
+    price(|l - k|).
+    """
+    cheapest = costs.min(axis=0)
+    # truncated: from here on a jump costs the same, however far
+    found = np.minimum(costs, cheapest + MAX_LABEL_STEP * price)
+    for step in range(1, MAX_LABEL_STEP):
+        np.minimum(found[step:], costs[:-step] + step * price, out=found[step:])
+        np.minimum(found[:-step], costs[step:] + step * price, out=found[:-step])
+    relative: Array = found - cheapest
+    return relative
+
+
+FocusMeasure = Callable[[Array], Array]
+
+TYPICAL_QUANTILE = 0.9  # quantile of the best sharpness: what a textured pixel has
+SMOOTHNESS = 0.1
+WINDOW_PX = 1.5
+
+
+@dataclass(frozen=True)
+class FocalStack:
+    """One scene refocused at several depths, from a light field or from recoveries.
+
+    Parameters
+    ----------
+    pictures : (depths, rows, columns) array
+    shears : (depths,) array
+        s of each picture, pixels per view step, ascending.
+
+    Raises
+    ------
+    ShapeError, InputError
+        Pictures and shears do not match, hold NaN, or the shears do not ascend.
+    """
+
+    pictures: Array
+    shears: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.pictures.ndim != 3 or self.shears.shape != (len(self.pictures),):
+            raise ShapeError(
+                "the pictures of a focal stack", "(shears, rows, columns)", self.pictures.shape
+            )
+        if not (np.all(np.isfinite(self.pictures)) and np.all(np.diff(self.shears) > 0)):
+            raise InputError("a focal stack needs finite pictures and ascending shears")
+
+    def all_in_focus(self, depths: NDArray[np.int64]) -> Array:
+        """Return the all-in-focus picture: each pixel from the picture whose number is in (rows,
+        columns) `depths`.
+        """
+        if depths.shape != self.pictures.shape[1:]:
+            raise ShapeError("the map of depths", self.pictures.shape[1:], depths.shape)
+        found: Array = np.take_along_axis(self.pictures, depths[np.newaxis], axis=0)[0]
+        return found
+
+
+def make_focal_stack(
+    light_field: LightField, shears: ArrayLike, reference: tuple[float, float] = (0.0, 0.0)
+) -> FocalStack:
+    """Refocus a light field at several shears, as seen from `reference`, any (v, u), fractions
+    included.
+
+    Depth from focus and `FocalStack.all_in_focus` on a stack from another reference synthesise that
+    viewpoint.
+
+    Parameters
+    ----------
+    light_field : LightField
+    shears : (depths,) array_like
+        Pixels per view step.
+    reference : (float, float)
+        Viewpoint (v, u) in view steps.
+
+    Returns
+    -------
+    FocalStack
+        Pictures (depths, rows, columns).
+    """
+    depths = np.asarray(shears, np.float64)
+    pictures = [light_field.refocus(float(shear), reference) for shear in depths]
+    return FocalStack(np.stack(pictures), depths)
+
+
+def compute_modified_laplacian(pictures: Array) -> Array:
+    """Second differences along rows and columns, their sizes added (S. K. Nayar, Y. Nakagawa, TPAMI
+    16, 824, 1994).
+
+    Parameters
+    ----------
+    pictures : (..., rows, columns) array
+
+    Returns
+    -------
+    array like `pictures`
+    """
+    padded = np.pad(pictures, [(0, 0)] * (pictures.ndim - 2) + [(1, 1), (1, 1)], mode="edge")
+    middle = 2 * padded[..., 1:-1, 1:-1]
+    # absolute values first: second derivatives of opposite sign must not cancel
+    down: Array = np.abs(middle - padded[..., :-2, 1:-1] - padded[..., 2:, 1:-1])
+    across: Array = np.abs(middle - padded[..., 1:-1, :-2] - padded[..., 1:-1, 2:])
+    return down + across
+
+
+def compute_image_energy(pictures: Array) -> Array:
+    """Squared slopes along rows and columns, added; shapes as in `compute_modified_laplacian`."""
+    down, across = np.gradient(pictures, axis=(-2, -1))
+    energy: Array = down**2 + across**2
+    return energy
+
+
+def estimate_depth_from_focus(
+    stack: FocalStack,
+    measure: FocusMeasure = compute_image_energy,
+    window_px: float = WINDOW_PX,
+    smoothness: float = SMOOTHNESS,
+) -> NDArray[np.int64]:
+    """Return for each pixel the number of the picture of the stack in which it is sharp, (rows,
+    columns).
+
+    Sharpness is averaged over a Gaussian window, which keeps noise from winning; labels are then
+    chosen so that neighbours differ little, which lets pixels without texture follow those that
+    have some.
+
+    Parameters
+    ----------
+    stack : FocalStack
+    measure : callable
+        `compute_modified_laplacian` or `compute_image_energy`, or another one.
+    window_px : float
+        Standard deviation of the window.
+    smoothness : float
+        Price of two neighbours being one picture apart, relative to a textured pixel being out of
+        focus.
+
+    Returns
+    -------
+    (rows, columns) int64 array
+
+    Raises
+    ------
+    InputError
+        The pictures have no texture.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    sharpness = gaussian_filter(
+        measure(stack.pictures.astype(np.float32)), (0, window_px, window_px)
+    )
+    best = sharpness.max(axis=0)
+    typical = float(np.quantile(best, TYPICAL_QUANTILE))
+    if typical == 0:
+        raise InputError(
+            "these pictures are even nearly everywhere; depth from focus needs texture"
+        )
+    # in units of a textured pixel's sharpness, so that the smoothness suits pictures of any
+    # contrast
+    return find_smooth_labels((best - sharpness) / typical, smoothness)

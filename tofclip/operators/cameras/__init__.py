@@ -1,3 +1,0 @@
-"""Cameras of compact light-field photography, one module for each kind; `light_field_camera` has
-the table.
-"""

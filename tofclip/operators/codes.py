@@ -1,0 +1,362 @@
+"""Area sensors: which pixels of the light on the sensor's plane are read.
+
+Codes of a single-pixel camera: sums of the picture under 0/1 masks.
+
+Operators of compressive light-field photography (supplement Note 5): whole light fields on dense
+area sensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from tofclip.errors import InputError, ShapeError
+from tofclip.operators.base import Array, LinearOperator
+from tofclip.operators.shear import LinearShear, View
+
+
+class _Sensor(LinearOperator):
+    """The measurements of some pixels of a plane; the adjoint leaves the others dark.
+
+    `plane_shape`: rows and columns of the light on the sensor's plane; `pixels` (measurements,):
+    flat numbers of the pixels that are read, without repeats.
+    """
+
+    def __init__(
+        self, plane_shape: tuple[int, int], pixels: NDArray[np.intp], dtype: DTypeLike
+    ) -> None:
+        if pixels.size == 0:
+            raise InputError(
+                f"no pixel of the {tuple(plane_shape)} plane is read; check the sensor's mask and offset"
+            )
+        super().__init__(plane_shape, (pixels.size,), dtype)
+        self.pixels = pixels
+
+    def _forward(self, block: Array) -> Array:
+        read: Array = block.reshape(-1, block.shape[-1])[self.pixels]
+        return read
+
+    def _adjoint(self, block: Array) -> Array:
+        plane = np.zeros((self.shape_in[0] * self.shape_in[1], block.shape[-1]), self.dtype)
+        plane[self.pixels] = block
+        return plane.reshape(*self.shape_in, -1)
+
+
+class DenseSensor(_Sensor):
+    """Every pixel is read, row by row.
+
+    Parameters
+    ----------
+    plane_shape : (int, int)
+    dtype : dtype
+        float32 or float64.
+    """
+
+    def __init__(self, plane_shape: tuple[int, int], dtype: DTypeLike = np.float32) -> None:
+        super().__init__(plane_shape, np.arange(plane_shape[0] * plane_shape[1]), dtype)
+
+    def _forward(self, block: Array) -> Array:
+        return block.reshape(-1, block.shape[-1])
+
+    def _adjoint(self, block: Array) -> Array:
+        return block.reshape(*self.shape_in, -1)
+
+
+class PitchedSensor(_Sensor):
+    """Small pixels far apart: every n-th pixel of the plane is read (supplement Note 3, sparse 2D
+    sensors).
+
+    Parameters
+    ----------
+    plane_shape : (int, int)
+    pitch_px : (float, float)
+        Distance from row to row and from column to column, at least 1. A pitch that is not a whole
+        number reads the pixels nearest below the true places.
+    offset_px : (float, float)
+        First row and column that are read.
+    dtype : dtype
+        float32 or float64.
+    """
+
+    def __init__(
+        self,
+        plane_shape: tuple[int, int],
+        pitch_px: tuple[float, float],
+        offset_px: tuple[float, float] = (0, 0),
+        dtype: DTypeLike = np.float32,
+    ) -> None:
+        rows, columns = (
+            _pixel_positions(*axis) for axis in zip(plane_shape, pitch_px, offset_px, strict=True)
+        )
+        super().__init__(
+            plane_shape, (rows[:, np.newaxis] * plane_shape[1] + columns).ravel(), dtype
+        )
+        self.grid_shape = (rows.size, columns.size)
+        """Rows and columns of the sensor: measurements reshaped to it are a picture."""
+
+
+class MaskedSensor(_Sensor):
+    """Only live pixels are read: defective ones are left out, or the sensor has any layout
+    whatever.
+
+    Parameters
+    ----------
+    live : (rows, columns) bool array
+    dtype : dtype
+        float32 or float64.
+    """
+
+    def __init__(self, live: ArrayLike, dtype: DTypeLike = np.float32) -> None:
+        mask = np.asarray(live, dtype=bool)
+        if mask.ndim != 2:
+            raise ShapeError("the mask of live pixels", "(rows, columns)", mask.shape)
+        super().__init__((mask.shape[0], mask.shape[1]), np.flatnonzero(mask), dtype)
+
+
+def _pixel_positions(size: int, pitch_px: float, offset_px: float) -> NDArray[np.intp]:
+    if not (np.isfinite(pitch_px) and pitch_px >= 1):
+        raise InputError(f"a sensor's pitch must be at least one pixel, got {pitch_px}")
+    if not 0 <= offset_px < size:
+        raise InputError(f"a sensor's offset must lie on the plane of {size} px, got {offset_px}")
+    # The sum of many pitches must not fall short of a whole number by rounding.
+    return np.floor(np.arange(offset_px, size, pitch_px) + 1e-9).astype(np.intp)
+
+
+class HadamardCodes(LinearOperator):
+    """Random 0/1 codes with a fast product: rows of a Hadamard matrix whose columns have random
+    signs.
+
+    A code is ``(1 + H D) / 2``: D holds a random sign for each pixel, and the rows of H are drawn
+    without replacement (structurally random matrices, T. T. Do et al., IEEE Trans. Signal Process.
+    60, 139 (2012)). H is the Kronecker product of one Hadamard matrix for each side, the picture
+    padded to powers of two, so that all of it is a fast Walsh-Hadamard transform along either side
+    of the picture.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+    codes : int
+        Number of measurements.
+    seed : int
+        Of the signs and the rows.
+    dtype : dtype
+        float32 or float64.
+    """
+
+    def __init__(
+        self, image_shape: tuple[int, int], codes: int, seed: int, dtype: DTypeLike = np.float32
+    ) -> None:
+        super().__init__(image_shape, (codes,), dtype)
+        self._padded = tuple(1 << (size - 1).bit_length() for size in image_shape)
+        cells = self._padded[0] * self._padded[1]
+        if codes > cells:
+            raise InputError(f"a {image_shape} picture has at most {cells} codes, not {codes}")
+        random = np.random.default_rng(seed)
+        self._signs = random.choice(np.array([-1, 1], self.dtype), image_shape)[..., np.newaxis]
+        rows, columns = np.unravel_index(random.choice(cells, codes, replace=False), self._padded)
+        self._chosen = columns * self._padded[0] + rows  # the spectrum comes out transposed
+
+    def _forward(self, block: Array) -> Array:
+        from tofclip.operators.kernels import transform_walsh_hadamard
+
+        (rows, columns), (padded_rows, padded_columns), batch = (
+            self.shape_in,
+            self._padded,
+            block.shape[-1],
+        )
+        signed = np.zeros((padded_rows, columns, batch), self.dtype)
+        np.multiply(block, self._signs, out=signed[:rows])
+        transform_walsh_hadamard(signed.reshape(padded_rows, -1))
+        spectrum = np.zeros((padded_columns, padded_rows, batch), self.dtype)
+        spectrum[:columns] = signed.swapaxes(0, 1)
+        transform_walsh_hadamard(spectrum.reshape(padded_columns, -1))
+        coded: Array = spectrum.reshape(-1, batch)[self._chosen]
+        coded += block.sum(axis=0).sum(axis=0)
+        coded /= 2
+        return coded
+
+    def _adjoint(self, block: Array) -> Array:
+        from tofclip.operators.kernels import transform_walsh_hadamard
+
+        (rows, columns), (padded_rows, padded_columns), batch = (
+            self.shape_in,
+            self._padded,
+            block.shape[-1],
+        )
+        spectrum = np.zeros((padded_columns * padded_rows, batch), self.dtype)
+        spectrum[self._chosen] = block
+        transform_walsh_hadamard(spectrum.reshape(padded_columns, -1))
+        half_way = spectrum.reshape(padded_columns, padded_rows, batch)[:columns]
+        signed = np.ascontiguousarray(half_way.swapaxes(0, 1))
+        transform_walsh_hadamard(signed.reshape(padded_rows, -1))
+        pictures: Array = signed[:rows] * self._signs
+        pictures += block.sum(axis=0)
+        pictures /= 2
+        return pictures
+
+
+class RandomCodes(LinearOperator):
+    """Independent random 0/1 codes, kept as a dense matrix: the reference for `HadamardCodes`.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+    codes : int
+        Number of measurements.
+    seed : int
+    dtype : dtype
+        float32 or float64.
+    """
+
+    def __init__(
+        self, image_shape: tuple[int, int], codes: int, seed: int, dtype: DTypeLike = np.float32
+    ) -> None:
+        super().__init__(image_shape, (codes,), dtype)
+        drawn = np.random.default_rng(seed).integers(0, 2, (codes, image_shape[0] * image_shape[1]))
+        self._codes = drawn.astype(self.dtype)
+
+    def _forward(self, block: Array) -> Array:
+        coded: Array = self._codes @ block.reshape(-1, block.shape[-1])
+        return coded
+
+    def _adjoint(self, block: Array) -> Array:
+        return (self._codes.T @ block).reshape(*self.shape_in, block.shape[-1])
+
+
+class WeightedViews(LinearOperator):
+    """Exposures through masks in the aperture: ``y_j = sum_k w_jk P_k`` (supplement Eq. 17).
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+    weights : (exposures, views) array
+        w, what fraction of each view's light an exposure's mask lets pass.
+    dtype : dtype
+        float32 or float64.
+
+    Notes
+    -----
+    Light fields are (views, rows, columns); measurements are (exposures * rows * columns,).
+    """
+
+    def __init__(
+        self, image_shape: tuple[int, int], weights: ArrayLike, dtype: DTypeLike = np.float32
+    ) -> None:
+        self.weights = np.asarray(weights, dtype=dtype)
+        if self.weights.ndim != 2:
+            raise ShapeError("mask weights", "(exposures, views)", self.weights.shape)
+        if not np.all(np.isfinite(self.weights)):
+            raise InputError("mask weights must be finite")
+        exposures, views = self.weights.shape
+        super().__init__(
+            (views, *image_shape), (exposures * image_shape[0] * image_shape[1],), dtype
+        )
+
+    def _forward(self, block: Array) -> Array:
+        # One dense product for all pixels and frames: a mask in the aperture treats every pixel
+        # alike.
+        seen: Array = self.weights @ block.reshape(len(block), -1)
+        return seen.reshape(*self.shape_out, -1)
+
+    def _adjoint(self, block: Array) -> Array:
+        spread: Array = self.weights.T @ block.reshape(len(self.weights), -1)
+        return spread.reshape(*self.shape_in, -1)
+
+
+class MaskedViews(LinearOperator):
+    """One exposure through a mask near the sensor: ``y = sum_k C_k P_k``, C_k the mask as view k
+    sees it (Eq. 18).
+
+    Parameters
+    ----------
+    codes : (views, rows, columns) array
+        Diagonals of C_k.
+    dtype : dtype
+        float32 or float64.
+
+    Notes
+    -----
+    Light fields are (views, rows, columns); measurements are (rows * columns,).
+    """
+
+    def __init__(self, codes: ArrayLike, dtype: DTypeLike = np.float32) -> None:
+        self.codes = np.asarray(codes, dtype=dtype)
+        if self.codes.ndim != 3:
+            raise ShapeError("mask codes", "(views, rows, columns)", self.codes.shape)
+        if not np.all(np.isfinite(self.codes)):
+            raise InputError("mask codes must be finite")
+        super().__init__(self.codes.shape, (self.codes.shape[1] * self.codes.shape[2],), dtype)
+
+    def _forward(self, block: Array) -> Array:
+        seen: Array = np.einsum("kyx,kyxb->yxb", self.codes, block)
+        return seen.reshape(*self.shape_out, -1)
+
+    def _adjoint(self, block: Array) -> Array:
+        # A diagonal matrix is its own transpose: light goes back through the same holes.
+        plane = block.reshape(*self.shape_in[1:], -1)
+        spread: Array = self.codes[..., np.newaxis] * plane
+        return spread
+
+
+class ShearedViews(LinearOperator):
+    """All views that a picture at one depth has: ``[B_1; B_2; ...]``, (rows, columns) to (views,
+    rows, columns).
+
+    Composed with a model of the whole light field it makes that of the picture refocused at one
+    depth (Eq. 21).
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+    views : sequence of (float, float)
+    shear : float
+        s, pixels per view step.
+    reference : (float, float)
+    dtype : dtype
+        float32 or float64.
+    """
+
+    def __init__(
+        self,
+        image_shape: tuple[int, int],
+        views: Sequence[View],
+        shear: float,
+        reference: View = (0.0, 0.0),
+        dtype: DTypeLike = np.float32,
+    ) -> None:
+        super().__init__(image_shape, (len(views), *image_shape), dtype)
+        self._shears = [LinearShear(image_shape, shear, view, reference, dtype) for view in views]
+
+    def _forward(self, block: Array) -> Array:
+        return np.stack([shear._forward(block) for shear in self._shears])
+
+    def _adjoint(self, block: Array) -> Array:
+        total = np.zeros((*self.shape_in, block.shape[-1]), self.dtype)
+        for shear, part in zip(self._shears, block, strict=True):
+            total += shear._adjoint(part)
+        return total
+
+
+def make_sheared_mask(
+    image_shape: tuple[int, int],
+    views: Sequence[View],
+    mask_shear: float,
+    random: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Make the codes of a random mask at some distance in front of the sensor.
+
+    `mask_shear`: pixels by which the mask appears moved from view to view: 0 on the sensor, where
+    all views see it alike; `random`: of the mask's transmissions, evenly from 0 to 1. Returns
+    (views, rows, columns).
+    """
+    # So much larger that no view looks past the edge of the mask.
+    margin = int(np.ceil(abs(mask_shear) * np.abs(np.asarray(views)).max())) + 1
+    large = (image_shape[0] + 2 * margin, image_shape[1] + 2 * margin)
+    mask = random.random(large)
+    inner = (slice(margin, -margin), slice(margin, -margin))
+    return np.stack(
+        [LinearShear(large, mask_shear, view, dtype=np.float64)(mask)[inner] for view in views]
+    )

@@ -1,0 +1,138 @@
+"""Shot after shot recovered with a prior, each beginning at what the last one showed.
+
+From one shot to the next little changes but the noise. Iterations that begin at the last shot's
+pictures need a few steps where those that begin in darkness need forty.
+
+Shot after shot by its surfaces, each beginning at those of the shot before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera, Rectifier
+from tofclip.lidar.pulse_tables import PictureTraces, TraceBins
+from tofclip.operators import LinearOperator
+from tofclip.recovery import DepthLockedFocus, Shot, SurfaceRecovery, open_shot, plan_recovery
+from tofclip.recovery.focus import DEFAULT_FOCUS
+from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces, list_returns
+from tofclip.shots import Returns, Streak
+from tofclip.solvers import ProximalMethod
+
+WARM_ITERATIONS = 4
+"""Of each shot but the first, which has the method's own number."""
+
+
+class WarmStartedRecovery:
+    """Recovers the rows of a shot that hold light, beginning at the same rows of the shot before.
+
+    Shots are taken one after the other, each with all cores: what comes out of a shot depends on
+    those before it, and only on them.
+
+    `method`: its iterations are the first shot's; `operator`: of all rows; `alive` (columns,):
+    false for slit columns that are never to be trusted; `iterations`: of each further shot.
+    """
+
+    def __init__(
+        self,
+        method: ProximalMethod,
+        operator: LinearOperator,
+        alive: NDArray[np.bool_],
+        iterations: int = WARM_ITERATIONS,
+    ) -> None:
+        self.method, self.operator, self._alive = method, operator, alive
+        # so few iterations end before the gap is looked at
+        self._warm = replace(method, iterations=iterations, gap=0.0)
+        self._rows = np.zeros(0, np.int64)
+        self._pictures = np.zeros((0, *operator.shape_in), np.float32)
+
+    def recover(self, measurements: NDArray[np.float32], bins: TraceBins) -> PictureTraces:
+        """Recover some rows of a shot.
+
+        `measurements` (columns, bins): rectified, of these rows; `bins`: rows of which one stands
+        for several are dark, and stay so.
+        """
+        lit = bins.bin_weights == 1
+        rows = bins.numbers[lit]
+        seen = np.ascontiguousarray(measurements[:, lit])
+        valid = None if self._alive.all() else np.repeat(self._alive[:, np.newaxis], rows.size, 1)
+        shared, here, before = np.intersect1d(rows, self._rows, True, return_indices=True)
+        pictures = np.zeros((bins.numbers.size, *self.operator.shape_in), np.float32)
+        if rows.size == 0:
+            return PictureTraces(pictures, bins)
+        if shared.size == 0:
+            found = self.method.recover(self.operator, seen, valid).frames
+        else:
+            start = self._pictures
+            if not np.array_equal(rows, self._rows):
+                start = np.zeros((rows.size, *self.operator.shape_in), np.float32)
+                start[here] = self._pictures[before]
+            found = self._warm.recover(self.operator, seen, valid, start=start).frames
+        self._rows, self._pictures = rows, found
+        pictures[lit] = found
+        return PictureTraces(pictures, bins)
+
+
+class SurfacePipeline:
+    """Makes clouds of shots of one camera by method "surfaces".
+
+    The first shot has its surfaces found. Each further one begins at the surfaces, brightnesses and
+    state of the instrument of the shot before, and needs a step on them and twenty iterations. Where
+    they no longer explain the shot, as when something has come in, surfaces are found anew. Shots
+    are taken in order.
+
+    `shot`: opened, its sweep known.
+
+    Memory: as `SurfaceRecovery`; nothing is kept of the shots before but the last fit.
+    """
+
+    in_order = True
+
+    def __init__(self, shot: Shot, method: SurfaceRecovery | None = None) -> None:
+        self.method = SurfaceRecovery() if method is None else method
+        self.camera, self._centre_error_px = shot.camera, shot.centre_error_px
+        self.rectifier = Rectifier(shot.camera, shot.times.size)
+        self.searches = 0
+        self._fit: SurfaceFit | None = None
+        self._lock = Lock()
+
+    @classmethod
+    def for_shot(
+        cls,
+        shot: Streak,
+        camera: Path | Camera | None = None,
+        time_zero: float | None = None,
+        method: SurfaceRecovery | None = None,
+    ) -> SurfacePipeline:
+        """Prepare for shots like this one; a sweep that is not known is found from it.
+
+        `shot`: with a time axis; `camera`: defaults to the one that the shot carries; `time_zero`:
+        reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
+        """
+        return cls(open_shot(shot, camera, time_zero).fit_camera(), method)
+
+    def rectify(self, shot: Streak) -> None:
+        """Do nothing: surfaces explain the raw image."""
+
+    def recover_shot(self, shot: Streak, rectified: None) -> SurfaceFit:
+        """Fit the surfaces of a shot."""
+        with self._lock:
+            if self._fit is not None:
+                self._fit = follow_surfaces(self._fit, shot, self.method.weight)
+            if self._fit is None:
+                self.searches += 1
+                opened = Shot(shot, self.camera, self._centre_error_px)
+                focus = DepthLockedFocus() if self.camera.lenslet_pitch > 0 else DEFAULT_FOCUS
+                start = plan_recovery(opened, self.method.start, focus).run()
+                weight, iterations = self.method.weight, self.method.iterations
+                self._fit = fit_surfaces(shot, start, weight, iterations)
+            return self._fit
+
+    def search(self, found: SurfaceFit) -> Returns:
+        """List the returns of what `recover_shot` returned."""
+        return list_returns(found, self.method.detection, self._centre_error_px)

@@ -1,0 +1,475 @@
+"""A grid of pinhole cameras, all looking the same way, their pictures shifted to agree at one
+distance.
+
+Light fields under a distant lamp: what each camera of an array sees of a scene.
+
+Time of flight in light fields: which instant brings which light to which pixel of each view,
+lamps and shadows included.
+
+Light goes from a lamp to a surface and on to a view; a lamp that something else shades adds
+nothing. Interreflections are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofclip.errors import InputError, ShapeError
+from tofclip.light_field import LightField
+from tofclip.operators.shear import View
+from tofclip.simulate.bodies import Body
+from tofclip.simulate.rays import (
+    FWHM_PER_SIGMA,
+    NO_BODY,
+    bin_by_time,
+    cast_rays,
+    compute_irradiance,
+    look_up_reflectance,
+    number_ray_pixels,
+)
+from tofclip.threads import limit_blas_threads, run_blocks
+from tofclip.units import SPEED_OF_LIGHT
+
+__all__ = [
+    "CameraArray",
+    "PulsedScene",
+    "RenderedLightField",
+    "TimeAxis",
+    "render_flash",
+    "render_flash_view",
+    "render_light_field",
+    "render_shear_map",
+    "render_view",
+]
+
+
+@dataclass(frozen=True)
+class CameraArray:
+    """Cameras at ``(u, v) * view_step`` metres in the plane z = 0, looking along z; x points right
+    and y down.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Rows and columns of each picture.
+    view_count : int
+        Cameras on a side; they are numbered ``-(n // 2), ...``.
+    focal_length_px : float
+    view_step : float
+        Distance between neighbours, m.
+    focus : float
+        Distance at which all pictures agree (s = 0), m.
+    samples : int
+        Rays on a side of each pixel.
+    view_rows : int, optional
+        Rows of cameras, numbered alike; as many as `view_count` if not given.
+
+    Raises
+    ------
+    InputError
+        A count or length is not positive.
+    """
+
+    image_shape: tuple[int, int] = (128, 128)
+    view_count: int = 8
+    focal_length_px: float = 160.0
+    view_step: float = 0.0125
+    focus: float = 1.0
+    samples: int = 2
+    view_rows: int | None = None
+
+    def __post_init__(self) -> None:
+        counts = (*self.image_shape, *self._view_counts, self.samples)
+        lengths = (*counts, self.focal_length_px, self.view_step, self.focus)
+        if not all(np.isfinite(length) and length > 0 for length in lengths):
+            raise InputError("every count and length of a camera array must be positive")
+
+    @property
+    def _view_counts(self) -> tuple[int, int]:
+        """Cameras down and across."""
+        return (self.view_count if self.view_rows is None else self.view_rows), self.view_count
+
+    @property
+    def views(self) -> NDArray[np.float64]:
+        """(v, u) of each camera in raster order, (views, 2)."""
+        numbers = (np.arange(count) - count // 2 for count in self._view_counts)
+        return (
+            np.stack(np.meshgrid(*numbers, indexing="ij"), axis=-1)
+            .reshape(-1, 2)
+            .astype(np.float64)
+        )
+
+    def position(self, view: View) -> NDArray[np.float64]:
+        """Where the camera at (v, u) stands, (x, y, z) in metres; fractions are places between the
+        array's.
+        """
+        return np.array([view[1] * self.view_step, view[0] * self.view_step, 0.0])
+
+    def shear(self, depth: ArrayLike) -> NDArray[np.float64]:
+        """Shear s in pixels per view step of points at `depth` metres along z (supplement Note 1, s
+        = 0 at focus).
+        """
+        inverse = 1 / np.asarray(depth, np.float64)
+        shear: NDArray[np.float64] = (
+            self.focal_length_px * self.view_step * (1 / self.focus - inverse)
+        )
+        return shear
+
+    def depth(self, shear: float) -> float:
+        """Distance along z, in metres, of points with a shear.
+
+        Raises
+        ------
+        InputError
+            They would lie beyond infinity.
+        """
+        inverse = 1 / self.focus - shear / (self.focal_length_px * self.view_step)
+        if not inverse > 0:
+            raise InputError(
+                f"shear {shear} lies beyond infinity for this camera array; take a smaller one"
+            )
+        return 1 / inverse
+
+    def point(self, x: float, y: float, shear: float) -> NDArray[np.float64]:
+        """The point (x, y, z) in metres that the reference view sees `x`, `y` pixels off its centre
+        at a shear.
+
+        Parameters
+        ----------
+        x, y : float
+            Pixels off the centre, right and down.
+        shear : float
+            Pixels per view step.
+
+        Returns
+        -------
+        (3,) float64 array
+        """
+        depth = self.depth(shear)
+        return np.array([x / self.focal_length_px * depth, y / self.focal_length_px * depth, depth])
+
+    def rays(self, view: View, samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rays of one camera.
+
+        Parameters
+        ----------
+        view : (float, float)
+            (v, u); fractions are cameras between those of the grid.
+        samples : int
+            Rays on a side of each pixel.
+
+        Returns
+        -------
+        origin : (3,) array
+        directions : (rows * samples * columns * samples, 3) array
+            As long as the way from the camera to the plane in focus.
+        """
+        rows, columns = self.image_shape
+        origin = self.position(view)
+        y, x = (
+            _sample_positions(count, samples) * self.focus / self.focal_length_px
+            for count in (rows, columns)
+        )
+        # all views' pictures agree on the plane in focus: rays of one pixel meet there
+        at_focus = np.stack(np.broadcast_arrays(x, y[:, np.newaxis], self.focus), axis=-1)
+        return origin, at_focus.reshape(-1, 3) - origin
+
+
+def _sample_positions(pixels: int, samples: int) -> NDArray[np.float64]:
+    """Places of the samples in pixels from the middle of the picture's central pixel, number n //
+    2.
+    """
+    places: NDArray[np.float64] = (np.arange(pixels * samples) + 0.5) / samples - 0.5 - pixels // 2
+    return places
+
+
+Array = NDArray[Any]
+
+LIGHT_DIRECTION = (-0.35, -0.45, -0.82)
+"""Towards the lamp: over the viewer's left shoulder."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Bodies under one distant lamp.
+
+    Parameters
+    ----------
+    bodies : tuple of Body
+    light : (float, float, float)
+        Towards the lamp; any length.
+    """
+
+    bodies: tuple[Body, ...]
+    light: tuple[float, float, float] = LIGHT_DIRECTION
+
+    def __post_init__(self) -> None:
+        if not self.bodies:
+            raise InputError("a scene needs at least one body")
+        if not np.linalg.norm(self.light) > 0:
+            raise InputError("the direction towards the lamp must not be zero")
+
+
+@dataclass(frozen=True)
+class RenderedLightField:
+    """A light field and the truth about it.
+
+    Parameters
+    ----------
+    light_field : LightField
+    shears : (rows, columns) float32 array
+        Shear of what the reference view (0, 0) sees in the middle of each pixel; infinite where it
+        sees nothing.
+    """
+
+    light_field: LightField
+    shears: Array
+
+
+def render_light_field(scene: Scene, array: CameraArray) -> RenderedLightField:
+    """Render every view of an array; memory is about 200 bytes for each ray of one view and thread.
+
+    Parameters
+    ----------
+    scene : Scene
+    array : CameraArray
+
+    Returns
+    -------
+    RenderedLightField
+        Pictures (views, rows, columns) float32 and the reference view's map of shears.
+    """
+    views = array.views
+    pictures = np.empty((len(views), *array.image_shape), np.float32)
+
+    def some(which: slice) -> None:
+        for number in range(which.start, which.stop):
+            v, u = views[number]
+            pictures[number] = render_view(scene, array, (float(v), float(u)))
+
+    with limit_blas_threads():  # the threads are used for views
+        run_blocks(some, len(views), 1)
+    return RenderedLightField(LightField(pictures, views), render_shear_map(scene, array))
+
+
+def render_view(scene: Scene, array: CameraArray, view: View) -> Array:
+    """Return what the camera at (v, u) sees, (rows, columns) float32; fractions are cameras between
+    the array's.
+
+    Parameters
+    ----------
+    scene : Scene
+    array : CameraArray
+    view : (float, float)
+        View steps down and to the right.
+
+    Returns
+    -------
+    (rows, columns) float32 array
+    """
+    origin, directions = array.rays(view, array.samples)
+    _, brightness = _shade_rays(scene, origin, directions)
+    rows, columns = array.image_shape
+    by_pixel = brightness.reshape(rows, array.samples, columns, array.samples)
+    picture: Array = by_pixel.mean(axis=(1, 3)).astype(np.float32)
+    return picture
+
+
+def render_shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) -> Array:
+    """Return the shear of what a view sees in the middle of each pixel, (rows, columns) float32;
+    infinite: nothing.
+
+    Parameters
+    ----------
+    scene : Scene
+    array : CameraArray
+    view : (float, float)
+        View steps down and to the right.
+
+    Returns
+    -------
+    (rows, columns) float32 array
+        Pixels per view step.
+    """
+    origin, directions = array.rays(view, 1)
+    distance, _ = _shade_rays(scene, origin, directions)
+    seen = np.isfinite(distance)
+    depth = np.where(seen, distance, 1.0) * array.focus  # directions reach to the plane in focus
+    return np.where(seen, array.shear(depth), np.inf).reshape(array.image_shape).astype(np.float32)
+
+
+def _shade_rays(scene: Scene, origin: Array, directions: Array) -> tuple[Array, Array]:
+    """Distance to the nearest surface along each ray and the light that comes back from it."""
+    sight = cast_rays(scene.bodies, origin, directions)
+    brightness = np.zeros(len(directions))
+    light = np.array(scene.light) / np.linalg.norm(scene.light)
+    for index, body in enumerate(scene.bodies):
+        own = np.flatnonzero(sight.body == index)
+        brightness[own] = body.material.radiance(
+            sight.pattern_position[own], sight.normal[own], directions[own], light
+        )
+    return sight.distance, brightness
+
+
+@dataclass(frozen=True)
+class PulsedScene:
+    """Bodies and the lamps that flash at time zero, all with the same power.
+
+    Parameters
+    ----------
+    bodies : tuple of Body
+        Matt: of a glossy one only the matt part sends light back.
+    lamps : (lamps, 3) array
+        Where they stand, m; all before the bodies.
+
+    Raises
+    ------
+    InputError, ShapeError
+        There is no body, or the lamps are not a list of places.
+    """
+
+    bodies: tuple[Body, ...]
+    lamps: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if not self.bodies:
+            raise InputError("a scene needs at least one body")
+        if self.lamps.ndim != 2 or self.lamps.shape[1] != 3 or not len(self.lamps):
+            raise ShapeError("the lamps' places", "(lamps, 3)", self.lamps.shape)
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """Bins of time, and how long the instrument's answer to an instant is.
+
+    Parameters
+    ----------
+    start : float
+        Middle of the first bin, s after the lamps' flash.
+    bin_width : float
+        s.
+    bins : int
+    pulse_fwhm : float
+        Full width at half maximum of lamp and detector together, a Gaussian, s.
+
+    Raises
+    ------
+    InputError
+        A duration is not positive.
+    """
+
+    start: float
+    bin_width: float
+    bins: int
+    pulse_fwhm: float
+
+    def __post_init__(self) -> None:
+        durations = (self.bin_width, self.bins, self.pulse_fwhm)
+        if not (np.isfinite(self.start) and all(np.isfinite(one) and one > 0 for one in durations)):
+            raise InputError("bins, their width and the pulse must be positive, the start finite")
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Middle of each bin, s."""
+        return np.linspace(self.start, self.start + (self.bins - 1) * self.bin_width, self.bins)
+
+    @classmethod
+    def for_ranges(cls, near: float, far: float, bin_width: float, pulse_fwhm: float) -> TimeAxis:
+        """Return a time axis for surfaces from `near` to `far` metres away, lamps beside the views.
+
+        Parameters
+        ----------
+        near, far : float
+            Metres.
+        bin_width : float
+            Seconds.
+        pulse_fwhm : float
+            Full width at half maximum of the instrument's response, seconds.
+
+        Returns
+        -------
+        TimeAxis
+        """
+        start = 2 * near / SPEED_OF_LIGHT
+        return cls(
+            start,
+            bin_width,
+            int(np.ceil(2 * (far - near) / SPEED_OF_LIGHT / bin_width)) + 1,
+            pulse_fwhm,
+        )
+
+
+def render_flash(
+    scene: PulsedScene, array: CameraArray, time_axis: TimeAxis
+) -> NDArray[np.float32]:
+    """Return what every view sees at every instant, (views, rows, columns, bins).
+
+    A surface of reflectance 1 that faces all lamps from the distance of the array's focus has
+    brightness 1, summed over time. Memory beyond the result is about 1 kB for each ray of a view
+    and thread.
+
+    Parameters
+    ----------
+    scene : PulsedScene
+        Bodies and lamps.
+    array : CameraArray
+    time_axis : TimeAxis
+
+    Returns
+    -------
+    (views, rows, columns, bins) float32 array
+    """
+    views = array.views
+    pictures = np.empty((len(views), *array.image_shape, time_axis.bins), np.float32)
+
+    def some(which: slice) -> None:
+        for number in range(which.start, which.stop):
+            pictures[number] = render_flash_view(
+                scene, array, time_axis, (views[number, 0], views[number, 1])
+            )
+
+    with limit_blas_threads():  # the threads are used for views
+        run_blocks(some, len(views), 1)
+    return pictures
+
+
+def render_flash_view(
+    scene: PulsedScene, array: CameraArray, time_axis: TimeAxis, view: View
+) -> Array:
+    """Return what the camera at (v, u) sees in every time bin.
+
+    Parameters
+    ----------
+    scene : PulsedScene
+    array : CameraArray
+    time_axis : TimeAxis
+    view : (float, float)
+        View steps down and to the right.
+
+    Returns
+    -------
+    (rows, columns, bins) float32 array
+    """
+    origin, directions = array.rays(view, array.samples)
+    sight = cast_rays(scene.bodies, origin, directions)
+    seen = np.flatnonzero(sight.body != NO_BODY)
+    reflectance = look_up_reflectance(scene.bodies, sight)[seen]
+    points = origin + sight.distance[seen, np.newaxis] * directions[seen]
+    back = np.linalg.norm(points - origin, axis=1)
+    pixel = number_ray_pixels(array.image_shape, array.samples)[seen]
+    shape = (int(np.prod(array.image_shape)), time_axis.bins)
+    sigma = time_axis.pulse_fwhm / FWHM_PER_SIGMA / time_axis.bin_width
+    total = np.zeros(shape)
+    for lamp in scene.lamps:
+        light = compute_irradiance(scene.bodies, lamp, points, sight.normal[seen]) * reflectance
+        lit = light > 0
+        path = np.linalg.norm(points[lit] - lamp, axis=1) + back[lit]
+        position = (path / SPEED_OF_LIGHT - time_axis.start) / time_axis.bin_width
+        total += bin_by_time(pixel[lit], position, light[lit], sigma, shape)
+    # so that a white surface that faces all lamps from the focus distance has brightness 1
+    share = array.focus**2 / len(scene.lamps) / array.samples**2
+    return (share * total).astype(np.float32).reshape(*array.image_shape, time_axis.bins)

@@ -1,0 +1,657 @@
+"""What stands in front of a streak camera: bodies, most of them flat plates, and one pulsed lamp.
+
+The simulated instrument: lenslets with a baseline, a sweep, and a detector that counts photons.
+
+From a scene to the expected streak image, ray by ray.
+
+Nothing here uses the projection operator that recovery inverts: rays are cast from each lenslet,
+and each ray's light is put on the slit where the ray falls and when it arrives.
+
+What a perfect instrument would see from the reference viewpoint, and how near returns come to it.
+
+One simulated shot: the streak image with everything that is known about it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from tofclip.camera import Camera
+from tofclip.errors import InputError, ShapeError
+from tofclip.lidar import Returns
+from tofclip.shots import Frames, Streak
+from tofclip.simulate.bodies import Body, Lambertian, Rectangle, Vector
+from tofclip.simulate.rays import (
+    FWHM_PER_SIGMA,
+    NO_BODY,
+    accumulate_cells,
+    bin_by_time,
+    cast_rays,
+    compute_irradiance,
+    look_up_reflectance,
+    number_ray_pixels,
+    spread_pulse,
+)
+from tofclip.storage import collect_provenance
+from tofclip.units import SPEED_OF_LIGHT
+
+FloatArray = NDArray[np.float64]
+
+
+def make_plate(
+    centre: Vector,
+    size: tuple[float, float],
+    reflectance: ArrayLike,
+    yaw: float = 0.0,
+    pitch: float = 0.0,
+) -> Body:
+    """Return a flat, diffusely reflecting rectangle.
+
+    Parameters
+    ----------
+    centre : (float, float, float)
+        Position of its middle, m; x right, y down, z away from the camera.
+    size : (float, float)
+        Width and height, m.
+    reflectance : (rows, columns) array
+        Diffuse reflectance over the rectangle, 0..1, row 0 on top. NaN: cut out, light passes.
+    yaw, pitch : float
+        Turn about the vertical axis (positive: the right side goes back) and then about the plate's
+        own horizontal axis (positive: the upper side goes back), rad. Both zero: facing the camera.
+
+    Returns
+    -------
+    Body
+
+    Raises
+    ------
+    ShapeError, InputError
+        A reflectance that is not a picture or lies outside 0..1, a size that is not positive, or
+        nothing but holes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> plate = make_plate((0, 0, 2.0), (0.3, 0.2), np.full((1, 1), 0.8))
+    >>> plate.intersect(np.zeros(3), np.array([[0.0, 0.0, 1.0]])).distance
+    array([2.])
+    """
+    material = Lambertian(np.array(reflectance, dtype=np.float32))
+    if min(size) <= 0 or not np.all(np.isfinite([*centre, *size, yaw, pitch])):
+        raise InputError("a plate needs a finite position and a positive size")
+    right = np.array([np.cos(yaw), 0.0, np.sin(yaw)])
+    # The plate is turned about the vertical first, so that its own horizontal axis stays level.
+    ahead = np.array([-np.sin(yaw), 0.0, np.cos(yaw)])
+    down = np.cos(pitch) * np.array([0.0, 1.0, 0.0]) - np.sin(pitch) * ahead
+    # A right-handed frame; its third axis is the normal, which points away from the camera.
+    axes = np.stack([right, down, np.cross(right, down)], axis=-1)
+    return Body(Rectangle(*size), material, np.asarray(centre, np.float64), axes)
+
+
+class RayCast(NamedTuple):
+    """What the rays of one viewpoint see, ray by ray.
+
+    Parameters
+    ----------
+    body : (n,) int array
+        Number of the body; `NO_BODY` where the ray meets none.
+    path : (n,) array
+        Half of the path of the light from the lamp over the surface to the viewpoint, m.
+    distance : (n,) array
+        Distance of the surface from the lamp, m.
+    reflectance : (n,) array
+        Diffuse reflectance times the cosine of incidence; 0 in shadow.
+    """
+
+    body: NDArray[np.intp]
+    path: FloatArray
+    distance: FloatArray
+    reflectance: FloatArray
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Bodies lit by one pulsed point source.
+
+    Parameters
+    ----------
+    bodies : tuple of Body
+    lamp : (float, float, float)
+        Position of the source, m, before the bodies. At the origin it is co-located with the
+        reference view, which then sees no shadow.
+
+    Raises
+    ------
+    InputError
+        There is no body.
+    """
+
+    bodies: tuple[Body, ...]
+    lamp: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not self.bodies:
+            raise InputError("a scene needs at least one body")
+
+    def trace(self, viewpoint: FloatArray, directions: FloatArray) -> RayCast:
+        """Follow rays to the nearest surface and from there to the lamp.
+
+        Parameters
+        ----------
+        viewpoint : (3,) float array
+            m.
+        directions : (n, 3) float array
+            All with z > 0.
+
+        Returns
+        -------
+        RayCast
+        """
+        first, lamp = cast_rays(self.bodies, viewpoint, directions), np.asarray(self.lamp)
+        seen = first.body != NO_BODY
+        # Only what is seen is lit: a missed ray has an infinite distance, which would spread as
+        # NaN.
+        points = viewpoint + first.distance[seen, np.newaxis] * directions[seen]
+        lamp_distance = np.linalg.norm(points - lamp, axis=1)
+        irradiance = compute_irradiance(self.bodies, lamp, points, first.normal[seen])
+
+        def scatter(values: Any) -> FloatArray:
+            spread = np.zeros(seen.shape)
+            spread[seen] = values
+            return spread
+
+        return RayCast(
+            first.body,
+            # Half of the way there and back, which is what a time of flight says of a co-located
+            # source.
+            scatter((lamp_distance + np.linalg.norm(points - viewpoint, axis=1)) / 2),
+            scatter(lamp_distance),
+            # The fall-off to the lamp is taken out of the irradiance: who renders puts it back with
+            # the whole path.
+            look_up_reflectance(self.bodies, first) * scatter(irradiance * lamp_distance**2),
+        )
+
+
+@dataclass(frozen=True)
+class StreakDetector:
+    """The streak tube's screen, read out in photons.
+
+    Parameters
+    ----------
+    rows : int
+        Rows of the streak image.
+    bin_width : float
+        Duration of a row, s.
+    peak_photons : float
+        Expected signal of the brightest streak pixel; sets the exposure.
+    background_photons : float
+        Expected background of every streak pixel.
+    full_scale_photons : float
+        Reading at which a pixel saturates.
+    """
+
+    rows: int = 576
+    bin_width: float = 20e-12
+    peak_photons: float = 2000.0
+    background_photons: float = 2.0
+    full_scale_photons: float = 65535.0
+
+    def __post_init__(self) -> None:
+        if not (self.rows >= 1 and self.bin_width > 0):
+            raise InputError(
+                f"a detector needs rows and a positive bin width, got {self.rows} and {self.bin_width}"
+            )
+        if not (
+            self.peak_photons > 0 and self.background_photons >= 0 and self.full_scale_photons > 0
+        ):
+            raise InputError(
+                "peak and full scale must be positive numbers of photons, the background not negative"
+            )
+
+    @property
+    def row_times(self) -> NDArray[np.float64]:
+        """Instant of each row's middle on the streak's own time axis, s; the first is 0."""
+        times: NDArray[np.float64] = np.arange(self.rows) * np.float64(self.bin_width)
+        return times
+
+    def expose(
+        self, signal: NDArray[np.float64], noise: np.random.Generator
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Draw one shot: measurements in photons, and which of them saturated.
+
+        Parameters
+        ----------
+        signal : (rows, columns) array
+            Expected signal, photons.
+        noise : numpy.random.Generator
+
+        Returns
+        -------
+        counts : float32 array
+            Photons, none above full scale.
+        saturated : bool array
+        """
+        # Background is light as well, so that it brings photon noise of its own.
+        photons = noise.poisson(signal + self.background_photons)
+        saturated = photons >= self.full_scale_photons
+        return np.minimum(photons, self.full_scale_photons).astype(np.float32), saturated
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """A camera with what only a simulation has to know of it.
+
+    Parameters
+    ----------
+    camera : Camera
+        Geometry, gains, sweep, pulse, time zero, lenslet pitch and focus distance. View k stands at
+        ``x = lenslet_pitch * view_positions[k]``.
+    detector : StreakDetector
+    rays_per_pixel_side : int
+        A picture pixel is sampled by the square of this number of rays.
+    """
+
+    camera: Camera
+    detector: StreakDetector = field(default_factory=StreakDetector)
+    rays_per_pixel_side: int = 4
+
+    def __post_init__(self) -> None:
+        if not self.rays_per_pixel_side >= 1:
+            raise InputError(f"the number of rays must be positive, got {self.rays_per_pixel_side}")
+
+    def viewpoint(self, position: float) -> NDArray[np.float64]:
+        """Where the view at `position` view steps stands, m."""
+        return np.array([self.camera.lenslet_pitch * position, 0.0, 0.0])
+
+    def pixel_grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rays of a picture: X and Y from the optical axis in pixels, flat, sub-pixel by sub-pixel
+        in raster order.
+        """
+        (rows, columns), (axis_row, axis_column) = (
+            self.camera.image_shape,
+            self.camera.optical_axis_px,
+        )
+        y, x = np.meshgrid(
+            self._samples(rows) - axis_row, self._samples(columns) - axis_column, indexing="ij"
+        )
+        return x.ravel(), y.ravel()
+
+    def _samples(self, pixels: int) -> NDArray[np.float64]:
+        side = self.rays_per_pixel_side
+        # Middles of the sub-pixels; pixel centres are whole numbers, hence the half taken off.
+        samples: NDArray[np.float64] = (np.arange(pixels * side) + 0.5) / side - 0.5
+        return samples
+
+    def directions(
+        self, x: NDArray[np.float64], y: NDArray[np.float64], position: float = 0.0
+    ) -> NDArray[np.float64]:
+        """Directions (n, 3), with z = 1, in which the view at `position` sees its picture points
+        (x, y).
+
+        A view's picture is laid so that a point at the focus distance appears at the same place in
+        all views.
+
+        Parameters
+        ----------
+        x, y : (n,) float64 array
+            Picture points in pixels from the centre.
+        position : float
+            Of the view, in view steps.
+
+        Returns
+        -------
+        (n, 3) float64 array
+        """
+        focal = self.camera.focal_length_px
+        # Turned towards the point on the axis at the focus distance, where all views coincide.
+        aside = self.camera.lenslet_pitch * position / self.camera.focus_distance
+        return np.stack([x / focal - aside, y / focal, np.ones_like(x)], axis=-1)
+
+
+class RayBundle(NamedTuple):
+    """The light that one view receives."""
+
+    x: FloatArray  # (n,), where the rays fall in the view's picture, pixels from its optical axis
+    y: FloatArray  # (n,), where the rays fall in the view's picture, pixels from its optical axis
+    time: FloatArray  # (n,), arrival, s after time zero
+    # (n,), arbitrary units, the same for all views; proportional to reflectance / range^2
+    brightness: FloatArray
+
+
+def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundle:
+    """Cast the rays of the view at `position` view steps; those that bring no light are left out.
+
+    `position`: of the view, in view steps. Returns picture point in pixels, time of flight in
+    seconds and brightness of each ray.
+    """
+    x, y = instrument.pixel_grid()
+    hits = scene.trace(instrument.viewpoint(position), instrument.directions(x, y, position))
+    bright = (hits.body != NO_BODY) & (hits.reflectance > 0)
+    share = 1 / instrument.rays_per_pixel_side**2
+    return RayBundle(
+        x[bright],
+        y[bright],
+        2 * hits.path[bright] / SPEED_OF_LIGHT,
+        # light falls with the square of the distance, on the way back from a matt surface
+        share * hits.reflectance[bright] / hits.distance[bright] ** 2,
+    )
+
+
+def render_streak(rays: RayBundle, view: int, instrument: Instrument) -> FloatArray:
+    """Put one view's light on the streak image: (rows, columns), in the units of the rays'
+    brightness.
+
+    `rays`: of the view, from `cast_view_rays`; `view`: number of the lenslet, counted from 0.
+    Returns (rows, columns): time runs along the rows.
+    """
+    camera, detector = instrument.camera, instrument.detector
+    # a cylindrical lenslet turned by the angle images a point as a slanted line, which crosses the
+    # slit here
+    slit = camera.centres_px[view] + rays.x - rays.y * np.tan(camera.angles[view])
+    row = (rays.time + camera.time_zero) / detector.bin_width
+    row, slit, stretch = _apply_sweep(camera, row, slit)
+    ray, column, light = _split_over_columns(
+        slit, camera.gains[view] * rays.brightness, instrument.rays_per_pixel_side
+    )
+    first, pulse = spread_pulse(row, stretch * compute_pulse_sigma_bins(instrument))
+    reach, width = pulse.shape[1], camera.slit_width_px
+    seen = (first[ray] > -reach) & (first[ray] < detector.rows) & (column >= 0) & (column < width)
+    ray, column, light = ray[seen], column[seen], light[seen]
+    rows = first[ray][:, np.newaxis] + np.arange(
+        reach, 2 * reach
+    )  # the screen has a margin for pulses it cuts off
+    amount = light[:, np.newaxis] * pulse[ray]
+    with_margin = accumulate_cells(
+        rows * width + column[:, np.newaxis], amount, (detector.rows + 2 * reach, width)
+    )
+    return with_margin[reach:-reach]
+
+
+def _apply_sweep(
+    camera: Camera, row: FloatArray, slit: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Raw row and column of rectified positions, and how many raw rows a rectified one takes there."""
+    if camera.sweep is None:
+        return row, slit, np.ones_like(row)
+    raw_row, raw_column = camera.sweep.raw_position(row, slit)
+    # raw rows for one rectified row, which lengthen the pulse as well
+    stretch = (
+        camera.sweep.raw_position(row + 0.5, slit)[0]
+        - camera.sweep.raw_position(row - 0.5, slit)[0]
+    )
+    return raw_row, raw_column, stretch
+
+
+def _split_over_columns(
+    position: FloatArray, light: FloatArray, side: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+    """Split each ray, 1/side of a pixel wide, exactly between the one or two slit pixels that it
+    covers.
+
+    Slit pixel j reaches from j - 1/2 to j + 1/2. Returns ray number, slit pixel and amount of
+    light, piece by piece.
+    """
+    left_edge = position - 0.5 / side
+    column = np.floor(left_edge + 0.5)
+    on_next = np.clip((left_edge + 1 / side - (column + 0.5)) * side, 0.0, 1.0)
+    crossing = np.flatnonzero(on_next > 0)
+    return (
+        np.concatenate([np.arange(position.size), crossing]),
+        np.concatenate([column, column[crossing] + 1]).astype(np.intp),
+        np.concatenate([light * (1 - on_next), light[crossing] * on_next[crossing]]),
+    )
+
+
+def compute_pulse_sigma_bins(instrument: Instrument) -> float:
+    """Standard deviation of the Gaussian pulse in rows of the rectified streak image."""
+    return float(instrument.camera.pulse_fwhm / FWHM_PER_SIGMA / instrument.detector.bin_width)
+
+
+MIN_REFLECTANCE = 0.1  # a surface that reflects less says too little about where it is
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """The reference view, pixel by pixel.
+
+    Parameters
+    ----------
+    range : (y, x) float32 array
+        Distance along the line of sight, m, of the plate that fills most of the pixel; NaN where
+        there is none.
+    reflectance : (y, x) float32 array
+        Diffuse reflectance times the cosine of incidence, averaged over the pixel.
+    target : (y, x) bool array
+        Pixels whose range can be asked for: the pixel and its eight neighbours lie on one and the
+        same plate, with a reflectance of at least 0.1 everywhere.
+    bin_width : float
+        Duration of a bin of the shot, s, which sets the scale of range errors.
+    """
+
+    range: NDArray[np.float32]
+    reflectance: NDArray[np.float32]
+    target: NDArray[np.bool_]
+    bin_width: float
+
+    @classmethod
+    def from_scene(cls, scene: Scene, instrument: Instrument) -> GroundTruth:
+        """Look at `scene` from the reference viewpoint.
+
+        Parameters
+        ----------
+        scene : Scene
+        instrument : Instrument
+            Its reference view, rays per pixel and detector.
+
+        Returns
+        -------
+        GroundTruth
+        """
+        x, y = instrument.pixel_grid()
+        hits = scene.trace(instrument.viewpoint(0.0), instrument.directions(x, y))
+        plate, path, reflectance = (
+            _group_by_pixel(values, instrument)
+            for values in (hits.body, hits.path, hits.reflectance)
+        )
+        filled = np.stack(
+            [np.mean(plate == number, axis=-1) for number in range(len(scene.bodies))]
+        )
+        most = np.argmax(filled, axis=0)[..., np.newaxis]
+        own = plate == most
+        count = own.sum(axis=-1)
+        distance = np.full(count.shape, np.nan, dtype=np.float32)
+        np.divide(
+            (path * own).sum(axis=-1), count, out=distance, where=count > 0, casting="same_kind"
+        )
+        firm = np.all(reflectance >= MIN_REFLECTANCE, axis=-1)
+        whole = (
+            scipy.ndimage.binary_erosion((share == 1) & firm, np.ones((3, 3))) for share in filled
+        )
+        return cls(
+            range=distance,
+            reflectance=reflectance.mean(axis=-1).astype(np.float32),
+            target=np.logical_or.reduce(list(whole)),
+            bin_width=instrument.detector.bin_width,
+        )
+
+
+def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1.0) -> Frames:
+    """Transient frames that a perfect camera at the reference viewpoint would deliver, without
+    noise or background.
+
+    Parameters
+    ----------
+    scene : Scene
+    instrument : Instrument
+    exposure : float
+        Photons for reflectance 1 at 1 m that fills a pixel.
+
+    Returns
+    -------
+    Frames
+        On the time axis of the instrument's streak images, time zero taken off.
+    """
+    camera, detector = instrument.camera, instrument.detector
+    x, y = instrument.pixel_grid()
+    hits = scene.trace(instrument.viewpoint(0.0), instrument.directions(x, y))
+    pixel = number_ray_pixels(camera.image_shape, instrument.rays_per_pixel_side)
+    seen = hits.body != NO_BODY
+    brightness = (
+        exposure
+        / instrument.rays_per_pixel_side**2
+        * hits.reflectance[seen]
+        / hits.distance[seen] ** 2
+    )
+    row = (2 * hits.path[seen] / SPEED_OF_LIGHT + camera.time_zero) / detector.bin_width
+    shape = (int(np.prod(camera.image_shape)), detector.rows)
+    sigma = compute_pulse_sigma_bins(instrument)
+    by_pixel = bin_by_time(pixel[seen], row, brightness, sigma, shape)
+    values = np.ascontiguousarray(by_pixel.T, np.float32).reshape(-1, *camera.image_shape)
+    times = detector.row_times - camera.time_zero
+    # The reference view itself has no parallax: its pictures are those that the right shear would
+    # give.
+    shears = camera.shear_at(
+        np.maximum(SPEED_OF_LIGHT * times / 2, detector.bin_width * SPEED_OF_LIGHT)
+    )
+    return Frames(values, times, camera, shears=shears)
+
+
+def _group_by_pixel(values: NDArray[Any], instrument: Instrument) -> NDArray[Any]:
+    """Sort flat sub-pixel values into (rows, columns, rays of the pixel)."""
+    (rows, columns), side = instrument.camera.image_shape, instrument.rays_per_pixel_side
+    return values.reshape(rows, side, columns, side).swapaxes(1, 2).reshape(rows, columns, side**2)
+
+
+MEDIAN_PER_SIGMA = 0.6745
+"""Median of the absolute value of a normal variate in units of its deviation."""
+
+
+def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
+    """Compare each target pixel's most intense return with the true range.
+
+    Parameters
+    ----------
+    returns : Returns
+    truth : GroundTruth
+
+    Returns
+    -------
+    dict
+        ``median_depth_error_m``: median absolute range error of the target pixels that have a
+        return; ``share_within_one_bin``: fraction of all target pixels whose return is within ``c *
+        bin_width / 2`` of the truth, so that a missing return counts against it;
+        ``share_with_return``: fraction of the target pixels that have a return;
+        ``false_return_share``: fraction of all returns that lie more than a pixel away from anything
+        in the scene; ``range_z``: robust standard deviation of the range errors of the target
+        pixels in units of what each return says of its own, 1 if that is true; ``bin_m``: ``c *
+        bin_width / 2``.
+
+    Raises
+    ------
+    ShapeError, InputError
+        Another picture size, or no target pixel with a return.
+    """
+    distance = returns.image("range")
+    if distance.shape != truth.range.shape:
+        raise ShapeError("the returns' picture", truth.range.shape, distance.shape)
+    error = np.abs(distance - truth.range)[truth.target]
+    found = np.isfinite(error)
+    if not found.any():
+        raise InputError("no target pixel of the truth has a return")
+    sigma = returns.image("confidence")[truth.target]
+    surest = np.finfo(np.float32).tiny
+    ratio = error[found] / np.maximum(sigma[found], surest)
+    z = float(np.median(ratio) / MEDIAN_PER_SIGMA)
+    bin_m = SPEED_OF_LIGHT * truth.bin_width / 2
+    # a return beside a border may belong to either side
+    near_anything = scipy.ndimage.binary_dilation(np.isfinite(truth.range), np.ones((3, 3)))
+    return {
+        "median_depth_error_m": float(np.median(error[found])),
+        "share_within_one_bin": float(np.mean(error <= bin_m)),
+        "share_with_return": float(np.mean(found)),
+        "false_return_share": float(np.mean(~near_anything[returns.y, returns.x])),
+        "range_z": z,
+        "bin_m": bin_m,
+    }
+
+
+@dataclass(frozen=True)
+class SimulatedShot:
+    """A streak image and the truth behind it.
+
+    Parameters
+    ----------
+    streak : Streak
+        Measurements in photons with noise, background and saturation; carries the true camera.
+    camera : Camera
+        The true camera, with the gains and the sweep that made the picture.
+    truth : GroundTruth
+        What the reference view sees.
+    signal : (rows, columns) float32 array
+        Expected signal of each streak pixel without background, photons.
+    exposure : float
+        Photons for reflectance 1 at 1 m that fills a picture pixel, in a view of gain 1.
+    """
+
+    streak: Streak
+    camera: Camera
+    truth: GroundTruth
+    signal: NDArray[np.float32]
+    exposure: float
+
+
+def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedShot:
+    """Take one shot of `scene`.
+
+    Parameters
+    ----------
+    scene : Scene
+    instrument : Instrument
+    seed : int
+        Of the photon noise; the same seed gives the same shot.
+
+    Returns
+    -------
+    SimulatedShot
+        Streak image, camera, ground truth, and expected photons (rows, columns).
+
+    Raises
+    ------
+    InputError
+        No light of the scene reaches the streak image.
+    """
+    camera, detector = instrument.camera, instrument.detector
+    # In relative units: the exposure below decides what a unit is in photons.
+    light = np.zeros((detector.rows, camera.slit_width_px))
+    for view, position in enumerate(camera.view_positions):
+        light += render_streak(cast_view_rays(scene, instrument, float(position)), view, instrument)
+    if not light.any():
+        raise InputError(
+            "no light of the scene reaches the streak image: check positions, number of rows and time zero"
+        )
+    # Scaled by the brightest pixel, as one opens the iris of a real camera until it almost
+    # saturates.
+    exposure = detector.peak_photons / float(light.max())
+    counts, saturated = detector.expose(exposure * light, np.random.default_rng(seed))
+    streak = Streak(
+        counts,
+        detector.row_times,
+        saturated,
+        camera=camera,
+        source="simulated streak image",
+        provenance=collect_provenance(
+            {"seed": seed, "peak_photons": detector.peak_photons, "exposure": exposure}
+        ),
+    )
+    return SimulatedShot(
+        streak,
+        camera,
+        GroundTruth.from_scene(scene, instrument),
+        (exposure * light).astype(np.float32),
+        exposure,
+    )
