@@ -115,3 +115,15 @@ def test_what_cannot_be_is_refused():
         LeastSquares(SCALED, np.ones((2, 1), bool))
     with pytest.raises(InputError, match="met exactly"):
         estimate_robust_deviation(np.zeros(5))
+
+
+@pytest.mark.parametrize("make", [LeastSquares, partial(Huber, threshold=4.0)])
+@pytest.mark.parametrize("scale", [0.3, 1.0])
+def test_the_dual_value_is_minus_the_conjugate(make, scale):
+    """Of f at u: the largest of <u, z> - f(z), which is where the gradient at z is u."""
+    slope = np.random.default_rng(3).standard_normal(SCALED.shape)
+    term, pull = make(SCALED), scale * slope
+    reached = SCALED + pull
+    np.testing.assert_allclose(term.gradient(reached), pull)
+    expected = term.value(reached) - np.sum(pull * reached, axis=0)
+    np.testing.assert_allclose(term.dual_value(slope, np.array([scale])), expected, rtol=1e-9)
