@@ -12,6 +12,7 @@ from tofclip.camera import (
     estimate_dark_level,
     measure,
 )
+from tofclip.camera.measurement import MeasurementNoise
 from tofclip.errors import CalibrationError, InputError
 
 WIDTH, ROWS = 61, 80
@@ -170,3 +171,13 @@ def test_the_dark_level_is_the_median_of_the_quietest_rows(columns):
     counts = np.random.default_rng(columns).poisson(90, (60, columns)).astype(np.float32)
     counts[5:] += 1000
     assert estimate_dark_level(counts) == np.median(counts[np.argsort(counts.sum(axis=1))[:3]])
+
+
+def test_the_variance_of_a_measurement_by_hand():
+    """Floor and misfit are deviations, the gain is counts for each photon."""
+    light = np.array([[0.0, 2.0], [30.0, 4.0]], np.float32)
+    noise = MeasurementNoise(floor=3.0, gain=2.0, misfit=0.1)
+    np.testing.assert_allclose(
+        noise.compute_variance(light), [[9 + 4.5, 9 + 4 + 0.1], [9 + 60 + 4.5, 9 + 8 + 0.1]]
+    )
+    assert MeasurementNoise.from_figures(noise.list_figures()) == noise

@@ -372,3 +372,20 @@ def test_returns_of_frames_are_corrected_once() -> None:
     # The cloud has it as a column; without a calibration it has none.
     names = [[one.name for one in point_cloud(found).columns] for found in (corrected, measured)]
     assert ["reflectance" in listed for listed in names] == [True, False]
+
+
+def test_the_deviation_of_a_correction_by_hand():
+    """Of 100 ps of time zero, c / 2 of it; of the walk, at two decades; of the pixel's own."""
+    known = RangeCalibration(
+        time_zero_sigma=100e-12,
+        walk=np.array([3e-3]),
+        walk_covariance=np.array([[4e-6]]),
+        reference_signal=10.0,
+        signal_range=np.array([1.0, 1e4]),
+        offsets=np.array([[1e-3, -2e-3]]),
+        offset_sigma=np.array([[5e-3, 0.0]]),
+    )
+    excess, sigma = known.compute_excess([1000.0, 10.0], np.array([0, 0]), np.array([0, 1]))
+    zero = SPEED_OF_LIGHT / 2 * 100e-12
+    np.testing.assert_allclose(excess, [2 * 3e-3 + 1e-3, -2e-3])
+    np.testing.assert_allclose(sigma, [np.sqrt(zero**2 + 4e-3**2 + 5e-3**2), zero])
