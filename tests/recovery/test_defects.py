@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from three_view_shot import CAMERA
 
 from tofclip.lidar import depth
 from tofclip.recovery import open_shot, recover
@@ -14,6 +15,7 @@ from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.demo import make_default_camera
 from tofclip.simulate.patterns import make_plain_pattern
+from tofclip.solvers import TotalVariation
 
 PULSE_ROWS = 3.0
 
@@ -146,3 +148,21 @@ def test_what_strikes_the_sensor_is_not_taken_for_the_lights_own_noise() -> None
     # three counts for a photon; what a pulse bends may add to it, what strikes the sensor may not
     assert gain >= 3
     assert beside == pytest.approx(gain, rel=0.25)
+
+
+def test_light_that_is_cut_off_is_recovered_whatever_the_dark_level_is() -> None:
+    """Where the sensor ends there is as much light or more: a picture is not flattened to it."""
+    picture = np.zeros((16, 16), np.float32)
+    picture[3:13, 6:10] = 1
+    pulse = np.exp(-(((np.arange(40) - 18.3) / 4) ** 2))
+    light = pulse[:, np.newaxis] * CAMERA.operator()(picture) * 300
+    light += np.random.default_rng(0).normal(0, 1, light.shape)
+    limit = np.float32(0.7 * light.max())
+    found = []
+    for dark, most in ((0, np.inf), (0, limit), (800, limit)):
+        counts = (np.minimum(light, most) + dark).astype(np.float32)
+        streak = Streak(counts, camera=CAMERA).with_bin_width(20e-12)
+        found.append(recover(streak, method=TotalVariation(iterations=300)).values.max())
+    whole, cut, raised = found
+    assert cut == pytest.approx(whole, rel=0.1)
+    assert raised == pytest.approx(cut, rel=0.01)
