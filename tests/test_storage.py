@@ -122,6 +122,19 @@ def test_no_damaged_byte_goes_unnoticed(record: Record, tmp_path: Path) -> None:
             Record.load(path)
 
 
+@pytest.mark.parametrize("compressed", [True, False])
+def test_no_damaged_byte_of_a_large_array_goes_unnoticed(compressed: bool, tmp_path: Path) -> None:
+    path, values = tmp_path / "a.h5", np.random.default_rng(0).random((70, 40, 40), np.float32)
+    Record("frames", {"values": Field(values)}).save(path, compressed)
+    whole = path.read_bytes()
+    for position in np.linspace(0.2, 0.8, 9):  # where nothing but the array is
+        damaged = bytearray(whole)
+        damaged[int(position * len(whole))] ^= 0x41
+        path.write_bytes(damaged)
+        with pytest.raises(FileFormatError, match=r"a\.h5"):
+            Record.load(path)
+
+
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.999])
 def test_a_truncated_file_is_refused(record: Record, share: float, tmp_path: Path) -> None:
     path = tmp_path / "a.h5"

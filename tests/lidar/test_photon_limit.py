@@ -23,6 +23,7 @@ from tofclip.lidar.photons import (
     locate_with_smoothness,
     measure_accuracy,
 )
+from tofclip.lidar.photons.background import remove_bumps
 from tofclip.lidar.photons.kernels import find_best_scores
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -458,3 +459,12 @@ def test_ranges_are_true_in_a_bright_background(detector, photons, background):
     assert abs(scores.mean()) < 4 / np.sqrt(scores.size)
     # A normal number's square has a variance of two.
     assert np.mean(scores**2) == pytest.approx(1, abs=4 * np.sqrt(2 / scores.size))
+
+
+def test_a_bump_is_taken_off_a_background_that_rises():
+    """A surface's light, without noise, on a slope: what is left beneath it is the slope."""
+    bins = np.arange(400)
+    slope = 1000.0 + 10 * bins
+    bump = 3000 * np.exp2(-((2 * (bins - 200) / 12) ** 2))
+    left = remove_bumps(slope + bump, slope + bump, 12.0)
+    np.testing.assert_allclose(left, slope, rtol=0.015)

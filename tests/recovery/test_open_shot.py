@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from three_view_shot import CAMERA, make_streak
 
+from tofclip.camera import Camera
 from tofclip.errors import InputError, MissingTimeAxisError
 from tofclip.recovery import open_shot, plan_recovery
+from tofclip.recovery import shot as opening
 from tofclip.shots import Streak
 from tofclip.solvers import LinearInverse
 
@@ -61,3 +63,24 @@ def test_what_a_shot_lacks_is_said_when_it_is_opened(streak):
 def test_a_known_sweep_stays_as_it_is(streak):
     shot = open_shot(streak)
     assert shot.fit_camera() is shot
+
+
+def test_the_error_of_slit_centres_is_told_though_a_part_of_it_shows_in_no_shot(monkeypatch):
+    """A displaced picture looks like displaced centres: of the errors of seven views a shot shows
+    what is no displacement, and from that the error of each is known without bias.
+    """
+    centres = 40.0 + 60 * np.arange(7)
+    angles = np.arctan([0.7, -0.4, 0.1, 0.9, -0.8, -0.1, 0.4])
+    nominal = Camera(centres, angles, (16, 16), 440, time_zero=1e-9)
+    looks = np.stack([np.ones(7), -np.tan(angles)], axis=1)
+    random, squares = np.random.default_rng(0), []
+    counts = np.ones((12, 440), np.float32)
+    shot = open_shot(Streak(counts, np.arange(12) * 20e-12), nominal)
+    for _ in range(2000):
+        error = random.normal(0, 0.5, 7)
+        shown = error - looks @ np.linalg.lstsq(looks, error)[0]
+        found = nominal.replace(centres_px=centres + shown)
+        monkeypatch.setattr(opening, "fit_camera_to_shot", lambda *_, found=found: found)
+        squares.append(shot.fit_camera().centre_error_px ** 2)
+    # 10,000 degrees of freedom know a variance to 1.4 %
+    assert np.mean(squares) == pytest.approx(0.5**2, rel=0.05)

@@ -51,6 +51,8 @@ def test_a_deviation_is_that_of_the_fit_of_further_steps_and_of_the_centres():
         moved = np.hypot(right * (reach(x + 1, y) - distance), down * (reach(x, y + 1) - distance))
         expected = np.sqrt(stated**2 + remainder[surface] ** 2 + moved**2)
         np.testing.assert_allclose(found.confidence[own], expected, rtol=1e-4)
+        # light falls with the square of the range
+        np.testing.assert_allclose(found.intensity[own], 500 * distance**2, rtol=1e-5)
 
 
 def test_errors_that_alternate_displace_the_picture_by_their_mean():

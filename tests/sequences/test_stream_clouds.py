@@ -64,6 +64,8 @@ def test_a_stream_gives_the_clouds_of_its_shots():
         np.testing.assert_allclose(one.cloud.intensity, alone.intensity, rtol=1e-3)
         assert one.latency > 0
         assert set(one.seconds) == {"read", "wait", "rectify", "recover", "range", "place"}
+        # what was not work was waiting; the source's own time is no latency
+        assert sum(one.seconds.values()) == pytest.approx(one.latency + one.seconds["read"])
     medians = [np.median(one.cloud.range) for one in streamed]
     np.testing.assert_allclose(np.diff(medians), -0.05, atol=2e-3)
 
