@@ -23,7 +23,7 @@ from tofclip.recovery import (
     recover,
 )
 from tofclip.recovery.focus import FrameSegment
-from tofclip.recovery.segments import recover_segments
+from tofclip.recovery.plan import recover_segments
 from tofclip.simulate import (
     Instrument,
     Scene,
