@@ -60,6 +60,8 @@ def test_requests_come_back(exposure: ExposureRequest) -> None:
 def test_requests_as_the_makers_examples_write_them() -> None:
     assert ExposureRequest(8, 2e-3, 3, 128).encode() == b"I,8,2,3,0,1,0,1,128"  # milliseconds
     assert ExposureRequest(1, 2e-3, 3).encode() == b"I,1,2000,3,0,1,0,1,512"  # microseconds
+    assert ExposureRequest(4, 2e-3, 3, 64).encode() == b"I,4,2000,3,0,1,0,1,64"  # these as well
+    assert ExposureRequest(6, 2e-3, 3).encode() == b"I,6,2,3,0,1,0,1,512"
     # The vendor's class leaves the width out, and its gated mode has none.
     assert ExposureRequest.decode(b"I,8,2,3,0,1,0,1") == ExposureRequest(8, 2e-3, 3)
     gated = ExposureRequest(8, 2e-3, 3, gate=GateScan(10, 36, 5, 100))

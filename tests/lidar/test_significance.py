@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import tofclip
-from tofclip.lidar.significance import find_most_significant
+from tofclip.camera.rectifier import MeasurementNoise
+from tofclip.lidar import Pulse
+from tofclip.lidar.significance import find_most_significant, weigh_candidates
 
 SIZE = 32
 SURFACE, RAY = (slice(6, 26), 30, 2000.0), (slice(14, 18), 70, 100.0)
@@ -46,3 +49,21 @@ def test_the_most_significant_of_each_pixel() -> None:
     best, brightness = find_most_significant(pixel, pooled, signal)
     np.testing.assert_array_equal(best, [3, 3, 2, 9, 9, 9])
     np.testing.assert_array_equal(brightness, [11, 11, 12, 13, 13, 13])
+
+
+def test_the_significance_of_a_candidate_is_its_height_over_its_deviation() -> None:
+    """In even noise, of one pixel whose light is known to have the pulse's course: the deviation of
+    its height by least squares over all measurements of all frames.
+    """
+    camera = tofclip.Camera([20.3, 60.0, 99.6], [-0.7, 0.1, 0.6], (12, 12), 121, pulse_fwhm=60e-12)
+    times, floor = np.arange(60) * 10e-12, 3.0
+    pixel, pulse = np.array([40, 77]), Pulse.gaussian(camera.pulse_fwhm)
+    arrival, signal = np.array([200e-12, 333e-12]), np.array([50.0, 80.0])
+    frames = tofclip.Frames(np.zeros((60, 12, 12), np.float32), times, camera)
+    found = weigh_candidates(frames, MeasurementNoise(floor, 0.0), pulse, pixel, arrival, signal)
+    matrix = camera.operator().matrix.toarray()
+    for place, late, counts, stated in zip(pixel, arrival, signal, found, strict=True):
+        course = pulse(times - late)
+        seen = np.outer(matrix[:, place], course)  # of a height of one
+        expected = counts / course.sum() * np.sqrt(np.sum(seen**2)) / floor
+        assert stated == pytest.approx(expected, rel=0.01)  # the pulse's far ends are left out

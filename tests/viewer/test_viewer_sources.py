@@ -115,6 +115,15 @@ def test_time_walks_through_a_transient(transient: Source) -> None:
     assert np.nanmax(pictures["depth"]) == pytest.approx(range_of(FAR_FRAME), abs=1e-3)
 
 
+def test_a_gate_around_a_frame_reaches_as_far_before_it_as_behind(transient: Source) -> None:
+    session = Session(transient)
+    session.gate, session.half_gate = GATE_AROUND_FRAME, 5
+    for away, points in ((-6, 0), (-5, 36), (0, 36), (5, 36), (6, 0)):
+        session.jump(NEAR_FRAME + away)
+        assert len(session.frame_at(0.0).cloud) == points
+    assert session.gate_at(2) == Gate(0, 8)
+
+
 def test_playing_begins_anew_and_ends_at_the_last_frame(transient: Source) -> None:
     session = Session(transient)
     session.play()
