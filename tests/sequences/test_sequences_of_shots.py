@@ -129,6 +129,16 @@ def test_ranging_on_workers_is_bit_for_bit_ranging_here(scheduler, recorded, tmp
             RangingSettings(**unusable)
 
 
+def test_shots_that_are_left_over_make_a_cloud_of_their_own(recorded, tmp_path):
+    """Of six shots, four are averaged and then two; no shot is lost."""
+    ranging = RangingSettings(recorded / "camera.h5", average=4)
+    jobs = ranging.jobs(list_shots(recorded / "shots"), tmp_path / "out", ".ply")
+    reports = []
+    assert run_jobs(jobs, on_report=lambda report: reports.append(report.figures)).done == 2
+    assert [len(late) for _, late in reports] == [4, 2]
+    assert all(job.result.is_file() for job in jobs)
+
+
 def test_a_sweep_that_is_not_known_is_found_from_the_first_shot(recorded, camera, tmp_path):
     camera.replace(sweep=None, time_zero=0.0).save(tmp_path / "camera.h5")
     ranging = RangingSettings(tmp_path / "camera.h5", time_zero=-6e-9)
