@@ -11,6 +11,7 @@ from time import sleep
 
 import pytest
 
+from tofclip.errors import InputError
 from tofclip.sequences.streaming import run_in_order
 
 STEP = 0.05
@@ -187,3 +188,37 @@ def test_leaving_early_ends_the_threads_and_closes_the_source(worker):
     stream.close()
     assert closed.wait(5)
     assert not stream_threads()
+
+
+def test_what_fails_is_told_and_the_stream_goes_on(worker):
+    def work(value: int) -> int:
+        if value == 2:
+            raise InputError("dark")
+        return value
+
+    failed: list[tuple[int, str]] = []
+    source = [0, InputError("half written"), 2, 3]
+    items = run_in_order(
+        source,
+        work,
+        worker,
+        1,
+        on_failure=lambda number, fault: failed.append((number, str(fault))),
+    )
+    assert [(item.number, item.value) for item in items] == [(0, 0), (3, 3)]
+    assert failed == [(1, "half written"), (2, "dark")]
+    with pytest.raises(InputError, match="half written"):
+        list(run_in_order(source, work, worker, 1))
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ({"at_once": 0}, "one entry"),
+        ({"queue_size": 0}, "one entry"),
+        ({"policy": "all"}, "policy"),
+    ],
+)
+def test_unusable_streams_are_refused(worker, settings, problem):
+    with pytest.raises(InputError, match=problem):
+        next(run_in_order([], keep, worker, **{"at_once": 1, **settings}))

@@ -1,9 +1,9 @@
-"""Shots to clouds while they come: a reader, a bounded channel, an executor, results in order.
+"""Work on things while they come: a reader, a bounded queue, an executor, results in order.
 
-    source --reader--> channel (drops or blocks) --dispatcher--> executor --> results in order
+    source --reader--> queue (drops or blocks) --> executor --> results in order
 
-The one road from many shots to clouds in this process: a file's, a folder's and an instrument's
-shots take it, on the command line and in a live view.
+`run_in_order` serves streams of any kind, such as captures of hidden scenes; `stream_clouds` makes
+clouds of shots: a file's, a folder's and an instrument's, on the command line and in a live view.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from threading import Condition, Semaphore, Thread
+from threading import Condition, Thread
 from time import perf_counter
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,91 +30,11 @@ from tofclip.shots import Returns, Streak
 from tofclip.threads import open_worker_pool, thread_count
 
 Policy = Literal["block", "drop_oldest"]
-"""What happens to a full channel: the producer waits, or what has waited longest is dropped."""
-
 POLICIES: tuple[Policy, ...] = ("block", "drop_oldest")
-STOP_TIMEOUT_S = 5.0
-"""Seconds that the end of a stream waits for a source that is just being read."""
+OnFailure = Callable[[int, TofclipError], object]
 
-READ, WAIT = "read", "wait"
-STEPS = ("rectify", "recover", "range", "place")
-"""What is done to a shot, in this order."""
-
-Entry = TypeVar("Entry")
-
-
-class ChannelClosedError(Exception):
-    """No consumer takes entries any more."""
-
-
-class Channel(Generic[Entry]):
-    """Hands entries from one thread to another, in order.
-
-    `capacity`: entries held at most.
-    """
-
-    def __init__(self, capacity: int, policy: Policy = "block") -> None:
-        if capacity < 1:
-            raise InputError(f"a channel holds one entry or more, not {capacity}")
-        if policy not in POLICIES:
-            raise InputError(
-                f"a full channel's policy is one of {', '.join(POLICIES)}, not '{policy}'"
-            )
-        self._capacity, self._policy = capacity, policy
-        self._entries: deque[Entry] = deque()
-        # One lock for all fields; every change wakes both sides, which test again in a loop.
-        self._changed = Condition()
-        self._finished = self._closed = False
-        self._fault: BaseException | None = None
-        self.dropped = 0
-
-    def put(self, entry: Entry) -> None:
-        """Hand one entry over."""
-        with self._changed:
-            while len(self._entries) >= self._capacity and not self._closed:
-                if self._policy == "drop_oldest":
-                    self._entries.popleft()
-                    self.dropped += 1
-                else:
-                    self._changed.wait()
-            if self._closed:
-                raise ChannelClosedError
-            self._entries.append(entry)
-            self._changed.notify_all()
-
-    def finish(self, fault: BaseException | None = None) -> None:
-        """Say that no further entry will come, because of a fault or because that was all."""
-        with self._changed:
-            self._finished, self._fault = True, fault
-            self._changed.notify_all()
-
-    def get(self) -> Entry | None:
-        """Return the next entry, or None behind the last one; there a fault is raised."""
-        with self._changed:
-            while not self._entries and not self._finished and not self._closed:
-                self._changed.wait()
-            if self._entries and not self._closed:
-                entry = self._entries.popleft()
-                self._changed.notify_all()
-                return entry
-            # Raised only when the queue is empty, so that what came before the fault is still
-            # delivered.
-            if self._fault is not None:
-                raise self._fault
-            return None
-
-    def peek(self) -> Entry | None:
-        """Return what `get` would return next, without taking it; None where that has to come."""
-        with self._changed:
-            return self._entries[0] if self._entries else None
-
-    def close(self) -> None:
-        """Let go of everything; `put` fails from now on and `get` returns None."""
-        with self._changed:
-            self._closed = True
-            # Cleared so that memory is freed even while a thread still holds the channel.
-            self._entries.clear()
-            self._changed.notify_all()
+STOP_TIMEOUT_S = 5.0  # that the end of a stream waits for a source that is just being read
+STEPS = ("rectify", "recover", "range", "place")  # what is done to a shot, in this order
 
 
 @dataclass(frozen=True)
@@ -137,9 +57,6 @@ class _Arrival:
     ready: float
 
 
-_Started = tuple[_Arrival, "Future[Any]"]
-
-
 def run_in_order(
     source: Iterable[Any],
     work: Callable[[Any], Any],
@@ -147,107 +64,164 @@ def run_in_order(
     at_once: int,
     queue_size: int = 1,
     policy: Policy = "block",
+    on_failure: OnFailure | None = None,
 ) -> Generator[StreamItem, None, None]:
     """Yield what `work` makes of everything that `source` brings, in order, while more is read and
     worked on.
 
-    The source is read on a thread of its own. When the consumer is slow the work waits for it, then
-    the channel behind the source is full, and there the policy decides. With ``"drop_oldest"`` the
-    consumer gets the newest of the results that were finished meanwhile, which is about as old as
-    its own work on the one before takes; at most ``at_once - 1`` things were worked on in vain. At most
-    ``queue_size + at_once + 1`` things are alive besides the one handed out: those that wait, those
-    that are worked on or done before their turn, and the one that the reader holds. Closing the
-    generator stops the threads, and closes the source on its own thread if it can be closed.
+    The source is read on a thread of its own; closing the generator stops it, and closes the source
+    there if it can be closed. At most ``queue_size + at_once + 1`` things are alive besides the one
+    handed out: those that wait, those that are worked on or done before their turn, and the one
+    that the reader holds.
 
-    `work`: called by the executor; must not depend on the order in which things are done;
-    `executor`: threads, processes or a cluster's workers; where they are processes, work and things
-    have to survive pickling; `at_once`: things that the executor has at a time, at most;
-    `queue_size`: things that wait before it, at most; `policy`: ``"block"`` lets the source wait:
-    nothing is lost of a file, and an instrument's own buffer fills up. ``"drop_oldest"`` keeps the
-    latency low: a live view takes the newest.
+    Parameters
+    ----------
+    source : iterable
+        In the place of a thing that cannot be read may come its `TofclipError`.
+    work : callable
+        Called by the executor; must not depend on the order in which things are done.
+    executor : Executor
+        Threads, processes or a cluster's workers; where they are processes, work and things have to
+        survive pickling.
+    at_once : int
+        Things that the executor has at a time, at most.
+    queue_size : int
+        Things that wait before it, at most.
+    policy : str
+        ``"block"`` lets the source wait: nothing is lost of a file, and an instrument's own buffer
+        fills up. ``"drop_oldest"`` keeps the latency low: what has waited longest is dropped, and
+        of results that were finished while the consumer was busy it gets the newest.
+    on_failure : callable, optional
+        Called with the number of a thing of which nothing can be made, and its error; the stream
+        goes on. By default the error ends it.
     """
-    if at_once < 1:
-        raise InputError(f"a stream works on one thing or more at once, not {at_once}")
-    waiting = Channel[_Arrival](queue_size, policy)
-    started = Channel[_Started](at_once)
-    # A thing is taken out of the channel only when the executor has room: in the executor's own
-    # queue it could no longer be dropped, and would grow old.
-    room = Semaphore(at_once)
-    threads = [
-        Thread(target=_read_source, args=(source, waiting), name="stream reader", daemon=True),
-        Thread(
-            target=_dispatch,
-            args=(waiting, started, room, lambda value: executor.submit(work, value)),
-            name="stream dispatcher",
-            daemon=True,
-        ),
-    ]
-    for thread in threads:
-        thread.start()
+    for what, number in (("works on", at_once), ("holds", queue_size)):
+        if number < 1:
+            raise InputError(f"a stream {what} one entry or more, not {number}")
+    if policy not in POLICIES:
+        raise InputError(f"a stream's policy is one of {', '.join(POLICIES)}, not '{policy}'")
+    submit, drops = partial(executor.submit, _raise_or_work, work), policy == "drop_oldest"
+    stream = _Stream(source, submit, at_once, queue_size, drops)
+    reader = Thread(target=stream.read, name="stream reader", daemon=True)
+    reader.start()
     try:
-        while (entry := started.get()) is not None:
-            value = entry[1].result()
-            room.release()
-            if policy == "drop_oldest":
-                # Results that were finished while the consumer was busy: only the newest is news.
-                while (later := started.peek()) is not None and _has_result(later[1]):
-                    started.get()
-                    room.release()
-                    entry, value = later, later[1].result()
-            arrival = entry[0]
-            yield StreamItem(
-                arrival.number, value, arrival.read_seconds, perf_counter() - arrival.ready
-            )
+        while (entry := stream.wait_for_next()) is not None:
+            arrival, future = entry
+            fault = future.exception()
+            stream.make_room()
+            if fault is not None:
+                if on_failure is None or not isinstance(fault, TofclipError):
+                    raise fault
+                on_failure(arrival.number, fault)
+                continue
+            if drops:
+                arrival, future = stream.skip_to_newest(entry)
+            seconds = perf_counter() - arrival.ready
+            yield StreamItem(arrival.number, future.result(), arrival.read_seconds, seconds)
     finally:
-        # First both channels and the room, then the threads: one that waits for a neighbour must
-        # wake up.
-        waiting.close()
-        started.close()
-        room.release()
-        for thread in threads:
-            thread.join(STOP_TIMEOUT_S)
+        stream.close()
+        reader.join(STOP_TIMEOUT_S)
 
 
-def _dispatch(
-    source: Channel[_Arrival],
-    target: Channel[_Started],
-    room: Semaphore,
-    submit: Callable[[Any], Future[Any]],
-) -> None:
-    """Hand things to the executor as it has room; the dispatcher's whole life."""
-    try:
-        while room.acquire() and (arrival := source.get()) is not None:
-            # Without its value: the executor alone holds a shot, until its work is done.
-            target.put((replace(arrival, value=None), submit(arrival.value)))
-        target.finish()
-    except ChannelClosedError:
-        pass
-    except BaseException as fault:  # the consumer gets to see it
-        target.finish(fault)
+def _raise_or_work(work: Callable[[Any], Any], value: Any) -> Any:
+    if isinstance(value, TofclipError):
+        raise value
+    return work(value)
 
 
-def _has_result(future: Future[Any]) -> bool:
-    """Whether work is done and went well: what failed is not newer than what did not."""
-    if not future.done() or future.exception() is not None:
-        return False
-    return not isinstance(future.result(), TofclipError)
+class _Stream:
+    """What reader and consumer share: things that wait and things that the executor has.
 
+    Nothing waits while the executor has room: in its own queue a thing could no longer be dropped,
+    and would grow old.
+    """
 
-def _read_source(source: Iterable[Any], target: Channel[_Arrival]) -> None:
-    """Bring what the source has; the reader's whole life."""
-    items = iter(source)
-    try:
-        began = perf_counter()
-        for number, value in enumerate(items):
-            now = perf_counter()
-            target.put(_Arrival(number, value, now - began, now))
+    def __init__(
+        self,
+        source: Iterable[Any],
+        submit: Callable[[Any], Future[Any]],
+        at_once: int,
+        queue_size: int,
+        drops: bool,
+    ) -> None:
+        self._source, self._submit, self._room = source, submit, at_once
+        self._queue_size, self._drops = queue_size, drops
+        self._waiting: deque[_Arrival] = deque()
+        self._started: deque[tuple[_Arrival, Future[Any]]] = deque()
+        # One lock for all fields; every change wakes both sides, which test again in a loop.
+        self._changed = Condition()
+        self._closed = self._ended = False
+        self._fault: BaseException | None = None
+
+    def read(self) -> None:
+        """Bring what the source has; the reader's whole life."""
+        items = iter(self._source)
+        try:
             began = perf_counter()
-        target.finish()
-    except ChannelClosedError:
-        # Closed on this thread, because a generator cannot be closed while another thread runs it.
-        getattr(items, "close", lambda: None)()
-    except BaseException as fault:  # the consumer gets to see it
-        target.finish(fault)
+            for number, value in enumerate(items):
+                now = perf_counter()
+                self._bring(_Arrival(number, value, now - began, now))
+                if self._closed:
+                    break
+                began = perf_counter()
+        except BaseException as fault:  # the consumer gets to see it
+            self._fault = fault
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        if self._closed:  # on this thread: a generator cannot be closed while another one runs it
+            getattr(items, "close", lambda: None)()
+
+    def _bring(self, arrival: _Arrival) -> None:
+        with self._changed:
+            while len(self._waiting) >= self._queue_size and not self._closed:
+                if self._drops:
+                    self._waiting.popleft()
+                else:
+                    self._changed.wait()
+            self._waiting.append(arrival)
+            self._start_waiting()
+
+    def _start_waiting(self) -> None:
+        while self._waiting and self._room > 0 and not self._closed:
+            arrival = self._waiting.popleft()
+            self._room -= 1
+            # Without its value: the executor alone holds a shot, until its work is done.
+            self._started.append((replace(arrival, value=None), self._submit(arrival.value)))
+        self._changed.notify_all()
+
+    def wait_for_next(self) -> tuple[_Arrival, Future[Any]] | None:
+        """Return what was started first; behind the last one None, or the source's fault."""
+        with self._changed:
+            while not self._started and not self._ended:
+                self._changed.wait()
+            if self._started:
+                return self._started.popleft()
+            if self._fault is not None:
+                raise self._fault
+            return None
+
+    def make_room(self) -> None:
+        """Say that a result has been taken."""
+        with self._changed:
+            self._room += 1
+            self._start_waiting()
+
+    def skip_to_newest(self, entry: tuple[_Arrival, Future[Any]]) -> tuple[_Arrival, Future[Any]]:
+        """Drop results that were finished while the consumer was busy; what failed is not newer."""
+        with self._changed:
+            while self._started and (later := self._started[0][1]).done() and not later.exception():
+                entry = self._started.popleft()
+                self._room += 1
+            self._start_waiting()
+        return entry
+
+    def close(self) -> None:
+        """Let go of everything; nothing is started from now on."""
+        with self._changed:
+            self._closed = True
+            self._waiting.clear()  # memory is freed even while the reader still runs
+            self._changed.notify_all()
 
 
 @dataclass(frozen=True)
@@ -279,24 +253,26 @@ def stream_clouds(
     policy: Policy = "block",
     executor: Executor | None = None,
     at_once: int | None = None,
-    on_failure: Callable[[int, TofclipError], object] | None = None,
+    on_failure: OnFailure | None = None,
 ) -> Generator[StreamedCloud, None, None]:
-    """Yield the cloud of every shot, as soon as it is made.
+    """Yield the cloud of every shot as soon as it is made; arguments not named here as in
+    `run_in_order`.
 
-    A shot is rectified and recovered, its returns are found and placed in space, while other shots
-    are worked on and the next ones are read.
+    Parameters
+    ----------
+    pipeline : CloudPipeline, optional
+        By default a `RangingPipeline` for the camera that the first shot carries.
+    executor : Executor, optional
+        By default a core for each shot: shared out among all, a shot would be done sooner, but
+        cores would wait for each other. Where a shot begins at what the last one showed, all cores
+        work on it.
+    at_once : int, optional
+        By default as many as there are cores, and one more where all shots are worth waiting for.
 
-    `shots`: A file's, a folder's or an instrument's; it is read on a thread of its own. In the
-    place of a shot that cannot be read may come its error; `pipeline`: by default a
-    `RangingPipeline` for the camera that the first shot carries; `queue_size`: shots that wait for
-    their turn, at most; `policy`: what happens when shots come faster than the clouds are taken;
-    see `run_in_order`; `executor`: where the work is done; `at_once`: shots that the executor has
-    at a time; by default as many as there are cores, and one more where all shots are worth waiting
-    for; `on_failure`: called with the number of a shot of which no cloud can be made, and its
-    error; the stream goes on. By default the error ends it.
-
+    Notes
+    -----
     Memory: ``queue_size + at_once + 1`` shots, one more for each core with what is recovered of it,
-    and what a `RangingPipeline` takes.
+    and what the pipeline takes.
     """
     coming = iter(shots)
     if pipeline is None:
@@ -306,56 +282,41 @@ def stream_clouds(
         if isinstance(first, TofclipError):
             raise first
         pipeline, coming = RangingPipeline.for_shot(first), _prepend_shot(first, coming)
-    # A core for each shot: shared out among all, a shot would be done sooner, but cores would wait
-    # for each other.
     pool: AbstractContextManager[Executor]
-    if executor is None:
-        # Where a shot begins at what the last one showed, all cores work on it.
-        pool = ThreadPoolExecutor(1, "tofclip") if pipeline.in_order else open_worker_pool()
-    else:
+    if executor is not None:
         pool = nullcontext(executor)
-    with pool as workers:
+    else:
+        pool = ThreadPoolExecutor(1, "tofclip") if pipeline.in_order else open_worker_pool()
+    if at_once is None:
         # One more than cores: results are taken in order, and a core whose shot was done before its
-        # turn has the next one at hand. It grows old there, where the channel would have a newer.
-        cores = 1 if pipeline.in_order else thread_count()
-        room = cores + (policy == "block") if at_once is None else at_once
-        work = partial(_make_cloud_or_fail, pipeline)
-        with closing(run_in_order(coming, work, workers, room, queue_size, policy)) as items:
-            for item in items:
-                if isinstance(item.value, TofclipError):
-                    if on_failure is None:
-                        raise item.value
-                    on_failure(item.number, item.value)
-                    continue
-                streak, returns, cloud, seconds = item.value
-                waited = item.latency - sum(seconds.values())
-                steps = {READ: item.read_seconds, WAIT: waited, **seconds}
-                yield StreamedCloud(
-                    cloud, returns, streak, pipeline.rectifier, item.number, steps, item.latency
-                )
+        # turn has the next one at hand. It grows old there, where the queue would have a newer.
+        at_once = (1 if pipeline.in_order else thread_count()) + (policy == "block")
+    work = partial(_make_cloud, pipeline)
+    with (
+        pool as workers,
+        closing(
+            run_in_order(coming, work, workers, at_once, queue_size, policy, on_failure)
+        ) as items,
+    ):
+        for item in items:
+            streak, returns, cloud, seconds = item.value
+            waited = item.latency - sum(seconds.values())
+            steps = {"read": item.read_seconds, "wait": waited, **seconds}
+            yield StreamedCloud(
+                cloud, returns, streak, pipeline.rectifier, item.number, steps, item.latency
+            )
 
 
-_Made = tuple[Streak, Returns, PointCloud, dict[str, float]]
-
-
-def _make_cloud_or_fail(
-    pipeline: CloudPipeline, shot: Streak | TofclipError
-) -> _Made | TofclipError:
-    """Return the error of a shot as a result, which lets those behind it go on."""
-    try:
-        return shot if isinstance(shot, TofclipError) else _make_cloud(pipeline, shot)
-    except TofclipError as fault:
-        return fault
-
-
-def _make_cloud(pipeline: CloudPipeline, shot: Streak) -> _Made:
+def _make_cloud(
+    pipeline: CloudPipeline, shot: Streak
+) -> tuple[Streak, Returns, PointCloud, dict[str, float]]:
     """Return a shot with its returns and cloud, and what each step took, s."""
     ends = [perf_counter()]
     rectified = pipeline.rectify(shot)
     ends.append(perf_counter())
-    found = pipeline.recover_shot(shot, rectified)
+    recovered = pipeline.recover_shot(shot, rectified)
     ends.append(perf_counter())
-    returns = pipeline.search(found)
+    returns = pipeline.search(recovered)
     ends.append(perf_counter())
     cloud = point_cloud(returns)
     ends.append(perf_counter())
