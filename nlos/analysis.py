@@ -18,68 +18,48 @@ from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
+# Steps of the mean signal's profile per width of the wall.
 PROFILE_STEPS_PER_WALL = 50
-"""Steps of the mean signal's profile per width of the wall."""
-
+# The wall's own light arrives within this fraction of the wall's width of its own path.
 FIRST_BOUNCE_WALL_FRACTION = 0.1
-"""The wall's own light arrives within this fraction of the wall's width of its own path."""
-
+# The wall's own light falls at least by this factor before anything else arrives.
 MIN_BOUNCE_RATIO = 3.0
-"""The wall's own light falls at least by this factor before anything else arrives."""
-
+# The wall's own light has faded when it is this fraction of the brightest light that follows.
 FADED_FRACTION = 0.1
-"""The wall's own light has faded when it is this fraction of the brightest light that follows."""
-
-
+# Of the samples, before any light can have come, that tell the noise.
 MIN_EARLY_FRACTION = 0.02
-"""Of the samples, before any light can have come, that tell the noise."""
-
+# Of all frequencies, the highest are taken for noise.
 NOISE_BAND_FRACTION = 0.25
-"""Of all frequencies, the highest are taken for noise."""
-
+# Wall points whose signals are looked at.
 MAX_ANALYSED_POINTS = 1024
-"""Wall points whose signals are looked at."""
-
+# Of the strongest wave's energy, the least that is noise and not the tail of a pulse.
 MIN_FLOOR_RATIO = 1e-5
-"""Of the strongest wave's energy, the least that is noise and not the tail of a pulse."""
-
+# What noise's energy may change from the lower to the upper half of the highest frequencies.
 MAX_FLOOR_SLOPE = 0.15
-"""What noise's energy may change from the lower to the upper half of the highest frequencies."""
-
+# Of the brightest light, what the last bins hold if light still comes.
 LIT_END_FRACTION = 0.01
-"""Of the brightest light, what the last bins hold if light still comes."""
-
+# Signal over noise of all wall points together that a wavelength needs: with it a letter of some
+# hundred resolved voxels stands out. Measured on recorded letters and a mannequin.
 MIN_COHERENT_SIGNAL = 800.0
-"""Signal over noise of all wall points together that a wavelength needs: with it a letter of some
-hundred resolved voxels stands out. Measured on recorded letters and a mannequin."""
-
+# Energy that a wavelength has in the record, relative to before any light can have come.
 MIN_BAND_OVER_EARLY = 3.0
-"""Energy that a wavelength has in the record, relative to before any light can have come."""
-
+# Of a pulse's signal, what may be of waves finer than the wall samples.
 MAX_ALIASED_FRACTION = 0.2
-"""Of a pulse's signal, what may be of waves finer than the wall samples."""
-
+# From one wavelength that is tried to the next.
 WAVELENGTH_STEP_RATIO = 1.05
-"""From one wavelength that is tried to the next."""
-
+# Of the default wavelength in mm, rounded up.
 WAVELENGTH_DIGITS = 2
-"""Of the default wavelength in mm, rounded up."""
-
+# A laser spot farther from the wall than this number of its widths is a mistake.
 MAX_LASER_WALL_WIDTHS = 5.0
-"""A laser spot farther from the wall than this number of its widths is a mistake."""
-
+# A laser spot may stand so far before the foremost or behind the hindmost wall point, and farther
+# by this part of how far aside it is, where the wall is not known.
 MAX_LASER_OFF_WALL_M, LASER_OFF_WALL_SLOPE = 0.05, 0.5
-"""A laser spot may stand so far before the foremost or behind the hindmost wall point, and farther
-by this part of how far aside it is, where the wall is not known."""
-
+# A record that begins after a longer path, m, still holds the ways to the devices.
 MAX_START_M = 1e3
-"""A record that begins after a longer path, m, still holds the ways to the devices."""
-
+# Of the samples, what may have the largest value: light comes during a part of the record.
 MAX_SATURATED_FRACTION = 0.5
-"""Of the samples, what may have the largest value: light comes during a part of the record."""
-
+# Larger samples overflow once they are squared.
 MAX_SIGNAL = 1e30
-"""Larger samples overflow once they are squared."""
 
 
 @dataclass(frozen=True)

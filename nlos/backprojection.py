@@ -35,15 +35,15 @@ from tofclip.arrays import is_numpy
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, split_blocks
 
+# Filtered signals held at a time; and how often, while they are filtered.
 TABLE_BYTES, TABLE_COPIES = 32 << 20, 2
-"""Filtered signals held at a time; and how often, while they are filtered."""
 
 SignalFilter = Callable[[NDArray[np.float32]], Waveforms]
 """Turns signals (points, t) into what is back-projected over the voxels."""
 
+# Voxels treated together: few enough for the cache, rows along x long enough for vector registers,
+# and at a batch of wall points some 30 ms of work, which is how long an interruption waits.
 BRICK_Z, BRICK_Y, BRICK_X = 8, 8, 128
-"""Voxels treated together: few enough for the cache, rows along x long enough for vector registers, and at a batch of
-wall points some 30 ms of work, which is how long an interruption waits."""
 
 
 @dataclass(frozen=True)
@@ -264,21 +264,15 @@ def _add_batch(batch: _Batch, grid: Grid, total: NDArray[np.complex64], progress
     run_blocks(process_block, len(bricks), size=1)
 
 
+# Zeros before and after every signal, where look-ups outside the record end.
 PADDING_SAMPLES = (1, 2)
-"""Zeros before and after every signal, where look-ups outside the record end."""
-
-
+# Standard deviations at which the Laplacian is cut off: at 4, a thousandth of the haze would pass
+# it.
 FILTER_TRUNCATION_SIGMAS = 6.0
-"""Standard deviations at which the Laplacian is cut off: at 4, a thousandth of the haze would pass
-it.
-"""
-
-
+# Volumes in float32 that are held beside the sum while it is sharpened.
 LAPLACIAN_COPIES = 4
-"""Volumes in float32 that are held beside the sum while it is sharpened."""
-
+# All voxels alike: the signals' own scale.
 UNIFORM_WEIGHTING = Weighting(falloff=0.0)
-"""All voxels alike: the signals' own scale."""
 
 
 @dataclass(frozen=True)

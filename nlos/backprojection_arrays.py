@@ -22,11 +22,10 @@ if TYPE_CHECKING:
     from nlos.backprojection import Weighting
 
 
+# Waveforms held at a time.
 TABLE_BYTES = 64 << 20
-"""Waveforms held at a time."""
-
+# A pair of voxel and wall point takes five times as much, in several arrays.
 BYTES_PER_PAIR = 16
-"""A pair of voxel and wall point takes five times as much, in several arrays."""
 
 
 def backproject_on_device(

@@ -18,32 +18,23 @@ from nlos.capture import TimeAxis
 from tofclip.errors import InputError, require_type
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 
+# The pulse's cycles fill its Gaussian envelope from -3 to +3 standard deviations.
 ENVELOPE_SIGMAS = 3.0
-"""The pulse's cycles fill its Gaussian envelope from -3 to +3 standard deviations."""
-
+# Frequencies at which the pulse's spectrum is weaker than this, relative to its peak, are left out.
 BAND_EDGE_LEVEL = 0.01
-"""Frequencies at which the pulse's spectrum is weaker than this, relative to its peak, are left
-out.
-"""
-
+# Room for the pulse before and after the record, in standard deviations of its envelope.
 TAIL_SIGMAS = 4.0
-"""Room for the pulse before and after the record, in standard deviations of its envelope."""
-
+# Bins that are reduced to the few shapes of waves in the band before the Fourier transform.
 BLOCK_BINS = 64
-"""Bins that are reduced to the few shapes of waves in the band before the Fourier transform."""
-
+# Wall points that a thread filters at once.
 POINTS_PER_BLOCK = 1024
-"""Wall points that a thread filters at once."""
-
+# Samples below this fraction of the strongest count as 0: products with them would leave float32's
+# normal numbers, which takes processors ten times as long (tails of simulated pulses are like
+# that).
 NEGLIGIBLE_FRACTION = 1e-20
-"""Samples below this fraction of the strongest count as 0: products with them would leave float32's
-normal numbers, which takes processors ten times as long (tails of simulated pulses are like that).
-"""
-
+# Samples of a filtered signal per carrier wavelength: linear interpolation then errs by 1e-3 rms
+# for 3 cycles.
 SAMPLES_PER_WAVELENGTH = 64
-"""Samples of a filtered signal per carrier wavelength: linear interpolation then errs by 1e-3 rms
-for 3 cycles.
-"""
 
 
 @dataclass(frozen=True)

@@ -74,12 +74,10 @@ class TimeAxis:
 
 FloatArray = NDArray[np.float64]
 
+# m; a wider one was not measured in metres.
 MAX_WALL_EXTENT_M = 1e3
-"""m; a wider one was not measured in metres."""
-
-
+# Wall points whose nearest neighbours tell the sampling of the wall.
 MAX_SPACING_POINTS = 1000
-"""Wall points whose nearest neighbours tell the sampling of the wall."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,10 +391,9 @@ def _to_real_array(values: Any, dtype: type, name: str) -> NDArray[Any]:
 
 
 ATTACHMENT_NAME = "relay_wall"
+# Steps of a time axis may differ from their mean by this fraction; over 1000 bins that stays below
+# one bin.
 STEP_TOLERANCE = 1e-3
-"""Steps of a time axis may differ from their mean by this fraction; over 1000 bins that stays below
-one bin.
-"""
 
 
 def extract_wall_capture(frames: Frames) -> Capture:

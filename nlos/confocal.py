@@ -26,18 +26,15 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 
+# Points may be off the lattice by this fraction of its step.
 LATTICE_TOLERANCE = 0.02
-"""Points may be off the lattice by this fraction of its step."""
-
+# Larger transforms are refused before anything is allocated.
 MEMORY_LIMIT_BYTES = 4 << 30
-"""Larger transforms are refused before anything is allocated."""
-
+# Of the padded box (2 rows, 2 columns, 2 bins): two half spectra in complex64, and the signals and
+# what is cut out of the result besides.
 BYTES_PER_SAMPLE = 12
-"""Of the padded box (2 rows, 2 columns, 2 bins): two half spectra in complex64, and the signals and what is cut out of
-the result besides."""
-
+# A start that lies this close to a whole bin, in bins, is taken for one.
 WHOLE_BIN_TOLERANCE = 1e-3
-"""A start that lies this close to a whole bin, in bins, is taken for one."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,8 @@ from tofclip.files import atomic_path, require_suffix
 if TYPE_CHECKING:
     from nlos.volume import FloatArray, Volume
 
+# m; thickness given to a volume that is a single voxel deep.
 FLAT_VOXEL_M = 1e-3
-"""m; thickness given to a volume that is a single voxel deep."""
 
 
 @dataclass(frozen=True, eq=False)

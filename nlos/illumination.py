@@ -21,11 +21,10 @@ from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
+# Of the wall's width: nearer to each other, a laser spot and a wall point are one.
 SAME_SPOT_FRACTION = 1e-6
-"""Of the wall's width: nearer to each other, a laser spot and a wall point are one."""
-
+# With fewer wall points per laser spot, a wave from each spot is not worth its own field.
 MIN_POINTS_PER_SPOT = 4
-"""With fewer wall points per laser spot, a wave from each spot is not worth its own field."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,8 @@ from tofclip.compiling import compile_and_keep, inlined
 # stay exact.
 compiled = compile_and_keep(fastmath={"contract"}, error_model="numpy")
 
+# Distance in m below which the weight 1 / distance stops growing, for voxels that touch the wall.
 MIN_DISTANCE_M = 1e-3
-"""Distance in m below which the weight 1 / distance stops growing, for voxels that touch the wall."""
-
 COSINE_COEFFICIENTS = (
     1.0,
     -19.739208,
@@ -28,10 +27,9 @@ COSINE_COEFFICIENTS = (
     7.8001313,
     -1.4531124,
 )
+# Polynomials in the square of an angle in turns, fitted to cos(2 pi t) and sin(2 pi t) / t up to
+# half a turn.
 SINE_COEFFICIENTS = (6.2831855, -41.341702, 81.605133, -76.703018, 42.025928, -14.899847, 3.2381375)
-"""Polynomials in the square of an angle in turns, fitted to cos(2 pi t) and sin(2 pi t) / t up to
-half a turn.
-"""
 
 
 @inlined

@@ -23,11 +23,10 @@ Progress = Callable[[int], None]
 interrupt.
 """
 
+# Larger volumes are refused before anything is allocated.
 MEMORY_LIMIT_BYTES = 8 << 30
-"""Larger volumes are refused before anything is allocated."""
-
+# A complex64 sum and its float32 magnitude.
 VOXEL_BYTES = 12
-"""A complex64 sum and its float32 magnitude."""
 
 
 def ignore_progress(_: int) -> None:
@@ -97,6 +96,11 @@ class Plan(ABC):
     def cost(self) -> int:
         """What `image` reports as progress in all: look-ups, or voxels once per laser spot."""
         return self.grid.size
+
+    @property
+    def images(self) -> int:
+        """Images that are made and added up."""
+        return 1
 
     @property
     @abstractmethod

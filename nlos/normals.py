@@ -27,11 +27,10 @@ from tofclip.errors import InputError
 from tofclip.files import atomic_path, require_suffix
 from tofclip.threads import run_blocks, thread_count
 
+# Standard deviation of the neighbourhood whose gradients give a normal, voxels.
 GRADIENT_VOXELS = 2.0
-"""Standard deviation of the neighbourhood whose gradients give a normal, voxels."""
-
+# Neighbouring pixels whose depths differ by more, in voxels, are of different things.
 MAX_STEP_VOXELS = 3.0
-"""Neighbouring pixels whose depths differ by more, in voxels, are of different things."""
 
 
 @dataclass(frozen=True, eq=False)

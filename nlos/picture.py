@@ -23,19 +23,17 @@ if TYPE_CHECKING:
 
 
 PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
+# The depth map shows columns whose brightest voxel has at least this fraction of the volume's
+# brightest.
 DEPTH_THRESHOLD = 0.4
-"""The depth map shows columns whose brightest voxel has at least this fraction of the volume's
-brightest.
-"""
-
 COLOUR_MAP = "inferno"
 DEPTH_COLOUR_MAP = "viridis"
+# Of the colours' scale: a flat thing whose depths are one voxel apart would look like steps.
 MIN_DEPTH_SPAN_VOXELS = 8
-"""Of the colours' scale: a flat thing whose depths are one voxel apart would look like steps."""
 WIDTH_INCHES = 13.0
 DOTS_PER_INCH = 110
+# Bounds of a panel's side relative to the scene's width, so that flat and deep boxes stay legible.
 MIN_PANEL_RATIO, MAX_PANEL_RATIO = 0.3, 2.0
-"""Bounds of a panel's side relative to the scene's width, so that flat and deep boxes stay legible."""
 
 
 def save_picture(volume: Volume, path: str | Path) -> None:

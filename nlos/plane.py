@@ -22,10 +22,9 @@ from typing import Any
 
 FloatArray = NDArray[np.float64]
 
+# Points may be off an even spacing by this fraction of it; at half a wavelength that is a phase of
+# 3 mrad.
 EVENNESS_TOLERANCE = 1e-3
-"""Points may be off an even spacing by this fraction of it; at half a wavelength that is a phase of
-3 mrad.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +96,8 @@ def is_evenly_spaced(axis: FloatArray) -> bool:
     return bool(spacing > 0 and np.max(np.abs(axis - even)) <= EVENNESS_TOLERANCE * spacing)
 
 
+# The virtual plane keeps this far from the foremost wall point, m.
 MIN_GAP_M, MAX_GAP_M = 0.05, 0.1
-"""The virtual plane keeps this far from the foremost wall point, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +119,8 @@ class PlaneField:
     wavenumbers: FloatArray
 
 
+# Of the room beside the straight ways, over how much the field fades towards the rim.
 FADE_FRACTION = 0.75
-"""Of the room beside the straight ways, over how much the field fades towards the rim."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +214,8 @@ def _fit_spacing(widest: float, axis: FloatArray) -> float:
     return step * int(widest / step) if step <= widest else step / int(np.ceil(step / widest))
 
 
+# Coordinates nearer to each other than this fraction of the widest gap are one.
 SAME_COORDINATE_FRACTION = 0.02
-"""Coordinates nearer to each other than this fraction of the widest gap are one."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,6 @@
 """What is done to a capture before it is imaged: cutting the record, putting bins together, gating
-the wall's glare.
-
-All of it where the capture's signal lives.
-
-Pairs of a laser spot and a wall point as confocal ones at their midpoint.
+the wall's glare, all where its signal lives; and taking pairs of a laser spot and a wall point for
+confocal ones at their midpoint.
 
 Light by way of a hidden point at distance R from the midpoint of a pair, in direction u, takes the
 path L of an ellipse with foci h before and behind the midpoint,
@@ -43,7 +40,8 @@ def crop_capture(capture: Capture, nearest: float, farthest: float) -> Capture:
             f"fewer than two bins hold paths from {nearest:.4g} to {farthest:.4g} m; the record runs from "
             f"{paths[0]:.4g} to {paths[-1]:.4g} m"
         )
-    return _select_bins(capture, slice(int(kept[0]), int(kept[-1]) + 1))
+    bins = slice(int(kept[0]), int(kept[-1]) + 1)
+    return replace(capture, signal=capture.signal[bins, ...], start=float(paths[bins.start]))
 
 
 def rebin_capture(capture: Capture, factor: int) -> Capture:
@@ -66,9 +64,7 @@ def rebin_capture(capture: Capture, factor: int) -> Capture:
     # A bin stands for its middle.
     start = capture.start + (factor - 1) / 2 * capture.axis.spacing
     bin_width = factor * capture.bin_width
-    return Capture(
-        xp.sum(kept, axis=1), capture.wall, capture.laser, bin_width, start, capture.provenance
-    )
+    return replace(capture, signal=xp.sum(kept, axis=1), bin_width=bin_width, start=start)
 
 
 def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> Capture:
@@ -91,9 +87,7 @@ def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> C
     if ramp > 0:
         rising = (1 - np.cos(np.pi * np.clip(np.nan_to_num(late) / ramp, 0, 1))) / 2
         signal = signal * capture.device.put(rising.astype(np.float32))
-    return Capture(
-        signal, capture.wall, capture.laser, capture.bin_width, capture.start, capture.provenance
-    )
+    return replace(capture, signal=signal)
 
 
 def flip_capture(capture: Capture, axis: str) -> Capture:
@@ -105,14 +99,7 @@ def flip_capture(capture: Capture, axis: str) -> Capture:
         raise InputError(f"a capture is mirrored along x or y, not along '{axis}'")
     sign = np.ones(3)
     sign["xy".index(axis)] = -1.0
-    return Capture(
-        capture.signal,
-        capture.wall * sign,
-        capture.laser * sign,
-        capture.bin_width,
-        capture.start,
-        capture.provenance,
-    )
+    return replace(capture, wall=capture.wall * sign, laser=capture.laser * sign)
 
 
 def fade_record_end(capture: Capture, length: float) -> Capture:
@@ -128,46 +115,28 @@ def fade_record_end(capture: Capture, length: float) -> Capture:
     weight = (1 - np.cos(np.pi * np.clip((paths[-1] - paths) / length, 0, 1))) / 2
     shape = (-1, *[1] * (capture.wall.ndim - 1))
     signal = capture.signal * capture.device.put(weight.reshape(shape).astype(np.float32))
-    return Capture(
-        signal, capture.wall, capture.laser, capture.bin_width, capture.start, capture.provenance
-    )
+    return replace(capture, signal=signal)
 
 
-def _select_bins(capture: Capture, bins: slice) -> Capture:
-    start = float(capture.axis.paths[bins.start])
-    signal = capture.signal[bins, ...]
-    return Capture(
-        signal, capture.wall, capture.laser, capture.bin_width, start, capture.provenance
-    )
-
-
+# Of the wall's width: a laser spot so near to its wall point makes a confocal pair as it is.
 NEAR_LASER_FRACTION = 0.03
-"""Of the wall's width: a laser spot so near to its wall point makes a confocal pair as it is."""
-
+# So does one as near as this, if that is less than this fraction of the wall's width.
 NEAR_LASER_M, MAX_NEAR_LASER_FRACTION = 0.02, 0.1
-"""So does one as near as this, if that is less than this fraction of the wall's width."""
-
+# Of the wall's width: pairs farther apart are no confocal ones, whatever is done.
 MAX_OFFSET_FRACTION = 0.3
-"""Of the wall's width: pairs farther apart are no confocal ones, whatever is done."""
-
+# Of the distance of neighbouring pairs, the root mean square error of the path. The shortest wave
+# that a confocal scan carries is six of these distances: a phase of 0.1 rad.
 MAX_PATH_ERROR_FRACTION = 0.1
-"""Of the distance of neighbouring pairs, the root mean square error of the path. The shortest wave
-that a confocal scan carries is six of these distances: a phase of 0.1 rad."""
-
+# Wall widths before the wall, where hidden things may be.
 SAMPLED_DEPTHS = (0.4, 0.7, 1.0)
-"""Wall widths before the wall, where hidden things may be."""
-
+# Wall widths beside the wall's middle.
 SAMPLED_PLACES = (-0.4, 0.0, 0.4)
-"""Wall widths beside the wall's middle."""
-
+# Pairs whose errors are looked at.
 MAX_SAMPLED_PAIRS = 500
-"""Pairs whose errors are looked at."""
-
+# Pairs whose signals are read together.
 PAIRS_PER_BLOCK = 256
-"""Pairs whose signals are read together."""
-
+# A bin and a weight; where they take more than this together, they are found again every time.
 BYTES_PER_READING, MAX_KEPT_BYTES = 12, 1 << 28
-"""A bin and a weight; where they take more than this together, they are found again every time."""
 
 
 def join_near_lasers(capture: Capture) -> Capture:

@@ -13,15 +13,13 @@ from nlos.capture import Capture
 from nlos.volume import FloatArray, Volume
 from tofclip.errors import InputError
 
+# Places along each axis at which the ideal image is computed.
 PROFILE_SAMPLES = 401
-"""Places along each axis at which the ideal image is computed."""
-
+# They extend this number of times the width that a small aperture would have, to either side.
 PROFILE_EXTENT_WIDTHS = 4.0
-"""They extend this number of times the width that a small aperture would have, to either side."""
-
 HALF_MAXIMUM = 0.5
+# More wall points than this, evenly picked, change no width.
 MAX_WALL_POINTS = 4096
-"""More wall points than this, evenly picked, change no width."""
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from nlos.volume import Grid, Volume
 from tofclip.errors import InputError, ShapeError
 
+# m; the usual measure for waves of some 12 cm.
 SCORE_RADIUS_M = 0.04
-"""m; the usual measure for waves of some 12 cm."""
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ voxels, the box, and the quickest method. The command line and Python use the sa
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,39 +40,28 @@ from tofclip.errors import InputError
 Limits = tuple[float, float]
 
 VOXELS_PER_WAVELENGTH = 8
+# Of the path of a bin, the voxel of transforms. Half of it is the bin's depth, but a surface that
+# lies between two such voxels would be dimmed and drawn with stripes.
 VOXEL_BIN_FRACTION = 1 / 3
-"""Of the path of a bin, the voxel of transforms. Half of it is the bin's depth, but a surface that
-lies between two such voxels would be dimmed and drawn with stripes."""
-
+# A default voxel is not so small that more would fit along the longest side of the wall.
 MAX_VOXELS_PER_SIDE = 256
-"""A default voxel is not so small that more would fit along the longest side of the wall."""
-
+# Time bins are put together while a wavelength keeps this number: 0.6 % of the carrier is lost.
 BINS_PER_WAVELENGTH = 16
-"""Time bins are put together while a wavelength keeps this number: 0.6 % of the carrier is lost."""
-
+# The Laplacian of filtered back-projection is a quarter of a wavelength wide.
 SIGMAS_PER_WAVELENGTH = 4
-"""The Laplacian of filtered back-projection is a quarter of a wavelength wide."""
-
-
+# A gate that was found opens over this fraction of its length: a sharp edge would be an image.
 GATE_RAMP_FRACTION = 0.25
-"""A gate that was found opens over this fraction of its length: a sharp edge would be an image."""
-
+# Of the record, what fades out where light still comes at its end.
 FADE_FRACTION = 0.1
-"""Of the record, what fades out where light still comes at its end."""
-
-
+# Waves by which the box is looked over are this number of times longer, if the wall is so wide and
+# the voxels more than can be imaged in no time: longer waves see less of few photons.
 SCOUT_WAVELENGTHS, QUICK_SCOUT_VOXELS = 2.0, 1 << 13
-"""Waves by which the box is looked over are this number of times longer, if the wall is so wide and
-the voxels more than can be imaged in no time: longer waves see less of few photons.
-"""
-
-
+# Nearer than this fraction of the gate everything was blanked; the default box begins there.
 GATE_DEPTH_FRACTION = 0.4
-"""Nearer than this fraction of the gate everything was blanked; the default box begins there."""
-
+# A voxel nearer to a wall point than this is on the wall.
 BRIGHTEST_ON_WALL_WAVELENGTHS = 0.5
-"""A voxel nearer to a wall point than this is on the wall."""
 
+# Class in `nlos` by the method's name, and the settings that it takes.
 METHOD_CLASSES = {
     "rsd": ("PlanarRSD", ("wavelength", "cycles", "tolerance")),
     "hybrid": ("Hybrid", ("wavelength", "cycles", "tolerance")),
@@ -80,77 +70,102 @@ METHOD_CLASSES = {
     "lct": ("LightCone", ("signal_to_noise", "falloff")),
     "fk": ("FKMigration", ("falloff",)),
 }
-"""Class in `nlos` by the method's name, and the settings that it takes."""
-
+# They give the same picture; the later one takes more walls and lasers, and more time.
 METHODS_BY_SPEED = ("rsd", "hybrid", "backprojection")
-"""They give the same picture; the later one takes more walls and lasers, and more time."""
-
+# An image by waves takes as long as to back-project this many pairs of spots; measured. One is
+# made for every laser spot, or two for every wall point that sees many.
 MIN_PAIRS_PER_IMAGE = 250
-"""An image by waves takes as long as to back-project this many pairs of spots; measured. One is made
-for every laser spot, or two for every wall point that sees many."""
-
+# They see no finer than the wall's lattice and the time bins, whatever the wavelength.
 TRANSFORM_METHODS = ("lct", "fk")
-"""They see no finer than the wall's lattice and the time bins, whatever the wavelength."""
+
+
+def _setting(
+    unit: str, meaning: str, default: Any = None, shown: str | None = None, **more: Any
+) -> Any:
+    """Declare a setting: its unit, what it means, and in words what it is where it is not given."""
+    shown = str(default) if shown is None else shown
+    metadata = {"unit": unit, "help": meaning, "shown": shown, **more}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True)
 class Settings:
     """How a capture is imaged; None is found by `settings_for`.
 
-    Parameters
-    ----------
-    flip : {"x", "y"}, optional
-        Coordinate that changes sign, where the picture would be mirrored.
-    gate : float, optional
-        m of path after the wall's own light that are blanked; None where nothing is.
-    gate_found : bool
-        Whether the gate was found from the capture.
-    gate_ramp : float, optional
-        m of path over which signals then rise to their whole strength.
-    fade : float, optional
-        m of path before the record's end over which signals fade out.
-    bins_together : int, optional
-        Time bins added up to one before imaging.
-    wavelength : float, optional
-        Carrier of the virtual pulse, m of path.
-    cycles : float
-        Length of the virtual pulse in wavelengths.
-    voxel : float, optional
-        Distance of neighbouring voxels, m.
-    x, y : (float, float), optional
-        First and last voxel across the wall, m.
-    near, far : float, optional
-        First and last depth, m.
-    everywhere : bool
-        Whether all of that box is filled with voxels, not only the part that is bright.
-    method : str, optional
-        One of `METHOD_CLASSES`.
-    tolerance, sigma, falloff, signal_to_noise : float, optional
-        Of the methods; None where the method's own default holds, or does not apply. `sigma` in m.
-    reasons : mapping of str to str
-        Why the settings that were found are what they are, by their names.
+    What is done to the capture first: `flip`, `gate`, `gate_ramp`, `fade`, `bins_together`; the
+    virtual pulse: `wavelength`, `cycles`; the voxels: `voxel`, and their box, `x`, `y`, `near`,
+    `far`, `everywhere`; the `method`, one of `METHOD_CLASSES`, and its own settings, of which None
+    is left to it: `tolerance`, `sigma`, `falloff`, `signal_to_noise`. The metadata of each field
+    hold its ``unit``, its meaning (``help``) and, in words, the default (``shown``). `gate_found`
+    tells whether the gate was found from the capture, and `reasons`, by the names of settings, why
+    those that were found are what they are.
     """
 
-    flip: str | None = None
-    gate: float | None = None
+    wavelength: float | None = _setting(
+        "m",
+        "Carrier of the virtual pulse.",
+        shown="the shortest that wall points and time bins carry, and that stands out of the noise",
+    )
+    cycles: float = _setting("wavelengths", "Length of the virtual pulse in wavelengths.", 3.0)
+    voxel: float | None = _setting(
+        "m",
+        "Distance of neighbouring voxels.",
+        shown="an eighth of the wavelength; lct, fk: a third of the path of a bin",
+    )
+    near: float | None = _setting(
+        "m",
+        "First depth.",
+        shown="one voxel beyond the middle of the wall's relief, and of the gate",
+    )
+    far: float | None = _setting(
+        "m", "Last depth.", shown="as far as the record reaches, at most two wall widths"
+    )
+    x: tuple[float, float] | None = _setting("m", "First and last x.", shown="the wall's")
+    y: tuple[float, float] | None = _setting(
+        "m", "First and last y; y points down.", shown="the wall's"
+    )
+    everywhere: bool = _setting(
+        "",
+        "Fill all of that box with voxels, not only the part that coarse ones find bright.",
+        False,
+        shown="no",
+    )
+    flip: str | None = _setting(
+        "", "Mirror the picture along x or y.", shown="no", choices=("x", "y")
+    )
+    gate: float | None = _setting(
+        "m",
+        "Blank what arrives up to so much path after the wall's own light.",
+        shown="until it has faded, where the record holds it",
+    )
+    gate_ramp: float | None = _setting(
+        "m", "Signals rise over so much path after the gate.", shown="a quarter of a gate found"
+    )
+    fade: float | None = _setting(
+        "m",
+        "Signals fade out over so much path before the record ends.",
+        shown="a tenth of the record, where light still comes then",
+    )
+    bins_together: int | None = _setting(
+        "bins", "Time bins added up to one before imaging.", shown="while a wavelength keeps 16"
+    )
+    tolerance: float | None = _setting(
+        "1", "Error allowed for the sake of speed: rsd, hybrid.", shown="0.01"
+    )
+    sigma: float | None = _setting(
+        "m",
+        "Width of the Laplacian: filtered-backprojection.",
+        shown="a quarter of the wavelength",
+    )
+    falloff: float | None = _setting(
+        "1",
+        "How light fades with distance: lct, fk; 4 for matte things, 2 for retroreflecting ones.",
+        shown="4",
+    )
+    signal_to_noise: float | None = _setting("1", "Of the Wiener filter: lct.", shown="0.8")
+    method: str | None = _setting("", "How the hidden scene is imaged.", shown="the quickest")
     gate_found: bool = False
-    gate_ramp: float | None = None
-    fade: float | None = None
-    bins_together: int | None = None
-    wavelength: float | None = None
-    cycles: float = 3.0
-    voxel: float | None = None
-    x: Limits | None = None
-    y: Limits | None = None
-    near: float | None = None
-    far: float | None = None
-    everywhere: bool = False
-    method: str | None = None
-    tolerance: float | None = None
-    sigma: float | None = None
-    falloff: float | None = None
-    signal_to_noise: float | None = None
-    reasons: Mapping[str, str] = field(default_factory=dict)
+    reasons: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def box(self) -> tuple[Limits, Limits, Limits]:
@@ -236,8 +251,7 @@ class Settings:
                 plan = self.make_method(name).plan(capture, grid)
             except InputError:
                 continue
-            images = getattr(plan, "images", 1)
-            if images == 1 or images * MIN_PAIRS_PER_IMAGE <= len(capture.points):
+            if plan.images == 1 or plan.images * MIN_PAIRS_PER_IMAGE <= len(capture.points):
                 return name, plan
         return last, self.make_method(last).plan(capture, grid)
 
@@ -285,8 +299,7 @@ def settings_for(capture: Capture, **given: Any) -> Settings:
         # Which walls a method takes does not depend on the voxels: coarse ones are planned quickly.
         prepared = found.prepare(capture)
         scout, grid = find_scout(prepared, found) or (found, found.grid())
-        name, _ = scout.plan_quickest(prepared, grid)
-        found = found.with_method(name)
+        found = found.with_method(scout.plan_quickest(prepared, grid)[0])
     return found
 
 
@@ -295,7 +308,9 @@ def complete_settings(capture: Capture, **given: Any) -> Settings:
     # As recorded: midpoints would hide that lasers stand off the wall.
     require_plausible(choose_roles(capture))
     capture = choose_roles(join_near_lasers(capture))
-    found = _complete_gate(capture, Settings(**given))
+    found = Settings(**given)
+    if found.gate is None:
+        found = _complete(found, _find_gate(capture, found))
     gated = replace(found, bins_together=1).prepare(capture)
     if found.fade is None and find_lit_end(gated):
         fade = FADE_FRACTION * float(np.ptp(capture.axis.paths))
@@ -307,21 +322,20 @@ def complete_settings(capture: Capture, **given: Any) -> Settings:
         )
     require_usable_cycles(capture, found.cycles)
     if found.wavelength is None:
-        wavelength, reason = choose_wavelength(gated, found.cycles)
-        found = _add(found, "wavelength", wavelength, reason)
+        found = _add(found, "wavelength", *choose_wavelength(gated, found.cycles))
     else:
         require_usable_wavelength(capture, found.wavelength, found.cycles)
-    return _complete_box(gated, _complete_sampling(capture, found))
+    for rule in (_find_bins, _find_voxel, _find_sigma):
+        found = _complete(found, rule(capture, found))
+    return _complete_box(gated, found)
 
 
 def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | None:
     """Return settings and coarse voxels with which all of the box is looked over quickly.
 
     Waves twice as long have an eighth of the work, on voxels of their half; small boxes are looked
-    over with the waves themselves.
-
-    `settings`: complete but for the method. Returns (Settings, Grid): none where the voxels asked
-    for are no finer, or all of the box is wanted.
+    over with the waves themselves. `settings`: complete but for the method. Returns none where the
+    voxels asked for are no finer, or all of the box is wanted.
     """
     wavelength = settings.wavelength or 0.0
     if settings.everywhere or (settings.voxel or 0.0) >= wavelength / 2:
@@ -329,21 +343,18 @@ def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | 
     quick = settings.grid(wavelength / 2)
     if math.prod(quick.shape) <= QUICK_SCOUT_VOXELS:
         return settings, quick
-    usable = min(
-        find_longest_wavelength(capture), float(np.ptp(capture.axis.paths)) / settings.cycles
-    )
+    record = float(np.ptp(capture.axis.paths))
+    usable = min(find_longest_wavelength(capture), record / settings.cycles)
     longer = max(wavelength, min(SCOUT_WAVELENGTHS * wavelength, usable))
     return replace(settings, wavelength=longer), settings.grid(longer / 2)
 
 
 def find_bright_box(settings: Settings, scouted: Volume) -> Settings:
-    """Return the settings with the box that holds everything bright in a coarse volume.
-
-    `scouted`: by `find_scout`.
+    """Return the settings with the box that holds everything bright in a coarse volume, which was
+    imaged as `find_scout` says.
     """
-    part = Grid.around(scouted, _voxel_size(settings))
-    x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (part.x, part.y, part.z))
-    return replace(settings, x=x, y=y, near=z[0], far=z[1], everywhere=True)
+    x, y, (near, far) = _find_ends(Grid.around(scouted, _voxel_size(settings)))
+    return replace(settings, x=x, y=y, near=near, far=far, everywhere=True)
 
 
 def is_brightest_on_wall(volume: Volume, capture: Capture, wavelength: float) -> bool:
@@ -360,49 +371,68 @@ def _voxel_size(settings: Settings) -> float:
     return math.nan if settings.voxel is None else settings.voxel
 
 
+def _find_ends(grid: Grid) -> tuple[Limits, Limits, Limits]:
+    x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (grid.x, grid.y, grid.z))
+    return x, y, z
+
+
+Found = Iterator[tuple[str, Any, str]]
+"""Settings that a rule finds: name, value, and the reason, which may be empty."""
+
+
+def _complete(settings: Settings, found: Found) -> Settings:
+    """Take what a rule finds for what is not given."""
+    for name, value, reason in found:
+        if (given := getattr(settings, name)) is None or given is False:
+            settings = _add(settings, name, value, reason)
+    return settings
+
+
 def _add(settings: Settings, name: str, value: Any, reason: str) -> Settings:
     """Return the settings with one more that was found, and why."""
-    return replace(settings, **{name: value}, reasons={**settings.reasons, name: reason})
+    reasons = {**settings.reasons, name: reason} if reason else settings.reasons
+    return replace(settings, **{name: value}, reasons=reasons)
 
 
-def _complete_gate(capture: Capture, settings: Settings) -> Settings:
-    if settings.gate is not None:
-        return settings
+def _find_gate(capture: Capture, settings: Settings) -> Found:
     bounce = find_first_bounce(capture)
     if bounce is None:
-        return _add(settings, "gate", None, "no light of the wall's own is in the record")
-    reason = (
-        f"the wall's own light is in the record, {bounce.ratio:.3g} times what follows; "
-        f"{bounce.end:.3g} m later it has faded"
-    )
-    ramp = GATE_RAMP_FRACTION * bounce.end if settings.gate_ramp is None else settings.gate_ramp
-    return replace(_add(settings, "gate", bounce.end, reason), gate_found=True, gate_ramp=ramp)
+        yield "gate", None, "no light of the wall's own is in the record"
+        return
+    reason = f"the wall's own light is in the record, {bounce.ratio:.3g} times what follows; "
+    yield "gate", bounce.end, f"{reason}{bounce.end:.3g} m later it has faded"
+    yield "gate_ramp", GATE_RAMP_FRACTION * bounce.end, ""
+    yield "gate_found", True, ""
 
 
-def _complete_sampling(capture: Capture, settings: Settings) -> Settings:
-    """Find time bins and voxels: of what the wavelength resolves, or for methods without a virtual
-    pulse of what the wall's lattice does.
-    """
-    wavelength = settings.wavelength or math.nan
-    by_lattice = settings.method in TRANSFORM_METHODS and capture.spacing < math.inf
-    if settings.bins_together is None:
-        finest = capture.spacing if by_lattice else wavelength / BINS_PER_WAVELENGTH
-        bins = max(1, min(int(finest / capture.axis.spacing + 1e-9), capture.axis.bins // 2))
-        reason = (
-            "path per bin as neighbouring wall points are apart"
-            if by_lattice
-            else f"{BINS_PER_WAVELENGTH} bins per wavelength, or as recorded"
-        )
-        settings = _add(settings, "bins_together", bins, reason)
-    if settings.voxel is None:
-        extent = float(np.ptp(capture.points, axis=0).max())
-        depth = (settings.bins_together or 1) * capture.axis.spacing * VOXEL_BIN_FRACTION
-        wanted = depth if by_lattice else wavelength / VOXELS_PER_WAVELENGTH
-        reason = "a third of the path of a bin" if by_lattice else "an eighth of the wavelength"
-        settings = _add(settings, "voxel", max(wanted, extent / MAX_VOXELS_PER_SIDE), reason)
-    if settings.sigma is None:
-        settings = replace(settings, sigma=wavelength / SIGMAS_PER_WAVELENGTH)
-    return settings
+def _by_lattice(capture: Capture, settings: Settings) -> bool:
+    """Whether the wall's lattice, not a virtual pulse, tells what is resolved."""
+    return settings.method in TRANSFORM_METHODS and capture.spacing < math.inf
+
+
+def _find_bins(capture: Capture, settings: Settings) -> Found:
+    if _by_lattice(capture, settings):
+        finest, reason = capture.spacing, "path per bin as neighbouring wall points are apart"
+    else:
+        finest = (settings.wavelength or math.nan) / BINS_PER_WAVELENGTH
+        reason = f"{BINS_PER_WAVELENGTH} bins per wavelength, or as recorded"
+    bins = min(int(finest / capture.axis.spacing + 1e-9), capture.axis.bins // 2)
+    yield "bins_together", max(1, bins), reason
+
+
+def _find_voxel(capture: Capture, settings: Settings) -> Found:
+    if _by_lattice(capture, settings):
+        path = (settings.bins_together or 1) * capture.axis.spacing
+        wanted, reason = path * VOXEL_BIN_FRACTION, "a third of the path of a bin"
+    else:
+        wanted = (settings.wavelength or math.nan) / VOXELS_PER_WAVELENGTH
+        reason = "an eighth of the wavelength"
+    extent = float(np.ptp(capture.points, axis=0).max())
+    yield "voxel", max(wanted, extent / MAX_VOXELS_PER_SIDE), reason
+
+
+def _find_sigma(capture: Capture, settings: Settings) -> Found:
+    yield "sigma", (settings.wavelength or math.nan) / SIGMAS_PER_WAVELENGTH, ""
 
 
 def _complete_box(capture: Capture, settings: Settings) -> Settings:
@@ -417,16 +447,15 @@ def _complete_box(capture: Capture, settings: Settings) -> Settings:
         raise InputError(
             f"a box from z = {near:.4g} m on lies beyond the record, whose paths end at {last:.4g} m"
         )
-    front = Grid.in_front_of(capture, voxel, near, settings.far)
-    x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (front.x, front.y, front.z))
-    completed = replace(
-        settings,
-        x=x if settings.x is None else settings.x,
-        y=y if settings.y is None else settings.y,
-        near=z[0] if settings.near is None else settings.near,
-        far=z[1] if settings.far is None else settings.far,
+    x, y, (first, last) = _find_ends(Grid.in_front_of(capture, voxel, near, settings.far))
+    ends = (("x", x, ""), ("y", y, ""), ("near", first, ""), ("far", last, ""))
+    completed = _complete(settings, iter(ends))
+    # The longest path from a laser spot by way of the box to a wall point is one by way of corners.
+    corners = np.array(np.meshgrid(*completed.box)).reshape(3, -1).T
+    longest = sum(
+        max(float(np.linalg.norm(spots - corner, axis=1).max()) for corner in corners)
+        for spots in (capture.lasers, capture.points)
     )
-    longest = _find_longest_path(capture, completed)
     if capture.start > longest:
         raise InputError(
             f"the record begins at a path of {capture.start:.4g} m, but none by way of the box up to "
@@ -434,13 +463,3 @@ def _complete_box(capture: Capture, settings: Settings) -> Settings:
             "devices off, or choose a farther box"
         )
     return completed
-
-
-def _find_longest_path(capture: Capture, settings: Settings) -> float:
-    """Longest path from a laser spot by way of the box to a wall point at most, m."""
-    corners = np.array(np.meshgrid(*settings.box)).reshape(3, -1).T
-    legs = [
-        max(float(np.linalg.norm(spots - corner, axis=1).max()) for corner in corners)
-        for spots in (capture.lasers, capture.points)
-    ]
-    return sum(legs)

@@ -86,14 +86,11 @@ class DepthAverage:
         return Volume(brightness, field.grid, field.provenance)
 
 
+# Instants of one depth in memory at once.
 INSTANTS_PER_BLOCK = 32
-"""Instants of one depth in memory at once."""
-
+# Instants of a time gate per standard deviation of the pulse's envelope: its sum is then exact to
+# single precision.
 SAMPLES_PER_SIGMA = 2
-"""Instants of a time gate per standard deviation of the pulse's envelope: its sum is then exact to
-single precision.
-"""
-
 NO_DELAY = np.zeros(2)
 
 FieldCallback = Callable[[int, slice, NDArray[np.complex64]], None]

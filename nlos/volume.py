@@ -26,25 +26,20 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
+# Deeper than this a wall is too narrow an aperture to resolve much.
 MAX_DEPTH_WALL_WIDTHS = 2.0
-"""Deeper than this a wall is too narrow an aperture to resolve much."""
-
+# No computer holds an image of more; the axes themselves would fill its memory before any plan
+# could say so.
 MAX_VOXELS_PER_AXIS = 1 << 20
-"""No computer holds an image of more; the axes themselves would fill its memory before any plan could
-say so."""
-
+# Of the longest way, what a window about wall points holds at least, and how much more for each
+# digit of the tolerance: where the plane stands close to the wall, crossings are wide beside their
+# distance. Measured with noise, which comes by all ways alike; errors of 1e-2 and 1e-3 ask for 0.7
+# and 0.9.
 MIN_WALL_FRACTION, WALL_FRACTION_PER_DIGIT = 0.3, 0.2
-"""Of the longest way, what a window about wall points holds at least, and how much more for each
-digit of the tolerance: where the plane stands close to the wall, crossings are wide beside their
-distance. Measured with noise, which comes by all ways alike; errors of 1e-2 and 1e-3 ask for 0.7
-and 0.9.
-"""
-
+# Of the fade towards the plane's rim, how wide a rim carries too little to be told from an image of
+# it a period away: at most, and how much less for each digit of the tolerance. Measured with noise;
+# none where the error is 1e-3.
 MAX_RIM_FRACTION, RIM_FRACTION, RIM_FRACTION_PER_DIGIT = 0.7, 1.5, 0.5
-"""Of the fade towards the plane's rim, how wide a rim carries too little to be told from an image
-of it a period away: at most, and how much less for each digit of the tolerance. Measured with
-noise; none where the error is 1e-3.
-"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ from tofclip.io.archive import Archive, ArchiveEntry
 from tofclip.io.mat import list_mat_variables
 from tofclip.storage import HDF5_SIGNATURE
 
+# Of a v7.3 file, before the HDF5 data begin.
 MATLAB_HEADER_BYTES = 512
-"""Of a v7.3 file, before the HDF5 data begin."""
 
 Entries = Mapping[str, ArchiveEntry]
 

@@ -49,8 +49,8 @@ def read_native(path: str | Path) -> Capture | None:
 
 
 ZIP_SIGNATURE = b"PK\x03\x04"
+# Of .mat files from version 5 to 7.3.
 MATLAB_SIGNATURE = b"MATLAB"
-"""Of .mat files from version 5 to 7.3."""
 
 Reader = Callable[[NamedArrays], Capture]
 

@@ -71,8 +71,8 @@ from tofclip.errors import FileFormatError, InputError
 from tofclip.files import translate_read_errors
 from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
 
+# Cosine beyond which a direction counts as z.
 MIN_Z_COSINE = 1 - 1e-6
-"""Cosine beyond which a direction counts as z."""
 
 
 def rotate_to_scene(capture: Capture, towards_scene: NDArray[np.float64]) -> Capture:
@@ -106,18 +106,14 @@ SETUP_FILE = "experimental_setup.m"
 STEP_NAMES = ("bx", "by", "bz")
 SETUP_NAMES = ("c", "delta_t", *STEP_NAMES)
 
+# Where no script says otherwise.
 BIN_WIDTH_S = 32e-12
-"""Where no script says otherwise."""
-
+# Where the script's c is larger, its delta_t is in s; else c is 1 and delta_t is a path, m.
 MIN_SPEED_IN_SECONDS = 1e8
-"""Where the script's c is larger, its delta_t is in s; else c is 1 and delta_t is a path, m."""
-
+# Whole numbers that reach over less than this may be metres.
 MIN_LATTICE_EXTENT = 8
-"""Whole numbers that reach over less than this may be metres."""
-
+# Turns (depth, to the left, up) into (x to the right, y down, z into the scene).
 TO_SCENE = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""Turns (depth, to the left, up) into (x to the right, y down, z into the scene)."""
-
 MAX_SCRIPT_BYTES = 1 << 20
 
 OPERATIONS: Mapping[type[ast.operator], Callable[[float, float], float]] = {
@@ -219,8 +215,8 @@ def _read_points(fields: NamedArrays, name: str, pairs: int) -> NDArray[np.float
 
 LIGHT_CONE_BIN_WIDTH_S = 4e-12
 MIGRATION_BIN_WIDTH_S = 32e-12
+# m
 MIGRATION_WALL_WIDTH_M = 2.0
-"""m"""
 
 
 def read_light_cone_data(fields: NamedArrays) -> Capture:
@@ -315,19 +311,16 @@ def match_lasers_to_sensors(
     )
 
 
+# Path per bin, m.
 SURFACE_OPTIMISATION_BIN_M = 1.2e-3
-"""Path per bin, m."""
-
 PAIR_BIN_WIDTH_S = 32e-12
 
+# About z: from x to the left and y up to x to the right and y down.
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
-"""About z: from x to the left and y up to x to the right and y down."""
-
+# Of a bin's width, what even bins may differ by: times are often rounded.
 EVEN_BINS_TOLERANCE = 1e-3
-"""Of a bin's width, what even bins may differ by: times are often rounded."""
-
+# Uneven bins become at most this number of times as many even ones.
 MAX_EVEN_BINS_RATIO = 8
-"""Uneven bins become at most this number of times as many even ones."""
 
 
 def read_numpy_archive(fields: NamedArrays) -> Capture:

@@ -18,11 +18,9 @@ from nlos.illumination import IlluminationGroup
 from nlos.plane import WallLattice
 from tofclip.arrays import Array, ComputeDevice, namespace
 
+# Bytes of the largest array that is made at a time: on a processor, with its caches, and on a GPU,
+# with its thousands of lanes.
 CPU_CHUNK_BYTES, GPU_CHUNK_BYTES = 8 << 20, 256 << 20
-"""Bytes of the largest array that is made at a time: on a processor, with its caches, and on a GPU,
-with its thousands of lanes.
-"""
-
 SINGLE_PRECISION_DTYPES = {"f": np.float32, "c": np.complex64}
 
 

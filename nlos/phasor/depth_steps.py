@@ -32,13 +32,11 @@ from tofclip.threads import split_blocks
 
 FloatArray = NDArray[np.float64]
 
+# Chebyshev nodes over the distances on a plane; enough for a band that turns by 25 periods across
+# them.
 CHEBYSHEV_NODES = 64
-"""Chebyshev nodes over the distances on a plane; enough for a band that turns by 25 periods across
-them.
-"""
-
+# Samples of a distance function; linear interpolation between them errs by 1e-4 at 6 periods.
 TABLE_SAMPLES = 512
-"""Samples of a distance function; linear interpolation between them errs by 1e-4 at 6 periods."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,13 +116,11 @@ def _build_continuation_matrix(odd: int) -> FloatArray:
 
 IntArray = NDArray[np.int64]
 
+# Of the error allowed, what weak plane waves that are left out may hold. Half of it or less is an
+# error of voxels: the rest lies on the window's edge, beyond most of them.
 WAVES_ERROR_FRACTION = 0.8
-"""Of the error allowed, what weak plane waves that are left out may hold. Half of it or less is an
-error of voxels: the rest lies on the window's edge, beyond most of them.
-"""
-
+# Lateral wavenumbers nearer to each other are one, rad/m.
 LATERAL_ROUNDING = 1e-9
-"""Lateral wavenumbers nearer to each other are one, rad/m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,8 +185,8 @@ class PlaneWaves:
         return self._sorted_waves[2]
 
 
+# A complex64 phasor of a plane wave at one frequency.
 BYTES_PER_WAVE = 8
-"""A complex64 phasor of a plane wave at one frequency."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,21 +296,17 @@ class DiffractionPlan:
 # travel, alpha that of the laser's wave. A band has few f, so that depths finer than half their
 # period are redundant: they follow from their neighbours, with an error that theory gives.
 
+# Spacings of computed depths that are tried, relative to that of the wanted ones.
 SPACING_RATIOS = (4.0, 3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5)
-"""Spacings of computed depths that are tried, relative to that of the wanted ones."""
-
+# Computed depths on either side that an interpolated one takes.
 NEIGHBOURS = 6
-"""Computed depths on either side that an interpolated one takes."""
-
+# Wanted depths that are interpolated by one matrix product.
 DEPTHS_PER_BLOCK = 16
-"""Wanted depths that are interpolated by one matrix product."""
-
+# Cosines of each angle, and bins of f, that stand for the spectrum along z.
 ANGLES, AXIAL_BINS = 24, 128
-"""Cosines of each angle, and bins of f, that stand for the spectrum along z."""
-
+# Independent errors that computed depths may have, relative to the error allowed: interpolation
+# does not enlarge them.
 NOISE_FRACTION = 0.03
-"""Independent errors that computed depths may have, relative to the error allowed: interpolation
-does not enlarge them."""
 
 
 @dataclass(frozen=True, eq=False)

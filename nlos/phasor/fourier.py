@@ -37,13 +37,11 @@ pyfftw: Any = _import_fftw()
 
 ComplexArray = NDArray[np.complex64]
 
+# FFTW plans one transform at a time.
 PLANNING_LOCK = threading.Lock()
-"""FFTW plans one transform at a time."""
-
+# Plans that are measured are no faster here, and differ from run to run, as the last bits of an
+# image would.
 FFTW_FLAGS = ("FFTW_ESTIMATE",)
-"""Plans that are measured are no faster here, and differ from run to run, as the last bits of an
-image would.
-"""
 
 
 class FourierPlan(Protocol):

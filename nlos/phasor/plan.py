@@ -54,15 +54,13 @@ from nlos.volume import FloatArray, Grid, StraightWays, Volume
 from tofclip.arrays import Array
 from tofclip.errors import InputError
 
+# Per voxel: a complex64 sum, and its float32 magnitude.
 SUM_BYTES, MAGNITUDE_BYTES = 8, 4
-"""Per voxel: a complex64 sum, and its float32 magnitude."""
-
+# Per voxel, at most: the complex64 images of those depths that are computed, from which the others
+# follow.
 COMPUTED_BYTES = 8
-"""Per voxel, at most: the complex64 images of those depths that are computed, from which the others
-follow."""
-
+# Spectra are held before and after they are transformed.
 SPECTRUM_COPIES = 2
-"""Spectra are held before and after they are transformed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -444,19 +442,16 @@ def require_even_grid(grid: Grid) -> None:
             )
 
 
+# Relative error of the image where one Fresnel zone has room on the virtual plane beside the
+# straight ways; that of n zones is n^3 times less. Measured, for fields that fade as
+# `VirtualPlane`'s.
 RIM_ERROR = 0.016
-"""Relative error of the image where one Fresnel zone has room on the virtual plane beside the
-straight ways; that of n zones is n^3 times less. Measured, for fields that fade as `VirtualPlane`'s.
-"""
-
+# Of the error allowed, what the virtual plane's rim may take.
 RIM_ERROR_FRACTION = 0.3
-"""Of the error allowed, what the virtual plane's rim may take."""
-
+# Of the error allowed, what the way from the wall to the plane may take.
 WALL_TO_PLANE_ERROR_FRACTION = 0.6
-"""Of the error allowed, what the way from the wall to the plane may take."""
-
+# Of all time, what the way from the wall to the plane takes, roughly.
 WALL_TO_PLANE_TIME_FRACTIONS = {"spectral": 0.4, "time": 0.95}
-"""Of all time, what the way from the wall to the plane takes, roughly."""
 
 
 @dataclass(frozen=True)

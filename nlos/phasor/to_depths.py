@@ -150,10 +150,9 @@ class DepthPropagator:
         ), turn.ravel()
 
 
+# Transfer functions and illuminations of all depths are kept for the next field if they take no
+# more.
 MAX_CACHE_BYTES = 1 << 30
-"""Transfer functions and illuminations of all depths are kept for the next field if they take no
-more.
-"""
 
 
 @dataclass(frozen=True, eq=False)

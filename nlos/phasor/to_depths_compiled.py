@@ -228,13 +228,11 @@ class _AxisTransform:
         ]
 
 
+# Spectra that are transformed at a time: they stay in a core's second cache, and calls stay few.
 CACHE_BYTES = 1 << 19
-"""Spectra that are transformed at a time: they stay in a core's second cache, and calls stay few."""
-
+# How many operations of a matrix product take as long as one of a pruned Fourier transform;
+# measured.
 PRODUCT_SPEEDUP = 3
-"""How many operations of a matrix product take as long as one of a pruned Fourier transform;
-measured.
-"""
 
 
 WaveIndices = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -397,20 +395,16 @@ def _pad_to_vector(count: int) -> int:
 Field = NDArray[np.complex64]
 FloatParts = NDArray[np.float32]
 
+# Depths that a group of plane waves is propagated to while its spectrum is in cache.
 PLANES_PER_BLOCK = 2
-"""Depths that a group of plane waves is propagated to while its spectrum is in cache."""
-
+# Half the range of distances from the laser spot to a plane is rounded up to a power of the first,
+# and at least the second, m.
 HALF_RANGE_RATIO, MIN_HALF_RANGE_M = 1.05, 1e-3
-"""Half the range of distances from the laser spot to a plane is rounded up to a power of the first, and at least the
-second, m."""
-
+# Of the error allowed, what splitting the illumination may take; where little is hidden it weighs
+# more.
 ILLUMINATION_ERROR_FRACTION = 0.25
-"""Of the error allowed, what splitting the illumination may take; where little is hidden it weighs
-more.
-"""
-
+# Of the error allowed, what interpolation between depths may take.
 DEPTH_ERROR_FRACTION = 0.35
-"""Of the error allowed, what interpolation between depths may take."""
 
 
 @dataclass(frozen=True, eq=False)

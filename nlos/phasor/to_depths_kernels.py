@@ -13,23 +13,19 @@ compiled = compile_and_keep(fastmath=SUMS_IN_ANY_ORDER, error_model="numpy")
 
 part_of_loop = compile_as_part(_nrt=False)
 
+# Side of the squares that matrices are transposed in: two cache lines of complex64.
 TILE_SIDE = 16
-"""Side of the squares that matrices are transposed in: two cache lines of complex64."""
-
+# Nodes that the interpolation along the radius takes.
 TAPS = 6
-"""Nodes that the interpolation along the radius takes."""
-
+# Plane waves treated together: neighbours in lateral wavenumber, two full vectors of 512 bits, and
+# their mirror images in the axes.
 LANES, MIRROR_IMAGES = 32, 4
-"""Plane waves treated together: neighbours in lateral wavenumber, two full vectors of 512 bits, and their mirror images
-in the axes."""
-
+# Real numbers of such a group at one frequency.
 GROUP_FLOATS = 2 * MIRROR_IMAGES * LANES
-"""Real numbers of such a group at one frequency."""
-
 WAVE_LANES = np.uintp(LANES)
 
+# Frequencies of the transfer function that stay in registers.
 FREQUENCY_STEPS = 8
-"""Frequencies of the transfer function that stay in registers."""
 
 
 @compiled

@@ -18,30 +18,23 @@ from nlos.plane import Plane, axis_step
 FloatArray = NDArray[np.float64]
 Sides = tuple[float, float]
 
+# Where the window begins to fall at least, relative to the largest distance of a source and a
+# target, and how much farther out for each digit of the tolerance. Between two squares few pairs
+# are so far apart: independent signals (noise) miss 0.1 % of their amplitude beyond 0.88, and 0.01
+# % beyond 0.94.
 INNER_RADIUS_FRACTION, INNER_RADIUS_FRACTION_PER_DIGIT = 0.76, 0.06
-"""Where the window begins to fall at least, relative to the largest distance of a source and a
-target, and how much farther out for each digit of the tolerance. Between two squares few pairs are
-so far apart: independent signals (noise) miss 0.1 % of their amplitude beyond 0.88, and 0.01 %
-beyond 0.94.
-"""
-
+# Width of the window's edge, relative to the largest distance along one axis.
 MIN_EDGE_FRACTION, MAX_EDGE_FRACTION = 0.25, 0.5
-"""Width of the window's edge, relative to the largest distance along one axis."""
-
+# Lengths of single-precision Fourier transforms, among the multiples of 16, that take no longer
+# than a greater one; others, such as 176 and 288, take twice as long. Measured. From here on they
+# are powers of 2, and five times such.
 FAST_LENGTHS = (16, 32, 48, 64, 80, 96, 128, 144, 160, 192, 240, 256, 320, 384, 400, 512, 640)
-"""Lengths of single-precision Fourier transforms, among the multiples of 16, that take no longer
-than a greater one; others, such as 176 and 288, take twice as long. Measured. From here on they
-are powers of 2, and five times such.
-"""
-
+# Of the window's edge, an error function, and how much more for each digit of the tolerance: for
+# 1e-2 it is cut off at 1 - 0.012 and at 0.012, for 1e-4 at a tenth of that; and of one that is not
+# cut off.
 STEEPNESS, STEEPNESS_PER_DIGIT, WHOLE_STEEPNESS = 1.1, 0.25, 4.0
-"""Of the window's edge, an error function, and how much more for each digit of the tolerance: for
-1e-2 it is cut off at 1 - 0.012 and at 0.012, for 1e-4 at a tenth of that; and of one that is not
-cut off.
-"""
-
+# complex64 numbers in 64 bytes: where vector instructions like rows to start.
 VECTOR_LENGTH = 8
-"""complex64 numbers in 64 bytes: where vector instructions like rows to start."""
 
 
 @dataclass(frozen=True)
@@ -149,17 +142,14 @@ def find_fast_length(count: float) -> int:
     return min(length for length in (*FAST_LENGTHS, *longer) if length >= count)
 
 
+# Nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius;
+# interpolation then errs by 1.6e-4 in noise, which comes from the rim as well, and with finer nodes
+# by 3e-5.
 NODE_OVERSAMPLING, FINE_NODE_OVERSAMPLING = 2.5, 3.5
-"""Nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius;
-interpolation then errs by 1.6e-4 in noise, which comes from the rim as well, and with finer nodes
-by 3e-5.
-"""
-
+# Relative error allowed, below which nodes are finer.
 FINE_NODES_TOLERANCE = 5e-4
-"""Relative error allowed, below which nodes are finer."""
-
+# Samples along the radius per period of the fastest product of wave and Bessel function.
 RADII_PER_PERIOD = 1.25
-"""Samples along the radius per period of the fastest product of wave and Bessel function."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,8 +275,8 @@ class TransferFunction:
         return nodes
 
 
+# Nodes that tell how strong waves are, without interpolation between them.
 ENERGY_OVERSAMPLING = 1.25
-"""Nodes that tell how strong waves are, without interpolation between them."""
 
 
 def find_lateral_limits(

@@ -14,17 +14,14 @@ compiled = compile_and_keep(fastmath=SUMS_IN_ANY_ORDER, error_model="numpy")
 
 UINT64_ONE = np.uint64(1)
 
+# Points of the plane treated together: four full vectors of 512 bits.
 TARGET_LANES = 64
-"""Points of the plane treated together: four full vectors of 512 bits."""
-
+# Frequencies for which a wave stays in registers.
 FREQUENCY_STEPS = 8
-"""Frequencies for which a wave stays in registers."""
-
+# float32 factors in a vector of 512 bits.
 VECTOR_FLOATS = 16
-"""float32 factors in a vector of 512 bits."""
-
+# Distance in m below which 1 / distance stops growing.
 MIN_DISTANCE_M = 1e-3
-"""Distance in m below which 1 / distance stops growing."""
 
 
 @compiled

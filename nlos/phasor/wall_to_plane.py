@@ -41,22 +41,17 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
+# Neighbouring frequencies that share their functions of depth.
 FREQUENCIES_PER_GROUP = 6
-"""Neighbouring frequencies that share their functions of depth."""
-
+# Of the error allowed, what interpolation between depths and leaving out terms may take; they are
+# independent, and their squares add up.
 INTERPOLATION_ERROR_FRACTION, TERMS_ERROR_FRACTION = 0.2, 0.6
-"""Of the error allowed, what interpolation between depths and leaving out terms may take; they are
-independent, and their squares add up.
-"""
-
+# Depths closer than this are one, m.
 MIN_DEPTH_RANGE_M = 1e-5
-"""Depths closer than this are one, m."""
-
+# Wavenumber along z, relative to the band's highest, about which the waves vary least with depth.
 CARRIER_FRACTION = 0.4
-"""Wavenumber along z, relative to the band's highest, about which the waves vary least with depth."""
-
+# Combinations of depths that hold less than this fraction of the wall points are none.
 EIGENVALUE_CUTOFF = 1e-10
-"""Combinations of depths that hold less than this fraction of the wall points are none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,8 +243,8 @@ def count_nodes(
     return max(phase, int(np.ceil(np.log(1 / error) / fall)) + 1)
 
 
+# Columns from one plan for Fourier transforms to the next.
 COLUMN_STEP = 8
-"""Columns from one plan for Fourier transforms to the next."""
 
 
 class PlaneWaveAnalysis(Protocol):
@@ -350,23 +345,18 @@ class LatticeAnalysis:
 
 IntArray = NDArray[np.int64]
 
+# Times the shortest period, that a lattice may be longer to suit both wall and plane.
 MAX_PERIOD_RATIO = 1.25
-"""Times the shortest period, that a lattice may be longer to suit both wall and plane."""
-
+# Points by which the far end of a plane may be off the lattice.
 WHOLE_PERIOD_TOLERANCE = 1e-3
-"""Points by which the far end of a plane may be off the lattice."""
-
+# Tolerance down to which Fourier transforms keep it; measured.
 MIN_FOURIER_TOLERANCE = 5e-4
-"""Tolerance down to which Fourier transforms keep it; measured."""
-
+# Seconds on one core, roughly: for all transfer functions, and per term, lattice place, and term of
+# a direct sum.
 PREPARATION_S, TERM_S, LATTICE_POINT_S, DIRECT_TERM_S = 0.02, 2e-5, 3e-9, 2e-10
-"""Seconds on one core, roughly: for all transfer functions, and per term, lattice place, and term
-of a direct sum.
-"""
-
+# Of the error allowed, what weak plane waves that are left out may hold: most of it passes beside
+# all voxels, or is on the edge of the window. Measured with noise.
 WAVES_ERROR_FRACTION = 2.0
-"""Of the error allowed, what weak plane waves that are left out may hold: most of it passes beside all
-voxels, or is on the edge of the window. Measured with noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -597,17 +587,14 @@ def find_common_period(side: float, wall: float, plane: float, count: int) -> tu
     return shortest, shortest * wall / plane
 
 
+# Of the error allowed, what the transforms of scattered points may take.
 ANALYSIS_ERROR_FRACTION = 0.1
-"""Of the error allowed, what the transforms of scattered points may take."""
-
+# Of the transforms' own grids; half as slow as the usual 2 for as few points as walls have.
 UPSAMPLING = 1.25
-"""Of the transforms' own grids; half as slow as the usual 2 for as few points as walls have."""
-
+# Indices along an axis from one plan to the next: a plan serves several frequencies.
 INDEX_STEP = 8
-"""Indices along an axis from one plan to the next: a plan serves several frequencies."""
-
+# Seconds on one core per term, roughly, for a wall point and for a plane wave.
 POINT_S, WAVE_S = 2.5e-8, 9e-9
-"""Seconds on one core per term, roughly, for a wall point and for a plane wave."""
 
 
 def has_finufft() -> bool:

@@ -31,11 +31,10 @@ from tofclip.threads import limit_blas_threads, run_blocks
 
 FloatArray = NDArray[np.float64]
 
+# Enough wall points to tell the strength of a frequency from.
 STRENGTH_POINTS = 1024
-"""Enough wall points to tell the strength of a frequency from."""
-
+# Groups of targets per piece of work.
 LANE_GROUPS_PER_BLOCK = 4
-"""Groups of targets per piece of work."""
 
 
 class CompiledPropagation:

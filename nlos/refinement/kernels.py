@@ -8,11 +8,10 @@ import numpy as np
 
 from nlos.kernels import MIN_DISTANCE_M, compiled
 
+# Voxels whose light is placed in time together: their edges stay in the first cache level.
 VOXELS_PER_RUN = 256
-"""Voxels whose light is placed in time together: their edges stay in the first cache level."""
-
+# Light of one voxel is spread over at least a bin, so that its mean arrival is kept.
 MIN_WIDTH_BINS = 1.0
-"""Light of one voxel is spread over at least a bin, so that its mean arrival is kept."""
 
 
 @compiled

@@ -35,8 +35,8 @@ from tofclip.threads import limit_blas_threads, split_blocks
 Array = NDArray[Any]
 FloatArray = NDArray[np.float64]
 
+# Distances held at a time in double precision: 16 MB of waves.
 PAIRS_PER_BLOCK = 1 << 20
-"""Distances held at a time in double precision: 16 MB of waves."""
 
 
 def propagate_spherical_waves(
@@ -200,13 +200,11 @@ class WallModel:
         return np.asarray(np.linalg.norm(np.stack([x, y, z], axis=-1) - group.laser, axis=-1))
 
 
+# float32 volumes that the solver holds at once, with the duals of total variation.
 SOLVER_VOLUMES = 12
-"""float32 volumes that the solver holds at once, with the duals of total variation."""
-
+# Voxels per carrier wavelength in depth: a point between two of them is then off by less than 1.3
+# rad.
 MIN_VOXELS_PER_WAVELENGTH = 5.0
-"""Voxels per carrier wavelength in depth: a point between two of them is then off by less than 1.3
-rad.
-"""
 
 
 def build_total_variation(

@@ -30,20 +30,16 @@ from tofclip.errors import InputError
 
 Array = NDArray[Any]
 
+# Photons of a bin; more are not counted one by one.
 MAX_COUNT = 1 << 22
-"""Photons of a bin; more are not counted one by one."""
-
+# What a sample may be off by: of the step between counts, and of itself.
 STEP_TOLERANCE, ROUNDING = 1e-3, 2e-7
-"""What a sample may be off by: of the step between counts, and of itself."""
-
+# Each wall point's background is drawn to the mean of all as by this number of photons.
 BACKGROUND_PHOTONS = 50.0
-"""Each wall point's background is drawn to the mean of all as by this number of photons."""
-
+# Photons per bin: nothing is impossible.
 MIN_BACKGROUND = 1e-6
-"""Photons per bin: nothing is impossible."""
-
+# Steps in which the brightness of light of a given shape is fitted.
 BRIGHTNESS_STEPS = 10
-"""Steps in which the brightness of light of a given shape is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,17 +158,15 @@ class LikelihoodGain:
 
 MIN_POINTS_PER_SUBSET = 16
 
+# Gain of likelihood, relative to that over a dark scene, at which the iteration ends.
 MIN_GAIN = 1e-5
-"""Gain of likelihood, relative to that over a dark scene, at which the iteration ends."""
-
+# Falls of light with the angle, of which the likeliest is taken.
 OBLIQUITIES = (0, 1, 2)
-"""Falls of light with the angle, of which the likeliest is taken."""
-
+# A voxel whose neighbourhood is brighter than noise by this number of standard deviations pays
+# little.
 NOISE_SIGMAS = 3.0
-"""A voxel whose neighbourhood is brighter than noise by this number of standard deviations pays little."""
-
+# Subsets of the first passes on fine voxels; later ones treat all of the wall at once.
 FINE_SUBSETS = (4, 4, 4, 2, 2)
-"""Subsets of the first passes on fine voxels; later ones treat all of the wall at once."""
 
 
 class PhotonFit:
@@ -359,48 +353,37 @@ def build_response(sigma: float) -> FloatArray:
     return np.asarray(response / response.sum())
 
 
+# Parts of the wall that the albedo is improved by in turns, at first.
 SUBSETS = 16
-"""Parts of the wall that the albedo is improved by in turns, at first."""
-
+# Passes over the wall on coarse voxels; each improves the albedo once per subset.
 COARSE_PASSES = 2
-"""Passes over the wall on coarse voxels; each improves the albedo once per subset."""
-
+# Along every axis; smaller grids are not made coarser.
 MIN_COARSE_VOXELS = 8
-"""Along every axis; smaller grids are not made coarser."""
-
+# Coarse voxels fainter than this, of the brightest voxel's photons or in standard deviations of the
+# noise, are not looked at more closely.
 FAINT_FRACTION, FAINT_SIGMAS = 2e-3, 1.0
-"""Coarse voxels fainter than this, of the brightest voxel's photons or in standard deviations of the
-noise, are not looked at more closely."""
-
+# Of the brightest voxel, the least that the albedo starts from: 0 would stay 0.
 START_FRACTION = 1e-3
-"""Of the brightest voxel, the least that the albedo starts from: 0 would stay 0."""
-
+# Instrument's responses of which the likeliest is taken.
 RESPONSE_SIGMAS_BINS = (0.0, 0.6, 1.2, 2.5, 5.0)
-"""Instrument's responses of which the likeliest is taken."""
-
+# Of the photons, what is set aside to judge the refinement by, and the seed that chooses them.
 HELD_OUT_FRACTION, HELD_OUT_SEED = 0.1, 0
-"""Of the photons, what is set aside to judge the refinement by, and the seed that chooses them."""
-
+# Gain of likelihood of the photons set aside, in standard deviations, with which the refined image
+# is shown and not the linear one.
 MIN_GAIN_SIGMAS = 3.0
-"""Gain of likelihood of the photons set aside, in standard deviations, with which the refined image
-is shown and not the linear one."""
-
+# Passes over all photons, those that were set aside included.
 FINAL_PASSES = 2
-"""Passes over all photons, those that were set aside included."""
-
+# Standard deviation of the least sharpness that is shown, voxels.
 MIN_BEAM_VOXELS = 0.5
-"""Standard deviation of the least sharpness that is shown, voxels."""
-
+# Of the brightest voxel: below, where photons decide little, voxels stand in the order of the
+# linear image.
 UNDECIDED_FRACTION = 1e-2
-"""Of the brightest voxel: below, where photons decide little, voxels stand in the order of the
-linear image."""
-
 LINEAR_SHOWN = (
     "photons set aside are no likelier under the refined image: the linear image is shown"
 )
 
+# float32 volumes held at once.
 VOLUME_COPIES = 6
-"""float32 volumes held at once."""
 
 
 @dataclass(frozen=True)

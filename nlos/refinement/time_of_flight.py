@@ -20,8 +20,8 @@ from tofclip.threads import run_blocks, thread_count
 
 Array = NDArray[Any]
 
+# Wall points that a thread treats at a time.
 POINTS_PER_BLOCK = 64
-"""Wall points that a thread treats at a time."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,9 @@ import numpy as np
 
 from nlos.kernels import compiled
 
+# Share of a way at either end where a triangle hides nothing: the facet's own triangle begins
+# there.
 CONTACT_FRACTION = 1e-4
-"""Share of a way at either end where a triangle hides nothing: the facet's own triangle begins
-there.
-"""
 
 
 @compiled

@@ -116,8 +116,8 @@ def _require_albedo(albedo: float) -> None:
 FloatArray = NDArray[np.float64]
 
 TOWARDS_WALL = (0.0, 0.0, -1.0)
+# A surface is refused rather than cut into more.
 MAX_FACETS = 200_000
-"""A surface is refused rather than cut into more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,12 +371,11 @@ def _rasterize_letters(text: str, height: float, spacing: float) -> tuple[FloatA
     return x[inside], y[inside]
 
 
+# Fine bins per time bin: light shared between two of them spreads by less than a tenth of a bin.
 BIN_OVERSAMPLING = 4
-"""Fine bins per time bin: light shared between two of them spreads by less than a tenth of a bin."""
-
 POINTS_PER_BLOCK = 64
+# Standard deviations at which the instrument's response is cut off.
 RESPONSE_SIGMAS = 5.0
-"""Standard deviations at which the instrument's response is cut off."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,11 +18,8 @@ half width, m.
 CYLINDER_RADIUS_M = 2.5
 WAVE_HEIGHT_M = 0.1
 RELIEF_DEPTH_M = 0.3
+# Half the gap between the plates in half wall widths, and by how much the right one stands back, m.
 PLATE_GAP_FRACTION, PLATE_STEP_M = 0.1, 0.25
-"""Half the gap between the plates in half wall widths, and by how much the right one stands back,
-m.
-"""
-
 MIN_POINTS = 2
 
 
@@ -111,6 +108,7 @@ def _plates_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
     return np.where(np.abs(x) < PLATE_GAP_FRACTION, np.nan, z)
 
 
+# Shapes by name.
 WALLS: Mapping[str, DepthFunction] = {
     "planar": _planar_depth,
     "cylinder": _cylinder_depth,
@@ -118,4 +116,3 @@ WALLS: Mapping[str, DepthFunction] = {
     "relief": _relief_depth,
     "plates": _plates_depth,
 }
-"""Shapes by name."""
