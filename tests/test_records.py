@@ -42,10 +42,8 @@ class Whole(Storable):
     inner: Part = field(metadata=stored_part(Part))
     mask: Any = field(default=None, metadata=stored_array("", "x", dtype=bool, optional=True))
     free: Any = field(
-        default_factory=lambda: np.zeros(1, np.complex64),
-        metadata=stored_array(
-            "m", dtype=(np.float32, np.complex64), name_axes=lambda n: ("z", "y", "x")[:n]
-        ),
+        default_factory=lambda: np.zeros((1, 1), np.complex64),
+        metadata=stored_array("m", "y", "x", dtype=np.complex64),
     )
     other: Part | None = field(
         default=None, metadata=stored_child(Part.from_record, "part", optional=True)
@@ -81,7 +79,7 @@ def test_every_kind_of_field_survives_its_file(tmp_path):
     stored = Record.load(tmp_path / "a.h5")
     assert stored.fields["counts"].units == "count"
     assert stored.fields["counts"].axes == ("time", "x")
-    assert stored.fields["free"].axes == ("z", "y")
+    assert stored.fields["free"].axes == ("y", "x")
     assert stored.attributes == {"rows": 4, "columns": 5, "length_m": 0.5, "label": "a"}
 
 

@@ -399,6 +399,22 @@ def translate_read_errors(path: str | Path) -> Iterator[None]:
         raise StorageError(f"{path}: reading is not permitted") from fault
 
 
+@contextlib.contextmanager
+def guard(path: str | Path, problem: str = "is truncated or damaged") -> Iterator[None]:
+    """Read a file of unknown origin: whatever its decoder stumbles over, it is the file that is
+    damaged (`problem`); what the system refuses is translated as by `translate_read_errors`.
+    """
+    with translate_read_errors(path):
+        try:
+            yield
+        except (TofclipError, FileNotFoundError, IsADirectoryError, PermissionError):
+            raise
+        except MemoryError as fault:
+            raise StorageError(f"{path}: does not fit into this computer's memory") from fault
+        except Exception as fault:
+            raise FileFormatError(path, f"{problem} ({format_error_line(fault)})") from fault
+
+
 def _is_endless(path: str | Path) -> bool:
     with contextlib.suppress(OSError):  # opening it will say
         mode = os.stat(path).st_mode

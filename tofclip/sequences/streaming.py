@@ -100,7 +100,11 @@ def run_in_order(
             raise InputError(f"a stream {what} one entry or more, not {number}")
     if policy not in POLICIES:
         raise InputError(f"a stream's policy is one of {', '.join(POLICIES)}, not '{policy}'")
-    submit, drops = partial(executor.submit, _raise_or_work, work), policy == "drop_oldest"
+    drops = policy == "drop_oldest"
+
+    def submit(value: Any) -> Future[Any]:
+        return executor.submit(_raise_or_work, work, value)
+
     stream = _Stream(source, submit, at_once, queue_size, drops)
     reader = Thread(target=stream.read, name="stream reader", daemon=True)
     reader.start()
