@@ -40,19 +40,6 @@ class IlluminationGroup:
         """How often the field's wave runs between wall and voxel: 1, or 2 if confocal."""
         return 2 if self.laser is None else 1
 
-    def compute_phasors(self, capture: Capture, band: Band) -> NDArray[np.complex64]:
-        """Return the phasors of the group's wall points.
-
-        `band`: frequencies of the virtual pulse. Returns (n, frequencies).
-        """
-        traces = capture.traces()
-        return np.asarray(
-            band.compute_phasors(
-                traces if len(self.indices) == len(traces) else traces[self.indices]
-            ),
-            np.complex64,
-        )
-
 
 def is_confocal(capture: Capture) -> bool:
     """Whether every wall point is its own laser spot, but for rounding."""

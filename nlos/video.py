@@ -29,7 +29,7 @@ from nlos.method import (
     require_imageable,
     require_numpy_signal,
 )
-from nlos.phasor.plan import GroupPlan, Hybrid, PlanarRSD, require_even_grid
+from nlos.phasor.plan import GroupPlan, Hybrid, PlanarRSD, plan_groups, require_even_grid
 from nlos.phasor.propagate import choose_backend
 from nlos.phasor.to_depths import DepthPropagator
 from nlos.volume import FloatArray, Grid, Volume
@@ -200,7 +200,7 @@ class TransientImaging:
             )
         require_imageable(capture, grid)
         require_even_grid(grid)
-        (group,) = self.method.plan_groups(capture, grid, band, choose_backend(capture, band))
+        (group,) = plan_groups(self.method, capture, grid, band, choose_backend(capture, band))
         return group
 
     def video(

@@ -1,22 +1,19 @@
-"""Wall to plane to depths: the three steps that `PlanarRSD` and `Hybrid` share, on any backend.
+"""Imaging by waves: wall to plane to depths, the three steps that `PlanarRSD` and `Hybrid` share,
+on NumPy's arrays or any other library's.
 
-See ``docs/nlos_algorithm.md``: phasors P_k on the wall, the field S_k on a plane, and the image,
-the sum over k of ``S_k(r) * exp(1j * k * |r_L - r|)``, at every depth.
-
-Laser spots and wall points in each other's place: light takes the same path either way.
-
-Phasor-field imaging from a planar wall, by Rayleigh-Sommerfeld diffraction in the frequency
-domain.
-
-Imaging from walls of any shape: onto a virtual plane first, then from plane to plane.
+See ``docs/nlos_algorithm.md``: phasors P_k on the wall; the field S_k on a plane, the wall's own
+(Rayleigh-Sommerfeld diffraction in the frequency domain) or a virtual one before a wall of any
+shape; and the image, the sum over k of ``S_k(r) * exp(1j * k * |r_L - r|)``, at every depth. Laser
+spots and wall points may take each other's place: light takes the same path either way.
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,10 +38,12 @@ from nlos.phasor.depth_steps import BYTES_PER_WAVE, DiffractionPlan
 from nlos.phasor.propagate import (
     Backend,
     Diffraction,
+    GroupToPlane,
     Propagation,
     WallToPlane,
     choose_backend,
     plan_wall_to_plane,
+    require_in_front,
     require_propagation,
     require_tolerance,
 )
@@ -65,24 +64,14 @@ SPECTRUM_COPIES = 2
 
 @dataclass(frozen=True, eq=False)
 class GroupPlan:
-    """The road of one illumination group: from its wall points to a plane, and on to the voxels.
-
-    Parameters
-    ----------
-    group : IlluminationGroup
-    wall_to_plane : callable
-        Gives the field S_k where `plane_to_depths` begins; on a virtual plane, times the area that
-        each of its points stands for, as the Rayleigh-Sommerfeld integral has it.
-    plane_to_depths : DiffractionPlan
-        From the plane, the wall's own or a virtual one, to the voxels.
-    wall_fraction : float
-        Of all time, what the way from the wall to the plane takes, roughly.
-    """
+    """One illumination group's light from its wall points to a plane, and on to the voxels."""
 
     group: IlluminationGroup
+    # The field S_k where `plane_to_depths` begins; on a virtual plane, times the area that each of
+    # its points stands for, as the Rayleigh-Sommerfeld integral has it.
     wall_to_plane: WallToPlane
-    plane_to_depths: DiffractionPlan
-    wall_fraction: float = 0.0
+    plane_to_depths: DiffractionPlan  # from the plane, the wall's own or a virtual one
+    wall_fraction: float = 0.0  # of all time, what the way from the wall to the plane takes
 
     @property
     def memory_bytes(self) -> int:
@@ -93,20 +82,7 @@ class GroupPlan:
 
 
 class WavePlan(PhasorPlan):
-    """Every illumination group's road, and the images at their ends added up.
-
-    Parameters
-    ----------
-    capture : Capture
-    grid : Grid
-    band : Band
-        The frequencies that are imaged.
-    backend : Backend
-        Of the capture's arrays.
-    groups : sequence of GroupPlan
-    settings : mapping
-        What a volume reports of how it was imaged.
-    """
+    """The images of all illumination groups, added up."""
 
     def __init__(
         self,
@@ -115,7 +91,7 @@ class WavePlan(PhasorPlan):
         band: Band,
         backend: Backend,
         groups: Sequence[GroupPlan],
-        settings: Mapping[str, Any],
+        settings: Mapping[str, Any],  # what a volume reports of how it was imaged
     ) -> None:
         super().__init__(capture, grid)
         self.band, self.groups, self.settings = band, groups, dict(settings)
@@ -134,7 +110,6 @@ class WavePlan(PhasorPlan):
 
     @property
     def images(self) -> int:
-        """Images that are made and added up."""
         return len(self.groups)
 
     @property
@@ -152,9 +127,8 @@ class WavePlan(PhasorPlan):
             self._warned = True
         total = self.zeros()
         for number in range(len(self.groups)):
-            self.add_to_depths(
-                number, self.propagate_to_plane(number, capture, progress), total, progress
-            )
+            on_plane = self.propagate_to_plane(number, capture, progress)
+            self.add_to_depths(number, on_plane, total, progress)
         return Volume(total, self.grid, {**capture.provenance, "imaging": self.settings})
 
     def zeros(self) -> Array:
@@ -162,19 +136,8 @@ class WavePlan(PhasorPlan):
         return self._backend.zeros(self.grid.shape)
 
     def propagate_to_plane(self, number: int, capture: Capture, progress: Progress) -> Array:
-        """Return the field (y, x, frequencies) of one illumination group on its plane.
-
-        Parameters
-        ----------
-        number : int
-            Of the group.
-        capture : Capture
-        progress : callable
-            Called with a part of the number of voxels.
-
-        Returns
-        -------
-        (y, x, frequencies) complex64 array
+        """Return the field (y, x, frequencies) of one illumination group on its plane, complex64;
+        this and `add_to_depths` report all voxels together.
         """
         group = self.groups[number]
         plane, waves = group.plane_to_depths.plane, group.plane_to_depths.waves
@@ -182,18 +145,7 @@ class WavePlan(PhasorPlan):
         return group.wall_to_plane(capture, SubProgress(progress, points, self._wall_work(number)))
 
     def add_to_depths(self, number: int, on_plane: Array, total: Array, progress: Progress) -> None:
-        """Add what the field of one illumination group shows to a volume.
-
-        Parameters
-        ----------
-        number : int
-            Of the group.
-        on_plane : (y, x, frequencies) complex64 array
-        total : (z, y, x) complex64 array
-            Added to, in place.
-        progress : callable
-            Called with the rest of the number of voxels.
-        """
+        """Add what the field of one illumination group shows to a volume, in place."""
         work = self.grid.size - self._wall_work(number)
         diffraction = self._hold_diffraction(number)
         diffraction.add(on_plane, total, SubProgress(progress, self.grid.size, work))
@@ -242,7 +194,6 @@ class ReciprocalPlan(PhasorPlan):
 
     @property
     def images(self) -> int:
-        """Images that are made and added up."""
         return 2 * self.swapped.images
 
     @property
@@ -279,8 +230,100 @@ def _find_distance(spot: FloatArray | None, grid: Grid) -> NDArray[np.float32]:
     return np.asarray(np.sqrt(np.maximum(squared, MIN_DISTANCE_M**2)), np.float32)
 
 
+class WaveMethod(PhasorMethod):
+    """Imaging by waves, a field for every laser spot; `_plan_points` is what methods differ by."""
+
+    wavelength: float
+    cycles: float
+    tolerance: float
+    name: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        _ = self.pulse
+        require_tolerance(self.tolerance)
+
+    @cached_property
+    def pulse(self) -> VirtualPulse:
+        """The virtual pulse."""
+        return VirtualPulse(self.wavelength, self.cycles)
+
+    @property
+    def settings(self) -> dict[str, str | float]:
+        """What a volume reports of how it was imaged."""
+        pulse: dict[str, str | float] = {"wavelength_m": self.wavelength, "cycles": self.cycles}
+        return {"method": self.name, **pulse, "tolerance": self.tolerance}
+
+    def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
+        """Make the method ready for captures like `capture` on `grid`.
+
+        Parameters
+        ----------
+        capture : Capture
+            Of few laser spots, or of few wall points; the wall such as the method takes.
+        grid : Grid
+            In front of the wall, evenly spaced along x and y.
+
+        Returns
+        -------
+        PhasorPlan
+
+        Raises
+        ------
+        InputError
+            The method cannot image such a capture on the grid, or not within memory.
+        """
+        quicker = choose_roles(capture)
+        plan = plan_waves(self, quicker, grid)
+        return plan if quicker is capture else ReciprocalPlan(capture, grid, plan)
+
+    @abstractmethod
+    def _plan_points(
+        self, capture: Capture, group: IlluminationGroup, grid: Grid, band: Band, backend: Backend
+    ) -> tuple[DiffractionPlan, GroupToPlane, float]:
+        """Plan an illumination group, and others of the same wall points: their common way from a
+        plane to the voxels, what carries each group to that plane, and the fraction of time that
+        this takes.
+        """
+
+
+def plan_waves(method: WaveMethod, capture: Capture, grid: Grid) -> WavePlan:
+    """Make a method ready for captures like `capture`, a wave for every laser spot."""
+    require_imageable(capture, grid)
+    require_even_grid(grid)
+    band = choose_unaliased_band(capture, grid, method.pulse)
+    backend = choose_backend(capture, band)
+    groups = plan_groups(method, capture, grid, band, backend)
+    settings = dict(method.settings)
+    if isinstance(method, Hybrid):
+        settings["plane_z_m"] = groups[-1].plane_to_depths.plane.z
+    return WavePlan(capture, grid, band, backend, groups, settings)
+
+
+def plan_groups(
+    method: WaveMethod, capture: Capture, grid: Grid, band: Band, backend: Backend
+) -> list[GroupPlan]:
+    """Plan the way of every illumination group to the voxels, at a band's frequencies."""
+    groups = group_by_illumination(capture)
+    require_few_spots(capture, groups)
+    plans = []
+    for same in gather_by_points(capture, groups):
+        depths, carry, fraction = method._plan_points(capture, same[0], grid, band, backend)
+        depths.require_memory()
+        plans += [GroupPlan(one, partial(carry, group=one), depths, fraction) for one in same]
+    return plans
+
+
+def require_even_grid(grid: Grid) -> None:
+    """Refuse voxels that Fourier transforms cannot reach."""
+    for name in ("x", "y"):
+        if not is_evenly_spaced(getattr(grid, name)):
+            raise InputError(
+                f"the voxels are not evenly spaced along {name}: Fourier transforms need them to be"
+            )
+
+
 @dataclass(frozen=True)
-class PlanarRSD(PhasorMethod):
+class PlanarRSD(WaveMethod):
     """Diffraction from a planar wall to all depths: the image of `Backprojection`, thousands of
     times faster.
 
@@ -329,133 +372,37 @@ class PlanarRSD(PhasorMethod):
     wavelength: float
     cycles: float = 3.0
     tolerance: float = 1e-2
-    pulse: VirtualPulse = field(init=False, repr=False, compare=False)
+    name = "rsd"
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "pulse", VirtualPulse(self.wavelength, self.cycles))
-        require_tolerance(self.tolerance)
-
-    def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
-        """Make the method ready for captures like `capture` on `grid`.
-
-        Parameters
-        ----------
-        capture : Capture
-            Of a planar, evenly sampled wall at z = const and few laser spots; or the other way round.
-        grid : Grid
-            In front of the wall, evenly spaced along x and y.
-
-        Returns
-        -------
-        WavePlan or ReciprocalPlan
-
-        Raises
-        ------
-        InputError
-            The method cannot image such a capture on the grid, or not within memory.
-        """
-        quicker = choose_roles(capture)
-        if quicker is not capture:
-            return ReciprocalPlan(capture, grid, self._plan_waves(quicker, grid))
-        return self._plan_waves(capture, grid)
-
-    def _plan_waves(self, capture: Capture, grid: Grid) -> WavePlan:
-        require_imageable(capture, grid)
-        require_even_grid(grid)
-        band = choose_unaliased_band(capture, grid, self.pulse)
-        backend = choose_backend(capture, band)
-        groups = self.plan_groups(capture, grid, band, backend)
-        return WavePlan(capture, grid, band, backend, groups, self.settings)
-
-    def plan_groups(
-        self, capture: Capture, grid: Grid, band: Band, backend: Backend
-    ) -> list[GroupPlan]:
-        """Return the road of every illumination group to the voxels, at a band's frequencies.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        band : Band
-        backend : Backend
-
-        Returns
-        -------
-        list
-            One plan for each illumination group.
-
-        Raises
-        ------
-        InputError
-            The wall is not planar or not evenly sampled, or the grid does not lie in front of it.
-        """
-        groups = group_by_illumination(capture)
-        require_few_spots(capture, groups)
-        plans: list[GroupPlan] = []
-        for same in gather_by_points(capture, groups):
-            plans += self._plan_groups_at(capture, same, grid, band, backend)
-        return plans
-
-    @property
-    def settings(self) -> dict[str, str | float]:
-        """What a volume reports of how it was imaged."""
-        return {
-            "method": "rsd",
-            "wavelength_m": self.wavelength,
-            "cycles": self.cycles,
-            "tolerance": self.tolerance,
-        }
-
-    def _plan_groups_at(
-        self,
-        capture: Capture,
-        groups: Sequence[IlluminationGroup],
-        grid: Grid,
-        band: Band,
-        backend: Backend,
-    ) -> list[GroupPlan]:
-        """Plan groups of the same wall points, whose ways differ in the laser spot only."""
-        wall = PlanarWall.of(capture.points[groups[0].indices])
+    def _plan_points(
+        self, capture: Capture, group: IlluminationGroup, grid: Grid, band: Band, backend: Backend
+    ) -> tuple[DiffractionPlan, GroupToPlane, float]:
+        wall = PlanarWall.of(capture.points[group.indices])
         if grid.z[0] <= wall.plane.z:
             raise InputError(
                 f"the grid must begin in front of the wall, which is at z = {wall.plane.z:.4g} m"
             )
-        waves = build_waves(groups[0], band, continued=False)
-        plane_to_depths = DiffractionPlan(wall.plane, grid, waves, band.strength, self.tolerance)
-        plane_to_depths.require_memory()
+        waves = build_waves(group, band, continued=False)
+        depths = DiffractionPlan(wall.plane, grid, waves, band.strength, self.tolerance)
 
         def place_phasors(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
             return backend.place_on_lattice(backend.compute_phasors(one, group), wall.lattice)
 
-        return [
-            GroupPlan(group, partial(place_phasors, group=group), plane_to_depths)
-            for group in groups
-        ]
-
-
-def require_even_grid(grid: Grid) -> None:
-    """Refuse voxels that Fourier transforms cannot reach."""
-    for name in ("x", "y"):
-        if not is_evenly_spaced(getattr(grid, name)):
-            raise InputError(
-                f"the voxels are not evenly spaced along {name}: Fourier transforms need them to be"
-            )
+        return depths, place_phasors, 0.0
 
 
 # Relative error of the image where one Fresnel zone has room on the virtual plane beside the
 # straight ways; that of n zones is n^3 times less. Measured, for fields that fade as
 # `VirtualPlane`'s.
 RIM_ERROR = 0.016
-# Of the error allowed, what the virtual plane's rim may take.
-RIM_ERROR_FRACTION = 0.3
-# Of the error allowed, what the way from the wall to the plane may take.
-WALL_TO_PLANE_ERROR_FRACTION = 0.6
+# Of the error allowed, what the virtual plane's rim, and the way from the wall to it, may take.
+RIM_ERROR_FRACTION, WALL_TO_PLANE_ERROR_FRACTION = 0.3, 0.6
 # Of all time, what the way from the wall to the plane takes, roughly.
 WALL_TO_PLANE_TIME_FRACTIONS = {"spectral": 0.4, "time": 0.95}
 
 
 @dataclass(frozen=True)
-class Hybrid(PhasorMethod):
+class Hybrid(WaveMethod):
     """The hybrid frequency-time solver: curved, disconnected and scattered walls at nearly the
     speed of planar ones.
 
@@ -499,147 +446,40 @@ class Hybrid(PhasorMethod):
     propagation: Propagation = "spectral"
     tolerance: float = 1e-2
     plane_z: float | None = None
-    pulse: VirtualPulse = field(init=False, repr=False, compare=False)
+    name = "hybrid"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "pulse", VirtualPulse(self.wavelength, self.cycles))
-        require_tolerance(self.tolerance)
+        super().__post_init__()
         require_propagation(self.propagation)
-
-    def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
-        """Make the method ready for captures like `capture` on `grid`.
-
-        Parameters
-        ----------
-        capture : Capture
-            Of few laser spots, or of few wall points.
-        grid : Grid
-            Evenly spaced along x and y.
-
-        Returns
-        -------
-        WavePlan or ReciprocalPlan
-
-        Raises
-        ------
-        InputError
-            The method cannot image such a capture on the grid, or not within memory, or the virtual
-            plane would not stand in front of the wall.
-        """
-        quicker = choose_roles(capture)
-        if quicker is not capture:
-            return ReciprocalPlan(capture, grid, self.plan_waves(quicker, grid))
-        return self.plan_waves(capture, grid)
-
-    def plan_waves(self, capture: Capture, grid: Grid) -> WavePlan:
-        """Make the method ready for captures like `capture`, a wave for every laser spot; see
-        `plan`.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        WavePlan
-
-        Raises
-        ------
-        InputError
-            As of `plan`.
-        """
-        require_imageable(capture, grid)
-        require_even_grid(grid)
-        band = choose_unaliased_band(capture, grid, self.pulse)
-        backend = choose_backend(capture, band)
-        groups = self.plan_groups(capture, grid, band, backend)
-        settings = {**self.settings, "plane_z_m": groups[-1].plane_to_depths.plane.z}
-        return WavePlan(capture, grid, band, backend, groups, settings)
-
-    def plan_groups(
-        self, capture: Capture, grid: Grid, band: Band, backend: Backend
-    ) -> list[GroupPlan]:
-        """Return the road of every illumination group to the voxels, at a band's frequencies.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        band : Band
-        backend : Backend
-
-        Returns
-        -------
-        list
-            One plan for each illumination group.
-
-        Raises
-        ------
-        InputError
-            The virtual plane would not stand in front of the wall, or memory does not suffice.
-        """
-        groups = group_by_illumination(capture)
-        require_few_spots(capture, groups)
-        foremost = float(capture.points[:, 2].max())
-        if self.plane_z is not None and self.plane_z <= foremost:
-            raise InputError(
-                f"the virtual plane must lie in front of the wall, which reaches up to z = {foremost:.4g} m"
-            )
-        return [
-            plan
-            for same in gather_by_points(capture, groups)
-            for plan in self._plan_groups_at(capture, same, grid, band, backend)
-        ]
-
-    def _plan_groups_at(
-        self,
-        capture: Capture,
-        groups: Sequence[IlluminationGroup],
-        grid: Grid,
-        band: Band,
-        backend: Backend,
-    ) -> list[GroupPlan]:
-        """Plan groups of the same wall points, whose ways differ in the laser spot only."""
-        waves = build_waves(groups[0], band, continued=True)
-        zones = (RIM_ERROR / (RIM_ERROR_FRACTION * self.tolerance)) ** (1 / 3)
-        points = capture.points[groups[0].indices]
-        lattice = WallLattice.find(points)
-        plane = choose_virtual_plane(points, grid, waves, zones, self.plane_z, lattice)
-        ways = StraightWays.find(points, plane, grid, self.tolerance)
-        plane_to_depths = DiffractionPlan(plane, grid, waves, band.strength, self.tolerance, ways)
-        plane_to_depths.require_memory()
-        tolerance = WALL_TO_PLANE_ERROR_FRACTION * self.tolerance
-        carry = plan_wall_to_plane(
-            capture,
-            WallBeforePlane(points, plane, lattice, ways),
-            groups[0],
-            band,
-            backend,
-            self.propagation,
-            tolerance,
-        )
-        # The Rayleigh-Sommerfeld integral over the plane, as a sum over its points.
-        weights = capture.device.put(plane.weights[..., np.newaxis])
-
-        def wall_to_plane(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
-            field = carry(one, progress, group)
-            field *= weights  # in place: nobody else has it
-            return field
-
-        fraction = WALL_TO_PLANE_TIME_FRACTIONS[self.propagation]
-        return [
-            GroupPlan(group, partial(wall_to_plane, group=group), plane_to_depths, fraction)
-            for group in groups
-        ]
 
     @property
     def settings(self) -> dict[str, str | float]:
         """What a volume reports of how it was imaged."""
-        return {
-            "method": "hybrid",
-            "wavelength_m": self.wavelength,
-            "cycles": self.cycles,
-            "propagation": self.propagation,
-            "tolerance": self.tolerance,
-        }
+        return {**super().settings, "propagation": self.propagation}
+
+    def _plan_points(
+        self, capture: Capture, group: IlluminationGroup, grid: Grid, band: Band, backend: Backend
+    ) -> tuple[DiffractionPlan, GroupToPlane, float]:
+        points = capture.points[group.indices]
+        if self.plane_z is not None:
+            require_in_front(self.plane_z, points)
+        waves = build_waves(group, band, continued=True)
+        zones = (RIM_ERROR / (RIM_ERROR_FRACTION * self.tolerance)) ** (1 / 3)
+        lattice = WallLattice.find(points)
+        plane = choose_virtual_plane(points, grid, waves, zones, self.plane_z, lattice)
+        ways = StraightWays.find(points, plane, grid, self.tolerance)
+        depths = DiffractionPlan(plane, grid, waves, band.strength, self.tolerance, ways)
+        geometry = WallBeforePlane(points, plane, lattice, ways)
+        tolerance = WALL_TO_PLANE_ERROR_FRACTION * self.tolerance
+        carry = plan_wall_to_plane(
+            capture, geometry, group, band, backend, self.propagation, tolerance
+        )
+        # The Rayleigh-Sommerfeld integral over the plane, as a sum over its points.
+        weights = capture.device.put(plane.weights[..., np.newaxis])
+
+        def carry_weighted(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
+            field = carry(one, progress, group)
+            field *= weights  # in place: nobody else has it
+            return field
+
+        return depths, carry_weighted, WALL_TO_PLANE_TIME_FRACTIONS[self.propagation]

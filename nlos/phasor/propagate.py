@@ -1,12 +1,8 @@
-"""The inner loops that imaging by waves needs, per kind of array and under the same names.
+"""From a wall of any shape to a plane in front of it, by the kind of array that the signal is.
 
-`CompiledBackend` has loops of its own for NumPy's arrays; `PortableBackend` has matrix products for
-arrays of any library, which stay where they are. What is computed, and in which order, is written
-once, in `nlos.phasor.plan`.
-
-From wall to plane in time, as the paper does it: signals shifted by their ways and added up.
-
-`nlos.propagate`: what a wall of any shape recorded, as the field on a plane in front of it.
+`CompiledBackend` has compiled loops for NumPy's arrays; `PortableBackend` has matrix products for
+arrays of any library, which stay where they are. They have the same methods; what is computed, and
+in which order, is written once, in `nlos.phasor.plan`. `nlos.propagate` gives the field on a plane.
 """
 
 from __future__ import annotations
@@ -21,11 +17,14 @@ from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
 from nlos.illumination import IlluminationGroup, build_waves, find_leg_bounds, group_by_illumination
 from nlos.method import Progress, ignore_progress, require_numpy_signal
+from nlos.phasor.arrays import ArrayLibrary, BandTransform, arrange_on_lattice, get_group_traces
 from nlos.phasor.depth_steps import DiffractionPlan
+from nlos.phasor.to_depths import PortableDiffraction
 from nlos.phasor.to_depths_compiled import CompiledDiffraction, LaserSource
 from nlos.phasor.transfer import SphericalWaves
 from nlos.phasor.wall_kernels import shift_and_sum
 from nlos.phasor.wall_to_plane import WallBeforePlane
+from nlos.phasor.wall_to_plane_arrays import PortablePropagation
 from nlos.phasor.wall_to_plane_compiled import CompiledPropagation
 from nlos.plane import Plane, PlaneField, WallLattice
 from nlos.volume import FloatArray, Grid
@@ -33,101 +32,19 @@ from tofclip.arrays import Array, is_numpy
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks
 
+Propagation = Literal["spectral", "time"]
 
-class PhasorPropagation(Protocol):
-    """Carries phasors from wall points onto a plane."""
-
-    def field(self, phasors: Array, progress: Progress = ignore_progress) -> Array:
-        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64.
-
-        `phasors` (n, frequencies); `progress`: called with the number of plane points times
-        frequencies just done. Returns (y, x, frequencies).
-        """
-        ...
+WallToPlane = Callable[[Capture, Progress], Array]
+"""Carries what a capture's wall points recorded to a plane: the field (y, x, frequencies) there."""
 
 
-class Diffraction(Protocol):
-    """Carries fields from a plane to all depths of a grid, where they meet the laser's wave."""
+class GroupToPlane(Protocol):
+    """The same for one of several groups of the same wall points."""
 
-    def add(self, values: Array, total: Array, progress: Progress) -> None:
-        """Add the image of a field (y, x, frequencies) to a volume (z, y, x).
-
-        `values` (y, x, frequencies); `total` (z, y, x): added to, in place; `progress`: called with
-        the number of voxels just done.
-        """
-        ...
-
-    def for_laser(self, laser: FloatArray | None) -> Diffraction:
-        """Return the same for the light of another spot (3,), m, sharing what both need."""
-        ...
+    def __call__(self, one: Capture, progress: Progress, group: IlluminationGroup) -> Array: ...
 
 
-class Backend(Protocol):
-    """What `nlos.phasor.plan` asks of a kind of array."""
-
-    def zeros(self, shape: tuple[int, ...]) -> Array:
-        """Make complex64 zeros."""
-        ...
-
-    def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
-        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64.
-
-        Parameters
-        ----------
-        capture : Capture
-        group : IlluminationGroup
-
-        Returns
-        -------
-        (points, frequencies) complex64 array
-        """
-        ...
-
-    def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
-        """Put phasors (points, frequencies) into their places, (y, x, frequencies).
-
-        Parameters
-        ----------
-        phasors : (points, frequencies) complex64 array
-        lattice : WallLattice
-
-        Returns
-        -------
-        (y, x, frequencies) complex64 array
-        """
-        ...
-
-    def propagate_phasors(
-        self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float
-    ) -> PhasorPropagation:
-        """Return what carries phasors from wall points onto a plane.
-
-        Parameters
-        ----------
-        geometry : WallBeforePlane
-        waves : SphericalWaves
-        tolerance : float
-            Relative error.
-
-        Returns
-        -------
-        PhasorPropagation
-        """
-        ...
-
-    def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
-        """Return what carries fields from the plane of `plan` to all depths.
-
-        Parameters
-        ----------
-        plan : DiffractionPlan
-        source : LaserSource
-
-        Returns
-        -------
-        Diffraction
-        """
-        ...
+POINTS_PER_BLOCK = 64
 
 
 class CompiledBackend:
@@ -142,7 +59,9 @@ class CompiledBackend:
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
         """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
-        return group.compute_phasors(capture, self.band)
+        traces = capture.traces()
+        own = traces if len(group.indices) == len(traces) else traces[group.indices]
+        return np.asarray(self.band.compute_phasors(own), np.complex64)
 
     def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
         """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
@@ -150,11 +69,11 @@ class CompiledBackend:
 
     def propagate_phasors(
         self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float
-    ) -> PhasorPropagation:
+    ) -> CompiledPropagation:
         """Return what carries phasors from wall points onto a plane."""
         return CompiledPropagation(geometry, waves, tolerance)
 
-    def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
+    def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> CompiledDiffraction:
         """Return what carries fields from the plane of `plan` to all depths."""
         return CompiledDiffraction(plan, source)
 
@@ -166,105 +85,38 @@ class PortableBackend:
     """
 
     def __init__(self, band: Band, capture: Capture) -> None:
-        from nlos.phasor.arrays import ArrayLibrary, BandTransform
-
         self.library = ArrayLibrary(capture.device)
+        self.zeros = self.library.zeros
         self._transform = BandTransform(band, capture.axis.bins, self.library)
-
-    def zeros(self, shape: tuple[int, ...]) -> Array:
-        """Make complex64 zeros."""
-        return self.library.zeros(shape)
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
         """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
-        from nlos.phasor.arrays import get_group_traces
-
         return self._transform.of(get_group_traces(capture, group))
 
     def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
         """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
-        from nlos.phasor.arrays import arrange_on_lattice
-
         xp = self.library.xp
         placed = arrange_on_lattice(xp.permute_dims(phasors, (1, 0)), lattice, self.library)
         return xp.permute_dims(placed, (1, 2, 0))
 
     def propagate_phasors(
         self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float
-    ) -> PhasorPropagation:
+    ) -> PortablePropagation:
         """Return what carries phasors from wall points onto a plane."""
-        from nlos.phasor.wall_to_plane_arrays import PortablePropagation
-
         return PortablePropagation(geometry, waves, tolerance, self.library)
 
-    def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
+    def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> PortableDiffraction:
         """Return what carries fields from the plane of `plan` to all depths."""
-        from nlos.phasor.to_depths import PortableDiffraction
-
         return PortableDiffraction(plan, source, self.library)
 
 
+Backend = CompiledBackend | PortableBackend
+Diffraction = CompiledDiffraction | PortableDiffraction
+
+
 def choose_backend(capture: Capture, band: Band) -> Backend:
-    """Return the backend of a capture's arrays, for the frequencies of a band.
-
-    `band`: wavenumbers, rad/m.
-    """
+    """Return the backend of a capture's arrays, for the frequencies of a band."""
     return CompiledBackend(band) if is_numpy(capture.signal) else PortableBackend(band, capture)
-
-
-FloatArray_shift_and_sum = NDArray[np.float64]
-
-POINTS_PER_BLOCK = 64
-
-
-def propagate_in_time(
-    points: FloatArray_shift_and_sum,
-    traces: NDArray[np.float32],
-    plane: Plane,
-    band: Band,
-    legs: int,
-    progress: Progress = ignore_progress,
-) -> NDArray[np.complex64]:
-    """Return the band's phasors of transients propagated onto a plane bin by bin.
-
-    Every signal arrives on the plane earlier by its way there, interpolated linearly between bins:
-    an error of some
-    0.5 % for 15 bins per wavelength, growing as the square of their width. Costs a product per pair
-      of points and bin,
-    and memory for a few transients.
-
-    Supplementary Note 12 of X. Feng, Y. Ma, L. Gao, Nat. Commun. 13, 3333 (2022).
-
-    `points` (n, 3): m; `traces` (n, t); `legs`: how often light runs between wall and plane: 2 in a
-    confocal scan; `progress`: called with the number of values just done. Returns (y, x,
-    frequencies).
-    """
-    targets = plane.points.reshape(-1, 3)
-    scale = legs / band.axis.spacing
-    nearest, farthest = find_leg_bounds(points, Grid(plane.x, plane.y, np.array([plane.z])))
-    latest = np.ceil(farthest * scale)
-    bins = traces.shape[1] + int(latest - np.floor(nearest * scale)) + 2
-    paths = band.axis.start + band.axis.spacing * (np.arange(bins) - latest)
-    analysis = (band.weights * np.exp(-1j * np.outer(paths, band.wavenumbers))).astype(np.complex64)
-    field = np.empty((len(targets), band.wavenumbers.size), np.complex64)
-
-    def process_block(some: slice) -> None:
-        sums = np.zeros((some.stop - some.start, bins), np.float32)
-        shift_and_sum(traces, points, targets[some], scale, float(latest), sums)
-        field[some] = sums @ analysis
-        progress(field[some].size)
-
-    run_blocks(process_block, len(targets), size=POINTS_PER_BLOCK)
-    return field.reshape(*plane.shape, -1)
-
-
-Propagation = Literal["spectral", "time"]
-
-WallToPlane = Callable[[Capture, Progress], Array]
-"""Carries what a capture's wall points recorded to a plane: the field (y, x, frequencies) there."""
-
-GroupToPlane = Callable[[Capture, Progress, IlluminationGroup], Array]
-"""The same for one of several groups of the same wall points."""
 
 
 def propagate(
@@ -334,18 +186,10 @@ def plan_wall_to_plane(
     tolerance: float = 1e-2,
 ) -> GroupToPlane:
     """Return what carries an illumination group of such captures, or another one of the same wall
-    points, onto a plane; see `propagate`.
-
-    `capture`: for the device of its signal; `geometry`: the group's wall points, and the plane.
-    Returns from a capture, a progress, which counts points of the plane times frequencies, and a
-    group to the field (y, x, frequencies).
+    points, onto a plane; see `propagate`. Progress counts points of the plane times frequencies.
     """
     points, plane = geometry.points, geometry.plane
-    foremost = float(points[:, 2].max())
-    if plane.z <= foremost:
-        raise InputError(
-            f"the plane at z = {plane.z:.4g} m must lie in front of the wall, which reaches up to {foremost:.4g} m"
-        )
+    require_in_front(plane.z, points)
     if propagation == "time":
         require_numpy_signal("propagation in time", capture)
 
@@ -361,6 +205,54 @@ def plan_wall_to_plane(
         return propagated.field(backend.compute_phasors(one, group), progress)
 
     return propagate_spectrum
+
+
+def propagate_in_time(
+    points: FloatArray,
+    traces: NDArray[np.float32],
+    plane: Plane,
+    band: Band,
+    legs: int,
+    progress: Progress = ignore_progress,
+) -> NDArray[np.complex64]:
+    """Return the band's phasors of transients propagated onto a plane bin by bin.
+
+    Every signal arrives on the plane earlier by its way there, interpolated linearly between bins:
+    an error of some 0.5 % for 15 bins per wavelength, growing as the square of their width. Costs a
+    product per pair of points and bin, and memory for a few transients.
+
+    Supplementary Note 12 of X. Feng, Y. Ma, L. Gao, Nat. Commun. 13, 3333 (2022).
+
+    `points` (n, 3): m; `traces` (n, t); `legs`: how often light runs between wall and plane: 2 in a
+    confocal scan; `progress`: called with the number of values just done. Returns (y, x,
+    frequencies).
+    """
+    targets = plane.points.reshape(-1, 3)
+    scale = legs / band.axis.spacing
+    nearest, farthest = find_leg_bounds(points, Grid(plane.x, plane.y, np.array([plane.z])))
+    latest = np.ceil(farthest * scale)
+    bins = traces.shape[1] + int(latest - np.floor(nearest * scale)) + 2
+    paths = band.axis.start + band.axis.spacing * (np.arange(bins) - latest)
+    analysis = (band.weights * np.exp(-1j * np.outer(paths, band.wavenumbers))).astype(np.complex64)
+    field = np.empty((len(targets), band.wavenumbers.size), np.complex64)
+
+    def process_block(block: slice) -> None:
+        sums = np.zeros((block.stop - block.start, bins), np.float32)
+        shift_and_sum(traces, points, targets[block], scale, float(latest), sums)
+        field[block] = sums @ analysis
+        progress(field[block].size)
+
+    run_blocks(process_block, len(targets), size=POINTS_PER_BLOCK)
+    return field.reshape(*plane.shape, -1)
+
+
+def require_in_front(z: float, points: FloatArray) -> None:
+    """Refuse a virtual plane that a wall's points (n, 3) reach up to."""
+    foremost = float(points[:, 2].max())
+    if z <= foremost:
+        raise InputError(
+            f"the virtual plane must lie in front of the wall, which reaches up to z = {foremost:.4g} m"
+        )
 
 
 def require_propagation(propagation: str) -> None:

@@ -20,7 +20,7 @@ from nlos.capture import Capture
 from nlos.illumination import IlluminationGroup, build_source, choose_roles, warn_of_aliasing
 from nlos.method import MEMORY_LIMIT_BYTES, Method, Plan, Progress, require_numpy_signal
 from nlos.phasor.depth_steps import DiffractionPlan
-from nlos.phasor.plan import GroupPlan, Hybrid, WavePlan
+from nlos.phasor.plan import GroupPlan, Hybrid, WavePlan, plan_waves
 from nlos.phasor.to_depths import IlluminatedDepthPropagator
 from nlos.phasor.wall_to_plane_compiled import sum_spherical_waves
 from nlos.plane import axis_step
@@ -267,7 +267,7 @@ class Refinement(Method):
             or memory does not suffice.
         """
         require_numpy_signal("iterative refinement", capture)
-        hybrid = self.hybrid.plan_waves(choose_roles(capture), grid)
+        hybrid = plan_waves(self.hybrid, choose_roles(capture), grid)
         _require_fine_depths(grid, self.hybrid.wavelength)
         _require_memory(grid)
         return RefinementPlan(capture, grid, self, hybrid)

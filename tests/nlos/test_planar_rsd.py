@@ -16,6 +16,7 @@ import nlos.phasor.to_depths_compiled
 from nlos import Backprojection, Capture, Grid, PlanarRSD
 from nlos.capture import TimeAxis
 from nlos.illumination import build_waves, choose_unaliased_band, group_by_illumination
+from nlos.phasor.propagate import CompiledBackend
 from nlos.plane import Plane
 from nlos.simulate import PointScene
 from tofclip.errors import InputError, ShapeError
@@ -100,7 +101,7 @@ def test_the_sampled_wave_is_the_exact_sum() -> None:
         group_by_illumination(capture),
     )
     plane = Plane(wall[0, :, 0], wall[:, 0, 1], 0.0)
-    values = part.compute_phasors(capture, band).reshape(9, 11, -1)
+    values = CompiledBackend(band).compute_phasors(capture, part).reshape(9, 11, -1)
     found = diffract_by_convolution(
         values, plane, grid, build_waves(part, band, continued=False)
     ).sum(axis=0)
