@@ -24,6 +24,8 @@ from tofclip.errors import InputError, MissingDependencyError
 
 T = TypeVar("T")
 
+FloatArray = NDArray[np.float64]
+
 Array = Any
 """An array of any library that follows the array API standard."""
 
@@ -308,34 +310,3 @@ def _find_torch_device(name: str) -> ComputeDevice:
             f"PyTorch finds no device '{name}' with float64 here; use `device=\"cpu\"`"
         ) from problem
     return ComputeDevice("torch", device)
-
-
-def gather_entries(table: Array, numbers: Array) -> Array:
-    """Return ``table[numbers]`` for a one-dimensional table and numbers of any shape.
-
-    `table` (n,); `numbers`: any shape. Returns of the numbers' shape.
-    """
-    xp = namespace(table, numbers)
-    return xp.reshape(xp.take(table, xp.reshape(numbers, (-1,)), axis=0), numbers.shape)
-
-
-def gather_rows(columns: Array, rows: Array) -> Array:
-    """Return ``columns[rows[i, n], n]``; `rows` is (i, n), or (n,) for one entry of each column.
-
-    `columns` (rows, n); `rows` (i, n). Returns of the shape of `rows`.
-    """
-    xp = namespace(columns, rows)
-    if rows.ndim == 1:
-        return xp.take_along_axis(columns, rows[None, :], axis=0)[0, ...]
-    return xp.take_along_axis(columns, rows, axis=0)
-
-
-def build_index_window(first: Array, width: int, last: Array, end: int) -> tuple[Array, Array]:
-    """Return the numbers from `first` on, (width, n), none beyond ``end - 1``, and which of them
-    are below `last`.
-
-    `first` (n,); `last` (n,). Returns `numbers` (width, n); `inside` (width, n).
-    """
-    xp = namespace(first, last)
-    numbers = first + xp.arange(width, dtype=first.dtype, device=native_device(first))[:, None]
-    return xp.clip(numbers, max=end - 1), numbers < last

@@ -18,6 +18,11 @@ PICOSECOND: Final = 1e-12
 NANOSECOND: Final = 1e-9
 MILLIMETRE: Final = 1e-3
 
+FWHM_PER_SIGMA: Final = 2.354820045030949  # of a Gaussian: 2 sqrt(2 ln 2)
+MAD_TO_SIGMA: Final = (
+    1.4826  # of Gaussian numbers: standard deviation over median absolute deviation
+)
+
 MIN_BIN_WIDTH_S = 1e-15
 MAX_BIN_WIDTH_S = 1e-7
 """s; shortest and longest credible time bin of a picture of ranges: 0.3 um and 30 m of path."""

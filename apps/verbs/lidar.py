@@ -31,9 +31,9 @@ from apps.verbs.photons import photons
 from tofclip.errors import InputError
 from tofclip.files import require_apart
 from tofclip.lidar import Detection, Pulse, depth, point_cloud
-from tofclip.lidar.detection import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.lidar.photons import PhotonDetector, measure_accuracy
 from tofclip.lidar.processing import find_objects
+from tofclip.lidar.significance import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.recovery import count_parallax_work, fit_parallax_to_shot, open_shot
 from tofclip.sequences import RangingSettings, list_shots
 from tofclip.shots import Frames

@@ -54,11 +54,11 @@ from tofclip.errors import FileFormatError, InputError, TofclipError
 from tofclip.files import format_error_line
 from tofclip.lidar import Detection, PointCloud, Returns, depth, point_cloud
 from tofclip.lidar.cloud import OPTIONAL_COLUMNS
-from tofclip.lidar.detection import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.lidar.export import read_table
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.photons import make_pinhole
 from tofclip.lidar.processing import select_points
+from tofclip.lidar.significance import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.loading import load, outline
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.sequences.ranger import RangingPipeline

@@ -17,7 +17,6 @@ from devices import aravis
 from nlos import backprojection
 from nlos.phasor import arrays as library
 from nlos.phasor import to_depths as diffraction
-from tofclip.lidar import search_array as array_api
 from tofclip.solvers import loops
 
 ROOT = Path(tofclip.__file__).parents[1]
@@ -48,7 +47,7 @@ def write_photons(path: Path) -> None:
 
 MEMORY = re.compile(r"(?<![\d.])(\d[\d.,]*)\s+([KMG]i?B)\b(?!/s)")
 LIMITS = {
-    "docs/gpu.md": {"2 GiB": loops.WORKING_BYTES, "1 GiB": array_api.WORKING_BYTES},
+    "docs/gpu.md": {"2 GiB": loops.WORKING_BYTES},
     "docs/nlos.md": {
         "32 MiB": backprojection.TABLE_BYTES,
         "8 MiB": library.CPU_CHUNK_BYTES,

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from tofclip.lidar.candidate_loops import pool_significance
 from tofclip.lidar.neighbours import (
     add_recovery_error,
     allocate_window,
     layer_returns,
     scatter_about_planes,
 )
+from tofclip.lidar.peak_kernels import pool_significance
 
 SHAPE = (64, 64)
 GATE_M = 9e-3

@@ -29,7 +29,6 @@ from numba.core.types import Array
 from numba.extending import overload
 
 from tofclip.compiling import ONE, compile_as_part, inlined
-from tofclip.lidar.detection import CONVERGENCE_STEP_BINS, MAX_FIT_ROUNDS
 from tofclip.lidar.peak_kernels import (
     FIRST_OFFSET,
     HEIGHT,
@@ -46,6 +45,10 @@ from tofclip.lidar.peak_kernels import (
 from tofclip.lidar.pulse_tables import MAX_OFFSET_BINS, PHASES_PER_BIN
 from tofclip.vectors import STEP, choose, fill_vector, load_vector, store_vector, sum_vector
 
+MAX_FIT_ROUNDS = (
+    8  # from near the top it has converged after two; more are for returns that overlap
+)
+CONVERGENCE_STEP_BINS = 5e-3  # a return that moved by less is done: its next step is smaller by far
 EVEN_VARIANCE = (
     1.0,
     0.0,

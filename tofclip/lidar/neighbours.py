@@ -23,9 +23,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.compiling import ONE, compile_as_part, compile_loop, inlined
-from tofclip.lidar.detection import find_quantile_value
+from tofclip.lidar.significance import find_quantile_value
 from tofclip.threads import run_blocks
+from tofclip.units import MAD_TO_SIGMA
 from tofclip.vectors import (
     LENGTH,
     STEP,
@@ -38,9 +40,6 @@ from tofclip.vectors import (
     store_vector,
     sum_vector,
 )
-
-FloatArray = NDArray[np.float64]
-
 
 plane_part = compile_as_part(fastmath=True, _nrt=False)
 
@@ -60,7 +59,6 @@ OUTLIER_DEVIATIONS = 3.0
 MIN_KNOWN = 20
 """Returns with enough neighbours that say how far the others are off."""
 
-MAD_TO_SIGMA = 1.4826
 MEDIAN_PRECISION = 1e-4
 RETURNS_PER_BLOCK = 2048
 """About 3 ms of planes: less than that is done before other threads have begun."""

@@ -16,7 +16,6 @@ import math
 import numpy as np
 
 from tofclip.compiling import ONE, SUMS_IN_ANY_ORDER, compile_as_part, compile_loop, inlined
-from tofclip.lidar.detection import PREFIT_THRESHOLD_FACTOR
 from tofclip.vectors import (
     LENGTH,
     STEP,
@@ -31,6 +30,10 @@ from tofclip.vectors import (
     store_vector,
     sum_vector,
 )
+
+# Of the share of the strongest return that a candidate needs before the fit, which does not make up
+# for more than the rest.
+PREFIT_THRESHOLD_FACTOR = 0.7
 
 search_step = compile_loop(fastmath=SUMS_IN_ANY_ORDER)
 search_part = compile_as_part(fastmath=SUMS_IN_ANY_ORDER, _nrt=False)
@@ -537,3 +540,32 @@ def interpolate_peak(before, here, after):
         rise *= 1 + rise * rise * (1 / 3 + rise * rise / 5)
         fall *= 1 + fall * fall * (1 / 3 + fall * fall / 5)
     return (rise - fall) / (4 * (rise + fall)) if rise + fall > 0 else 0.0
+
+
+@compile_loop()
+def pool_significance(pixel, at, distance, own, starts, image_shape, limits, pooled):
+    """Add to each candidate's significance those of its neighbours at the same range.
+
+    `pixel` (n,): not decreasing; `at` (n,): range at which neighbours are looked for, m; `distance`
+    (n,): range of each candidate, m; `own` (n,); `starts` (pixels + 1,): first candidate of each
+    pixel; `limits`: radius in pixels, and gate in m for each of them; `pooled` (n,): overwritten.
+    """
+    rows, columns = image_shape
+    radius, gate = limits
+    reach = int(radius)
+    for number in range(pixel.size):
+        y, x = pixel[number] // columns, pixel[number] % columns
+        total = own[number]
+        for j in range(-reach, reach + 1):
+            for i in range(-reach, reach + 1):
+                left = radius * radius - j * j - i * i
+                inside = 0 <= y + j < rows and 0 <= x + i < columns
+                if not inside or left < 0 or (j == 0 and i == 0):
+                    continue
+                # A ball, not a box: a neighbour farther across may differ less in range.
+                most = gate * math.sqrt(left)
+                there = (y + j) * columns + x + i
+                for k in range(starts[there], starts[there + 1]):
+                    if math.fabs(distance[k] - at[number]) <= most:
+                        total += own[k]
+        pooled[number] = total

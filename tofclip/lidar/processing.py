@@ -14,13 +14,12 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.files import import_open3d
 from tofclip.lidar.cloud import PROPERTY_COLUMNS, PointCloud
+from tofclip.units import MAD_TO_SIGMA
 
-FloatArray = NDArray[np.float64]
-
-MAD_TO_SIGMA = 1.4826
 MIN_SPACING_RATIO = 3.0
 
 
@@ -255,7 +254,7 @@ def _measure_object(cloud: PointCloud, points: NDArray[np.intp]) -> DetectedObje
         points=points,
         range=middle,
         range_sigma=float(np.median(cloud.range_sigma[points])),
-        scatter=1.4826 * float(np.median(np.abs(distance - middle))),
+        scatter=MAD_TO_SIGMA * float(np.median(np.abs(distance - middle))),
         centre=(x, y, z),
         width=float(high[0] - low[0]),
         height=float(high[1] - low[1]),

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.errors import InputError
+from tofclip.units import FWHM_PER_SIGMA
 
 SAMPLES_PER_FWHM = 128  # linear interpolation then errs by less than 2e-5 of the peak
 EXTENT_FWHM = 2.0  # a Gaussian is 1.5e-5 of its peak there
 EXTENT_DECAYS = 11.0  # an exponential is 1.7e-5 of its start there
-FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
 SAMPLES_PER_BIN = 64  # of a pulse that was summed over bins
 MAX_SAMPLES = 1 << 23
 """Of a pulse: 10,000 times as long as a bin and as long as its tail may be."""

@@ -22,6 +22,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray, to_numpy
 from tofclip.lidar.pulse import Pulse, Table
 from tofclip.shots import Frames
 
@@ -84,13 +85,10 @@ class PictureTraces:
 
 
 class FrameTraces(PictureTraces):
-    """Traces of a transient cube."""
+    """Traces of a transient cube, fetched from wherever it is."""
 
     def __init__(self, frames: Frames) -> None:
-        super().__init__(frames.values, TraceBins.all_bins(frames.times.size))
-
-
-FloatArray = NDArray[np.float64]
+        super().__init__(to_numpy(frames.values), TraceBins.all_bins(frames.times.size))
 
 
 def list_windows(

@@ -29,13 +29,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, RangeCalibration
 from tofclip.errors import CalibrationError, InputError
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.shots import Returns
-from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT
-
-FloatArray = NDArray[np.float64]
+from tofclip.units import MAD_TO_SIGMA, MILLIMETRE, SPEED_OF_LIGHT
 
 EM_ROUNDS = 10, 60
 """At most: a rough estimate to tell what does not belong, then the one that counts."""
@@ -622,7 +621,7 @@ def _require_plate(
     raise CalibrationError(
         f"{name}: no plate but {fault}: {target.sum()} of {target.size} returns ({share:.0%}) agree to "
         f"{width / MILLIMETRE:.2g} mm, {flank:.0%} as many lie just before and behind, and they scatter by "
-        f"{1.4826 * rough / MILLIMETRE:.2g} mm about a plane where "
+        f"{MAD_TO_SIGMA * rough / MILLIMETRE:.2g} mm about a plane where "
         f"{np.median(sigma[target]) / MILLIMETRE:.2g} mm is stated; {SHOW_A_PLATE}"
     )
 

@@ -7,7 +7,7 @@ is the maximum-likelihood estimate, so candidates are judged by the matched filt
 Gauss-Newton steps of that fit, below a bin. Histograms of counted photons are for
 `tofclip.lidar.photons`, whose estimator is the maximum-likelihood one there.
 
-The steps, for each pixel:
+The steps, for each pixel (`tofclip.lidar.trace_search` takes some of them at once):
 
 1. Filter the trace with a pulse compressed to half its width, which still shows two returns where
    the matched filter would merge them; its local maxima are the candidates.
@@ -21,10 +21,6 @@ The steps, for each pixel:
 5. Measure what the fit confirms: sum over the bins and the arrival's standard deviation
    (`measure_returns_by_table`).
 6. Add the recovery's own errors to the deviation, by what neighbours show (`add_recovery_error`).
-
-They are carried out by one of two sets of inner loops: those of `tofclip.lidar.trace_search`
-take NumPy's traces one after the other, `.array_api` takes all pixels of an array of another library
-at once. `tests/lidar/test_search_backends.py` holds them together.
 """
 
 from __future__ import annotations
@@ -37,29 +33,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import is_numpy
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.camera.rectifier import MeasurementNoise
 from tofclip.errors import InputError, ShapeError, require_type
-from tofclip.lidar.detection import Detection
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.pulse import Pulse
-from tofclip.lidar.pulse_tables import FrameTraces, PulseFilters, TraceBins, Traces, build_filters
+from tofclip.lidar.pulse_tables import FrameTraces, PulseFilters, Traces
 from tofclip.lidar.range_calibration import correct_returns
-from tofclip.lidar.search_array import ArraySearch, ArrayTraces
-from tofclip.lidar.significance import CANDIDATES, DEFAULT_FALSE_ALARM, SignificanceJudge
+from tofclip.lidar.significance import (
+    CANDIDATES,
+    DEFAULT_FALSE_ALARM,
+    Detection,
+    SignificanceJudge,
+)
 from tofclip.shots import Frames, Returns
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
-FloatArray = NDArray[np.float64]
-
-REFERENCE_RANGE_M = 1.0  # m; an intensity is what the same surface would send back from here
-BATCH_BYTES = 1 << 19  # traces that fit the second-level cache
-MAX_PIXELS_PER_BATCH, BATCHES_PER_BLOCK = 512, 1
-SAMPLE_THRESHOLD_FACTOR = (
-    0.85  # the response at the bin of a peak is up to 5 % below that at its top
-)
+BATCH_BYTES, MAX_PIXELS_PER_BATCH = 1 << 19, 512  # traces that fit the second-level cache
+# the response at the bin of a peak is up to 5 % below that at its top, and the fit makes up for more
+SAMPLE_THRESHOLD_FACTOR = 0.85
 MIN_SAMPLED_BATCHES, SAMPLING_STEP = 32, 7  # odd, or all of a sample might lie in one column
 MIN_PULSE_BINS = 2.0  # anything shorter falls between the samples
 
@@ -67,10 +61,10 @@ MIN_PULSE_BINS = 2.0  # anything shorter falls between the samples
 class ReturnSearch:
     """What stays the same from shot to shot in the search for returns.
 
-    `times` (time,): time of flight of each frame, s, increasing; `detection`: what counts as a
-    return; `pulse`: shape of a single return; by default a Gaussian as wide as
-    ``camera.pulse_fwhm``. Two returns of similar strength are separated from 1.3 widths on;
-    `shears` (time,): shear at which each frame is recovered, pixels per view step; 0 by default.
+    `times` (time,): time of flight of each frame, s, increasing; `pulse`: shape of a single return,
+    by default a Gaussian as wide as ``camera.pulse_fwhm``. Two returns of similar strength are
+    separated from 1.3 widths on; `shears` (time,): shear at which each frame is recovered, pixels
+    per view step; 0 by default.
     """
 
     def __init__(
@@ -93,57 +87,60 @@ class ReturnSearch:
 
     def find_returns(
         self,
-        traces: Traces | ArrayTraces,
+        traces: Traces,
         provenance: Mapping[str, Any] | None = None,
         judge: SignificanceJudge | None = None,
     ) -> Returns:
         """Find the returns in the traces of all pixels.
 
-        `provenance`: how they came about; `judge`: decides which candidates count; by default the
-        fractions of `Detection`.
-
-        Memory: 256 KiB of traces a thread, and 100 bytes a pixel.
+        `judge` decides which candidates count; by default the fractions of `Detection`. Takes 256
+        KiB of traces a thread, and 100 bytes a pixel.
         """
         # the compiler takes as long to import as all else
-        from tofclip.lidar.candidate_loops import list_kept
         from tofclip.lidar.neighbours import add_recovery_error
 
-        pixel, values = self._find_candidates(traces, judge is not None)
-        time, intensity = values[0], values[1] * _square_distance(values[0])
-        doubt = np.empty(0)
+        pixel, (time, signal, deviation) = self._find_candidates(traces, judge is not None)
+        intensity = signal * _square_distance(time)
+        false_alarm = np.empty(0)
         if judge is None:
             kept = self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
+            kept &= time > 0
         else:
-            kept, doubt = judge.judge(pixel, time, values[1])
-        kept &= time > 0
-        values[1] = intensity
-        number, columns = int(np.count_nonzero(kept)), self.camera.image_shape[1]
-        pixels, places = np.empty(number, np.int64), np.empty((2, number), np.int32)
-        lengths, intensity = np.empty((3, number)), np.empty(number, np.float32)
-        return_number = np.empty(number, np.uint8)
-        list_kept(pixel, values, kept, columns, pixels, places, return_number, lengths, intensity)
+            kept, doubt = judge.judge(pixel, time, signal)
+            kept &= time > 0
+            false_alarm = doubt[kept]
+        pixel, time = pixel[kept], time[kept]
+        first = np.flatnonzero(np.diff(pixel, prepend=-1))  # of each pixel
+        rank = np.arange(pixel.size) - np.repeat(first, np.diff(first, append=pixel.size))
+        y, x = np.divmod(pixel.astype(np.int32), np.int32(self.camera.image_shape[1]))
+        distance = SPEED_OF_LIGHT / 2 * time
         sigma = add_recovery_error(
-            lengths[2],
-            lengths[1],
-            self._along_axis.take(pixels),
-            pixels,
+            SPEED_OF_LIGHT / 2 * deviation[kept],
+            distance,
+            self._along_axis.take(pixel),
+            pixel,
             self.camera.image_shape,
             SPEED_OF_LIGHT / 2 * self.pulse.fwhm,
         )
-        measured = Returns(
-            y=places[0],
-            x=places[1],
-            range=lengths[1],
-            intensity=intensity,
-            confidence=sigma.astype(np.float32),
-            return_number=return_number,
-            time=lengths[0],
-            camera=self.camera,
-            shear=self._shear_at(lengths[0]),
-            provenance={} if provenance is None else provenance,
-            false_alarm=doubt if judge is None else doubt[kept],
+        # looking up every instant takes longer than placing it in space
+        moves = np.ptp(self.shears) > 0
+        return correct_returns(
+            Returns(
+                y=y,
+                x=x,
+                range=distance,
+                intensity=intensity[kept].astype(np.float32),
+                confidence=sigma.astype(np.float32),
+                return_number=(rank + 1).astype(np.uint8),
+                time=time,
+                camera=self.camera,
+                shear=np.interp(time, self.times, self.shears)
+                if moves
+                else np.full(time.size, self.shears[0]),
+                provenance={} if provenance is None else provenance,
+                false_alarm=false_alarm,
+            )
         )
-        return correct_returns(measured)
 
     @cached_property
     def _along_axis(self) -> FloatArray:
@@ -151,21 +148,18 @@ class ReturnSearch:
         rows, columns = np.indices(self.camera.image_shape).reshape(2, -1)
         return np.ascontiguousarray(compute_ray_directions(self.camera, rows, columns)[:, 2])
 
-    def _shear_at(self, time: FloatArray) -> FloatArray:
-        if (
-            np.ptp(self.shears) == 0
-        ):  # looking up every instant takes longer than placing it in space
-            return np.full(time.size, self.shears[0])
-        return np.interp(time, self.times, self.shears)
-
     @property
     def reach_bins(self) -> int:
         """How many bins on either side of a return its search and its fit look at."""
         # the responses of a peak's neighbours tell where its top is
         return max(len(self._filters.matched) // 2 + 1, self._filters.table.half)
 
+    @cached_property
+    def _filters(self) -> PulseFilters:
+        return PulseFilters.build(self.pulse, self.times)
+
     def _find_candidates(
-        self, traces: Traces | ArrayTraces, judged: bool
+        self, traces: Traces, judged: bool
     ) -> tuple[NDArray[np.int64], FloatArray]:
         """Pixel number of every candidate, and (3, n) instants, counts and deviations, in raster and
         time order.
@@ -173,63 +167,45 @@ class ReturnSearch:
         Unless all candidates are `judged`, those that are too weak beside what a sample of the
         pixels shows are not fitted.
         """
-        if isinstance(traces, ArrayTraces):
-            pixel, *values = self._portable.find_candidates(traces.values)
-            return pixel, np.stack(values)
         # the compiler takes as long to import as all else
         from tofclip.lidar.trace_search import TraceSearch
 
-        total, bins = traces.pixels.size, traces.bins
-        times = self.times[bins.numbers]
+        times = self.times[traces.bins.numbers]
         size = min(max(BATCH_BYTES // (4 * times.size), 1), MAX_PIXELS_PER_BATCH)
-        batches = list(split_blocks(total, size))
+        batches = list(split_blocks(traces.pixels.size, size))
         loops = TraceSearch(times, traces, self._filters, self.detection, size)
 
         def search(chosen: list[slice]) -> None:
-            run_blocks(
-                lambda piece: loops.find_returns(chosen[piece]),
-                len(chosen),
-                BATCHES_PER_BLOCK,
-            )
+            run_blocks(lambda piece: loops.find_returns(chosen[piece]), len(chosen), 1)
 
         if judged or len(batches) < MIN_SAMPLED_BATCHES:
             search(batches)
         else:
             search(batches[::SAMPLING_STEP])
-            pixel, (time, signal, _) = loops.list_found()
-            loops.set_least(self._compute_least_responses(pixel, time, signal, bins))
+            loops.set_least(self._compute_least_responses(*loops.list_found(), times, traces))
             search([one for place, one in enumerate(batches) if place % SAMPLING_STEP])
         return loops.list_found()
 
     def _compute_least_responses(
-        self, pixel: NDArray[np.int64], time: FloatArray, signal: FloatArray, bins: TraceBins
+        self, pixel: NDArray[np.int64], values: FloatArray, at: FloatArray, traces: Traces
     ) -> NDArray[np.float32]:
-        """Response of the matched filter below which no candidate can become a return.
+        """Response of the matched filter, (bins,), below which no candidate can become a return.
 
-        `pixel, time, signal` (n,): what was found in some of the pixels. Those of all pixels are
-        brighter or as bright, so that nothing is lost. Returns (bins,).
+        `pixel, values`: what was found in some of the pixels. Those of all pixels are brighter or as
+        bright, so that nothing is lost.
         """
-        at = self.times[bins.numbers]
         if pixel.size == 0:
             return np.zeros(at.size, np.float32)
+        time, signal, _ = values
         needed = self.detection.compute_least_intensity(
             pixel, time, signal * _square_distance(time), self.pulse.fwhm, at
         )
         # The response to a pulse is its sum, over that of the filter.
-        sums = np.maximum(self._filters.sums[bins.numbers], np.finfo(np.float32).tiny)
-        squares = np.maximum(_square_distance(at), np.finfo(np.float32).tiny)
+        tiny = np.finfo(np.float32).tiny
+        sums = np.maximum(self._filters.sums[traces.bins.numbers], tiny)
+        squares = np.maximum(_square_distance(at), tiny)
         least: NDArray[np.float32] = SAMPLE_THRESHOLD_FACTOR * needed / (squares * sums)
         return least.astype(np.float32)
-
-    @cached_property
-    def _filters(self) -> PulseFilters:
-        return PulseFilters.build(self.pulse, self.times)
-
-    @cached_property
-    def _portable(self) -> ArraySearch:
-        return ArraySearch(
-            self.times, build_filters(self.pulse, self.times), self.pulse, self.detection
-        )
 
 
 def depth(
@@ -248,9 +224,8 @@ def depth(
     Parameters
     ----------
     frames : Frames
-        Brightness (time, y, x) on any increasing time axis, searched in whatever library and on
-        whatever device its array is; the returns are NumPy's. The source is co-located: range is
-        ``c * time / 2``.
+        Brightness (time, y, x) on any increasing time axis, fetched from the device where it is.
+        The source is co-located: range is ``c * time / 2``.
     camera : Camera, optional
         Takes the place of the camera inside `frames`.
     detection, pulse
@@ -296,14 +271,13 @@ def depth(
     search = ReturnSearch(
         camera, frames.times, detection if noise is None else CANDIDATES, pulse, frames.shears
     )
-    traces = FrameTraces(frames) if is_numpy(frames.values) else ArrayTraces(frames)
-    if noise is None:
-        return search.find_returns(traces, frames.provenance)
-    limit = DEFAULT_FALSE_ALARM if false_alarm is None else false_alarm
-    judge = SignificanceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
-    return search.find_returns(traces, frames.provenance, judge)
+    judge = None
+    if noise is not None:
+        limit = DEFAULT_FALSE_ALARM if false_alarm is None else false_alarm
+        judge = SignificanceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
+    return search.find_returns(FrameTraces(frames), frames.provenance, judge)
 
 
 def _square_distance(time: FloatArray) -> FloatArray:
-    """Square of the range of a return, relative to `REFERENCE_RANGE_M`."""
-    return (SPEED_OF_LIGHT / 2 / REFERENCE_RANGE_M * time) ** 2
+    """Square of the range of a return, m^2: an intensity is what its surface would send back from 1 m."""
+    return (SPEED_OF_LIGHT / 2 * time) ** 2

@@ -1,4 +1,5 @@
-"""Which candidates count as returns, judged by the noise of the recovery that showed them.
+"""Which candidates count as returns: by fractions of what is brightest (`Detection`), or judged by the
+noise of the recovery that showed them (`SignificanceJudge`).
 
 A recovered frame shows light where there is none: photons' noise, and what the recovery spreads.
 How bright that is depends on what else the views saw at that instant, so no fraction of the scene's
@@ -9,7 +10,7 @@ brightest return tells it from a dim wall beside a retroreflector. Three things 
   known to ``1 / sqrt(sum a_m^2 / variance_m)``: the diagonal of the linear inverse's covariance at
   the solution. A pixel of which some view saw little else is known well; one that bright objects
   cross in every view is hardly known.
-* **Neighbours** (`pool_significance`). Surfaces go on in the pixels around, at the same range; noise
+* **Neighbours** (`CandidatePool`). Surfaces go on in the pixels around, at the same range; noise
   does not.
 * **Decoys** (`estimate_false_alarms`). The same sums at ranges displaced by chance are what noise
   makes of this very shot. Where true and displaced sums are equally frequent, a candidate is noise;
@@ -26,24 +27,153 @@ bright, dark and dazzled shots.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tofclip.arrays import to_numpy
+from tofclip.arrays import FloatArray, to_numpy
 from tofclip.camera.rectifier import MeasurementNoise
 from tofclip.errors import InputError
-from tofclip.lidar.detection import Detection
 from tofclip.lidar.pulse import Pulse
 from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
-FloatArray = NDArray[np.float64]
+SLOTS_PER_WIDTH = 4
+# of the scene's brightness: that of its brightest pixels, but not of a single glint
+SCENE_BRIGHTNESS_QUANTILE = 0.999
 
-DEFAULT_FALSE_ALARM = 0.5
-"""Probability of being noise above which a candidate is dropped."""
+
+@dataclass(frozen=True)
+class Detection:
+    """What counts as a return.
+
+    Parameters
+    ----------
+    signal_to_noise : float
+        Least response of the matched filter, in standard deviations of the pixel's background.
+    min_scene_fraction : float
+        Least intensity relative to the brightest returns of the scene.
+    min_time_bin_fraction : float
+        Least intensity relative to the brightest return of any pixel at the same instant, within a
+        pulse width: leaves out the streaks that recovery from few views draws across a frame around
+        its bright objects.
+    min_pixel_fraction : float
+        Least intensity relative to the pixel's strongest return: leaves out echoes inside the
+        instrument.
+    max_returns : int
+        Maximum number of returns in a pixel, the strongest.
+
+    Raises
+    ------
+    InputError
+        A share outside 0..1, a negative signal-to-noise, or no return allowed.
+    """
+
+    signal_to_noise: float = 5.0
+    min_scene_fraction: float = 0.05
+    min_time_bin_fraction: float = 0.12
+    min_pixel_fraction: float = 0.2
+    max_returns: int = 4
+
+    def __post_init__(self) -> None:
+        if not self.signal_to_noise >= 0:
+            raise InputError(
+                f"the signal-to-noise limit must not be negative, got {self.signal_to_noise}"
+            )
+        for share in (self.min_scene_fraction, self.min_time_bin_fraction, self.min_pixel_fraction):
+            if not 0 <= share <= 1:
+                raise InputError(f"a share must lie between 0 and 1, got {share}")
+        if not 1 <= self.max_returns <= 255:
+            raise InputError(f"a pixel can have 1 to 255 returns, got {self.max_returns}")
+
+    def find_significant(
+        self, pixel: NDArray[np.int64], time: FloatArray, intensity: FloatArray, pulse_width: float
+    ) -> NDArray[np.bool_]:
+        """Say which candidates are strong enough.
+
+        Parameters
+        ----------
+        pixel : (n,) int array
+            Pixel number of each candidate.
+        time : (n,) array
+            Its instant, s.
+        intensity : (n,) array
+            Its brightness with the fall-off with range undone.
+        pulse_width : float
+            Instants that differ by less than this, s, are the same.
+
+        Returns
+        -------
+        (n,) bool array
+        """
+        if pixel.size == 0:
+            return np.zeros(0, bool)
+        strongest = find_strongest(pixel, intensity)
+        strong = intensity >= (self.min_pixel_fraction * strongest)[pixel]
+        strong &= intensity >= self.compute_least_intensity(
+            pixel, time, intensity, pulse_width, time
+        )
+        return strong
+
+    def compute_least_intensity(
+        self,
+        pixel: NDArray[np.int64],
+        time: FloatArray,
+        intensity: FloatArray,
+        pulse_width: float,
+        at: FloatArray,
+    ) -> FloatArray:
+        """Return what the scene and its other returns at the same instant ask of a return.
+
+        Parameters
+        ----------
+        pixel, time, intensity, pulse_width
+            As for `find_significant`; at least one candidate.
+        at : (m,) array
+            Instants, s.
+
+        Returns
+        -------
+        (m,) float64 array
+            Brightness with the fall-off with range undone.
+        """
+        start, end = min(time.min(), at.min()), max(time.max(), at.max())
+
+        def find_slot(instants: FloatArray) -> NDArray[np.int64]:
+            slots = (instants - start) * (SLOTS_PER_WIDTH / pulse_width) + 0.5
+            return np.asarray(slots, dtype=np.int64)
+
+        brightest = np.zeros(int(find_slot(end)) + 1)
+        np.maximum.at(brightest, find_slot(time), intensity)
+        around = scipy.ndimage.maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)
+        strongest = find_strongest(pixel, intensity)
+        scene = find_quantile_value(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
+        needed = np.maximum(self.min_scene_fraction * scene, self.min_time_bin_fraction * around)
+        least: FloatArray = needed[find_slot(at)]
+        return least
+
+
+def find_strongest(pixel: NDArray[np.int64], intensity: FloatArray) -> FloatArray:
+    """Largest intensity of each pixel, (last pixel + 1,); 0 where there is no candidate."""
+    strongest = np.zeros(int(pixel.max()) + 1)
+    np.maximum.at(strongest, pixel, intensity)
+    return strongest
+
+
+def find_quantile_value(values: NDArray[np.floating], fraction: float) -> float:
+    """As `numpy.quantile`, in a tenth of its time: that one looks for two numbers at once."""
+    place = fraction * (values.size - 1)
+    before = int(place)
+    ordered = np.partition(values, before)
+    value = float(ordered[before])
+    above = float(ordered[before + 1 :].min(initial=np.inf))
+    return value + (place - before) * (above - value) if place > before else value
+
+
+DEFAULT_FALSE_ALARM = 0.5  # probability of being noise above which a candidate is dropped
 
 CANDIDATES = Detection(
     signal_to_noise=3.0,
@@ -54,14 +184,12 @@ CANDIDATES = Detection(
 )
 """What is looked at: nearly everything that a trace shows."""
 
-POOL_RADIUS_PX = 2.9
-CORE_RADIUS_PX = 1.5
+CORE_RADIUS_PX, POOL_RADIUS_PX = 1.5, 2.9
+GATE_PULSES_PER_PX = 0.45  # the wider pool then reaches 1.3 pulse lengths in range
+
 MIN_PIXEL_SHARE = 0.3
 """Of the pixel's most significant candidate, pooled over either radius. What is brighter than that
 one is not what it spreads, however little is known of it at an instant full of light."""
-
-GATE_PULSES_PER_PX = 0.45
-"""A pool of 2.9 pixels then reaches 1.3 pulse lengths in range."""
 
 MIN_INSTANT_SHARE, INSTANT_QUANTILE = 0.42, 0.8
 """Of what the upper candidates at the same range have. Streaks that a recovery from few views
@@ -72,12 +200,9 @@ MIN_INSTANT_BRIGHTNESS = 0.06
 """Of the same quantile of the signals at the same range: what the model does not explain beside the
 light of a bright shot is weak, however sure it is."""
 
-DECOY_ROUNDS = 3
-MIN_DISPLACEMENT_GATES = 6.0
+DECOY_ROUNDS, DECOY_SEED = 3, 20220614
+MIN_DISPLACEMENT_GATES = 6.0  # displaced candidates must not meet the surface they come from
 MIN_RANGE_GATES = 4 * MIN_DISPLACEMENT_GATES
-"""Displaced candidates must not meet the surface they come from."""
-
-DECOY_SEED = 20220614
 FRAMES_PER_BLOCK = 32
 
 
@@ -88,7 +213,6 @@ class SignificanceJudge:
     frames: Frames  # recovered, with what was known of the measurements' noise
     noise: MeasurementNoise
     pulse: Pulse
-    # candidates that are noise with a higher probability are dropped
     max_false_alarm: float = DEFAULT_FALSE_ALARM
 
     def __post_init__(self) -> None:
@@ -102,14 +226,13 @@ class SignificanceJudge:
     ) -> tuple[NDArray[np.bool_], FloatArray]:
         """Say which candidates are returns, and how probable it is that each is noise.
 
-        `pixel` (n,): number of the pixel, not decreasing; `time` (n,): instant, s; `signal` (n,):
-        counts, summed over the bins. Returns `kept` (n,); `probability` (n,).
+        `pixel` (n,) does not decrease; `signal` (n,): counts, summed over the bins.
         """
         length = SPEED_OF_LIGHT / 2 * self.pulse.fwhm
-        gate = GATE_PULSES_PER_PX * length
         own = weigh_candidates(self.frames, self.noise, self.pulse, pixel, time, signal)
         distance = SPEED_OF_LIGHT / 2 * time
-        pool = CandidatePool(pixel, distance, own, self.frames.camera.image_shape, gate)
+        shape = self.frames.camera.image_shape
+        pool = CandidatePool(pixel, distance, own, shape, GATE_PULSES_PER_PX * length)
         core, whole = pool.sum_around(CORE_RADIUS_PX), pool.sum_around(POOL_RADIUS_PX)
         probability = estimate_false_alarms(pool, whole)
         kept = probability <= self.max_false_alarm
@@ -124,19 +247,6 @@ class SignificanceJudge:
         return kept, probability
 
 
-def find_most_significant(
-    pixel: NDArray[np.int64], pooled: FloatArray, signal: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return significance and signal of the most significant candidate in each one's pixel.
-
-    `pixel` (n,): not decreasing; `pooled` (n,): significance; `signal` (n,): counts. Returns
-    `significance, signal` (n,).
-    """
-    order = np.lexsort((pooled, pixel))
-    last = order[np.searchsorted(pixel, pixel, side="right") - 1]
-    return pooled[last], signal[last]
-
-
 def weigh_candidates(
     frames: Frames,
     noise: MeasurementNoise,
@@ -145,45 +255,44 @@ def weigh_candidates(
     time: FloatArray,
     signal: FloatArray,
 ) -> FloatArray:
-    """Return by how many of its own standard deviations each candidate is brighter than nothing.
-
-    `pixel` (n,); `time` (n,): s; `signal` (n,): counts, summed over the bins. Returns (n,).
-    """
+    """Return by how many of its own standard deviations each candidate is brighter than nothing."""
     values = to_numpy(frames.values)
     order = np.argsort(time)
     at, first, last = time[order], *pulse.support
-    information = np.zeros(time.size)
-    total = np.zeros(time.size)
-    for start, stop in _list_blocks(frames.shears):
+    information, total = np.zeros((2, time.size))
+    # blocks of one shear
+    number = frames.times.size
+    changes = np.flatnonzero(np.diff(frames.shears)) + 1
+    edges = np.union1d(changes, [*range(0, number, FRAMES_PER_BLOCK), number])
+    for start, stop in pairwise(edges.tolist()):
         operator = frames.camera.operator(float(frames.shears[start])).matrix
         pictures = values[start:stop].reshape(stop - start, -1).T.astype(np.float32)
-        light = np.maximum(operator @ pictures, 0)
-        variance = noise.compute_variance(light)
+        variance = noise.compute_variance(np.maximum(operator @ pictures, 0))
         squares = operator.copy()
         squares.data = squares.data**2
         known = squares.T @ (1 / np.maximum(variance, np.finfo(np.float32).tiny))
         for place in range(start, stop):
-            # Candidates whose pulse reaches this frame.
-            here = slice(
-                *np.searchsorted(at, [frames.times[place] - last, frames.times[place] - first])
-            )
-            some = order[here]
-            shape = np.maximum(pulse(frames.times[place] - at[here]), 0)
-            information[some] += shape**2 * known[pixel[some], place - start]
-            total[some] += shape
+            instant = frames.times[place]
+            # candidates whose pulse reaches this frame
+            here = slice(*np.searchsorted(at, [instant - last, instant - first]))
+            shape = np.maximum(pulse(instant - at[here]), 0)
+            reached = order[here]
+            information[reached] += shape**2 * known[pixel[reached], place - start]
+            total[reached] += shape
     # The pulse's samples are a shape; a candidate's counts are its sum over the bins.
     height = signal / np.maximum(total, np.finfo(np.float64).tiny)
     return np.asarray(height * np.sqrt(information))
 
 
-def _list_blocks(shears: FloatArray) -> list[tuple[int, int]]:
-    """Cut the frames into blocks of one shear."""
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(shears)) + 1, [shears.size]])
-    return [
-        (start, min(start + FRAMES_PER_BLOCK, stop))
-        for first, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
-        for start in range(first, stop, FRAMES_PER_BLOCK)
-    ]
+def find_most_significant(
+    pixel: NDArray[np.int64], pooled: FloatArray, signal: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return significance and signal of the most significant candidate in each one's pixel; `pixel`
+    does not decrease.
+    """
+    order = np.lexsort((pooled, pixel))
+    last = order[np.searchsorted(pixel, pixel, side="right") - 1]
+    return pooled[last], signal[last]
 
 
 @dataclass(frozen=True)
@@ -199,16 +308,14 @@ class CandidatePool:
     gate: float
 
     def sum_around(self, radius: float, displaced: FloatArray | None = None) -> FloatArray:
-        """Return each candidate's significance together with those around it, at the same range.
-
-        `radius`: pixels; `displaced` (n,): ranges at which neighbours are looked for instead, m.
-        Returns (n,).
+        """Return each candidate's significance with those within `radius` pixels at the same range, m,
+        or around the ranges `displaced`.
         """
-        from tofclip.lidar.candidate_loops import pool_significance
+        # the compiler takes as long to import as all else
+        from tofclip.lidar.peak_kernels import pool_significance
 
-        starts = np.searchsorted(
-            self.pixel, np.arange(self.image_shape[0] * self.image_shape[1] + 1)
-        )
+        rows, columns = self.image_shape
+        starts = np.searchsorted(self.pixel, np.arange(rows * columns + 1))
         at = self.distance if displaced is None else displaced
         pooled = np.empty(self.own.size)
         pool_significance(
@@ -225,10 +332,8 @@ class CandidatePool:
 
 
 def find_usual_at_range(distance: FloatArray, pooled: FloatArray, length: float) -> FloatArray:
-    """Return what the upper candidates within a pulse of each one's range have.
-
-    `distance` (n,): m; `pooled` (n,): significance; candidates of 0 do not count; `length`: of a
-    pulse, m. Returns (n,).
+    """Return what the upper candidates within a pulse's `length`, m, of each one's range have; those
+    of 0 do not count.
     """
     slot = np.floor((distance - distance.min()) / length).astype(np.int64)
     order = np.argsort(slot, kind="stable")
@@ -248,8 +353,8 @@ def find_usual_at_range(distance: FloatArray, pooled: FloatArray, length: float)
 def estimate_false_alarms(pool: CandidatePool, pooled: FloatArray) -> FloatArray:
     """Return the probability that each candidate is noise, by decoys at displaced ranges.
 
-    `pooled` (n,): of `CandidatePool.sum_around` with `POOL_RADIUS_PX`. Returns (n,): 0 where all
-    candidates lie so close together that no decoy can be had.
+    `pooled`: of `POOL_RADIUS_PX`. 0 where all candidates lie so close together that no decoy can be
+    had.
     """
     span = float(np.ptp(pool.distance)) if pooled.size else 0.0
     if span < MIN_RANGE_GATES * pool.gate:

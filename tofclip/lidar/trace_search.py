@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.lidar.detection import Detection
+from tofclip.arrays import FloatArray
 from tofclip.lidar.fit_kernels import (
     fit_crowded_returns,
     fit_lone_returns,
@@ -24,9 +24,8 @@ from tofclip.lidar.peak_kernels import (
     find_candidates,
 )
 from tofclip.lidar.pulse_tables import PulseFilters, Traces, list_windows
+from tofclip.lidar.significance import Detection
 from tofclip.vectors import LENGTH
-
-FloatArray = NDArray[np.float64]
 
 NEIGHBOUR_FRACTION = 0.5  # of what is of interest: weaker peaks do not move a return beside them
 
