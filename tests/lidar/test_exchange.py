@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
@@ -228,17 +227,3 @@ def test_what_cannot_be_organised_is_refused(tmp_path) -> None:
         save_organised(make_two_walls(), tmp_path / "scene.pcd")
     with pytest.raises(InputError, match=r"\.pcd, \.ply, \.npz, \.csv"):
         save_organised(make_two_walls().select("last"), tmp_path / "scene.las")
-
-
-def test_the_deviation_is_read_by_its_older_name(cloud, tmp_path) -> None:
-    for suffix in (".ply", ".csv", ".h5"):
-        path = tmp_path / f"older{suffix}"
-        cloud.save(path)
-        if suffix == ".h5":
-            with h5py.File(path, "r+") as file:
-                file.move("range_sigma", "confidence")
-        else:
-            path.write_bytes(path.read_bytes().replace(b"range_sigma", b"confidence"))
-        back = PointCloud.load(path)
-        np.testing.assert_array_equal(back.range_sigma, cloud.range_sigma)
-        np.testing.assert_array_equal(back.confidence, cloud.range_sigma)

@@ -1,8 +1,7 @@
 """Point clouds: where in space each return came from.
 
-Organised clouds: one point for each pixel of the picture, row by row, NaN where nothing came back.
-
-Programs that work on neighbours take these from the rows and columns, without a search in space.
+Organised clouds have one point for each pixel of the picture, row by row, NaN where nothing came
+back: programs that work on neighbours take these from the rows and columns.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import FileFormatError, InputError, ShapeError, require_type
 from tofclip.files import import_open3d, require_suffix
 from tofclip.io.archive import ArchiveEntry
@@ -48,16 +48,10 @@ COLUMN_UNITS = {
 """The columns of a point cloud, in the order in which files hold them."""
 
 PROPERTY_COLUMNS = tuple(name for name in COLUMN_UNITS if name not in "xyz")
-"""Those beside the positions."""
-
-OPTIONAL_COLUMNS = ("false_alarm", "reflectance")
-"""In files only where they are known of a point."""
-
-FRONT_PIXELS = 64
-"""Rows and columns of a cloud's picture in a notebook."""
-
-OLD_NAMES = {"confidence": "range_sigma"}
-"""Columns of older files, read for one more version, and what they are called now."""
+OPTIONAL_COLUMNS = ("false_alarm", "reflectance")  # in files only where they are known of a point
+FRONT_PIXELS = 64  # rows and columns of a cloud's picture in a notebook
+ORGANISED_SUFFIXES = (".pcd", ".ply", ".npz", ".csv")
+"""Formats that can say what is missing; PCD says rows and columns as well."""
 
 
 def _column(name: str, dtype: type = np.float32) -> dict[str, Any]:
@@ -152,11 +146,6 @@ class PointCloud(Storable):
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(self.xyz, dtype=dtype)
 
-    @property
-    def confidence(self) -> NDArray[np.float32]:
-        """`range_sigma` by its name in earlier versions; goes with the next one."""
-        return self.range_sigma
-
     def __repr__(self) -> str:
         if len(self) == 0:
             return "PointCloud(0 points)"
@@ -170,15 +159,13 @@ class PointCloud(Storable):
             rows["range"] = f"{self.range.min():.3f} to {self.range.max():.3f} m"
         return render_html("PointCloud", rows, self._render_front())
 
-    def _render_front(self) -> NDArray[np.float64] | None:
+    def _render_front(self) -> FloatArray | None:
         """Light of the points as the camera sees them, (rows, columns); None without points."""
         if len(self) == 0:
             return None
         x, y, _ = self.xyz.T
-        light: NDArray[np.float64]
-        light, *_ = np.histogram2d(y, x, bins=FRONT_PIXELS, weights=self.intensity)
-        picture: NDArray[np.float64] = np.sqrt(np.maximum(light, 0))
-        return picture
+        light: FloatArray = np.histogram2d(y, x, bins=FRONT_PIXELS, weights=self.intensity)[0]
+        return np.sqrt(np.maximum(light, 0))
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the points as the camera sees them, coloured by range.
@@ -299,12 +286,6 @@ class PointCloud(Storable):
             record, fields={name: one for name, one in record.fields.items() if name in known}
         )
 
-    @classmethod
-    def from_record(cls, record: Record) -> PointCloud:
-        """Rebuild a point cloud from what was stored, whatever its columns were called then."""
-        fields = {OLD_NAMES.get(name, name): one for name, one in record.fields.items()}
-        return super().from_record(replace(record, fields=fields))
-
     @property
     def columns(self) -> list[Column]:
         """Everything that is known of the points, in the order in which files hold it."""
@@ -347,24 +328,18 @@ def point_cloud(returns: Returns) -> PointCloud:
 
 def _list_columns(path: str | Path) -> dict[str, ArchiveEntry]:
     """List the columns of a point cloud's table; refuse one that lacks any."""
-    listed = export.list_columns(path)
-    columns = {OLD_NAMES.get(name, name): entry for name, entry in listed.items()}
+    columns = export.list_columns(path)
     for name in COLUMN_UNITS:
         if name not in columns and name not in OPTIONAL_COLUMNS:
             raise FileFormatError(path, f"has no column '{name}': it was not written by tofclip")
     return {name: columns[name] for name in COLUMN_UNITS if name in columns}
 
 
-ORGANISED_SUFFIXES = (".pcd", ".ply", ".npz", ".csv")
-"""Formats that can say what is missing; PCD says rows and columns as well."""
-
-
 def save_organised(returns: Returns, path: str | Path) -> int:
-    """Write a point for every pixel, whole or not at all; return how many there are.
+    """Write a place for every pixel, whole or not at all; return how many have a point.
 
-    `returns`: at most one for each pixel, see `Returns.select`; `path`: ends in ``.pcd`` (WIDTH and
-    HEIGHT are the picture's), ``.ply``, ``.npz`` (pictures, (rows, columns)) or ``.csv``. Returns
-    pixels with a point.
+    There is at most one return for each pixel (`Returns.select`). WIDTH and HEIGHT of PCD are the
+    picture's, and NPZ holds pictures, (rows, columns).
     """
     suffix = Path(path).suffix.lower()
     if suffix not in ORGANISED_SUFFIXES:

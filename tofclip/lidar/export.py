@@ -1,28 +1,22 @@
-"""One property of all points, as files hold it.
-
-LAS and its compressed form LAZ, through laspy (an optional library).
-
-Positions are whole multiples of a micrometre, as LAS wants them; all other columns are extra
-dimensions in full precision, named ``tofclip_NAME`` and with their unit in the description. The
-standard intensity is theirs too, scaled to 16 bits for viewers.
-
-E57 (ASTM E2807), through pye57 (an optional library).
-
-The scan holds positions and intensity, which every reader of E57 knows. All other columns lie in a
-table of an extension beside it, ``tofclip:columns``, row by row in the same order.
-
-Tables of points in the formats that other programs read: PLY, PCD, CSV, NPZ, LAS and LAZ.
+"""Tables of points in the formats that other programs read, and depth pictures.
 
 Every file says the units of its columns: PLY and PCD in a comment, CSV and NPZ in the columns'
-names (``x_m``).
+names (``x_m``), LAS in the description of its dimensions. PLY and PCD are written and read here and
+not by Open3D, which does not load on every machine.
 
-Depth pictures in OpenEXR: what renderers and compositors read.
+LAS and its compressed form LAZ, through laspy: positions are whole multiples of a micrometre; all
+other columns are extra dimensions in full precision, named ``tofclip_NAME``. The standard intensity
+is theirs too, scaled to 16 bits for viewers.
+
+E57 (ASTM E2807), through pye57: the scan holds positions and intensity, which every reader knows.
+All other columns lie in a table of an extension beside it, ``tofclip:columns``, in the same order.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import struct
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,10 +27,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from tofclip.errors import FileFormatError, InputError, MissingDependencyError, TofclipError
+from tofclip.errors import FileFormatError, InputError, MissingDependencyError
 from tofclip.files import (
     BoundedFile,
     atomic_path,
+    guard,
     require_bounded_size,
     require_suffix,
     translate_read_errors,
@@ -45,10 +40,23 @@ from tofclip.io.archive import Archive, ArchiveEntry
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.shots import Returns
 
+MAX_HEADER_BYTES = 1 << 16
+PLY_WORDS = 3  # in a line of a header: what it is, type, name or number
+PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
+PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8", ("U", "1"): "u1"}
+
+COORDINATE_STEP_M = 1e-6  # of LAS; 32 bits then reach 2.1 km
+LAS_HEADER_BYTES, LAS_RECORD_BYTES = 375, 54  # of version 1.4; of a record's own header
+DIMENSION_PREFIX = "tofclip_"
+
+EXTENSION, EXTENSION_URI = "tofclip", "urn:tofclip:cloud:1"
+EXTRA_COLUMNS = f"{EXTENSION}:columns"
+E57_NAMES = {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ", "intensity": "intensity"}
+
 
 @dataclass(frozen=True)
 class Column:
-    """One property of all points.
+    """One property of all points, as files hold it.
 
     Parameters
     ----------
@@ -70,344 +78,60 @@ class Column:
 
 
 Columns = Sequence[Column]
-Table = dict[str, NDArray[Any]]
-
-
-COORDINATE_STEP_M = 1e-6  # m; 32 bits then reach 2.1 km
-# Places in the header of LAS 1.4, table 3 of its specification, and the size of a record's own one.
-HEADER_BYTES, VERSION_PLACE, RECORD_COUNT_PLACES = 375, 25, (100, 243)
-POINTS_PLACE, VERSION_WITH_EXTENDED_RECORDS, RECORD_BYTES = 96, 4, 54
-DIMENSION_PREFIX = "tofclip_"
-
-
-def write_las(path: Path, columns: Columns) -> None:
-    """Write columns x, y, z and others to LAS 1.4, compressed if the name ends in ``.laz``.
-
-    `columns`: with ``x``, ``y`` and ``z`` in m, ``intensity`` and ``return_number``.
-    """
-    laspy = _import_laspy()
-    values = {column.name: column.values for column in columns}
-    if any(np.abs(values[axis]).max(initial=0) >= COORDINATE_STEP_M * 2**31 for axis in "xyz"):
-        raise InputError(
-            f"{path}: LAS reaches {COORDINATE_STEP_M * 2**31:.0f} m at a micrometre; use another format"
-        )
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = np.full(3, COORDINATE_STEP_M), np.zeros(3)
-    others = [column for column in columns if column.name not in "xyz"]
-    header.add_extra_dims(
-        [
-            laspy.ExtraBytesParams(
-                DIMENSION_PREFIX + one.name, one.values.dtype, description=one.unit
-            )
-            for one in others
-        ]
-    )
-    table = laspy.LasData(header)
-    table.x, table.y, table.z = (values[axis].astype(np.float64) for axis in "xyz")
-    for one in others:
-        table[DIMENSION_PREFIX + one.name] = one.values
-    brightness = np.maximum(values["intensity"], 0).astype(np.float64)
-    table.intensity = np.rint(brightness * (65535 / (brightness.max(initial=0) or 1))).astype(
-        np.uint16
-    )
-    table.return_number = np.minimum(values["return_number"], 15)
-    table.number_of_returns = table.return_number
-    with open(path, "wb") as file:
-        table.write(file, do_compress=path.suffix.lower() == ".laz")
-
-
-def list_las_columns(path: Path) -> dict[str, ArchiveEntry]:
-    """List the columns that `write_las` wrote; the first that is loaded reads all points."""
-    read_points = functools.cache(lambda: _read_points(path))
-    names = {axis: axis for axis in "xyz"}
-    with _open_reader(path) as reader:
-        layout, points = reader.header.point_format, reader.header.point_count
-        packed = path.suffix.lower() == ".laz"
-        require_bounded_size(path, "LAS points", points * layout.size, path.stat().st_size, packed)
-        for name in layout.extra_dimension_names:
-            if name.startswith(DIMENSION_PREFIX):
-                names[name.removeprefix(DIMENSION_PREFIX)] = name
-        types = {
-            name: np.dtype(np.float32) if name in "xyz" else layout.dimension_by_name(name).dtype
-            for name in names.values()
-        }
-    return {
-        column: ArchiveEntry(
-            (points,),
-            types[name],
-            lambda name=name: np.array(read_points()[name], types[name]),  # type: ignore[misc]
-        )
-        for column, name in names.items()
-    }
-
-
-def _read_points(path: Path) -> Any:
-    with _open_reader(path) as reader:
-        points, table = reader.header.point_count, reader.read()
-    if len(table.points) != points:
-        raise FileFormatError(
-            path, f"is not a complete LAS file: {len(table.points)} of {points} points are there"
-        )
-    return table
-
-
-@contextlib.contextmanager
-def _open_reader(path: Path) -> Iterator[Any]:
-    laspy = _import_laspy()
-    _require_bounded_records(path)
-    try:
-        with BoundedFile(path) as file, laspy.open(file) as reader:
-            yield reader
-    except TofclipError:
-        raise
-    # laspy and its backends raise whatever the damage happens to cause, want of memory included:
-    # what the points take is known to be there
-    except Exception as fault:
-        raise FileFormatError(
-            path, f"is not a LAS or LAZ file, or a damaged one ({type(fault).__name__})"
-        ) from fault
-
-
-def _require_bounded_records(path: Path) -> None:
-    """Refuse a header that claims more records of variable length than the file can hold.
-
-    The library would look for each of them, for hours.
-    """
-    with open(path, "rb") as file:
-        header = file.read(HEADER_BYTES).ljust(HEADER_BYTES, b"\0")
-    records, extended = (struct.unpack_from("<I", header, at)[0] for at in RECORD_COUNT_PLACES)
-    claimed = records * RECORD_BYTES
-    if header[VERSION_PLACE] >= VERSION_WITH_EXTENDED_RECORDS:
-        claimed += extended * RECORD_BYTES
-    size = path.stat().st_size
-    require_bounded_size(path, "LAS records of variable length", claimed, size)
-    require_bounded_size(
-        path, "LAS header", struct.unpack_from("<I", header, POINTS_PLACE)[0], size
-    )
-
-
-def _import_laspy() -> Any:
-    try:
-        import laspy
-    except ImportError as fault:
-        raise MissingDependencyError(
-            "LAS and LAZ need laspy: pip install 'tofclip[las]'"
-        ) from fault
-    return laspy
-
-
-EXTENSION = "tofclip"
-EXTENSION_URI = "urn:tofclip:cloud:1"
-EXTRA_COLUMNS = f"{EXTENSION}:columns"
-STANDARD_NAMES = {
-    "x": "cartesianX",
-    "y": "cartesianY",
-    "z": "cartesianZ",
-    "intensity": "intensity",
-}
-
-
-def write_e57(path: Path, columns: Columns) -> None:
-    """Write columns x, y, z, intensity and others to an E57 file of one scan.
-
-    `columns`: float32 or uint8, (n,) values each.
-    """
-    pye57 = _import_pye57()
-    # The library makes its files itself.
-    path.unlink(missing_ok=True)
-    file = pye57.E57(str(path), mode="w")
-    try:
-        _write_scan(pye57.libe57, file, columns)
-        file.close()
-    except Exception:
-        # Closed once more when it is collected, it would print that it still cannot be written.
-        vars(file).pop("image_file", None)
-        raise
-
-
-def _write_scan(lib: Any, file: Any, columns: Columns) -> None:
-    image = file.image_file
-    image.extensionsAdd(EXTENSION, EXTENSION_URI)
-    scan = lib.StructureNode(image)
-    scan.set("guid", lib.StringNode(image, f"{{{uuid.uuid4()}}}"))
-    scan.set("name", lib.StringNode(image, "point cloud"))
-    scan.set("cartesianBounds", _describe_bounds(lib, image, columns))
-    standard = [column for column in columns if column.name in STANDARD_NAMES]
-    own = [column for column in columns if column.name not in STANDARD_NAMES]
-    points, fill_points = _prepare_vector(lib, image, standard)
-    scan.set("points", points)
-    file.data3d.append(scan)
-    fill_points()
-    extra, fill_extra = _prepare_vector(lib, image, own)
-    file.root.set(EXTRA_COLUMNS, extra)
-    fill_extra()
-
-
-def list_e57_columns(path: Path) -> dict[str, ArchiveEntry]:
-    """List the columns that `write_e57` wrote; the first that is loaded reads all points."""
-
-    @functools.cache
-    def read() -> Table:
-        with _open_tables(path) as (lib, tables):
-            return {
-                name: values
-                for image, table in tables
-                for name, values in _read_vector(lib, image, table)
-            }
-
-    def make_entry(name: str, dtype: DTypeLike, points: int) -> ArchiveEntry:
-        return ArchiveEntry((points,), np.dtype(dtype), lambda: read()[name])
-
-    size = path.stat().st_size
-    with _open_tables(path) as (lib, tables):
-        entries = {}
-        for _, table in tables:
-            points = table.childCount()
-            for _, name, dtype in _list_elements(lib, table):
-                claimed = points * np.dtype(dtype).itemsize
-                require_bounded_size(path, name, claimed, size, compressed=True)
-                entries[name] = make_entry(name, dtype, points)
-    return entries
-
-
-@contextlib.contextmanager
-def _open_tables(path: Path) -> Iterator[tuple[Any, list[tuple[Any, Any]]]]:
-    """Open the scan's points and the extension's columns, each with the file that it is in."""
-    pye57 = _import_pye57()
-    try:
-        with contextlib.closing(pye57.E57(str(path))) as file:
-            tables = [(file.image_file, file.data3d[0]["points"])]
-            if file.root.isDefined(EXTRA_COLUMNS):
-                tables.append((file.image_file, file.root[EXTRA_COLUMNS]))
-            yield pye57.libe57, tables
-    except (TofclipError, MemoryError):
-        raise
-    except Exception as fault:  # the library raises whatever the damage happens to cause
-        raise FileFormatError(
-            path, f"is not an E57 file, or a damaged one ({type(fault).__name__})"
-        ) from fault
-
-
-def _prepare_vector(lib: Any, image: Any, columns: Columns) -> tuple[Any, Callable[[], None]]:
-    """Return an empty table of columns, and what fills it once it is part of the file."""
-    prototype, buffers = lib.StructureNode(image), lib.VectorSourceDestBuffer()
-    # The library reads from this memory while it writes.
-    held = [np.ascontiguousarray(column.values) for column in columns]
-    for column, values in zip(columns, held, strict=True):
-        name = STANDARD_NAMES.get(column.name, f"{EXTENSION}:{column.name}")
-        prototype.set(name, _make_element(lib, image, values))
-        buffers.append(lib.SourceDestBuffer(image, name, values, max(values.size, 1), True, False))
-    table = lib.CompressedVectorNode(image, prototype, lib.VectorNode(image, True))
-
-    def fill() -> None:
-        writer = table.writer(buffers)
-        if held[0].size:
-            writer.write(held[0].size)
-        writer.close()
-
-    return table, fill
-
-
-def _list_elements(lib: Any, table: Any) -> list[tuple[str, str, type]]:
-    """Label in the file, name and type of each column."""
-    names = {element: name for name, element in STANDARD_NAMES.items()}
-    prototype = lib.StructureNode(table.prototype())
-    found: list[tuple[str, str, type]] = []
-    for number in range(prototype.childCount()):
-        element = prototype.get(number)
-        label = element.elementName()
-        kind = np.uint8 if element.type() == lib.NodeType.E57_INTEGER else np.float32
-        found.append((label, names.get(label, label.removeprefix(f"{EXTENSION}:")), kind))
-    return found
-
-
-def _read_vector(lib: Any, image: Any, table: Any) -> list[tuple[str, NDArray[Any]]]:
-    found, buffers = [], lib.VectorSourceDestBuffer()
-    for label, name, kind in _list_elements(lib, table):
-        values = np.empty(table.childCount(), kind)
-        found.append((name, values))
-        if values.size:
-            buffers.append(lib.SourceDestBuffer(image, label, values, values.size, True, False))
-    if table.childCount():
-        reader = table.reader(buffers)
-        reader.read()
-        reader.close()
-    return found
-
-
-def _make_element(lib: Any, image: Any, values: Any) -> Any:
-    """Describe a column: its type and its bounds."""
-    if values.dtype.kind == "f":
-        return lib.FloatNode(image, 0.0, lib.E57_SINGLE, lib.E57_FLOAT_MIN, lib.E57_FLOAT_MAX)
-    return lib.IntegerNode(image, 0, 0, int(np.iinfo(values.dtype).max))
-
-
-def _describe_bounds(lib: Any, image: Any, columns: Columns) -> Any:
-    bounds = lib.StructureNode(image)
-    for column in columns:
-        if column.name in "xyz":
-            low, high = (
-                (float(column.values.min()), float(column.values.max()))
-                if column.values.size
-                else (0.0, 0.0)
-            )
-            bounds.set(f"{column.name}Minimum", lib.FloatNode(image, low))
-            bounds.set(f"{column.name}Maximum", lib.FloatNode(image, high))
-    return bounds
-
-
-def _import_pye57() -> Any:
-    try:
-        import pye57
-    except ImportError as fault:
-        raise MissingDependencyError("E57 needs pye57: pip install 'tofclip[exchange]'") from fault
-    return pye57
-
-
 Entries = dict[str, ArchiveEntry]
-ColumnWriter = Callable[..., None]
-ColumnLister = Callable[[Path], Entries]
-
-PLY_WORDS = 3
-"""In a line of a header: what it is, type, name or number."""
-PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
-PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8", ("U", "1"): "u1"}
-MAX_HEADER_BYTES = 1 << 16
 
 
 def write_table(path: str | Path, columns: Columns, shape: tuple[int, int] | None = None) -> None:
     """Write columns to the format that the suffix of `path` names, whole or not at all.
 
-    `columns`: with name, unit and (n,) values each; `shape`: rows and columns of a picture whose
-    pixels the values are, in raster order. PCD and NPZ say so.
+    `shape`: rows and columns of a picture whose pixels the values are, in raster order; PCD and NPZ
+    say so.
     """
-    writer = _look_up_format(path)[0]
+    require_suffix(path, *FORMATS)
+    writer = FORMATS[Path(path).suffix.lower()][0]
     with atomic_path(path) as temporary:
-        # Only these formats can say where in a picture the points lie.
-        if shape is not None and writer in (_write_pcd, _write_npz):
-            writer(temporary, columns, shape)
-        else:
-            writer(temporary, columns)
+        writer(temporary, columns, shape)
 
 
-def list_columns(path: str | Path) -> dict[str, ArchiveEntry]:
-    """List the columns of a table that `write_table` wrote, by their names without units."""
-    lister = _look_up_format(path)[1]
+def list_columns(path: str | Path) -> Entries:
+    """List the columns of a table that `write_table` wrote, by their names without units; the first
+    that is loaded reads all.
+    """
+    require_suffix(path, *FORMATS)
+    lister = FORMATS[Path(path).suffix.lower()][1]
     with translate_read_errors(path):
-        return {_strip_unit(label): entry for label, entry in lister(Path(path)).items()}
+        listed = lister(Path(path))
+    entries = {}
+    for label, entry in listed.items():
+        name, _, unit = label.rpartition("_")
+        entries[name if unit in ("m", "s", "count", "percent") else label] = entry
+    return entries
 
 
-def read_table(path: str | Path) -> Table:
+def read_table(path: str | Path) -> dict[str, NDArray[Any]]:
     """Read a table that `write_table` wrote: its columns by their names, without units."""
     return {name: entry.load() for name, entry in list_columns(path).items()}
 
 
-def _look_up_format(path: str | Path) -> tuple[ColumnWriter, ColumnLister]:
-    require_suffix(path, *FORMATS)
-    return FORMATS[Path(path).suffix.lower()]
+def _defer(
+    points: int, types: Mapping[str, DTypeLike], read: Callable[[], Mapping[str, Any]]
+) -> Entries:
+    read_all = functools.cache(read)
+    return {
+        name: ArchiveEntry(
+            (points,),
+            np.dtype(dtype),
+            lambda name=name, dtype=dtype: np.array(read_all()[name], dtype),  # type: ignore[misc]
+        )
+        for name, dtype in types.items()
+    }
 
 
-def _write_ply(path: Path, columns: Columns) -> None:
+def _format_units(columns: Columns) -> str:
+    return ", ".join(f"{column.name} {column.unit}" for column in columns if column.unit)
+
+
+def _write_ply(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
     names = {np.dtype(code): name for name, code in PLY_TYPES.items()}
     lines = ["ply", "format binary_little_endian 1.0", f"comment units: {_format_units(columns)}"]
     lines += [f"element vertex {columns[0].values.size}"]
@@ -415,7 +139,7 @@ def _write_ply(path: Path, columns: Columns) -> None:
     _write_binary(path, [*lines, "end_header"], columns)
 
 
-def _write_pcd(path: Path, columns: Columns, shape: tuple[int, int] | None = None) -> None:
+def _write_pcd(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
     points = columns[0].values.size
     height, width = (1, points) if shape is None else shape
     kinds = {np.dtype(code): kind for kind, code in PCD_TYPES.items()}
@@ -437,33 +161,19 @@ def _write_pcd(path: Path, columns: Columns, shape: tuple[int, int] | None = Non
     _write_binary(path, lines, columns)
 
 
-def _write_csv(path: Path, columns: Columns) -> None:
-    table = np.stack([column.values for column in columns], axis=-1)
-    header = ",".join(column.label for column in columns)
-    # Nine significant digits bring every float32 back exactly.
-    np.savetxt(path, table, fmt="%.9g", delimiter=",", header=header, comments="", encoding="ascii")
-
-
-def _write_npz(path: Path, columns: Columns, shape: tuple[int, int] | None = None) -> None:
-    arrays: Mapping[str, Any] = {
-        column.label: column.values if shape is None else column.values.reshape(shape)
-        for column in columns
-    }
-    np.savez_compressed(path, **arrays)
-
-
-def _format_units(columns: Columns) -> str:
-    return ", ".join(f"{column.name} {column.unit}" for column in columns if column.unit)
+def make_rows(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    """Return columns as packed rows, little endian."""
+    layout = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
+    rows = np.empty(next(iter(columns.values())).size, layout)
+    for name, values in columns.items():
+        rows[name] = values
+    return rows
 
 
 def _write_binary(path: Path, header: list[str], columns: Columns) -> None:
-    layout = np.dtype([(column.name, column.values.dtype.newbyteorder("<")) for column in columns])
-    rows = np.empty(columns[0].values.size, layout)
-    for column in columns:
-        rows[column.name] = column.values
     with open(path, "wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
-        file.write(rows.tobytes())
+        file.write(make_rows({column.name: column.values for column in columns}).tobytes())
 
 
 def _list_ply(path: Path) -> Entries:
@@ -495,39 +205,6 @@ def _list_pcd(path: Path) -> Entries:
         return _list_binary(path, file.tell(), properties, points)
 
 
-def _list_csv(path: Path) -> Entries:
-    with open(path, encoding="ascii", errors="replace") as file:
-        labels = file.readline(MAX_HEADER_BYTES).strip().split(",")
-        points = sum(1 for _ in file)
-    read = functools.cache(lambda: _read_csv(path, labels))
-    return {
-        label: ArchiveEntry((points,), np.dtype(np.float64), lambda n=n: read()[:, n])  # type: ignore[misc]
-        for n, label in enumerate(labels)
-    }
-
-
-def _read_csv(path: Path, labels: list[str]) -> NDArray[np.float64]:
-    with open(path, encoding="ascii", errors="replace") as file:
-        lines = file.readlines()[1:]
-    try:
-        table = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.empty((0, len(labels)))
-    except ValueError as fault:
-        raise FileFormatError(path, f"holds something that is not a number ({fault})") from fault
-    if table.shape[1] != len(labels):
-        raise FileFormatError(path, f"names {len(labels)} columns, holds {table.shape[1]}")
-    return table
-
-
-def _list_npz(path: Path) -> Entries:
-    archive = Archive(path)
-    return {label: archive.describe(label) for label in sorted(archive.names)}
-
-
-def _strip_unit(label: str) -> str:
-    name, _, unit = label.rpartition("_")
-    return name if unit in ("m", "s", "count", "percent") else label
-
-
 def _read_header(file: BinaryIO, path: Path, first: str, last: str) -> list[list[str]]:
     """Words of each header line, up to and including the one that begins with `last`."""
     lines: list[list[str]] = []
@@ -548,37 +225,263 @@ def _list_binary(
     """List the columns of the binary rows from byte `start` on."""
     if any(code is None for _, code in properties) or not points.isdecimal():
         raise FileFormatError(path, "has columns of a type that tofclip does not write")
-    if len({name for name, _ in properties}) < len(properties):
+    types = {name: str(code) for name, code in properties}
+    if len(types) < len(properties):
         raise FileFormatError(path, "has two columns of one name")
-    layout = np.dtype([(name, str(code)) for name, code in properties])
-    held = path.stat().st_size - start
-    if held != int(points) * layout.itemsize:
+    layout = np.dtype(list(types.items()))
+    size = path.stat().st_size - start
+    if size != int(points) * layout.itemsize:
         raise FileFormatError(
-            path, f"should hold {points} points of {layout.itemsize} bytes, found {held} bytes"
+            path, f"should hold {points} points of {layout.itemsize} bytes, found {size} bytes"
         )
 
-    @functools.cache
-    def read() -> NDArray[Any]:
-        return np.fromfile(path, layout, offset=start)
+    def read() -> Mapping[str, Any]:
+        rows = np.fromfile(path, layout, offset=start)
+        return {name: rows[name] for name in types}
 
-    return {
-        name: ArchiveEntry(
-            (int(points),),
-            layout[name],
-            lambda name=name: np.ascontiguousarray(read()[name]),  # type: ignore[misc]
-        )
-        for name in layout.names or ()
+    return _defer(int(points), types, read)
+
+
+def _write_csv(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
+    table = np.stack([column.values for column in columns], axis=-1)
+    header = ",".join(column.label for column in columns)
+    # Nine significant digits bring every float32 back exactly.
+    np.savetxt(path, table, fmt="%.9g", delimiter=",", header=header, comments="", encoding="ascii")
+
+
+def _list_csv(path: Path) -> Entries:
+    with open(path, encoding="ascii", errors="replace") as file:
+        labels = file.readline(MAX_HEADER_BYTES).strip().split(",")
+        points = sum(1 for _ in file)
+
+    def read() -> Mapping[str, Any]:
+        table = np.empty((0, len(labels)))
+        try:
+            if points:
+                table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2, encoding="ascii")
+        except ValueError as fault:
+            raise FileFormatError(
+                path, f"holds something that is not a number ({fault})"
+            ) from fault
+        if table.shape[1] != len(labels):
+            raise FileFormatError(path, f"names {len(labels)} columns, holds {table.shape[1]}")
+        return dict(zip(labels, table.T, strict=True))
+
+    return _defer(points, dict.fromkeys(labels, np.float64), read)
+
+
+def _write_npz(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
+    arrays: dict[str, Any] = {
+        column.label: column.values.reshape(-1 if shape is None else shape) for column in columns
     }
+    np.savez_compressed(path, **arrays)
 
 
-FORMATS: dict[str, tuple[ColumnWriter, ColumnLister]] = {
+def _list_npz(path: Path) -> Entries:
+    archive = Archive(path)
+    return {label: archive.describe(label) for label in sorted(archive.names)}
+
+
+def _import_writer(name: str, formats: str, extra: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as fault:
+        raise MissingDependencyError(
+            f"{formats} need {name}: pip install 'tofclip[{extra}]'"
+        ) from fault
+
+
+def _write_las(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
+    laspy = _import_writer("laspy", "LAS and LAZ", "las")
+    values = {column.name: column.values for column in columns}
+    reach = COORDINATE_STEP_M * 2**31
+    if any(np.abs(values[axis]).max(initial=0) >= reach for axis in "xyz"):
+        raise InputError(f"{path}: LAS reaches {reach:.0f} m at a micrometre; use another format")
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, COORDINATE_STEP_M), np.zeros(3)
+    extra = [column for column in columns if column.name not in "xyz"]
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams(
+                DIMENSION_PREFIX + column.name, column.values.dtype, description=column.unit
+            )
+            for column in extra
+        ]
+    )
+    table = laspy.LasData(header)
+    table.x, table.y, table.z = (values[axis].astype(np.float64) for axis in "xyz")
+    for column in extra:
+        table[DIMENSION_PREFIX + column.name] = column.values
+    brightness = np.maximum(values["intensity"], 0).astype(np.float64)
+    scaled = np.rint(brightness * (65535 / (brightness.max(initial=0) or 1)))
+    table.intensity = scaled.astype(np.uint16)
+    table.return_number = np.minimum(values["return_number"], 15)
+    table.number_of_returns = table.return_number
+    with open(path, "wb") as file:
+        table.write(file, do_compress=path.suffix.lower() == ".laz")
+
+
+def _list_las(path: Path) -> Entries:
+    types: dict[str, DTypeLike] = dict.fromkeys("xyz", np.float32)
+    with _open_las(path) as reader:
+        layout, points = reader.header.point_format, reader.header.point_count
+        packed = path.suffix.lower() == ".laz"
+        require_bounded_size(path, "LAS points", points * layout.size, path.stat().st_size, packed)
+        for name in layout.extra_dimension_names:
+            if name.startswith(DIMENSION_PREFIX):
+                types[name.removeprefix(DIMENSION_PREFIX)] = layout.dimension_by_name(name).dtype
+
+    def read() -> Mapping[str, Any]:
+        with _open_las(path) as reader:
+            table = reader.read()
+        if len(table.points) != points:
+            raise FileFormatError(
+                path,
+                f"is not a complete LAS file: {len(table.points)} of {points} points are there",
+            )
+        return {name: table[name if name in "xyz" else DIMENSION_PREFIX + name] for name in types}
+
+    return _defer(points, types, read)
+
+
+@contextlib.contextmanager
+def _open_las(path: Path) -> Iterator[Any]:
+    laspy = _import_writer("laspy", "LAS and LAZ", "las")
+    with (
+        guard(path, "is not a LAS or LAZ file, or a damaged one"),
+        BoundedFile(path) as file,
+    ):
+        # The library would look for as many records of variable length as a damaged header claims,
+        # for hours. Where they are is said by table 3 of the specification of LAS 1.4.
+        header = file.read(LAS_HEADER_BYTES).ljust(LAS_HEADER_BYTES, b"\0")
+        start, records = struct.unpack_from("<II", header, 96)
+        (extended,) = struct.unpack_from("<I", header, 243)
+        records += extended if header[25] >= 4 else 0
+        claimed = max(start, LAS_RECORD_BYTES * records)
+        require_bounded_size(path, "LAS header", claimed, path.stat().st_size)
+        file.seek(0)
+        with laspy.open(file) as reader:
+            yield reader
+
+
+def _write_e57(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
+    pye57 = _import_writer("pye57", "E57 files", "exchange")
+    path.unlink(missing_ok=True)  # the library makes its files itself
+    file = pye57.E57(str(path), mode="w")
+    try:
+        lib, image = pye57.libe57, file.image_file
+        image.extensionsAdd(EXTENSION, EXTENSION_URI)
+        scan = lib.StructureNode(image)
+        scan.set("guid", lib.StringNode(image, f"{{{uuid.uuid4()}}}"))
+        scan.set("name", lib.StringNode(image, "point cloud"))
+        bounds = lib.StructureNode(image)
+        for column in columns:
+            if column.name in "xyz":
+                ends = (column.values.min(), column.values.max()) if column.values.size else (0, 0)
+                for which, end in zip(("Minimum", "Maximum"), ends, strict=True):
+                    bounds.set(column.name + which, lib.FloatNode(image, float(end)))
+        scan.set("cartesianBounds", bounds)
+
+        def attach_points(table: Any) -> None:
+            scan.set("points", table)
+            file.data3d.append(scan)
+
+        standard = [column for column in columns if column.name in E57_NAMES]
+        extra = [column for column in columns if column.name not in E57_NAMES]
+        _write_vector(lib, image, standard, attach_points)
+        _write_vector(lib, image, extra, lambda table: file.root.set(EXTRA_COLUMNS, table))
+        file.close()
+    except Exception:
+        # Closed once more when it is collected, it would print that it still cannot be written.
+        vars(file).pop("image_file", None)
+        raise
+
+
+def _write_vector(lib: Any, image: Any, columns: Columns, attach: Callable[[Any], None]) -> None:
+    """Make a table of columns, attach it to the file, and fill it, which can only be done there."""
+    prototype, buffers = lib.StructureNode(image), lib.VectorSourceDestBuffer()
+    arrays = [np.ascontiguousarray(column.values) for column in columns]  # read while it writes
+    for column, values in zip(columns, arrays, strict=True):
+        name = E57_NAMES.get(column.name, f"{EXTENSION}:{column.name}")
+        if values.dtype.kind == "f":
+            limits = lib.E57_SINGLE, lib.E57_FLOAT_MIN, lib.E57_FLOAT_MAX
+            prototype.set(name, lib.FloatNode(image, 0.0, *limits))
+        else:
+            prototype.set(name, lib.IntegerNode(image, 0, 0, int(np.iinfo(values.dtype).max)))
+        buffers.append(lib.SourceDestBuffer(image, name, values, max(values.size, 1), True, False))
+    table = lib.CompressedVectorNode(image, prototype, lib.VectorNode(image, True))
+    attach(table)
+    writer = table.writer(buffers)
+    if arrays[0].size:
+        writer.write(arrays[0].size)
+    writer.close()
+
+
+def _list_e57(path: Path) -> Entries:
+    def read() -> Mapping[str, Any]:
+        found = {}
+        with _open_e57(path) as (lib, image, tables):
+            for table, elements in tables:
+                points, buffers = table.childCount(), lib.VectorSourceDestBuffer()
+                for label, name, kind in elements:
+                    found[name] = np.empty(points, kind)
+                    if points:
+                        buffers.append(
+                            lib.SourceDestBuffer(image, label, found[name], points, True, False)
+                        )
+                if points:
+                    reader = table.reader(buffers)
+                    reader.read()
+                    reader.close()
+        return found
+
+    types: dict[str, DTypeLike] = {}
+    with _open_e57(path) as (_, _, tables):
+        for table, elements in tables:
+            points = table.childCount()
+            for _, name, kind in elements:
+                claimed = points * np.dtype(kind).itemsize
+                require_bounded_size(path, name, claimed, path.stat().st_size, compressed=True)
+                types[name] = kind
+    return _defer(points, types, read)
+
+
+@contextlib.contextmanager
+def _open_e57(path: Path) -> Iterator[tuple[Any, Any, list[tuple[Any, Any]]]]:
+    """Open the scan's points and the extension's columns: each table with the label in the file, name
+    and type of its columns.
+    """
+    pye57 = _import_writer("pye57", "E57 files", "exchange")
+    names = {label: name for name, label in E57_NAMES.items()}
+    with (
+        guard(path, "is not an E57 file, or a damaged one"),
+        contextlib.closing(pye57.E57(str(path))) as file,
+    ):
+        lib, tables = pye57.libe57, [file.data3d[0]["points"]]
+        if file.root.isDefined(EXTRA_COLUMNS):
+            tables.append(file.root[EXTRA_COLUMNS])
+        listed = []
+        for table in tables:
+            prototype = lib.StructureNode(table.prototype())
+            elements = []
+            for number in range(prototype.childCount()):
+                element = prototype.get(number)
+                label = element.elementName()
+                whole = element.type() == lib.NodeType.E57_INTEGER
+                name = names.get(label, label.removeprefix(f"{EXTENSION}:"))
+                elements.append((label, name, np.uint8 if whole else np.float32))
+            listed.append((table, elements))
+        yield lib, file.image_file, listed
+
+
+FORMATS: dict[str, tuple[Callable[..., None], Callable[[Path], Entries]]] = {
     ".ply": (_write_ply, _list_ply),
     ".pcd": (_write_pcd, _list_pcd),
     ".csv": (_write_csv, _list_csv),
     ".npz": (_write_npz, _list_npz),
-    ".las": (write_las, list_las_columns),
-    ".laz": (write_las, list_las_columns),
-    ".e57": (write_e57, list_e57_columns),
+    ".las": (_write_las, _list_las),
+    ".laz": (_write_las, _list_las),
+    ".e57": (_write_e57, _list_e57),
 }
 
 
@@ -599,9 +502,9 @@ def save_depth(returns: Returns, path: str | Path) -> None:
 
     distance, intensity = returns.image("range"), returns.image("intensity")
     seen = np.isfinite(distance)
-    rows, columns = np.nonzero(seen)
     depth = np.full(distance.shape, np.inf, dtype=np.float32)
-    depth[seen] = distance[seen] * compute_ray_directions(returns.camera, rows, columns)[:, 2]
+    directions = compute_ray_directions(returns.camera, *np.nonzero(seen))
+    depth[seen] = distance[seen] * directions[:, 2]
     brightness = np.where(seen, intensity, 0).astype(np.float32)
     header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
     channels = {"Z": np.ascontiguousarray(depth), "Y": np.ascontiguousarray(brightness)}

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.errors import CalibrationError
 
@@ -12,9 +13,7 @@ MAX_ITERATIONS = 50
 CONVERGENCE_TOLERANCE = 1e-10  # in units of the focal length; far below a thousandth of a pixel
 
 
-def compute_ray_directions(
-    camera: Camera, rows: ArrayLike, columns: ArrayLike
-) -> NDArray[np.float64]:
+def compute_ray_directions(camera: Camera, rows: ArrayLike, columns: ArrayLike) -> FloatArray:
     """Direction in which each pixel of the reference view looks.
 
     A pinhole ``((column - column_0) / f, (row - row_0) / f, 1)``, normalised, with the camera's
@@ -44,11 +43,8 @@ def compute_ray_directions(
 
 def compute_slopes(
     camera: Camera, rows: ArrayLike, columns: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes x / z and y / z of the directions of `compute_ray_directions`.
-
-    `camera, rows, columns`: as for `compute_ray_directions`. Returns `right, down` (n,).
-    """
+) -> tuple[FloatArray, FloatArray]:
+    """Slopes x / z and y / z of the directions of `compute_ray_directions`."""
     axis_row, axis_column = camera.optical_axis_px
     right = (np.asarray(columns, dtype=np.float64) - axis_column) / camera.focal_length_px
     down = (np.asarray(rows, dtype=np.float64) - axis_row) / camera.focal_length_px
@@ -58,12 +54,10 @@ def compute_slopes(
 
 
 def distort_directions(
-    right: NDArray[np.float64], down: NDArray[np.float64], coefficients: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where a lens puts the direction (right, down, 1), in units of the focal length.
-
-    `right, down` (n,); `coefficients` (5,): k1, k2, p1, p2, k3 of D. C. Brown, "Close-range camera
-    calibration", Photogramm. Eng. 37, 855 (1971). Returns `right, down` (n,).
+    right: FloatArray, down: FloatArray, coefficients: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where a lens puts the direction (right, down, 1), in units of the focal length; k1, k2, p1, p2,
+    k3 are those of D. C. Brown, "Close-range camera calibration", Photogramm. Eng. 37, 855 (1971).
     """
     k1, k2, p1, p2, k3 = coefficients
     square = right**2 + down**2
@@ -75,13 +69,9 @@ def distort_directions(
 
 
 def undistort_directions(
-    right: NDArray[np.float64], down: NDArray[np.float64], coefficients: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Undo `distort_directions`, by a fixed-point iteration.
-
-    `right, down` (n,): slopes x / z and y / z as the lens shows them; `coefficients` (5,): as for
-    `distort_directions`. Returns `right, down` (n,): slopes in front of the lens.
-    """
+    right: FloatArray, down: FloatArray, coefficients: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Undo `distort_directions`, by a fixed-point iteration."""
     x, y = right.copy(), down.copy()
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(MAX_ITERATIONS):

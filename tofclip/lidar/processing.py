@@ -1,8 +1,7 @@
 """Point clouds cleaned, thinned, measured and laid over each other; their columns are kept.
 
-Neighbourhoods, planes and registration are Open3D's, which is loaded on first use.
-
-The objects of a cloud: groups of points that hang together, with range, its deviation, and size.
+Normals, planes and registration are Open3D's, which is loaded on first use; what also works where it
+does not load is SciPy's.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from tofclip.lidar.cloud import PROPERTY_COLUMNS, PointCloud
 from tofclip.units import MAD_TO_SIGMA
 
 MIN_SPACING_RATIO = 3.0
+SIZE_PERCENTILES = (5.0, 95.0)  # of an object's points: a few strays do not widen it
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,8 @@ class Alignment:
 
 
 def select_points(cloud: PointCloud, chosen: NDArray[Any]) -> PointCloud:
-    """Return some points of a cloud, by mask or by numbers.
-
-    `chosen` (points,).
-    """
-    columns: dict[str, Any] = {name: getattr(cloud, name)[chosen] for name in PROPERTY_COLUMNS}
-    return replace(cloud, xyz=cloud.xyz[chosen], **columns)
+    """Return some points of a cloud, by mask or by numbers."""
+    return cloud[chosen]
 
 
 def transform_cloud(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
@@ -70,8 +66,6 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     """Return one point for each occupied cube of side `voxel`, m: means of its points.
 
     Deviations of independent points shrink with their number; the return number is the least.
-
-    `voxel`: metres.
     """
     if not (np.isfinite(voxel) and voxel > 0):
         raise InputError(f"the side of a voxel must be a positive length, got {voxel}")
@@ -99,11 +93,8 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
 
 
 def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0) -> PointCloud:
-    """Leave out points that lie far from their neighbours, by the density of where these are.
-
-    `deviations`: see `find_outliers`.
-    """
-    return select_points(cloud, ~find_outliers(cloud, neighbours, deviations))
+    """Leave out what `find_outliers` finds."""
+    return cloud[~find_outliers(cloud, neighbours, deviations)]
 
 
 def find_outliers(
@@ -139,10 +130,8 @@ def find_outliers(
 
 
 def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
-    """Return each point's surface normal, (n, 3), towards the camera, from a plane through its
-    neighbours.
-
-    `neighbours`: points of the plane, at least 3. Returns (n, 3): of length 1.
+    """Return each point's surface normal, (n, 3), towards the camera, from a plane through at least
+    three neighbours.
     """
     if len(cloud) < 3 or neighbours < 3:
         raise InputError("a normal needs at least three points and three neighbours")
@@ -154,11 +143,7 @@ def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
 
 
 def fit_plane(cloud: PointCloud, reach: float, seed: int = 0) -> Plane:
-    """Find the plane with most points, by random sampling, and fit it to them.
-
-    `reach`: points within this distance, m, lie on the plane. Returns its points lie at ``normal .
-    x = distance``, m.
-    """
+    """Find the plane with most points within `reach`, m, by random sampling, and fit it to them."""
     if len(cloud) < 3 or not reach > 0:
         raise InputError("a plane needs at least three points and a positive reach")
     open3d = import_open3d()
@@ -180,9 +165,7 @@ def align_clouds(
     """Lay a cloud over another one, such as the next of a sequence (point-to-plane iterated closest
     points).
 
-    `reach`: largest distance of points that may belong together, m; `start` (4, 4): first guess of
-    the pose. Returns pose (4, 4) from source to target, fraction of matched points, and their root
-    mean square distance, m.
+    `reach`: largest distance of points that may belong together, m; `start` (4, 4): first guess.
     """
     if min(len(source), len(target)) < 3 or not reach > 0:
         raise InputError(
@@ -201,12 +184,6 @@ def align_clouds(
     return Alignment(
         np.asarray(found.transformation), float(found.fitness), float(found.inlier_rmse)
     )
-
-
-SIZE_PERCENTILES = (
-    5.0,
-    95.0,
-)  # percent of an object's points that count for its size: a few strays do not widen it
 
 
 @dataclass(frozen=True)
@@ -238,25 +215,23 @@ def find_objects(cloud: PointCloud, reach: float, min_points: int = 40) -> list[
         (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(cloud), len(cloud))
     )
     groups, label = scipy.sparse.csgraph.connected_components(links, directed=False)
-    members = (np.flatnonzero(label == group) for group in range(groups))
-    return sorted(
-        (_measure_object(cloud, one) for one in members if one.size >= min_points),
-        key=lambda seen: seen.range,
-    )
-
-
-def _measure_object(cloud: PointCloud, points: NDArray[np.intp]) -> DetectedObject:
-    xyz, distance = cloud.xyz[points], cloud.range[points]
-    low, high = np.percentile(xyz, SIZE_PERCENTILES, axis=0)
-    middle = float(np.median(distance))
-    x, y, z = (float(one) for one in np.median(xyz, axis=0))
-    return DetectedObject(
-        points=points,
-        range=middle,
-        range_sigma=float(np.median(cloud.range_sigma[points])),
-        scatter=MAD_TO_SIGMA * float(np.median(np.abs(distance - middle))),
-        centre=(x, y, z),
-        width=float(high[0] - low[0]),
-        height=float(high[1] - low[1]),
-        intensity=float(np.median(cloud.intensity[points])),
-    )
+    objects = []
+    for group in np.flatnonzero(np.bincount(label, minlength=groups) >= min_points):
+        points = np.flatnonzero(label == group)
+        xyz, distance = cloud.xyz[points], cloud.range[points]
+        low, high = np.percentile(xyz, SIZE_PERCENTILES, axis=0)
+        middle = float(np.median(distance))
+        x, y, z = (float(axis) for axis in np.median(xyz, axis=0))
+        objects.append(
+            DetectedObject(
+                points=points,
+                range=middle,
+                range_sigma=float(np.median(cloud.range_sigma[points])),
+                scatter=MAD_TO_SIGMA * float(np.median(np.abs(distance - middle))),
+                centre=(x, y, z),
+                width=float(high[0] - low[0]),
+                height=float(high[1] - low[1]),
+                intensity=float(np.median(cloud.intensity[points])),
+            )
+        )
+    return sorted(objects, key=lambda seen: seen.range)

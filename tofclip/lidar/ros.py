@@ -18,13 +18,13 @@ import numpy as np
 
 from tofclip.errors import InputError, MissingDependencyError, StorageError
 from tofclip.lidar.cloud import PointCloud
+from tofclip.lidar.export import make_rows
 
 MCAP_SUFFIX = ".mcap"
 TOPIC = "/tofclip/points"
 FRAME_ID = "tofclip_optical"
 MESSAGE_TYPE = "sensor_msgs/msg/PointCloud2"
-FIELD_TYPES = {"<f4": 7, "|u1": 2}
-"""NumPy's name of a type and ROS's number for it."""
+FIELD_TYPES = {"<f4": 7, "|u1": 2}  # NumPy's name of a type and ROS's number for it
 
 NANOSECONDS_PER_SECOND = 1_000_000_000
 
@@ -40,9 +40,8 @@ class StampedCloud:
 def write_bag(clouds: Iterable[StampedCloud], path: str | Path) -> int:
     """Write clouds as a ROS 2 recording, whole or not at all; return how many.
 
-    `clouds`: taken one at a time, in the order of their stamps; `path`: A name that ends in
-    ``.mcap`` becomes one MCAP file. Any other name becomes a folder, a bag in SQLite, and must not
-    exist yet.
+    `clouds` come in the order of their stamps. A `path` that ends in ``.mcap`` becomes one MCAP file,
+    any other a folder, a bag in SQLite, which must not exist yet.
     """
     target = Path(path)
     single = target.suffix.lower() == MCAP_SUFFIX
@@ -71,46 +70,39 @@ def write_bag(clouds: Iterable[StampedCloud], path: str | Path) -> int:
 def _write_messages(clouds: Iterable[StampedCloud], writer: Any, typestore: Any) -> int:
     connection = writer.add_connection(TOPIC, MESSAGE_TYPE, typestore=typestore)
     number, latest = 0, 0
-    for one in clouds:
-        if one.stamp_ns < latest:
+    for stamped in clouds:
+        if stamped.stamp_ns < latest:
             raise InputError("stamps must not be negative, nor earlier than the one before")
-        latest = one.stamp_ns
-        message = make_point_cloud_message(one, typestore)
-        writer.write(connection, one.stamp_ns, typestore.serialize_cdr(message, MESSAGE_TYPE))
+        latest = stamped.stamp_ns
+        message = _make_message(stamped, typestore.types)
+        writer.write(connection, latest, typestore.serialize_cdr(message, MESSAGE_TYPE))
         number += 1
     return number
 
 
-def make_point_cloud_message(stamped: StampedCloud, typestore: Any) -> Any:
-    """Return a cloud as the message that ROS 2 passes on.
-
-    `typestore`: with ROS 2's common messages.
-    """
-    types, cloud = typestore.types, stamped.cloud
-    columns = {axis: cloud.xyz[:, number] for number, axis in enumerate("xyz")}
-    for column in cloud.columns:
-        if column.name not in "xyz":
-            columns["time_of_flight" if column.name == "time" else column.name] = column.values
-    layout = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
-    rows = np.empty(len(cloud), layout)
-    for name, values in columns.items():
-        rows[name] = values
+def _make_message(stamped: StampedCloud, types: Any) -> Any:
+    rows = make_rows(
+        {
+            "time_of_flight" if column.name == "time" else column.name: column.values
+            for column in stamped.cloud.columns
+        }
+    )
     fields = [
         types["sensor_msgs/msg/PointField"](
             name=name, offset=offset, datatype=FIELD_TYPES[kind.str], count=1
         )
-        for name, (kind, offset, *_) in (layout.fields or {}).items()
+        for name, (kind, offset, *_) in (rows.dtype.fields or {}).items()
     ]
     seconds, rest = divmod(stamped.stamp_ns, NANOSECONDS_PER_SECOND)
     stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
     return types[MESSAGE_TYPE](
         header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME_ID),
         height=1,
-        width=len(cloud),
+        width=rows.size,
         fields=fields,
         is_bigendian=False,
-        point_step=layout.itemsize,
-        row_step=layout.itemsize * len(cloud),
+        point_step=rows.itemsize,
+        row_step=rows.nbytes,
         data=rows.view(np.uint8).reshape(-1),
         is_dense=True,
     )
