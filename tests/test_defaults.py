@@ -30,7 +30,7 @@ from tofclip.solvers import (
     Wavelets,
 )
 from tofclip.solvers.denoising import CollaborativeWiener, NonlocalMeans
-from tofclip.solvers.priors import LightFieldVariation
+from tofclip.solvers.fista import LightFieldVariation
 
 FISTA = "docs/recovery_algorithm.md: ## 4. Frames from f, with a prior: FISTA"
 LINEAR = "docs/recovery_algorithm.md: ## 5. Frames from f, without: the linear inverse"

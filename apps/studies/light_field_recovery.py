@@ -25,7 +25,7 @@ from apps.studies.cases import (
 from apps.studies.outcome import CROSS_VALIDATED, Advance, Outcome, Panel, Row, Study
 from tofclip.light_field import LightField
 from tofclip.metrics import nmse
-from tofclip.solvers.priors import LightFieldVariation
+from tofclip.solvers.fista import LightFieldVariation
 from tofclip.threads import map_parallel
 
 TV_WEIGHT, ITERATIONS, ANGULAR_WEIGHT = (

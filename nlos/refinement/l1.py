@@ -29,7 +29,7 @@ from tofclip.errors import InputError
 from tofclip.operators import Diagonal, LinearOperator, Stack
 from tofclip.solvers import Method as Prior
 from tofclip.solvers import Sparse
-from tofclip.solvers.priors import LightFieldVariation
+from tofclip.solvers.fista import LightFieldVariation
 from tofclip.threads import limit_blas_threads, split_blocks
 
 Array = NDArray[Any]

@@ -18,6 +18,7 @@ from tofclip.solvers import (
     LeastSquares,
     NonnegativeSparsity,
     NonnegativeTotalVariation,
+    ProximalStep,
     Sparse,
     StoppingRule,
     TotalVariation,
@@ -29,7 +30,6 @@ from tofclip.solvers.fista import (
     MIN_FURTHER_FALL,
     NOISE_FRACTION,
     IterationHistory,
-    ProximalStep,
     Result,
 )
 from tofclip.threads import LANES

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tofclip.errors import InputError, ShapeError
-from tofclip.solvers import NonnegativeTotalVariation
-from tofclip.solvers.fista import Regulariser
+from tofclip.solvers import NonnegativeTotalVariation, Regulariser
 from tofclip.solvers.priors import NonnegativeLightFieldVariation
 
 

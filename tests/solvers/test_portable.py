@@ -27,14 +27,13 @@ from tofclip.solvers import (
     StoppingRule,
     TotalVariation,
     Wavelets,
+    fista,
     ignore_progress,
     iterate,
-    loops,
     relative_residual,
 )
 from tofclip.solvers.cross_validation import choose_weight
-from tofclip.solvers.loops import CompiledLoops, PortableLoops
-from tofclip.solvers.priors import LightFieldVariation
+from tofclip.solvers.fista import LightFieldVariation
 
 METHODS = [Sparse(iterations=40), TotalVariation(iterations=40), LinearInverse(), Backprojection()]
 # What is promised is 1e-4. Float32 sums in another order differ by 1e-6 or so, which the linear
@@ -108,8 +107,8 @@ def test_pieces_make_no_difference(device, method, monkeypatch):
     """
     measurements, valid = (device.put(array) for array in letters(5))
     whole = to_numpy(method.recover(projection(), measurements, valid).frames)
-    monkeypatch.setattr(loops, "WORKING_BYTES", 2 * loops.WORKING_PICTURES * 24 * 23 * 4)
-    assert loops.frames_per_block(projection(), measurements) == 2
+    monkeypatch.setattr(fista, "WORKING_BYTES", 2 * fista.WORKING_PICTURES * 24 * 23 * 4)
+    assert fista.frames_per_block(projection(), measurements) == 2
     found = to_numpy(method.recover(projection(), measurements, valid).frames)
     assert difference(found, whole) < ROUNDING[np.float32]
 
@@ -203,49 +202,27 @@ def test_a_tolerance_waits_for_the_device_once_in_an_iteration(monkeypatch):
 
 @pytest.mark.parametrize("shape", [(7, 6, 3), (1, 9, 2), (8, 1, 1)], ids=str)
 @pytest.mark.parametrize("weight", [0.0, 0.3])
-def test_total_variation_sweep_by_sweep(device, shape, weight):
+@pytest.mark.parametrize("prior", [NonnegativeSparsity, NonnegativeTotalVariation])
+def test_proximal_steps_are_those_of_the_compiled_loops(device, prior, shape, weight):
     rng = np.random.default_rng(3)
     current, previous, gradient = rng.standard_normal((3, *shape))
     momentum, step = rng.random((2, shape[-1]))
-    here, there = None, None
+    here, there = prior(weight), prior(weight)
     for _ in range(3):
-        result, total, here = CompiledLoops().prox_tv(
-            current, previous.copy(), momentum, gradient.copy(), step, weight, here
-        )
+        expected = here.proximal_step(current, previous.copy(), momentum, gradient.copy(), step)
         given = (device.put(a) for a in (current, previous, momentum, gradient.copy(), step))
-        found, variation, there = PortableLoops().prox_tv(*given, weight, there)
-        np.testing.assert_allclose(to_numpy(found), result, atol=1e-13)
-        np.testing.assert_allclose(to_numpy(variation), total, rtol=1e-12, atol=1e-13)
-        np.testing.assert_allclose(to_numpy(there), here, atol=1e-13)
-
-
-def test_sparse_step(device):
-    rng = np.random.default_rng(5)
-    current, previous, gradient = rng.standard_normal((3, 7, 6, 4))
-    momentum, step = rng.random((2, 4))
-    found = CompiledLoops().prox_l1(current, previous.copy(), momentum, gradient.copy(), step, 0.3)
-    given = (device.put(a) for a in (current, previous, momentum, gradient.copy(), step))
+        found = there.proximal_step(*given)
+        for one, other in zip(found, expected, strict=True):
+            if other is not None:
+                np.testing.assert_allclose(to_numpy(one), other, rtol=1e-12, atol=1e-13)
     point = current + momentum * (current - previous)
-    picture = np.maximum(point - step * (gradient + 0.3), 0)
-    expected = picture, picture.sum((0, 1)), ((picture - point) ** 2).sum((0, 1))
-    for one, other, wanted in zip(
-        found, PortableLoops().prox_l1(*given, 0.3), expected, strict=True
-    ):
-        np.testing.assert_allclose(one, wanted, rtol=1e-12, atol=1e-14)
-        np.testing.assert_allclose(to_numpy(other), wanted, rtol=1e-12, atol=1e-14)
-
-
-def test_refused_frames_are_put_back(device):
-    rng = np.random.default_rng(4)
-    values, before = rng.random((4, 5, 3)), rng.random((4, 5, 3))
-    rejected = np.array([False, True, False])
-    found = PortableLoops().restore_frames(
-        device.put(values), device.put(before), device.put(rejected)
-    )
-    expected = CompiledLoops().restore_frames(values.copy(), before, rejected)
-    np.testing.assert_allclose(to_numpy(found), expected, rtol=1e-14)
-    np.testing.assert_array_equal(to_numpy(found)[..., 1], before[..., 1])
-    np.testing.assert_array_equal(to_numpy(found)[..., ::2], values[..., ::2])
+    if prior is NonnegativeSparsity:
+        picture = np.maximum(point - step * (gradient + weight), 0)
+        np.testing.assert_allclose(expected.picture, picture, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(expected.penalty, weight * picture.sum((0, 1)), rtol=1e-12)
+        np.testing.assert_allclose(
+            expected.distance, ((picture - point) ** 2).sum((0, 1)), rtol=1e-12
+        )
 
 
 @pytest.mark.parametrize(

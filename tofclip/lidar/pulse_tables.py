@@ -81,7 +81,7 @@ class PictureTraces:
         from tofclip.solvers.kernels import copy_lanes_to_frames
 
         # contiguous: the loop is compiled for solvers' blocks, and copying short runs costs little
-        copy_lanes_to_frames(np.ascontiguousarray(self._pictures[:, piece]), traces)
+        copy_lanes_to_frames(np.ascontiguousarray(self._pictures[:, piece]), 0, traces)
 
 
 class FrameTraces(PictureTraces):

@@ -39,7 +39,7 @@ from tofclip.solvers.cross_validation import (
 )
 from tofclip.solvers.data_terms import estimate_robust_deviation
 from tofclip.solvers.denoising import BlockMatching, CollaborativeWiener, Denoiser, NonlocalMeans
-from tofclip.solvers.priors import LightFieldVariation
+from tofclip.solvers.fista import LightFieldVariation
 
 VARIATIONAL_PRIORS: dict[str, type[ProximalMethod]] = {
     kind.name: kind for kind in (TotalVariation, Wavelets, Sparse)

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 
-from tofclip.arrays import Array, ComputeDevice, namespace, scalar_like
+from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, scalar_like
 from tofclip.errors import InputError, ShapeError
-from tofclip.solvers.loops import select_loops
 
 Mask = Array | None
+
+
+def sum_squares(values: Array) -> Array:
+    """Sum of squares of each frame of (measurements, frames) values, float64."""
+    if is_numpy(values):  # multiplied and added without a temporary
+        return np.einsum("if,if->f", values, values, dtype=np.float64)
+    return namespace(values).sum(values * values, axis=0, dtype=namespace(values).float64)
 
 
 class DataTerm(ABC):
@@ -70,32 +76,24 @@ class DataTerm(ABC):
 
     def squared_length(self, change: Array) -> Array:
         """Return the sum of squares over the valid measurements of each frame, (frames,) float64."""
-        return select_loops(change).sum_squares(self._apply_mask(change))
+        return sum_squares(self._apply_mask(change))
 
     def _apply_mask(self, values: Array) -> Array:
         return values if self.valid is None else values * self.valid
 
 
-class DataTermMaker(Protocol):
-    """Makes the data term of a block of frames."""
-
-    def __call__(self, measurements: Array, valid: Mask = None) -> DataTerm:
-        """Return the term for `measurements` (measurements, frames), those not `valid` left out."""
-        ...
+DataTermMaker = Callable[..., DataTerm]
+"""Makes the term of a block of (measurements, frames) measurements, and the mask of valid ones."""
 
 
 class _SquaredNearZero(DataTerm):
     """A data term whose conjugate is ``<dual, f> + 1/2 |dual|^2`` wherever its gradient gets to."""
 
     def dual_value(self, slope: Array, scale: Array) -> Array:
-        """Return ``-<dual, f> - 1/2 |dual|^2`` of the dual point; see `DataTerm.dual_value`.
-
-        Arguments and result are those of `DataTerm.dual_value`.
-        """
         xp = namespace(slope)
         # the slope of an invalid measurement is zero
         along = xp.sum(slope * self.measurements, axis=0, dtype=xp.float64)
-        return -scale * along - scale**2 / 2 * select_loops(slope).sum_squares(slope)
+        return -scale * along - scale**2 / 2 * sum_squares(slope)
 
 
 class LeastSquares(_SquaredNearZero):
@@ -104,8 +102,7 @@ class LeastSquares(_SquaredNearZero):
     """
 
     def value(self, predicted: Array) -> Array:
-        residual = self.gradient(predicted)
-        return 0.5 * select_loops(residual).sum_squares(residual)
+        return 0.5 * sum_squares(self.gradient(predicted))
 
     def weights(self, predicted: Array) -> Array:
         return self._apply_mask(namespace(predicted).ones_like(predicted))
@@ -135,8 +132,7 @@ class ClippedSquares(DataTerm):
         self._clipped = measurements >= scalar_like(limit, measurements)
 
     def value(self, predicted: Array) -> Array:
-        residual = self.gradient(predicted)
-        return 0.5 * select_loops(residual).sum_squares(residual)
+        return 0.5 * sum_squares(self.gradient(predicted))
 
     def weights(self, predicted: Array) -> Array:
         xp = namespace(predicted)

@@ -1,13 +1,14 @@
-"""Denoisers that serve as priors: each takes a picture and the noise to remove, and knows nothing of any
-camera.
+"""Denoisers that serve as priors, and recovery with one: plug-and-play and regularisation by
+denoising.
 
-Recovery with a denoiser as prior: plug-and-play and regularisation by denoising.
+A denoiser takes a picture, a pilot and the noise to remove, and knows nothing of any camera.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,28 +16,17 @@ from numpy.typing import NDArray
 from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.operators import LinearOperator
-from tofclip.solvers.data_terms import DataTerm
-from tofclip.solvers.fista import Mask, Progress, ProximalMethod, Result, ignore_progress
+from tofclip.solvers.data_terms import DataTerm, Mask
+from tofclip.solvers.fista import Progress, ProximalMethod, Result, ignore_progress
 from tofclip.threads import limit_blas_threads
 
 Picture = NDArray[Any]
 
 
-class Denoiser(Protocol):
-    """Removes even noise of a known strength from one picture."""
-
-    def __call__(self, noisy: Picture, pilot: Picture, deviation: float) -> Picture:
-        """Return the picture without its noise.
-
-        Parameters
-        ----------
-        noisy : (rows, columns) array
-        pilot : (rows, columns) array
-            A cleaner estimate of the same picture, for denoisers that look there for what is alike.
-        deviation : float
-            Standard deviation of the noise, in the picture's unit.
-        """
-        ...
+Denoiser = Callable[[Picture, Picture, float], Picture]
+"""Removes even noise of a known standard deviation from a (rows, columns) picture; looks for what is
+alike in a pilot, a cleaner estimate of the same picture.
+"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +41,7 @@ class NonlocalMeans:
     filtering: float = 0.6  # decay of a patch's say with its distance, over the noise's deviation
 
     def __call__(self, noisy: Picture, pilot: Picture, deviation: float) -> Picture:
-        """Return the picture without its noise; the pilot is not needed."""
+        """Return the picture without its noise, see `Denoiser`; the pilot is not needed."""
         from skimage.restoration import denoise_nl_means
 
         clean: Picture = denoise_nl_means(
@@ -73,7 +63,7 @@ class BlockMatching:
     """
 
     def __call__(self, noisy: Picture, pilot: Picture, deviation: float) -> Picture:
-        """Return the picture without its noise; the pilot is not needed."""
+        """Return the picture without its noise, see `Denoiser`; the pilot is not needed."""
         try:
             from bm3d import bm3d
         except ImportError as fault:
@@ -113,16 +103,13 @@ class CollaborativeWiener:
                 f"a picture of {noisy.shape} is smaller than a patch of {self.patch_px} px"
             )
         settings = (self.patch_px, self.stride_px, self.reach_px, self.group)
-        seen = np.ascontiguousarray(noisy, np.float32)
-        clean = filter_patch_groups(
-            seen, np.ascontiguousarray(pilot, np.float32), np.float32(deviation), settings
-        )
+        pictures = (np.ascontiguousarray(one, np.float32) for one in (noisy, pilot))
+        clean = filter_patch_groups(*pictures, np.float32(deviation), settings)
         return np.asarray(clean, noisy.dtype)
 
 
-PEAK_QUANTILE = (
-    0.999  # quantile that stands for the brightest pixel: a single hot one must not set the scale
-)
+# Stands for the brightest pixel: a single hot one must not set the scale.
+PEAK_QUANTILE = 0.999
 
 
 @dataclass(frozen=True)
@@ -156,6 +143,7 @@ class PlugAndPlay:
     coupling: float = 0.1
     name = "plug-and-play"
     portable = False
+    _returns_fitted = False
 
     def __post_init__(self) -> None:
         if self.calls < 1:
@@ -200,14 +188,15 @@ class PlugAndPlay:
             for number, picture in enumerate(started.frames):
                 column = slice(number, number + 1)
                 kept = None if valid is None else valid[:, column]
-                misfit = self.start.data_term(
-                    measurements[:, column].astype(operator.dtype, copy=False), kept
-                )
+                seen = measurements[:, column].astype(operator.dtype, copy=False)
+                misfit = self.start.data_term(seen, kept)
                 frames[number] = self._alternate(operator, misfit, picture, coupling)
                 progress(self.calls)
-        why = f"{self.calls} calls of the denoiser done"
         return replace(
-            started, frames=frames, iterations=started.iterations + self.calls, stop_reason=why
+            started,
+            frames=frames,
+            iterations=started.iterations + self.calls,
+            stop_reason=f"{self.calls} calls of the denoiser done",
         )
 
     def _alternate(
@@ -220,16 +209,15 @@ class PlugAndPlay:
         for _ in range(self.calls):
             fitted = np.maximum(solve_data_step(operator, misfit, clean, coupling), 0)
             clean = np.maximum(self.denoiser(fitted, clean, deviation), 0)
-        return self._select_estimate(fitted, clean)
-
-    def _select_estimate(self, fitted: Array, clean: Array) -> Array:
-        """Return the picture that counts, of the last that met the data and the last that was
-        denoised.
-        """
-        return clean
+        return fitted if self._returns_fitted else clean
 
     def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most."""
+        """Return how many frame iterations `recover` reports at most.
+
+        Parameters
+        ----------
+        frames : int
+        """
         return self.start.work(frames) + frames * self.calls
 
 
@@ -245,9 +233,7 @@ class RegularisationByDenoising(PlugAndPlay):
     strength: float = 0.08
     coupling: float = 0.3
     name = "regularisation by denoising"
-
-    def _select_estimate(self, fitted: Array, clean: Array) -> Array:
-        return fitted
+    _returns_fitted = True
 
 
 def solve_data_step(
@@ -257,13 +243,10 @@ def solve_data_step(
     coupling: float,
     iterations: int = 10,
 ) -> NDArray[Any]:
-    """Minimise ``misfit(A h) + coupling / 2 |h - anchor|^2`` near `anchor`, by conjugate gradients.
+    """Minimise ``misfit(A h) + coupling / 2 |h - anchor|^2`` near `anchor`, for a misfit of a single
+    frame, by conjugate gradients; ten leave 1 % of the first gradient at the couplings in use.
 
     The misfit's weights are those at `anchor` (one pass of iteratively reweighted least squares).
-
-    `operator`: pictures (rows, columns) to measurements (measurements,); `misfit`: of a single
-    frame; `anchor` (rows, columns); `iterations`: of conjugate gradients; ten leave 1 % of the
-    first gradient at the couplings in use. Returns (rows, columns).
     """
     predicted = operator(anchor)[:, np.newaxis]
     weights = misfit.weights(predicted)[:, 0]

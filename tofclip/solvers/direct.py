@@ -1,16 +1,13 @@
 """Recovery without iterations: the regularised linear inverse and the adjoint.
 
-The linear inverse pixel by pixel: a few pixels at all instants, instead of all pixels at a few
-instants.
-
-Code that looks at one pixel's brightness over time, as the search for returns does, never needs the
-transient cube: the dense part of the inverse, which is small, is worked out for the whole shot, and
-the sparse part for a few pixels at a time, whose traces stay in cache.
+The inverse goes pixel by pixel as well: code that looks at one pixel's brightness over time, as the
+search for returns does, never needs the transient cube. The dense part of the inverse, which is
+small, is worked out for the whole shot, and the sparse part for a few pixels at a time, whose traces
+stay in cache.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -30,16 +27,14 @@ from tofclip.arrays import (
 )
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, SparseMatrix
-from tofclip.operators.panels import PanelMatrix
-from tofclip.operators.panels.tiles import TileMatrix, arrange_matrix
 from tofclip.operators.sparse import Tiles
-from tofclip.solvers.fista import Mask, Progress, Result, ignore_progress, validate_measurements
-from tofclip.solvers.loops import PortableBatches, make_batches, write_frames
+from tofclip.solvers.data_terms import Mask
+from tofclip.solvers.fista import Blocks, Progress, Result, ignore_progress, validate_measurements
 from tofclip.threads import LANES, count_block_threads, limit_blas_threads, run_blocks
 
+# Numbers between rows of weights: at a distance of a power of two they would share few places of the
+# cache.
 ROW_GAP = 16
-"""Numbers between rows of weights: at a distance of a power of two they would share few places of
-the cache."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +93,9 @@ class LinearInverse:
         gram = (seen @ seen.T).toarray()
         gram[np.diag_indices_from(gram)] += mu
         factor = scipy.linalg.cho_factor(gram, lower=True, overwrite_a=True)
-        inverse = scipy.linalg.cho_solve(factor, np.eye(used.size)).astype(operator.dtype)
-        prepared = PreparedInverse(operator, inverse, used)
+        inverse = np.zeros((alive.size, alive.size), operator.dtype)
+        inverse[np.ix_(used, used)] = scipy.linalg.cho_solve(factor, np.eye(used.size))
+        prepared = PreparedInverse(operator, inverse)
         # One dark block loads the compiled loops and the BLAS before the first shot needs them.
         prepared.recover(np.zeros((alive.size, LANES), operator.dtype))
         return prepared
@@ -147,7 +143,12 @@ class LinearInverse:
         return replace(prepared.recover(measurements, progress), setup_seconds=setup_seconds)
 
     def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most."""
+        """Return how many frame iterations `recover` reports at most.
+
+        Parameters
+        ----------
+        frames : int
+        """
         return frames
 
 
@@ -158,39 +159,16 @@ class PreparedInverse:
     Parameters
     ----------
     operator : LinearOperator
-    inverse_gram : (n, n) array
-        ``(A A' + mu I)^-1`` of the measurements that are used.
-    used : (n,) int array
-        Their numbers, increasing: those that are alive and see a pixel.
-
-    Notes
-    -----
-    Memory: in single precision the matrix is held twice, or two and a half times on a processor with
-    matrix registers; see `tofclip.operators.panels.tiles`.
+    inverse_gram : (measurements, measurements) array
+        ``(A A' + mu I)^-1`` of the measurements that are alive and see a pixel; 0 for the others.
     """
 
     operator: LinearOperator
     inverse_gram: NDArray[Any]
-    used: NDArray[np.int64]
 
     @cached_property
     def _inverse(self) -> PerDevice[Array]:
-        """Of all measurements, with zeros for those that are not used."""
-        every = np.zeros((math.prod(self.operator.shape_out),) * 2, self.inverse_gram.dtype)
-        every[np.ix_(self.used, self.used)] = self.inverse_gram
-        return PerDevice(partial(ComputeDevice.put, values=every))
-
-    @cached_property
-    def _panels(self) -> PanelMatrix | TileMatrix | None:
-        """The inverse as compiled products take it, which are for single precision."""
-        return arrange_matrix(self.inverse_gram) if self.operator.dtype == np.float32 else None
-
-    @cached_property
-    def _stretches(self) -> NDArray[np.int64]:
-        """First, and the one after the last, of neighbouring measurements that are used."""
-        cuts = np.flatnonzero(np.diff(self.used, prepend=-2) != 1)
-        last = self.used[np.append(cuts[1:], self.used.size)[: cuts.size] - 1]
-        return np.stack([self.used[cuts], last + 1], axis=1)
+        return PerDevice(partial(ComputeDevice.put, values=self.inverse_gram))
 
     def recover(self, measurements: Array, progress: Progress = ignore_progress) -> Result:
         """Recover one picture per column of `measurements`, where they are.
@@ -207,35 +185,22 @@ class PreparedInverse:
             Frames (frames, rows, columns).
         """
         measurements = validate_measurements(self.operator, measurements, None)
-        if not is_numpy(measurements):
-            return self._recover_on_device(measurements, progress)
-        frames = np.empty((measurements.shape[1], *self.operator.shape_in), self.operator.dtype)
-        weights = self.weights(measurements)
+        blocks = Blocks(self.operator, measurements)
+        weights = self.weights(measurements) if is_numpy(measurements) else None
 
         def project(piece: slice) -> None:
-            lanes = slice(piece.start, piece.start + (LANES if len(frames) > 1 else 1))
-            block = np.zeros((measurements.shape[0], lanes.stop - lanes.start), weights.dtype)
-            block[self.used] = weights[:, lanes]
-            write_frames(self.operator.adjoint(block), frames, piece)
+            if weights is None:
+                block = self._inverse.get(measurements) @ blocks.take(measurements, piece)
+            else:
+                block = weights[:, piece.start : piece.start + blocks.size]
+            blocks.write(self.operator.adjoint(block), piece)
             progress(piece.stop - piece.start)
 
-        run_blocks(project, measurements.shape[1])
-        return Result(frames)
-
-    def _recover_on_device(self, measurements: Array, progress: Progress) -> Result:
-        """Recover as many frames at once as memory allows, where the measurements are."""
-        batches = PortableBatches(self.operator, measurements)
-
-        def project(piece: slice) -> None:
-            weights = self._inverse.get(measurements) @ batches.take_block(measurements, piece)
-            batches.write_block(self.operator.adjoint(weights), piece)
-            progress(piece.stop - piece.start)
-
-        batches.for_each_piece(project)
-        return Result(batches.frames)
+        blocks.for_each(project)
+        return Result(blocks.frames)
 
     def weights(self, measurements: NDArray[Any]) -> NDArray[Any]:
-        """Return ``(A A' + mu I)^-1 f``, (used, frames and some): its adjoint is the pictures.
+        """Return ``(A A' + mu I)^-1 f``, (measurements, frames and some): its adjoint is the pictures.
 
         Beyond the last frame rows are zero to a multiple of `LANES` frames and `ROW_GAP` more.
 
@@ -243,21 +208,16 @@ class PreparedInverse:
         ----------
         measurements : (measurements, frames) array, finite
         """
-        frames = measurements.shape[1]
-        held = -(-frames // LANES) * LANES + ROW_GAP
-        if self._panels is not None:
-            return self._panels.multiply(measurements, self._stretches, held)
-        weights = empty_aligned((self.used.size, held), self.operator.dtype)
+        number, frames = measurements.shape
+        width = -(-frames // LANES) * LANES + ROW_GAP
+        weights = empty_aligned((number, width), self.operator.dtype)
         weights[:, frames:] = 0
-        inverse, solved, seen = self.inverse_gram, weights[:, :frames], measurements[self.used]
 
         def solve(piece: slice) -> None:
-            np.matmul(inverse[piece], seen, out=solved[piece])
+            np.matmul(self.inverse_gram[piece], measurements, out=weights[piece, :frames])
 
-        # The blocks already keep every core busy: BLAS threads of its own would wait for, and spin
-        # against, ours.
         with limit_blas_threads():
-            run_blocks(solve, len(solved), max(1, -(-len(solved) // count_block_threads())))
+            run_blocks(solve, number, -(-number // count_block_threads()))
         return weights
 
 
@@ -308,40 +268,39 @@ class Backprojection:
         measurements = validate_measurements(operator, measurements, valid)
         if valid is not None:
             measurements = measurements * namespace(valid).astype(valid, measurements.dtype)
-        scale, batches = _fit_scale(operator, measurements), make_batches(operator, measurements)
+        scale, blocks = _fit_scale(operator, measurements), Blocks(operator, measurements)
 
         def solve(piece: slice) -> None:
-            batches.write_block(
-                operator.adjoint(scale * batches.take_block(measurements, piece)), piece
-            )
+            blocks.write(operator.adjoint(scale * blocks.take(measurements, piece)), piece)
             progress(piece.stop - piece.start)
 
-        batches.for_each_piece(solve)
-        return Result(batches.frames)
+        blocks.for_each(solve)
+        return Result(blocks.frames)
 
     def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most."""
+        """Return how many frame iterations `recover` reports at most.
+
+        Parameters
+        ----------
+        frames : int
+        """
         return frames
 
 
 def _fit_scale(operator: LinearOperator, measurements: Array) -> float:
-    """The factor c that minimises ``|c A A'f - f|`` over the brightest block of frames."""
+    """The factor c that minimises ``|c A A'f - f|`` over the brightest frames, in which signal
+    outweighs noise.
+    """
     xp = namespace(measurements)
-    # the brightest frames, in which signal outweighs noise
-    brightest = xp.argsort(xp.sum(measurements * measurements, axis=0))[
-        -min(LANES, measurements.shape[1]) :
-    ]
-    block = xp.take(measurements, brightest, axis=1)
+    order = xp.argsort(xp.sum(measurements * measurements, axis=0))
+    block = xp.take(measurements, order[-min(LANES, measurements.shape[1]) :], axis=1)
     seen = operator(operator.adjoint(block))
     energy = float(xp.sum(seen * seen, dtype=xp.float64))
     return float(xp.sum(seen * block, dtype=xp.float64)) / energy if energy > 0 else 1.0
 
 
-PATCH_ROWS, PATCH_COLUMNS = 8, 8
-"""The measurements that such a patch looks at stay in the first-level cache."""
-
-GROUP_PIXELS = 4
-"""Neighbours in a row of a patch: of each view they look at nearly the same measurements."""
+PATCH_ROWS, PATCH_COLUMNS = 8, 8  # what such a patch looks at stays in the first-level cache
+GROUP_PIXELS = 4  # neighbours in a row of a patch, which look at nearly the same measurements
 
 
 def order_by_patch(image_shape: tuple[int, int]) -> NDArray[np.int64]:
@@ -351,10 +310,10 @@ def order_by_patch(image_shape: tuple[int, int]) -> NDArray[np.int64]:
 
 
 class InverseTraces:
-    """A prepared inverse whose sparse part is applied to pixels in an order of their own.
+    """A prepared inverse of a sparse matrix in float32, whose sparse part is applied to `pixels` (n,),
+    numbers in raster order, in an order of their own; see `order_by_patch`.
 
-    `inverse`: of a sparse matrix in float32; `pixels` (n,): numbers of the pixels, counted in
-    raster order; see `order_by_patch`.
+    `tiles` is the operator's transpose, a row for each pixel, without measurements that are not used.
     """
 
     def __init__(self, inverse: PreparedInverse, pixels: NDArray[np.int64]) -> None:
@@ -363,30 +322,17 @@ class InverseTraces:
                 f"traces of single pixels need a sparse matrix, not {inverse.operator!r}"
             )
         self.inverse = inverse
-        # The transpose has one row per pixel, in the order in which they are wanted.
-        self._tiles = Tiles.from_csr(inverse.operator.matrix[inverse.used].T.tocsr()[pixels])
-
-    @property
-    def tiles(self) -> Tiles:
-        """The operator's transpose, a row for each pixel, a column for each measurement; without
-        what is not used.
-        """
-        used = self.inverse.used.astype(np.uint32)
-        return self._tiles._replace(columns=used[self._tiles.columns])
+        matrix = inverse.operator.matrix.copy()
+        unused = np.diagonal(inverse.inverse_gram) == 0
+        matrix.data[np.repeat(unused, np.diff(matrix.indptr))] = 0
+        matrix.eliminate_zeros()
+        self.tiles = Tiles.from_csr(matrix.T.tocsr()[pixels])
 
     def fill(self, weights: Array, piece: slice, traces: Array, frames: slice) -> None:
-        """Write what the inverse makes of a shot at the pixels ``pixels[piece]``.
-
-        `weights` (used measurements, time and some): `PreparedInverse.weights` of the shot's
-        measurements; `traces` (pixels of the piece, time): its columns `frames` are overwritten;
-        `frames`: time bins; as many as the measurements have.
+        """Write what the inverse makes of a shot at ``pixels[piece]`` into the columns `frames` of
+        `traces` (pixels, time); `weights` are `PreparedInverse.weights` of its measurements.
         """
         from tofclip.solvers.kernels import compute_traces
 
-        compute_traces(
-            *self._tiles,
-            (piece.start, piece.start + len(traces)),
-            weights,
-            traces,
-            (frames.start, frames.stop),
-        )
+        rows = piece.start, piece.start + len(traces)
+        compute_traces(*self.tiles, rows, weights, traces, (frames.start, frames.stop))

@@ -1,15 +1,11 @@
-"""What every method that turns measurements into pictures has in common: its interface, its result, and
-the loop around an iterative solver.
+"""What every method that turns measurements into pictures has in common, and FISTA with its priors.
 
 A method holds its settings and has one `recover`. It takes NumPy arrays; those that are `portable`
 take the arrays of any library that follows the array API standard as well, and return the same kind,
-on the same device. Memory beyond the result is bounded: see `tofclip.solvers.loops`.
+on the same device. Memory beyond the result is bounded: frames are worked on in `Blocks`.
 
-Recovery with a prior by FISTA: the priors with their proximal maps, the algorithm, and the methods
-that apply it to a batch of frames.
-
-Minimises ``1/2 |A h - f|^2 + weight * R(h)`` over h >= 0 for each frame, R the l1 norm or the total
-variation.
+FISTA minimises ``data(A h) + weight * R(h)`` over h >= 0 for each frame, R being a prior of
+`tofclip.solvers.priors`.
 """
 
 from __future__ import annotations
@@ -18,20 +14,34 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from math import log
-from typing import NamedTuple, Protocol
+from math import log, prod
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import Array, as_type, clip_values, namespace, require_numpy, to_numpy, zeros
+from tofclip.arrays import (
+    Array,
+    as_type,
+    clip_values,
+    is_numpy,
+    namespace,
+    require_numpy,
+    to_numpy,
+    zeros,
+)
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
-from tofclip.solvers.data_terms import DataTerm, DataTermMaker, LeastSquares
-from tofclip.solvers.loops import Batches, frames_per_block, make_batches, select_loops
-from tofclip.threads import limit_blas_threads, split_blocks
-
-Mask = Array | None
+from tofclip.solvers.data_terms import DataTerm, DataTermMaker, LeastSquares, Mask
+from tofclip.solvers.priors import (
+    TINY,
+    NonnegativeLightFieldVariation,
+    NonnegativeSparsity,
+    NonnegativeTotalVariation,
+    NonnegativeWavelets,
+    Regulariser,
+)
+from tofclip.threads import LANES, limit_blas_threads, run_blocks, split_blocks
 
 Progress = Callable[[int], None]
 """Called with the number of frame iterations just done; may raise to interrupt."""
@@ -41,18 +51,13 @@ def ignore_progress(_: int) -> None:
     """Report nothing."""
 
 
-GAP_INTERVAL = 10
-"""Iterations between two looks at the duality gap, each of which costs half an iteration."""
-
-
+GAP_INTERVAL = 10  # iterations between looks at the duality gap: each costs half an iteration
+# Of a block's energy: what is left of it beyond is noise, since no model of a camera misses as much.
 NOISE_FRACTION = 0.1
-"""Of a block's energy: what is left of it beyond is noise, since no model of a camera misses as much.
-"""
-
+# Of the objective. Between iterations 30 and 40 it falls by 0.9 to 3.6 % in shots whose thin bars have
+# a rim of false points by then, and by 0.1 to 0.2 % in dark ones, in which more iterations only follow
+# the noise.
 MIN_FURTHER_FALL = 6e-3
-"""Of the objective. Between iterations 30 and 40 it falls by 0.9 to 3.6 % in shots whose thin bars
-have a rim of false points by then, and by 0.1 to 0.2 % in dark ones, in which more iterations only
-follow the noise."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +91,8 @@ class StoppingRule:
     def __post_init__(self) -> None:
         if self.iterations < 1:
             raise InputError(f"at least one iteration is needed, got {self.iterations}")
-        for name, value in (
-            ("tolerance", self.tolerance),
-            ("gap", self.gap),
-            ("noise_fall", self.noise_fall),
-        ):
+        for name in ("tolerance", "gap", "noise_fall"):
+            value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"{name} must be finite and not negative, got {value}")
         if self.further < 0:
@@ -105,9 +107,8 @@ class StoppingRule:
             Of the block before the first and after every iteration.
         """
         before, last = objective[-2], objective[-1]
-        return bool(
-            (last > NOISE_FRACTION * objective[0]) & (before - last < self.noise_fall * last)
-        )
+        noisy = last > NOISE_FRACTION * objective[0]
+        return bool(noisy & (before - last < self.noise_fall * last))
 
     def continues(self, objective: Sequence[Array]) -> bool:
         """Say whether a block goes on after its iterations.
@@ -339,6 +340,13 @@ def relative_residual(
 ) -> float:
     """``|A h - f| / |f|`` over all good measurements of all frames.
 
+    Parameters
+    ----------
+    operator : LinearOperator
+    frames : (frames, rows, columns) array
+    measurements : (measurements, frames) array
+    valid : (measurements, frames) bool array, optional
+
     Returns
     -------
     float
@@ -347,37 +355,24 @@ def relative_residual(
     ------
     InputError
         Every valid measurement is zero.
-
-    Parameters
-    ----------
-    operator : LinearOperator
-    frames : (frames, rows, columns) array
-    measurements : (measurements, frames) array
-    valid : (measurements, frames) bool array, optional
     """
     # Block by block: predictions of all frames at once would double the memory.
     misfit = energy = 0.0
     xp = namespace(frames, measurements)
     for piece in split_blocks(frames.shape[0], frames_per_block(operator, measurements)):
-        block = xp.moveaxis(frames[piece, ...], 0, -1)
-        # Invalid measurements count neither as misfit nor as energy.
-        mask = 1.0 if valid is None else xp.astype(valid[:, piece], measurements.dtype)
-        misfit += float(
-            xp.sum(((operator(block) - measurements[:, piece]) * mask) ** 2, dtype=xp.float64)
-        )
-        energy += float(xp.sum((measurements[:, piece] * mask) ** 2, dtype=xp.float64))
+        seen = measurements[:, piece]
+        mask = 1.0 if valid is None else xp.astype(valid[:, piece], seen.dtype)
+        residual = (operator(xp.moveaxis(frames[piece, ...], 0, -1)) - seen) * mask
+        misfit += float(xp.sum(residual**2, dtype=xp.float64))
+        energy += float(xp.sum((seen * mask) ** 2, dtype=xp.float64))
     if energy == 0:
         raise InputError("every valid measurement is zero; there is nothing to compare with")
     return float(np.sqrt(misfit / energy))
 
 
 def validate_measurements(operator: LinearOperator, measurements: Array, valid: Mask) -> Array:
-    """Return `measurements` contiguous and in the operator's type, refusing wrong shapes, NaN and
-    infinity.
-
-    `operator`: pictures (rows, columns) to measurements (measurements,); `measurements`
-    (measurements, frames); `valid` (measurements, frames). Returns (measurements, frames):
-    contiguous, of the operator's dtype.
+    """Return (measurements, frames) values contiguous and in the operator's type, refusing wrong
+    shapes, NaN and infinity.
     """
     xp = namespace(measurements) if valid is None else namespace(measurements, valid)
     if measurements.ndim != 2 or measurements.shape[:1] != operator.shape_out:
@@ -393,166 +388,91 @@ def validate_measurements(operator: LinearOperator, measurements: Array, valid: 
     return as_type(measurements, operator.dtype)
 
 
-class ProximalStep(NamedTuple):
-    """A proximal gradient step and what is known about it, frame by frame.
+WORKING_BYTES = 1 << 31  # what a solver may take for the frames that it works on at once
+# Arrays of the frames' size that total variation, which needs most, has at once: solution, dual,
+# gradient and their temporaries.
+WORKING_PICTURES = 16
 
-    Parameters
-    ----------
-    picture : (rows, columns, lanes) array
-    penalty : (lanes,) float64 array
-        R of the picture.
-    distance : (lanes,) float64 array, optional
-        Squared distance of the picture from the point that the step began at. Without it, steps keep
-        their size.
+
+def frames_per_block(operator: LinearOperator, measurements: Array) -> int:
+    """`LANES` for NumPy's (measurements, frames), or one if it is alone; for others as many as
+    `WORKING_BYTES` hold.
+    """
+    if is_numpy(measurements):
+        return LANES if measurements.shape[1] > 1 else 1
+    picture = prod(operator.shape_in) * operator.dtype.itemsize
+    return max(1, WORKING_BYTES // (WORKING_PICTURES * picture))
+
+
+class Blocks:
+    """The frames of (measurements, frames) values, cut into blocks that are worked on together, and
+    their pictures, `frames`.
+
+    NumPy's blocks stay in cache, and threads share them. All have one width, because compiled loops
+    unroll it, and so no frame's result depends on its neighbours; zeros fill the last one. Other
+    libraries' blocks fill the memory of their device, one after the other.
     """
 
-    picture: Array
-    penalty: Array
-    distance: Array | None = None
-
-
-class Regulariser(Protocol):
-    """A penalty R(h) whose proximal map is known, on a block of (rows, columns, lanes) pictures; 0
-    where h is.
-
-    Attributes
-    ----------
-    zero_bound : float
-        A frame is zero where A'f (the data term's negative gradient at zero) nowhere exceeds this.
-    """
-
-    zero_bound: float
-
-    def proximal_step(
-        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
-    ) -> ProximalStep:
-        """Return ``prox_{step R}(z - step * gradient)``, a proximal gradient step.
-
-        ``z = current + momentum * (current - previous)`` is the extrapolated point and `gradient`
-        belongs to it. `previous` and `gradient` may be overwritten; the result may lie in their
-        memory.
-
-        Parameters
-        ----------
-        current, previous : (rows, columns, lanes) array
-            The last two solutions.
-        momentum : (lanes,) array
-        gradient : (rows, columns, lanes) array
-            Of the data term at z.
-        step : (lanes,) array
-            Step sizes, of the pictures' dtype.
-
-        Returns
-        -------
-        ProximalStep
-        """
-        ...
-
-    def scale_dual(self, pull: Array) -> Array | None:
-        """Return by how much each frame's dual point must shrink to be feasible, (lanes,) float64,
-        or None where that is not known.
-
-        Parameters
-        ----------
-        pull : (rows, columns, lanes) array
-            Negative gradient of the data term.
-        """
-        ...
-
-
-class NonnegativeSparsity:
-    """``weight * sum(h)`` for h >= 0, infinite otherwise: the l1 norm of a nonnegative picture.
-
-    Parameters
-    ----------
-    weight : float
-        In the unit of ``A'f``.
-    """
-
-    def __init__(self, weight: float) -> None:
-        self.weight = self.zero_bound = validate_weight(weight)
-
-    def proximal_step(
-        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
-    ) -> ProximalStep:
-        """Shift by ``step * weight`` and clip at zero; see `Regulariser`.
-
-        Arguments and result are those of `Regulariser.proximal_step`.
-        """
-        loops = select_loops(current)
-        picture, total, distance = loops.prox_l1(
-            current, previous, momentum, gradient, step, self.weight
+    def __init__(self, operator: LinearOperator, measurements: Array) -> None:
+        self._compiled = is_numpy(measurements)
+        self.size = frames_per_block(operator, measurements)
+        number = measurements.shape[1]
+        shape = number, *operator.shape_in
+        # not zeros: NumPy asks for large pages of memory for empty arrays only
+        self.frames = (
+            np.empty(shape, operator.dtype) if self._compiled else zeros(shape, measurements)
         )
-        return ProximalStep(picture, self.weight * total, distance)
+        self._order = np.arange(number)
 
-    def scale_dual(self, pull: Array) -> Array:
-        """Return what makes ``A' dual`` nowhere greater than the weight."""
-        xp = namespace(pull)
-        steepest = xp.max(pull, axis=tuple(range(pull.ndim - 1)))
-        steepest = clip_values(xp.astype(steepest, xp.float64), TINY)
-        return clip_values(self.weight / steepest, highest=1.0)
+    def leave_out(self, dark: NDArray[np.bool_]) -> None:
+        """Make the frames that are dark zero; pieces count the others only."""
+        if self._compiled:
+            self.frames[dark] = 0
+        self._order = np.flatnonzero(~dark)
 
+    def for_each(self, work: Callable[[slice], None]) -> None:
+        """Call `work` on every piece; the first exception is raised."""
+        if self._compiled:
+            run_blocks(work, self._order.size, self.size)
+        else:
+            for piece in split_blocks(self._order.size, self.size):
+                work(piece)
 
-class NonnegativeTotalVariation:
-    """``weight * TV(h)`` for h >= 0, infinite otherwise; TV is the isotropic total variation of
-    each frame.
+    def take(self, values: Array, piece: slice) -> Array:
+        """Copy a piece's columns of (n, frames) values."""
+        if not self._compiled:
+            return namespace(values).concat([values[:, run] for run in self._runs(piece)], axis=1)
+        chosen = self._order[piece]
+        block = np.zeros((values.shape[0], self.size), values.dtype)
+        block[:, : chosen.size] = values[:, chosen]
+        return block
 
-    The proximal map has no closed form. Its dual is kept from one call to the next (warm start), so
-    that a single sweep a call follows the solver's own convergence: on the clip scene's shot one
-    sweep ends 1.4 % above the objective of ten after 60 iterations and 0.4 % after 200, and the time
-    of further sweeps is better spent on further iterations. One instance therefore belongs to one
-    block. Steps keep their size: an inexact proximal map after a longer step is refused, or not, by
-    the rounding of the last digits, and pictures of two devices would differ by a percent.
+    def write(self, block: Array, piece: slice) -> None:
+        """Put a piece's (..., frames) pictures where they belong."""
+        done = 0
+        for run in self._runs(piece):
+            lanes = slice(done, done + run.stop - run.start)
+            done = lanes.stop
+            if self._compiled:
+                from tofclip.solvers.kernels import copy_lanes_to_frames
 
-    Parameters
-    ----------
-    weight : float
-        In the unit of ``A'f``.
-    """
+                size = run.stop - run.start
+                flat = block.reshape(-1, block.shape[-1])
+                copy_lanes_to_frames(flat, lanes.start, self.frames[run].reshape(size, -1))
+            else:
+                self.frames[run, ...] = namespace(block).moveaxis(block[..., lanes], -1, 0)
 
-    zero_bound = 0.0
-
-    def __init__(self, weight: float) -> None:
-        self.weight = validate_weight(weight)
-        self._dual: Array | None = None
-
-    def proximal_step(
-        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
-    ) -> ProximalStep:
-        """Sweep the dual once and return the picture that belongs to it; see `Regulariser`.
-
-        Arguments and result are those of `Regulariser.proximal_step`.
-        """
-        loops = select_loops(current)
-        picture, total, self._dual = loops.prox_tv(
-            current, previous, momentum, gradient, step, self.weight, self._dual
-        )
-        return ProximalStep(picture, self.weight * total)
-
-    def scale_dual(self, pull: Array) -> None:
-        """Not known: a dual point is feasible for a field of differences, not for a number."""
+    def _runs(self, piece: slice) -> list[slice]:
+        """Neighbouring frames of a piece, which a slice can name on any device."""
+        chosen = self._order[piece]
+        runs = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
+        return [slice(int(run[0]), int(run[-1]) + 1) for run in runs]
 
 
-def validate_weight(weight: float) -> float:
-    """Return a regularisation weight, refusing what is none."""
-    if not (np.isfinite(weight) and weight >= 0):
-        raise InputError(f"a regularisation weight must be finite and not negative, got {weight}")
-    return float(weight)
-
-
-STEP_GROWTH = 1.1
-"""From one iteration to the next a step grows at most by this factor."""
-
-STEP_MARGIN = 0.97
-"""What steps keep to of the longest one that the last iteration would have allowed."""
-
-STEP_RETREAT = 3.0
-"""Factors of `STEP_GROWTH` that a refused step shrinks by."""
-
-MAX_STEP_LEVEL = 40.0
-"""Of the same factors: a step of 45 times the safe one, more than was ever of use."""
-
-TINY = 1e-300
+STEP_GROWTH = 1.1  # from one iteration to the next a step grows at most by this factor
+STEP_MARGIN = 0.97  # of the longest step that the last iteration would have allowed
+STEP_RETREAT = 3.0  # factors of `STEP_GROWTH` that a refused step shrinks by
+MAX_STEP_LEVEL = 40.0  # such factors: 45 times the safe step, more than was ever of use
 
 
 class Fista:
@@ -639,7 +559,7 @@ class Fista:
 
     def step(self) -> None:
         """Advance every frame by one iteration."""
-        xp, loops = namespace(self.current), select_loops(self.current)
+        xp = namespace(self.current)
         sizes = self.step_sizes
         shrunk = xp.exp((self._level_before - self._level) * log(STEP_GROWTH))
         # Beck and Teboulle, Eq. 4.2, with the ratio of the last two steps; the momentum is that of
@@ -666,8 +586,8 @@ class Fista:
             self._level_before = xp.where(self.rejected, level, self._level)
             self._level = level
         # Refused frames go back to where they were, and their momentum starts anew.
-        candidate = loops.restore_frames(candidate, self.current, self.rejected)
-        seen = loops.restore_frames(seen, self.seen, self.rejected)
+        candidate = _restore(candidate, self.current, self.rejected)
+        seen = _restore(seen, self.seen, self.rejected)
         self.objective = xp.where(self.rejected, self.objective, objective)
         self._age = xp.where(self.rejected, 1.0, age)
         self.previous, self.current = self.current, candidate
@@ -700,8 +620,16 @@ class Fista:
         return None if bound is None else self.objective - bound
 
 
-NORM_MARGIN = 1.02
-"""What 15 Lanczos iterations may lack of the largest eigenvalue; a test checks every camera."""
+def _restore(values: Array, before: Array, rejected: Array) -> Array:
+    """The frames that are `rejected` as they were before, without asking a device whether any is."""
+    if not is_numpy(values):
+        return namespace(values).where(rejected, before, values)
+    if rejected.any():
+        values[..., rejected] = before[..., rejected]
+    return values
+
+
+NORM_MARGIN = 1.02  # 15 Lanczos iterations may lack so much of the norm; a test checks every camera
 
 
 @dataclass(frozen=True)
@@ -717,7 +645,7 @@ class ProximalMethod(ABC):
         Maximum number for each frame.
     tolerance : float
         Relative change of a block's objective below which it is done; 0: never. What a block is
-        depends on the arrays (`tofclip.solvers.loops`), and with it when its frames are done.
+        depends on the arrays (`Blocks`), and with it when its frames are done.
     data_term : DataTermMaker
         What a misfit costs.
     gap : float
@@ -785,23 +713,17 @@ class ProximalMethod(ABC):
             A measurement is NaN or infinite, or the arrays are not NumPy's and the prior is not
             portable.
         """
-        if start is not None and start.shape != (measurements.shape[1], *operator.shape_in):
-            raise ShapeError(
-                "pictures to begin at", (measurements.shape[1], *operator.shape_in), start.shape
-            )
+        expected = (measurements.shape[1], *operator.shape_in)
+        if start is not None and start.shape != expected:
+            raise ShapeError("pictures to begin at", expected, start.shape)
         if not self.portable:
             require_numpy(f"recovery with the prior {type(self).__name__}", measurements)
+        measurements = validate_measurements(operator, measurements, valid)
         # Blocks share the cores already, and a lone picture's products are too small to share.
         with limit_blas_threads():
-            return self._recover_batches(
-                operator,
-                validate_measurements(operator, measurements, valid),
-                valid,
-                progress,
-                start,
-            )
+            return self._recover(operator, measurements, valid, progress, start)
 
-    def _recover_batches(
+    def _recover(
         self,
         operator: LinearOperator,
         measurements: Array,
@@ -814,80 +736,86 @@ class ProximalMethod(ABC):
         )
         started = time.perf_counter()
         step = 1 / (NORM_MARGIN * operator.squared_norm)
-        batches = make_batches(operator, measurements)
-        # a lone picture has the calling thread to itself; after a shot before all is there
+        blocks = Blocks(operator, measurements)
+        # A lone picture has the calling thread to itself; after a shot before all is there. Else one
+        # step on a dark block loads the compiled loops, and brings the operator's matrix to where the
+        # measurements are, before the first thread comes.
         if measurements.shape[1] > 1 and start is None:
-            self._warm_up_loops(operator, step, batches.zero_measurements())
+            lanes = LANES if is_numpy(measurements) else 1
+            nothing = LeastSquares(zeros((measurements.shape[0], lanes), measurements))
+            first = Fista(operator, nothing, self._make_regulariser(1.0), step, lanes)
+            first.step()
+            blocks.write(first.current, slice(0, 1))
         setup_seconds = time.perf_counter() - started
-        zero = self._look_at_zero(operator, batches, measurements, valid)
-        # with max(A'f) as weight the l1 solution is zero: relative weights suit shots of any
-        # brightness
-        weight = self.weight * zero.peak
+        peaks, pulls, values = self._look_at_zero(operator, blocks, measurements, valid)
+        if not peaks.max() > 0:
+            raise InputError(
+                "no view sees anything positive; was too high a background subtracted?"
+            )
+        # With max(A'f) as weight the l1 solution is zero: relative weights suit shots of any
+        # brightness.
+        weight = self.weight * float(peaks.max())
         # most frames of most shots see nothing: they cost no iteration
-        dark = zero.pulls <= self._make_regulariser(weight).zero_bound
-        batches.leave_out(dark)
+        dark = pulls <= self._make_regulariser(weight).zero_bound
+        blocks.leave_out(dark)
         progress(self.work(int(dark.sum())))
         histories: dict[int, IterationHistory] = {}
 
         def solve(piece: slice) -> None:
-            trusted = None if valid is None else batches.take_block(valid, piece)
-            data = self.data_term(batches.take_block(measurements, piece), trusted)
-            solver = Fista(
-                operator, data, self._make_regulariser(weight), step, data.measurements.shape[1]
-            )
+            trusted = None if valid is None else blocks.take(valid, piece)
+            data = self.data_term(blocks.take(measurements, piece), trusted)
+            frames = data.measurements.shape[1]
+            solver = Fista(operator, data, self._make_regulariser(weight), step, frames)
             if start is not None:
-                begun = batches.take_block(_list_pixels(start), piece)
-                solver.start_from(
-                    namespace(begun).reshape(begun, (*operator.shape_in, begun.shape[-1]))
-                )
+                xp = namespace(start)
+                pixels = xp.moveaxis(xp.reshape(start, (start.shape[0], -1)), 0, -1)
+                begun = blocks.take(pixels, piece)
+                solver.start_from(xp.reshape(begun, (*operator.shape_in, frames)))
             histories[piece.start] = iterate(solver, stopping, progress, piece.stop - piece.start)
-            batches.write_block(solver.current, piece)
+            blocks.write(solver.current, piece)
 
-        batches.for_each_piece(solve)
-        in_order = [histories[start] for start in sorted(histories)]
-        still = IterationHistory(zero.values[dark].sum(keepdims=True), True, 0.0)
-        return Result.from_blocks(batches.frames, [still, *in_order], setup_seconds)
+        blocks.for_each(solve)
+        still = IterationHistory(values[dark].sum(keepdims=True), True, 0.0)
+        in_order = [histories[first] for first in sorted(histories)]
+        return Result.from_blocks(blocks.frames, [still, *in_order], setup_seconds)
 
     def _look_at_zero(
-        self, operator: LinearOperator, batches: Batches, measurements: Array, valid: Mask
-    ) -> _ZeroPictures:
-        """Find what the data term makes of pictures of nothing."""
-        zero = _ZeroPictures(batches.frames.shape[0])
+        self, operator: LinearOperator, blocks: Blocks, measurements: Array, valid: Mask
+    ) -> NDArray[np.float64]:
+        """What is known of pictures of nothing, (3, frames): the largest value of A'f, that of the data
+        term's negative gradient, and the data term.
+        """
+        known = np.zeros((3, measurements.shape[1]))
 
         def look(piece: slice) -> None:
             size = piece.stop - piece.start
-            block = batches.take_block(measurements, piece)
-            trusted = None if valid is None else batches.take_block(valid, piece)
-            least_squares = LeastSquares(block, trusted)
+            block = blocks.take(measurements, piece)
+            trusted = None if valid is None else blocks.take(valid, piece)
             nothing = namespace(block).zeros_like(block)
-            back = operator.adjoint(-least_squares.gradient(nothing))
-            highest = _max_of_frames(back)[:size]
-            zero.peaks[piece] = highest
-            if self.data_term is LeastSquares:
-                zero.pulls[piece] = highest
-                zero.values[piece] = to_numpy(least_squares.value(nothing))[:size]
-            else:
+
+            def pull(data: DataTerm) -> NDArray[np.float64]:
+                back = operator.adjoint(-data.gradient(nothing))
+                for _ in operator.shape_in:  # NumPy takes five times as long for all axes at once
+                    back = namespace(back).max(back, axis=0)
+                return to_numpy(back)[:size]
+
+            data: DataTerm = LeastSquares(block, trusted)
+            known[:2, piece] = pull(data)
+            if self.data_term is not LeastSquares:
                 data = self.data_term(block, trusted)
-                zero.pulls[piece] = _max_of_frames(operator.adjoint(-data.gradient(nothing)))[:size]
-                zero.values[piece] = to_numpy(data.value(nothing))[:size]
+                known[1, piece] = pull(data)
+            known[2, piece] = to_numpy(data.value(nothing))[:size]
 
-        batches.for_each_piece(look)
-        return zero
-
-    def _warm_up_loops(self, operator: LinearOperator, step: float, dark: Array) -> None:
-        """Take one step on a dark block and write it, so that compiled loops are there before the
-        first thread comes.
-
-        The operator's matrix is brought to where the measurements are, for the same reason.
-        """
-        solver = Fista(
-            operator, LeastSquares(dark), self._make_regulariser(1.0), step, dark.shape[1]
-        )
-        solver.step()
-        make_batches(operator, dark).write_block(solver.current, slice(0, dark.shape[1]))
+        blocks.for_each(look)
+        return known
 
     def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most."""
+        """Return how many frame iterations `recover` reports at most.
+
+        Parameters
+        ----------
+        frames : int
+        """
         return frames * (self.iterations + self.further)
 
 
@@ -918,6 +846,24 @@ class TotalVariation(ProximalMethod):
 
 
 @dataclass(frozen=True)
+class LightFieldVariation(ProximalMethod):
+    """Nonnegative light fields with sharp borders, their views alike (4D total variation;
+    supplement Eq. 20).
+    """
+
+    weight: float = 1e-2
+    iterations: int = 200
+    grid: tuple[int, int] = (1, 1)  # views down and across
+    # How much a difference between neighbouring views counts beside one between neighbouring pixels.
+    # Views differ by their parallax: 0.5 suits disparities of about a pixel, more suits less.
+    angular: float = 0.5
+    name = "light-field tv"
+
+    def _make_regulariser(self, weight: float) -> Regulariser:
+        return NonnegativeLightFieldVariation(weight, self.grid, self.angular)
+
+
+@dataclass(frozen=True)
 class Wavelets(ProximalMethod):
     """Nonnegative pictures with few details at every scale (Daubechies 4, cycle spinning)."""
 
@@ -926,42 +872,4 @@ class Wavelets(ProximalMethod):
     name = "wavelet"
 
     def _make_regulariser(self, weight: float) -> Regulariser:
-        from tofclip.solvers.priors import NonnegativeWavelets
-
         return NonnegativeWavelets(weight)
-
-
-class _ZeroPictures:
-    """What is known about pictures of nothing, frame by frame.
-
-    `peaks` (frames,): largest value of A'f; `pulls` (frames,): largest value of the data term's
-    negative gradient; `values` (frames,): the data term.
-    """
-
-    def __init__(self, frames: int) -> None:
-        self.peaks, self.pulls, self.values = np.zeros((3, frames))
-
-    @property
-    def peak(self) -> float:
-        """Largest value of A'f: the weight at which the sparsest nonnegative solution is zero."""
-        peak = float(self.peaks.max())
-        if peak <= 0:
-            raise InputError(
-                "no view sees anything positive; was too high a background subtracted?"
-            )
-        return peak
-
-
-def _list_pixels(pictures: Array) -> Array:
-    """Return pictures (frames, ...) as (pixels, frames), the way of measurements."""
-    xp = namespace(pictures)
-    return xp.moveaxis(xp.reshape(pictures, (pictures.shape[0], -1)), 0, -1)
-
-
-def _max_of_frames(pictures: Array) -> NDArray[np.float64]:
-    xp = namespace(pictures)
-    for _ in range(
-        pictures.ndim - 1
-    ):  # one after the other: NumPy takes five times as long at once
-        pictures = xp.max(pictures, axis=0)
-    return to_numpy(pictures).astype(np.float64)

@@ -2,9 +2,10 @@
 single one.
 
 Every array is C-contiguous with the frames as last axis, so that one vector instruction treats many
-frames at once and every frame's result is independent of its neighbours in the block. Sums over a
-picture are taken row by row and added up in float64, because a solver compares objectives that
-differ in the sixth digit.
+frames at once and every frame's result is independent of its neighbours in the block. A row is one of
+a picture with all its lanes; numbers that each lane has are repeated for every pixel of it. Sums over
+a picture are taken row by row and added up in float64, because a solver compares objectives that
+differ in the sixth digit. Throughout, ``z = current + momentum * (current - previous)``.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import math
 
 import numpy as np
 
-from tofclip.compiling import compile_as_part, compile_loop, inlined
+from tofclip.compiling import compile_as_part, compile_loop
 from tofclip.operators.kernels import (
     WIDE_LANES,
     multiply_sparse_rows,
@@ -22,38 +23,26 @@ from tofclip.operators.kernels import (
 from tofclip.threads import LANES
 
 TILE_PIXELS = 32
-
-STRETCH_NUMBERS = 512
-"""At most so many numbers are worked on together: nine arrays of them are 18 kB in float32."""
-
-STRETCHES_PER_SUM = 128
-"""Stretches that are added up before they go to a sum of higher precision."""
+STRETCH_NUMBERS = 512  # worked on together, at most: nine arrays of them are 18 kB in float32
+STRETCHES_PER_SUM = 128  # added up before they go to a sum of higher precision
 
 FASTMATH = {"contract", "nsz", "arcp", "afn"}
 fast_loop = compile_loop(fastmath=FASTMATH)
-
-
+# For a row: a loop over few arrays is a vector loop, because the compiler checks only a few for
+# overlap.
 row_part = compile_as_part(fastmath=FASTMATH, _nrt=False)
-"""For a row of a picture with all its lanes, one after the other: a loop over few arrays is a vector
-loop, because the compiler checks only a few for overlap. Numbers that each lane has are repeated for
-every pixel of a row.
-"""
 
 
 @fast_loop
 def shrink_nonnegative(
-    current, previous, momentum, gradient, step, threshold, memory, total, distance
+    current, previous, gradient, momentum, step, threshold, memory, total, distance
 ):
-    """``previous = max(z - step * gradient - threshold, 0)`` with ``z = current + momentum *
-    (current - previous)``.
+    """``previous = max(z - step * gradient - threshold, 0)`` of flat pictures; adds the sums of that
+    and of its squared distance from z to `total` and `distance`.
 
     A stretch of pixels at a time, which stays in the first-level cache with all that lanes have for
-    themselves: whole rows of a picture took twice as long.
-
-    `current` (n,): pictures, all lanes of a pixel side by side; `previous` (n,): overwritten with
-    the result; `momentum` (stretch,); `gradient` (n,); `step, threshold` (stretch,): step size, and
-    step size times weight; `memory` (3, stretch): zeros; overwritten; `total, distance` (stretch,):
-    to which sums over stretches of the result, and of its squared difference from z, are added.
+    themselves, (stretch,): whole rows of a picture took twice as long. `memory` is three stretches of
+    zeros.
     """
     result, some, far = memory[0], memory[1], memory[2]
     for number in range((current.size + result.size - 1) // result.size):
@@ -110,48 +99,32 @@ def _move_sum(some, total):
 
 
 @fast_loop
-def take_gradient_step(current, previous, momentum, gradient, step):
-    """``gradient = z - step * gradient`` with ``z = current + momentum * (current - previous)``.
-
-    `current, previous` (rows, columns, lanes); `momentum` (lanes,); `gradient` (rows, columns,
-    lanes): overwritten.
-    """
-    lanes = current.shape[2]
+def take_gradient_step(current, previous, momentum, step, gradient):
+    """``gradient = z - step * gradient``, arrays (rows, row) and (row,)."""
     for row in range(current.shape[0]):
-        for column in range(current.shape[1]):
-            for lane in range(lanes):
-                here = current[row, column, lane]
-                point = here + momentum[lane] * (here - previous[row, column, lane])
-                gradient[row, column, lane] = point - step * gradient[row, column, lane]
+        _descend_row(current[row], previous[row], momentum, gradient[row], step)
 
 
 @fast_loop
-def copy_lanes_to_frames(block, frames):
-    """``frames[lane, pixel] = block[pixel, lane]`` for as many lanes as there are frames;
-    contiguous 2D arrays.
+def copy_lanes_to_frames(block, start, frames):
+    """``frames[lane, pixel] = block[pixel, start + lane]`` for as many lanes as there are frames.
 
-    Tile by tile, so that both sides move whole cache lines: several times faster than a strided
-    copy.
-
-    `block` (pixels, lanes); `frames` (frames, pixels): overwritten; not more frames than lanes.
+    Tile by tile, so that both sides move whole cache lines: several times faster than a strided copy.
     """
-    pixels = block.shape[0]
-    # Tile by tile, as a transposition reads along one axis and writes along the other.
-    for first in range(0, pixels, TILE_PIXELS):
-        last = first + TILE_PIXELS if first + TILE_PIXELS < pixels else pixels
+    for first in range(0, block.shape[0], TILE_PIXELS):
+        last = min(first + TILE_PIXELS, block.shape[0])
         for lane in range(frames.shape[0]):
             for pixel in range(first, last):
-                frames[lane, pixel] = block[pixel, lane]
+                frames[lane, pixel] = block[pixel, start + lane]
 
 
 @compile_loop(fastmath=FASTMATH, _nrt=True)
 def compute_traces(tile_starts, columns, values, rows, weights, traces, span):
     """``traces[:, span[0] : span[1]] = M[rows[0] : rows[1]] @ weights`` for a sparse matrix M in
-    column tiles.
+    column tiles, see `tofclip.operators.sparse.Tiles`.
 
-    `tile_starts, columns, values`: see `tofclip.operators.sparse.Tiles`; a row for each trace;
-    `weights` (M's columns, time): its rows are a multiple of `LANES` long at least; `traces`
-    (rows[1] - rows[0], time): overwritten from column ``span[0]`` to below ``span[1]``.
+    `weights` (M's columns, time): rows are a multiple of `LANES` long at least; `traces`
+    (rows[1] - rows[0], at least span[1]).
     """
     starts, time, done = tile_starts[:, rows[0] : rows[1] + 1], span[1] - span[0], 0
     while done + WIDE_LANES <= time:
@@ -171,42 +144,20 @@ def compute_traces(tile_starts, columns, values, rows, weights, traces, span):
 
 
 @fast_loop
-def restore_frames(candidate, current, rejected):
-    """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are
-    (..., lanes).
-
-    `candidate` (rows, columns, lanes): overwritten in rejected lanes; `current` (rows, columns,
-    lanes); `rejected` (lanes,): 1 or 0.
-    """
-    lanes = candidate.shape[2]
-    for row in range(current.shape[0]):
-        for column in range(current.shape[1]):
-            for lane in range(lanes):
-                here = candidate[row, column, lane]
-                candidate[row, column, lane] = here + rejected[lane] * (
-                    current[row, column, lane] - here
-                )
-
-
-@fast_loop
 def descend_total_variation(
     lanes, current, previous, momentum, gradient, step, weight, dual, sweep, scratch, total
 ):
-    """A gradient step from ``z = current + momentum * (current - previous)``, and one sweep towards
-    the picture nearest to it in total variation.
+    """A gradient step from z, and one sweep towards the picture nearest to it in total variation.
 
-    The sweep is one of projected gradient on the dual of ``1/2 |x - noisy|^2 + weight * TV(x), x >=
-    0`` (Chambolle 2004). Every row passes through memory once: the primal row below is made before
-    a row's dual changes.
+    The sweep is one of projected gradient, of step size `sweep`, on the dual of ``1/2 |x - noisy|^2 +
+    weight * TV(x), x >= 0`` (Chambolle 2004). Every row passes through memory once: the primal row
+    below is made before a row's dual changes.
 
-    `lanes`: pixels of a row are `lanes` numbers apart; `current` (rows, row): pictures, all lanes
-    of a pixel side by side; `previous` (rows, row): overwritten with the result; `momentum` (row,);
-    `gradient` (rows, row): overwritten with ``noisy = z - step * gradient``; `step, weight` (row,):
-    step size, and step size times the variation's weight; `dual` (2, rows, row): vertical and
-    horizontal; updated in place. The last row of the one and the last column of the other stay
-    zero: the difference across the border is; `sweep` (row,): step size of the dual; `scratch` (4,
-    row): the first row is zero; the others are overwritten; `total` (row,): to which the sum over
-    rows of the result's isotropic total variation is added.
+    Pictures are (rows, row), `lanes` numbers from pixel to pixel; numbers of lanes (row,). `previous`
+    becomes the result, `gradient` ``noisy = z - step * gradient``, and the result's variation is added
+    to `total` (row,). Of the `dual` (2, rows, row), vertical and horizontal, the last row of the one
+    and the last column of the other stay zero: the difference across the border is. Of `scratch` (4,
+    row) the first row is zero.
     """
     rows, dark, room = current.shape[0], scratch[0], scratch[1]
     for row in range(rows + 1):
@@ -286,93 +237,123 @@ def _add_variation(lanes, here, below, total):
 
 
 @fast_loop
-def compute_light_field_primal(noisy, dual, weight, angular, result):
-    """``result = max(noisy + weight * div(dual), 0)``; arrays are (v, u, rows, columns, lanes),
-    `dual` four of them.
+def compute_light_field_primal(lanes, noisy, dual, weight, angular, room, result):
+    """``result = max(noisy + weight * div(dual), 0)``; arrays are (v, u, rows, row), `dual` four of
+    them along rows, columns, v and u. `room` is two rows, the second one of zeros.
 
-    The last difference along every axis crosses the border and is always zero, so only the first
-    needs care.
-
-    `noisy` (v, u, rows, columns, lanes); `dual` (4, v, u, rows, columns, lanes): along rows,
-    columns, v and u; `angular`: how many times the differences between views count; `result` (v, u,
-    rows, columns, lanes): overwritten.
+    The last difference along every axis crosses the border and is always zero.
     """
-    down, across, rows, columns, lanes = noisy.shape
+    down, across, rows, _ = noisy.shape
+    between, dark = room[0], room[1]
     for v in range(down):
         for u in range(across):
             for row in range(rows):
-                for column in range(columns):
-                    for lane in range(lanes):
-                        divergence = (
-                            dual[0, v, u, row, column, lane] + dual[1, v, u, row, column, lane]
-                        )
-                        between = (
-                            dual[2, v, u, row, column, lane] + dual[3, v, u, row, column, lane]
-                        )
-                        if row > 0:
-                            divergence -= dual[0, v, u, row - 1, column, lane]
-                        if column > 0:
-                            divergence -= dual[1, v, u, row, column - 1, lane]
-                        if v > 0:
-                            between -= dual[2, v - 1, u, row, column, lane]
-                        if u > 0:
-                            between -= dual[3, v, u - 1, row, column, lane]
-                        value = noisy[v, u, row, column, lane] + weight * (
-                            divergence + angular * between
-                        )
-                        result[v, u, row, column, lane] = max(value, np.float32(0))
+                _subtract_rows(
+                    dual[2, v, u, row],
+                    dual[2, v - 1, u, row] if v > 0 else dark,
+                    dual[3, v, u, row],
+                    dual[3, v, u - 1, row] if u > 0 else dark,
+                    between,
+                )
+                _make_light_field_row(
+                    lanes,
+                    noisy[v, u, row],
+                    weight,
+                    dual[0, v, u, row],
+                    dual[0, v, u, row - 1] if row > 0 else dark,
+                    dual[1, v, u, row],
+                    angular,
+                    between,
+                    result[v, u, row],
+                )
 
 
-@inlined
-def _forward_differences(field, v, u, row, column, lane, angular):
-    """The four forward differences at a sample, 0 across borders."""
-    down, across, rows, columns = field.shape[:4]
-    here = field[v, u, row, column, lane]
-    return (
-        field[v, u, min(row + 1, rows - 1), column, lane] - here,
-        field[v, u, row, min(column + 1, columns - 1), lane] - here,
-        angular * (field[min(v + 1, down - 1), u, row, column, lane] - here),
-        angular * (field[v, min(u + 1, across - 1), row, column, lane] - here),
-    )
+@row_part
+def _subtract_rows(one, before, other, other_before, result):
+    for i in range(result.size):
+        result[i] = one[i] - before[i] + (other[i] - other_before[i])
+
+
+@row_part
+def _make_light_field_row(lanes, noisy, weight, down, above, across, angular, between, result):
+    first, end = np.uintp(lanes), np.uintp(noisy.size)
+    for i in range(first):
+        divergence = down[i] - above[i] + across[i] + angular * between[i]
+        value = noisy[i] + weight * divergence
+        result[i] = value if value > 0 else np.float32(0)
+    for i in range(first, end):
+        divergence = down[i] - above[i] + (across[i] - across[i - first]) + angular * between[i]
+        value = noisy[i] + weight * divergence
+        result[i] = value if value > 0 else np.float32(0)
 
 
 @fast_loop
-def update_light_field_dual(field, dual, step, angular):
-    """``dual = project(dual + step * grad(field))`` onto vectors of length at most 1.
-
-    `field` (v, u, rows, columns, lanes); `dual` (4, v, u, rows, columns, lanes): updated in place;
-    `angular`: how many times the differences between views count.
+def update_light_field_dual(lanes, field, dual, step, angular, square):
+    """``dual = project(dual + step * grad(field))`` onto vectors of length at most 1; `square` is room
+    for a row.
     """
-    down, across, rows, columns, lanes = field.shape
+    down, across, rows, end = field.shape
+    inner = end - lanes
     for v in range(down):
         for u in range(across):
             for row in range(rows):
-                for column in range(columns):
-                    for lane in range(lanes):
-                        slope = _forward_differences(field, v, u, row, column, lane, angular)
-                        a = dual[0, v, u, row, column, lane] + step * slope[0]
-                        b = dual[1, v, u, row, column, lane] + step * slope[1]
-                        c = dual[2, v, u, row, column, lane] + step * slope[2]
-                        d = dual[3, v, u, row, column, lane] + step * slope[3]
-                        shrink = 1 / max(np.sqrt(a * a + b * b + c * c + d * d), np.float32(1))
-                        dual[0, v, u, row, column, lane] = a * shrink
-                        dual[1, v, u, row, column, lane] = b * shrink
-                        dual[2, v, u, row, column, lane] = c * shrink
-                        dual[3, v, u, row, column, lane] = d * shrink
+                here = field[v, u, row]
+                square[:] = 0
+                # across the border the difference is zero, and the dual stays so
+                if row + 1 < rows:
+                    _ascend_row(dual[0, v, u, row], here, field[v, u, row + 1], step, square)
+                right = dual[1, v, u, row, :inner]
+                _ascend_row(right, here[:inner], here[lanes:], step, square[:inner])
+                if v + 1 < down:
+                    _ascend_row(
+                        dual[2, v, u, row], here, field[v + 1, u, row], step * angular, square
+                    )
+                if u + 1 < across:
+                    _ascend_row(
+                        dual[3, v, u, row], here, field[v, u + 1, row], step * angular, square
+                    )
+                for axis in range(4):
+                    _shorten_row(dual[axis, v, u, row], square)
+
+
+@row_part
+def _ascend_row(dual, here, there, step, square):
+    """A step of the dual along a difference; its squares are added up."""
+    for i in range(dual.size):
+        raised = dual[i] + step * (there[i] - here[i])
+        dual[i] = raised
+        square[i] += raised * raised
+
+
+@row_part
+def _shorten_row(dual, square):
+    for i in range(dual.size):
+        dual[i] /= math.sqrt(max(square[i], np.float32(1)))
 
 
 @fast_loop
-def sum_light_field_variation(field, angular, total):
-    """Add the isotropic variation of each lane to `total` (lanes,), float64.
-
-    `field` (v, u, rows, columns, lanes); `angular`: how many times the differences between views
-    count; `total` (lanes,): added to, in place.
-    """
-    down, across, rows, columns, lanes = field.shape
+def sum_light_field_variation(lanes, field, angular, square, total):
+    """Add the isotropic variation of all rows to `total` (row,), float64; `square` is room for a row."""
+    down, across, rows, end = field.shape
+    inner, whole = end - lanes, field.dtype.type(1)
     for v in range(down):
         for u in range(across):
             for row in range(rows):
-                for column in range(columns):
-                    for lane in range(lanes):
-                        a, b, c, d = _forward_differences(field, v, u, row, column, lane, angular)
-                        total[lane] += np.sqrt(a * a + b * b + c * c + d * d)
+                here = field[v, u, row]
+                square[:] = 0
+                if row + 1 < rows:
+                    _add_difference(here, field[v, u, row + 1], whole, square)
+                _add_difference(here[:inner], here[lanes:], whole, square[:inner])
+                if v + 1 < down:
+                    _add_difference(here, field[v + 1, u, row], angular, square)
+                if u + 1 < across:
+                    _add_difference(here, field[v, u + 1, row], angular, square)
+                for i in range(end):
+                    total[i] += math.sqrt(square[i])
+
+
+@row_part
+def _add_difference(here, there, factor, square):
+    for i in range(here.size):
+        difference = factor * (there[i] - here[i])
+        square[i] += difference * difference

@@ -1,0 +1,32 @@
+# The public names of this package and their homes; they are imported on first use.
+
+from .data_terms import ClippedSquares as ClippedSquares
+from .data_terms import DataTerm as DataTerm
+from .data_terms import DataTermMaker as DataTermMaker
+from .data_terms import Huber as Huber
+from .data_terms import LeastSquares as LeastSquares
+from .data_terms import Poisson as Poisson
+from .denoising import Denoiser as Denoiser
+from .denoising import PlugAndPlay as PlugAndPlay
+from .denoising import RegularisationByDenoising as RegularisationByDenoising
+from .direct import Backprojection as Backprojection
+from .direct import LinearInverse as LinearInverse
+from .direct import PreparedInverse as PreparedInverse
+from .fista import Fista as Fista
+from .fista import IterationHistory as IterationHistory
+from .fista import IterativeSolver as IterativeSolver
+from .fista import Method as Method
+from .fista import Progress as Progress
+from .fista import ProximalMethod as ProximalMethod
+from .fista import Result as Result
+from .fista import Sparse as Sparse
+from .fista import StoppingRule as StoppingRule
+from .fista import TotalVariation as TotalVariation
+from .fista import Wavelets as Wavelets
+from .fista import ignore_progress as ignore_progress
+from .fista import iterate as iterate
+from .fista import relative_residual as relative_residual
+from .priors import NonnegativeSparsity as NonnegativeSparsity
+from .priors import NonnegativeTotalVariation as NonnegativeTotalVariation
+from .priors import ProximalStep as ProximalStep
+from .priors import Regulariser as Regulariser
