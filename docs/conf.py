@@ -27,7 +27,7 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = [
     "_build",
     "notebooks/*.ipynb",
-    "reproduction/*.md",
+    "results/reproduction/*.md",
 ]  # those are parts of reproduction.md
 myst_enable_extensions = ["deflist"]
 myst_heading_anchors = 3

@@ -38,7 +38,7 @@ RANGES = "docs/recovery_algorithm.md: ## 6. From frames to ranges"
 SURFACES = "docs/recovery_algorithm.md: ## 7. Surfaces instead of frames"
 SHEARS = "docs/recovery_algorithm.md: ## 3. Which shear each frame has"
 REFOCUS = (
-    "docs/reproduction.md: ## Refocusing a recovered light field beside direct recovery, SR = 1"
+    "docs/results/reproduction.md: ## Refocusing a recovered light field beside direct recovery, SR = 1"
 )
 HIDDEN = "docs/nlos.md: ## Which method for which capture"
 REFINED = "docs/nlos.md: ## Refined"

@@ -115,7 +115,7 @@ def test_every_study_can_be_called_by_its_tables_and_figures_names():
 
 def test_the_page_says_of_every_table_how_its_weight_was_chosen():
     """And nothing that the studies do not say: notes and page change together."""
-    page = Path(__file__).parents[3] / "docs" / "reproduction.md"
+    page = Path(__file__).parents[3] / "docs" / "results" / "reproduction.md"
     sections = page.read_text("utf-8").split("\n## ")[1:]
     by_title = {study.title: study for study in STUDIES}
     # These are on the pages about occluders and about the recovery of shots.
