@@ -29,6 +29,7 @@ from nlos.method import (
     require_imageable,
     require_numpy_signal,
 )
+from nlos.phasor.arrays import ArrayLibrary
 from nlos.phasor.plan import GroupPlan, Hybrid, PlanarRSD, plan_groups, require_even_grid
 from nlos.phasor.propagate import choose_backend
 from nlos.phasor.to_depths import DepthPropagator
@@ -337,7 +338,7 @@ class TransientImaging:
         band = self._choose_band(capture, grid, instants)
         group = self._plan_group(capture, grid, band)
         warn_of_aliasing(capture, band)
-        depths = DepthPropagator(group.plane_to_depths)
+        depths = DepthPropagator(group.plane_to_depths, ArrayLibrary())
         spectrum = depths.to_waves(group.wall_to_plane(capture, ignore_progress))
         turns = np.exp(1j * SPEED_OF_LIGHT * np.outer(band.wavenumbers, instants)).astype(
             np.complex64
@@ -345,9 +346,10 @@ class TransientImaging:
 
         def process_block(planes: slice) -> None:
             for depth in range(planes.start, planes.stop):
-                arrived = spectrum * depths.transfer(float(grid.z[depth]), NO_DELAY)
+                nodes = depths.transfer_nodes(float(grid.z[depth]), NO_DELAY)[np.newaxis]
+                arrived = spectrum * depths.transfer(nodes)
                 for some in split_blocks(instants.size, INSTANTS_PER_BLOCK):
-                    use(depth, some, depths.to_images(arrived @ turns[:, some]))
+                    use(depth, some, depths.to_images(arrived @ turns[:, some])[0])
                 progress(grid.shape[1] * grid.shape[2])
 
         with limit_blas_threads():

@@ -5,7 +5,7 @@ Signals of a capture as arrays of any library, and their phasors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -21,14 +21,14 @@ from tofclip.arrays import Array, ComputeDevice, namespace
 # Bytes of the largest array that is made at a time: on a processor, with its caches, and on a GPU,
 # with its thousands of lanes.
 CPU_CHUNK_BYTES, GPU_CHUNK_BYTES = 8 << 20, 256 << 20
-SINGLE_PRECISION_DTYPES = {"f": np.float32, "c": np.complex64}
 
 
 @dataclass(frozen=True)
 class ArrayLibrary:
-    """A library at one place, computing in single precision."""
+    """A library at one place, computing in single precision unless told otherwise."""
 
-    device: ComputeDevice
+    device: ComputeDevice = field(default_factory=ComputeDevice)
+    double: bool = False
 
     @classmethod
     def of(cls, array: Array) -> ArrayLibrary:
@@ -40,6 +40,16 @@ class ArrayLibrary:
         """The functions of the array API standard."""
         return namespace(self.device.put(np.zeros(1, np.float32)))
 
+    @cached_property
+    def _dtypes(self) -> dict[str, type]:
+        """Of real and of complex numbers, by NumPy's letters."""
+        names = ("float64", "complex128") if self.double else ("float32", "complex64")
+        return {name[0]: getattr(np, name) for name in names}
+
+    @property
+    def _complex(self) -> Any:
+        return self.xp.complex128 if self.double else self.xp.complex64
+
     @property
     def chunk_bytes(self) -> int:
         """The largest array that should be made at a time; some four of its size are alive
@@ -48,17 +58,17 @@ class ArrayLibrary:
         return CPU_CHUNK_BYTES if "cpu" in str(self.device.device).lower() else GPU_CHUNK_BYTES
 
     def put(self, values: NDArray[Any]) -> Array:
-        """Bring a NumPy array here, in single precision if it holds real or complex numbers."""
-        return self.device.put(np.asarray(values, SINGLE_PRECISION_DTYPES.get(values.dtype.kind)))
+        """Bring a NumPy array here, real and complex numbers in the library's precision."""
+        return self.device.put(np.asarray(values, self._dtypes.get(values.dtype.kind)))
 
     def zeros(self, shape: tuple[int, ...]) -> Array:
-        """Make complex64 zeros."""
-        return self.xp.zeros(shape, dtype=self.xp.complex64, device=self.device.device)
+        """Make complex zeros."""
+        return self.xp.zeros(shape, dtype=self._complex, device=self.device.device)
 
     def exp_turns(self, turns: Array) -> Array:
         """Return ``exp(2j * pi * turns)``, accurate however large the turns are."""
         angle = 2 * np.pi * (turns - self.xp.round(turns))
-        return self.xp.exp(1j * self.xp.astype(angle, self.xp.complex64))
+        return self.xp.exp(1j * self.xp.astype(angle, self._complex))
 
     def make_complex(self, real: Array, imaginary: Array) -> Array:
         """Make complex numbers of real and imaginary parts.

@@ -19,9 +19,10 @@ from nlos.band import Band
 from nlos.capture import Capture
 from nlos.illumination import IlluminationGroup, build_source, choose_roles, warn_of_aliasing
 from nlos.method import MEMORY_LIMIT_BYTES, Method, Plan, Progress, require_numpy_signal
+from nlos.phasor.arrays import ArrayLibrary
 from nlos.phasor.depth_steps import DiffractionPlan
 from nlos.phasor.plan import GroupPlan, Hybrid, WavePlan, plan_waves
-from nlos.phasor.to_depths import IlluminatedDepthPropagator
+from nlos.phasor.to_depths import PortableDiffraction
 from nlos.phasor.wall_to_plane_compiled import sum_spherical_waves
 from nlos.plane import axis_step
 from nlos.volume import Grid, Volume
@@ -93,9 +94,8 @@ class HiddenToWall(LinearOperator):
         self.points, self.plane = points, plan.plane
         self.wavenumbers = group.legs * band.wavenumbers
         self._complex_dtype = np.result_type(self.dtype, np.complex64)
-        self._depths = IlluminatedDepthPropagator(
-            plan, build_source(group, band), self._complex_dtype
-        )
+        library = ArrayLibrary(double=self.dtype == np.float64)
+        self._depths = PortableDiffraction(plan, build_source(group, band), library, True)
         area = float(np.prod(plan.plane.steps))
         # sqrt(G_k) of the class's formula, and the area that a point of the virtual plane stands
         # for
@@ -123,7 +123,7 @@ class HiddenToWall(LinearOperator):
         waves = propagate_spherical_waves(
             self.points, phasors, self.plane.points.reshape(-1, 3), self.wavenumbers
         )
-        return self._depths.to_volume(waves.reshape(*self.plane.shape, -1))
+        return np.asarray(self._depths.to_volume(waves.reshape(*self.plane.shape, -1)))
 
     def _apply_per_frame(self, work: Callable[[Array], Array], block: Array) -> Array:
         """Treat every frame alone: each is a volume, too large to gain from company."""
