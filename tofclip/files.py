@@ -198,17 +198,6 @@ def require_bounded_size(
         )
 
 
-def require_own_member(group: h5py.Group, name: str, origin: str | Path) -> None:
-    """Refuse a member of an HDF5 group that is a link, be it within the file or out of it.
-
-    `origin`: the file that it is in.
-    """
-    import h5py
-
-    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-        raise FileFormatError(origin, f"'{name}' cannot be read: links are not followed")
-
-
 def iterate_members(
     group: h5py.Group, visited: set[int]
 ) -> Iterator[tuple[str, h5py.Dataset | h5py.Group | None]]:

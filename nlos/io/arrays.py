@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,51 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
-from tofclip.files import format_error_line, require_bounded_dataset, translate_read_errors
-from tofclip.io.archive import Archive, ArchiveEntry
-from tofclip.io.mat import list_mat_variables
+from tofclip.files import require_bounded_dataset, translate_read_errors
+from tofclip.io.archive import Archive, ArchiveEntry, Entries, list_mat_entries
 from tofclip.storage import HDF5_SIGNATURE
 
 # Of a v7.3 file, before the HDF5 data begin.
 MATLAB_HEADER_BYTES = 512
 
-Entries = Mapping[str, ArchiveEntry]
-
 
 class NamedArrays(Archive):
-    """Named arrays with the file that they come from; see `Archive` for how they are taken out.
-
-    `list_entries`: lists what the file holds; by default that of a NumPy archive.
-    """
-
-    def __init__(
-        self, path: str | Path, list_entries: Callable[[Path], Entries] | None = None
-    ) -> None:
-        self._list_own = list_entries
-        super().__init__(path)
-
-    def _list_entries(self) -> Entries:
-        if self._list_own is None:
-            return super()._list_entries()
-        list_own = self._list_own
-        with translate_read_errors(self.path):
-            self.path.stat()
-        found: Entries = self._guard(lambda: list_own(self.path))
-        return found
-
-    def _guard(self, read: Callable[[], Any]) -> Any:
-        if self._list_own is None:
-            return super()._guard(read)
-        try:
-            return read()
-        except (FileFormatError, MemoryError):
-            raise
-        except (
-            Exception
-        ) as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-            raise FileFormatError(
-                self.path, f"is truncated or damaged ({format_error_line(fault)})"
-            ) from fault
+    """Named arrays of a file in the orders and units that captures come in."""
 
     def read_numbers(self, name: str) -> NDArray[Any]:
         """Return entry `name`, numbers of any shape but an empty one."""
@@ -142,12 +107,12 @@ def _make_hdf5_loader(path: Path, name: str, matlab: bool) -> Callable[[], NDArr
 
 def _list_mat_entries(path: Path) -> Entries:
     return {
-        variable.name: ArchiveEntry(
-            tuple(n for n in variable.shape if n != 1),
-            variable.dtype,
-            lambda load=variable.load: np.squeeze(load()),  # type: ignore[misc]
+        name: ArchiveEntry(
+            tuple(n for n in entry.shape if n != 1),
+            entry.dtype,
+            lambda load=entry.load: np.squeeze(load()),  # type: ignore[misc]
         )
-        for variable in list_mat_variables(path)
+        for name, entry in list_mat_entries(path).items()
     }
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
-from fuzz_files import FORMATS, FileFormat
+from fuzz_files import FORMATS, FileFormat, encode_itex
 
 from devices.address import Uri
 from devices.frames import FrameCodec
@@ -30,7 +30,6 @@ from devices.spad512 import ExposureRequest, Spad512Feed
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec, mark_wraps
 from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError, ProtocolError
 from tofclip.io import hamamatsu as hpdta
-from tofclip.io import hamamatsu as itex
 
 FILE_SLOWNESS = 20
 Decode = Callable[[bytes], object]
@@ -95,11 +94,8 @@ def _frames(bits: int) -> Target:
 def _itex() -> Target:
     text = '[Scaling],ScalingXScalingFile="",ScalingYUnit="ns",ScalingYScalingFile=""'
     tables = {"X": np.arange(9, dtype=np.float32), "Y": np.arange(7, dtype=np.float32)}
-    seeds = [
-        itex.encode_itex(itex.ItexImage(np.ones((7, 9), dtype), text, tables=tables))
-        for dtype in ("u1", "<u2", "<u4")
-    ]
-    return Target(lambda data: itex.encode_itex(itex.decode_itex(data)), tuple(seeds))
+    seeds = [encode_itex(np.ones((7, 9), dtype), text, tables) for dtype in ("u1", "<u2", "<u4")]
+    return Target(hpdta.decode_itex, tuple(seeds))
 
 
 def _answer(data: bytes) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from itex_files import encode_itex
 
 import devices
 from devices.transients import read_transient
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.io.hamamatsu import ItexImage, write_itex
 
 TEXT = (
     '[Application],Date="1/2/2023",Software="HPD-TA"[Camera],CameraName="C1",SerialNumber="S/N: 5"'
@@ -23,10 +23,8 @@ TEXT = (
 def picture(tmp_path: Path) -> Path:
     """Six rows of four pixels with a time axis."""
     pixels = np.arange(24, dtype="<u2").reshape(6, 4)
-    write_itex(
-        ItexImage(pixels, TEXT, tables={"Y": np.arange(6, dtype=np.float32) ** 1.5}),
-        tmp_path / "shot.img",
-    )
+    content = encode_itex(pixels, TEXT, {"Y": np.arange(6, dtype=np.float32) ** 1.5})
+    (tmp_path / "shot.img").write_bytes(content)
     return tmp_path / "shot.img"
 
 

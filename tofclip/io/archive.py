@@ -1,14 +1,17 @@
-"""NumPy archives (``.npz``) of unknown origin, with every entry checked as it is taken out.
+"""Named arrays of NumPy's archives (``.npz``) and of MATLAB's files of version 5, of unknown origin.
 
-Only headers are read when an archive is opened: an entry is looked at when it is asked for, and
+What a file holds is listed before a value is read: an entry is looked at when it is asked for, and
 only if its shape and type are the ones asked for.
 """
 
 from __future__ import annotations
 
 import math
+import struct
 import zipfile
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -17,16 +20,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
-from tofclip.files import (
-    BoundedFile,
-    format_error_line,
-    require_bounded_size,
-    translate_read_errors,
-)
+from tofclip.files import BoundedFile, guard, require_bounded_size
 
 NPY_SUFFIX = ".npy"
+# Those that NumPy writes; others can claim to unpack to any size.
 MEMBER_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""Those that NumPy writes; others can claim to unpack to any size."""
+MAT_HEADER_BYTES, PEEKED_BYTES = 128, 1 << 12
+# Of MATLAB's files: types of elements; classes of matrices; their types in memory and in the file.
+MAT_MATRIX, MAT_COMPRESSED = 14, 15
+MAT_CELL, MAT_STRUCT, MAT_COMPLEX = 1, 2, 0x0800
+MAT_CLASSES = dict(
+    enumerate(map(np.dtype, ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"]), 6)
+)
+MAT_TYPES = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], 1)) | {
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
+DAMAGED_MAT = "is a truncated or damaged MAT file"
 
 
 @dataclass(frozen=True)
@@ -34,7 +45,7 @@ class ArchiveEntry:
     """An array in a file that has not been read yet."""
 
     shape: tuple[int, ...]
-    dtype: np.dtype[Any]
+    dtype: np.dtype[Any]  # objects for MATLAB's cells
     load: Callable[[], NDArray[Any]]  # reads the values
 
     @classmethod
@@ -42,6 +53,9 @@ class ArchiveEntry:
         """Make an entry of an array that is in memory."""
         array = np.asarray(values)
         return cls(array.shape, array.dtype, lambda: array)
+
+
+Entries = Mapping[str, ArchiveEntry]
 
 
 def list_npz_entries(path: Path) -> dict[str, ArchiveEntry]:
@@ -61,28 +75,22 @@ def list_npz_entries(path: Path) -> dict[str, ArchiveEntry]:
             claimed = math.prod(shape) * dtype.itemsize
             packed = member.compress_type != zipfile.ZIP_STORED
             require_bounded_size(path, name, claimed, member.compress_size, packed)
-            entries[name] = ArchiveEntry(shape, dtype, _make_loader(path, member))
+            entries[name] = ArchiveEntry(shape, dtype, _make_npz_loader(path, member))
     return entries
 
 
 def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Read shape and type of an ``.npy`` file, up to its first value.
-
-    `file`: at its beginning.
-    """
-    version = np.lib.format.read_magic(file)
-    read = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
+    """Read shape and type of an ``.npy`` file, up to its first value."""
+    is_first = np.lib.format.read_magic(file) == (1, 0)
+    reader = np.lib.format
+    read = reader.read_array_header_1_0 if is_first else reader.read_array_header_2_0
     shape, _, dtype = read(file)
     if dtype.hasobject:
         raise ValueError("it holds pickled Python objects, which are never loaded")
     return shape, dtype
 
 
-def _make_loader(path: Path, member: zipfile.ZipInfo) -> Callable[[], NDArray[Any]]:
+def _make_npz_loader(path: Path, member: zipfile.ZipInfo) -> Callable[[], NDArray[Any]]:
     def load() -> NDArray[Any]:
         with (
             BoundedFile(path) as opened,
@@ -94,31 +102,173 @@ def _make_loader(path: Path, member: zipfile.ZipInfo) -> Callable[[], NDArray[An
     return load
 
 
+def list_mat_entries(path: Path) -> dict[str, ArchiveEntry]:
+    """List the numeric and cell arrays of a MAT file of version 5, those in its structs by names
+    with dots.
+
+    SciPy's reader trusts what a file says of itself, and a damaged one ends the program; here every
+    size is held against the bytes that are there. The format is MathWorks' "MAT-File Format"
+    (R2022a): elements with a tag of type and length, padded to eight bytes; a matrix holds flags,
+    dimensions, name and values, a cell holds matrices, a struct the names of its fields and their
+    matrices.
+    """
+    entries: dict[str, ArchiveEntry] = {}
+    size = path.stat().st_size
+    with guard(path, DAMAGED_MAT), open(path, "rb") as file:
+        # The header ends in the characters MI as a 16-bit number: read back as IM, the file is
+        # little-endian.
+        order = {b"IM": "<", b"MI": ">"}[file.read(MAT_HEADER_BYTES)[126:]]
+        while file.tell() + 8 <= size:
+            kind, length = struct.unpack(f"{order}II", file.read(8))
+            start, packed = file.tell(), kind == MAT_COMPRESSED
+            if start + length > size:
+                raise FileFormatError(path, DAMAGED_MAT)
+            # Only the beginning is unpacked: name and shape are wanted here, not the values.
+            first = file.read(min(length, PEEKED_BYTES))
+            if packed:
+                first = zlib.decompressobj().decompress(first, PEEKED_BYTES)
+                kind, first = struct.unpack(f"{order}I", first[:4])[0], first[8:]
+            if kind == MAT_MATRIX:
+                element = _MatElement(path, order, start, length, packed)
+                entries.update(element.list_entries(_MatMatrix(path, order, first)))
+            file.seek(start + length)
+    return entries
+
+
+@dataclass(frozen=True)
+class _MatElement:
+    """Where a matrix lies in a file: its bytes from `start` on, compressed ones where `packed`."""
+
+    path: Path
+    order: str
+    start: int
+    length: int
+    packed: bool
+
+    def list_entries(self, matrix: _MatMatrix) -> Iterator[tuple[str, ArchiveEntry]]:
+        if matrix.kind == MAT_STRUCT and math.prod(matrix.shape) == 1:
+            for name, part in self.read().fields():
+                if part.is_readable:
+                    label = f"{matrix.name}.{name}"
+                    yield label, ArchiveEntry(part.shape, part.dtype, part.values)
+        elif matrix.is_readable:
+            if matrix.kind != MAT_CELL:
+                # A number takes at least one byte in the file, whatever its class.
+                number = math.prod(matrix.shape)
+                require_bounded_size(self.path, matrix.name, number, self.length, self.packed)
+            yield (
+                matrix.name,
+                ArchiveEntry(matrix.shape, matrix.dtype, lambda: self.read().values()),
+            )
+
+    def read(self) -> _MatMatrix:
+        with guard(self.path, DAMAGED_MAT), open(self.path, "rb") as file:
+            file.seek(self.start)
+            content = file.read(self.length)
+            if self.packed:
+                unpacker = zlib.decompressobj()
+                claimed = struct.unpack(f"{self.order}I", unpacker.decompress(content, 8)[4:])[0]
+                require_bounded_size(self.path, "a variable", claimed, self.length, True)
+                content = unpacker.decompress(unpacker.unconsumed_tail, claimed + 1)
+            return _MatMatrix(self.path, self.order, content)
+
+
+class _MatMatrix:
+    """A matrix that begins at byte `at` of unpacked content; what is missing there raises errors of
+    struct and NumPy.
+    """
+
+    def __init__(self, path: Path, order: str, content: bytes, at: int = 0) -> None:
+        self._path, self._order, self._content = path, order, content
+        self._tag = struct.Struct(f"{order}II")
+        _, start, _, at = self._read_tag(at)
+        flags = self._tag.unpack_from(content, start)[0]
+        self.kind, self._is_complex = flags & 0xFF, bool(flags & MAT_COMPLEX)
+        _, start, end, at = self._read_tag(at)
+        self.shape = struct.unpack_from(f"{order}{(end - start) // 4}i", content, start)
+        _, start, end, self._at = self._read_tag(at)
+        self.name = content[start:end].decode("latin-1")
+        if len(self.shape) < 2 or min(self.shape) < 0:
+            raise FileFormatError(path, DAMAGED_MAT)
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether it holds numbers or cells."""
+        return self.kind == MAT_CELL or self.kind in MAT_CLASSES
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of its values, objects for cells."""
+        return MAT_CLASSES.get(self.kind, np.dtype(object))
+
+    def _read_tag(self, at: int) -> tuple[int, int, int, int]:
+        """Return type, start and end of the element at a byte, and where the next one begins."""
+        kind, length = self._tag.unpack_from(self._content, at)
+        if kind >> 16:  # a short one, whose values are inside the tag
+            return kind & 0xFFFF, at + 4, at + 4 + min(kind >> 16, 4), at + 8
+        return kind, at + 8, at + 8 + length, at + 8 + length + (-length) % 8
+
+    def values(self, is_cell: bool = False) -> NDArray[Any]:
+        """Return the numbers, or the contents of the cells, which hold no cells."""
+        with nullcontext() if is_cell else guard(self._path, DAMAGED_MAT):
+            number = math.prod(self.shape)
+            if self.kind == MAT_CELL and not is_cell:
+                # Every cell takes a tag of eight bytes at least, so that a damaged count is found
+                # before the array is made.
+                if 8 * number > len(self._content):
+                    raise FileFormatError(self._path, DAMAGED_MAT)
+                cells, at = np.empty(number, dtype=object), self._at
+                for place in range(number):
+                    cell, at = self._read_matrix(at)
+                    cells[place] = np.zeros((0, 0)) if cell is None else cell.values(is_cell=True)
+                return cells.reshape(self.shape, order="F")
+            if self.kind not in MAT_CLASSES or self._is_complex:
+                raise FileFormatError(self._path, f"'{self.name}' holds no real numbers")
+            if number == 0:  # may come without an element for its values
+                return np.zeros(self.shape, self.dtype)
+            kind, start, end, _ = self._read_tag(self._at)
+            stored = np.dtype(self._order + MAT_TYPES[kind])
+            if end - start != number * stored.itemsize:
+                raise FileFormatError(self._path, DAMAGED_MAT)
+            values = np.frombuffer(self._content, stored, number, start)
+            return values.astype(self.dtype, copy=False).reshape(self.shape, order="F")
+
+    def fields(self) -> Iterator[tuple[str, _MatMatrix]]:
+        """Yield names and contents of the fields of a struct."""
+        _, start, _, at = self._read_tag(self._at)
+        width = struct.unpack_from(f"{self._order}i", self._content, start)[0]
+        _, start, end, at = self._read_tag(at)
+        if width <= 0:
+            raise FileFormatError(self._path, DAMAGED_MAT)
+        for place in range(start, end, width):
+            field, at = self._read_matrix(at)
+            if field is not None:
+                name = self._content[place : place + width].partition(b"\0")[0]
+                yield name.decode("latin-1"), field
+
+    def _read_matrix(self, at: int) -> tuple[_MatMatrix | None, int]:
+        """Return the matrix inside at a byte, None for an empty one, and where the next begins."""
+        kind, start, end, at = self._read_tag(at)
+        if kind != MAT_MATRIX:
+            raise FileFormatError(self._path, DAMAGED_MAT)
+        if start == end:
+            return None, at
+        return _MatMatrix(self._path, self._order, self._content, start), at
+
+
 class Archive:
-    """The arrays of an ``.npz`` file; pickled objects are never loaded."""
+    """The arrays of a file of unknown origin, by default an ``.npz`` file."""
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        list_entries: Callable[[Path], Entries] | None = None,
+    ) -> None:
         self.path = Path(path)
-        self._entries = self._list_entries()
-
-    def _list_entries(self) -> Mapping[str, ArchiveEntry]:
-        # A missing file is reported as such before the decoder turns it into a damaged one.
-        with translate_read_errors(self.path):
-            self.path.stat()
-        entries: Mapping[str, ArchiveEntry] = self._guard(lambda: list_npz_entries(self.path))
-        return entries
-
-    def _guard(self, read: Callable[[], Any]) -> Any:
-        try:
-            return read()
-        except (FileFormatError, MemoryError):
-            raise
-        except (
-            Exception
-        ) as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-            raise FileFormatError(
-                self.path, f"is a truncated or damaged NumPy archive ({format_error_line(fault)})"
-            ) from fault
+        what = "is truncated or damaged"
+        self._problem = what if list_entries else "is a truncated or damaged NumPy archive"
+        with guard(self.path, self._problem):
+            self._entries = (list_entries or list_npz_entries)(self.path)
 
     def __contains__(self, name: str) -> bool:
         return name in self._entries
@@ -136,8 +286,9 @@ class Archive:
 
     def read(self, name: str) -> NDArray[Any]:
         """Return entry `name`, of whatever shape and type."""
-        values: NDArray[Any] = self._guard(self.describe(name).load)
-        return values
+        entry = self.describe(name)
+        with guard(self.path, self._problem):
+            return entry.load()
 
     def array(self, name: str, *shape: int | None) -> NDArray[Any]:
         """Return entry `name`, a numeric array of `shape`; None stands for any length but zero."""
@@ -146,30 +297,30 @@ class Archive:
 
     def require_numbers(self, name: str, *shape: int | None) -> None:
         """Refuse an entry `name` that is not a numeric array of `shape`, without reading it."""
-        found = self.describe(name)
-        fits = len(shape) == len(found.shape) and all(
-            n > 0 and wanted in (None, n) for wanted, n in zip(shape, found.shape, strict=True)
+        entry = self.describe(name)
+        fits = len(shape) == len(entry.shape) and all(
+            n > 0 and wanted in (None, n) for wanted, n in zip(shape, entry.shape, strict=True)
         )
-        if not fits or found.dtype.kind not in "uif":
+        if not fits or entry.dtype.kind not in "uif":
             wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
             raise FileFormatError(
                 self.path,
-                f"field '{name}' must be numbers of shape {wanted}, found {found.dtype} of {found.shape}",
+                f"field '{name}' must be numbers of shape {wanted}, found {entry.dtype} of {entry.shape}",
             )
 
     def finite_array(self, name: str, *shape: int | None) -> NDArray[np.float64]:
         """Return entry `name` in float64, refusing NaN and infinity; arguments as in `array`."""
-        found = self.array(name, *shape).astype(np.float64)
-        if not np.all(np.isfinite(found)):
+        values = self.array(name, *shape).astype(np.float64)
+        if not np.all(np.isfinite(values)):
             raise FileFormatError(self.path, f"field '{name}' must not hold NaN or infinity")
-        return found
+        return values
 
     def text(self, name: str) -> str:
         """Return entry `name`, a single string."""
-        found = self._entries.get(name, ArchiveEntry.of(0))
-        if found.shape or found.dtype.kind != "U":
+        entry = self._entries.get(name, ArchiveEntry.of(0))
+        if entry.shape or entry.dtype.kind != "U":
             raise FileFormatError(
-                self.path, f"field '{name}' must be a string, found {found.dtype} of {found.shape}"
+                self.path, f"field '{name}' must be a string, found {entry.dtype} of {entry.shape}"
             )
         return str(self.read(name))
 

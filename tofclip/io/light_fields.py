@@ -1,6 +1,4 @@
-"""OpenEXR files of unknown origin: header first, pixels only if the file can hold them.
-
-Light fields in files: NumPy archives, our own HDF5, multi-part OpenEXR (one part for each view, as
+"""Light fields in files: NumPy archives, our own HDF5, multi-part OpenEXR (one part for each view, as
 renderers write stereo pictures), and folders with one picture for each view.
 
 The names of a folder's pictures end in a view's row and column, ``anything_03_05.png``, or, if
@@ -27,68 +25,76 @@ from tofclip.files import (
     BoundedFile,
     atomic_path,
     format_error_line,
+    guard,
     require_bounded_size,
     require_suffix,
-    translate_read_errors,
 )
 from tofclip.io.archive import NPY_SUFFIX, Archive
 from tofclip.io.hamamatsu import MAX_PIXELS, require_bounded_page
 from tofclip.light_field import LightField
 from tofclip.storage import Record, collect_provenance
 
-MAX_SAMPLE_BYTES = 4
-"""Samples are half or single precision, or 32-bit integers."""
+MAX_SAMPLE_BYTES = 4  # samples are half or single precision, or 32-bit integers
+PART_NAME_PATTERN = re.compile("v={0},u={0}".format(r"([-+]?\d+(?:\.\d+)?)"))
+TIFF_SUFFIXES = (".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", *TIFF_SUFFIXES, ".jpg", ".jpeg", ".bmp")
+# Weights of linear red, green and blue in the luminance of ITU-R BT.709.
+LUMA_WEIGHTS = np.array([0.2125, 0.7154, 0.0721])
+GRID_NAME_PATTERN = re.compile(r"(?<!\d)(\d+)\D+(\d+)\D*$")
+RASTER_NAME_PATTERN = re.compile(r"(?<!\d)(\d+)\D*$")
 
 Channels = dict[str, NDArray[Any]]
 
 
 def read_exr_parts(path: Path) -> list[tuple[str, Channels]]:
-    """Read name and channels of every part."""
+    """Read name and channels of every part; pixels only if the file can hold them."""
     try:
         import OpenEXR
     except ImportError as fault:
         raise MissingDependencyError(
             f"reading {path} needs OpenEXR: {format_error_line(fault)}"
         ) from fault
-    with translate_read_errors(path):
+    claimed, count = 0, 0
+    with guard(path, "is a truncated or damaged EXR file"):
         held = os.path.getsize(path)
-    try:
         with OpenEXR.File(str(path), header_only=True) as file:
-            sizes = [_count_bytes(part.header) for part in file.parts]
-        require_bounded_size(path, "pixels", sum(sizes), held, compressed=True)
+            for count, part in enumerate(file.parts, 1):  # noqa: B007 - counted
+                first, last = np.asarray(part.header["dataWindow"], np.int64)
+                columns, rows = (last - first + 1).tolist()
+                claimed += rows * columns * len(part.header["channels"]) * MAX_SAMPLE_BYTES
+        require_bounded_size(path, "pixels", claimed, held, compressed=True)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [
                 (part.name(), {name: part.channels[name].pixels for name in part.channels})
                 for part in file.parts
             ]
-    except (FileFormatError, MemoryError):
-        raise
-    except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-        raise FileFormatError(
-            path, f"is a truncated or damaged EXR file ({format_error_line(fault)})"
-        ) from fault
-    if len(parts) != len(sizes):  # the library leaves out the parts that it cannot decode
+    if len(parts) != count:  # the library leaves out the parts that it cannot decode
         raise FileFormatError(path, "is a truncated or damaged EXR file (a part cannot be decoded)")
     return parts
 
 
-def _count_bytes(header: dict[str, Any]) -> int:
-    first, last = (np.asarray(corner, np.int64).tolist() for corner in header["dataWindow"])
-    columns, rows = (b - a + 1 for a, b in zip(first, last, strict=True))
-    return int(rows * columns * len(header["channels"]) * MAX_SAMPLE_BYTES)
-
-
-NUMBER_PATTERN = r"([-+]?\d+(?:\.\d+)?)"
-PART_NAME_PATTERN = re.compile(rf"v={NUMBER_PATTERN},u={NUMBER_PATTERN}")
-
-
 def read_exr(path: Path) -> LightField:
     """Read the parts named like ``v=-1,u=0``, with a channel Y or with R, G and B."""
-    named = read_exr_parts(path)
-    pictures = [_read_luminance(path, name, channels) for name, channels in named]
+    pictures, views = [], []
+    for name, channels in read_exr_parts(path):
+        view = PART_NAME_PATTERN.fullmatch(name)
+        if "Y" in channels:
+            pictures.append(channels["Y"].astype(np.float32))
+        elif {"R", "G", "B"} <= channels.keys():
+            colours = np.stack([channels[colour] for colour in "RGB"], axis=-1)
+            pictures.append(compute_luminance(colours))
+        else:
+            raise FileFormatError(
+                path, f"part '{name}' needs a channel Y or R, G and B, found {', '.join(channels)}"
+            )
+        if view is None:
+            raise FileFormatError(
+                path, f"part '{name}' does not say which view it is; name it like 'v=0,u=-1'"
+            )
+        views.append([float(number) for number in view.groups()])
     if len({picture.shape for picture in pictures}) != 1:
         raise FileFormatError(path, "its parts differ in size; every view must have as many pixels")
-    return LightField(np.stack(pictures), np.array([_parse_view(path, name) for name, _ in named]))
+    return LightField(np.stack(pictures), np.array(views))
 
 
 def write_exr(light_field: LightField, path: Path) -> None:
@@ -108,40 +114,24 @@ def write_exr(light_field: LightField, path: Path) -> None:
         OpenEXR.File(parts).write(str(temporary))
 
 
-def _parse_view(path: Path, name: str) -> tuple[float, float]:
-    found = PART_NAME_PATTERN.fullmatch(name)
-    if found is None:
-        raise FileFormatError(
-            path, f"part '{name}' does not say which view it is; name it like 'v=0,u=-1'"
-        )
-    return float(found[1]), float(found[2])
-
-
-def _read_luminance(path: Path, name: str, channels: Channels) -> NDArray[Any]:
-    if "Y" in channels:
-        return channels["Y"].astype(np.float32)
-    if not {"R", "G", "B"} <= channels.keys():
-        raise FileFormatError(
-            path, f"part '{name}' needs a channel Y or R, G and B, found {', '.join(channels)}"
-        )
-    return compute_luminance(np.stack([channels[colour] for colour in "RGB"], axis=-1))
-
-
-TIFF_SUFFIXES = (".tif", ".tiff")
-IMAGE_SUFFIXES = (".png", *TIFF_SUFFIXES, ".jpg", ".jpeg", ".bmp")
-# Weights of linear red, green and blue in the luminance of ITU-R BT.709.
-LUMA_WEIGHTS = np.array([0.2125, 0.7154, 0.0721])
-GRID_NAME_PATTERN = re.compile(r"(\d+)\D+(\d+)\D*")
-RASTER_NAME_PATTERN = re.compile(r"(\d+)\D*")
-
-
 def read_folder(folder: Path) -> LightField:
     """Read a folder of pictures; whole numbers are scaled to 0..1, colours become luminance."""
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
     if not paths:
         raise FileFormatError(folder, f"holds no pictures ({', '.join(IMAGE_SUFFIXES)})")
     places = _parse_grid_positions(folder, paths)
-    _check_complete_grid(folder, places)
+    rows, columns = places.max(axis=0) + 1
+    is_there = np.zeros((rows, columns), bool)
+    is_there[tuple(places.T)] = True
+    if is_there.sum() < len(places):
+        raise FileFormatError(folder, "two pictures have the same view's number")
+    if not is_there.all():
+        row, column = np.argwhere(~is_there)[0]
+        raise FileFormatError(
+            folder,
+            f"{np.sum(~is_there)} of {rows} x {columns} views are missing, the first in row {row}, "
+            f"column {column} (counted from 0)",
+        )
     pictures = [_read_picture(path) for path in paths]
     for path, picture in zip(paths, pictures, strict=True):
         if picture.shape != pictures[0].shape:
@@ -168,18 +158,21 @@ def compute_luminance(picture: NDArray[Any]) -> NDArray[Any]:
 
 def _parse_grid_positions(folder: Path, paths: list[Path]) -> NDArray[np.int64]:
     """Row and column of each picture on the grid, from 0, (pictures, 2)."""
-    both = [_match_at_end(GRID_NAME_PATTERN, path.stem) for path in paths]
-    if all(both):
-        found = np.array([[int(n) for n in match.groups()] for match in both if match])
-        places: NDArray[np.int64] = found - found.min(axis=0)
-        return places
-    one = [_match_at_end(RASTER_NAME_PATTERN, path.stem) for path in paths]
-    if not all(one):
-        unnamed = paths[[bool(match) for match in one].index(False)]
+    names = [
+        GRID_NAME_PATTERN.search(path.stem) or RASTER_NAME_PATTERN.search(path.stem)
+        for path in paths
+    ]
+    if not all(names):
         raise FileFormatError(
-            unnamed, "its name must end in the view's row and column, as in view_03_05"
+            paths[names.index(None)],
+            "its name must end in the view's row and column, as in view_03_05",
         )
-    numbers = np.array([int(match[1]) for match in one if match])
+    groups = [match.groups() for match in names if match]
+    if all(len(group) == 2 for group in groups):
+        places: NDArray[np.int64] = np.array(groups, np.int64)
+        places -= places.min(axis=0)
+        return places
+    numbers = np.array([group[-1] for group in groups], np.int64)
     numbers -= numbers.min()
     # One number says nothing about the width of the grid, so that only a square one is certain.
     side = math.isqrt(len(paths))
@@ -191,37 +184,10 @@ def _parse_grid_positions(folder: Path, paths: list[Path]) -> NDArray[np.int64]:
     return np.stack(np.divmod(numbers, side), axis=-1)
 
 
-def _match_at_end(pattern: re.Pattern[str], stem: str) -> re.Match[str] | None:
-    """Match `pattern` at the end of a name, as many digits as there are."""
-    found = None
-    for match in re.finditer(r"(?<!\d)\d", stem):
-        found = pattern.fullmatch(stem, match.start()) or found
-    return found
-
-
-def _check_complete_grid(folder: Path, places: NDArray[np.int64]) -> None:
-    rows, columns = (int(n) + 1 for n in places.max(axis=0))
-    have = {(int(row), int(column)) for row, column in places}
-    if len(have) < len(places):
-        raise FileFormatError(folder, "two pictures have the same view's number")
-    if rows * columns != len(have):
-        row, column = next(
-            (r, c) for r in range(rows) for c in range(columns) if (r, c) not in have
-        )
-        raise FileFormatError(
-            folder,
-            f"{rows * columns - len(have)} of {rows} x {columns} views are missing, the first in row {row}, "
-            f"column {column} (counted from 0)",
-        )
-
-
 def _read_picture(path: Path) -> NDArray[Any]:
-    try:
-        picture = _decode_tiff(path) if path.suffix.lower() in TIFF_SUFFIXES else _decode(path)
-    except (FileFormatError, MemoryError):
-        raise
-    except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-        raise FileFormatError(path, f"is a damaged picture ({format_error_line(fault)})") from fault
+    with guard(path, "is a damaged picture"):
+        is_tiff = path.suffix.lower() in TIFF_SUFFIXES
+        picture = _decode_tiff(path) if is_tiff else _decode(path)
     if picture.ndim not in (2, 3):
         raise FileFormatError(path, f"must be one grey or colour picture, found {picture.shape}")
     scale = np.iinfo(picture.dtype).max if picture.dtype.kind in "ui" else 1
@@ -282,21 +248,16 @@ def write_light_field(light_field: LightField, path: str | Path) -> None:
 
 
 def read_depth_map(path: str | Path) -> NDArray[np.float64]:
-    """Read the shear of each pixel of the reference view.
-
-    `path`: ``.npy``: an array (rows, columns), pixels per view step, infinite where there is
-    nothing. ``.h5``: a picture with its shears, written by ``tofclip clip recover --all-in-focus``.
-    Returns (rows, columns).
+    """Read the shear of each pixel of the reference view, (rows, columns), pixels per view step,
+    infinite where there is nothing: ``.npy``, or ``.h5`` written by ``tofclip clip recover
+    --all-in-focus``.
     """
     source = Path(path)
     if source.suffix.lower() != NPY_SUFFIX:
         return Record.load(source, "picture").array("shears", np.float64, 2, "px")
-    with translate_read_errors(source):
-        try:
-            # mapped, so that a header that claims more than there is takes no memory
-            mapped = np.load(source, mmap_mode="r", allow_pickle=False)
-        except (ValueError, EOFError) as fault:
-            raise FileFormatError(source, format_error_line(fault)) from fault
+    with guard(source):
+        # mapped, so that a header that claims more than there is takes no memory
+        mapped = np.load(source, mmap_mode="r", allow_pickle=False)
     if mapped.ndim != 2 or mapped.dtype.kind not in "fiu":
         raise FileFormatError(
             source, f"a map of depths is (rows, columns) numbers, found {mapped.shape}"
@@ -308,8 +269,8 @@ def _read_archive(path: Path) -> LightField:
     archive = Archive(path)
     pictures = archive.array("lf", None, None, None, None)
     v, u = (
-        archive.finite_array("v", pictures.shape[0]),
-        archive.finite_array("u", pictures.shape[1]),
+        archive.finite_array(name, count)
+        for name, count in zip("vu", pictures.shape[:2], strict=True)
     )
     # Pictures may be stored as integers to save space; `scale` turns them into values.
     scaled = pictures.astype(np.float32) * np.float32(archive.finite_array("scale"))

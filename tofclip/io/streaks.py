@@ -2,35 +2,39 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError, ShapeError, require_path
-from tofclip.files import (
-    atomic_path,
-    require_bounded_dataset,
-    require_own_member,
-    translate_read_errors,
-)
+from tofclip.files import atomic_path, guard, require_bounded_dataset, translate_read_errors
 from tofclip.io.hamamatsu import SIGNATURE as ITEX_SIGNATURE
-from tofclip.io.hamamatsu import outline_itex, outline_tiff, read_itex, read_tiff
-from tofclip.io.lift import outline_lift, read_lift
+from tofclip.io.hamamatsu import StreakFile, open_itex, open_tiff
+from tofclip.io.lift import open_lift
 from tofclip.shots import Streak
 from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance, read_outline
 
+
+@contextlib.contextmanager
+def _open_own(path: str | Path) -> Iterator[StreakFile]:
+    yield partial(read_outline, path), partial(Streak.load, path)
+
+
 # A file is known by its first bytes: suffixes get lost and lie.
-READERS: dict[bytes, tuple[Callable[[str | Path], Streak], Callable[[str | Path], Record]]] = {
-    b"II*\0": (read_tiff, outline_tiff),
-    b"MM\0*": (read_tiff, outline_tiff),
-    b"PK\x03\x04": (read_lift, outline_lift),
-    HDF5_SIGNATURE: (Streak.load, read_outline),
-    ITEX_SIGNATURE: (read_itex, outline_itex),
+READERS: dict[bytes, Callable[[str | Path], AbstractContextManager[StreakFile]]] = {
+    b"II*\0": open_tiff,
+    b"MM\0*": open_tiff,
+    b"PK\x03\x04": open_lift,
+    HDF5_SIGNATURE: _open_own,
+    ITEX_SIGNATURE: open_itex,
 }
 
 
@@ -64,7 +68,8 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
         Its pixels hold NaN, are all zero, all saturated, or negative where counts cannot be.
     """
     require_path(path)
-    streak = _select_reader(path)[0](path)
+    with _open_streak(path) as (_, read):
+        streak = read()
     if bin_width is not None:
         streak = streak.with_bin_width(bin_width)
     history = collect_provenance({"bin_width_s": bin_width}, path)
@@ -75,26 +80,22 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
 
 
 def outline_streak_file(path: str | Path) -> Record:
-    """Describe the streak image in a file without reading its pixels.
-
-    Returns see `tofclip.storage.read_outline`.
-    """
-    outline = _select_reader(path)[1](path)
+    """Describe the streak image in a file without reading its pixels, as `read_outline` does."""
+    with _open_streak(path) as (describe, _):
+        outline = describe()
     if outline.provenance:
         return outline
     return replace(outline, provenance=collect_provenance({"bin_width_s": None}, path))
 
 
-def _select_reader(
-    path: str | Path,
-) -> tuple[Callable[[str | Path], Streak], Callable[[str | Path], Record]]:
+def _open_streak(path: str | Path) -> AbstractContextManager[StreakFile]:
     with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(8)
     if not start:
         raise FileFormatError(path, "is empty")
-    for signature, readers in READERS.items():
+    for signature, open_file in READERS.items():
         if start.startswith(signature):
-            return readers
+            return open_file(path)
     size = os.path.getsize(path)
     raise FileFormatError(
         path,
@@ -137,60 +138,33 @@ class StreakStack:
         import h5py
 
         self.path = Path(path)
-        with translate_read_errors(path):
-            open(path, "rb").close()
-        try:
-            with h5py.File(path, "r") as file:
-                require_own_member(file, "counts", path)
-                counts = file["counts"]
-                self._shape = tuple(int(n) for n in counts.shape)
-                require_bounded_dataset(counts, path, at_once=math.prod(self._shape[1:]))
-                self.row_times: NDArray[np.float64] | None = None
-                if "row_times" in file:
-                    require_own_member(file, "row_times", path)
-                    require_bounded_dataset(file["row_times"], path)
-                    self.row_times = np.asarray(file["row_times"], dtype=np.float64)
-        except FileFormatError:
-            raise
-        except (OSError, KeyError, RuntimeError, AttributeError) as fault:
-            raise FileFormatError(
-                path, "is not a stack of streak images: it needs a dataset 'counts'"
-            ) from fault
-        if len(self._shape) != 3 or 0 in self._shape:
-            raise FileFormatError(
-                path, f"'counts' must be (shot, time, column), found {self._shape}"
-            )
+        self.row_times: NDArray[np.float64] | None = None
+        with guard(path, "is not a stack of streak images"), h5py.File(path, "r") as file:
+            for name in ("counts", "row_times"):
+                if name in file and not isinstance(file.get(name, getlink=True), h5py.HardLink):
+                    raise FileFormatError(path, f"'{name}' cannot be read: links are not followed")
+            counts = file.get("counts")
+            if not isinstance(counts, h5py.Dataset) or counts.ndim != 3 or counts.size == 0:
+                raise FileFormatError(
+                    path, "is not a stack of streak images: it needs 'counts' (shot, time, column)"
+                )
+            self._shape = tuple(int(n) for n in counts.shape)
+            require_bounded_dataset(counts, path, at_once=math.prod(self._shape[1:]))
+            if "row_times" in file:
+                require_bounded_dataset(file["row_times"], path)
+                self.row_times = np.asarray(file["row_times"], dtype=np.float64)
 
     def __len__(self) -> int:
         return self._shape[0]
 
     def read_shot(self, number: int) -> Streak:
-        """Read one shot, from 0.
-
-        Parameters
-        ----------
-        number : int
-
-        Returns
-        -------
-        Streak
-
-        Raises
-        ------
-        InputError
-            There is no shot of that number.
-        FileFormatError
-            The shot is damaged.
-        """
+        """Read one shot, counted from 0; `InputError` where there is none of that number."""
         import h5py
 
         if not 0 <= number < len(self):
             raise InputError(f"{self.path} holds shots 0..{len(self) - 1}, not {number}")
-        try:
-            with h5py.File(self.path, "r") as file:
-                counts = np.asarray(file["counts"][number], dtype=np.float32)
-        except (OSError, RuntimeError) as fault:
-            raise FileFormatError(self.path, f"shot {number} is damaged") from fault
+        with guard(self.path, f"shot {number} is damaged"), h5py.File(self.path, "r") as file:
+            counts = np.asarray(file["counts"][number], dtype=np.float32)
         return Streak(counts, self.row_times, source=f"{self.path} shot {number}")
 
     def __iter__(self) -> Iterator[Streak]:
@@ -200,24 +174,7 @@ class StreakStack:
 
 def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
     """Write shots to one file, whole or not at all; return how many. All have the first one's shape
-    and time axis.
-
-    Parameters
-    ----------
-    shots : iterable of Streak
-        Taken one at a time.
-    path : str or Path
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    ShapeError
-        A shot has another shape than the first.
-    InputError
-        There is no shot.
+    and time axis; `ShapeError` where one has not, `InputError` where there is no shot. They are taken one at a time.
     """
     import h5py
 

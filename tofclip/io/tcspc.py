@@ -1,9 +1,9 @@
-"""PicoQuant's PTU files of any size: events as the electronics tagged them, a piece at a time, and
-the pictures of a scanner.
+"""Files of photon counters.
 
-In T3 mode the electronics count the laser's pulses and time each photon after its pulse. In T2 mode
-they tag every event, pulses included, by an absolute time; there a photon's pulse is the last one
-before it. Markers of lines and frames come in between.
+PicoQuant's PTU files of any size: events as the electronics tagged them, a piece at a time, and the
+pictures of a scanner. In T3 mode the electronics count the laser's pulses and time each photon
+after its pulse. In T2 mode they tag every event, pulses included, by an absolute time; there a
+photon's pulse is the last one before it. Markers of lines and frames come in between.
 
 Becker & Hickl's ``.sdt`` files: what their blocks claim is checked before `sdtfile` reads them.
 """
@@ -15,7 +15,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,16 +24,14 @@ from tofclip.errors import FileFormatError
 from tofclip.files import BoundedFile, import_file_reader, require_bounded_size
 from tofclip.io.archive import MEMBER_COMPRESSIONS
 
-TCSPC = "tofclip[tcspc]"
-"""What brings the libraries for files of photon counters."""
+TCSPC = "tofclip[tcspc]"  # what brings the libraries for these files
 
 CHUNK_EVENTS = 1 << 20
 RECORD_BYTES = 4
 PICOHARP_T2 = "PicoHarpT2"
 NO_PULSE = int(np.iinfo(np.int64).min)
 MAX_SCAN_BYTES = 1 << 32
-PHOTON_BYTES = 12
-"""Of a photon of a picture: its pixel and its time."""
+PHOTON_BYTES = 12  # of a photon of a picture: its pixel and its time
 
 MILLISECOND_S = 1e-3
 MARKER_TAGS = ("LineStart", "LineStop", "Frame")
@@ -44,8 +42,8 @@ class PulseCount:
     """The laser's pulses up to some event."""
 
     pulses: int = 0  # how many there were
-    first: int = NO_PULSE  # times of the first and last one in ticks, `NO_PULSE` before the first
-    last: int = NO_PULSE  # times of the first and last one in ticks, `NO_PULSE` before the first
+    first: int = NO_PULSE  # time of the first one in ticks, `NO_PULSE` before it
+    last: int = NO_PULSE  # and of the last one
 
     @property
     def period_ticks(self) -> float:
@@ -55,10 +53,9 @@ class PulseCount:
     def find_pulses(
         self, times: NDArray[np.int64], is_pulse: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], PulseCount]:
-        """Find the last pulse before each of the events that follow.
-
-        `times` (n,): ticks, not going back; `is_pulse` (n,). Returns (n,): number of each event's
-        pulse from 0, -1 where there was none; (n,): ticks since it; behind these events.
+        """Find the last pulse before each of the events that follow, at `times` (n,) in ticks that
+        do not go back: its number from 0, -1 where there was none, and the ticks since it; and the
+        count behind these events.
         """
         at = np.concatenate([[self.last], times[is_pulse]])
         own = np.cumsum(is_pulse)
@@ -124,10 +121,7 @@ class PtuEvents:
         return -(-self.events // CHUNK_EVENTS)
 
     def decode(self, piece: int, before: Checkpoint) -> tuple[Events, Checkpoint]:
-        """Decode a piece.
-
-        Returns behind it.
-        """
+        """Decode a piece; return its events, and what has to be known behind it."""
         first = piece * CHUNK_EVENTS
         # Read, not mapped: mapped pages would count as this program's memory.
         words = np.fromfile(
@@ -183,8 +177,7 @@ class ScannedPhotons:
     time: NDArray[np.float64]  # (photons,), s after the laser's pulse
 
 
-@dataclass(frozen=True)
-class _Lines:
+class _Lines(NamedTuple):
     """When the scanner was on which row: ticks where each line begins and ends, and its row."""
 
     begin: NDArray[np.int64]
@@ -205,10 +198,9 @@ def get_scan_shape(events: PtuEvents) -> tuple[int, int]:
 
 def read_scan(events: PtuEvents) -> ScannedPhotons:
     """Put the photons of a file in T2 mode into the pixels of a scanner's picture, by the markers
-    that it sets where lines begin and end and frames change.
+    that it sets where lines begin and end and frames change; those between lines are left out.
 
-    Photons between lines are left out. The file is read twice. Memory: a piece of it, and 12 bytes
-    for each photon.
+    The file is read twice. Memory: a piece of it, and 12 bytes for each photon.
     """
     rows, columns = get_scan_shape(events)
     lines = _find_lines(events, rows, columns)
@@ -270,16 +262,12 @@ def _find_lines(events: PtuEvents, rows: int, columns: int) -> _Lines:
 
 
 LAST_OLD_REVISION = 14
-# `no_of_data_blocks` has 16 bits; where they do not suffice it says this, and the number is in
-# `reserved1`.
-EXTENDED_COUNT = 0x7FFF
+EXTENDED_COUNT = 0x7FFF  # where 16 bits do not suffice: the number of blocks is in `reserved1`
 
 
 def read_sdt_blocks(path: Path) -> tuple[list[NDArray[Any]], float]:
-    """Read all histograms of a file.
-
-    Returns (..., bins) counts of each block: (rows, columns, bins) of an image; duration of a bin,
-    s.
+    """Read counts (..., bins) of each block, (rows, columns, bins) of an image, and the duration of
+    a bin, s.
     """
     sdtfile = import_file_reader("sdtfile", "tofclip[tcspc]")
     require_bounded_sdt(path)
@@ -316,19 +304,21 @@ def require_bounded_sdt(path: Path) -> None:
         packed = bool(sdtfile.BlockType(int(found["block_type"])).compress)
         require_bounded_size(path, f"block {block}", int(found["block_length"]), size, packed)
         begin, place = int(found["data_offs"]), int(found["next_block_offs"])
-        if packed:
-            _require_bounded_archive(path, f"block {block}", begin, place)
-
-
-def _require_bounded_archive(path: Path, name: str, begin: int, end: int) -> None:
-    """Refuse a packed block, a ZIP archive of one member, that would unpack to any size."""
-    if not 0 <= begin < end <= path.stat().st_size:
-        raise FileFormatError(path, f"is truncated or damaged: {name} lies beyond its end")
-    with BoundedFile(path) as opened:
-        opened.seek(begin)
-        content = opened.read(end - begin)
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        for member in archive.filelist[:1]:
-            if member.compress_type not in MEMBER_COMPRESSIONS:
-                raise FileFormatError(path, f"{name} is packed in a way that is not read")
-            require_bounded_size(path, name, member.file_size, member.compress_size, True)
+        if not packed:
+            continue
+        # A ZIP archive of one member, which could unpack to any size.
+        if not 0 <= begin < place <= size:
+            raise FileFormatError(
+                path, f"is truncated or damaged: block {block} lies beyond its end"
+            )
+        with BoundedFile(path) as opened:
+            opened.seek(begin)
+            content = opened.read(place - begin)
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            for member in archive.filelist[:1]:
+                if member.compress_type not in MEMBER_COMPRESSIONS:
+                    raise FileFormatError(
+                        path, f"block {block} is packed in a way that is not read"
+                    )
+                claimed, held = member.file_size, member.compress_size
+                require_bounded_size(path, f"block {block}", claimed, held, True)

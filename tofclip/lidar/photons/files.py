@@ -26,9 +26,8 @@ from tofclip.files import (
     require_bounded_size,
     translate_read_errors,
 )
-from tofclip.io.archive import list_npz_entries, read_npy_header
+from tofclip.io.archive import list_mat_entries, list_npz_entries, read_npy_header
 from tofclip.io.hamamatsu import require_whole_chain
-from tofclip.io.mat import list_mat_variables
 from tofclip.io.tcspc import TCSPC, PtuEvents, get_scan_shape, read_scan, read_sdt_blocks
 from tofclip.lidar.photons.image import PhotonImage
 from tofclip.storage import HDF5_SIGNATURE
@@ -319,12 +318,12 @@ def _find_bin_width(scalars: Mapping[str, Any]) -> float | None:
 def _open_mat(path: Path) -> PhotonFile:
     """Version 5; version 7.3 is HDF5."""
     arrays, scalars = [], {}
-    for variable in list_mat_variables(path):
-        if variable.name in BIN_WIDTH_NAMES and math.prod(variable.shape) == 1:
-            scalars[variable.name] = variable.load()
+    for name, entry in list_mat_entries(path).items():
+        if name in BIN_WIDTH_NAMES and math.prod(entry.shape) == 1:
+            scalars[name] = entry.load()
         else:
-            kind = "cell" if variable.dtype.hasobject else str(variable.dtype)
-            arrays.append(ArrayEntry(variable.name, variable.shape, kind, variable.load))
+            kind = "cell" if entry.dtype.hasobject else str(entry.dtype)
+            arrays.append(ArrayEntry(name, entry.shape, kind, entry.load))
     return PhotonFile(arrays, _find_bin_width(scalars))
 
 
