@@ -8,7 +8,7 @@ import pytest
 from tofclip.errors import InputError
 from tofclip.lidar.photons import PhotonImage
 from tofclip.lidar.photons.image import find_hot_pixels, leave_out_pixels
-from tofclip.lidar.photons.response import measure_pulse_width
+from tofclip.lidar.photons.scene import measure_pulse_width
 
 BIN = 50e-12
 ROWS, COLUMNS, BINS = 32, 40, 200

@@ -17,8 +17,8 @@ from tofclip.lidar.photons import (
     make_pinhole,
     matching,
 )
-from tofclip.lidar.photons.planes import estimate_bias
-from tofclip.lidar.photons.response import BinnedResponse, Scene, measure_pulse_width
+from tofclip.lidar.photons.matching import estimate_bias
+from tofclip.lidar.photons.scene import BinnedResponse, Scene, measure_pulse_width
 from tofclip.lidar.photons.surface import keep_significant
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -82,11 +82,14 @@ def test_two_signal_photons_among_fifty_show_the_surface(dim) -> None:
 
 
 def check_outlier_probability(found: SurfaceImage, error: np.ndarray) -> None:
-    """Where one in ten is said to be wrong, as many are."""
+    """Where one in ten is said to be wrong, as many are: over twelve seeds the logarithm of found over
+    said is 0.01 on average, with a deviation of 0.24.
+    """
     wrong, reported = np.abs(error) > 3, found.outlier_probability
     doubtful = (reported > 0.05) & (reported < 0.2)
     assert doubtful.sum() > 100
-    assert 0.5 < wrong[doubtful].mean() / reported[doubtful].mean() < 2
+    ratio = wrong[doubtful].mean() / reported[doubtful].mean()
+    assert abs(np.log(ratio)) < 2.5 * 0.24
     assert wrong[reported < 0.05].mean() < 0.01
 
 
@@ -231,7 +234,7 @@ def test_the_search_keeps_to_its_memory(monkeypatch: pytest.MonkeyPatch) -> None
     photons = PhotonImage.from_events(
         pixel, np.floor(noise.uniform(0, bins, pixel.size)), shape, 1e-12, bins
     )
-    scene = Scene(BinnedResponse.from_pulse(Pulse.gaussian(4e-12), 1e-12), 1e-6)
+    scene = Scene(BinnedResponse(Pulse.gaussian(4e-12).integrate_bins(1e-12), 1e-12), 1e-6)
     tracemalloc.start()
     axis = matching.choose_label_axis(photons, scene)
     peak = tracemalloc.get_traced_memory()[1]
@@ -242,7 +245,7 @@ def test_the_search_keeps_to_its_memory(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_further_surface_is_kept_where_chance_is_below_one_in_fifty() -> None:
     """Of a mean of one photon, four or more come with 1.90 %, three or more with 8.03 %."""
-    response = BinnedResponse.from_pulse(Pulse.gaussian(FWHM), BIN)
+    response = BinnedResponse(Pulse.gaussian(FWHM).integrate_bins(BIN), BIN)
     bins_seen = 2 * (0.5 * response.width + 1) + 1
     scene = Scene(response, 1 / bins_seen)
     counts = np.zeros((7, 7, 60))

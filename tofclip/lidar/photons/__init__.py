@@ -8,17 +8,20 @@ are found by the same compiled steps. `PhotonDetector` takes every pixel alone, 
 lets neighbours lend each other their photons.
 """
 
-from tofclip.lidar.photons.background import learn_background
 from tofclip.lidar.photons.detector import (
     Arrivals,
     PhotonDetector,
     correct_pile_up,
     estimate_pixels,
 )
-from tofclip.lidar.photons.image import PhotonImage
+from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, make_pinhole
 from tofclip.lidar.photons.limits import Accuracy, compute_range_bound, measure_accuracy
-from tofclip.lidar.photons.smoothing import Smoothness, locate_with_smoothness
-from tofclip.lidar.photons.surface import SurfaceImage, estimate_surface, make_pinhole
+from tofclip.lidar.photons.scene import learn_background
+from tofclip.lidar.photons.surface import (
+    Smoothness,
+    estimate_surface,
+    locate_with_smoothness,
+)
 
 __all__ = [
     "Accuracy",

@@ -1,13 +1,9 @@
-"""Pile-up: what a detector that goes blind after each photon would have counted without.
-
-Find returns in histograms of photons, at a stated rate of false alarms.
-
-The return of every pixel by its own photons alone.
+"""Returns in histograms of photons, at a stated rate of false alarms, and of pixels that each stand
+alone; and what a detector that goes blind after each photon would have counted without (pile-up).
 """
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -15,17 +11,32 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.errors import InputError, ShapeError
-from tofclip.lidar.photons.background import learn_background
-from tofclip.lidar.photons.image import PhotonImage, find_hot_pixels, leave_out_pixels
-from tofclip.lidar.photons.response import (
-    find_time_step,
-    measure_pulse_width,
-    require_plausible_pulse,
-)
-from tofclip.lidar.photons.surface import SurfaceImage
+from tofclip.lidar.photons.image import FloatArray, PhotonImage, SurfaceImage
+from tofclip.lidar.photons.scene import learn_background, prepare_photons
 from tofclip.lidar.pulse import Pulse, Table
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
+
+CALIBRATION_HISTOGRAMS = 20_000  # for each threshold: a rate of 1 % is met to within 7 % of itself
+CALIBRATION_SEED = 20220614
+MIN_FALSE_ALARM_RATE = 20 / CALIBRATION_HISTOGRAMS
+DITHER = 1e-6  # breaks ties between scores; far below any difference that photons make
+HISTOGRAMS_PER_BATCH = 2000
+DENSE_PHOTONS_PER_BIN = 8  # beyond, drawing the bins is quicker than throwing the photons
+MAX_EXACT_PHOTONS = 40  # up to this number of photons every one has a threshold of its own
+THRESHOLD_RATIO = 1.2  # beyond, of the numbers for which there is one: others lie between
+PHOTON_LEVEL_RATIO = 1.03  # numbers that differ by less share a filter
+PULSE_CUTOFF = 1e-4  # of its peak: what a pulse brings beyond it is not worth the bins
+HISTOGRAMS_PER_BLOCK = 256
+SHADE_RATIO = 1.1  # backgrounds that differ by less share a filter; thresholds hold for any filter
+MIN_RELATIVE_BACKGROUND = 1e-3  # of a usual bin; no bin is so dark that one photon decides
+NO_PILE_UP = 1e15  # cycles: the rate of any bin is as good as zero
+MAX_THRESHOLDS = 4096  # that are remembered, a number each
+MIN_LIVE_CYCLES = (
+    0.5  # a bin that hardly any cycle reaches says nothing, but not with infinite surety
+)
+SAMPLED_PIXELS = 8192  # that say what the pixels' background has in common
+DETECTED_PIXELS_PER_BLOCK = 1 << 10
 
 
 def correct_pile_up(
@@ -74,12 +85,8 @@ def correct_pile_up(
 
 def count_live_cycles(
     counts: NDArray[np.integer] | NDArray[np.floating], cycles: int, dead_bins: int | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Count the cycles in which the detector was ready, bin by bin.
-
-    `counts, cycles, dead_bins`: as for `correct_pile_up`. Returns `counts, live` (..., bins):
-    photons counted, and cycles that no photon before had blinded.
-    """
+) -> tuple[FloatArray, FloatArray]:
+    """Return photons counted, and the cycles that no photon before had blinded, (..., bins) both."""
     seen = np.asarray(counts, dtype=np.float64)
     if cycles < 1 or not np.all(np.isfinite(seen) & (seen >= 0)):
         raise InputError(
@@ -97,44 +104,6 @@ def count_live_cycles(
             f"more photons were counted than {cycles} cycles with this dead time allow"
         )
     return seen, live
-
-
-FloatArray = NDArray[np.float64]
-
-CALIBRATION_HISTOGRAMS = (
-    20_000  # histograms for each threshold: a rate of 1 % is met to within 7 % of itself
-)
-CALIBRATION_SEED = 20220614
-MIN_FALSE_ALARM_RATE = 20 / CALIBRATION_HISTOGRAMS
-DITHER = 1e-6  # breaks ties between scores; far below any difference that photons make
-HISTOGRAMS_PER_BATCH = 2000
-DENSE_PHOTONS_PER_BIN = (
-    8  # with more photons a bin, drawing the bins is quicker than throwing the photons
-)
-MAX_EXACT_PHOTONS = 40  # up to this number of photons every one has a threshold of its own
-PHOTON_LEVEL_RATIO = 1.03  # beyond, numbers that differ by less share one
-PULSE_CUTOFF = 1e-4  # of its peak: what a pulse brings beyond it is not worth the bins
-HISTOGRAMS_PER_BLOCK = 256
-SHADE_RATIO = 1.1  # backgrounds that differ by less share a filter; thresholds hold for any filter
-MIN_RELATIVE_BACKGROUND = 1e-3  # of a usual bin; no bin is so dark that one photon decides
-NO_PILE_UP = 1e15  # cycles: the rate of any bin is as good as zero
-MAX_SHARED_THRESHOLDS = 32
-"""Settings of detectors whose thresholds are remembered: some hundred numbers each."""
-
-MIN_LIVE_CYCLES = (
-    0.5  # a bin that hardly any cycle reaches says nothing, but not with infinite surety
-)
-
-_thresholds_lock = threading.Lock()
-"""Held while a threshold is sought or found: detectors on several threads share them."""
-
-
-@lru_cache(maxsize=MAX_SHARED_THRESHOLDS)
-def _share_thresholds(
-    weights: bytes, first_offset: int, background: bytes, false_alarm_rate: float
-) -> dict[int, float]:
-    """Return the same dictionary whenever the settings are the same: shots of a sequence are."""
-    return {}
 
 
 @dataclass(frozen=True)
@@ -159,6 +128,53 @@ class Arrivals:
     def detected(self) -> NDArray[np.bool_]:
         """Whether there is a return, (n, returns)."""
         return ~np.isnan(self.range)
+
+
+@dataclass(frozen=True)
+class LogMatchedFilter:
+    """Log-likelihood ratios of photons around a return of the weakest strength, for each background.
+
+    Of hashable fields only, so that thresholds of the same filter are simulated once.
+    """
+
+    share: tuple[float, ...]  # of a return's photons, in the bins from `first` on
+    first: int  # bin of the first weight relative to the return's
+    min_photons: float
+    background: tuple[float, ...]  # of each bin, relative to the mean
+
+    @cached_property
+    def shades(self) -> tuple[FloatArray, NDArray[np.int64]]:
+        """Backgrounds for which there are weights, and which of them each bin has."""
+        step = np.rint(np.log(self.background) / np.log(SHADE_RATIO)).astype(np.int64)
+        known, shade = np.unique(step, return_inverse=True)
+        return SHADE_RATIO ** known.astype(np.float64), shade.ravel()
+
+    def weigh(self, photons: int) -> FloatArray:
+        """Weights of each shade, (shades, width), where a histogram has so many photons."""
+        level = max(photons, 1) / len(self.background) * self.shades[0]
+        odds = self.min_photons * np.array(self.share) / level[:, np.newaxis]
+        return np.asarray(np.log1p(odds))
+
+
+@lru_cache(maxsize=MAX_THRESHOLDS)
+def _simulate_threshold(matched: LogMatchedFilter, photons: int, false_alarm_rate: float) -> float:
+    """Score that the background alone exceeds at the stated rate where there are so many photons."""
+    from tofclip.lidar.photons import kernels
+
+    bins, best = len(matched.background), np.empty(CALIBRATION_HISTOGRAMS)
+    share = np.array(matched.background) / bins
+    noise = np.random.default_rng(CALIBRATION_SEED + photons)
+    filtering = matched.weigh(photons), matched.shades[1], matched.first
+    if photons <= DENSE_PHOTONS_PER_BIN * bins:
+        arrived = np.cumsum(share)
+        arrived[-1] = 1.0  # whatever rounding left
+        kernels.simulate_best_scores(photons, arrived, noise, *filtering, best)
+    else:
+        for piece in split_blocks(CALIBRATION_HISTOGRAMS, HISTOGRAMS_PER_BATCH):
+            thrown = noise.multinomial(photons, share, best[piece].size)
+            kernels.find_best_scores(thrown.astype(np.float64), *filtering, best[piece])
+    best += noise.uniform(0, DITHER, best.size)
+    return float(np.quantile(best, 1 - false_alarm_rate))
 
 
 @dataclass(frozen=True)
@@ -232,36 +248,11 @@ class PhotonDetector:
         """The pulse as bins show it."""
         return self.pulse.integrate_bins(self.bin_width)
 
-    @cached_property
-    def kernel_pulse(self) -> Table:
-        """The binned pulse as the compiled loops take it."""
-        return self.shape.kernel_table(PULSE_CUTOFF)
-
     @property
     def times(self) -> FloatArray:
         """Instant of each bin's middle, s; the first is 0."""
         times: FloatArray = np.arange(self.bins) * np.float64(self.bin_width)
         return times
-
-    @cached_property
-    def _offsets(self) -> NDArray[np.int64]:
-        """Bins of a pulse, relative to its arrival."""
-        first, last = self.shape.extent(PULSE_CUTOFF)
-        return np.arange(
-            int(np.ceil(first / self.bin_width)), int(np.floor(last / self.bin_width)) + 1
-        )
-
-    @property
-    def first_offset(self) -> int:
-        """Bin of the filter's first weight relative to the return's."""
-        return int(self._offsets[0])
-
-    def weights(self, background: float) -> FloatArray:
-        """Log-matched filter for the weakest return on a background of a given number of photons
-        per bin.
-        """
-        share = self.shape(self._offsets * self.bin_width) * self.bin_width / self.shape.area
-        return np.log1p(self.min_photons * share / background)
 
     @cached_property
     def relative_background(self) -> FloatArray:
@@ -274,52 +265,32 @@ class PhotonDetector:
         return even
 
     @cached_property
-    def _shades(self) -> tuple[FloatArray, NDArray[np.int64]]:
-        """Backgrounds for which there is a filter, and which of them each bin has."""
-        step = np.rint(np.log(self.relative_background) / np.log(SHADE_RATIO)).astype(np.int64)
-        known, shade = np.unique(step, return_inverse=True)
-        return SHADE_RATIO ** known.astype(np.float64), shade.ravel()
-
-    def _build_filter(self, background: float) -> FloatArray:
-        """Log-matched filter for each shade of a background of this many photons in a usual bin."""
-        return np.array([self.weights(background * shade) for shade in self._shades[0]])
+    def _kernel_pulse(self) -> Table:
+        return self.shape.kernel_table(PULSE_CUTOFF)
 
     @cached_property
-    def _threshold_cache(self) -> dict[int, float]:
-        """Thresholds by number of photons, shared by all detectors that would simulate the same."""
-        background = self.relative_background
-        filtering = self.weights(1.0).tobytes(), self.first_offset
-        return _share_thresholds(*filtering, background.tobytes(), self.false_alarm_rate)
+    def _offsets(self) -> NDArray[np.int64]:
+        """Bins of a pulse, relative to its arrival."""
+        first, last = np.array(self.shape.extent(PULSE_CUTOFF)) / self.bin_width
+        return np.arange(int(np.ceil(first)), int(np.floor(last)) + 1)
+
+    @cached_property
+    def _filter(self) -> LogMatchedFilter:
+        share = self.shape(self._offsets * self.bin_width) * self.bin_width / self.shape.area
+        background = tuple(self.relative_background.tolist())
+        first = int(self._offsets[0])
+        return LogMatchedFilter(tuple(share.tolist()), first, self.min_photons, background)
 
     def threshold(self, photons: int) -> float:
         """Least score of a return in a histogram of a given number of photons, by simulation;
-        remembered.
+        remembered. Many photons have theirs between those of numbers that are a fifth apart.
         """
-        from tofclip.lidar.photons.kernels import find_best_scores, simulate_best_scores
-
-        with _thresholds_lock:
-            if photons in self._threshold_cache:
-                return self._threshold_cache[photons]
-            best = np.empty(CALIBRATION_HISTOGRAMS)
-            noise = np.random.default_rng(CALIBRATION_SEED + photons)
-            share = self.relative_background / self.bins
-            filtering = (
-                self._build_filter(photons / self.bins),
-                self._shades[1],
-                self.first_offset,
-            )
-            if photons <= DENSE_PHOTONS_PER_BIN * self.bins:
-                arrived = np.cumsum(share)
-                arrived[-1] = 1.0  # whatever rounding left
-                simulate_best_scores(photons, arrived, noise, *filtering, best)
-            else:
-                for piece in split_blocks(CALIBRATION_HISTOGRAMS, HISTOGRAMS_PER_BATCH):
-                    thrown = noise.multinomial(photons, share, best[piece].size)
-                    find_best_scores(thrown.astype(np.float64), *filtering, best[piece])
-            best += noise.uniform(0, DITHER, best.size)
-            found = float(np.quantile(best, 1 - self.false_alarm_rate))
-            self._threshold_cache[photons] = found
-            return found
+        nodes = [photons]
+        if photons > MAX_EXACT_PHOTONS:
+            step = np.floor(np.log(photons / MAX_EXACT_PHOTONS) / np.log(THRESHOLD_RATIO))
+            nodes = [round(MAX_EXACT_PHOTONS * THRESHOLD_RATIO**k) for k in (step, step + 1)]
+        known = [_simulate_threshold(self._filter, n, self.false_alarm_rate) for n in nodes]
+        return float(np.interp(photons, nodes, known))
 
     def adapt(self, histograms: FloatArray) -> PhotonDetector:
         """Return a detector for the background that these histograms have in common.
@@ -333,7 +304,7 @@ class PhotonDetector:
         -------
         PhotonDetector
             This one where its background is given already, or where the histograms are too few
-            to tell it from an even one; see `tofclip.lidar.photons.background`.
+            to tell it from an even one; see `tofclip.lidar.photons.scene`.
         """
         if self.background is not None:
             return self
@@ -376,11 +347,15 @@ class PhotonDetector:
         -----
         Memory beyond the result is one float64 copy of the histograms, with pile-up three.
         """
-        counts = self.validate_histograms(histograms)
+        counts = np.ascontiguousarray(histograms, dtype=np.float64)
+        if counts.ndim != 2 or counts.shape[1] != self.bins:
+            raise ShapeError("histograms", f"(n, {self.bins})", counts.shape)
+        if not np.all(np.isfinite(counts) & (counts >= 0)):
+            raise InputError("photon counts must be finite and not negative")
         dither = np.random.default_rng(seed).uniform(0, DITHER, size=counts.shape[:1])
         detector = self.adapt(counts)
         if cycles is None:
-            return detector.refine(counts, *detector._detect(counts, dither))
+            return detector._refine(counts, *detector._detect(counts, dither))
         _, live = count_live_cycles(counts, cycles, dead_bins)
         live = np.maximum(live, MIN_LIVE_CYCLES) / cycles
         # Counts fall as fewer cycles are left, with and without a return. A background that was
@@ -390,16 +365,7 @@ class PhotonDetector:
             own, ramp = self, replace(self, background=self.relative_background * ready)
         else:
             own, ramp = replace(self, background=detector.relative_background / ready), detector
-        return own.refine(counts, *ramp._detect(counts, dither), live, cycles)
-
-    def validate_histograms(self, histograms: ArrayLike) -> FloatArray:
-        """Return histograms as float64, refusing what is none."""
-        counts = np.ascontiguousarray(histograms, dtype=np.float64)
-        if counts.ndim != 2 or counts.shape[1] != self.bins:
-            raise ShapeError("histograms", f"(n, {self.bins})", counts.shape)
-        if not np.all(np.isfinite(counts) & (counts >= 0)):
-            raise InputError("photon counts must be finite and not negative")
-        return counts
+        return own._refine(counts, *ramp._detect(counts, dither), live, cycles)
 
     def _detect(
         self, counts: FloatArray, dither: FloatArray
@@ -408,7 +374,7 @@ class PhotonDetector:
         from tofclip.lidar.photons.kernels import extract_strongest_returns
 
         rest, free = counts.copy(), np.full(counts.shape[0], float(self.bins))
-        background = self.relative_background, self._shades[1]
+        matched, background = self._filter, (self.relative_background, self._filter.shades[1])
         peaks = np.zeros((counts.shape[0], self.max_returns), np.int64)
         numbers = np.zeros(counts.shape[0], np.int64)
         for turn in range(self.max_returns):
@@ -419,19 +385,14 @@ class PhotonDetector:
                 break
             rows = np.full(sought.size, -1)
             rows[sought] = np.where(photons[sought] > 0, level, -1)
-            table = self._build_table(known)
-            arguments = table, background, self.first_offset, self.kernel_pulse[1], self.times
+            # an empty histogram has no threshold to pass
+            thresholds = np.array([self.threshold(int(n)) if n else np.inf for n in known])
+            table = thresholds, np.array([matched.weigh(int(n)) for n in known])
+            arguments = table, background, matched.first, self._kernel_pulse[1], self.times
             extract_strongest_returns(rest, free, dither, rows, *arguments, peaks, numbers)
         return peaks, numbers
 
-    def _build_table(self, levels: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-        """Thresholds and filters for a given number of photons in a histogram; an empty one has
-        none to pass.
-        """
-        thresholds = np.array([self.threshold(int(n)) if n else np.inf for n in levels])
-        return thresholds, np.array([self._build_filter(max(n, 1) / self.bins) for n in levels])
-
-    def refine(
+    def _refine(
         self,
         counts: FloatArray,
         peaks: NDArray[np.int64],
@@ -441,22 +402,7 @@ class PhotonDetector:
     ) -> Arrivals:
         """Move returns from the bins where they were found to the likelihood's maximum.
 
-        Parameters
-        ----------
-        counts : (n, bins) array
-        peaks : (n, returns) array
-            Bins of the returns.
-        numbers : (n,) array
-            How many of them there are.
-        live : (n, bins) array, optional
-            Fraction of the cycles in which the detector was ready; all by default.
-        cycles : float
-            Laser cycles of a histogram.
-
-        Returns
-        -------
-        Arrivals
-            Range in m, photons, and the range's Cramer-Rao deviation in m.
+        `live` (n, bins): fraction of the cycles in which the detector was ready; all by default.
         """
         from tofclip.lidar.photons.kernels import fit_histograms
 
@@ -468,22 +414,11 @@ class PhotonDetector:
             if live is not None:
                 ready = live[piece]
                 # where every live cycle counted, half a cycle is taken not to have
-                counted = np.minimum(
-                    some / (ready * cycles), 1 - 0.5 / np.maximum(ready * cycles, 1)
-                )
-                arrived = -cycles * np.log1p(-counted)
-            fit_histograms(
-                some,
-                arrived,
-                ready,
-                float(cycles),
-                peaks[piece],
-                numbers[piece],
-                self.relative_background,
-                *self.kernel_pulse,
-                self.times,
-                found[piece],
-            )
+                most = 1 - 0.5 / np.maximum(ready * cycles, 1)
+                arrived = -cycles * np.log1p(-np.minimum(some / (ready * cycles), most))
+            seen = some, arrived, ready, float(cycles), peaks[piece], numbers[piece]
+            pulse = *self._kernel_pulse, self.times
+            fit_histograms(*seen, self.relative_background, *pulse, found[piece])
 
         run_blocks(work, counts.shape[0], HISTOGRAMS_PER_BLOCK)
         arrival, photons, deviation = np.moveaxis(found, -1, 0)
@@ -491,18 +426,11 @@ class PhotonDetector:
 
 
 def _quantise_photons(photons: FloatArray) -> NDArray[np.int64]:
-    """Numbers of photons that have thresholds of their own, nearest to those found."""
-    steps = np.log(np.maximum(photons, MAX_EXACT_PHOTONS) / MAX_EXACT_PHOTONS) / np.log(
-        PHOTON_LEVEL_RATIO
-    )
-    coarse = MAX_EXACT_PHOTONS * PHOTON_LEVEL_RATIO ** np.rint(steps)
+    """Numbers of photons that have filters of their own, nearest to those found."""
+    many = np.maximum(photons, MAX_EXACT_PHOTONS) / MAX_EXACT_PHOTONS
+    steps = np.rint(np.log(many) / np.log(PHOTON_LEVEL_RATIO))
+    coarse = MAX_EXACT_PHOTONS * PHOTON_LEVEL_RATIO**steps
     return np.rint(np.where(photons <= MAX_EXACT_PHOTONS, photons, coarse)).astype(np.int64)
-
-
-SAMPLED_PIXELS = 8192
-"""That say what the pixels' background has in common."""
-
-DETECTED_PIXELS_PER_BLOCK = 1 << 10
 
 
 def estimate_pixels(
@@ -540,46 +468,30 @@ def estimate_pixels(
     InputError
         No pulse is given and none can be recognised, or the time axis is shorter than two pulses.
     """
-    hot = find_hot_pixels(photons)
-    photons = leave_out_pixels(photons, hot)
-    if background is None:  # which has the photons' own bins
-        photons = photons.join_bins(find_time_step(photons))
-    shape = Pulse.gaussian(measure_pulse_width(photons)) if pulse is None else pulse
-    require_plausible_pulse(photons, shape)
-    detector = PhotonDetector(
-        shape,
-        photons.bin_width,
-        photons.bins,
-        false_alarm_rate,
-        max_returns,
-        background=background,
-    )
+    # a background that is given has the photons' own bins
+    photons, shape, hot = prepare_photons(photons, pulse, join=background is None)
+    settings = shape, photons.bin_width, photons.bins, false_alarm_rate, max_returns
+    detector = PhotonDetector(*settings, background=background)
     pixels = photons.offsets.size - 1
     if background is None:
         # once for the whole picture, from pixels all over it
         some = photons.histograms(slice(0, pixels, -(-pixels // SAMPLED_PIXELS)))
-        learnt = detector.adapt(some).relative_background
-        detector = replace(detector, background=learnt)
-    found = np.full((max_returns, 3, pixels), np.nan)
+        detector = replace(detector, background=detector.adapt(some).relative_background)
+    found = np.full((max_returns, pixels, 4), np.nan)
     for piece in split_blocks(pixels, DETECTED_PIXELS_PER_BLOCK):
         arrivals = detector.locate(photons.histograms(piece), piece.start, cycles)
-        located = np.stack([arrivals.range, arrivals.confidence, arrivals.photons])
-        found[..., piece] = np.moveaxis(located, -1, 0)
-    settings: dict[str, float | str] = {
+        located = np.stack([arrivals.range, arrivals.confidence, arrivals.photons], axis=-1)
+        found[:, piece, :3] = located.swapaxes(0, 1)
+    for layer in found:
+        seen = np.isfinite(layer[:, 0])
+        layer[seen, 3] = min(false_alarm_rate * pixels / max(int(seen.sum()), 1), 1.0)
+    learnt = "learnt" if np.ptp(detector.relative_background) else "even"
+    chosen: dict[str, float | str] = {
         "response": "learnt" if pulse is None else "given",
         "pulse_fwhm_ps": detector.shape.fwhm * 1e12,
         "false_alarm_rate": false_alarm_rate,
-        "background": "given"
-        if background is not None
-        else "learnt"
-        if np.ptp(detector.relative_background)
-        else "even",
+        "background": learnt if background is None else "given",
         "hot_pixels": int(hot.sum()),
     }
-    images = []
-    for distance, sigma, signal in found.reshape(max_returns, 3, *photons.image_shape):
-        seen = np.isfinite(distance)
-        false_share = min(false_alarm_rate * pixels / max(int(seen.sum()), 1), 1.0)
-        doubt = np.where(seen, false_share, np.nan)
-        images.append(SurfaceImage(distance, sigma, signal, doubt, detector.shape, settings))
-    return replace(images[0], further=tuple(images[1:]), hot_pixels=hot)
+    layers = found.reshape(max_returns, *photons.image_shape, 4)
+    return SurfaceImage.from_layers(layers, detector.shape, chosen, hot)

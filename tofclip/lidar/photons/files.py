@@ -8,7 +8,7 @@ memory: a size is believed only if the file can hold it and if it stays below a 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,45 +17,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import FileFormatError, InputError, TofclipError
+from tofclip.errors import FileFormatError, InputError
 from tofclip.files import (
     BoundedFile,
-    format_error_line,
+    guard,
     import_file_reader,
     iterate_members,
     require_bounded_size,
     translate_read_errors,
 )
-from tofclip.io.archive import list_mat_entries, list_npz_entries, read_npy_header
+from tofclip.io.archive import (
+    ArchiveEntry,
+    list_mat_entries,
+    list_npz_entries,
+    read_npy_header,
+)
 from tofclip.io.hamamatsu import require_whole_chain
 from tofclip.io.tcspc import TCSPC, PtuEvents, get_scan_shape, read_scan, read_sdt_blocks
 from tofclip.lidar.photons.image import PhotonImage
 from tofclip.storage import HDF5_SIGNATURE
 
-MAX_IMAGE_BYTES = 1 << 32
-"""4 GiB, of a histogram that is made of a list of events."""
-
-MAX_BINS = MAX_PIXELS = 1 << 26
-"""Events may claim any bin and any pixel; pictures and histograms are not larger than this."""
-
+MAX_IMAGE_BYTES = 1 << 32  # of a histogram that is made of a list of events
+MAX_BINS = MAX_PIXELS = 1 << 26  # events may claim any; pictures and histograms are not larger
 MIN_AXES_CERTAINTY = 2.0
 """Factor by which the time axis has to be ahead: the square of that by which it is longer, or light
 more uneven along it, than another axis."""
-
-MAX_LENGTH_RATIO = 3.0
-"""A line of pixels may be longer than time by any factor: length alone does not decide."""
-
-MIN_UNEVENNESS = 0.03
-"""Variance of light along an axis over its mean squared; what is less says nothing."""
-
+MAX_LENGTH_RATIO = 3.0  # a line of pixels may be longer than time by any factor
+MIN_UNEVENNESS = 0.03  # variance of light over its mean squared; what is less says nothing
+# Pixels brighter than this many times the quantile of all weigh no more: up to a tenth may be hot.
 BRIGHT_PIXEL_QUANTILE, BRIGHT_PIXEL_RATIO = 0.9, 2.0
-"""Pixels brighter than this many times the quantile of all weigh no more: up to a tenth may be hot."""
-
-MAX_LOOKED_AT = 1 << 25
-"""Values, evenly chosen, that say which axis is time."""
-
-MAX_SECONDS = 1e-3
-"""s; photon times that are all shorter and not whole are seconds, others are numbers of bins."""
+MAX_LOOKED_AT = 1 << 25  # values, evenly chosen, that say which axis is time
+MAX_SECONDS = 1e-3  # photon times that are all shorter and not whole are seconds, others bins
 
 SUITABLE = (
     "a cube of counts (y, x, t), a list of photon times for each pixel (cells (y, x)), or events "
@@ -70,33 +62,21 @@ BIN_WIDTH_NAMES = {
     "resolution_s": 1.0,
     "resolution_ps": 1e-12,
 }
-PhotonReader = Callable[[Path], "PhotonFile"]
-
-
-@dataclass(frozen=True)
-class ArrayEntry:
-    """An array in a file that has not been read yet."""
-
-    name: str
-    shape: tuple[int, ...]
-    type: str  # of its values; ``cell`` for lists of different length
-    load: Callable[[], NDArray[Any]]  # reads the values
-
-    @property
-    def length(self) -> tuple[int, ...]:
-        """The shape without axes of length one."""
-        return tuple(n for n in self.shape if n != 1)
 
 
 @dataclass(frozen=True)
 class PhotonFile:
     """What a file says it holds."""
 
-    arrays: Sequence[ArrayEntry]
-    bin_width: float | None = None  # duration of a bin, s, where the file says it
+    arrays: Mapping[
+        str, ArchiveEntry
+    ]  # by name; of objects where pixels have lists of times (cells)
+    bin_width: float | None = None  # s, where the file says it
     axes: str = ""  # order of the axes of a cube where the format says it
-    # rows and columns of the picture of events where the format says them
-    image_shape: tuple[int, int] | None = None
+    image_shape: tuple[int, int] | None = None  # of the picture of events where the format says it
+
+
+PhotonReader = Callable[[Path], PhotonFile]
 
 
 def read_photons(
@@ -104,7 +84,7 @@ def read_photons(
 ) -> PhotonImage:
     """Read the photons that every pixel of a picture counted.
 
-    `path`: ``.npy``; ``.npz``; ``.mat`` (version 5 and 7.3);; `bin_width`: duration of a bin, or
+    `bin_width`: duration of a bin, or
     unit of the photon times, s; overrides the file's own; `axes`: order of a cube's axes, such as
     ``"yxt"`` or ``"txy"``; by default that is time along which light is most concentrated and which
     is longest; `PhotonImage.axes` says how surely.
@@ -116,12 +96,8 @@ def read_photons(
     width = opened.bin_width if bin_width is None else bin_width
     if width is None:
         raise InputError(f"{source}: does not say how long a bin lasts; give `bin_width`")
-    try:
+    with guard(source, "is damaged"):
         return _read_layout(opened, source, width, axes)
-    except TofclipError:
-        raise
-    except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-        raise FileFormatError(source, f"is damaged ({format_error_line(fault)})") from fault
 
 
 def describe_photons(path: str | Path) -> dict[str, Any]:
@@ -140,7 +116,8 @@ def describe_photons(path: str | Path) -> dict[str, Any]:
     if axes:
         found["axes"] = axes
     found["arrays"] = {
-        entry.name: f"{' x '.join(map(str, entry.shape))} {entry.type}" for entry in opened.arrays
+        name: f"{' x '.join(map(str, entry.shape))} {'cell' if _is_cell(entry) else entry.dtype}"
+        for name, entry in opened.arrays.items()
     }
     return found
 
@@ -161,35 +138,35 @@ def open_photons(path: Path) -> PhotonFile:
         raise FileFormatError(
             path, f"is not NPY, NPZ, MAT, HDF5, TIFF, PTU or SDT with photons; {SUITABLE}"
         )
-    try:
+    with guard(path, "is damaged"):
         return reader(path)
-    except (TofclipError, MemoryError):
-        raise
-    except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-        raise FileFormatError(
-            path, f"is damaged ({format_error_line(fault)}); {SUITABLE}"
-        ) from fault
+
+
+def _is_cell(entry: ArchiveEntry) -> bool:
+    return bool(entry.dtype.hasobject)
 
 
 def _find_layout(
     opened: PhotonFile, path: Path, axes: str | None = None
-) -> tuple[str, list[ArrayEntry]]:
+) -> tuple[str, list[ArchiveEntry]]:
     """Choose the arrays that hold the photons."""
-    cubes = [entry for entry in opened.arrays if len(entry.length) == 3 and entry.type != "cell"]
-    small = [entry for entry in opened.arrays if len(entry.shape) == 3 and entry.type != "cell"]
+    arrays = opened.arrays
+    small = {name: one for name, one in arrays.items() if len(one.shape) == 3 and not _is_cell(one)}
+    thick = {name: sum(length != 1 for length in one.shape) for name, one in arrays.items()}
+    cubes = {n: one for n, one in arrays.items() if thick[n] == 3 and not _is_cell(one)}
     if axes or opened.axes:  # known: there may be one row, or one pixel
         cubes = cubes or small
-    named = [entry for entry in cubes if entry.name.rpartition("/")[2].lower() in CUBE_NAMES]
-    cells = [entry for entry in opened.arrays if entry.type == "cell" and len(entry.shape) == 2]
+    named = [one for n, one in cubes.items() if n.rpartition("/")[2].lower() in CUBE_NAMES]
+    cells = [one for one in arrays.values() if _is_cell(one) and len(one.shape) == 2]
     if len(named) == 1 or len(cubes) == 1:
-        return "cube", [named[0] if len(named) == 1 else cubes[0]]
+        return "cube", named if len(named) == 1 else list(cubes.values())
     if not cubes and len(cells) == 1:
         return "cells", cells
-    flat = {entry.name.lower(): entry for entry in opened.arrays if len(entry.length) == 1}
+    flat = {name.lower(): one for name, one in arrays.items() if thick[name] == 1}
     times = [flat[name] for name in TIME_NAMES if name in flat]
     if not cubes and not cells and times and "x" in flat and "y" in flat:
         return "events", [flat["y"], flat["x"], times[0]]
-    held = ", ".join(f"{entry.name} {entry.shape}" for entry in opened.arrays[:6]) or "no arrays"
+    held = ", ".join(f"{name} {one.shape}" for name, one in [*arrays.items()][:6]) or "no arrays"
     problem = "several cubes of photons" if len(cubes) > 1 else "no photons"
     remedy = "give `axes`, e.g. yxt, of a picture of one row" if small and not cubes else SUITABLE
     raise FileFormatError(path, f"holds {problem} ({held}); {remedy}")
@@ -207,10 +184,8 @@ def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | N
         if not order:
             order, certainty = recognise_axes(cube, path)
             how = f"{order}, ahead of the next axis by a factor of {certainty:.2g}"
-        image = PhotonImage.from_cube(
-            np.transpose(cube, [order.index(axis) for axis in "yxt"]), bin_width
-        )
-        return replace(image, axes=how)
+        ordered = np.transpose(cube, [order.index(axis) for axis in "yxt"])
+        return replace(PhotonImage.from_cube(ordered, bin_width), axes=how)
     if layout == "cells":
         cells = arrays[0].load()
         lists = [np.asarray(cell).ravel() for cell in cells.ravel()]
@@ -221,10 +196,8 @@ def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | N
         y, x, times = (np.squeeze(entry.load()) for entry in arrays)
         if not y.shape == x.shape == times.shape or min(y.min(initial=0), x.min(initial=0)) < 0:
             raise FileFormatError(path, "its x, y and time are not lists of the same events")
-        rows, columns = opened.image_shape or (
-            int(y.max(initial=0)) + 1,
-            int(x.max(initial=0)) + 1,
-        )
+        seen = int(y.max(initial=0)) + 1, int(x.max(initial=0)) + 1
+        rows, columns = opened.image_shape or seen
         if rows * columns > MAX_PIXELS:
             raise FileFormatError(path, f"claims a picture of {rows} x {columns} pixels")
         pixel = y.astype(np.int64) * columns + x.astype(np.int64)
@@ -240,8 +213,7 @@ def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | N
 def recognise_axes(cube: NDArray[Any], path: Path) -> tuple[str, float]:
     """Say which axis of a cube is time: light is concentrated along it, and it is long.
 
-    `path`: for the message. Returns ``tyx``, ``ytx`` or ``yxt``, and by what factor it is ahead of
-    the next axis.
+    Returns ``tyx``, ``ytx`` or ``yxt``, and by what factor it is ahead of the next axis.
     """
     step = math.ceil((cube.size / MAX_LOOKED_AT) ** (1 / 3))
     light, score = np.empty(3), np.empty(3)
@@ -254,7 +226,7 @@ def recognise_axes(cube: NDArray[Any], path: Path) -> tuple[str, float]:
     # Hot pixels in a short picture make light uneven along its long axis: then two are in question.
     rival = max(light[axis] for axis in range(3) if axis != first)
     certainty = float(score[first] / score[second] / max(rival, 1.0))
-    order = {0: "tyx", 1: "ytx", 2: "yxt"}
+    order = "tyx", "ytx", "yxt"
     if certainty < MIN_AXES_CERTAINTY:
         raise InputError(
             f"{path}: neither its shape {cube.shape} nor its light says which axis is time ({order[int(first)]} "
@@ -273,15 +245,12 @@ def _compare_concentration(cube: NDArray[Any], time: int) -> float:
     axes = "yxt".replace("yxt"[time], "")
     along = np.einsum(f"yxt,{axes}->{'yxt'[time]}", cube, weight)
     weighted = picture * weight
-    own, *others = (
+    unevenness = []
+    for profile in (along, weighted.sum(axis=0), weighted.sum(axis=1)):
+        mean = max(profile.mean(), 1e-9)
         # photons alone make a profile uneven by one over their number in an entry
-        max(
-            (profile.var() / max(profile.mean(), 1e-9) - 1) / max(profile.mean(), 1e-9),
-            MIN_UNEVENNESS,
-        )
-        for profile in (along, weighted.sum(axis=0), weighted.sum(axis=1))
-    )
-    return float(own / max(others))
+        unevenness.append(max((profile.var() / mean - 1) / mean, MIN_UNEVENNESS))
+    return float(unevenness[0] / max(unevenness[1:]))
 
 
 def _open_npy(path: Path) -> PhotonFile:
@@ -293,16 +262,17 @@ def _open_npy(path: Path) -> PhotonFile:
     def load() -> NDArray[Any]:
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
-    return PhotonFile([ArrayEntry("array", shape, str(dtype), load)])
+    return PhotonFile({"array": ArchiveEntry(shape, dtype, load)})
 
 
 def _open_npz(path: Path) -> PhotonFile:
-    arrays, scalars = [], {}
-    for name, entry in list_npz_entries(path).items():
-        if entry.shape:
-            arrays.append(ArrayEntry(name, entry.shape, str(entry.dtype), entry.load))
-        elif entry.dtype.kind in "uif":
-            scalars[name] = float(entry.load())
+    entries = list_npz_entries(path)
+    scalars = {
+        name: one.load()
+        for name, one in entries.items()
+        if not one.shape and one.dtype.kind in "uif"
+    }
+    arrays = {name: one for name, one in entries.items() if one.shape}
     return PhotonFile(arrays, _find_bin_width(scalars))
 
 
@@ -317,20 +287,19 @@ def _find_bin_width(scalars: Mapping[str, Any]) -> float | None:
 
 def _open_mat(path: Path) -> PhotonFile:
     """Version 5; version 7.3 is HDF5."""
-    arrays, scalars = [], {}
+    arrays, scalars = {}, {}
     for name, entry in list_mat_entries(path).items():
         if name in BIN_WIDTH_NAMES and math.prod(entry.shape) == 1:
             scalars[name] = entry.load()
         else:
-            kind = "cell" if entry.dtype.hasobject else str(entry.dtype)
-            arrays.append(ArrayEntry(name, entry.shape, kind, entry.load))
+            arrays[name] = entry
     return PhotonFile(arrays, _find_bin_width(scalars))
 
 
 def _open_hdf5(path: Path) -> PhotonFile:
     import h5py
 
-    arrays, scalars = [], {}
+    arrays, scalars = {}, {}
     with h5py.File(path, "r") as file:
         scalars.update(file.attrs)
         for name, dataset in _iterate_datasets(file, set()):
@@ -345,8 +314,8 @@ def _open_hdf5(path: Path) -> PhotonFile:
                 # MATLAB counts its axes from the other end.
                 matlab = "MATLAB_class" in dataset.attrs
                 shape = dataset.shape[::-1] if matlab else dataset.shape
-                kind = "cell" if is_cell else str(dataset.dtype)
-                arrays.append(ArrayEntry(name, shape, kind, _make_hdf5_loader(path, name, matlab)))
+                load = partial(_load_dataset, path, name, matlab)
+                arrays[name] = ArchiveEntry(shape, dataset.dtype, load)
     return PhotonFile(arrays, _find_bin_width(scalars))
 
 
@@ -364,25 +333,21 @@ def _iterate_datasets(group: Any, visited: set[int], prefix: str = "") -> Iterat
             yield from _iterate_datasets(item, visited, f"{prefix}{name}/")
 
 
-def _make_hdf5_loader(path: Path, name: str, matlab: bool) -> Callable[[], NDArray[Any]]:
-    def load() -> NDArray[Any]:
-        import h5py
+def _load_dataset(path: Path, name: str, matlab: bool) -> NDArray[Any]:
+    import h5py
 
-        with h5py.File(path, "r") as file:
-            values = file[name][()]
-            if values.dtype.kind == "O":
-                total, cells = 0, np.empty(values.shape, dtype=object)
-                for place in np.ndindex(values.shape):
-                    cell = file[values[place]]
-                    total += cell.size * cell.dtype.itemsize
-                    require_bounded_size(path, name, total, path.stat().st_size, True)
-                    empty = bool(cell.attrs.get("MATLAB_empty", 0))
-                    cells[place] = np.zeros(0, np.uint8) if empty else cell[()]
-                values = cells
-            ordered: NDArray[Any] = values.T if matlab else values
-            return ordered
-
-    return load
+    with h5py.File(path, "r") as file:
+        values: NDArray[Any] = file[name][()]
+        if values.dtype.kind == "O":
+            total, cells = 0, np.empty(values.shape, dtype=object)
+            for place in np.ndindex(values.shape):
+                cell = file[values[place]]
+                total += cell.size * cell.dtype.itemsize
+                require_bounded_size(path, name, total, path.stat().st_size, True)
+                empty = bool(cell.attrs.get("MATLAB_empty", 0))
+                cells[place] = np.zeros(0, np.uint8) if empty else cell[()]
+            values = cells
+    return values.T if matlab else values
 
 
 def _open_tiff(path: Path) -> PhotonFile:
@@ -398,21 +363,13 @@ def _open_tiff(path: Path) -> PhotonFile:
         packed = sum(sum(page.databytecounts) for page in series.pages if page is not None)
         size = math.prod(series.shape) * series.dtype.itemsize
         require_bounded_size(path, "pictures", size, packed, series.keyframe.compression != 1)
-        shape, kind = tuple(series.shape), str(series.dtype)
+        shape, dtype = tuple(series.shape), series.dtype
 
     def load() -> NDArray[Any]:
         with BoundedFile(path) as reopened, tifffile.TiffFile(reopened) as again:
             return np.asarray(again.series[0].asarray())
 
-    return PhotonFile([ArrayEntry("pages", shape, kind, load)], axes="tyx")
-
-
-def _require_bounded_image(path: Path, size: int) -> None:
-    """Refuse a histogram of events that is too large; the file does not bound it, it is sparse."""
-    if size > MAX_IMAGE_BYTES:
-        raise FileFormatError(
-            path, f"'image' claims {size} bytes, more than the {MAX_IMAGE_BYTES} that are read"
-        )
+    return PhotonFile({"pages": ArchiveEntry(shape, dtype, load)}, axes="tyx")
 
 
 def _open_ptu(path: Path) -> PhotonFile:
@@ -426,7 +383,12 @@ def _open_ptu(path: Path) -> PhotonFile:
         if not file.is_t3:
             return _open_scan(path)
         _, rows, columns, _, bins = file.shape
-        _require_bounded_image(path, rows * columns * bins * 4)
+        shape, claimed = (rows, columns, bins), rows * columns * bins * 4
+        if claimed > MAX_IMAGE_BYTES:  # the file does not bound it: it is sparse
+            raise FileFormatError(
+                path,
+                f"'image' claims {claimed} bytes, more than the {MAX_IMAGE_BYTES} that are read",
+            )
         width = float(file.tcspc_resolution)
         start = int(file.record_offset)
         # Where the end was cut off, what is there counts.
@@ -440,7 +402,7 @@ def _open_ptu(path: Path) -> PhotonFile:
         summed: NDArray[Any] = np.asarray(cube).sum(axis=(0, 3), dtype=np.uint32)
         return summed
 
-    return PhotonFile([ArrayEntry("image", (rows, columns, bins), "uint32", load)], width, "yxt")
+    return PhotonFile({"image": ArchiveEntry(shape, np.dtype(np.uint32), load)}, width, "yxt")
 
 
 def _open_scan(path: Path) -> PhotonFile:
@@ -450,11 +412,8 @@ def _open_scan(path: Path) -> PhotonFile:
     if rows * columns > MAX_PIXELS:
         raise FileFormatError(path, f"claims a picture of {rows} x {columns} pixels")
     scan = read_scan(events)  # only then it is known which events are photons in a line
-    found: dict[str, NDArray[Any]] = {"x": scan.x, "y": scan.y, "time": scan.time}
-    arrays = [
-        ArrayEntry(name, values.shape, str(values.dtype), partial(np.asarray, values))
-        for name, values in found.items()
-    ]
+    found = {"x": scan.x, "y": scan.y, "time": scan.time}
+    arrays = {name: ArchiveEntry.of(values) for name, values in found.items()}
     return PhotonFile(arrays, events.tick, "", (rows, columns))
 
 
@@ -471,13 +430,12 @@ def _open_sdt(path: Path) -> PhotonFile:
     if any(image.shape != shape for image in images):
         shapes = ", ".join(" x ".join(map(str, image.shape)) for image in images)
         raise FileFormatError(path, f"holds images of different shapes ({shapes})")
-
-    kind = "uint32" if len(images) > 1 else str(images[0].dtype)
+    dtype = np.dtype(np.uint32) if len(images) > 1 else images[0].dtype
 
     def load() -> NDArray[Any]:
-        return np.asarray(np.sum(np.stack(images), axis=0, dtype=kind))
+        return np.asarray(np.sum(np.stack(images), axis=0, dtype=dtype))
 
-    return PhotonFile([ArrayEntry("image", shape, kind, load)], width, "yxt")
+    return PhotonFile({"image": ArchiveEntry(shape, dtype, load)}, width, "yxt")
 
 
 READERS_BY_SIGNATURE: dict[bytes, PhotonReader] = {

@@ -13,34 +13,25 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError
 from tofclip.lidar.photons.image import FloatArray, PhotonImage
-from tofclip.lidar.photons.planes import PLANE_ROUNDS, TRIAL_ROUNDS, fit_surface
-from tofclip.lidar.photons.response import BinnedResponse, Scene, learn_response
+from tofclip.lidar.photons.matching import PLANE_ROUNDS, TRIAL_ROUNDS, fit_surface
+from tofclip.lidar.photons.scene import BinnedResponse, Scene, learn_response
 
 REACHES_PX = (1, 2, 3, 4, 6, 8)
-
-RESPONSE_ROUNDS = 3
-
-RESPONSE_REACH_PX = 3
-
+RESPONSE_ROUNDS, RESPONSE_REACH_PX = 3, 3
+# Log-likelihood, and its standard deviations, by which a learnt response has to beat a given one;
+# its free shape alone gains some hundred.
 MIN_LEARNT_GAIN, MIN_LEARNT_SIGNIFICANCE = 500.0, 5.0
-"""Log-likelihood, and its standard deviations, by which a learnt response has to beat a given one;
-its free shape alone gains some hundred."""
-
 SIGNAL_POOL_PX = 5
 WIDER_POOLS_PX = (SIGNAL_POOL_PX, 9, 17, 33, 65)
-
+# Log odds in a unit of a label's margin, and how far (in its logarithm) scenes differ in it: eight
+# paths count what they share several times. In 16 simulated scenes of 0.7 to 20 signal and 2 to 200
+# background photons the weight was 0.076 to 0.28.
 MARGIN_WEIGHT, MARGIN_WEIGHT_SPREAD = 1 / 7, 0.5
-"""Log odds in a unit of a label's margin, and how far (in its logarithm) scenes differ in it: eight
-paths count what they share several times. In 16 simulated scenes of 0.7 to 20 signal and 2 to 200
-background photons the weight was 0.076 to 0.28."""
-
+# Of the logarithm of the number of labels that rival the best one: about one on surfaces (0.6 to
+# 2.4 in the same scenes), many where no light comes back.
 RIVAL_SPREAD = 0.5
-"""Of the logarithm of the number of labels that rival the best one: about one on surfaces (0.6 to
-2.4 in the same scenes), many where no light comes back."""
-
 MARGIN_WEIGHTS, RIVALS = np.geomspace(0.03, 0.8, 24), np.geomspace(0.5, 256, 10)
-MAX_JUDGED_PIXELS = 20_000
-"""Pixels, evenly chosen, that the outlier probability is learnt from."""
+MAX_JUDGED_PIXELS = 20_000  # evenly chosen, that the outlier probability is learnt from
 
 
 def weigh_evidence(
@@ -50,54 +41,31 @@ def weigh_evidence(
     surface: FloatArray,
     signal_pool: int = SIGNAL_POOL_PX,
 ) -> FloatArray:
-    """Log-likelihood ratio of each pixel's held-back photons: this surface against any instant.
+    """Log-likelihood ratio of each pixel's held-back photons, (pixels,): this surface, in bins, against
+    any instant.
 
-    `test, train`: the photons held back, and those that found the surface; `surface` (rows,
-    columns): in bins; `signal_pool`: side of the square of pixels, in pixels, whose share of signal
-    photons is taken as one. Returns (pixels,).
+    Pixels in a square of `signal_pool` share one fraction of signal photons.
     """
-    from tofclip.lidar.photons import surface_kernels as kernels
+    from tofclip.lidar.photons import kernels
 
     response = scene.response
     flat = np.ascontiguousarray(surface, dtype=np.float64).ravel()
-    ahead = response.start
     late = train.bin - flat[train.pixel]
-    inside = (late >= ahead) & (late <= -ahead + response.width)
-    length = response.width - 2 * ahead
+    inside = (late >= response.start) & (late <= response.width - response.start)
+    length = response.width - 2 * response.start
     seen = np.bincount(train.pixel, train.count * inside, flat.size).reshape(surface.shape)
-    whole = train.photons_per_pixel
     pooled, total = (
-        scipy.ndimage.uniform_filter(part, signal_pool, mode="nearest") for part in (seen, whole)
+        scipy.ndimage.uniform_filter(part, signal_pool, mode="nearest")
+        for part in (seen, train.photons_per_pixel)
     )
     # Background within the response's length, as dense as outside of it.
     outside = np.maximum(total - pooled, 0) * length / max(train.bins - length, 1)
     # Neither certainty is ever claimed: one photon against it would decide for the pixel.
     signal = np.clip((pooled - outside) / np.maximum(total, 1e-9), 0.02, 0.98)
     evidence = np.empty(flat.size)
-    density = response.density * train.bins
-    kernels.sum_evidence(
-        test.offsets,
-        test.bin,
-        test.count,
-        flat,
-        density,
-        response.start,
-        response.step,
-        signal.ravel(),
-        evidence,
-    )
+    sampled = response.density * train.bins, response.start, response.step, signal.ravel()
+    kernels.sum_evidence(test.offsets, test.bin, test.count, flat, *sampled, evidence)
     return evidence
-
-
-def judge_surface(
-    test: PhotonImage, train: PhotonImage, scene: Scene, surface: FloatArray
-) -> float:
-    """Mean log-likelihood of the photons that were held back; see `weigh_evidence`.
-
-    `test, train`: photons held back, and those that the surface was found from; `surface` (rows,
-    columns): instants, bins. Returns nats per photon.
-    """
-    return float(weigh_evidence(test, train, scene, surface).mean())
 
 
 def learn_scene(
@@ -105,9 +73,7 @@ def learn_scene(
 ) -> BinnedResponse | None:
     """Learn the response from the photons held back, around the surface that the others found.
 
-    `scene`: with the response that is known so far; `surface` (rows, columns): in bins; `required`:
-    there is no other response to stay with. Returns none if the response known so far explains the
-    photons as well.
+    Returns None if the response known so far explains the photons as well and none is required.
     """
     fitted = fit_surface(train, scene, surface, RESPONSE_REACH_PX)[..., 0]
     before = weigh_evidence(test, train, scene, fitted)
@@ -124,9 +90,8 @@ def learn_scene(
 def choose_reach(
     train: PhotonImage, test: PhotonImage, scene: Scene, surface: FloatArray
 ) -> tuple[int, FloatArray]:
-    """Find the reach of the planes that explains the photons held back best.
-
-    `surface` (rows, columns): in bins. Returns pixels, and the surface that it gives.
+    """Find the reach of planes, in pixels, that explains the photons held back best, and the surface
+    that it gives.
     """
     best, chosen, highest = REACHES_PX[0], surface, -np.inf
     rounds = PLANE_ROUNDS
@@ -135,7 +100,7 @@ def choose_reach(
             break
         surface = fit_surface(train, scene, surface, reach, rounds)[..., 0]
         rounds = TRIAL_ROUNDS
-        value = judge_surface(test, train, scene, surface)
+        value = float(weigh_evidence(test, train, scene, surface).mean())
         if value <= highest:
             break
         best, chosen, highest = reach, surface, value
@@ -149,41 +114,37 @@ def calibrate_outliers(
     surface: FloatArray,
     margin: NDArray[np.float32],
 ) -> Callable[[NDArray[np.float32]], FloatArray]:
-    """Learn the probability of an outlier from what the photons held back say.
+    """Learn how to turn margins of labels into probabilities of an outlier.
 
-    The margin between two labels is what the paths make of the log odds: the probability is a
-    logistic function of it, one half where two labels are as good and the others are not. Its slope
-    and the number of rivals are the most likely ones given the photons held back, in which right
-    and wrong pixels are mixed.
-
-    `surface` (rows, columns): in bins; `margin` (rows, columns): by how much the label of each
-    pixel beat the others. Returns turns margins into probabilities.
+    A margin is what the paths make of the log odds: the probability is a logistic function of it,
+    one half where two labels are as good and the others are not. Its slope and the number of rivals
+    are the most likely ones given the photons held back, in which right and wrong pixels are mixed.
     """
+    # A response does not explain the photons that it was learnt from as it does others, nor one that
+    # is given what a surface that is slightly off shows: either half is judged by the other one's.
     # Noise of the assumed share of signal makes surfaces look surer than they are: it is taken from
     # as large a neighbourhood as explains the photons best.
-    # Nor does a response explain the photons that it was learnt from as it does others, or one that
-    # is given what a surface that is slightly off shows: either half is judged by the other one's.
     one, other = test.split(0.5, 0)
     evidence = np.zeros(surface.size)
     for teacher, part in ((other, one), (one, other)):
-        evidence += _weigh_best_pooled(part, train, *_learn_anew(teacher, scene, surface))
+        learnt, moved = _learn_anew(teacher, scene, surface)
+        pooled = (weigh_evidence(part, train, learnt, moved, pool) for pool in WIDER_POOLS_PX)
+        evidence += max(pooled, key=np.sum)
     some = slice(None, None, -(-margin.size // MAX_JUDGED_PIXELS))
     for_surface = np.exp(np.clip(evidence[some], -30, 30))
-    known = np.maximum(margin.ravel()[some], 0).astype(np.float64)
 
-    def weigh(choice: tuple[np.float64, np.float64]) -> float:
-        weight, rivals = choice
-        wrong = _logistic(np.log(rivals) - weight * known)
-        prior = (np.log(weight / MARGIN_WEIGHT) / MARGIN_WEIGHT_SPREAD) ** 2
-        prior += (np.log(rivals) / RIVAL_SPREAD) ** 2
+    def doubt(value: NDArray[np.float32], weight: float, rivals: float) -> FloatArray:
+        odds = np.log(rivals) - weight * np.maximum(value, 0).astype(np.float64)
+        return np.asarray(scipy.special.expit(odds))
+
+    def weigh(choice: tuple[float, float]) -> float:
+        wrong = doubt(margin.ravel()[some], *choice)
+        prior = (np.log(choice[0] / MARGIN_WEIGHT) / MARGIN_WEIGHT_SPREAD) ** 2
+        prior += (np.log(choice[1]) / RIVAL_SPREAD) ** 2
         return float(np.sum(np.log((1 - wrong) * for_surface + wrong)) - prior / 2)
 
     weight, rivals = max(itertools.product(MARGIN_WEIGHTS, RIVALS), key=weigh)
-
-    def to_probability(value: NDArray[np.float32]) -> FloatArray:
-        return _logistic(np.log(rivals) - weight * np.maximum(value, 0).astype(np.float64))
-
-    return to_probability
+    return lambda value: doubt(value, weight, rivals)
 
 
 def _learn_anew(
@@ -197,20 +158,3 @@ def _learn_anew(
     except InputError:
         return scene, surface
     return Scene(BinnedResponse(pulse, teacher.bin_width), scene.background), surface + later
-
-
-def _weigh_best_pooled(
-    test: PhotonImage,
-    train: PhotonImage,
-    scene: Scene,
-    surface: FloatArray,
-) -> FloatArray:
-    """Return the evidence of each pixel, with the share of signal pooled as explains most."""
-    candidates = (weigh_evidence(test, train, scene, surface, pool) for pool in WIDER_POOLS_PX)
-    return max(candidates, key=lambda evidence: float(evidence.sum()))
-
-
-def _logistic(value: FloatArray) -> FloatArray:
-    # exp does not overflow, and at 40 the result is 0 or 1 within 1e-17
-    result: FloatArray = 1 / (1 + np.exp(-np.clip(value, -40, 40)))
-    return result

@@ -1,29 +1,29 @@
 """Photons counted in every pixel of a picture, as a list of events: what a photon-counting camera
-delivers, without the empty bins of a cube.
-
-Hot pixels of a photon-counting detector: one bin far beyond all that the other pixels count.
-
-Pairs of photons grow with the square of their number: one such pixel would say more about the
-pulse than all others together. It is found before anything is learnt.
+delivers, without the empty bins of a cube; which of its pixels are hot; and the picture of ranges
+that is made of it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 
-from tofclip.errors import InputError, ShapeError
-from tofclip.units import require_credible_bin_width
+from tofclip.camera import Camera
+from tofclip.errors import CalibrationError, InputError, ShapeError
+from tofclip.lidar.pulse import Pulse
+from tofclip.lidar.range_calibration import correct_ranges
+from tofclip.shots import Returns
+from tofclip.units import SPEED_OF_LIGHT, require_credible_bin_width
 
 FloatArray = NDArray[np.float64]
 
-MIN_BIN_WIDTH_S = 1e-13
-"""Half of the finest channel that a time-correlated counter offers (0.2 ps)."""
+MIN_BIN_WIDTH_S = 1e-13  # half of the finest channel of time-correlated counters (0.2 ps)
 
 
 @dataclass(frozen=True)
@@ -101,11 +101,10 @@ class PhotonImage:
             raise InputError("photon counts must be finite")
         if cube.size and cube.min() < 0:
             raise InputError("photon counts must not be negative")
-        histograms = np.ascontiguousarray(cube).reshape(-1, cube.shape[2])
+        histograms = cube.reshape(-1, cube.shape[2])
         pixel, bin_number = np.nonzero(histograms)
-        offsets = np.searchsorted(pixel, np.arange(histograms.shape[0] + 1))
         return cls(
-            offsets.astype(np.int64),
+            np.searchsorted(pixel, np.arange(len(histograms) + 1)).astype(np.int64),
             bin_number.astype(np.float32),
             histograms[pixel, bin_number].astype(np.float32),
             (cube.shape[0], cube.shape[1]),
@@ -164,6 +163,12 @@ class PhotonImage:
         """Raster number of the pixel of each event."""
         return np.repeat(np.arange(self.offsets.size - 1), np.diff(self.offsets))
 
+    @cached_property
+    def table(self) -> csr_array:
+        """Photons by pixel and bin, (pixels, bins); bins of several events are not summed up yet."""
+        whole = np.clip(np.rint(self.bin), 0, self.bins - 1).astype(np.int64)
+        return csr_array((self.count, whole, self.offsets), (self.offsets.size - 1, self.bins))
+
     @property
     def photons(self) -> float:
         """Photons of the whole picture."""
@@ -178,60 +183,32 @@ class PhotonImage:
     @cached_property
     def time_profile(self) -> FloatArray:
         """Photons of all pixels in each bin, (bins,)."""
-        whole = np.clip(np.rint(self.bin).astype(np.int64), 0, self.bins - 1)
-        return np.bincount(whole, self.count, self.bins).astype(np.float64)
+        return np.bincount(self.table.indices, self.count, self.bins).astype(np.float64)
 
     def select(self, count: NDArray[np.float32]) -> PhotonImage:
-        """Return the events with other counts; those with none are left out.
-
-        Parameters
-        ----------
-        count : (events,) float32 array
-        """
+        """Return the events with other counts, (events,); those with none are left out."""
         kept = count > 0
         offsets = np.concatenate([[0], np.cumsum(kept)])[self.offsets]
-        return PhotonImage(
-            offsets, self.bin[kept], count[kept], self.image_shape, self.bins, self.bin_width
-        )
+        return replace(self, offsets=offsets, bin=self.bin[kept], count=count[kept], axes="")
 
     def join_bins(self, number: int) -> PhotonImage:
-        """Return the same events, at the same instants, on a time axis of longer bins.
-
-        Parameters
-        ----------
-        number : int
-            Bins that make a new one; the middle of the first stays where it was.
+        """Return the same events, at the same instants, on a time axis of bins that are as many
+        times as long.
         """
         if number == 1:
             return self
         # A bin's middle is its instant: half of the first new bin lies before the record.
-        return PhotonImage(
-            self.offsets,
-            self.bin / np.float32(number),
-            self.count,
-            self.image_shape,
-            (self.bins - 1 + number // 2) // number + 1,
-            self.bin_width * number,
+        return replace(
+            self,
+            bin=self.bin / np.float32(number),
+            bins=(self.bins - 1 + number // 2) // number + 1,
+            bin_width=self.bin_width * number,
+            axes="",
         )
 
     def split(self, fraction: float, seed: int) -> tuple[PhotonImage, PhotonImage]:
-        """Divide the photons at random, so that one part can judge what the other part says.
-
-        Parameters
-        ----------
-        fraction : float
-            Share of the photons in the second part.
-        seed : int
-
-        Returns
-        -------
-        (PhotonImage, PhotonImage)
-            Independent of each other if the photons are Poisson distributed.
-
-        Raises
-        ------
-        InputError
-            So few photons that one part has none.
+        """Divide the photons at random, a fraction of them into the second part, so that one part
+        can judge what the other part says.
         """
         noise = np.random.default_rng(seed)
         # binomial thinning of Poisson counts gives two independent Poisson counts
@@ -245,14 +222,7 @@ class PhotonImage:
 
     def histograms(self, pixels: slice) -> FloatArray:
         """Return the histograms of some pixels in raster order, (n, bins)."""
-        start, stop, step = pixels.indices(self.offsets.size - 1)
-        some = slice(self.offsets[start], self.offsets[stop])
-        table = np.zeros((len(range(start, stop, step)), self.bins))
-        whole = np.clip(np.rint(self.bin[some]).astype(np.int64), 0, self.bins - 1)
-        row, beside = np.divmod(self.pixel[some] - start, step)
-        taken = beside == 0
-        np.add.at(table, (row[taken], whole[taken]), self.count[some][taken])
-        return table
+        return np.asarray(self.table[pixels].toarray(), np.float64)
 
 
 PEAK_RATIO = 20.0
@@ -260,104 +230,203 @@ PEAK_RATIO = 20.0
 the bins beside it, and over those of each neighbour at that time: light of a pulse is in several
 bins, or a surface goes on in the next pixel."""
 
-TOTAL_RATIO = 2.0
-"""Photons of a hot pixel over those of a usual one; saves looking at the bins of all others."""
-
-USUAL_QUANTILE = 0.9
-"""Of the pixels: up to a tenth of them may be hot."""
-
+TOTAL_RATIO = (
+    2.0  # photons of a hot pixel over a usual one; saves looking at the bins of all others
+)
+USUAL_QUANTILE = 0.9  # of the pixels: up to a tenth of them may be hot
 SAMPLED_PIXELS = 4096
-NEIGHBOUR_BINS = 2
-"""By how many bins the same surface may lie earlier or later in the next pixel."""
-
-
-@dataclass(frozen=True)
-class BinTable:
-    """Photons in the bins that are not empty."""
-
-    place: NDArray[np.int64]  # (n,), pixel times the number of bins, plus the bin; ascending
-    count: FloatArray  # (n,)
-    bins: int  # bins of the time axis
-
-    @classmethod
-    def from_pixels(cls, photons: PhotonImage, chosen: NDArray[np.bool_]) -> BinTable:
-        """Count the photons of some pixels.
-
-        `chosen` (pixels,).
-        """
-        some = chosen[photons.pixel]
-        whole = np.clip(np.rint(photons.bin[some]).astype(np.int64), 0, photons.bins - 1)
-        place, event = np.unique(photons.pixel[some] * photons.bins + whole, return_inverse=True)
-        count = np.bincount(event.ravel(), photons.count[some], place.size)
-        return cls(place, count.astype(np.float64), photons.bins)
-
-    def find_fullest(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.int64], FloatArray]:
-        """Return the fullest bin of each of these pixels, and its photons."""
-        pixel = self.place // self.bins
-        order = np.lexsort((self.count, pixel))
-        last = np.searchsorted(pixel, pixels, side="right") - 1
-        held = np.maximum(last, 0)
-        seen = (last >= 0) & (pixel[held] == pixels)
-        fullest = order[held]
-        return np.where(seen, self.place[fullest] % self.bins, 0), np.where(
-            seen, self.count[fullest], 0.0
-        )
-
-    def count_at(self, pixels: NDArray[np.int64], number: NDArray[np.int64]) -> FloatArray:
-        """Return the photons of these pixels in these bins."""
-        sought = pixels * self.bins + number
-        nearest = np.minimum(np.searchsorted(self.place, sought), self.place.size - 1)
-        there = (self.place[nearest] == sought) & (number >= 0) & (number < self.bins)
-        return np.where(there, self.count[nearest], 0.0)
+NEIGHBOUR_BINS = 2  # by which the same surface may lie earlier or later in the next pixel
 
 
 def find_hot_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
-    """Say which pixels have one bin far beyond what the others count.
+    """Say which pixels, (rows, columns), have one bin far beyond what the others count.
 
-    Returns (rows, columns).
+    Pairs of photons grow with the square of their number: one such pixel would say more about the
+    pulse than all others together. They are found before anything is learnt.
     """
-    hot = np.zeros(photons.image_shape, np.bool_)
+    rows, columns = photons.image_shape
+    hot, table = np.zeros((rows, columns), np.bool_), photons.table
     total = photons.photons_per_pixel.ravel()
     usual_total = max(float(np.quantile(total, USUAL_QUANTILE)), 1.0)
     bright = np.flatnonzero(total > np.maximum(TOTAL_RATIO * usual_total, PEAK_RATIO))
     if not bright.size:
         return hot
-    sampled = np.arange(0, total.size, -(-total.size // SAMPLED_PIXELS))
-    chosen = np.zeros(total.size, np.bool_)
-    chosen[sampled] = chosen[bright] = True
-    table = BinTable.from_pixels(photons, chosen)
-    usual = max(float(np.quantile(table.find_fullest(sampled)[1], USUAL_QUANTILE)), 1.0)
-    number, peak = table.find_fullest(bright)
-    kept = peak > PEAK_RATIO * usual
-    bright, number, peak = bright[kept], number[kept], peak[kept]
-    hot.ravel()[bright] = True
-    table = BinTable.from_pixels(
-        photons, scipy.ndimage.binary_dilation(hot, np.ones((3, 3))).ravel()
-    )
-    # A surface goes on in the next pixel or the next bin; what stands alone in both is the
-    # sensor's.
+    sampled = table[:: -(-total.size // SAMPLED_PIXELS)].max(axis=1).toarray()
+    usual = max(float(np.quantile(sampled, USUAL_QUANTILE)), 1.0)
+    peak = table[bright].max(axis=1).toarray().ravel()
+    bright, peak = bright[peak > PEAK_RATIO * usual], peak[peak > PEAK_RATIO * usual]
+    if not bright.size:
+        return hot
+    number = table[bright].argmax(axis=1)
+    # A surface goes on in the next pixel or the next bin; what stands alone in both is the sensor's.
     alone = np.ones(bright.size, np.bool_)
-    rows, columns = photons.image_shape
-    for step_y, step_x in np.ndindex(3, 3):
-        y, x = bright // columns + step_y - 1, bright % columns + step_x - 1
-        inside = (y >= 0) & (y < rows) & (x >= 0) & (x < columns)
-        own = (step_y, step_x) == (1, 1)
+    for down, right in np.ndindex(3, 3):
+        y, x = bright // columns + down - 1, bright % columns + right - 1
         for later in range(-NEIGHBOUR_BINS, NEIGHBOUR_BINS + 1):
-            if not (own and later == 0):
-                light = table.count_at(np.where(inside, y * columns + x, 0), number + later)
-                alone &= ~inside | (light * PEAK_RATIO < peak)
+            beside = number + later
+            seen = (y >= 0) & (y < rows) & (x >= 0) & (x < columns)
+            seen &= (beside >= 0) & (beside < photons.bins)
+            if (down, right, later) != (1, 1, 0):
+                light = np.asarray(table[(y * columns + x)[seen], beside[seen]]).ravel()
+                alone[seen] &= light * PEAK_RATIO < peak[seen]
     hot.ravel()[bright] = alone
     return hot
 
 
 def leave_out_pixels(photons: PhotonImage, pixels: NDArray[np.bool_]) -> PhotonImage:
-    """Return the photons of the other pixels.
-
-    `pixels` (rows, columns).
-    """
+    """Return the photons of all but some pixels, (rows, columns)."""
     if not pixels.any():
         return photons
     count = np.where(pixels.ravel()[photons.pixel], np.float32(0), photons.count)
     if not count.any():
         raise InputError(f"only hot pixels counted photons ({int(pixels.sum())} of {pixels.size})")
     return photons.select(count)
+
+
+@dataclass(frozen=True)
+class SurfaceImage:
+    """A range for every pixel.
+
+    Parameters
+    ----------
+    range : (rows, columns) float64 array
+        Distance for a co-located source, m; the middle of the first bin is range 0. NaN where there
+        is none.
+    range_sigma : (rows, columns) float64 array
+        One standard deviation of the range, m.
+    intensity : (rows, columns) float64 array
+        Expected photons of the return.
+    outlier_probability : (rows, columns) float64 array
+        That the return is not of this pixel's surface.
+    pulse : Pulse
+        The response that was used, as bins show it.
+    settings : mapping
+        What was chosen from the data, by name.
+    further : tuple of SurfaceImage
+        Weaker returns of the same pixels, the strongest first; NaN where there is none.
+    hot_pixels : (rows, columns) bool array, optional
+        Pixels whose photons were left out; see `find_hot_pixels`.
+    """
+
+    range: FloatArray
+    range_sigma: FloatArray
+    intensity: FloatArray
+    outlier_probability: FloatArray
+    pulse: Pulse
+    settings: dict[str, float | str]
+    further: tuple[SurfaceImage, ...] = ()
+    hot_pixels: NDArray[np.bool_] | None = None
+
+    @classmethod
+    def from_layers(
+        cls,
+        layers: FloatArray,
+        pulse: Pulse,
+        settings: dict[str, float | str],
+        hot: NDArray[np.bool_],
+    ) -> SurfaceImage:
+        """Make one of range, deviation, photons and outlier probability of each pixel's returns, the
+        strongest first, (layers, rows, columns, 4).
+        """
+        first, *further = (
+            cls(one[..., 0], one[..., 1], one[..., 2], one[..., 3], pulse, settings)
+            for one in layers
+        )
+        return replace(first, further=tuple(further), hot_pixels=hot)
+
+    def calibrate(self, camera: Camera, first_time: float = 0.0) -> SurfaceImage:
+        """Return the ranges from the camera's time zero, with its range calibration applied.
+
+        Parameters
+        ----------
+        camera : Camera
+        first_time : float
+            Reading of the time axis at the middle of the first bin, s.
+
+        Returns
+        -------
+        SurfaceImage
+
+        Raises
+        ------
+        CalibrationError
+            The camera has another number of pixels.
+        """
+        if camera.image_shape != self.range.shape:
+            raise CalibrationError(
+                f"the camera has {camera.image_shape} pixels, the photons {self.range.shape}"
+            )
+        further = tuple(one.calibrate(camera, first_time) for one in self.further)
+        distance = self.range - SPEED_OF_LIGHT / 2 * (camera.time_zero - first_time)
+        sigma = self.range_sigma
+        if camera.range_calibration is not None:
+            y, x = np.indices(self.range.shape)
+            distance, _, sigma = correct_ranges(
+                camera.range_calibration, distance, self.intensity, sigma, (y, x)
+            )
+        return replace(self, range=distance, range_sigma=sigma, further=further)
+
+    def to_returns(self, camera: Camera, provenance: Mapping[str, Any] | None = None) -> Returns:
+        """List the pixels with a range.
+
+        Parameters
+        ----------
+        camera : Camera
+            Says where the pixels look, see `make_pinhole`.
+        provenance : mapping, optional
+            How they came about.
+
+        Returns
+        -------
+        tofclip.lidar.Returns
+        """
+        layers = [self, *self.further]
+        distance, sigma, signal, doubt = (
+            np.stack([getattr(one, name).ravel() for one in layers], axis=1)
+            for name in ("range", "range_sigma", "intensity", "outlier_probability")
+        )
+        order = np.argsort(distance, axis=1)
+        pixel, nearness = np.nonzero(np.isfinite(np.take_along_axis(distance, order, axis=1)))
+        chosen = pixel, order[pixel, nearness]
+        y, x = np.divmod(pixel, self.range.shape[1])
+        return Returns(
+            y=y.astype(np.int32),
+            x=x.astype(np.int32),
+            range=distance[chosen],
+            intensity=(signal[chosen] * distance[chosen] ** 2).astype(np.float32),
+            confidence=sigma[chosen].astype(np.float32),
+            return_number=(nearness + 1).astype(np.uint8),
+            time=2 * distance[chosen] / SPEED_OF_LIGHT,
+            camera=camera,
+            provenance={} if provenance is None else provenance,
+            false_alarm=doubt[chosen],
+        )
+
+
+def make_pinhole(image_shape: tuple[int, int], focal_length_px: float, pulse_fwhm: float) -> Camera:
+    """Return a camera that only says where its pixels look.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Rows and columns.
+    focal_length_px : float
+        Distance of the pinhole from the picture, in pixels; the optical axis meets pixel
+        ``(rows // 2, columns // 2)``.
+    pulse_fwhm : float
+        Full width at half maximum of a return, s.
+
+    Returns
+    -------
+    Camera
+        Of one view.
+    """
+    columns = image_shape[1]
+    return Camera(
+        np.array([min(columns / 2, columns - 1)]),
+        np.zeros(1),
+        image_shape,
+        columns,
+        pulse_fwhm=pulse_fwhm,
+        focal_length_px=focal_length_px,
+    )

@@ -1,7 +1,12 @@
-"""The compiled search for returns in histograms of photons.
+"""The compiled loops of counted photons: the search of each pixel's histogram, and the steps of the
+search for a surface.
 
-Positions below a bin and overlapping returns are treated by the steps of
-`tofclip.lidar.fit_kernels`; here is what Poisson statistics add.
+Of histograms, positions below a bin and overlapping returns are treated by the steps of
+`tofclip.lidar.fit_kernels`, whose `curve`, `scale` and `times` (bins,) in s are here as there; this is
+what Poisson statistics add. Of events all times are in bins, and a label is an instant that a surface
+may have on a coarse time axis. A filter is given as `weights` (shades, width), log-likelihood ratios
+for each brightness of the background, `shade` (bins,), the row for each bin, and `first`, the bin of
+the first weight counted from the return's. Every function is serial and holds no interpreter lock.
 """
 
 from __future__ import annotations
@@ -17,22 +22,23 @@ from tofclip.lidar.fit_kernels import (
     subtract_returns,
 )
 
-MAX_ITERATIONS = (
-    16  # the weights change with the estimate, which takes some rounds more than the plain fit
-)
+compiled = compile_and_keep(error_model="numpy")
+vectorised = compile_and_keep(error_model="numpy", fastmath=True)
+per_histogram = compile_and_keep()
+
+MAX_ITERATIONS = 16  # the weights change with the estimate: some rounds more than the plain fit
 MIN_PHOTONS = 0.5  # lets an empty histogram have a background
+MIN_PLANE_PIXELS = 6  # a plane through fewer pixels is taken as level
+MIN_DETERMINED_FRACTION = 1e-2  # of the information that must be left for the middle after slopes
+SLOPE_RIDGE_FRACTION = 1e-3  # of it, for level planes: finite slopes where one row has photons
 
 
-@compile_and_keep()
+@per_histogram
 def find_best_score(counts, weights, shade, first):
     """Largest log-matched filter response over all bins, and its bin.
 
     ``score[j] = sum_w weights[shade[j + first + w], w] * counts[j + first + w]``; photons are few,
     so each one adds to the bins it concerns. A photon where the background is bright says less.
-
-    `counts` (bins,): photons; `weights` (shades, width): of the log-matched filter, for each
-    brightness of the background; `shade` (bins,): row of `weights` for each bin; `first`: bin of
-    the first weight, counted from the return's.
     """
     score = np.zeros(counts.size)
     for i in range(counts.size):
@@ -46,25 +52,18 @@ def find_best_score(counts, weights, shade, first):
     return score[best], best
 
 
-@compile_and_keep()
+@per_histogram
 def find_best_scores(histograms, weights, shade, first, best):
-    """Fill `best` with the largest response of each histogram.
-
-    `histograms` (n, bins): photons; `weights, shade, first`: as for `find_best_score`; `best` (n,):
-    overwritten.
-    """
+    """Fill `best` (n,) with the largest response of each histogram, (n, bins)."""
     table = spread_filter(weights, shade)
     score = np.zeros(shade.size)
     for row in range(histograms.shape[0]):
         best[row] = compute_best_score(histograms[row], table, first, score)
 
 
-@compile_and_keep()
+@per_histogram
 def spread_filter(weights, shade):
-    """Weights that each bin has in the filter, (width, bins): as `compute_best_score` takes them.
-
-    `weights, shade`: as for `find_best_score`.
-    """
+    """Weights that each bin has in the filter, (width, bins): as `compute_best_score` takes them."""
     table = np.empty((weights.shape[1], shade.size))
     for w in range(weights.shape[1]):
         for i in range(shade.size):
@@ -72,25 +71,19 @@ def spread_filter(weights, shade):
     return table
 
 
-@compile_and_keep()
+@per_histogram
 def compute_best_score(counts, table, first, score):
     """What `find_best_score` says of histograms in which most bins hold photons, to the bit.
 
     Taking all bins at a time, one weight after the other, needs neither a question about each bin
     nor a search for what it reaches.
-
-    `counts` (bins,): photons; `table` (width, bins): from `spread_filter`; `first`: bin of the
-    first weight, counted from the return's; `score` (bins,): overwritten.
     """
     score[:] = 0
     for w in range(table.shape[0]):
         ahead = first + w
         begin, end = max(0, ahead), min(counts.size, counts.size + ahead)
-        own, light, sums = (
-            table[w, begin:end],
-            counts[begin:end],
-            score[begin - ahead : end - ahead],
-        )
+        own, light = table[w, begin:end], counts[begin:end]
+        sums = score[begin - ahead : end - ahead]
         for i in range(sums.size):
             sums[i] += own[i] * light[i]
     best = score[0]
@@ -100,14 +93,10 @@ def compute_best_score(counts, table, first, score):
     return best
 
 
-@compile_and_keep()
+@per_histogram
 def simulate_best_scores(photons, arrived, noise, weights, shade, first, best):
-    """Fill `best` with the best scores of histograms over which `photons` are thrown by a random
-    generator as the background is distributed.
-
-    `photons`: in each histogram; `arrived` (bins,): fraction of the background up to the end of
-    each bin; the last is 1; `weights, shade, first`: as for `find_best_score`; `best` (trials,):
-    overwritten.
+    """Fill `best` (trials,) with the best scores of histograms over which so many photons are thrown
+    as the background arrives, of which `arrived` (bins,) is the fraction up to the end of each bin.
     """
     bins = arrived.size
     counts, score, table = np.zeros(bins), np.zeros(bins), spread_filter(weights, shade)
@@ -124,19 +113,17 @@ def simulate_best_scores(photons, arrived, noise, weights, shade, first, best):
         best[trial] = compute_best_score(counts, table, first, score)
 
 
-@compile_and_keep()
+@per_histogram
 def extract_strongest_returns(
     rest, free, dither, level, table, background, first, scale, times, peaks, numbers
 ):
     """Find the strongest return of each histogram and take its bins out, for the next one to be
     sought in the rest.
 
-    `rest` (n, bins): photons that belong to no return yet; `free` (n,): background of the bins that
-    belong to no return yet, relative to that of a usual bin; `dither` (n,): added to the scores, to
-    decide ties; `level` (n,): row of the table for each histogram; negative: nothing is sought;
-    `table` (levels,): threshold and filter weights; `background` (bins,): relative brightness of
-    each bin, and its row of the filter; `first`: bin of the first weight relative to the return's;
-    `scale, times`: as in `tofclip.lidar.fit_kernels`; `peaks` (n, most returns); `numbers` (n,).
+    `rest` (n, bins): photons that belong to no return yet; `free` (n,): background of their bins,
+    relative to that of a usual bin; `dither` (n,): decides ties; `level` (n,): row of the table of
+    thresholds and weights, negative where nothing is sought; `background`: relative brightness of
+    each bin, and its shade; `peaks` (n, most returns) and `numbers` (n,) are added to.
     """
     (thresholds, weights), (relative, shade) = table, background
     for row in range(rest.shape[0]):
@@ -152,18 +139,15 @@ def extract_strongest_returns(
         free[row] -= relative[begin:end].sum()
 
 
-@compile_and_keep()
+@per_histogram
 def fit_histograms(
     histograms, arrived, live, cycles, peaks, numbers, relative, curve, scale, times, found
 ):
     """Refine the returns of each histogram to the likelihood's maximum.
 
-    `histograms` (n, bins): photons counted; `arrived` (n, bins): photons with pile-up corrected;
-    `live` (n, bins): fraction of the cycles in which the detector was ready; `peaks, numbers`: as
-    `extract_strongest_returns` left them; `relative` (bins,): background of each bin, relative to
-    that of a usual one; `curve, scale, times`: as in `tofclip.lidar.fit_kernels`; `found` (n, most
-    returns, 3): overwritten with arrival, photons and standard deviation of the arrival where there
-    is a return.
+    `histograms, arrived` (n, bins): photons counted, and with pile-up corrected; `live` (n, bins):
+    fraction of the cycles in which the detector was ready; `relative` (bins,): background over that
+    of a usual bin; `found` (n, most returns, 3): arrival, photons and deviation of each return.
     """
     estimate = np.empty((peaks.shape[1], 5))
     for row in range(histograms.shape[0]):
@@ -177,38 +161,16 @@ def fit_histograms(
             peak = peaks[row, k]
             estimate[k, 0], estimate[k, 2], estimate[k, 3] = times[peak], peak, peak
             estimate[k, 1] = estimate_height(trace, times, background, curve, scale, peak)
-        refine_returns(
-            trace,
-            times,
-            background,
-            curve,
-            scale,
-            estimate[:number],
-            variance,
-            MAX_ITERATIONS,
-        )
+        own = estimate[:number]
+        refine_returns(trace, times, background, curve, scale, own, variance, MAX_ITERATIONS)
         for k in range(number):
-            summarise_return(
-                trace,
-                times,
-                background,
-                curve,
-                scale,
-                estimate[:number],
-                k,
-                variance,
-                found[row, k],
-            )
+            around = trace, times, background, curve, scale
+            summarise_return(around, own, k, variance, found[row, k])
 
 
-@compile_and_keep()
+@per_histogram
 def estimate_background(trace, relative, times, peaks, scale):
-    """Background photons of a usual bin, from the bins that no return reaches.
-
-    `trace` (bins,): photons; `relative` (bins,): background of each bin, relative to that of a
-    usual one; `times` (bins,): seconds, increasing; `peaks`: bins of the returns; `scale` (4,): the
-    pulse's; see `tofclip.lidar.fit_kernels`. Returns photons per bin, above zero.
-    """
+    """Background photons of a usual bin, above zero, from the bins that no return reaches."""
     free = np.ones(trace.size, np.bool_)
     for peak in peaks:
         first, last = find_pulse_window(times, (peak, peak), times[peak], scale)
@@ -222,15 +184,9 @@ def estimate_background(trace, relative, times, peaks, scale):
     return (photons + MIN_PHOTONS) / max(bins, 1.0)
 
 
-@compile_and_keep()
+@per_histogram
 def estimate_height(trace, times, background, curve, scale, peak):
-    """Height of a return from the photons around its bin; never less than half a photon's.
-
-    `trace` (bins,): photons; `times` (bins,): seconds, increasing; `background` (bins,): photons
-    per bin; `curve` (samples, 2): pulse and slope; `scale` (4,): the pulse's; see
-    `tofclip.lidar.fit_kernels`; `peak`: bin of the return. Returns photons per bin at the pulse's
-    peak.
-    """
+    """Height of a return, photons per bin, from the photons around its bin; at least half a one's."""
     arrival = times[peak]
     first, last = find_pulse_window(times, (peak, peak), arrival, scale)
     area = excess = 0.0
@@ -240,21 +196,15 @@ def estimate_height(trace, times, background, curve, scale, peak):
     return max(excess, MIN_PHOTONS) / max(area, 1e-3)
 
 
-@compile_and_keep()
-def summarise_return(trace, times, background, curve, scale, estimate, k, variance, found):
-    """Write arrival, photons and the arrival's Cramer-Rao deviation at the estimate to `found`.
-
-    `trace` (bins,): photons; `times` (bins,): seconds, increasing; `background` (bins,): photons
-    per bin; `curve` (samples, 2): pulse and slope; `scale` (4,): the pulse's; see
-    `tofclip.lidar.fit_kernels`; `estimate` (returns, 5): see
-    `tofclip.lidar.fit_kernels.refine_returns`; `k`: number of the return; `variance`: see
-    `tofclip.lidar.fit_kernels.get_variance`; `found` (3,): overwritten: arrival in seconds, photons,
-    standard deviation in seconds (infinite where the fit says nothing).
+@per_histogram
+def summarise_return(around, estimate, k, variance, found):
+    """Write arrival, photons and the arrival's Cramer-Rao deviation at the estimate to `found`; the
+    deviation is infinite where the fit says nothing.
     """
+    trace, times, background, curve, scale = around
     arrival, height = estimate[k, 0], estimate[k, 1]
-    first, last = find_pulse_window(
-        times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale
-    )
+    peaks = int(estimate[k, 2]), int(estimate[k, 3])
+    first, last = find_pulse_window(times, peaks, arrival, scale)
     pp = pd = dd = total = 0.0
     for i in range(first, last):
         p, d = interpolate_pulse(times[i] - arrival, curve, scale)
@@ -272,71 +222,241 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, varian
         found[2] = np.sqrt(pp / determinant) / height
 
 
-@compile_and_keep()
-def compute_scores(histograms, weights, first, score):
-    """Fill `score` with the log-matched filter's response of each histogram at each bin.
+@compiled
+def score_labels(offsets, coarse_bin, count, place, weights, first, score):
+    """Log-likelihood ratio of a surface at each label against none, `score` (pixels, labels).
 
-    `histograms` (n, bins): photons; `weights` (width,): of the filter; `first`: bin of the first
-    weight, counted from the return's; `score` (n, bins): overwritten.
+    `place` (coarse bins,): label of each, or -1; `weights` (width,): log-likelihood ratio of a photon
+    ``first + w`` coarse bins after the surface.
     """
-    score[:] = 0
-    for row in range(histograms.shape[0]):
-        for i in range(histograms.shape[1]):
-            if histograms[row, i] > 0:
-                for w in range(weights.size):
-                    j = i - first - w
-                    if 0 <= j < histograms.shape[1]:
-                        score[row, j] += histograms[row, i] * weights[w]
+    for pixel in range(score.shape[0]):
+        own = score[pixel]
+        own[:] = 0
+        for event in range(offsets[pixel], offsets[pixel + 1]):
+            for w in range(weights.size):
+                label_bin = coarse_bin[event] - first - w
+                if 0 <= label_bin < place.size and place[label_bin] >= 0:
+                    own[place[label_bin]] += weights[w] * count[event]
 
 
-@compile_and_keep()
+@vectorised
+def find_highest(values):
+    """Largest of the values: four at a time, as one after the other each waits for the one before."""
+    first = second = third = fourth = values[0]
+    whole = values.size - values.size % 8
+    for t in range(0, whole, 8):
+        first = max(first, max(values[t], values[t + 1]))
+        second = max(second, max(values[t + 2], values[t + 3]))
+        third = max(third, max(values[t + 4], values[t + 5]))
+        fourth = max(fourth, max(values[t + 6], values[t + 7]))
+    for t in range(whole, values.size):
+        first = max(first, values[t])
+    return max(max(first, second), max(third, fourth))
+
+
+@vectorised
+def extend_path(score, before, highest, slope_cost, jump_cost, path, total):
+    """One step of semi-global matching; return the path's highest score.
+
+    ``path[t] = score[t] + max(before[t], before[t -+ 1] - slope_cost, highest - jump_cost) -
+    highest``; Hirschmueller, IEEE Trans. Pattern Anal. 30, 328 (2008), Eq. 13, with likelihoods
+    where he has costs. `path` is overwritten and added to `total`.
+    """
+    last = score.size - 1
+    floor = highest - jump_cost
+    # The ends have one neighbour only. The highest score is taken off in every step, or sums would
+    # grow along the path until single precision loses the differences.
+    path[0] = score[0] + max(max(before[0], floor), before[min(1, last)] - slope_cost) - highest
+    path[last] = (
+        score[last] + max(max(before[last], floor), before[max(last - 1, 0)] - slope_cost) - highest
+    )
+    for t in range(1, last):
+        beside = max(before[t - 1], before[t + 1]) - slope_cost
+        path[t] = score[t] + max(max(before[t], floor), beside) - highest
+    for t in range(score.size):
+        total[t] += path[t]
+    return find_highest(path)
+
+
+@compiled
 def add_path_scores(score, slope_cost, jump_cost, total):
-    """Add to `total` the best score of all paths that reach each entry along the first axis.
-
-    From one step to the next a path may keep its bin for nothing, change by one bin at
-    `slope_cost`, or by any number at `jump_cost`: the recursion of semi-global matching. `score`
-    and `total` are (steps, lanes, bins).
-
-    `score` (steps, lanes, bins); `slope_cost, jump_cost`: in the score's unit, nats; `total`
-    (steps, lanes, bins): added to, in place.
+    """Add to `total` the scores, (rows, columns, labels), of the four paths that come from the left
+    and from the row above; called again with both picture axes reversed, of the other four.
     """
-    path, before = np.empty(score.shape[2]), np.empty(score.shape[2])
-    for lane in range(score.shape[1]):
-        before[:] = 0
-        for step in range(score.shape[0]):
-            highest = before.max()
-            for t in range(path.size):
-                best = max(before[t], highest - jump_cost)
-                if t > 0:
-                    best = max(best, before[t - 1] - slope_cost)
-                if t + 1 < path.size:
-                    best = max(best, before[t + 1] - slope_cost)
-                # the subtraction keeps the numbers small and changes no comparison (H.
-                # Hirschmueller, IEEE TPAMI 30, 328, 2008)
-                path[t] = score[step, lane, t] + best - highest
-                total[step, lane, t] += path[t]
-            before[:] = path
-
-
-@compile_and_keep()
-def pool_neighbours(counts, label, reach, apart, pooled, contributors):
-    """Sum each pixel's histogram with those of neighbours on the same surface, moved to the pixel's
-    own bin.
-
-    `counts` (rows, columns, bins); `label` (rows, columns): bin of the return; `reach`: neighbours
-    up to this number of pixels away; `apart`: neighbours whose bins differ by more for each pixel
-    of distance lie on another surface; `pooled` (rows, columns, bins); `contributors` (rows,
-    columns).
-    """
-    rows, columns, bins = counts.shape
-    pooled[:] = 0
-    contributors[:] = 0
+    rows, columns, labels = score.shape
+    above = np.zeros((3, columns, labels), np.float32)
+    here = np.zeros((3, columns, labels), np.float32)
+    above_top, here_top = np.zeros((3, columns), np.float32), np.zeros((3, columns), np.float32)
+    beside, start = np.zeros((2, labels), np.float32), np.zeros(labels, np.float32)
     for y in range(rows):
+        beside[:] = 0
+        beside_top = np.float32(0)
         for x in range(columns):
-            for v in range(max(0, y - reach), min(rows, y + reach + 1)):
-                for u in range(max(0, x - reach), min(columns, x + reach + 1)):
-                    move = label[v, u] - label[y, x]
-                    if abs(move) <= apart * max(abs(v - y), abs(u - x)):
-                        contributors[y, x] += 1
-                        for t in range(max(0, -move), min(bins, bins - move)):
-                            pooled[y, x, t] += counts[v, u, t + move]
+            own, summed = score[y, x], total[y, x]
+            beside_top = extend_path(
+                own, beside[x % 2], beside_top, slope_cost, jump_cost, beside[1 - x % 2], summed
+            )
+            # the three directions from the row above; the row itself is the fourth
+            for way in range(3):
+                u = x + way - 1
+                before, top = start, np.float32(0)
+                if y > 0 and 0 <= u < columns:
+                    before, top = above[way, u], above_top[way, u]
+                here_top[way, x] = extend_path(
+                    own, before, top, slope_cost, jump_cost, here[way, x], summed
+                )
+        # two rows in turn: only the row above is looked back at
+        above, here = here, above
+        above_top, here_top = here_top, above_top
+
+
+@compiled
+def find_best_labels(score, total, extra_paths, apart, label, margin):
+    """Best label of each pixel, and by how much it beats every label further than `apart` away.
+
+    `score, total` (pixels, labels); the paths counted a pixel's own score `extra_paths` too often.
+    """
+    for pixel in range(score.shape[0]):
+        best, highest = 0, np.float32(-np.inf)
+        for t in range(score.shape[1]):
+            # every path counted the pixel's own score: all but one are taken off
+            value = total[pixel, t] - extra_paths * score[pixel, t]
+            if value > highest:
+                best, highest = t, value
+        other = np.float32(-np.inf)
+        for t in range(score.shape[1]):
+            if abs(t - best) > apart:
+                other = max(other, total[pixel, t] - extra_paths * score[pixel, t])
+        label[pixel] = best
+        margin[pixel] = highest - other if other > -np.inf else np.float32(0)
+
+
+@compiled
+def measure_events(offsets, bin_time, count, surface, table, start, step, brightness, sums):
+    """What the photons of each pixel say about moving its surface, `sums` (pixels, 3): slope of the
+    log-likelihood, its Fisher information, photons of the signal.
+
+    `table` (n, 2): of the response, sampled from `start` by `step`: minus the slope of its logarithm,
+    and its density over that of the background for one photon of signal, of which `brightness`
+    (pixels,) are expected.
+    """
+    for pixel in range(surface.size):
+        slope = information = photons = 0.0
+        for event in range(offsets[pixel], offsets[pixel + 1]):
+            position = (bin_time[event] - surface[pixel] - start) / step
+            if not 0 <= position < table.shape[0] - 1:
+                continue
+            left = int(position)
+            part = position - left
+            push = table[left, 0] * (1 - part) + table[left + 1, 0] * part
+            odds = brightness[pixel] * (table[left, 1] * (1 - part) + table[left + 1, 1] * part)
+            # Probability that the photon is of the signal. The derivative of log(background +
+            # signal) is the signal's own, weighted by it.
+            belongs = odds / (1 + odds)
+            slope += count[event] * belongs * push
+            information += count[event] * (belongs * push) ** 2
+            photons += count[event] * belongs
+        sums[pixel, 0], sums[pixel, 1], sums[pixel, 2] = slope, information, photons
+
+
+@compiled
+def fit_planes(surface, sums, reach, gate, slopes, rows, fitted):
+    """Move each pixel's surface to the most likely plane through the neighbours on the same one.
+
+    Around the present surface the log-likelihood of every pixel is a parabola, so that a plane's
+    is a weighted least-squares fit (one step of Fisher scoring). `sums`: as of `measure_events`; a
+    neighbour further than `gate` off the present plane, of `slopes` (rows, columns, 2), lies on
+    another surface; `rows`: first and the one after the last; `fitted` (rows, columns, 3): instant,
+    its standard deviation, and the mean photons of a neighbour.
+    """
+    height, width = surface.shape
+    # of the rows of a disc
+    half_widths = np.sqrt(reach * reach - np.arange(reach + 1.0) ** 2).astype(np.int64)
+    for y in range(rows[0], rows[1]):
+        for x in range(width):
+            slope_x, slope_y = slopes[y, x, 0], slopes[y, x, 1]
+            here = surface[y, x]
+            w = wx = wy = wxx = wxy = wyy = b = bx = by = photons = 0.0
+            pixels = 0
+            for v in range(max(0, y - reach), min(height, y + reach + 1)):
+                dy = v - y
+                wide = half_widths[abs(dy)]
+                row_w = row_wx = row_wxx = row_b = row_bx = 0.0
+                for u in range(max(0, x - wide), min(width, x + wide + 1)):
+                    dx = np.float64(u - x)
+                    later = surface[v, u] - here
+                    # pixels beyond a border belong to another surface
+                    if abs(later - slope_x * dx - slope_y * dy) > gate:
+                        continue
+                    weight = sums[v, u, 1]
+                    moment = weight * later + sums[v, u, 0]
+                    row_w += weight
+                    row_wx += weight * dx
+                    row_wxx += weight * dx * dx
+                    row_b += moment
+                    row_bx += moment * dx
+                    photons += sums[v, u, 2]
+                    pixels += 1
+                w += row_w
+                wx += row_wx
+                wxx += row_wxx
+                b += row_b
+                bx += row_bx
+                wy += dy * row_w
+                wxy += dy * row_wx
+                wyy += dy * dy * row_w
+                by += dy * row_b
+            fitted[y, x, 0], fitted[y, x, 1] = surface[y, x], np.inf
+            fitted[y, x, 2] = photons / max(pixels, 1)
+            if w <= 0:
+                continue
+            move, information = b / w, w
+            # a ridge on the slopes keeps the fit determined where pixels lie in a row
+            wxx += SLOPE_RIDGE_FRACTION * w
+            wyy += SLOPE_RIDGE_FRACTION * w
+            determinant = wxx * wyy - wxy * wxy
+            if pixels >= MIN_PLANE_PIXELS and determinant > 0:
+                xx, yy, xy = wyy / determinant, wxx / determinant, -wxy / determinant
+                # information on the middle that is left when the slopes are unknown too (Schur
+                # complement)
+                left = w - (wx * (xx * wx + xy * wy) + wy * (xy * wx + yy * wy))
+                if left > MIN_DETERMINED_FRACTION * w:
+                    move = (b - (bx * (xx * wx + xy * wy) + by * (xy * wx + yy * wy))) / left
+                    information = left
+                    slopes[y, x, 0] = xx * (bx - wx * move) + xy * (by - wy * move)
+                    slopes[y, x, 1] = xy * (bx - wx * move) + yy * (by - wy * move)
+            fitted[y, x, 0] = surface[y, x] + min(max(move, -gate), gate)
+            fitted[y, x, 1] = 1 / np.sqrt(information)
+
+
+@compiled
+def sum_pair_lags(offsets, bin_time, count, lags):
+    """Add to `lags` the histogram of the time between any two photons of a pixel, in whole bins."""
+    for pixel in range(offsets.size - 1):
+        for one in range(offsets[pixel], offsets[pixel + 1]):
+            # pairs within one event have lag 0
+            lags[0] += count[one] * (count[one] - 1) / 2
+            for other in range(one + 1, offsets[pixel + 1]):
+                lag = int(abs(bin_time[one] - bin_time[other]) + 0.5)
+                if lag < lags.size:
+                    lags[lag] += count[one] * count[other]
+
+
+@compiled
+def sum_evidence(offsets, bin_time, count, surface, density, start, step, signal, evidence):
+    """Log-likelihood ratio of the photons of each pixel: its surface against light at any instant.
+
+    `density` (n,): of the response over that of light spread over the whole axis, sampled from
+    `start` by `step`; `signal` (pixels,): share of the pixel's photons that are signal.
+    """
+    for pixel in range(surface.size):
+        total = 0.0
+        for event in range(offsets[pixel], offsets[pixel + 1]):
+            position = (bin_time[event] - surface[pixel] - start) / step
+            ratio = 0.0
+            if 0 <= position < density.size - 1:
+                left = int(position)
+                part = position - left
+                ratio = density[left] * (1 - part) + density[left + 1] * part
+            total += count[event] * np.log(1 + signal[pixel] * (ratio - 1))
+        evidence[pixel] = total

@@ -1,7 +1,5 @@
-"""How well a return can be located at all: the Cramer-Rao bound of counted photons.
-
-Trials against the photon limit: simulated histograms through the detector, beside the Cramer-Rao
-bound.
+"""How well a return can be located at all: the Cramer-Rao bound of counted photons, and trials of
+simulated histograms through the detector beside it.
 """
 
 from __future__ import annotations
@@ -12,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofclip.errors import InputError
-from tofclip.lidar.photons.detector import FloatArray, PhotonDetector
+from tofclip.lidar.photons.detector import PhotonDetector
 from tofclip.lidar.pulse import Pulse
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN_PHASES = 16  # positions of the arrival within a bin that the bound is averaged over
-MAX_PHOTONS = 1e15
-"""Sums of counts up to here are exact in double precision, and generators of chance take them."""
+MAX_PHOTONS = 1e15  # sums of counts up to here are exact, and generators of chance take them
+BINS_PER_BATCH = 1 << 22  # of histograms that are held at a time: 32 MiB
 
 
 def compute_range_bound(pulse: Pulse, bin_width: float, photons: float, background: float) -> float:
@@ -72,10 +70,6 @@ def compute_range_bound(pulse: Pulse, bin_width: float, photons: float, backgrou
     # complement of the 2 x 2 information matrix).
     variance = 1 / (delay - mixed**2 / amount)
     return float(SPEED_OF_LIGHT / 2 * np.sqrt(variance.mean()))
-
-
-BINS_PER_BATCH = 1 << 22
-"""Histogram bins that are held at a time: 32 MiB."""
 
 
 @dataclass(frozen=True)
@@ -152,12 +146,11 @@ def measure_accuracy(
         count = min(batch, trials - begin)
         fractions = present.uniform(detector.bins / 4, 3 * detector.bins / 4, count)
         arrival = fractions * detector.bin_width
-        found = detector.locate(
-            draw_histograms(detector, arrival, photons, background, present), _draw_seed(chance)
-        )
-        false = detector.locate(
-            absent.poisson(background, (count, detector.bins)), _draw_seed(chance)
-        )
+        share = detector.shape(detector.times - arrival[:, np.newaxis]) / detector.shape.area
+        expected = photons * detector.bin_width * share + background
+        found = detector.locate(present.poisson(expected), int(chance.integers(1 << 62)))
+        dark = absent.poisson(background, (count, detector.bins))
+        false = detector.locate(dark, int(chance.integers(1 << 62)))
         detected = found.detected[:, 0]
         error = (found.range[:, 0] - SPEED_OF_LIGHT * arrival / 2)[detected]
         squared_error += float(np.sum(error**2))
@@ -166,25 +159,3 @@ def measure_accuracy(
         progress(count)
     rms = float(np.sqrt(squared_error / detections)) if detections else float("nan")
     return Accuracy(rms, bound, rms / bound, detections / trials, false_alarms / trials)
-
-
-def draw_histograms(
-    detector: PhotonDetector,
-    arrival: FloatArray,
-    photons: float,
-    background: float,
-    noise: np.random.Generator,
-) -> FloatArray:
-    """Draw histograms with one return each, (n, bins).
-
-    `arrival` (n,): instants of the returns, s; the middle of the first bin is 0; `photons,
-    background`: expected photons of a return, and of the background in each bin. Returns (n, bins):
-    photons.
-    """
-    shape = detector.shape
-    share = shape(detector.times - arrival[:, np.newaxis]) * detector.bin_width / shape.area
-    return noise.poisson(photons * share + background).astype(np.float64)
-
-
-def _draw_seed(chance: np.random.Generator) -> int:
-    return int(chance.integers(1 << 62))

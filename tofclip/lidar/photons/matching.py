@@ -1,6 +1,10 @@
-"""The instant of each pixel's surface on a coarse time axis: the most likely piecewise smooth one, by
-semi-global matching (H. Hirschmueller, IEEE Trans. Pattern Anal. 30, 328, 2008), with log-matched
-filter responses as scores.
+"""The surface that photons of a picture show, in two steps.
+
+1. On a coarse time axis: the most likely piecewise smooth one, by semi-global matching over eight
+   directions (H. Hirschmueller, IEEE Trans. Pattern Anal. 30, 328, 2008), with log-matched filter
+   responses as scores.
+2. Below a bin: planes through the neighbours on the same surface, fitted to the likelihood of their
+   photons by Fisher scoring, and what planes miss where it bends.
 """
 
 from __future__ import annotations
@@ -13,29 +17,25 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.lidar.photons.image import FloatArray, PhotonImage
-from tofclip.lidar.photons.response import Scene
+from tofclip.lidar.photons.scene import MIN_SIGNAL_PHOTONS, Scene
 from tofclip.threads import run_blocks
 
-LABELS_PER_WIDTH = 2
-"""Coarse bins in the full width of the response."""
-
+LABELS_PER_WIDTH = 2  # coarse bins in the full width of the response
 MAX_VOLUME_BYTES = 1 << 31
 """Memory of the two volumes (pixels, labels) of float32, and of the tables of tiles before them; a
 longer axis gets coarser labels."""
 
-JUMP_COST_RATIO = 7.0
-"""Any larger change costs this many times as much."""
-
 TILE_PX = 16
+TILE_TABLES = 3  # of (tiles, coarse bins) float64 at once: counts, pooled sums, and a sorted copy
+MIN_TILE_SIGNIFICANCE = 5.0  # above the background, where a tile says that some surface lies there
+PIXELS_PER_BLOCK, ROWS_PER_BLOCK = 1 << 14, 16
 
-TILE_TABLES = 3
-"""Of (tiles, coarse bins) float64 at once: counts, their pooled sums, and a copy that is sorted."""
-
-MIN_TILE_SIGNIFICANCE = 5.0
-"""Standard deviations above the background at which a tile of the picture says that some surface
-lies at an instant."""
-
-PIXELS_PER_BLOCK = 1 << 14
+PLANE_ROUNDS = 5
+TRIAL_ROUNDS = 3  # of a reach that is tried, from the fit of the reach before
+NESTED_BIAS_RATIO = 4 / 3
+"""A curved surface pulls a plane by the square of its reach: what a plane of half the reach differs
+by is three quarters of what both miss."""
+GATE_WIDTHS = 1.0  # of the response: a neighbour whose surface is further off is another's
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,6 @@ class LabelAxis:
         """Return the coarse bin of each event."""
         return ((photons.bin + 0.5) / self.coarse).astype(np.int64)
 
-    @property
-    def places(self) -> NDArray[np.int64]:
-        """Label of each coarse bin, or -1."""
-        places = np.full(self.coarse_bins, -1)
-        places[self.numbers] = np.arange(self.numbers.size)
-        return places
-
     def to_bins(self, label: NDArray[np.int64]) -> FloatArray:
         """Return the instants in the middle of labels, in bins."""
         return np.asarray((self.numbers[label] + 0.5) * self.coarse - 0.5, dtype=np.float64)
@@ -64,102 +57,75 @@ class LabelAxis:
 
 def choose_label_axis(photons: PhotonImage, scene: Scene) -> LabelAxis:
     """Cut the time axis into labels and leave out those at which nothing comes back anywhere."""
-    pixels = photons.offsets.size - 1
+    tiles = math.prod(-(-length // TILE_PX) for length in photons.image_shape)
     coarse = max(1, round(scene.response.width / LABELS_PER_WIDTH))
     while True:
         total = int(np.ceil((photons.bins + 1) / coarse))
-        if TILE_TABLES * 8 * count_tiles(photons.image_shape) * total > MAX_VOLUME_BYTES:
-            coarse *= 2
-            continue
-        axis = LabelAxis(coarse, np.arange(total), total)
-        numbers = np.flatnonzero(find_occupied_bins(photons, scene, axis))
-        if numbers.size == 0:
-            numbers = np.arange(total)
-        if 2 * 4 * pixels * numbers.size <= MAX_VOLUME_BYTES:
-            return LabelAxis(coarse, numbers, total)
-        # two float32 volumes, the scores and their sums, have to fit
+        if TILE_TABLES * 8 * tiles * total <= MAX_VOLUME_BYTES:
+            axis = LabelAxis(coarse, np.arange(total), total)
+            numbers = np.flatnonzero(_find_occupied_bins(photons, scene, axis, tiles))
+            axis = LabelAxis(coarse, numbers, total) if numbers.size else axis
+            # two float32 volumes, the scores and their sums, have to fit
+            if 2 * 4 * (photons.offsets.size - 1) * axis.numbers.size <= MAX_VOLUME_BYTES:
+                return axis
         coarse *= 2
 
 
-def count_tiles(image_shape: tuple[int, int]) -> int:
-    """Number of tiles that cover a picture."""
-    return math.prod(-(-length // TILE_PX) for length in image_shape)
-
-
-def find_occupied_bins(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArray[np.bool_]:
-    """Coarse bins at which some tile of the picture is brighter than the background, and those
-    around.
-
-    `scene`: response and background, photons per pixel and bin; `axis`: the coarse time axis.
-    Returns (coarse_bins,).
-    """
-    columns = photons.image_shape[1]
-    y, x = np.divmod(photons.pixel, columns)
-    across = -(-columns // TILE_PX)
-    tiles = count_tiles(photons.image_shape)
-    tile = (y // TILE_PX) * across + x // TILE_PX
+def _find_occupied_bins(
+    photons: PhotonImage, scene: Scene, axis: LabelAxis, tiles: int
+) -> NDArray[np.bool_]:
+    """Coarse bins, and those around, at which some tile of the picture is above the background."""
+    y, x = np.divmod(photons.pixel, photons.image_shape[1])
+    tile = (y // TILE_PX) * -(-photons.image_shape[1] // TILE_PX) + x // TILE_PX
     number = tile * axis.coarse_bins + axis.number_events(photons)
-    counts = np.bincount(number, photons.count, tiles * axis.coarse_bins)
-    counts = counts.reshape(tiles, axis.coarse_bins)
+    counts = np.bincount(number, photons.count, tiles * axis.coarse_bins).reshape(tiles, -1)
     length = max(1, round(scene.response.width / axis.coarse))
     pooled = scipy.ndimage.uniform_filter1d(counts, length, axis=1, mode="constant") * length
     # A tile may be brighter or darker than the others throughout.
     level = np.minimum(np.quantile(counts, 0.5, axis=1), counts.mean(axis=1))
-    expected = length * np.maximum(
-        level, scene.background * TILE_PX**2 * axis.coarse * (level == 0)
-    )
+    dark = scene.background * TILE_PX**2 * axis.coarse
+    expected = length * np.where(level > 0, level, dark)
     limit = expected + MIN_TILE_SIGNIFICANCE * np.sqrt(expected) + 2
     occupied = np.any(pooled > limit[:, np.newaxis], axis=0)
     return np.asarray(scipy.ndimage.binary_dilation(occupied, iterations=2 * LABELS_PER_WIDTH))
 
 
 def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArray[np.float32]:
-    """Log-likelihood ratio of a surface at each label against none, (pixels, labels).
-
-    Returns (pixels, labels).
-    """
-    from tofclip.lidar.photons import surface_kernels as kernels
+    """Log-likelihood ratio of a surface at each label against none, (pixels, labels)."""
+    from tofclip.lidar.photons import kernels
 
     shares, first = scene.response.coarse_shares(axis.coarse)
     odds = scene.count_signal(photons) * shares / (scene.background * axis.coarse)
     weights = np.log1p(odds).astype(np.float32)
     score = np.empty((photons.offsets.size - 1, axis.numbers.size), np.float32)
-    number, places = axis.number_events(photons), axis.places
+    number, label = axis.number_events(photons), np.full(axis.coarse_bins, -1)
+    label[axis.numbers] = np.arange(axis.numbers.size)
 
     def work(piece: slice) -> None:
-        kernels.score_labels(
-            photons.offsets[piece.start : piece.stop + 1],
-            number,
-            photons.count,
-            places,
-            weights,
-            first,
-            score[piece],
-        )
+        offsets = photons.offsets[piece.start : piece.stop + 1]
+        kernels.score_labels(offsets, number, photons.count, label, weights, first, score[piece])
 
     run_blocks(work, score.shape[0], PIXELS_PER_BLOCK)
     return score
 
 
 def match_labels(
-    score: NDArray[np.float32], image_shape: tuple[int, int], slope_cost: float
+    score: NDArray[np.float32], image_shape: tuple[int, int], slope_cost: float, jump_cost: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Find the labels of the most likely piecewise smooth surface.
+    """Find the labels of the most likely piecewise smooth surface, (rows, columns), and by how much
+    each beats the next best that is not beside it.
 
-    `score` (pixels, labels); `slope_cost`: for a change by one label; others cost `JUMP_COST_RATIO`
-    times as much. Returns (rows, columns): labels, and by how much each beats the next best that is
-    not beside it.
+    The costs are of a change by one label, and by more.
     """
-    from tofclip.lidar.photons import surface_kernels as kernels
+    from tofclip.lidar.photons import kernels
 
     cube = score.reshape(*image_shape, -1)
     total = np.zeros_like(cube)
-    costs = np.float32(slope_cost), np.float32(slope_cost * JUMP_COST_RATIO)
+    costs = np.float32(slope_cost), np.float32(jump_cost)
     kernels.add_path_scores(cube, *costs, total)
     kernels.add_path_scores(cube[::-1, ::-1], *costs, total[::-1, ::-1])
     label, margin = np.empty(score.shape[0], np.int64), np.empty(score.shape[0], np.float32)
-    summed = total.reshape(score.shape)
-    apart = 2 * LABELS_PER_WIDTH
+    summed, apart = total.reshape(score.shape), 2 * LABELS_PER_WIDTH
 
     def work(piece: slice) -> None:
         kernels.find_best_labels(
@@ -168,3 +134,61 @@ def match_labels(
 
     run_blocks(work, score.shape[0], PIXELS_PER_BLOCK)
     return label.reshape(image_shape), margin.reshape(image_shape)
+
+
+def fit_surface(
+    photons: PhotonImage,
+    scene: Scene,
+    surface: FloatArray,
+    reach: int,
+    rounds: int = PLANE_ROUNDS,
+) -> FloatArray:
+    """Move a surface, (rows, columns) in bins, to the likelihood's maximum, plane by plane.
+
+    Pixels up to `reach` away share a plane. Returns (rows, columns, 3): instant, deviation and mean
+    photons, as of `kernels.fit_planes`.
+    """
+    from tofclip.lidar.photons import kernels
+
+    response, now = scene.response, np.array(surface, dtype=np.float64)
+    table = np.stack([response.log_slope, response.density / scene.background], axis=1)
+    brightness = np.full(now.size, scene.count_signal(photons))
+    slopes, gate = np.zeros((*now.shape, 2)), GATE_WIDTHS * response.width
+    sums, fitted = np.empty((now.size, 3)), np.empty((*now.shape, 3))
+
+    def measure(piece: slice) -> None:
+        offsets, flat = photons.offsets[piece.start : piece.stop + 1], now.reshape(-1)[piece]
+        sampled = table, response.start, response.step, brightness[piece]
+        kernels.measure_events(offsets, photons.bin, photons.count, flat, *sampled, sums[piece])
+
+    def fit(piece: slice) -> None:
+        around = sums.reshape(fitted.shape)
+        kernels.fit_planes(now, around, reach, gate, slopes, (piece.start, piece.stop), fitted)
+
+    for _ in range(rounds):
+        run_blocks(measure, now.size, PIXELS_PER_BLOCK)
+        run_blocks(fit, now.shape[0], ROWS_PER_BLOCK)
+        now = fitted[..., 0].copy()
+        brightness = np.maximum(fitted[..., 2].ravel(), MIN_SIGNAL_PHOTONS)
+    return fitted
+
+
+def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int, width: float) -> FloatArray:
+    """Mean square, in bins, of what planes miss where a surface bends, (rows, columns).
+
+    Two estimates, here with a reach and with half of it, of which one uses a part of the other's
+    photons differ by the difference of their variances if neither is biased; what they differ by
+    beyond that is bias. Where a fit is less sure than the response's width nothing is known.
+    """
+    apart = (fitted[..., 0] - nested[..., 0]) ** 2
+    wide, narrow = fitted[..., 1] ** 2, nested[..., 1] ** 2
+    # A border that moved is not a bend.
+    known = (np.maximum(wide, narrow) < width**2) & (apart < 25 * narrow)
+    excess = np.zeros(apart.shape)
+    excess[known] = (apart - narrow)[known] + wide[known]
+    number, total = (
+        scipy.ndimage.uniform_filter(one, 2 * reach + 1, mode="nearest")
+        for one in (known.astype(float), excess)
+    )
+    bias: FloatArray = NESTED_BIAS_RATIO**2 * np.maximum(total / np.maximum(number, 1e-9), 0)
+    return bias

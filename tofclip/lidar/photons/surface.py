@@ -1,286 +1,59 @@
-"""The picture of ranges that counted photons give, and the returns that it lists.
+"""The surface that a picture of few photons shows: neighbours lend each other theirs.
 
-Several returns of a pixel: what a surface explains is taken out, and the next one is looked for in
-the rest.
-
-The surface that a picture of few photons shows: neighbours lend each other theirs.
-
-1. Semi-global matching over eight directions finds the instant of each pixel's surface on a coarse
-   time axis: the most likely piecewise smooth one (Hirschmueller, IEEE Trans. Pattern Anal. 30,
-   328, 2008), with log-matched filter responses as scores (`matching`).
-2. Planes through the neighbours on the same surface, fitted to the likelihood of their photons
-   (Fisher scoring), give the instant below a bin and its deviation (`planes`).
-3. Further returns are looked for in what the first surface leaves (`layers`).
+1. The instant of each pixel's surface is matched on a coarse time axis, and planes through the
+   neighbours on the same one give it below a bin, with its deviation (`matching`).
+2. Further returns are looked for in what the first surface leaves.
 
 How much neighbours have to agree, how far they reach, the response and the probability of an
 outlier come from the data: a part of the photons is held back, and what explains it best counts
-(`held_out`).
+(`held_out`). `locate_with_smoothness` is the same search with a detector's pulse and given costs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from tofclip.camera import Camera
-from tofclip.errors import CalibrationError
+from tofclip.errors import InputError, ShapeError
+from tofclip.lidar.photons.detector import Arrivals, PhotonDetector
 from tofclip.lidar.photons.held_out import (
     calibrate_outliers,
     choose_reach,
-    judge_surface,
     learn_scene,
+    weigh_evidence,
 )
-from tofclip.lidar.photons.image import FloatArray, PhotonImage, find_hot_pixels, leave_out_pixels
+from tofclip.lidar.photons.image import FloatArray, PhotonImage, SurfaceImage
 from tofclip.lidar.photons.matching import (
-    JUMP_COST_RATIO,
     LabelAxis,
     choose_label_axis,
     compute_scores,
+    estimate_bias,
+    fit_surface,
     match_labels,
 )
-from tofclip.lidar.photons.planes import estimate_bias, fit_surface
-from tofclip.lidar.photons.response import (
-    BinnedResponse,
-    Scene,
-    estimate_background,
-    find_time_step,
-    measure_pulse_width,
-    require_plausible_pulse,
-)
+from tofclip.lidar.photons.scene import Scene, prepare_photons, require_plausible_pulse
 from tofclip.lidar.pulse import Pulse
-from tofclip.lidar.range_calibration import correct_ranges
-from tofclip.shots import Returns
 from tofclip.units import SPEED_OF_LIGHT
 
-
-@dataclass(frozen=True)
-class SurfaceImage:
-    """A range for every pixel.
-
-    Parameters
-    ----------
-    range : (rows, columns) float64 array
-        Distance for a co-located source, m; the middle of the first bin is range 0. NaN where there
-        is none.
-    range_sigma : (rows, columns) float64 array
-        One standard deviation of the range, m.
-    intensity : (rows, columns) float64 array
-        Expected photons of the return.
-    outlier_probability : (rows, columns) float64 array
-        That the return is not of this pixel's surface.
-    pulse : Pulse
-        The response that was used, as bins show it.
-    settings : mapping
-        What was chosen from the data, by name.
-    further : tuple of SurfaceImage
-        Weaker returns of the same pixels, the strongest first; NaN where there is none.
-    hot_pixels : (rows, columns) bool array, optional
-        Pixels whose photons were left out; see `tofclip.lidar.photons.image`.
-    """
-
-    range: FloatArray
-    range_sigma: FloatArray
-    intensity: FloatArray
-    outlier_probability: FloatArray
-    pulse: Pulse
-    settings: dict[str, float | str]
-    further: tuple[SurfaceImage, ...] = ()
-    hot_pixels: NDArray[np.bool_] | None = None
-
-    def calibrate(self, camera: Camera, first_time: float = 0.0) -> SurfaceImage:
-        """Return the ranges from the camera's time zero, with its range calibration applied.
-
-        Parameters
-        ----------
-        camera : Camera
-        first_time : float
-            Reading of the time axis at the middle of the first bin, s.
-
-        Returns
-        -------
-        SurfaceImage
-
-        Raises
-        ------
-        CalibrationError
-            The camera has another number of pixels.
-        """
-        if camera.image_shape != self.range.shape:
-            raise CalibrationError(
-                f"the camera has {camera.image_shape} pixels, the photons {self.range.shape}"
-            )
-        further = tuple(one.calibrate(camera, first_time) for one in self.further)
-        # Light travels the range twice, hence half the speed.
-        distance = self.range - SPEED_OF_LIGHT / 2 * (camera.time_zero - first_time)
-        sigma = self.range_sigma
-        if camera.range_calibration is not None:
-            y, x = np.indices(self.range.shape)
-            distance, _, sigma = correct_ranges(
-                camera.range_calibration, distance, self.intensity, sigma, (y, x)
-            )
-        return replace(self, range=distance, range_sigma=sigma, further=further)
-
-    def to_returns(self, camera: Camera, provenance: Mapping[str, Any] | None = None) -> Returns:
-        """List the pixels with a range.
-
-        Parameters
-        ----------
-        camera : Camera
-            Says where the pixels look, see `make_pinhole`.
-        provenance : mapping, optional
-            How they came about.
-
-        Returns
-        -------
-        tofclip.lidar.Returns
-        """
-        columns = self.range.shape[1]
-        layers = [self, *self.further]
-        distance = np.stack([layer.range for layer in layers], axis=2).reshape(-1, len(layers))
-        order = np.argsort(distance, axis=1)
-        pixel, nearness = np.nonzero(np.isfinite(np.take_along_axis(distance, order, axis=1)))
-        layer = order[pixel, nearness]
-        sigma, signal, doubt = (
-            np.stack([getattr(one, name) for one in layers], axis=2).reshape(distance.shape)
-            for name in ("range_sigma", "intensity", "outlier_probability")
-        )
-        found = distance[pixel, layer]
-        y, x = np.divmod(pixel, columns)
-        return Returns(
-            y=y.astype(np.int32),
-            x=x.astype(np.int32),
-            range=found,
-            intensity=(signal[pixel, layer] * found**2).astype(np.float32),
-            confidence=sigma[pixel, layer].astype(np.float32),
-            return_number=(nearness + 1).astype(np.uint8),
-            time=2 * found / SPEED_OF_LIGHT,
-            camera=camera,
-            provenance={} if provenance is None else provenance,
-            false_alarm=doubt[pixel, layer],
-        )
-
-
-def make_pinhole(image_shape: tuple[int, int], focal_length_px: float, pulse_fwhm: float) -> Camera:
-    """Return a camera that only says where its pixels look.
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns.
-    focal_length_px : float
-        Distance of the pinhole from the picture, in pixels; the optical axis meets pixel
-        ``(rows // 2, columns // 2)``.
-    pulse_fwhm : float
-        Full width at half maximum of a return, s.
-
-    Returns
-    -------
-    Camera
-        Of one view.
-    """
-    columns = image_shape[1]
-    return Camera(
-        np.array([min(columns / 2, columns - 1)]),
-        np.zeros(1),
-        image_shape,
-        columns,
-        pulse_fwhm=pulse_fwhm,
-        focal_length_px=focal_length_px,
-    )
-
-
-MIN_EXPLAINED_DENSITY = 0.003
-"""Of the response's peak: photons where it is brighter belong to the surface."""
-
-MAX_OWN_CHANCE, MAX_POOLED_CHANCE = 0.02, 1e-4
-"""That the background alone shows as many photons at a further surface, in the pixel and in the
-nine pixels around it."""
-
-
-def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> PhotonImage:
-    """Leave out the photons that a surface explains better than the background does.
-
-    `layer` (rows, columns, 4): see `SurfacePlan.locate`.
-    """
-    response = scene.response
-    times = response.start + response.step * np.arange(response.density.size)
-    bright = response.density >= MIN_EXPLAINED_DENSITY * response.density.max()
-    first, last = times[bright][0], times[bright][-1]
-    late = photons.bin - layer[..., 0].ravel()[photons.pixel]
-    outside = ~((late >= first) & (late <= last))
-    return photons.select(photons.count * outside)
-
-
-def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> FloatArray:
-    """Drop a further surface where the background alone would explain its photons.
-
-    `photons`: those that no nearer surface explains; `layer` (rows, columns, 4): see
-    `SurfacePlan.locate`. Returns (rows, columns, 4): naN where the surface does not stand out of
-    the background.
-    """
-    reach = 0.5 * scene.response.width + 1
-    late = photons.bin - layer[..., 0].ravel()[photons.pixel]
-    seen = np.bincount(
-        photons.pixel, photons.count * (np.abs(late) <= reach), layer[..., 0].size
-    ).reshape(layer.shape[:2])
-    expected = scene.background * (2 * reach + 1)
-    pooled = scipy.ndimage.uniform_filter(seen, 3, mode="nearest") * 9
-    own = _find_chance(seen, expected) < MAX_OWN_CHANCE
-    around = _find_chance(np.rint(pooled), 9 * expected) < MAX_POOLED_CHANCE
-    return np.where((own & around)[..., np.newaxis], layer, np.nan)
-
-
-def _find_chance(seen: NDArray[Any], expected: NDArray[Any] | float) -> FloatArray:
-    """Chance of that many photons or more where a Poisson law with that mean holds."""
-    found = scipy.special.gammainc(np.maximum(seen, 1), expected)  # scipy.stats loads for a second
-    return np.where(seen > 0, found, 1.0)
-
-
-def combine_layers(
-    layers: list[FloatArray],
-    max_returns: int,
-    scene: Scene,
-    to_range: float,
-    settings: dict[str, float | str],
-) -> SurfaceImage:
-    """Turn the returns found one after the other into images, each pixel's strongest first.
-
-    `layers`: see `SurfacePlan.locate`; `max_returns`: of these the strongest in each pixel are
-    returned; `to_range`: metres in a bin. Returns the strongest layer of each pixel, the others in
-    ``further``.
-    """
-    stack = np.stack(layers, axis=2)
-    order = np.argsort(-np.nan_to_num(stack[..., 2], nan=-1.0), axis=2, kind="stable")
-    stack = np.take_along_axis(stack, order[..., np.newaxis], axis=2)
-    images = [
-        SurfaceImage(
-            range=stack[:, :, k, 0] * to_range,
-            range_sigma=stack[:, :, k, 1] * to_range,
-            intensity=stack[:, :, k, 2],
-            outlier_probability=stack[:, :, k, 3],
-            pulse=scene.response.pulse,
-            settings=settings,
-        )
-        for k in range(min(max_returns, len(layers)))
-    ]
-    return replace(images[0], further=tuple(images[1:]))
-
-
 HELD_OUT_FRACTION = 0.25
-
-SLOPE_COSTS = (1.5, 4.0, 10.0)
-"""Log-likelihood that a change of the surface by one label has to bring."""
+SLOPE_COSTS = (1.5, 4.0, 10.0)  # log-likelihood that a change by one label has to bring
+JUMP_COST_RATIO = 7.0  # any larger change costs this many times as much
 
 LEARNT_RESPONSE_SIGMA_WIDTHS = 1 / 8
 """Standard deviation of where the surface lies in a response that was learnt from the scene.
 
 Its shape varies from surface to surface with tilt, material and brightness; a response that is
 given is taken as exact."""
+
+MIN_EXPLAINED_DENSITY = 0.003  # of the response's peak: where it is brighter photons are explained
+# That the background alone shows as many photons at a further surface, in the pixel and in the nine
+# pixels around it.
+MAX_OWN_CHANCE, MAX_POOLED_CHANCE = 0.02, 1e-4
 
 
 def estimate_surface(
@@ -324,13 +97,8 @@ def estimate_surface(
     Memory: at most 2 GiB beside the photons.
     """
     report = (lambda _: None) if progress is None else progress
-    hot = find_hot_pixels(photons)
-    photons = leave_out_pixels(photons, hot)
-    photons = photons.join_bins(find_time_step(photons))
-    width = measure_pulse_width(photons) if pulse is None else 0.0
-    start = Pulse.gaussian(width) if pulse is None else pulse
-    require_plausible_pulse(photons, start)
-    scene = Scene(BinnedResponse.from_pulse(start, photons.bin_width), estimate_background(photons))
+    photons, start, hot = prepare_photons(photons, pulse)
+    scene = Scene.start(photons, start)
     axis = choose_label_axis(photons, scene)
     train, test = photons.split(HELD_OUT_FRACTION, seed)
     training = scene.scale(1 - HELD_OUT_FRACTION)
@@ -339,11 +107,13 @@ def estimate_surface(
     volume = compute_scores(train, training, axis)
     trials = []
     for cost in SLOPE_COSTS:
-        labels, _ = match_labels(volume, train.image_shape, cost)
-        trials.append((judge_surface(test, train, training, axis.to_bins(labels)), cost, labels))
+        labels, margin = match_labels(volume, train.image_shape, cost, cost * JUMP_COST_RATIO)
+        surface = axis.to_bins(labels)
+        evidence = float(weigh_evidence(test, train, training, surface).mean())
+        trials.append((evidence, cost, surface, margin))
         report(0.1 + 0.1 * len(trials))
-    _, slope_cost, labels = max(trials, key=lambda trial: trial[0])
-    surface = axis.to_bins(labels)
+    _, slope_cost, surface, margin = max(trials, key=lambda trial: trial[0])
+    costs = slope_cost, slope_cost * JUMP_COST_RATIO
 
     learnt = None
     if learn or pulse is None:
@@ -354,27 +124,16 @@ def estimate_surface(
         training = scene.scale(1 - HELD_OUT_FRACTION)
         del volume  # before there is another one
         volume = compute_scores(train, training, axis)
-    labels, margin = match_labels(volume, train.image_shape, slope_cost)
+        labels, margin = match_labels(volume, train.image_shape, *costs)
+        surface = axis.to_bins(labels)
     del volume
-    surface = axis.to_bins(labels)
     report(0.6)
     reach, surface = choose_reach(train, test, training, surface)
     to_probability = calibrate_outliers(test, train, training, surface, margin)
     report(0.8)
 
     systematic = LEARNT_RESPONSE_SIGMA_WIDTHS * scene.response.width if learnt is not None else 0.0
-    plan = SurfacePlan(axis, slope_cost, reach, systematic, to_probability)
-    to_range = SPEED_OF_LIGHT / 2 * photons.bin_width
-    settings: dict[str, float | str] = {
-        "response": "given" if learnt is None else "learnt",
-        "pulse_fwhm_ps": scene.response.pulse.fwhm * 1e12,
-        "background_photons_per_bin": scene.background,
-        "slope_cost": slope_cost,
-        "jump_cost": slope_cost * JUMP_COST_RATIO,
-        "reach_px": reach,
-        "response_sigma_m": systematic * to_range,
-        "hot_pixels": int(hot.sum()),
-    }
+    plan = SurfacePlan(axis, costs, reach, systematic, to_probability)
     layers = [plan.locate(photons, scene)]
     rest = photons
     # A surface goes on where another one stops: behind an edge the second of a pixel may be found
@@ -387,8 +146,22 @@ def estimate_surface(
         if np.isnan(further).all():
             break
         layers.append(further)
-    found = combine_layers(layers, max_returns, scene, to_range, settings)
-    return replace(found, hot_pixels=hot)
+    stack = np.stack(layers)
+    strongest = np.argsort(-np.nan_to_num(stack[..., 2], nan=-1.0), axis=0, kind="stable")
+    stack = np.take_along_axis(stack, strongest[..., np.newaxis], axis=0)[:max_returns]
+    bin_m = SPEED_OF_LIGHT / 2 * photons.bin_width
+    settings: dict[str, float | str] = {
+        "response": "given" if learnt is None else "learnt",
+        "pulse_fwhm_ps": scene.response.pulse.fwhm * 1e12,
+        "background_photons_per_bin": scene.background,
+        "slope_cost": slope_cost,
+        "jump_cost": costs[1],
+        "reach_px": reach,
+        "response_sigma_m": systematic * bin_m,
+        "hot_pixels": int(hot.sum()),
+    }
+    stack = stack * [bin_m, bin_m, 1, 1]
+    return SurfaceImage.from_layers(stack, scene.response.pulse, settings, hot)
 
 
 @dataclass(frozen=True)
@@ -396,28 +169,126 @@ class SurfacePlan:
     """How the surface of a picture's photons is located, all choices made."""
 
     axis: LabelAxis
-    slope_cost: float  # see `match_labels`
+    costs: tuple[float, float]  # of a slope and of a jump, see `match_labels`
     reach: int  # see `fit_surface`
     systematic: float  # standard deviation that no photons reduce, in bins
     to_probability: Callable[[NDArray[np.float32]], FloatArray]  # see `calibrate_outliers`
 
     def locate(self, photons: PhotonImage, scene: Scene) -> FloatArray:
-        """Find the strongest surface: (rows, columns, 4) array of instant and deviation in bins,
-        photons, and probability of an outlier.
-
-        `scene`: response and background. Returns (rows, columns, 4).
+        """Find the strongest surface, (rows, columns, 4): instant and deviation in bins, photons, and
+        probability of an outlier.
         """
         volume = compute_scores(photons, scene, self.axis)
-        labels, margin = match_labels(volume, photons.image_shape, self.slope_cost)
+        labels, margin = match_labels(volume, photons.image_shape, *self.costs)
         del volume
         nested = fit_surface(photons, scene, self.axis.to_bins(labels), max(self.reach // 2, 1))
         fitted = fit_surface(photons, scene, nested[..., 0], self.reach)
         # Where no photon is near, the label is all there is.
         counted = np.minimum(fitted[..., 1], scene.response.width)
-        variance = (
-            counted**2
-            + estimate_bias(fitted, nested, self.reach, scene.response.width)
-            + self.systematic**2
-        )
-        doubt = self.to_probability(margin)
-        return np.stack([fitted[..., 0], np.sqrt(variance), fitted[..., 2], doubt], axis=-1)
+        bias = estimate_bias(fitted, nested, self.reach, scene.response.width)
+        sigma = np.sqrt(counted**2 + bias + self.systematic**2)
+        return np.stack([fitted[..., 0], sigma, fitted[..., 2], self.to_probability(margin)], -1)
+
+
+def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> PhotonImage:
+    """Leave out the photons that a surface, as of `SurfacePlan.locate`, explains better than the
+    background does.
+    """
+    response = scene.response
+    times = response.start + response.step * np.arange(response.density.size)
+    bright = times[response.density >= MIN_EXPLAINED_DENSITY * response.density.max()]
+    late = photons.bin - layer[..., 0].ravel()[photons.pixel]
+    return photons.select(photons.count * ~((late >= bright[0]) & (late <= bright[-1])))
+
+
+def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> FloatArray:
+    """Return a further surface, NaN where the background alone would explain its photons.
+
+    `photons`: those that no nearer surface explains; `layer`: as of `SurfacePlan.locate`.
+    """
+    reach = 0.5 * scene.response.width + 1
+    late = photons.bin - layer[..., 0].ravel()[photons.pixel]
+    near = photons.count * (np.abs(late) <= reach)
+    seen = np.bincount(photons.pixel, near, layer[..., 0].size).reshape(layer.shape[:2])
+    expected = scene.background * (2 * reach + 1)
+    pooled = scipy.ndimage.uniform_filter(seen, 3, mode="nearest") * 9
+    own = _find_chance(seen, expected) < MAX_OWN_CHANCE
+    around = _find_chance(np.rint(pooled), 9 * expected) < MAX_POOLED_CHANCE
+    return np.where((own & around)[..., np.newaxis], layer, np.nan)
+
+
+def _find_chance(seen: NDArray[Any], expected: float) -> FloatArray:
+    """Chance of that many photons or more where a Poisson law with that mean holds."""
+    found = scipy.special.gammainc(np.maximum(seen, 1), expected)  # scipy.stats loads for a second
+    return np.where(seen > 0, found, 1.0)
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """How much neighbouring pixels have to agree.
+
+    Parameters
+    ----------
+    slope_cost : float
+        Log-likelihood that a change by one bin from pixel to pixel has to bring.
+    jump_cost : float
+        Log-likelihood that any larger change has to bring: borders of objects stay sharp.
+    reach_px : int
+        Photons of neighbours up to so far away are pooled, if they lie on the same surface.
+
+    Raises
+    ------
+    InputError
+        Costs that are negative or a jump that is cheaper than a slope; a negative reach.
+    """
+
+    slope_cost: float = 1.0
+    jump_cost: float = 6.0
+    reach_px: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.slope_cost <= self.jump_cost < np.inf or self.reach_px < 0:
+            raise InputError(
+                "slope and jump cost must not be negative, the jump not cheaper, the reach not negative"
+            )
+
+
+def locate_with_smoothness(
+    detector: PhotonDetector, counts: ArrayLike, smoothness: Smoothness | None = None
+) -> Arrivals:
+    """Find one return for every pixel of a picture, with the help of its neighbours.
+
+    The search of `estimate_surface`, with the detector's pulse, over all bins and at given costs: the
+    most likely piecewise smooth surface, then planes through neighbours on the same one. The
+    background is taken as even. Every pixel gets a return: `confidence`, the Cramer-Rao bound of the
+    pooled photons, says what it is worth. Neighbours share photons, so their errors are alike.
+
+    Parameters
+    ----------
+    detector : PhotonDetector
+    counts : (rows, columns, bins) array
+        Photons counted.
+    smoothness : Smoothness, optional
+
+    Returns
+    -------
+    Arrivals
+        Arrays of (rows * columns, 1), in raster order; photons are those of an average contributor.
+
+    Raises
+    ------
+    ShapeError, InputError
+        No cube, or counts that are negative or not finite, or no photon at all.
+    """
+    chosen = Smoothness() if smoothness is None else smoothness
+    cube = np.asarray(counts, dtype=np.float64)
+    if cube.ndim != 3 or cube.shape[2] != detector.bins:
+        raise ShapeError("counts", f"(rows, columns, {detector.bins})", cube.shape)
+    photons = PhotonImage.from_cube(cube, detector.bin_width)
+    scene = Scene.start(photons, detector.pulse)
+    every = LabelAxis(1, np.arange(detector.bins), detector.bins)
+    volume = compute_scores(photons, scene, every)
+    labels, _ = match_labels(volume, photons.image_shape, chosen.slope_cost, chosen.jump_cost)
+    fitted = fit_surface(photons, scene, every.to_bins(labels), chosen.reach_px).reshape(-1, 1, 3)
+    bin_m = SPEED_OF_LIGHT / 2 * detector.bin_width
+    return Arrivals(bin_m * fitted[..., 0], fitted[..., 2], bin_m * fitted[..., 1])

@@ -1,0 +1,407 @@
+"""What a picture's photons are made of: the response to a return, and the background.
+
+**Response.** Two photons of one surface in one pixel differ in time by what the response spreads
+them: the histogram of such differences is the response's autocorrelation, whatever the scene. It
+gives the width; the shape is what photons show around a surface that other photons found.
+
+**Background.** Light that comes back from nearby, fog, the ramp of a detector that counts first
+photons only: none of them is even over the bins, and a detector that takes it for even raises alarms
+where it is bright. All pixels see it alike, while their returns come at times of their own. So the
+mean over the pixels is the background's shape but for the returns, which are told in two ways:
+
+* **Clumps.** Where some pixels have a return and others have none, photons of one pixel come in
+  clumps: their number varies more than a Poisson law allows. There the background is the lower part
+  of a mixture (`find_lower_mean`).
+* **The pulse's shape.** A wall at the same distance in all pixels makes no clumps. Its bump is as
+  wide as a few pulses at most and stands on a level that goes on to either side (`remove_bumps`). A
+  single hot bin is narrower, a decay has no level before it.
+
+The mean is noisy; `segment_counts` joins neighbouring bins that do not differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from tofclip.errors import InputError
+from tofclip.lidar.photons.image import (
+    FloatArray,
+    PhotonImage,
+    find_hot_pixels,
+    leave_out_pixels,
+)
+from tofclip.lidar.pulse import Pulse
+from tofclip.units import PICOSECOND
+
+MAX_LAG_FRACTION = 0.25  # of the time axis: photons further apart than this are not of one pulse
+MIN_LAG_SIGNIFICANCE = 8.0  # standard deviations of pairs beyond those that meet by chance
+SAMPLES_PER_WIDTH = 24
+SMOOTHING_WIDTHS = 1 / 12
+# Full widths before and after the surface in which the response is learnt (tails are long), and
+# where only background is expected.
+EXTENT_WIDTHS, BACKGROUND_WIDTHS = (-3.0, 9.0), (-8.0, -4.0)
+MIN_PULSE_S = 1e-12  # superconducting counters, the quickest there are, spread a pulse over 3 ps
+# Of the gaps between bins with photons, the one that is taken for the counter's step; and how many
+# such bins with how many photons each say that the bins between them stay empty for a reason.
+STEP_QUANTILE, MIN_STEP_BINS, MIN_PHOTONS_PER_STEP = 0.05, 64, 4.0
+DENSITY_FLOOR = 1e-4  # of the peak: no instant is impossible, so that no single photon decides
+MIN_SIGNAL_PHOTONS = 0.05
+BACKGROUND_QUANTILE, BACKGROUND_GROUPS = 0.2, 64
+MIN_BACKGROUND_PHOTONS = 1.0  # of the whole picture: no background is exactly zero
+
+
+@dataclass(frozen=True)
+class BinnedResponse:
+    """Density of a signal photon's time around its surface, as bins show it."""
+
+    pulse: Pulse  # shape of a return, bins included
+    bin_width: float  # s
+
+    @property
+    def step(self) -> float:
+        """Time between two samples, in bins."""
+        return self.pulse.spacing / self.bin_width
+
+    @property
+    def start(self) -> float:
+        """Time of the first sample after the surface, in bins."""
+        return -self.pulse.origin * self.step
+
+    @property
+    def width(self) -> float:
+        """Full width at half maximum, in bins."""
+        return self.pulse.fwhm / self.bin_width
+
+    @cached_property
+    def density(self) -> FloatArray:
+        """Probability density of a photon's time at each sample, per bin."""
+        samples = np.maximum(self.pulse.samples, DENSITY_FLOOR)
+        density: FloatArray = samples / (samples.sum() * self.step)
+        return density
+
+    @cached_property
+    def log_slope(self) -> FloatArray:
+        """Minus the slope of the density's logarithm at each sample, per bin."""
+        slope: FloatArray = -np.gradient(np.log(self.density), self.step)
+        return slope
+
+    def coarse_shares(self, coarse: int) -> tuple[FloatArray, int]:
+        """Share of the photons in each of the coarse bins, of so many bins, around the one that holds
+        the surface, anywhere in it; and the number of the first relative to the surface's.
+        """
+        times = self.start + self.step * np.arange(self.density.size)
+        inside = np.arange(8) / 8 + 1 / 16 - 0.5  # eight places, in the middles of eighths
+        number = np.floor(times[:, np.newaxis] / coarse + inside + 0.5).astype(np.int64)
+        first = int(number.min())
+        weight = np.repeat(self.density, inside.size)
+        shares = np.bincount((number - first).ravel(), weight).astype(np.float64)
+        shares /= shares.sum()
+        # Shares of a thousandth of the greatest change no decision, but make every sum longer.
+        kept = np.flatnonzero(shares > 1e-3 * shares.max())
+        return shares[kept[0] : kept[-1] + 1], first + int(kept[0])
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a picture's photons are taken to be made of."""
+
+    response: BinnedResponse
+    background: float  # photons of a pixel in a bin
+
+    @classmethod
+    def start(cls, photons: PhotonImage, pulse: Pulse) -> Scene:
+        """Take the pulse, spread over the bins, and as background what most instants have."""
+        groups = min(BACKGROUND_GROUPS, photons.bins)
+        edges = np.linspace(0, photons.bins, groups + 1).astype(np.int64)
+        level = np.add.reduceat(photons.time_profile, edges[:-1]) / np.diff(edges)
+        # a low quantile: bins with a surface in them are brighter than the background
+        quiet = float(np.quantile(level, BACKGROUND_QUANTILE))
+        background = max(quiet, MIN_BACKGROUND_PHOTONS / photons.bins) / (photons.offsets.size - 1)
+        shape = pulse.integrate_bins(photons.bin_width)
+        return cls(BinnedResponse(shape, photons.bin_width), background)
+
+    def scale(self, fraction: float) -> Scene:
+        """Return what remains with a fraction of the photons."""
+        return Scene(self.response, self.background * fraction)
+
+    def count_signal(self, photons: PhotonImage) -> float:
+        """Mean signal photons of a pixel."""
+        mean = photons.photons / (photons.offsets.size - 1)
+        return max(mean - self.background * photons.bins, MIN_SIGNAL_PHOTONS)
+
+
+def prepare_photons(
+    photons: PhotonImage, pulse: Pulse | None, join: bool = True
+) -> tuple[PhotonImage, Pulse, NDArray[np.bool_]]:
+    """Return the photons of all but hot pixels, in bins that the counter tells apart if they are to
+    be joined; the pulse, or the one as wide as pairs of photons say; and the hot pixels.
+    """
+    hot = find_hot_pixels(photons)
+    photons = leave_out_pixels(photons, hot)
+    if join:
+        photons = photons.join_bins(find_time_step(photons))
+    pulse = Pulse.gaussian(measure_pulse_width(photons)) if pulse is None else pulse
+    require_plausible_pulse(photons, pulse)
+    return photons, pulse, hot
+
+
+def find_time_step(photons: PhotonImage) -> int:
+    """Return the bins between the instants that a counter tells apart: photon times in units of
+    1 ps come in steps of its converter, and pairs of equal times are no pulse.
+    """
+    filled = np.flatnonzero(photons.time_profile)
+    if filled.size < MIN_STEP_BINS or photons.photons < MIN_PHOTONS_PER_STEP * filled.size:
+        return 1
+    return int(np.quantile(np.diff(filled), STEP_QUANTILE))
+
+
+def require_plausible_pulse(photons: PhotonImage, pulse: Pulse) -> None:
+    """Refuse a pulse that no counter shows, or that is longer than the record, as of a wrong unit."""
+    if pulse.fwhm < MIN_PULSE_S:
+        fault = "shorter than any counter's"
+    elif pulse.fwhm > photons.bins * photons.bin_width:
+        fault = f"longer than all {photons.bins} bins"
+    else:
+        return
+    raise InputError(
+        f"a pulse of {pulse.fwhm / PICOSECOND:.3g} ps in bins of {photons.bin_width / PICOSECOND:.4g} "
+        f"ps is {fault}; check the unit of `bin_width`"
+    )
+
+
+def measure_pulse_width(photons: PhotonImage) -> float:
+    """Estimate the full width at half maximum of the response, s, from pairs of photons: that of the
+    Gaussian whose autocorrelation falls to half as soon.
+    """
+    from tofclip.lidar.photons.kernels import sum_pair_lags
+
+    number = max(8, int(MAX_LAG_FRACTION * photons.bins))
+    lags = np.zeros(number)
+    sum_pair_lags(photons.offsets, photons.bin, photons.count, lags)
+    lags[0] *= 2  # the others come with both signs
+    # Photons that meet by chance: the further apart, the fewer bins there are for both.
+    open_bins = photons.bins - np.arange(number)
+    chance = np.median((lags / open_bins)[number // 2 :]) * open_bins
+    group = 1
+    while number // group >= 8:
+        pieces = number // group
+        pairs = lags[: pieces * group].reshape(pieces, group).sum(axis=1)
+        expected = chance[: pieces * group].reshape(pieces, group).sum(axis=1)
+        excess = pairs - expected
+        # counts below one make negative pairs: a photon is none with itself
+        if excess[0] > MIN_LAG_SIGNIFICANCE * np.sqrt(max(expected[0] + pairs[0], 0.0) + 1):
+            below = np.flatnonzero(excess < excess[0] / 2)
+            if below.size:
+                last = int(below[0])
+                part = (excess[last - 1] - excess[0] / 2) / (excess[last - 1] - excess[last])
+                half = (last - 1 + part + (0.5 if group > 1 else 0.0)) * group
+                return float(np.sqrt(2) * max(half, 0.5) * photons.bin_width)
+        group *= 2
+    raise InputError(
+        "no pulse stands out from the background in these photons; give its width (`pulse`)"
+    )
+
+
+def learn_response(
+    residual_bins: NDArray[np.float64], count: NDArray[np.float32], width: float, bin_width: float
+) -> tuple[Pulse, float]:
+    """Estimate the response from the times of photons after their surface, which others found.
+
+    Times and rough full width are in bins, the bin width in s. Returns the response, whose arrival is
+    its highest point, and by how many bins later this is than the arrival was before.
+    """
+    step = width / SAMPLES_PER_WIDTH
+    first, last = (round(edge * SAMPLES_PER_WIDTH) for edge in EXTENT_WIDTHS)
+    early = [round(edge * SAMPLES_PER_WIDTH) for edge in BACKGROUND_WIDTHS]
+    number = np.rint(residual_bins / step).astype(np.int64)
+    known = (number >= early[0]) & (number <= last)
+    photons = np.bincount(number[known] - early[0], count[known], last - early[0] + 1)
+    # Before the pulse there is only background; behind it its own tail would count as one.
+    level = float(np.mean(photons[: early[1] - early[0]]))
+    shape = scipy.ndimage.gaussian_filter1d(photons, SMOOTHING_WIDTHS * SAMPLES_PER_WIDTH)[
+        first - early[0] :
+    ]
+    # A density is not negative, whatever noise does to the tail.
+    shape = np.maximum(shape - level, 0.0)
+    if not shape.any():
+        raise InputError("there is no light around the surface to learn the pulse from")
+    peak = int(np.argmax(shape))
+    before, here, after = np.pad(shape, 1, "edge")[peak : peak + 3]
+    # Vertex of the parabola through the highest sample and its neighbours.
+    bend = 2 * here - before - after
+    part = float((after - before) / (2 * bend)) if bend > 0 else 0.0
+    return Pulse(shape, step * bin_width, peak + part), (first + peak + part) * step
+
+
+WINDOW_WIDTHS = 2.0  # length of the windows in which clumps are looked for, in widths of the pulse
+MIN_HISTOGRAMS = 500  # fewer say too little of what they have in common
+CLUMP_SIGNIFICANCE = 5.0
+BLOCK_COST = 6.0  # log-likelihood that a further block has to bring
+MAX_USUAL_COUNT = 500  # photons of a window beyond four times the median: more say no more
+MAX_COUNTED = 4000  # up to which numbers of photons are told apart one by one; more are rounded
+BUMP_WIDTHS = (1.0, 1.6, 2.5)  # of what a surface may make, in widths of the pulse
+BUMP_SIGNIFICANCE = 5.0
+MAX_MISFIT_SHARE = (
+    0.1  # of a bump's energy beside the pulse's shape; a single bin leaves half of it
+)
+MIN_UNEVENNESS = 0.1  # backgrounds that differ by less, or less than their noise, are even
+
+
+def learn_background(histograms: FloatArray, width: float) -> FloatArray | None:
+    """Estimate the background's shape.
+
+    Parameters
+    ----------
+    histograms : (n, bins) array
+        Photons.
+    width : float
+        Full width at half maximum of the pulse, bins.
+
+    Returns
+    -------
+    (bins,) float64 array or None
+        Relative to its mean. None where it is even as far as these histograms say, or where they
+        are too few to say anything.
+    """
+    total = histograms.sum(axis=0)
+    number, bins = histograms.shape
+    if number < MIN_HISTOGRAMS or not total.any():
+        return None
+    length = max(2, round(WINDOW_WIDTHS * width))
+    edges = np.arange(0, bins, length)
+    # A short last window has too few photons of its own: it joins the one before.
+    if bins - edges[-1] < length / 2 and edges.size > 1:
+        edges = edges[:-1]
+    counts = np.add.reduceat(histograms, edges, axis=1)
+    sizes = np.diff(np.append(edges, bins))
+    background = remove_bumps(segment_counts(total), total, width)
+    for window in np.flatnonzero(find_clumps(counts)):
+        # Where pixels come in clumps the mean holds returns; the background's own form within the
+        # window stays, its level is that of the lower part of the mixture.
+        here = slice(edges[window], edges[window] + sizes[window])
+        lower = number * find_lower_mean(counts[:, window])
+        background[here] *= min(1.0, lower / max(background[here].sum(), 1e-9))
+    relative = background / background.mean()
+    noise = 1 / np.sqrt(np.maximum(np.add.reduceat(background, edges), 1.0))
+    unevenness = np.abs(np.add.reduceat(relative, edges) / sizes - 1)
+    # A single bin may be uneven where no window is: the edge of a gate, or a hot bin.
+    sharp = np.abs(relative - 1) > np.maximum(MIN_UNEVENNESS, 5 / np.sqrt(np.maximum(total, 1)))
+    if np.all(unevenness < np.maximum(MIN_UNEVENNESS, 5 * noise)) and not sharp.any():
+        return None
+    return np.asarray(relative)
+
+
+def segment_counts(counts: FloatArray) -> FloatArray:
+    """Return the most likely piecewise constant course of Poisson counts, (bins,), by dynamic
+    programming (J. D. Scargle and others, Astrophys. J. 764, 167, 2013).
+    """
+    summed = np.concatenate([[0.0], np.cumsum(counts)])
+    places = np.arange(counts.size + 1.0)
+    best, last = np.zeros(counts.size + 1), np.zeros(counts.size, np.int64)
+    for end in range(1, counts.size + 1):
+        # N ln(N / T) of every block that ends here, Scargle's Eq. 19: the likelihood of a constant
+        # rate at its best.
+        photons = summed[end] - summed[:end]
+        # 0 ln 0 is 0: a block without photons neither gains nor loses.
+        gain = photons * np.log(np.maximum(photons, 1e-300) / (end - places[:end]))
+        reached = gain + best[:end] - BLOCK_COST
+        last[end - 1] = int(np.argmax(reached))
+        best[end] = reached[last[end - 1]]
+    level, end = np.empty(counts.size), counts.size
+    # Backwards from the end: each block's best start says where the one before ends.
+    while end > 0:
+        start = int(last[end - 1])
+        level[start:end] = (summed[end] - summed[start]) / (end - start)
+        end = start
+    return level
+
+
+def find_clumps(counts: FloatArray) -> NDArray[np.bool_]:
+    """Say in which windows photons of pixels, (n, windows), vary more than a Poisson law allows."""
+    whole = counts.sum(axis=1, keepdims=True)
+    share = counts.sum(axis=0) / max(float(whole.sum()), 1.0)
+    expected = whole * share
+    # of photons thrown over the windows, those of one are binomial
+    variance = (expected * (1 - share)).sum(axis=0)
+    spread = ((counts - expected) ** 2).sum(axis=0) / np.maximum(variance, 1e-9)
+    mean = np.maximum(expected.mean(axis=0), 1e-9)
+    limit = 1 + CLUMP_SIGNIFICANCE * np.sqrt((2 + 1 / mean) / counts.shape[0])
+    return np.asarray(spread > limit)
+
+
+def find_lower_mean(counts: FloatArray) -> float:
+    """Return the mean of the lower part of a mixture: background, and background with a return.
+
+    Numbers of a return's photons are taken as geometrically distributed, so that returns of any
+    strength find room; fraction and mean of either part are those of the largest likelihood.
+    """
+    # What is far beyond the usual is no background, and a list as long as its photons takes hours.
+    limit = 4 * float(np.median(counts)) + MAX_USUAL_COUNT
+    unit = max(1.0, limit / MAX_COUNTED)
+    seen = np.bincount((np.minimum(counts, limit) / unit).astype(np.int64))
+    several = np.arange(seen.size)
+    logs = scipy.special.gammaln(several + 1)
+
+    def misfit(parameters: FloatArray) -> float:
+        share, lower, strength = unpack(parameters)
+        dark = np.exp(several * np.log(lower) - lower - logs)
+        odds = strength / (1 + strength)
+        # the convolution with a geometric law, as a recursion
+        bright = scipy.signal.lfilter([1 / (1 + strength)], [1.0, -odds], dark)
+        return -float(seen @ np.log((1 - share) * dark + share * bright + 1e-300))
+
+    def unpack(parameters: FloatArray) -> tuple[float, float, float]:
+        share = 1 / (1 + np.exp(-np.clip(parameters[0], -20, 20)))
+        lower, strength = np.exp(np.clip(parameters[1:], -20, 20))
+        return float(share), float(lower), float(strength)
+
+    mean = float(seen @ several) / counts.size
+    # what the darkest quarter would have if it were all background
+    quarter = int(np.searchsorted(np.cumsum(seen), counts.size / 4))
+    reached = float(seen[: quarter + 1].sum()) / counts.size
+    lower = float(scipy.special.gammainccinv(quarter + 1, min(reached, 0.999)))
+    start = np.array([-1.0, np.log(max(lower, 1e-6)), np.log(max(mean - lower, 0.3) + 1.0)])
+    found = scipy.optimize.minimize(misfit, start, method="Nelder-Mead").x
+    return unit * min(unpack(found)[1], mean)
+
+
+def remove_bumps(level: FloatArray, counts: FloatArray, width: float) -> FloatArray:
+    """Return the smoothed level with straight lines where a surface at the same distance in all
+    pixels makes a bump, in pulses of `width` bins.
+    """
+    smooth = level.copy()
+    for ratio in BUMP_WIDTHS:
+        wide = ratio * width
+        # At 1.3 widths from its middle a Gaussian is below 1 % of its height: the core holds the
+        # bump, the flanks as much again of the level beside it.
+        core, flank = int(np.ceil(1.3 * wide)), int(np.ceil(2.6 * wide))
+        offsets = np.arange(-core, core + 1)
+        shape = np.exp2(-((2 * offsets / wide) ** 2))
+        if flank < 2 or 2 * flank >= counts.size:
+            continue
+        for middle in range(flank, counts.size - flank):
+            # A bump has its middle at a local maximum.
+            around = smooth[middle - core : middle + core + 1]
+            if smooth[middle] < around.max():
+                continue
+            before = counts[middle - flank : middle - core].mean()
+            after = counts[middle + core + 1 : middle + flank + 1].mean()
+            line = before + (after - before) * (offsets + flank) / (2 * flank)
+            excess = counts[middle - core : middle + core + 1] - line
+            # Least squares for the height of a known shape; its noise is that of the line beneath
+            # it.
+            height = float(shape @ excess) / float(shape @ shape)
+            noise = np.sqrt(max(float(shape**2 @ np.maximum(line, 1.0)), 1.0)) / (shape @ shape)
+            if height < BUMP_SIGNIFICANCE * noise:
+                continue
+            # What the shape leaves, less what the photons' noise alone would: a decay or a lone bin
+            # leaves much, a return little.
+            left = float(np.sum((excess - height * shape) ** 2) - np.sum(line + height * shape))
+            if left < MAX_MISFIT_SHARE * height**2 * float(shape @ shape):
+                smooth[middle - core : middle + core + 1] = line
+    return smooth
