@@ -138,7 +138,7 @@ def open_photons(path: Path) -> PhotonFile:
         raise FileFormatError(
             path, f"is not NPY, NPZ, MAT, HDF5, TIFF, PTU or SDT with photons; {SUITABLE}"
         )
-    with guard(path, "is damaged"):
+    with guard(path, f"is damaged; {SUITABLE}"):
         return reader(path)
 
 
