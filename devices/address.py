@@ -1,12 +1,13 @@
 """Addresses of sources: ``scheme://place?name=value&...``, with every value checked and none
-ignored.
+ignored; and `Options`, by which an instrument declares once what values its address takes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TypeVar
+from dataclasses import dataclass, field, fields
+from math import inf
+from typing import Any, Self, TypeVar
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from tofclip.errors import InputError
@@ -50,15 +51,13 @@ class Uri:
                 raise InputError(f"'{self.text}': '{name}' is unknown; {self.scheme} takes {known}")
 
     def value(self, name: str, kind: Callable[[str], T], default: T) -> T:
-        """Return value `name` turned into a `kind` (``int``, ``float``, ``str``), `default` where
-        it is not given.
-
-        `kind`: from a text to a value.
-        """
+        """Return value `name` turned into a `kind` (``int``, ``float``, ``str``), or `default`."""
         if name not in self.values:
             return default
         try:
             return kind(self.values[name])
+        except InputError:
+            raise
         except ValueError as fault:
             raise InputError(f"'{self.text}': {name} cannot be '{self.values[name]}'") from fault
 
@@ -83,3 +82,75 @@ class Uri:
                 f"'{self.text}': name a computer, as in {self.scheme}://192.168.0.2:{default_port}"
             )
         return host, default_port if port is None else port
+
+
+def option(
+    default: Any,
+    kind: Callable[[str], Any] | None = None,
+    *,
+    least: float = -inf,
+    above: float = -inf,
+    most: float = inf,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Declare a field of `Options`: what makes it of a text (the default's type), and its bounds;
+    of `choices` the first is the default.
+    """
+    bounds = {"least": least, "above": above, "most": most}
+    return field(
+        default=choices[0] if choices else default,
+        metadata={"kind": kind or type(default), "choices": choices, **bounds},
+    )
+
+
+@dataclass(frozen=True)
+class Options:
+    """Values of an address: every field made by `option` is one, by its own name, in the unit that
+    its name ends in. A default of None is out of bounds: the value is not given.
+    """
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            value, known = getattr(self, one.name), one.metadata
+            if value is None or not isinstance(value, int | float):
+                continue
+            least, above, most = known["least"], known["above"], known["most"]
+            if not (least <= value <= most and above < value):
+                low = f"above {above:g}" if above > -inf else f"at least {least:g}"
+                high = f" and at most {most:g}" if most < inf else ""
+                raise InputError(f"{one.name} must be {low}{high}, got {value:g}")
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the names of all values."""
+        return tuple(one.name for one in fields(cls))
+
+    @classmethod
+    def from_uri(cls, uri: Uri, *others: str) -> Self:
+        """Read an address, which has no values but these and `others`."""
+        uri.reject_unknown(*cls.names(), *others)
+        found: dict[str, Any] = {}
+        for one in fields(cls):
+            kind, choices = one.metadata["kind"], one.metadata["choices"]
+            if one.name not in uri.values:
+                continue
+            if kind is bool:
+                found[one.name] = uri.choice(one.name, "0", "1") == "1"
+            elif choices:
+                found[one.name] = uri.choice(one.name, *choices)
+            else:
+                found[one.name] = uri.value(one.name, kind, one.default)
+        try:
+            return cls(**found)
+        except InputError as fault:
+            raise InputError(f"'{uri.text}': {fault}") from fault
+
+
+def parse_integers(text: str) -> tuple[int, ...]:
+    """Read whole numbers that are joined by commas."""
+    return tuple(int(word) for word in text.split(","))
+
+
+def parse_numbers(text: str) -> tuple[float, ...]:
+    """Read numbers that are joined by commas."""
+    return tuple(float(word) for word in text.split(","))

@@ -11,7 +11,7 @@ import contextlib
 import importlib.machinery
 import importlib.util
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from time import monotonic
@@ -19,19 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from devices.address import Uri
-from devices.frames import GATE_OPTIONS, FrameCodec, GateScan
+from devices.address import Uri, option
+from devices.frames import FrameCodec, FrameFeed, GatedOptions
 from devices.registry import DiscoveredInstrument
-from devices.source import Gap, Info, Ledger
-from devices.stream import (
-    STREAM_OPTIONS,
-    InstrumentClock,
-    StreamSource,
-    Transfer,
-    parse_buffer_settings,
-    parse_seconds,
-    retry_connect,
-)
+from devices.source import Info
+from devices.stream import StreamSource, Transfer
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceError,
@@ -43,19 +35,6 @@ from tofclip.errors import (
 )
 from tofclip.storage import Field, Record
 
-OPTIONS = (
-    "exposure_us",
-    "gain",
-    "frame_rate",
-    "pixel_format",
-    "row_ps",
-    "mode",
-    *GATE_OPTIONS,
-    "buffers",
-    "timeout_s",
-    "reconnect_s",
-    *STREAM_OPTIONS,
-)
 PIXEL_BITS = {"Mono8": 8, "Mono10": 16, "Mono12": 16, "Mono14": 16, "Mono16": 16}
 FRAME_ID_RANGE = 0xFFFF
 """GigE Vision's 16-bit identifiers go from 1 to this, and then to 1 again."""
@@ -75,61 +54,30 @@ NANOSECOND_S, PICOSECOND_S = 1e-9, 1e-12
 
 
 @dataclass(frozen=True)
-class CameraSettings:
-    """How to acquire; None leaves the camera's own setting."""
+class CameraOptions(GatedOptions):
+    """Values of an address that say how to acquire; None leaves the camera's own setting."""
 
-    exposure_us: float | None = None
-    gain: float | None = None  # in the camera's own unit, dB for most
-    frame_rate: float | None = None  # 1/s
-    pixel_format: str = ""  # as GenICam calls it, e.g. ``Mono16``; empty leaves the camera's
-    # duration of a row, ps, where the camera looks at a streak tube's screen
-    row_ps: float | None = None
-    # where a gated intensifier stands before it, stepped by each frame
-    gate: GateScan | None = None
+    exposure_us: float | None = option(None, float, above=0, most=1e12)
+    gain: float | None = option(None, float)  # in the camera's own unit, dB for most
+    frame_rate: float | None = option(None, float, above=0, most=1e12)  # 1/s
+    pixel_format: str = option("")  # as GenICam calls it; empty leaves the camera's
+    # duration of a row where the camera looks at a streak tube's screen
+    row_ps: float | None = option(None, float, above=0, most=1e12)
     # frames that Aravis holds while this program must wait; None: as many as fit into `HELD_BYTES`,
     # within `HELD_FRAMES`
-    buffers: int | None = None
-    # s without any frame after which the camera is asked whether it is there, and for it to come
-    # back
-    timeout: float = 5.0
-    # s without any frame after which the camera is asked whether it is there, and for it to come
-    # back
-    reconnect: float = 5.0
+    buffers: int | None = option(None, int, least=2, most=4096)
+    # without any frame, after which the camera is asked whether it is there
+    timeout_s: float = option(5.0, above=0, most=600)
 
     def __post_init__(self) -> None:
-        if self.buffers is not None and not 2 <= self.buffers <= 4096:
-            raise InputError(f"the number of buffers must be within 2..4096, got {self.buffers}")
-        for name in ("exposure_us", "frame_rate", "row_ps"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < 1e12:
-                raise InputError(f"{name} must be positive, got {value:g}")
+        super().__post_init__()
         if self.pixel_format and self.pixel_format not in PIXEL_BITS:
             raise InputError(
                 f"pixel_format must be one of {', '.join(PIXEL_BITS)}, not '{self.pixel_format}'"
             )
 
-    @classmethod
-    def from_uri(cls, uri: Uri) -> CameraSettings:
-        """Read the values of an address (`OPTIONS`) that say how to acquire."""
 
-        def number(name: str) -> float | None:
-            return uri.value(name, float, 0.0) if name in uri.values else None
-
-        gate = GateScan.from_uri(uri) if uri.choice("mode", "free", "gated") == "gated" else None
-        return cls(
-            number("exposure_us"),
-            number("gain"),
-            number("frame_rate"),
-            uri.value("pixel_format", str, ""),
-            number("row_ps"),
-            gate,
-            uri.value("buffers", int, 0) if "buffers" in uri.values else None,
-            parse_seconds(uri, "timeout_s", cls.timeout),
-            parse_seconds(uri, "reconnect_s", cls.reconnect),
-        )
-
-
-class AravisFeed:
+class AravisFeed(FrameFeed):
     """Frames in the order of their identifiers; see `devices.stream.Feed`.
 
     A frame of which packets are missing is malformed. A gap in the identifiers is lost by the camera
@@ -137,19 +85,33 @@ class AravisFeed:
     for malformed ones whose first packet is missing: that is the one that brings the identifier, and
     so they are counted with the next frame that has one.
 
-    `library`: aravis; `place`: name or address of the camera; empty for the first one found.
+    `library`: Aravis; `place`: name or address of the camera, empty for the first one found;
+    `prepare`: does what an emulated camera needs before its settings are made.
     """
 
-    def __init__(self, library: Any, place: str, ledger: Ledger, settings: CameraSettings) -> None:
-        self._library, self._place = library, place
-        self._ledger, self._settings = ledger, settings
-        self._clock = InstrumentClock()
-        self._number = self._unnumbered = 0
-        self._gap = Gap.NONE
-        self._camera: Any = None
-        self._stream: Any = None
+    _camera: Any
+    _stream: Any
+
+    def __init__(
+        self,
+        library: Any,
+        place: str,
+        options: CameraOptions,
+        prepare: Callable[[Any], None] = lambda camera: None,
+    ) -> None:
+        super().__init__()
+        self._library, self._place, self._options = library, place, options
+        self._prepare = prepare
+        self._unnumbered = 0
         self._open_camera()
-        self.codec = self._make_codec()
+        with self._translate_errors():
+            pixel_format = self._camera.get_pixel_format_as_string()
+            _, _, width, height = self._camera.get_region()
+        if pixel_format not in PIXEL_BITS:
+            raise InputError(
+                f"the camera sends {pixel_format}; choose pixel_format={' or '.join(PIXEL_BITS)}"
+            )
+        self.codec = FrameCodec(height, width, PIXEL_BITS[pixel_format])
 
     @property
     def info(self) -> Info:
@@ -171,18 +133,19 @@ class AravisFeed:
     @property
     def calibration(self) -> Record | None:
         """Times of the gate, or of the rows of a streak picture, where the address gives them."""
-        if self._settings.gate is not None:
-            return self._settings.gate.to_record()
-        if self._settings.row_ps is None:
+        options = self._options
+        if options.gate is not None:
+            return options.gate.to_record()
+        if options.row_ps is None:
             return None
-        times = (np.arange(self.codec.rows) + 0.5) * self._settings.row_ps * PICOSECOND_S
+        times = (np.arange(self.codec.rows) + 0.5) * options.row_ps * PICOSECOND_S
         return Record("streak_calibration", {"row_times": Field(times, "s", ("row",))})
 
     def start(self) -> None:
         with self._translate_errors():
             payload = self._camera.get_payload()
             held = min(max(HELD_BYTES // payload, HELD_FRAMES[0]), HELD_FRAMES[1])
-            for _ in range(self._settings.buffers or held):
+            for _ in range(self._options.buffers or held):
                 self._offer_buffer(self._library.Buffer.new_allocate(payload))
             self._packets_per_frame = self._count_packets(payload)
             self._camera.start_acquisition()
@@ -224,24 +187,25 @@ class AravisFeed:
             self._stream = self._camera = None
 
     def _open_camera(self) -> None:
-        settings = self._settings
+        options = self._options
         self._running = False
         self._last_id: int | None = None
         self._dropped = 0
         self._clock.reset()
         with self._translate_errors(DeviceNotFoundError):
-            self._camera = camera = self._library.Camera.new(self._place or None)
+            camera: Any = self._library.Camera.new(self._place or None)
+        self._camera = camera
         with self._translate_errors(InputError):
             camera.set_acquisition_mode(self._library.AcquisitionMode.CONTINUOUS)
-            self._prepare_camera(camera)
-            if settings.pixel_format:
-                camera.set_pixel_format_from_string(settings.pixel_format)
-            if settings.frame_rate is not None:
-                camera.set_frame_rate(settings.frame_rate)
-            if settings.exposure_us is not None:
-                camera.set_exposure_time(settings.exposure_us)
-            if settings.gain is not None:
-                camera.set_gain(settings.gain)
+            self._prepare(camera)
+            if options.pixel_format:
+                camera.set_pixel_format_from_string(options.pixel_format)
+            if options.frame_rate is not None:
+                camera.set_frame_rate(options.frame_rate)
+            if options.exposure_us is not None:
+                camera.set_exposure_time(options.exposure_us)
+            if options.gain is not None:
+                camera.set_gain(options.gain)
         with self._translate_errors():
             self._stream = camera.create_stream(None, None)
             if camera.is_gv_device():
@@ -249,20 +213,6 @@ class AravisFeed:
                 fixed = self._library.GvStreamSocketBuffer.FIXED
                 self._stream.set_property("socket-buffer", fixed)
                 self._stream.set_property("socket-buffer-size", SOCKET_BUFFER_BYTES)
-
-    def _prepare_camera(self, camera: Any) -> None:
-        """Do what an emulated camera needs before its settings are made."""
-
-    def _make_codec(self) -> FrameCodec:
-        with self._translate_errors():
-            pixel_format = self._camera.get_pixel_format_as_string()
-            _, _, width, height = self._camera.get_region()
-        bits = PIXEL_BITS.get(pixel_format)
-        if bits is None:
-            raise InputError(
-                f"the camera sends {pixel_format}; choose pixel_format={' or '.join(PIXEL_BITS)}"
-            )
-        return FrameCodec(height, width, bits)
 
     def _offer_buffer(self, buffer: Any) -> None:
         """Let Aravis fill a buffer; it keeps the identifier that it has if the frame brings none."""
@@ -284,23 +234,21 @@ class AravisFeed:
             return None  # never filled: acquisition was stopped
         if frame_id == UNNUMBERED:
             self._unnumbered += 1
-            self._gap = max(self._gap, Gap.LOSS)
+            self._note_gap()
             return None
         if not self._count_missing(frame_id):
             return None
         stamp = buffer.get_timestamp() * NANOSECOND_S
         self._number += 1
         if status != known.SUCCESS:
-            self._ledger.truncate()
-            self._gap = max(self._gap, Gap.LOSS)
+            self.ledger.truncate()
+            self._note_gap()
             return None
         pixels = buffer.get_data()
         if len(pixels) != self.codec.pixel_bytes:
             raise ProtocolError("the frames' size has changed; open the camera anew")
         self._clock.observe(stamp, arrived_at)
-        gap, self._gap = self._gap, Gap.NONE
-        data = memoryview(self.codec.pack_frame(self._number - 1, pixels))
-        return Transfer(data, gap, self._clock.to_host(stamp))
+        return self._hand_over(self._number - 1, pixels, self._clock.to_host(stamp))
 
     def _count_missing(self, frame_id: int) -> bool:
         """Enter frames between the last identifier and this one; False for one that comes behind a
@@ -323,12 +271,12 @@ class AravisFeed:
         self._unnumbered = 0
         dropped = min(missing - torn, self._count_underruns() - self._dropped)
         self._dropped += dropped
-        self._ledger.truncate(torn)
-        self._ledger.receive(dropped)
-        self._ledger.drop(dropped)
-        self._ledger.lose(missing - torn - dropped)
+        self.ledger.truncate(torn)
+        self.ledger.receive(dropped)
+        self.ledger.drop(dropped)
+        self.ledger.lose(missing - torn - dropped)
         self._number += missing
-        self._gap = max(self._gap, Gap.LOSS)
+        self._note_gap()
         return True
 
     def _count_underruns(self) -> int:
@@ -338,13 +286,13 @@ class AravisFeed:
 
     def _count_unnumbered(self) -> None:
         """Enter frames without an identifier that no other frame comes after."""
-        self._ledger.truncate(self._unnumbered)
+        self.ledger.truncate(self._unnumbered)
         self._number += self._unnumbered
         self._unnumbered = 0
 
     def _check_presence(self, now: float) -> None:
         """Where nothing came for long, ask the camera something; open it anew if it is gone."""
-        if now - self._heard_at < self._settings.timeout:
+        if now - self._heard_at < self._options.timeout_s:
             return
         self._heard_at = now
         try:
@@ -352,12 +300,8 @@ class AravisFeed:
                 self._camera.get_exposure_time()
         except DeviceError:
             self._count_unnumbered()
-            retry_connect(self._reopen, self._settings.reconnect)
-            self._ledger.reconnect()
-            self._gap = Gap.RESTART
-            gate = self._settings.gate
-            if gate is not None:
-                self._number += -self._number % gate.steps  # the scan is not finished
+            self._reconnect(self._reopen, self._options.reconnect_s)
+            self._end_scan(self._options.gate)
 
     def _reopen(self) -> None:
         self._open_camera()
@@ -429,11 +373,8 @@ def open_aravis(uri: Uri) -> StreamSource:
     """Open ``aravis://NAME?exposure_us=1000&gain=0&frame_rate=25&pixel_format=Mono16&buffers=64``.
 
     NAME is a camera's identifier or address, or nothing for the first one. ``row_ps`` gives the
-    duration of a row of a streak picture; ``mode=gated`` and `GATE_OPTIONS` say how an intensifier's
-    gate moves from frame to frame.
+    duration of a row of a streak picture; ``mode=gated`` and ``gate_steps`` and so on say how an
+    intensifier's gate moves from frame to frame.
     """
-    uri.reject_unknown(*OPTIONS)
-    settings, held = CameraSettings.from_uri(uri), parse_buffer_settings(uri)
-    ledger = Ledger()
-    feed = AravisFeed(load_aravis(), uri.location, ledger, settings)
-    return StreamSource(feed, feed.codec, ledger, held)
+    options = CameraOptions.from_uri(uri)
+    return StreamSource(AravisFeed(load_aravis(), uri.location, options), options)

@@ -1,36 +1,33 @@
-"""A gate that opens later from picture to picture: what turns a camera's frames into photons counted
-in time.
-
-Cameras' pictures as records, each with its number, so that they are buffered, recorded and
-replayed like photons.
+"""Cameras' pictures as records, each with its number, so that they are buffered, recorded and
+replayed like photons; what drivers of cameras share; and a gate that opens later from picture to
+picture, which turns a camera's frames into photons counted in time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.address import Uri
-from devices.source import ByteView, DecodeResult, Records, as_bytes
+from devices.address import Uri, option
+from devices.source import ByteView, DecodeResult, Gap, Ledger, Records, as_bytes
+from devices.stream import InstrumentClock, LiveOptions, Transfer, retry_connect
 from tofclip.errors import InputError
 from tofclip.storage import Field, Record, Scalar
-
-GATE_OPTIONS = ("gate_steps", "gate_step_ps", "gate_width_ns", "gate_offset_ps")
 
 
 @dataclass(frozen=True)
 class GateScan:
-    """A scan; a picture's number modulo `steps` is its step."""
+    """A scan of a gate; a picture's number modulo `steps` is its step."""
 
     steps: int = 72  # pictures of one scan
-    step_ps: float = 252.0  # how much later the gate opens from one to the next, ps
-    width_ns: float = 5.0  # how long it is open, ns
-    offset_ps: float = 5000.0  # when it opens in the first one, ps after the laser's pulse
+    step_ps: float = 252.0  # how much later the gate opens from one to the next
+    width_ns: float = 5.0  # how long it is open
+    offset_ps: float = 5000.0  # when it opens in the first one, after the laser's pulse
 
     def __post_init__(self) -> None:
         if not (
@@ -43,17 +40,6 @@ class GateScan:
                 f"a gate moves in 2 to 4096 steps of 1 ps to 1 ms and is open for up to 1 ms, got {self}"
             )
 
-    @classmethod
-    def from_uri(cls, uri: Uri) -> GateScan:
-        """Read `GATE_OPTIONS` of an address."""
-        usual = cls()
-        return cls(
-            uri.value("gate_steps", int, usual.steps),
-            uri.value("gate_step_ps", float, usual.step_ps),
-            uri.value("gate_width_ns", float, usual.width_ns),
-            uri.value("gate_offset_ps", float, usual.offset_ps),
-        )
-
     @property
     def opening_times(self) -> NDArray[np.float64]:
         """When the gate opens in each picture of a scan, s after the laser's pulse."""
@@ -64,6 +50,31 @@ class GateScan:
         """Return the calibration that `devices.counted_photons.read_photons` reads."""
         times = Field(self.opening_times, "s", ("gate_step",))
         return Record("gate_scan", {"gate_times": times}, {"gate_width_s": self.width_ns * 1e-9})
+
+
+@dataclass(frozen=True)
+class GatedOptions(LiveOptions):
+    """Values of cameras that may stand behind a gate, or be one: ``mode=gated&gate_steps=...``."""
+
+    mode: str = option("", choices=("free", "gated"))
+    gate_steps: int = option(GateScan.steps)
+    gate_step_ps: float = option(GateScan.step_ps)
+    gate_width_ns: float = option(GateScan.width_ns)
+    gate_offset_ps: float = option(GateScan.offset_ps)
+
+    @cached_property
+    def gate(self) -> GateScan | None:
+        """The scan, None where there is no gate."""
+        if self.mode != "gated":
+            return None
+        return GateScan(self.gate_steps, self.gate_step_ps, self.gate_width_ns, self.gate_offset_ps)
+
+    @classmethod
+    def from_uri(cls, uri: Uri, *others: str) -> Self:
+        found = super().from_uri(uri, *others)
+        if found.gate is None and any(name.startswith("gate_") for name in uri.values):
+            raise InputError(f"'{uri.text}': a gate needs mode=gated")
+        return found
 
 
 MAX_FRAME_BYTES = 1 << 26
@@ -199,3 +210,42 @@ class FrameCodec:
         if self.bits == 1:
             return np.packbits(flat, axis=1)
         return flat.view(np.uint8)
+
+
+class FrameFeed:
+    """What the drivers of cameras share: the number of the next picture, what is missing before it,
+    and the accounts; see `devices.stream.Feed`.
+    """
+
+    codec: FrameCodec
+
+    def __init__(self) -> None:
+        self.ledger = Ledger()
+        self._clock = InstrumentClock()
+        self._number, self._gap = 0, Gap.NONE
+
+    def _hand_over(self, number: int, pixels: bytes, taken_at: float = 0.0) -> Transfer:
+        """Return a picture, with the gap before it."""
+        gap, self._gap = self._gap, Gap.NONE
+        return Transfer(memoryview(self.codec.pack_frame(number, pixels)), gap, taken_at)
+
+    def _note_gap(self, gap: Gap = Gap.LOSS) -> None:
+        """Remember, at the next picture, that something is missing before it."""
+        self._gap = max(self._gap, gap)
+
+    def _lose(self, frames: int) -> None:
+        """Enter pictures that the instrument took and will not send."""
+        if frames > 0:
+            self.ledger.lose(frames)
+            self._note_gap()
+
+    def _reconnect(self, connect: Callable[[], object], seconds: float) -> None:
+        """Try until the instrument is back."""
+        retry_connect(connect, seconds)
+        self.ledger.reconnect()
+        self._gap = Gap.RESTART
+
+    def _end_scan(self, gate: GateScan | None) -> None:
+        """Count up to the beginning of the next scan: one that was cut is never finished."""
+        if gate is not None:
+            self._number += -self._number % gate.steps

@@ -1,4 +1,5 @@
-"""The lines of text that the kits' public programs send, to histograms (bins, zones).
+"""Histogram kits on a serial port as a source of frames (bins, zones), from the lines of text that
+their public programs send.
 
 TMF8828 (ams' Arduino program; single letters are its commands, e.g. ``m`` to measure): the bytes of
 each histogram's 128 bins come in three lines ``#Raw,ADDRESS,INDEX,b0,...,b127``. INDEX modulo 10 is
@@ -12,34 +13,24 @@ Ambient: A, Bins: v, v, ...``.
 
 Both are texts of programs that anybody may change, so lengths are checked and nothing is assumed of
 lines that are not known.
-
-Histogram kits on a serial port as a source of frames (bins, zones).
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import Any, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.address import Uri
-from devices.frames import FrameCodec
-from devices.source import Gap, Info, Ledger
-from devices.stream import (
-    STREAM_OPTIONS,
-    InstrumentClock,
-    StreamSource,
-    Transfer,
-    parse_buffer_settings,
-    parse_seconds,
-    retry_connect,
-)
+from devices.address import Uri, option
+from devices.frames import FrameCodec, FrameFeed
+from devices.source import Info
+from devices.stream import LiveOptions, StreamSource, Transfer
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceNotFoundError,
@@ -224,81 +215,99 @@ def _parse_floats(words: list[bytes]) -> NDArray[np.float64] | None:
     return found if np.all(np.isfinite(found)) else None
 
 
-def format_tmf8828(counts: NDArray[Any], number: int, tick: int) -> list[bytes]:
-    """Return the lines that a TMF8828's program sends for a frame; the inverse of `Tmf8828Parser`.
-
-    `counts` (128, zones); `number`: of the frame; `tick`: 0.2 us. Returns with their ends.
-    """
-    captures, halves = (TMF_CAPTURES, 2) if counts.shape[1] == 64 else (1, 1)
-    width = counts.shape[1] // captures
-    lines = []
-    for place in range(captures):
-        some = counts[:, place * width : (place + 1) * width].T.reshape(halves, -1, TMF_BINS)
-        for half in range(halves):
-            for lane in range(TMF_LANES):
-                channel, shift = lane % TMF_CHANNELS, 8 * (lane // TMF_CHANNELS)
-                values = np.zeros(TMF_BINS, np.int64)
-                if 1 <= channel <= some.shape[1]:
-                    values = some[half, channel - 1].astype(np.int64) >> shift & 0xFF
-                words = ",".join(map(str, values.tolist()))
-                lines.append(f"#Raw,65,{half * TMF_LANES + lane},{words}\r\n".encode())
-        result = (number * captures + place) % TMF_NUMBERS
-        lines.append(f"#Obj,65,{result},25,{width},{tick}{',0' * 72}\r\n".encode())
-    return lines
-
-
-def format_vl53l8(counts: NDArray[Any]) -> list[bytes]:
-    """Return the lines that a VL53L8CH's program sends for a frame of counts (bins, zones)."""
-    lines = [b"Ranging Results:\r\n"]
-    for zone, column in enumerate(counts.T):
-        words = "".join(f"{value / VL53_SCALE:.1f}, " for value in column.tolist())
-        lines.append(f"Aggregate {zone}, Ambient: 0.5, Bins: {words}\r\n".encode())
-    return lines
-
-
-COMMON_OPTIONS = ("baud", "start", "zones", "reconnect_s", *STREAM_OPTIONS)
-TMF8828_OPTIONS = ("bin_ps", *COMMON_OPTIONS)
-VL53L8_OPTIONS = ("bins", "sub_sample", "start_bin", *COMMON_OPTIONS)
-TMF8828_BAUD, VL53L8_BAUD = 1_000_000, 460_800
-TMF8828_START = "ezm"
-"""Enable, dump histograms, measure: the state after the reset that opening the port brings."""
-
 READ_BYTES = 1 << 16
 PICOSECOND_S = 1e-12
 
 
 @dataclass(frozen=True)
-class KitSettings:
-    """How to talk to a kit."""
+class KitOptions(LiveOptions):
+    """Values of an address that all kits share."""
 
-    instrument: str  # what it is, in words
-    port: str  # of the operating system, e.g. ``/dev/ttyACM0``
-    baud: int
-    # commands that begin and end measuring; empty for programs that measure by themselves
-    start: bytes
-    # commands that begin and end measuring; empty for programs that measure by themselves
-    stop: bytes
-    bin_width: float  # duration of a bin and middle of the first one, s
-    first_bin: float  # duration of a bin and middle of the first one, s
-    reconnect: float  # s to wait for a kit that went away
+    instrument: ClassVar[str]
+    baud: int = option(460_800)
+    start: str = option("")  # letters that begin measuring; none: the program does so by itself
+    zones: int = option(16)
+
+    @property
+    def stop(self) -> bytes:
+        """What ends measuring."""
+        return b""
+
+    @property
+    def bin_width(self) -> float:
+        """Duration of a bin, s."""
+        raise NotImplementedError
+
+    @property
+    def first_bin(self) -> float:
+        """Middle of the first bin, s."""
+        return self.bin_width / 2
+
+    def make_parser(self) -> Parser:
+        """Return a parser of the kit's lines that has seen none of them."""
+        raise NotImplementedError
 
 
-class KitFeed:
+@dataclass(frozen=True)
+class Tmf8828Options(KitOptions):
+    """Values of a TMF8828's address."""
+
+    instrument = "TMF8828 histogram kit"
+    bin_ps: float = option(0.0)  # depends on the kit's settings and has to be given
+    baud: int = option(1_000_000)
+    # Enable, dump histograms, measure: the state after the reset that opening the port brings.
+    start: str = option("ezm")
+    zones: int = option(64)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.bin_ps < 1e6:
+            raise InputError("add bin_ps=..., the duration of a bin as the kit was set")
+
+    @property
+    def stop(self) -> bytes:
+        return b"s" if self.start else b""
+
+    @property
+    def bin_width(self) -> float:
+        return self.bin_ps * PICOSECOND_S
+
+    def make_parser(self) -> Tmf8828Parser:
+        return Tmf8828Parser(self.zones)
+
+
+@dataclass(frozen=True)
+class Vl53l8Options(KitOptions):
+    """Values of a VL53L8CH's address: as the kit's program was set."""
+
+    instrument = "VL53L8CH histogram kit"
+    bins: int = option(24)
+    sub_sample: int = option(4, least=1, most=64)
+    start_bin: int = option(0, least=0, most=144)
+
+    @property
+    def bin_width(self) -> float:
+        return self.sub_sample * VL53_NATIVE_BIN_S
+
+    @property
+    def first_bin(self) -> float:
+        return self.start_bin * VL53_NATIVE_BIN_S + self.bin_width / 2
+
+    def make_parser(self) -> Vl53l8Parser:
+        return Vl53l8Parser(self.zones, self.bins)
+
+
+class KitFeed(FrameFeed):
     """Frames as a kit sends them; see `devices.stream.Feed`.
 
     Frames of which lines are missing or torn are malformed; those that the kit's numbers show to be
-    missing are lost by the instrument.
-
-    `make_parser`: returns a new parser: nothing of what came before a broken connection is of use
-    behind it.
+    missing are lost by the instrument. A broken connection needs a new parser: nothing of what came
+    before is of use behind it.
     """
 
-    def __init__(
-        self, settings: KitSettings, make_parser: Callable[[], Parser], ledger: Ledger
-    ) -> None:
-        self._settings, self._make_parser, self._ledger = settings, make_parser, ledger
-        self._clock = InstrumentClock()
-        self._number, self._gap = 0, Gap.NONE
+    def __init__(self, port: str, options: KitOptions) -> None:
+        super().__init__()
+        self._name, self._options = port, options
         self._ready: deque[tuple[int, bytes, float]] = deque()
         self._is_stopped = False
         self._open_port()
@@ -306,24 +315,23 @@ class KitFeed:
 
     @property
     def info(self) -> Info:
-        settings, codec = self._settings, self.codec
-        shape = {"bins": codec.rows, "zones": codec.columns, "bin_width_s": settings.bin_width}
+        codec, options = self.codec, self._options
+        shape = {"bins": codec.rows, "zones": codec.columns, "bin_width_s": options.bin_width}
         limits = "written from public programs; no such kit was at hand"
-        return Info(settings.instrument, "", {"port": settings.port, **shape, "limits": limits})
+        return Info(options.instrument, "", {"port": self._name, **shape, "limits": limits})
 
     @property
     def calibration(self) -> Record | None:
         """Middle of each bin, s, and what a stored count stands for."""
-        times = self._settings.first_bin + self._settings.bin_width * np.arange(self.codec.rows)
-        return Record(
-            "histograms",
-            {"bin_times": Field(times, "s", ("bin",))},
-            {"count_scale": self._parser.scale},
+        options = self._options
+        times = Field(
+            options.first_bin + options.bin_width * np.arange(self.codec.rows), "s", ("bin",)
         )
+        return Record("histograms", {"bin_times": times}, {"count_scale": self._parser.scale})
 
     def start(self) -> None:
         with self._translate_errors():
-            self._port.write(self._settings.start)
+            self._port.write(self._options.start.encode())
 
     def pull(self, timeout: float) -> Transfer | None:
         deadline = monotonic() + timeout
@@ -333,39 +341,38 @@ class KitFeed:
             try:
                 data = self._read_available(max(0.0, deadline - monotonic()))
             except DeviceDisconnectedError:
-                retry_connect(self._reopen, self._settings.reconnect)
-                self._ledger.reconnect()
-                self._gap = Gap.RESTART
+                self._reconnect(self._reopen, self._options.reconnect_s)
                 continue
             if data:
                 self._parse(data)
             elif monotonic() >= deadline:
-                raise DeviceTimeoutError(
-                    f"{self._settings.port} sent no histogram; is it the kit's?"
-                )
-        number, pixels, taken_at = self._ready.popleft()
-        gap, self._gap = self._gap, Gap.NONE
-        return Transfer(memoryview(self.codec.pack_frame(number, pixels)), gap, taken_at)
+                raise DeviceTimeoutError(f"{self._name} sent no histogram; is it the kit's?")
+        return self._hand_over(*self._ready.popleft())
 
     def stop(self) -> None:
         self._is_stopped = True
         with self._translate_errors():
-            self._port.write(self._settings.stop)
+            self._port.write(self._options.stop)
             self._port.flush()
 
     def close(self) -> None:
         self._port.close()
 
     def _open_port(self) -> None:
-        serial = _import_serial()
-        self._parser = self._make_parser()
+        try:
+            import serial
+        except ImportError as fault:
+            raise MissingDependencyError(
+                "histogram kits need pyserial: pip install 'tofclip[serial]'"
+            ) from fault
+        self._parser = self._options.make_parser()
         self._line, self._is_line_too_long = b"", False
         self._clock.reset()
         try:
-            self._port = serial.Serial(self._settings.port, self._settings.baud, timeout=0)
+            self._port = serial.Serial(self._name, self._options.baud, timeout=0)
         except (OSError, ValueError) as fault:
             raise DeviceNotFoundError(
-                f"{self._settings.port} cannot be opened ({fault}); is the kit connected?"
+                f"{self._name} cannot be opened ({fault}); is the kit connected?"
             ) from fault
 
     def _reopen(self) -> None:
@@ -394,14 +401,12 @@ class KitFeed:
             self._line, self._is_line_too_long = b"", True
 
     def _take_frame(self, frame: KitFrame) -> None:
-        if frame.missing:
-            self._ledger.lose(frame.missing)
-            self._number += frame.missing
-            self._gap = max(self._gap, Gap.LOSS)
-        number, self._number = self._number, self._number + 1
+        self._lose(frame.missing)
+        number = self._number + frame.missing
+        self._number = number + 1
         if frame.counts is None:
-            self._ledger.truncate()
-            self._gap = max(self._gap, Gap.LOSS)
+            self.ledger.truncate()
+            self._note_gap()
             return
         taken_at = 0.0
         if frame.stamp is not None:
@@ -414,87 +419,22 @@ class KitFeed:
         try:
             yield
         except OSError as fault:  # pyserial's own are such
-            raise DeviceDisconnectedError(f"{self._settings.port}: {fault}") from fault
-
-
-def _import_serial() -> Any:
-    try:
-        import serial
-    except ImportError as fault:
-        raise MissingDependencyError(
-            "histogram kits need pyserial: pip install 'tofclip[serial]'"
-        ) from fault
-    return serial
+            raise DeviceDisconnectedError(f"{self._name}: {fault}") from fault
 
 
 def open_tmf8828(uri: Uri) -> StreamSource:
-    """Open ``tmf8828:///dev/ttyACM0?bin_ps=PS&zones=64&baud=1000000&start=ezm``.
-
-    The duration of a bin depends on the kit's settings and has to be given. ``start`` are the
-    letters that begin measuring; none for a program that measures by itself.
-    """
-    uri.reject_unknown(*TMF8828_OPTIONS)
-    settings, zones = parse_tmf8828(uri, _find_port(uri))
-    return _open_kit(uri, settings, lambda: Tmf8828Parser(zones))
+    """Open ``tmf8828:///dev/ttyACM0?bin_ps=PS&zones=64&baud=1000000&start=ezm``."""
+    return _open_kit(uri, Tmf8828Options.from_uri(uri))
 
 
 def open_vl53l8(uri: Uri) -> StreamSource:
-    """Open ``vl53l8:///dev/ttyACM0?zones=16&bins=24&sub_sample=4&start_bin=0&baud=460800``, as the
-    kit's program was set.
-    """
-    uri.reject_unknown(*VL53L8_OPTIONS)
-    settings, zones, bins = parse_vl53l8(uri, _find_port(uri))
-    return _open_kit(uri, settings, lambda: Vl53l8Parser(zones, bins))
+    """Open ``vl53l8:///dev/ttyACM0?zones=16&bins=24&sub_sample=4&start_bin=0&baud=460800``."""
+    return _open_kit(uri, Vl53l8Options.from_uri(uri))
 
 
-def _open_kit(uri: Uri, settings: KitSettings, make_parser: Callable[[], Parser]) -> StreamSource:
-    held, ledger = parse_buffer_settings(uri), Ledger()
-    feed = KitFeed(settings, make_parser, ledger)
-    return StreamSource(feed, feed.codec, ledger, held)
-
-
-def parse_tmf8828(uri: Uri, port: str) -> tuple[KitSettings, int]:
-    """Read the values of a TMF8828's address; return how to talk to it, and its zones."""
-    width = uri.value("bin_ps", float, 0.0)
-    if not 0 < width < 1e6:
-        raise InputError(f"'{uri.text}': add bin_ps=..., the duration of a bin as the kit was set")
-    start = uri.value("start", str, TMF8828_START).encode()
-    settings = KitSettings(
-        "TMF8828 histogram kit",
-        port,
-        uri.value("baud", int, TMF8828_BAUD),
-        start,
-        b"s" if start else b"",
-        width * PICOSECOND_S,
-        width * PICOSECOND_S / 2,
-        parse_seconds(uri, "reconnect_s", 5.0),
-    )
-    return settings, uri.value("zones", int, 64)
-
-
-def parse_vl53l8(uri: Uri, port: str) -> tuple[KitSettings, int, int]:
-    """Read the values of a VL53L8CH's address; return how to talk to it, its zones and bins."""
-    merged, first = uri.value("sub_sample", int, 4), uri.value("start_bin", int, 0)
-    if not (1 <= merged <= 64 and 0 <= first <= 144):
-        raise InputError(f"'{uri.text}': sub_sample is within 1..64, start_bin within 0..144")
-    start = uri.value("start", str, "").encode()
-    width = merged * VL53_NATIVE_BIN_S
-    settings = KitSettings(
-        "VL53L8CH histogram kit",
-        port,
-        uri.value("baud", int, VL53L8_BAUD),
-        start,
-        b"",
-        width,
-        first * VL53_NATIVE_BIN_S + width / 2,
-        parse_seconds(uri, "reconnect_s", 5.0),
-    )
-    return settings, uri.value("zones", int, 16), uri.value("bins", int, 24)
-
-
-def _find_port(uri: Uri) -> str:
+def _open_kit(uri: Uri, options: KitOptions) -> StreamSource:
     if not uri.location:
         raise InputError(
             f"'{uri.text}': name the serial port, as in {uri.scheme}:///dev/ttyACM0?..."
         )
-    return uri.location
+    return StreamSource(KitFeed(uri.location, options), options)

@@ -9,8 +9,7 @@ What the handbook does not say is taken from a client that is proven on hardware
 ``hamamatsurx`` of delmic/odemis): text is Latin-1, names are not case-sensitive, a line of an
 answer may begin with a line feed, and texts of errors may hold bare carriage returns.
 
-A client of RemoteEx: one question at a time, and never the same one twice.
-
+Then come the client, which asks one question at a time and never the same one twice, and
 Hamamatsu's streak cameras as a source of frames.
 """
 
@@ -28,17 +27,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.address import Uri
-from devices.frames import MAX_FRAME_BYTES, FrameCodec
-from devices.source import Gap, Info, Ledger
-from devices.stream import (
-    STREAM_OPTIONS,
-    InstrumentClock,
-    StreamSource,
-    Transfer,
-    parse_buffer_settings,
-    retry_connect,
-)
+from devices.address import Uri, option, parse_numbers
+from devices.frames import MAX_FRAME_BYTES, FrameCodec, FrameFeed
+from devices.source import Gap, Info
+from devices.stream import LiveOptions, StreamSource, Transfer
 from devices.tcp import TcpLink
 from tofclip.errors import (
     DeviceBusyError,
@@ -63,6 +55,7 @@ ANNOUNCEMENT = "Livemonitor"
 MAX_MESSAGE_BYTES = 1 << 16
 
 _COMMAND = re.compile(r"([A-Za-z]\w*)\((.*)\)", re.ASCII)
+_ANSWER = re.compile(r"(\d{1,3}),([^,].*)", re.ASCII | re.DOTALL)
 _NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
 _ARGUMENT = re.compile(r"[^,()\x00-\x1f\x7f-\x9f\u0100-\U0010ffff]*")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
@@ -113,7 +106,7 @@ class Command:
     def encode(self) -> bytes:
         """Return the bytes to send."""
         _require_valid(self.name, self.arguments)
-        return f"{self.name}({','.join(self.arguments)})".encode(ENCODING) + TERMINATOR
+        return str(self).encode(ENCODING) + TERMINATOR
 
     @classmethod
     def decode(cls, message: bytes) -> Command:
@@ -145,26 +138,18 @@ class Answer:
     def encode(self) -> bytes:
         """Return the bytes to send."""
         _require_valid(self.name, self.arguments)
-        return (
-            ",".join([str(int(self.code)), self.name, *self.arguments]).encode(ENCODING)
-            + TERMINATOR
-        )
+        words = [str(int(self.code)), self.name, *self.arguments]
+        return ",".join(words).encode(ENCODING) + TERMINATOR
 
     @classmethod
     def decode(cls, message: bytes) -> Answer:
         """Read an answer, its end taken off."""
         text = _decode_text(message)
-        code, _, rest = text.partition(",")
-        name, *arguments = rest.split(",")
-        if not (
-            code.isascii()
-            and code.isdecimal()
-            and len(code) < 4
-            and int(code) in list(AnswerCode)
-            and name
-        ):
+        found = _ANSWER.fullmatch(text)
+        if found is None or int(found[1]) not in list(AnswerCode):
             raise ProtocolError(f"{text[:80]!r} is not an answer of RemoteEx")
-        return cls(AnswerCode(int(code)), name, tuple(arguments))
+        name, *arguments = found[2].split(",")
+        return cls(AnswerCode(int(found[1])), name, tuple(arguments))
 
     def require_done(self, command: Command) -> tuple[str, ...]:
         """Return the arguments, or raise what the code means."""
@@ -178,10 +163,7 @@ class Answer:
 
 
 def parse_integer(text: str, what: str) -> int:
-    """Return a whole number that RemoteEx sent.
-
-    `what`: what the number means, for the message.
-    """
+    """Return a whole number that RemoteEx sent; `what` it means is for the message."""
     # Python would convert digits of any length, at a cost that grows with their square
     if not (text.isascii() and text.isdecimal() and len(text) < 16):
         raise ProtocolError(f"RemoteEx sent {text[:40]!r} as {what}, expected a whole number")
@@ -238,18 +220,12 @@ class RemoteExClient:
         self._owed: deque[Command] = deque()
         self._unread = 0
         self._may_continue = False
-        self._commands = TcpLink(host, port, timeout)
-        try:
+        with contextlib.ExitStack() as opened:
+            self._commands = opened.enter_context(TcpLink(host, port, timeout))
             self._expect_greeting(self._commands, GREETING)
-            self._data = TcpLink(host, data_port, timeout)
-        except BaseException:
-            self._commands.close()
-            raise
-        try:
+            self._data = opened.enter_context(TcpLink(host, data_port, timeout))
             self._expect_greeting(self._data, DATA_GREETING)
-        except BaseException:
-            self.close()
-            raise
+            opened.pop_all()
 
     def ask(self, name: str, *arguments: str) -> tuple[str, ...]:
         """Send a command and return its answer's arguments."""
@@ -257,31 +233,22 @@ class RemoteExClient:
         return answer.require_done(command)
 
     def is_done(self, name: str, *arguments: str) -> bool:
-        """Send a command that may be refused.
-
-        Returns false where RemoteEx refused.
-        """
+        """Send a command that may be refused; False where it was."""
         return self._exchange(name, arguments)[0].code is AnswerCode.DONE
 
     def start_application(self, timeout: float) -> bool:
-        """Start HPD-TA where it is not up, which takes a while; False where that is refused.
+        """Start HPD-TA where it is not up, which takes a while; False where that is refused."""
+        return self._exchange("AppStart", ("1",), timeout)[0].code is AnswerCode.DONE
 
-        `timeout`: seconds to wait.
-        """
-        usual = self._timeout
-        self._timeout = timeout
-        try:
-            return self.is_done("AppStart", "1")
-        finally:
-            self._timeout = usual
-
-    def _exchange(self, name: str, arguments: tuple[str, ...]) -> tuple[Answer, Command]:
+    def _exchange(
+        self, name: str, arguments: tuple[str, ...], timeout: float | None = None
+    ) -> tuple[Answer, Command]:
         # After a timeout the late answer would be taken for that of the next command.
         self._wait_for_owed()
         if name in _COMMANDS_WITH_DATA:
             self._data.discard_available()  # of a client before this one
         command = self.send_command(name, *arguments)
-        answer = self._read_answer()
+        answer = self._read_answer(timeout)
         if answer.name.casefold() != command.name.casefold():
             raise ProtocolError(f"RemoteEx answered {answer.name} when asked {command}")
         return answer, command
@@ -353,8 +320,7 @@ class RemoteExClient:
     def close(self) -> None:
         """Close both connections; closing twice is fine."""
         self._commands.close()
-        if hasattr(self, "_data"):
-            self._data.close()
+        self._data.close()
 
     def _expect_greeting(self, link: TcpLink, greeting: str) -> None:
         said = link.read_until(TERMINATOR, MAX_MESSAGE_BYTES, self._timeout)
@@ -380,17 +346,18 @@ class RemoteExClient:
         if length:
             self._read_data(length, MAX_FRAME_BYTES)
 
-    def _read_answer(self) -> Answer:
+    def _read_answer(self, timeout: float | None = None) -> Answer:
         """Return the answer to the first command that is owed one; keep the messages that come
         before.
         """
-        deadline = monotonic() + self._timeout
+        timeout = timeout or self._timeout
+        deadline = monotonic() + timeout
         while True:
             try:
                 answer = self._receive(max(deadline - monotonic(), 0))
             except DeviceTimeoutError as fault:
                 raise DeviceTimeoutError(
-                    f"RemoteEx did not answer {self._owed[0]} for {self._timeout:g} s; it is not asked again"
+                    f"RemoteEx did not answer {self._owed[0]} for {timeout:g} s; it is not asked again"
                 ) from fault
             except ProtocolError:
                 self._owed.popleft()  # it was an answer, if one that cannot be understood
@@ -436,28 +403,14 @@ def parse_data_length(answer: Answer) -> int:
     if answer.code != 0:
         return 0
     numbers = [parse_integer(text, "a size") for text in answer.arguments[:3] if text.isdecimal()]
-    return (
-        numbers[0] * numbers[1] * numbers[2]
-        if len(numbers) == 3
-        else numbers[0] * 4
-        if numbers
-        else 0
-    )
+    if len(numbers) == 3:
+        return numbers[0] * numbers[1] * numbers[2]
+    return numbers[0] * 4 if numbers else 0
 
 
 INSTRUMENT = "Hamamatsu streak camera (RemoteEx)"
 STREAK_TUBE = "TD"
 GAIN_PARAMETER = "MCP Gain"
-OPTIONS = (
-    "data_port",
-    "buffers",
-    "mcp_gain",
-    "time_range",
-    "time_ranges_ps",
-    "timeout_s",
-    "reconnect_s",
-    *STREAM_OPTIONS,
-)
 APPLICATION_START_S = 30.0
 POLL_INTERVAL_S = 0.05
 SYNCHROSCAN_UNIT_S = 1e-12
@@ -469,33 +422,30 @@ ConnectFunction = Callable[[], RemoteExClient]
 
 
 @dataclass(frozen=True)
-class LiveSettings:
-    """How to acquire."""
+class StreakOptions(LiveOptions):
+    """Values of an address that say how to acquire."""
 
-    buffers: int = 16  # pictures that HPD-TA keeps for a client that is late
+    buffers: int = option(16, least=1, most=4096)  # pictures that HPD-TA keeps for a late client
     # of the micro-channel plate, set before the start; None leaves it as it is. It is 0 after the
     # stop in any case: an intensified tube that is not watched must not age in strong light
-    gain: int | None = None
-    timeout: float = 5.0  # seconds to wait for an answer
-    reconnect: float = 5.0  # seconds to wait for HPD-TA to come back when the connection broke
-    # set before the start, as HPD-TA writes it: ``20 ns``, or ``3`` for a synchroscan unit; empty
-    # leaves it as it is
-    time_range: str = ""
-    # how long ranges 1, 2, ... of a synchroscan unit last, ps, for cameras that give no scaling
-    # table
-    time_ranges_ps: tuple[float, ...] = ()
+    mcp_gain: int | None = option(None, int, least=0, most=63)
+    # set before the start, as HPD-TA writes it: ``20 ns``, or ``3`` for a synchroscan unit
+    time_range: str = option("")
+    # how long ranges 1, 2, ... of a synchroscan unit last, for one that gives no scaling table
+    time_ranges_ps: tuple[float, ...] = option((), parse_numbers)
+    timeout_s: float = option(5.0, above=0, most=600)  # to wait for an answer
 
     def __post_init__(self) -> None:
-        if not 1 <= self.buffers <= 4096:
-            raise InputError(f"the number of buffers must be within 1..4096, got {self.buffers}")
-        if self.gain is not None and not 0 <= self.gain <= 63:
-            raise InputError(
-                f"the gain of the micro-channel plate must be within 0..63, got {self.gain}"
-            )
-        if any(not 0 < one < 1e15 for one in self.time_ranges_ps):
+        super().__post_init__()
+        if any(not 0 < sweep < 1e15 for sweep in self.time_ranges_ps):
             raise InputError("time ranges must be positive numbers of ps, such as 165,500,1000")
-        if not (0 < self.timeout <= 600 and 0 <= self.reconnect <= 600):
-            raise InputError("times to wait must be within 0 s and 600 s")
+
+
+@dataclass(frozen=True)
+class RemoteExOptions(StreakOptions):
+    """The same, of a camera on a computer."""
+
+    data_port: int | None = option(None, int, least=1, most=65535)  # the command's, and 1
 
 
 class _Announcement(NamedTuple):
@@ -506,7 +456,7 @@ class _Announcement(NamedTuple):
     received_at: float  # s of `time.monotonic`
 
 
-class RemoteExFeed:
+class RemoteExFeed(FrameFeed):
     """Live pictures in the order of their numbers; see `devices.stream.Feed`.
 
     Pictures that fell out of the ring buffer before they were asked for are lost by the instrument.
@@ -515,10 +465,9 @@ class RemoteExFeed:
     `connect`: returns a new connection.
     """
 
-    def __init__(self, connect: ConnectFunction, ledger: Ledger, settings: LiveSettings) -> None:
-        self._connect, self._ledger, self._settings = connect, ledger, settings
-        self._gap = Gap.NONE
-        self._clock = InstrumentClock()
+    def __init__(self, connect: ConnectFunction, options: StreakOptions) -> None:
+        super().__init__()
+        self._connect, self._options = connect, options
         self._stamps: dict[int, float] = {}
         self._start_camera()
         try:
@@ -534,12 +483,8 @@ class RemoteExFeed:
 
     @property
     def info(self) -> Info:
-        details: dict[str, Scalar] = {
-            **self._parameters,
-            "rows": self.codec.rows,
-            "columns": self.codec.columns,
-        }
-        return Info(INSTRUMENT, "", details)
+        shape = {"rows": self.codec.rows, "columns": self.codec.columns}
+        return Info(INSTRUMENT, "", {**self._parameters, **shape})
 
     @property
     def calibration(self) -> Record | None:
@@ -558,17 +503,17 @@ class RemoteExFeed:
             try:
                 picture = self._read_next_frame(timeout)
             except DeviceDisconnectedError:
-                self._reconnect()
+                self._count_announced_lost()
+                self._link.close()
+                self._reconnect(self._start_camera, self._options.reconnect_s)
                 continue
-            if (picture.rows, picture.columns, 8 * picture.pixel_bytes) != (
-                self.codec.rows,
-                self.codec.columns,
-                self.codec.bits,
-            ):
+            codec = self.codec
+            shape = (picture.rows, picture.columns, 8 * picture.pixel_bytes)
+            if shape != (codec.rows, codec.columns, codec.bits):
                 raise ProtocolError("the pictures' size has changed; open the camera anew")
-            gap, self._gap = self._gap, Gap.NONE
-            data = memoryview(self.codec.pack_frame(picture.number, picture.pixels))
-            return Transfer(data, gap, self._estimate_time(picture.number))
+            transfer = self._hand_over(picture.number, picture.pixels)
+            # Afterwards, because a gap that this finds is behind the picture.
+            return replace(transfer, taken_at=self._estimate_time(picture.number))
 
     def stop(self) -> None:
         """Turn the gain down first, whatever the state of the connection, and stop the acquisition.
@@ -615,7 +560,7 @@ class RemoteExFeed:
                 self._prepare_live(link)
             if not link.is_done("AcqStart", "Live"):
                 self._join_or_restart(link)
-            announced = self._wait_for_announcement(self._settings.timeout)
+            announced = self._wait_for_announcement(self._options.timeout_s)
             self._clock.reset()
             self._stamps.clear()
             self._note_stamp(announced)
@@ -633,14 +578,14 @@ class RemoteExFeed:
 
     def _prepare_live(self, link: RemoteExClient) -> None:
         """Set what has to be set before live mode, and ask to be notified of every picture."""
-        settings = self._settings
-        if settings.gain is not None:
+        options = self._options
+        if options.mcp_gain is not None:
             with contextlib.suppress(ProtocolError):
                 (self._gain_before,) = link.ask("DevParamGet", STREAK_TUBE, GAIN_PARAMETER)[:1]
-            link.ask("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, str(settings.gain))
-        if settings.time_range:
-            link.ask("DevParamSet", STREAK_TUBE, "Time Range", settings.time_range)
-        link.ask("AcqLiveMonitor", "RingBuffer", str(settings.buffers))
+            link.ask("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, str(options.mcp_gain))
+        if options.time_range:
+            link.ask("DevParamSet", STREAK_TUBE, "Time Range", options.time_range)
+        link.ask("AcqLiveMonitor", "RingBuffer", str(options.buffers))
 
     def _join_or_restart(self, link: RemoteExClient) -> None:
         """Join live mode that runs already, or wait until what else keeps the camera busy is over;
@@ -652,7 +597,7 @@ class RemoteExFeed:
                 self._has_joined = True
                 return
         for is_last in (False, True):
-            deadline = monotonic() + self._settings.timeout
+            deadline = monotonic() + self._options.timeout_s
             while link.ask("AsyncCommandStatus")[:1] != ("0",) and monotonic() < deadline:
                 sleep(POLL_INTERVAL_S)
             if link.is_done("AcqStart", "Live"):
@@ -682,9 +627,7 @@ class RemoteExFeed:
         lost = picture.number - self._next
         if lost < 0:
             raise ProtocolError(f"RemoteEx sent picture {picture.number}, asked for {self._next}")
-        if lost:
-            self._ledger.lose(lost)
-            self._gap = max(self._gap, Gap.LOSS)
+        self._lose(lost)
         self._unread_frame, self._next = None, picture.number + 1
         self._newest = max(self._newest, picture.number)
         return picture
@@ -716,13 +659,13 @@ class RemoteExFeed:
             while number not in self._stamps and self._announced < number:
                 self._note_announcement(self._wait_for_announcement(0))
         stamp = self._stamps.get(number)
-        self._stamps = {later: one for later, one in self._stamps.items() if later > number}
+        self._stamps = {later: at for later, at in self._stamps.items() if later > number}
         return 0.0 if stamp is None else self._clock.to_host(stamp)
 
     def _have_numbers_restarted(self) -> bool:
         """Wait for the next announcement, and say whether it goes back."""
         expected = self._next
-        self._note_announcement(self._wait_for_announcement(self._settings.timeout))
+        self._note_announcement(self._wait_for_announcement(self._options.timeout_s))
         return self._next != expected
 
     def _wait_for_announcement(self, timeout: float) -> _Announcement:
@@ -737,16 +680,9 @@ class RemoteExFeed:
                     number, int(words[2]) * 1e-3 if is_stamped else None, message.received_at
                 )
 
-    def _reconnect(self) -> None:
-        self._count_announced_lost()
-        self._link.close()
-        retry_connect(self._start_camera, self._settings.reconnect)
-        self._ledger.reconnect()
-        self._gap = Gap.RESTART
-
     def _count_announced_lost(self) -> None:
         """Enter pictures that were announced and will not come."""
-        self._ledger.lose(max(0, self._newest - self._next + 1))
+        self.ledger.lose(max(0, self._newest - self._next + 1))
         self._newest, self._unread_frame = self._next - 1, None
 
     def _read_parameters(self) -> dict[str, Scalar]:
@@ -766,7 +702,7 @@ class RemoteExFeed:
         try:
             table = self._link.read_scaling_table().astype(np.float64)
         except ProtocolError:
-            ranges = self._settings.time_ranges_ps
+            ranges = self._options.time_ranges_ps
             if not is_numbered or not 1 <= int(time_range) <= len(ranges):
                 raise
             rows = self.codec.rows
@@ -789,32 +725,10 @@ def open_remoteex(uri: Uri) -> StreamSource:
     ``time_ranges_ps=165,500,1000`` says how long a synchroscan unit's ranges last, for one that
     gives no scaling table.
     """
-    uri.reject_unknown(*OPTIONS)
+    options = RemoteExOptions.from_uri(uri)
     host, port = uri.host_and_port(COMMAND_PORT)
-    data_port, settings, held = (
-        uri.value("data_port", int, port + 1),
-        parse_live_settings(uri),
-        parse_buffer_settings(uri),
+    data_port = options.data_port or port + 1
+    return StreamSource(
+        RemoteExFeed(lambda: RemoteExClient(host, port, data_port, options.timeout_s), options),
+        options,
     )
-    ledger = Ledger()
-    feed = RemoteExFeed(
-        lambda: RemoteExClient(host, port, data_port, settings.timeout), ledger, settings
-    )
-    return StreamSource(feed, feed.codec, ledger, held)
-
-
-def parse_live_settings(uri: Uri) -> LiveSettings:
-    """Read the values of an address (`OPTIONS`) that say how to acquire."""
-    standard = LiveSettings()
-    return LiveSettings(
-        uri.value("buffers", int, standard.buffers),
-        uri.value("mcp_gain", int, 0) if "mcp_gain" in uri.values else None,
-        uri.value("timeout_s", float, standard.timeout),
-        uri.value("reconnect_s", float, standard.reconnect),
-        uri.value("time_range", str, ""),
-        uri.value("time_ranges_ps", _parse_numbers, ()),
-    )
-
-
-def _parse_numbers(text: str) -> tuple[float, ...]:
-    return tuple(float(word) for word in text.split(","))

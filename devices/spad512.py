@@ -1,4 +1,4 @@
-"""Commands of the SPAD512S server, and how long its answers are.
+"""A SPAD512S array over TCP as a source of frames.
 
 A command is ASCII without an end: what comes at once is one command. The answers to ``I`` (pictures
 of all the light) and ``G`` (pictures behind a gate that moves from step to step) are all pictures
@@ -9,8 +9,6 @@ texts of no known length, which some versions end with `DONE_MARK`.
 
 Single bits come turned by a quarter, as the vendor's own class knows: ``rot90`` of what came is the
 picture that the other depths show.
-
-A SPAD array over TCP as a source of frames.
 """
 
 from __future__ import annotations
@@ -21,17 +19,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic
 
-from devices.address import Uri
-from devices.frames import GATE_OPTIONS, FrameCodec, GateScan
-from devices.source import Gap, Info, Ledger
-from devices.stream import (
-    STREAM_OPTIONS,
-    StreamSource,
-    Transfer,
-    parse_buffer_settings,
-    parse_seconds,
-    retry_connect,
-)
+from devices.address import Uri, option
+from devices.frames import FrameCodec, FrameFeed, GatedOptions, GateScan
+from devices.source import Info
+from devices.stream import StreamSource, Transfer
 from devices.tcp import TcpLink
 from tofclip.errors import (
     DeviceDisconnectedError,
@@ -57,22 +48,11 @@ GATE_STEP_PS = 18
 INFORMATION_COMMAND = b"D"
 BREAKDOWN_BEGINS, BREAKDOWN_ENDS = "The breakdown calibration process", "The breakdown is around"
 
-_NUMBER = rb"\d+(?:\.\d+)?(?:e[+-]?\d{1,2})?"
-_INTENSITY = re.compile(
-    rb"I,(?P<bits>\d{1,2}),(?P<time>"
-    + _NUMBER
-    + rb"),(?P<images>\d{1,6}),0,[01],0,1(?:,(?P<width>\d{1,3}))?"
-)
+_BITS, _COUNT, _NUMBER = rb"(\d{1,2})", rb"(\d{1,6})", rb"(\d+(?:\.\d+)?(?:e[+-]?\d{1,2})?)"
+_INTENSITY = re.compile(rb"I,%b,%b,%b,0,[01],0,1(?:,(\d{1,3}))?" % (_BITS, _NUMBER, _COUNT))
 _GATED = re.compile(
-    rb"G,(?P<bits>\d{1,2}),(?P<time>"
-    + _NUMBER
-    + rb"),(?P<images>\d{1,6}),(?P<steps>\d{1,5}),(?P<step>"
-    + _NUMBER
-    + rb"),0,(?P<gate>"
-    + _NUMBER
-    + rb"),(?P<offset>"
-    + _NUMBER
-    + rb"),[01],[01],[01],[01]"
+    rb"G,%b,%b,%b,(\d{1,5}),%b,0,%b,%b,[01],[01],[01],[01]"
+    % (_BITS, _NUMBER, _COUNT, _NUMBER, _NUMBER, _NUMBER)
 )
 _ERROR_TEXT = re.compile(rb"[\t\n\r -~]{0,240}\Z")
 _MICROSECOND_DEPTHS = (1, 4)  # the others take milliseconds
@@ -142,23 +122,18 @@ class ExposureRequest:
 
     @classmethod
     def decode(cls, line: bytes, pile_up: bool = False) -> ExposureRequest:
-        """Read a command.
-
-        `pile_up`: as in the class.
-        """
+        """Read a command; `pile_up`: as in the class."""
         found = _INTENSITY.fullmatch(line) or _GATED.fullmatch(line)
         if found is None:
             raise ProtocolError(f"{line[:60]!r} is not a request for pictures")
-        said = found.groupdict()
-        bits, images = int(said["bits"]), int(said["images"])
-        unit = 1e-6 if bits in _MICROSECOND_DEPTHS else 1e-3
+        bits, time, images, *rest = found.groups()
+        unit = 1e-6 if int(bits) in _MICROSECOND_DEPTHS else 1e-3
+        exposure = int(bits), float(time) * unit, int(images)
         try:
-            gate = None
-            if "steps" in said:
-                numbers = [float(said[name]) for name in ("step", "gate", "offset")]
-                gate = GateScan(int(said["steps"]), *numbers)
-            width = int(said.get("width") or ROWS)
-            return cls(bits, float(said["time"]) * unit, images, width, pile_up, gate)
+            if line.startswith(b"I"):
+                return cls(*exposure, int(rest[0] or ROWS), pile_up)
+            steps, *numbers = rest
+            return cls(*exposure, ROWS, pile_up, GateScan(int(steps), *map(float, numbers)))
         except InputError as fault:
             raise ProtocolError(f"{line[:60]!r} requests pictures that cannot be") from fault
 
@@ -182,18 +157,26 @@ def find_error_text(data: bytes | bytearray) -> str | None:
 
 
 INSTRUMENT = "SPAD512 array"
-OPTIONS = (
-    "mode",
-    *GATE_OPTIONS,
-    "bits",
-    "exposure_us",
-    "images",
-    "width",
-    "pile_up",
-    "timeout_s",
-    "reconnect_s",
-    *STREAM_OPTIONS,
-)
+
+
+@dataclass(frozen=True)
+class SpadOptions(GatedOptions):
+    """Values of an address that say what pictures to take."""
+
+    mode: str = option("", choices=("intensity", "gated"))
+    bits: int = option(8)
+    exposure_us: float = option(1000.0)
+    images: int = option(1)
+    width: int = option(ROWS)
+    pile_up: bool = option(False)
+    timeout_s: float = option(5.0, above=0, most=600)  # for an answer, beyond the exposure
+
+    @property
+    def request(self) -> ExposureRequest:
+        """What is asked for."""
+        exposure = self.bits, self.exposure_us * 1e-6, self.images
+        return ExposureRequest(*exposure, self.width, self.pile_up, self.gate)
+
 
 _SILENCE_S = 0.2
 """Seconds after which a text of unknown length has ended."""
@@ -201,32 +184,23 @@ _SILENCE_S = 0.2
 BREAKDOWN_CALIBRATION_S = 60.0
 """Seconds that the server may calibrate itself when it is first asked."""
 
-ConnectFunction = Callable[[], TcpLink]
 
-
-class Spad512Feed:
+class Spad512Feed(FrameFeed):
     """One picture after the other; see `devices.stream.Feed`.
 
     Pictures are asked for a request at a time, and a request that finds no answer in time is not
     sent again. Behind a gate a picture's number modulo the gate's steps is its step: a scan that
     was cut is never finished, and the next one's numbers begin behind it.
 
-    `connect`: returns a new connection; `patience, reconnect`: seconds to wait for an answer beyond
-    the exposure, and for a server that went away.
+    `connect`: returns a new connection.
     """
 
-    def __init__(
-        self,
-        connect: ConnectFunction,
-        ledger: Ledger,
-        exposure: ExposureRequest,
-        patience: float,
-        reconnect: float,
-    ) -> None:
-        self._connect, self._ledger, self._exposure = connect, ledger, exposure
-        self._patience, self._reconnect_time = patience, reconnect
-        self.codec = exposure.codec
-        self._number, self._frames_due, self._gap = 0, 0, Gap.NONE
+    def __init__(self, connect: Callable[[], TcpLink], options: SpadOptions) -> None:
+        super().__init__()
+        self._connect, self._options = connect, options
+        self._exposure, self._patience = options.request, options.timeout_s
+        self.codec = self._exposure.codec
+        self._frames_due = 0
         self._received = bytearray()
         self._stopped = False
         self._open_link()
@@ -266,7 +240,9 @@ class Spad512Feed:
             try:
                 return self._read_frame(timeout)
             except DeviceDisconnectedError:
-                self._reconnect()
+                self._count_truncated()
+                self._link.close()
+                self._reconnect(self._open_link, self._options.reconnect_s)
 
     def stop(self) -> None:
         self._stopped = True
@@ -321,20 +297,17 @@ class Spad512Feed:
         # Pixels may spell DONE: only the computed length tells where an answer ends.
         length = self.codec.pixel_bytes + (len(DONE_MARK) if is_last else 0)
         self._fill_buffer(length, timeout)
-        pixels, end = (
-            bytes(self._received[: self.codec.pixel_bytes]),
-            bytes(self._received[self.codec.pixel_bytes :]),
-        )
+        pixels = bytes(self._received[: self.codec.pixel_bytes])
+        end = self._received[self.codec.pixel_bytes :]
         if is_last and end != DONE_MARK:
             raise ProtocolError(
-                f"the SPAD array's answer ended in {end!r}, expected {DONE_MARK!r}; is its width another?"
+                f"the SPAD array's answer ended in {bytes(end)!r}, expected {DONE_MARK!r}; is its width another?"
             )
         self._received.clear()
         self._frames_due -= 1
         self._deadline = monotonic() + self._exposure.seconds + self._patience
         self._number += 1
-        gap, self._gap = self._gap, Gap.NONE
-        return Transfer(memoryview(self.codec.pack_frame(self._number - 1, pixels)), gap)
+        return self._hand_over(self._number - 1, pixels)
 
     def _fill_buffer(self, length: int, timeout: float) -> None:
         """Wait until `length` bytes came, a length that was computed, not reported; what came in
@@ -360,23 +333,14 @@ class Spad512Feed:
                 f"the SPAD array sent nothing for {self._patience:g} s beyond the exposure"
             )
 
-    def _reconnect(self) -> None:
-        self._count_truncated()
-        self._link.close()
-        retry_connect(self._open_link, self._reconnect_time)
-        self._ledger.reconnect()
-        self._gap = Gap.RESTART
-
     def _count_truncated(self) -> None:
         """Enter a picture of which only a part came; of those that never began it is not known whether
         they were taken.
         """
         if self._received:
-            self._ledger.truncate()
+            self.ledger.truncate()
             self._number += 1
-        gate = self._exposure.gate
-        if gate is not None:
-            self._number += -self._number % gate.steps  # the scan is not finished
+        self._end_scan(self._exposure.gate)
         self._frames_due = 0
         self._received.clear()
 
@@ -388,34 +352,8 @@ def open_spad512(uri: Uri) -> StreamSource:
     ``mode=gated&gate_steps=72&gate_step_ps=252&gate_width_ns=5&gate_offset_ps=5000`` moves a gate
     from picture to picture; ``images`` are whole scans then.
     """
-    uri.reject_unknown(*OPTIONS)
+    options = SpadOptions.from_uri(uri)
     host, port = uri.host_and_port(DEFAULT_PORT)
-    patience, back = parse_timeouts(uri)
-    held, ledger = parse_buffer_settings(uri), Ledger()
-    feed = Spad512Feed(
-        lambda: TcpLink(host, port, patience), ledger, parse_exposure(uri), patience, back
+    return StreamSource(
+        Spad512Feed(lambda: TcpLink(host, port, options.timeout_s), options), options
     )
-    return StreamSource(feed, feed.codec, ledger, held)
-
-
-def parse_exposure(uri: Uri) -> ExposureRequest:
-    """Read the values of an address that say what pictures to take."""
-    standard = ExposureRequest()
-    gate = None
-    if uri.choice("mode", "intensity", "gated") == "gated":
-        gate = GateScan.from_uri(uri)
-    elif set(uri.values) & set(GATE_OPTIONS):
-        raise InputError(f"'{uri.text}': a gate needs mode=gated")
-    return ExposureRequest(
-        uri.value("bits", int, standard.bits),
-        uri.value("exposure_us", float, standard.seconds * 1e6) * 1e-6,
-        uri.value("images", int, standard.images),
-        uri.value("width", int, standard.width),
-        uri.choice("pile_up", "0", "1") == "1",
-        gate,
-    )
-
-
-def parse_timeouts(uri: Uri) -> tuple[float, float]:
-    """Read how long to wait for an answer and for a server that went away, s."""
-    return parse_seconds(uri, "timeout_s", 5.0), parse_seconds(uri, "reconnect_s", 5.0)

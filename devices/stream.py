@@ -1,13 +1,11 @@
-"""From an instrument's own clock to the computer's.
-
-Sources whose instrument pushes bytes: one thread empties the instrument, `Source.read` decodes.
+"""Sources whose instrument pushes bytes: one thread empties the instrument, `Source.read` decodes.
 
 ::
 
     instrument -> Feed -> [thread: whole records] -> Ring -> (tap) -> Codec -> Batch
 
-At the end is what such sources share: values of their addresses, and trying again until an
-instrument that went away is back.
+Here is also what such sources share: the way from an instrument's own clock to the computer's,
+values of their addresses, and trying again until an instrument that went away is back.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from time import monotonic, sleep
 from typing import Protocol, TypeVar
 from weakref import WeakSet
 
-from devices.address import Uri
+from devices.address import Options, option
 from devices.source import (
     OVERFLOW_POLICIES,
     READ_TIMEOUT_S,
@@ -40,7 +38,6 @@ from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceNotFoundError,
     DeviceTimeoutError,
-    InputError,
 )
 from tofclip.storage import Record
 
@@ -103,9 +100,6 @@ STOP_TIMEOUT_S = 15.0
 RETRY_INTERVAL_S = 0.1
 """Seconds between two attempts to reach an instrument that went away."""
 
-STREAM_OPTIONS = ("buffer_mib", "policy")
-"""Values of an address that live sources share."""
-
 _MEBIBYTE = 1 << 20
 _Connected = TypeVar("_Connected")
 
@@ -124,6 +118,13 @@ class Transfer:
 
 class Feed(Protocol):
     """Where a stream's bytes come from. Every method is called from one thread, never two at once."""
+
+    ledger: Ledger
+    """Where the feed enters losses and reconnections."""
+
+    @property
+    def codec(self) -> Codec:
+        """What reads its bytes."""
 
     @property
     def info(self) -> Info:
@@ -149,28 +150,32 @@ class Feed(Protocol):
 
 
 @dataclass(frozen=True)
-class BufferSettings:
+class StreamOptions(Options):
     """How much a stream holds for a slow reader, and what happens then; see `RingBuffer`."""
 
-    capacity: int = 64 << 20
-    policy: OverflowPolicy = "block"
+    buffer_mib: float = option(64.0, above=0, most=65536)
+    policy: OverflowPolicy = option("", choices=OVERFLOW_POLICIES)  # noqa: RUF009 - declares a field
+
+
+@dataclass(frozen=True)
+class LiveOptions(StreamOptions):
+    """Seconds to wait for an instrument that went away."""
+
+    reconnect_s: float = option(5.0, least=0, most=600)
 
 
 class StreamSource(DecodedSource):
     """A live source. Opening starts the instrument.
 
     Memory: the buffer's capacity, plus one transfer and one decoded piece.
-
-    `ledger`: the one that the feed enters losses into.
     """
 
-    def __init__(
-        self, feed: Feed, codec: Codec, ledger: Ledger, buffering: BufferSettings | None = None
-    ) -> None:
-        buffering = buffering or BufferSettings()
-        super().__init__(codec, ledger)
+    def __init__(self, feed: Feed, options: StreamOptions | None = None) -> None:
+        options = options or StreamOptions()
+        super().__init__(feed.codec, feed.ledger)
         self._feed = feed
-        self._ring = RingBuffer(buffering.capacity, buffering.policy, ledger)
+        capacity = int(options.buffer_mib * _MEBIBYTE)
+        self._ring = RingBuffer(capacity, options.policy, feed.ledger)
         self._stopping, self._closed = threading.Event(), False
         self._thread = threading.Thread(target=self._run_reader, name="device reader", daemon=True)
         try:
@@ -226,7 +231,7 @@ class StreamSource(DecodedSource):
         Whatever goes wrong here, `read` raises it: a thread that ended without a word would look
         like an instrument in the dark.
         """
-        reader = _FeedReader(self._feed, self.codec, self._ledger, self._ring)
+        reader = _FeedReader(self._feed, self._ring)
         # The feed is closed even if reading failed, and on the thread that used it.
         for step in (lambda: reader.run(self._stopping), self._feed.close):
             try:
@@ -249,8 +254,8 @@ def _close_open_sources() -> None:
 class _FeedReader:
     """Cuts what a feed brings into whole records."""
 
-    def __init__(self, feed: Feed, codec: Codec, ledger: Ledger, ring: RingBuffer) -> None:
-        self._feed, self._codec, self._ledger, self._ring = feed, codec, ledger, ring
+    def __init__(self, feed: Feed, ring: RingBuffer) -> None:
+        self._feed, self._codec, self._ledger, self._ring = feed, feed.codec, feed.ledger, ring
         self._rest, self._gap = b"", Gap.NONE
 
     def run(self, stopping: threading.Event) -> None:
@@ -296,28 +301,6 @@ class _FeedReader:
         if self._rest:
             self._ledger.truncate()
             self._rest = b""
-
-
-def parse_buffer_settings(uri: Uri) -> BufferSettings:
-    """Read ``buffer_mib=64&policy=block`` (or ``drop_oldest``, ``fail``)."""
-    capacity = uri.value("buffer_mib", float, BufferSettings().capacity / _MEBIBYTE) * _MEBIBYTE
-    if not 0 < capacity <= 1 << 36:
-        raise InputError(f"'{uri.text}': buffer_mib must be within 0 and 65536")
-    policy = next(
-        policy for policy in OVERFLOW_POLICIES if policy == uri.choice("policy", *OVERFLOW_POLICIES)
-    )
-    return BufferSettings(int(capacity), policy)
-
-
-def parse_seconds(uri: Uri, name: str, default: float) -> float:
-    """Read a time to wait, within 0 and 600 s.
-
-    `default`: seconds.
-    """
-    found = uri.value(name, float, default)
-    if not 0 < found <= 600:
-        raise InputError(f"'{uri.text}': {name} must be above 0 and at most 600")
-    return found
 
 
 def retry_connect(connect: Callable[[], _Connected], seconds: float) -> _Connected:

@@ -5,23 +5,21 @@ computer's loopback, and pictures of a simulated scene instead of Aravis' stripe
 from __future__ import annotations
 
 import ctypes
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from devices.address import Uri
-from devices.aravis import OPTIONS, AravisFeed, CameraSettings, load_aravis
+from devices.address import Uri, option
+from devices.aravis import AravisFeed, CameraOptions, load_aravis
+from devices.emulation.harness import HOST, EmulatedFeed
 from devices.emulation.scenes import (
     EmulatedLight,
     simulate_demonstration_light,
     simulate_line_light,
 )
-from devices.source import Info, Ledger
-from devices.stream import StreamSource, parse_buffer_settings
-from tofclip.camera import Camera
-from tofclip.errors import DeviceNotFoundError, InputError, MissingDependencyError
+from devices.stream import StreamSource
+from tofclip.errors import DeviceNotFoundError, MissingDependencyError
 from tofclip.storage import Field, Record
 
-LOOPBACK = "127.0.0.1"
 LIBRARY_FILE = "libaravis-0.8.so.0"
 FillPattern = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
@@ -29,63 +27,35 @@ FillPattern = ctypes.CFUNCTYPE(
 """``(buffer, nothing, exposure_us, gain, pixel_format)``, called in the camera's own thread."""
 
 
-class EmulatedFeed(AravisFeed):
-    """Frames of Aravis' own emulated camera.
+class EmulatedCamera:
+    """Aravis' own emulated camera: of `light`, or of moving stripes where there is none.
 
-    `library, ledger, settings`: as for `AravisFeed`; `lost_per_thousand`: packets of a thousand
-    that are lost on the wire; `light`: what it sees; None for Aravis' moving stripes; `seen_by`:
-    what a calibration would know of the lenslets before it.
+    `lost_per_thousand`: packets of a thousand that are lost on the wire.
     """
 
     def __init__(
-        self,
-        library: Any,
-        ledger: Ledger,
-        settings: CameraSettings,
-        serial: str,
-        lost_per_thousand: int,
-        light: EmulatedLight | None = None,
-        seen_by: Camera | None = None,
+        self, library: Any, serial: str, lost_per_thousand: int, light: EmulatedLight | None = None
     ) -> None:
-        self._camera_process = library.GvFakeCamera.new(LOOPBACK, serial)
-        if not self._camera_process.is_running():
+        self._camera = library.GvFakeCamera.new(HOST, serial)
+        if not self._camera.is_running():
             raise DeviceNotFoundError(
-                f"an emulated camera cannot listen on {LOOPBACK}; another one does already"
+                f"an emulated camera cannot listen on {HOST}; another one does already"
             )
-        self._camera_process.set_property("gvsp-lost-ratio", lost_per_thousand / 1000)
-        self._light, self._seen_by = light, seen_by
-        self._shown = None if light is None else ShownLight(self._camera_process, light)
-        super().__init__(library, LOOPBACK, ledger, settings)
+        self._camera.set_property("gvsp-lost-ratio", lost_per_thousand / 1000)
+        self._light = light
+        self._shown = None if light is None else ShownLight(self._camera, light)
 
-    @property
-    def info(self) -> Info:
-        known = super().info
-        return replace(known, instrument=f"emulated {known.instrument}")
-
-    @property
-    def calibration(self) -> Record | None:
-        """The scene's own time axis, where there is a scene."""
-        if self._light is None or self._seen_by is None:
-            return super().calibration
-        times = Field(self._light.row_times, "s", ("row",))
-        return Record(
-            "streak_calibration",
-            {"row_times": times},
-            children={"camera": self._seen_by.to_record()},
-        )
-
-    def close(self) -> None:
-        try:
-            super().close()
-        finally:
-            if self._shown is not None:
-                self._shown.close()
-            del self._camera_process
-
-    def _prepare_camera(self, camera: Any) -> None:
+    def prepare(self, camera: Any) -> None:
+        """Let the driver's camera have pictures of the light's size."""
         if self._light is not None:
             rows, columns = self._light.photons.shape
             camera.set_region(0, 0, columns, rows)
+
+    def close(self) -> None:
+        """Switch it off."""
+        if self._shown is not None:
+            self._shown.close()
+        self._shown = self._camera = None
 
 
 class ShownLight:
@@ -134,28 +104,43 @@ def _load_library() -> ctypes.CDLL:
     return library
 
 
+@dataclass(frozen=True)
+class EmulationOptions(CameraOptions):
+    """Values of the emulation besides the driver's own."""
+
+    scene: str = option("", choices=("stripes", "small", "demo"))
+    seed: int = option(0, least=0)
+    lost_per_thousand: int = option(0, least=0, most=1000)
+
+
 def open_emulated(uri: Uri) -> StreamSource:
     """Open ``sim+aravis://?frame_rate=100&scene=stripes&lost_per_thousand=0``: Aravis' own emulated
     camera.
 
-    Besides the driver's own (`devices.aravis.OPTIONS`) it takes ``scene``: ``stripes`` that move, or
-    ``demo`` and ``small`` (a slit of 256 pixels), of which it sends streak pictures in Mono16; ``seed`` of
-    their photons; and ``lost_per_thousand``, the packets lost on the wire.
+    ``scene``: ``stripes`` that move, or ``demo`` and ``small`` (a slit of 256 pixels), of which it
+    sends streak pictures in Mono16; ``seed``: of their photons; ``lost_per_thousand``: packets lost
+    on the wire.
     """
-    uri.reject_unknown(*OPTIONS, "scene", "seed", "lost_per_thousand")
-    settings, held = CameraSettings.from_uri(uri), parse_buffer_settings(uri)
-    lost, seed = uri.value("lost_per_thousand", int, 0), uri.value("seed", int, 0)
-    if not 0 <= lost <= 1000:
-        raise InputError(f"'{uri.text}': lost_per_thousand must be within 0..1000")
-    if seed < 0:
-        raise InputError(f"'{uri.text}': a seed must not be negative")
-    scene = uri.choice("scene", "stripes", "small", "demo")
-    light = camera = None
-    if scene != "stripes":
-        settings = replace(settings, pixel_format="Mono16")
-        seen = simulate_line_light() if scene == "small" else simulate_demonstration_light()
-        light, camera = EmulatedLight.of(seen, seed), seen.camera
-    ledger = Ledger()
-    serial = uri.location or "EMULATED"
-    feed = EmulatedFeed(load_aravis(), ledger, settings, serial, lost, light, camera)
-    return StreamSource(feed, feed.codec, ledger, held)
+    options = EmulationOptions.from_uri(uri)
+    library, serial, lost = load_aravis(), uri.location or "EMULATED", options.lost_per_thousand
+    if options.scene == "stripes":
+        camera = EmulatedCamera(library, serial, lost)
+        return _open_camera(library, camera, options, None)
+    options = replace(options, pixel_format="Mono16")
+    seen = simulate_line_light() if options.scene == "small" else simulate_demonstration_light()
+    times = {"row_times": Field(seen.row_times, "s", ("row",))}
+    known = Record("streak_calibration", times, children={"camera": seen.camera.to_record()})
+    camera = EmulatedCamera(library, serial, lost, EmulatedLight.of(seen, options.seed))
+    return _open_camera(library, camera, options, known)
+
+
+def _open_camera(
+    library: Any, camera: EmulatedCamera, options: CameraOptions, known: Record | None
+) -> StreamSource:
+    """Open the driver's camera; `known` is the scene's own time axis, where there is a scene."""
+    feed = EmulatedFeed(
+        camera,
+        lambda: AravisFeed(library, HOST, options, camera.prepare),
+        lambda said: known or said,
+    )
+    return StreamSource(feed, options)

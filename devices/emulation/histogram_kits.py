@@ -9,29 +9,27 @@ import threading
 import time
 import tty
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.address import Uri
+from devices.address import Options, Uri, option
+from devices.emulation.harness import EmulatedFeed
 from devices.histogram_kits import (
-    TMF8828_OPTIONS,
+    TMF_BINS,
+    TMF_CAPTURES,
+    TMF_CHANNELS,
+    TMF_LANES,
+    TMF_NUMBERS,
     TMF_TICK_S,
-    VL53L8_OPTIONS,
+    VL53_SCALE,
     KitFeed,
-    KitSettings,
-    Parser,
-    Tmf8828Parser,
-    Vl53l8Parser,
-    format_tmf8828,
-    format_vl53l8,
-    parse_tmf8828,
-    parse_vl53l8,
+    Tmf8828Options,
+    Vl53l8Options,
 )
-from devices.source import Info, Ledger
-from devices.stream import StreamSource, parse_buffer_settings
-from tofclip.errors import InputError
+from devices.stream import StreamSource
 from tofclip.units import SPEED_OF_LIGHT
 
 LineFormatter = Callable[[NDArray[np.uint32], int, int], list[bytes]]
@@ -40,39 +38,87 @@ PULSE_BINS = 1.5
 """Standard deviation of the emulated pulse."""
 
 
+def format_tmf8828(counts: NDArray[Any], number: int, tick: int) -> list[bytes]:
+    """Return the lines that a TMF8828's program sends for a frame; the inverse of `Tmf8828Parser`.
+
+    `counts` (128, zones); `number`: of the frame; `tick`: 0.2 us. Returns with their ends.
+    """
+    captures, halves = (TMF_CAPTURES, 2) if counts.shape[1] == 64 else (1, 1)
+    width = counts.shape[1] // captures
+    lines = []
+    for place in range(captures):
+        some = counts[:, place * width : (place + 1) * width].T.reshape(halves, -1, TMF_BINS)
+        for half in range(halves):
+            for lane in range(TMF_LANES):
+                channel, shift = lane % TMF_CHANNELS, 8 * (lane // TMF_CHANNELS)
+                values = np.zeros(TMF_BINS, np.int64)
+                if 1 <= channel <= some.shape[1]:
+                    values = some[half, channel - 1].astype(np.int64) >> shift & 0xFF
+                words = ",".join(map(str, values.tolist()))
+                lines.append(f"#Raw,65,{half * TMF_LANES + lane},{words}\r\n".encode())
+        result = (number * captures + place) % TMF_NUMBERS
+        lines.append(f"#Obj,65,{result},25,{width},{tick}{',0' * 72}\r\n".encode())
+    return lines
+
+
+def format_vl53l8(counts: NDArray[Any], number: int = 0, tick: int = 0) -> list[bytes]:
+    """Return the lines that a VL53L8CH's program sends for a frame of counts (bins, zones), which
+    say neither its number nor its time.
+    """
+    lines = [b"Ranging Results:\r\n"]
+    for zone, column in enumerate(counts.T):
+        words = "".join(f"{value / VL53_SCALE:.1f}, " for value in column.tolist())
+        lines.append(f"Aggregate {zone}, Ambient: 0.5, Bins: {words}\r\n".encode())
+    return lines
+
+
 def compute_zone_ranges(zones: int) -> NDArray[np.float64]:
     """Return how far the emulated scene, an inclined wall, is in each zone, m."""
     return 0.5 + 1.0 * np.arange(zones) / zones
 
 
+@dataclass(frozen=True)
+class EmulationOptions(Options):
+    """Values of the emulation besides the driver's own: frames per second, and of which number of
+    frames one has a line cut (`torn`), or is not sent (`lost`); 0 for none.
+    """
+
+    seed: int = option(0, least=0)
+    rate: float = option(5.0, above=0, most=1000)
+    torn: int = option(0, least=0)
+    lost: int = option(0, least=0)
+
+
+@dataclass(frozen=True)
+class EmulatedTmf8828Options(EmulationOptions, Tmf8828Options):
+    """Of a TMF8828."""
+
+    bin_ps: float = option(250.0)
+
+
+@dataclass(frozen=True)
+class EmulatedVl53l8Options(EmulationOptions, Vl53l8Options):
+    """Of a VL53L8CH."""
+
+
+EmulatedOptions = EmulatedTmf8828Options | EmulatedVl53l8Options
+
+
 class EmulatedKit:
     """A kit that sends frames once it has been asked to, or at once where it needs no asking.
 
-    `settings`: of the driver, but for the port; `parser`: the driver's, for the histograms' shape;
-    `format_lines`: from counts, the frame's number and its tick to lines; `rate`: frames per
-    second; `torn, lost`: of this number of frames one has a line cut, or is not sent; 0 for none.
+    `format_lines`: from counts, the frame's number and its tick to lines.
     """
 
-    def __init__(
-        self,
-        settings: KitSettings,
-        parser: Parser,
-        format_lines: LineFormatter,
-        seed: int,
-        rate: float,
-        torn: int = 0,
-        lost: int = 0,
-    ) -> None:
-        if not 0 < rate <= 1000 or seed < 0 or torn < 0 or lost < 0:
-            raise InputError("a kit's rate is within 0..1000 per second, its seed not negative")
-        self._settings, self._format = settings, format_lines
-        self._rate, self._seed, self._torn, self._lost = rate, seed, torn, lost
-        self._bins, self._zones = parser.codec.rows, parser.codec.columns
+    def __init__(self, options: EmulatedOptions, format_lines: LineFormatter) -> None:
+        self._options, self._format = options, format_lines
+        codec = options.make_parser().codec
+        self._bins, self._zones = codec.rows, codec.columns
         self._controller, self._terminal = os.openpty()
         tty.setraw(self._terminal)  # without echo, as a serial port
         self.port = os.ttyname(self._terminal)
         self._closing = threading.Event()
-        self._measuring = not settings.start
+        self._measuring = not options.start
         self.taken = 0
         """Frames taken so far, sent or not."""
         self._thread = threading.Thread(target=self._run, name="emulated kit", daemon=True)
@@ -80,11 +126,11 @@ class EmulatedKit:
 
     def draw_counts(self, number: int) -> NDArray[np.uint32]:
         """Return frame `number`'s counts (bins, zones); the same number gives the same frame."""
-        times = self._settings.first_bin + self._settings.bin_width * np.arange(self._bins)
+        times = self._options.first_bin + self._options.bin_width * np.arange(self._bins)
         delays = 2 * compute_zone_ranges(self._zones) / SPEED_OF_LIGHT
-        off = (times[:, np.newaxis] - delays) / (PULSE_BINS * self._settings.bin_width)
+        off = (times[:, np.newaxis] - delays) / (PULSE_BINS * self._options.bin_width)
         light = BACKGROUND_COUNTS + PEAK_COUNTS * np.exp(-(off**2) / 2)
-        return np.random.default_rng([self._seed, number]).poisson(light).astype(np.uint32)
+        return np.random.default_rng([self._options.seed, number]).poisson(light).astype(np.uint32)
 
     def close(self) -> None:
         """Unplug it."""
@@ -95,27 +141,27 @@ class EmulatedKit:
                 os.close(end)
 
     def _run(self) -> None:
-        began = time.monotonic()
+        options, began = self._options, time.monotonic()
         while not self._closing.is_set():
             self._read_commands(0.0 if self._measuring else 0.02)
             if not self._measuring:
-                began = time.monotonic() - self.taken / self._rate
+                began = time.monotonic() - self.taken / options.rate
                 continue
-            due = began + self.taken / self._rate
+            due = began + self.taken / options.rate
             if self._closing.wait(max(0.0, due - time.monotonic())):
                 return
             number, self.taken = self.taken, self.taken + 1
             tick = round((time.monotonic() - began + 1) / TMF_TICK_S) % (1 << 32)
             lines = self._format(self.draw_counts(number), number, tick)
-            if self._torn and number % self._torn == self._torn - 1:
+            if options.torn and (number + 1) % options.torn == 0:
                 lines[len(lines) // 2] = lines[len(lines) // 2][:20]
-            if not (self._lost and number % self._lost == self._lost - 1):
+            if not (options.lost and (number + 1) % options.lost == 0):
                 self._write(b"".join(lines))
 
     def _read_commands(self, timeout: float) -> None:
         ready, _, _ = select.select([self._controller], [], [], timeout)
         for letter in os.read(self._controller, 64) if ready else b"":
-            if self._settings.start and letter in b"ms":
+            if self._options.start and letter in b"ms":
                 self._measuring = letter == b"m"[0]
 
     def _write(self, data: bytes) -> None:
@@ -126,62 +172,18 @@ class EmulatedKit:
                 left = left[os.write(self._controller, left[:4096]) :]
 
 
-class EmulatedFeed(KitFeed):
-    """Frames of an emulated kit, which is unplugged when they are closed."""
-
-    def __init__(self, kit: EmulatedKit, settings: KitSettings, make: Callable[[], Parser]) -> None:
-        self._kit = kit
-        self.ledger = Ledger()
-        super().__init__(replace(settings, port=kit.port), make, self.ledger)
-
-    @property
-    def info(self) -> Info:
-        known = super().info
-        return replace(known, instrument=f"emulated {known.instrument}")
-
-    def close(self) -> None:
-        super().close()
-        self._kit.close()
-
-
 def open_tmf8828(uri: Uri) -> StreamSource:
     """Open ``sim+tmf8828://?seed=1&rate=5&bin_ps=250``: an emulated kit that looks at an inclined
     wall. ``torn=N`` and ``lost=N`` cut or lose every Nth frame.
     """
-    uri.reject_unknown(*TMF8828_OPTIONS, "seed", "rate", "torn", "lost")
-    usual = replace(uri, values={"bin_ps": "250", **uri.values})
-    settings, zones = parse_tmf8828(usual, "")
-    return _open_emulated(usual, settings, lambda: Tmf8828Parser(zones), format_tmf8828)
+    return _open_emulated(EmulatedTmf8828Options.from_uri(uri), format_tmf8828)
 
 
 def open_vl53l8(uri: Uri) -> StreamSource:
     """Open ``sim+vl53l8://?seed=1&rate=5&sub_sample=4``, likewise."""
-    uri.reject_unknown(*VL53L8_OPTIONS, "seed", "rate", "torn", "lost")
-    settings, zones, bins = parse_vl53l8(uri, "")
-    return _open_emulated(
-        uri,
-        settings,
-        lambda: Vl53l8Parser(zones, bins),
-        lambda counts, number, tick: format_vl53l8(counts),
-    )
+    return _open_emulated(EmulatedVl53l8Options.from_uri(uri), format_vl53l8)
 
 
-def _open_emulated(
-    uri: Uri, settings: KitSettings, make_parser: Callable[[], Parser], format_lines: LineFormatter
-) -> StreamSource:
-    held = parse_buffer_settings(uri)
-    kit = EmulatedKit(
-        settings,
-        make_parser(),
-        format_lines,
-        uri.value("seed", int, 0),
-        uri.value("rate", float, 5.0),
-        uri.value("torn", int, 0),
-        uri.value("lost", int, 0),
-    )
-    try:
-        feed = EmulatedFeed(kit, settings, make_parser)
-    except BaseException:
-        kit.close()
-        raise
-    return StreamSource(feed, feed.codec, feed.ledger, held)
+def _open_emulated(options: EmulatedOptions, format_lines: LineFormatter) -> StreamSource:
+    kit = EmulatedKit(options, format_lines)
+    return StreamSource(EmulatedFeed(kit, lambda: KitFeed(kit.port, options)), options)

@@ -14,7 +14,7 @@ from time import monotonic, sleep
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.address import Uri
+from devices.address import Uri, option
 from devices.emulation.scenes import LineLight, simulate_line_light
 from devices.linospad2 import (
     CLOCK_PERIOD_S,
@@ -27,7 +27,7 @@ from devices.linospad2 import (
 )
 from devices.linospad2_kernels import ADDRESSES
 from devices.source import Info, Ledger, Records
-from devices.stream import STREAM_OPTIONS, StreamSource, Transfer, parse_buffer_settings
+from devices.stream import StreamOptions, StreamSource, Transfer
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Record
 
@@ -37,16 +37,6 @@ CYCLE_TIME_S = 4e-3
 """A cycle lasts as long, s; a code has room for 4.8 ms."""
 
 COUNTER_TICK_S = 7.5e-9
-OPTIONS = (
-    "seed",
-    "cycles",
-    "photons",
-    "firmware",
-    "timestamps",
-    "counter",
-    "pace",
-    *STREAM_OPTIONS,
-)
 
 
 @dataclass(frozen=True)
@@ -159,6 +149,7 @@ class SimulatedFeed:
     """
 
     def __init__(self, board: SimulatedBoard, cycles: int, cycle_time: float) -> None:
+        self.ledger, self.codec = Ledger(), board.codec
         self._board, self._left, self._cycle_time = board, cycles, cycle_time
         self._number = 0
 
@@ -193,29 +184,30 @@ class SimulatedFeed:
         """Do nothing: nothing is held."""
 
 
+@dataclass(frozen=True)
+class SimulationOptions(StreamOptions):
+    """Values of an address."""
+
+    seed: int = option(0, least=0)
+    cycles: int = option(250, least=0)
+    photons: float = option(6000.0)  # expected number in a cycle
+    firmware: str = option("", choices=FIRMWARES)
+    timestamps: int = option(512)
+    counter: bool = option(False)
+    pace: str = option("", choices=("fast", "realtime"))  # realtime: a cycle takes its 4 ms
+
+
 def open_simulated(uri: Uri) -> StreamSource:
     """Open
     ``sim+linospad2://?seed=1&cycles=250&photons=6000&firmware=2212b&timestamps=512&counter=0&pace=fast``.
-
-    `photons` is the expected number in a cycle; ``pace=realtime`` lets a cycle take its 4 ms.
     """
-    uri.reject_unknown(*OPTIONS)
-    seed, cycles = uri.value("seed", int, 0), uri.value("cycles", int, 250)
-    if seed < 0 or cycles < 0:
-        raise InputError(f"'{uri.text}': seed and cycles must not be negative")
-    codec = LinoSpad2Codec(
-        uri.choice("firmware", *FIRMWARES),
-        uri.value("timestamps", int, 512),
-        uri.choice("counter", "0", "1") == "1",
-    )
+    options = SimulationOptions.from_uri(uri)
     board = SimulatedBoard(
         simulate_line_light(),
-        draw_uneven_calibration(seed),
-        codec,
-        uri.value("photons", float, 6000.0),
-        seed,
+        draw_uneven_calibration(options.seed),
+        LinoSpad2Codec(options.firmware, options.timestamps, options.counter),
+        options.photons,
+        options.seed,
     )
-    cycle_time = CYCLE_TIME_S if uri.choice("pace", "fast", "realtime") == "realtime" else 0.0
-    return StreamSource(
-        SimulatedFeed(board, cycles, cycle_time), codec, Ledger(), parse_buffer_settings(uri)
-    )
+    cycle_time = CYCLE_TIME_S if options.pace == "realtime" else 0.0
+    return StreamSource(SimulatedFeed(board, options.cycles, cycle_time), options)

@@ -1,17 +1,25 @@
-"""A streak camera with HPD-TA's RemoteEx, made of software, on this computer's loopback.
-
-An emulated streak camera as a source: the real driver, its own connection, a simulated scene.
+"""A streak camera with HPD-TA's RemoteEx, made of software, on this computer's loopback: the real
+driver, its own connection, a simulated scene.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from devices.address import Uri
-from devices.emulation.faults import HOST, Connection, Fault, LoopbackServer
+from devices.address import Uri, option
+from devices.emulation.harness import (
+    FAULT_DELAY_S,
+    FOREVER,
+    HOST,
+    Connection,
+    EmulatedFeed,
+    Fault,
+    LoopbackServer,
+    index_faults,
+)
 from devices.emulation.scenes import (
     EmulatedLight,
     simulate_demonstration_light,
@@ -22,41 +30,22 @@ from devices.remoteex import (
     DATA_GREETING,
     GAIN_PARAMETER,
     GREETING,
-    OPTIONS,
     STREAK_TUBE,
     TERMINATOR,
     Answer,
     AnswerCode,
     Command,
-    LiveSettings,
     RemoteExClient,
     RemoteExFeed,
-    parse_live_settings,
+    StreakOptions,
 )
-from devices.source import Info, Ledger
-from devices.stream import StreamSource, parse_buffer_settings
-from tofclip.camera import Camera
+from devices.stream import StreamSource
 from tofclip.errors import InputError, ProtocolError
 from tofclip.storage import Record
 
 SUPPORTED_FAULTS = ("timeout", "short", "unplug", "corrupt", "lost", "overflow")
-UNLIMITED_FRAMES = 1 << 62
-FAULT_DELAY_S = 0.1
-"""Seconds by which a fault of amount 1 delays an answer."""
-
-
-@dataclass(frozen=True)
-class Circumstances:
-    """What a client finds."""
-
-    is_application_up: bool = True  # HPD-TA runs; otherwise all but the start of it is refused
-    is_live: bool = False  # an operator has started live mode
-    busy_for: int = 0  # questions for the state of an asynchronous command after which that is over
-    time_range: str = "20 ns"  # ``20 ns`` of a single sweep, ``3`` of a synchroscan unit
-    has_scaling_table: bool = True
-    stray_bytes: int = 17  # that wait on the data port, right behind the greeting
-    # number of the picture after which live mode is started anew, at the computer itself
-    restart_at: int | None = None
+SINGLE_SWEEPS = ("1 ns", "20 ns", "100 ns", "1 us", "10 \u00b5s")
+SYNCHROSCAN_SWEEPS = ("1", "2", "3", "4", "5")
 
 
 @dataclass
@@ -71,6 +60,10 @@ class _Acquisition:
     is_running: bool = False
 
 
+class _RefusedError(Exception):
+    """A command that is answered by a code: `AnswerCode`, then what is said."""
+
+
 class EmulatedStreakCamera:
     """The server. Pictures are numbered from 0 for each client.
 
@@ -78,34 +71,33 @@ class EmulatedStreakCamera:
     the request for a picture, from 0: ``timeout`` answers `amount` tenths of a second late,
     ``short`` pauses so long in the middle of a picture, ``unplug`` hangs up, ``corrupt`` answers
     nonsense, ``lost`` lets `amount` pictures fall out of the ring buffer, ``overflow`` announces
-    more than any picture takes.
+    more than any picture takes. What a client finds besides is the class's: subclasses differ.
     """
+
+    is_application_up = True  # HPD-TA runs; otherwise all but the start of it is refused
+    is_live = False  # an operator has started live mode
+    busy_for = 0  # questions for the state of an asynchronous command after which that is over
+    time_range = "20 ns"  # of a single sweep; ``3`` of a synchroscan unit
+    has_scaling_table = True
+    stray_bytes = 17  # that wait on the data port, right behind the greeting
+    # number of the picture after which live mode is started anew, at the computer itself
+    restart_at: int | None = None
 
     def __init__(
         self,
         light: EmulatedLight,
         frame_rate: float,
-        frames: int = UNLIMITED_FRAMES,
+        frames: int = FOREVER,
         faults: Sequence[Fault] = (),
-        found: Circumstances | None = None,
     ) -> None:
         if not 0 < frame_rate <= 1e4:
             raise InputError(
                 f"the frame rate must be above 0 and at most 10000 per second, got {frame_rate:g}"
             )
-        for fault in faults:
-            if fault.kind not in SUPPORTED_FAULTS:
-                raise InputError(
-                    f"a streak camera's faults are {', '.join(SUPPORTED_FAULTS)}, not {fault.kind}"
-                )
         self._light, self._interval, self._frames = light, 1 / frame_rate, frames
-        self._faults = {fault.transfer: fault for fault in faults}
-        self._found = found or Circumstances()
-        self._is_up = self._found.is_application_up
-        self._busy_for = self._found.busy_for
-        self._restarts = 0
-        self._parameters = {
-            "Time Range": self._found.time_range,
+        self._faults = index_faults(faults, SUPPORTED_FAULTS)
+        self._tube = {
+            "Time Range": self.time_range,
             "Mode": "Operate",
             GAIN_PARAMETER: "0",
             "Shutter": "Closed",
@@ -115,8 +107,8 @@ class EmulatedStreakCamera:
             "Trig. slope": "Rising",
             "DeviceName": "C0000",
         }
-        self._camera_parameters = {"Exposure": "30 ms", "Binning": "1 x 1"}
-        self._acquisition = _Acquisition()
+        self._sensor = {"Exposure": "30 ms", "Binning": "1 x 1"}
+        self._run = _Acquisition()
         self._requests = 0
         self.taken = 0
         """Pictures taken since it was switched on, in all rows of them."""
@@ -126,14 +118,14 @@ class EmulatedStreakCamera:
         self._lock = threading.Lock()
         self._command_server = LoopbackServer(self._serve_commands)
         self._frame_server = LoopbackServer(self._serve_data)
-        if self._found.is_live:
-            self._acquisition = _Acquisition(is_operators=True)
-            self._run_acquisition()
+        if self.is_live:
+            self._run = _Acquisition(is_operators=True)
+            self._start_acquisition()
 
     @property
     def is_running(self) -> bool:
         """Whether it takes pictures."""
-        return self._acquisition.is_running
+        return self._run.is_running
 
     @property
     def ports(self) -> tuple[int, int]:
@@ -143,11 +135,15 @@ class EmulatedStreakCamera:
     @property
     def gain(self) -> str:
         """The micro-channel plate's gain, as it was set last."""
-        return self._parameters[GAIN_PARAMETER]
+        return self._tube[GAIN_PARAMETER]
+
+    @gain.setter
+    def gain(self, value: str) -> None:
+        self._tube[GAIN_PARAMETER] = value
 
     def close(self) -> None:
         """Switch it off."""
-        self._acquisition.is_running = False
+        self._run.is_running = False
         self._command_server.close()
         self._frame_server.close()
 
@@ -156,161 +152,124 @@ class EmulatedStreakCamera:
 
     def _serve_data(self, connection: Connection) -> None:
         self._data = connection
-        stray = b"\xee" * self._found.stray_bytes
-        connection.send(DATA_GREETING.encode() + TERMINATOR + stray)
-        while (
-            connection.read_request(TERMINATOR) is not None
-        ):  # nothing is ever said here, only the end is waited for
-            pass
+        connection.send(DATA_GREETING.encode() + TERMINATOR + b"\xee" * self.stray_bytes)
+        while connection.read_request(TERMINATOR) is not None:
+            pass  # nothing is ever said here, only the end is waited for
 
     def _serve_commands(self, connection: Connection) -> None:
         connection.send(GREETING.encode() + TERMINATOR)
         while (message := connection.read_request(TERMINATOR)) is not None:
+            name = "Unknown"
             try:
                 command = Command.decode(message)
+                name = command.name
+                words = self._execute(command, connection)
+                if words is not None:
+                    _send_done(connection, name, *words)
             except ProtocolError:
-                connection.send(Answer(AnswerCode.SYNTAX, "Unknown").encode())
-                continue
-            name = command.name.casefold()
-            if not self._is_up and name not in ("appstart", "appinfo"):
-                refusal = Answer(AnswerCode.NOT_NOW, command.name, ("application not running",))
-                connection.send(refusal.encode())
-                continue
-            self._command_handlers().get(name, _send_unknown)(command, connection)
-        self._end_acquisition(connection)
+                connection.send(Answer(AnswerCode.SYNTAX, name).encode())
+            except _RefusedError as refusal:
+                code, *said = refusal.args
+                connection.send(Answer(code, name, tuple(said)).encode())
+        # No more pictures for this client; another one may have come by now.
+        if self._run.client is connection:
+            self._run.client = None
+            if not self._run.is_operators:
+                self._run.is_running = False
 
-    def _command_handlers(self) -> dict[str, Callable[[Command, Connection], None]]:
-        # Commands of the handbook; names are not case-sensitive.
-        known: dict[str, Callable[[Command, Connection], None]] = {
-            "AppStart": self._start_application,
-            "AppInfo": _answer_with("9.5 pf4"),
-            "AppLicenceGet": _answer_with("1", "1", "1"),
-            "AppEnd": _send_done,
-            "DevParamGet": self._get_parameter,
-            "DevParamSet": self._set_parameter,
-            "DevParamInfoEx": self._describe_parameter,
-            "DevParamsList": self._list_parameters,
-            "CamParamGet": self._get_camera_parameter,
-            "CamParamSet": self._set_camera_parameter,
-            "CamParamInfoEx": self._describe_camera_parameter,
-            "AcqLiveMonitor": self._set_monitor,
-            "AcqAcqMonitor": _send_done,
-            "AcqStart": self._start_acquisition,
-            "AcqStop": self._stop_acquisition,
-            "AcqStatus": self._get_status,
-            "AsyncCommandStatus": self._get_async_status,
-            "SeqStart": _send_done,
-            "ImgIndexGet": _answer_with("0"),
-            "ImgSave": _send_done,
-            "ImgLoad": _send_done,
-            "ImgRingBufferGet": self._get_frame,
-            "ImgDataGet": self._get_table,
-        }
-        return {name.casefold(): handler for name, handler in known.items()}
+    def _execute(  # noqa: C901 - a table
+        self, command: Command, connection: Connection
+    ) -> tuple[str, ...] | None:
+        """Do what the handbook says, and return what is answered; None where that has been sent.
+        Names of commands are not case-sensitive.
+        """
+        tube, sensor, run = self._tube, self._sensor, self._run
+        match (command.name.casefold(), *command.arguments):
+            case (name, *_) if not self.is_application_up and name not in ("appstart", "appinfo"):
+                raise _RefusedError(AnswerCode.NOT_NOW, "application not running")
+            case ("appstart", *_):
+                self.is_application_up = True
+                return ()
+            case (("append" | "acqacqmonitor" | "seqstart" | "imgsave" | "imgload"), *_):
+                return ()
+            case ("appinfo", *_):
+                return ("9.5 pf4",)
+            case ("applicenceget", *_):
+                return ("1", "1", "1")
+            case ("imgindexget", *_):
+                return ("0",)
+            case ("devparamget", place, name) if place == STREAK_TUBE and name in tube:
+                return (tube[name],)
+            case ("devparamset", _, name, value) if name in tube:
+                tube[name] = value
+                return ()
+            case ("devparaminfoex", _, name) if name == GAIN_PARAMETER:
+                # label, current value, type, readable and writable, range
+                return (name, self.gain, "1", "1", "1", "0", "63")
+            case ("devparaminfoex", _, name) if name in tube:
+                ranges = SYNCHROSCAN_SWEEPS if self.time_range.isdecimal() else SINGLE_SWEEPS
+                return (name, tube[name], "2", "1", "1", "5", *ranges)
+            case ("devparamslist", *_):
+                return (str(len(tube)), *tube)
+            case ("camparamget", *_, name) if name in sensor:
+                return (sensor[name],)
+            case ("camparamset", _, name, value) if name in sensor:
+                sensor[name] = value
+                return ()
+            case ("camparaminfoex", *_, name) if name in sensor:
+                return (name, sensor[name], "2", "1", "1", "1", sensor[name])
+            case ("acqlivemonitor", "RingBuffer", number) if number.isdecimal():
+                buffers = max(1, int(number))
+                if run.is_running and run.is_operators:
+                    run.client, run.buffers = connection, buffers
+                else:
+                    run.is_running = False
+                    self._run = _Acquisition(connection, buffers=buffers)
+                return ()
+            case ("acqlivemonitor", "Off", *_):
+                if run.is_operators:
+                    run.client = None
+                return ()
+            case ("acqstart", *_) if run.is_running or self.busy_for:
+                # The text of an error may hold carriage returns.
+                refusal = Answer(AnswerCode.IMPOSSIBLE, command.name).encode()
+                said = b",command is\ralready running \xb5\r\n(HAcq)\r"
+                connection.send(refusal.removesuffix(TERMINATOR) + said)
+                return None
+            case ("acqstart", *_):
+                _send_done(connection, command.name)
+                self._start_acquisition()
+                return None
+            case ("acqstop", *_):
+                with self._lock:  # none is taken after the answer
+                    run.is_running = False
+                self.busy_for = 0
+                return ()
+            case ("acqstatus", *_):
+                return ("busy", "Live") if run.is_running else ("idle",)
+            case ("asynccommandstatus", *_):
+                self.busy_for = max(0, self.busy_for - 1)
+                return (str(int(self.busy_for > 0)), "0", "0")
+            case ("imgringbufferget", _, number) if number.isdecimal() and self._data:
+                self._send_frame(int(number), connection)
+                return None
+            case ("imgringbufferget", *_):
+                raise _RefusedError(AnswerCode.NO_DATA_LINK)
+            case ("imgdataget", _, "ScalingTable", "Vertical") if (
+                self._data and self.has_scaling_table
+            ):
+                # In the unit of the time range: ns, or ps for a synchroscan unit.
+                per_s = 1e12 if self.time_range.isdecimal() else 1e9
+                table = (self._light.row_times * per_s).astype("<f4")
+                _send_done(connection, command.name, str(table.size), "1")
+                self._send_data(table.tobytes())
+                return None
+            case _:
+                raise _RefusedError(AnswerCode.UNKNOWN)
 
-    def _start_application(self, command: Command, connection: Connection) -> None:
-        self._is_up = True
-        _send_done(command, connection)
-
-    def _describe_parameter(self, command: Command, connection: Connection) -> None:
-        name = command.arguments[1] if len(command.arguments) == 2 else ""
-        if name == GAIN_PARAMETER:
-            # label, current value, type, readable and writable, range
-            return _send_done(command, connection, name, self.gain, "1", "1", "1", "0", "63")
-        ranges = ("1", "2", "3", "4", "5")
-        if not self._found.time_range.isdecimal():
-            ranges = ("1 ns", "20 ns", "100 ns", "1 us", "10 \u00b5s")
-        current = self._parameters.get(name)
-        if current is None:
-            return _send_unknown(command, connection)
-        return _send_done(command, connection, name, current, "2", "1", "1", "5", *ranges)
-
-    def _list_parameters(self, command: Command, connection: Connection) -> None:
-        _send_done(command, connection, str(len(self._parameters)), *self._parameters)
-
-    def _get_camera_parameter(self, command: Command, connection: Connection) -> None:
-        value = self._camera_parameters.get(command.arguments[-1] if command.arguments else "")
-        if value is None:
-            return _send_unknown(command, connection)
-        return _send_done(command, connection, value)
-
-    def _set_camera_parameter(self, command: Command, connection: Connection) -> None:
-        if len(command.arguments) != 3 or command.arguments[1] not in self._camera_parameters:
-            return _send_unknown(command, connection)
-        self._camera_parameters[command.arguments[1]] = command.arguments[2]
-        return _send_done(command, connection)
-
-    def _describe_camera_parameter(self, command: Command, connection: Connection) -> None:
-        name = command.arguments[-1] if command.arguments else ""
-        value = self._camera_parameters.get(name)
-        if value is None:
-            return _send_unknown(command, connection)
-        return _send_done(command, connection, name, value, "2", "1", "1", "1", value)
-
-    def _get_status(self, command: Command, connection: Connection) -> None:
-        words = ("busy", "Live") if self._acquisition.is_running else ("idle",)
-        _send_done(command, connection, *words)
-
-    def _get_async_status(self, command: Command, connection: Connection) -> None:
-        self._busy_for = max(0, self._busy_for - 1)
-        is_busy = str(int(self._busy_for > 0))
-        _send_done(command, connection, is_busy, "0", "0")
-
-    def _get_parameter(self, command: Command, connection: Connection) -> None:
-        value = self._parameters.get(command.arguments[1] if len(command.arguments) == 2 else "")
-        if value is None or command.arguments[0] != STREAK_TUBE:
-            return _send_unknown(command, connection)
-        return _send_done(command, connection, value)
-
-    def _set_parameter(self, command: Command, connection: Connection) -> None:
-        if len(command.arguments) != 3 or command.arguments[1] not in self._parameters:
-            return _send_unknown(command, connection)
-        self._parameters[command.arguments[1]] = command.arguments[2]
-        return _send_done(command, connection)
-
-    def _set_monitor(self, command: Command, connection: Connection) -> None:
-        kind, *numbers = command.arguments or ("",)
-        if kind == "RingBuffer" and len(numbers) == 1 and numbers[0].isdecimal():
-            buffers = max(1, int(numbers[0]))
-            if self._acquisition.is_running and self._acquisition.is_operators:
-                self._acquisition.client = connection
-                self._acquisition.buffers = buffers
-            else:
-                self._acquisition.is_running = False
-                self._acquisition = _Acquisition(connection, buffers=buffers)
-        elif kind == "Off":
-            if self._acquisition.is_operators:
-                self._acquisition.client = None
-        else:
-            return _send_unknown(command, connection)
-        return _send_done(command, connection)
-
-    def _start_acquisition(self, command: Command, connection: Connection) -> None:
-        if self._acquisition.is_running or self._busy_for:
-            # The text of an error may hold carriage returns.
-            refusal = Answer(AnswerCode.IMPOSSIBLE, command.name).encode().removesuffix(TERMINATOR)
-            connection.send(refusal + b",command is\ralready running \xb5\r\n(HAcq)\r")
-            return
-        _send_done(command, connection)
-        self._run_acquisition()
-
-    def _run_acquisition(self) -> None:
-        run = self._acquisition
-        run.is_running = True
-        threading.Thread(target=self._acquire_frames, args=(run,), daemon=True).start()
-
-    def _stop_acquisition(self, command: Command, connection: Connection) -> None:
-        with self._lock:  # none is taken after the answer
-            self._acquisition.is_running = False
-        self._busy_for = 0
-        _send_done(command, connection)
-
-    def _end_acquisition(self, connection: Connection) -> None:
-        """Take no more pictures for this client; another one may have come by now."""
-        if self._acquisition.client is connection:
-            self._acquisition.client = None
-            if not self._acquisition.is_operators:
-                self._acquisition.is_running = False
+    def _start_acquisition(self) -> None:
+        self._run.is_running = True
+        threading.Thread(target=self._acquire_frames, args=(self._run,), daemon=True).start()
 
     def _acquire_frames(self, run: _Acquisition) -> None:
         """Take pictures, one after the other, and say so."""
@@ -329,43 +288,28 @@ class EmulatedStreakCamera:
             if connection is not None:
                 words = ("RingBuffer", str(number), elapsed_ms)
                 connection.send(Answer(AnswerCode.MESSAGE, ANNOUNCEMENT, words).encode())
-            if number == self._found.restart_at and not self._restarts:
+            if number == self.restart_at:
+                self.restart_at = None
                 with self._lock:
-                    self._restarts += 1
-                    run.oldest = 0
-                    run.newest = -1
+                    run.oldest, run.newest = 0, -1
             time.sleep(max(0.0, began + (number + 1) * self._interval - time.monotonic()))
 
-    def _get_frame(self, command: Command, connection: Connection) -> None:
-        if (
-            len(command.arguments) != 2
-            or not command.arguments[1].isdecimal()
-            or self._data is None
-        ):
-            connection.send(Answer(AnswerCode.NO_DATA_LINK, command.name).encode())
-            return
+    def _send_frame(self, number: int, connection: Connection) -> None:
         fault = self._faults.get(self._requests)
         self._requests += 1
+        kind, amount = (fault.kind, fault.amount) if fault else ("", 0)
+        run = self._run
         with self._lock:
-            number = int(command.arguments[1])
-            if fault and fault.kind == "lost":
-                self._acquisition.oldest = number + fault.amount
-                self._acquisition.newest = max(self._acquisition.newest, self._acquisition.oldest)
-            number = max(number, self._acquisition.oldest)
-            newest = self._acquisition.newest
+            if kind == "lost":
+                run.oldest = number + amount
+                run.newest = max(run.newest, run.oldest)
+            number, newest = max(number, run.oldest), run.newest
         if number > newest:
-            connection.send(
-                Answer(AnswerCode.IMPOSSIBLE, command.name, (f"current max = {newest}",)).encode()
-            )
-            return
-        self._send_frame(number, fault, connection)
-
-    def _send_frame(self, number: int, fault: Fault | None, connection: Connection) -> None:
-        kind, pause = (fault.kind, fault.amount * FAULT_DELAY_S) if fault else ("", 0.0)
+            raise _RefusedError(AnswerCode.IMPOSSIBLE, f"current max = {newest}")
         pixels = self._light.draw_frame(number)
         rows, columns = pixels.shape
         if kind == "timeout":
-            time.sleep(pause)
+            time.sleep(amount * FAULT_DELAY_S)
         if kind == "unplug":
             self._command_server.close_connections()
             self._frame_server.close_connections()
@@ -374,113 +318,51 @@ class EmulatedStreakCamera:
             connection.send(b"\x00\xff?" + TERMINATOR)
             return
         size = (str(1 << 30), str(1 << 30)) if kind == "overflow" else (str(columns), str(rows))
-        connection.send(
-            Answer(
-                AnswerCode.DONE, "ImgRingBufferGet", (*size, "2", "0", str(number), "0")
-            ).encode()
-        )
+        _send_done(connection, "ImgRingBufferGet", *size, "2", "0", str(number), "0")
         # In halves, so that a client has to put a picture together.
         data, half = pixels.tobytes(), pixels.nbytes // 2
         self._send_data(data[:half])
         if kind == "short":
-            time.sleep(pause)
+            time.sleep(amount * FAULT_DELAY_S)
         self._send_data(data[half:])
         self.sent += 1
-
-    def _get_table(self, command: Command, connection: Connection) -> None:
-        is_table = command.arguments[1:] == ("ScalingTable", "Vertical")
-        if not is_table or self._data is None or not self._found.has_scaling_table:
-            return _send_unknown(command, connection)
-        # In the unit of the time range, which is ns, or ps for a synchroscan unit.
-        per_s = 1e12 if self._found.time_range.isdecimal() else 1e9
-        table = (self._light.row_times * per_s).astype("<f4")
-        _send_done(command, connection, str(table.size), "1")
-        return self._send_data(table.tobytes())
 
     def _send_data(self, data: bytes) -> None:
         if self._data is not None:
             self._data.send(data)
 
 
-def _answer_with(*words: str) -> Callable[[Command, Connection], None]:
-    """Return a handler that always gives the same answer."""
-    return lambda command, connection: _send_done(command, connection, *words)
+def _send_done(connection: Connection, name: str, *words: str) -> None:
+    connection.send(Answer(AnswerCode.DONE, name, words).encode())
 
 
-def _send_done(command: Command, connection: Connection, *arguments: str) -> None:
-    connection.send(Answer(AnswerCode.DONE, command.name, arguments).encode())
+@dataclass(frozen=True)
+class EmulationOptions(StreakOptions):
+    """Values of the emulation besides the driver's own."""
 
-
-def _send_unknown(command: Command, connection: Connection) -> None:
-    connection.send(Answer(AnswerCode.UNKNOWN, command.name).encode())
-
-
-class EmulatedFeed(RemoteExFeed):
-    """A camera's pictures, with what the calibration of the lenslets before it would tell.
-
-    Closing switches the emulated camera off.
-    """
-
-    def __init__(
-        self, server: EmulatedStreakCamera, camera: Camera, ledger: Ledger, settings: LiveSettings
-    ) -> None:
-        self._server, self._camera = server, camera
-        port, data_port = server.ports
-        super().__init__(
-            lambda: RemoteExClient(HOST, port, data_port, settings.timeout), ledger, settings
-        )
-
-    @property
-    def info(self) -> Info:
-        known = super().info
-        return replace(known, instrument=f"emulated {known.instrument}")
-
-    @property
-    def calibration(self) -> Record | None:
-        known = super().calibration
-        return (
-            None if known is None else replace(known, children={"camera": self._camera.to_record()})
-        )
-
-    def close(self) -> None:
-        try:
-            super().close()
-        finally:
-            self._server.close()
+    seed: int = option(0, least=0)
+    scene: str = option("", choices=("demo", "small"))
+    frame_rate: float = option(10.0)
+    frames: int = option(FOREVER)  # then it is dark
+    faults: tuple[Fault, ...] = option((), Fault.parse)
 
 
 def open_emulated(uri: Uri) -> StreamSource:
     """Open ``sim+remoteex://?seed=1&scene=demo&frame_rate=10&frames=N&faults=...``, an emulated
-    camera behind TCP.
-
-    Besides the driver's own (`devices.remoteex.OPTIONS`) it takes ``scene`` (``demo``, or
-    ``small`` for a slit of 256 pixels), ``frames`` (then it is dark) and ``faults`` (as
-    `devices.emulation.faults.Fault.parse` reads them).
+    camera behind TCP; ``scene=small`` has a slit of 256 pixels.
     """
-    uri.reject_unknown(
-        *(name for name in OPTIONS if name != "data_port"),
-        "seed",
-        "scene",
-        "frame_rate",
-        "frames",
-        "faults",
+    options = EmulationOptions.from_uri(uri)
+    seen = simulate_line_light() if options.scene == "small" else simulate_demonstration_light()
+    light = EmulatedLight.of(seen, options.seed)
+    server = EmulatedStreakCamera(light, options.frame_rate, options.frames, options.faults)
+
+    def connect() -> RemoteExClient:
+        return RemoteExClient(HOST, *server.ports, options.timeout_s)
+
+    def describe(known: Record | None) -> Record | None:
+        """Add what the calibration of the lenslets before the camera would tell."""
+        return known and replace(known, children={"camera": seen.camera.to_record()})
+
+    return StreamSource(
+        EmulatedFeed(server, lambda: RemoteExFeed(connect, options), describe), options
     )
-    seed = uri.value("seed", int, 0)
-    if seed < 0:
-        raise InputError(f"'{uri.text}': a seed must not be negative")
-    settings, held = parse_live_settings(uri), parse_buffer_settings(uri)
-    rate, frames = uri.value("frame_rate", float, 10.0), uri.value("frames", int, UNLIMITED_FRAMES)
-    faults = Fault.parse(uri.value("faults", str, ""))
-    scene = (
-        simulate_demonstration_light()
-        if uri.choice("scene", "demo", "small") == "demo"
-        else simulate_line_light()
-    )
-    server = EmulatedStreakCamera(EmulatedLight.of(scene, seed), rate, frames, faults)
-    ledger = Ledger()
-    try:
-        feed = EmulatedFeed(server, scene.camera, ledger, settings)
-    except BaseException:
-        server.close()
-        raise
-    return StreamSource(feed, feed.codec, ledger, held)

@@ -4,39 +4,41 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from devices.address import Uri
-from devices.emulation.faults import HOST, Connection, Fault, LoopbackServer
+from devices.address import Uri, option
+from devices.emulation.harness import (
+    FAULT_DELAY_S,
+    FOREVER,
+    HOST,
+    Connection,
+    EmulatedFeed,
+    Fault,
+    LoopbackServer,
+    index_faults,
+)
 from devices.emulation.scenes import render_array_delays, render_array_light
 from devices.frames import GateScan
-from devices.source import Info, Ledger
 from devices.spad512 import (
     DONE_MARK,
     ERROR_MARK,
     GATE_STEP_PS,
     INFORMATION_COMMAND,
-    OPTIONS,
     ROWS,
     ExposureRequest,
     Spad512Feed,
-    parse_exposure,
-    parse_timeouts,
+    SpadOptions,
 )
-from devices.stream import StreamSource, parse_buffer_settings
+from devices.stream import StreamSource
 from devices.tcp import TcpLink
-from tofclip.errors import InputError, ProtocolError, ShapeError
+from tofclip.errors import ProtocolError, ShapeError
 
 SUPPORTED_FAULTS = ("timeout", "short", "unplug", "corrupt", "stall")
 GREETING = b"SPAD512S emulated server, ready\n"
-UNLIMITED_FRAMES = 1 << 62
-FAULT_DELAY_S = 0.1
-"""Seconds by which a fault of amount 1 delays an answer."""
-
 LASER_PERIOD_S = 25e-9
 GATE_EDGE_S = 1e-10
 """Standard deviation of the laser's pulse and the gate's edges together."""
@@ -45,18 +47,10 @@ AMBIENT_FRACTION = 0.02
 """Of a white pixel's light: what comes at any time."""
 
 TEXTS = {
-    INFORMATION_COMMAND: b"\n".join(
-        [
-            b"Master FPGA serial: EMULATED-1",
-            b"Slave FPGA serial: EMULATED-2",
-            b"Software version: 0",
-            b"Firmware version: 0",
-            b"Hardware version: 0",
-            b"Hardware flavour: 512",
-            b"Intensity imaging: 1",
-            b"Gated imaging: 1",
-            b"FLIM imaging: 0",
-        ]
+    INFORMATION_COMMAND: (
+        b"Master FPGA serial: EMULATED-1\nSlave FPGA serial: EMULATED-2\n"
+        b"Software version: 0\nFirmware version: 0\nHardware version: 0\nHardware flavour: 512\n"
+        b"Intensity imaging: 1\nGated imaging: 1\nFLIM imaging: 0"
     ),
     b"V": b"20.0,3.0",
     b"R": b"40.0,40.0,35.0,20.0,40000000.0,100.0",
@@ -75,32 +69,26 @@ class EmulatedSpadArray:
     of the request, from 0: ``timeout`` answers `amount` tenths of a second late, ``short`` pauses
     so long in the middle of a picture, ``unplug`` hangs up there, ``corrupt`` ends with other
     letters, ``stall`` says that it failed: with the mark at the end, with amount 2 with the mark in
-    front, with amount 3 in the middle of a picture; `is_framed`: whether it ends its texts with
-    `DONE_MARK`; `calibrates`: whether it calibrates itself when it is first asked.
+    front, with amount 3 in the middle of a picture.
     """
+
+    is_framed = True  # it ends its texts with `DONE_MARK`
+    must_calibrate = False  # it calibrates itself when it is first asked
 
     def __init__(
         self,
         photons: NDArray[np.float64],
         seed: int,
-        pictures: int = UNLIMITED_FRAMES,
+        pictures: int = FOREVER,
         faults: Sequence[Fault] = (),
         delays: NDArray[np.float64] | None = None,
-        is_framed: bool = True,
-        calibrates: bool = False,
     ) -> None:
         if photons.shape != (ROWS, ROWS):
             raise ShapeError("a SPAD512's light", (ROWS, ROWS), photons.shape)
-        for fault in faults:
-            if fault.kind not in SUPPORTED_FAULTS:
-                raise InputError(
-                    f"a SPAD array's faults are {', '.join(SUPPORTED_FAULTS)}, not {fault.kind}"
-                )
         self._photons, self._seed, self._left = photons, seed, pictures
-        self._faults = {fault.transfer: fault for fault in faults}
+        self._faults = index_faults(faults, SUPPORTED_FAULTS)
         self._delays = np.full((ROWS, ROWS), np.nan) if delays is None else delays
-        self._end = b"\n" + DONE_MARK if is_framed else b""
-        self._must_calibrate = calibrates
+        self._end = b"\n" + DONE_MARK if self.is_framed else b""
         self._requests = 0
         self._server = LoopbackServer(self._serve_client)
 
@@ -112,8 +100,6 @@ class EmulatedSpadArray:
     def draw_frame(self, request: int, number: int, exposure: ExposureRequest) -> NDArray[np.uint8]:
         """Return the bytes of picture `number` of a request; the same numbers give the same
         picture.
-
-        Returns (bytes,).
         """
         light = self._photons[:, : exposure.width] * exposure.seconds
         if exposure.gate is not None:
@@ -124,10 +110,8 @@ class EmulatedSpadArray:
         if exposure.bits == 1:
             turned = np.rot90(counts.astype(np.uint8), -exposure.codec.quarter_turns)
             return np.packbits(turned, axis=1).ravel()
-        pixels: NDArray[np.uint8] = (
-            counts.astype("<u2" if exposure.codec.bits == 16 else "u1").ravel().view(np.uint8)
-        )
-        return pixels
+        kind = "<u2" if exposure.codec.bits == 16 else "u1"
+        return np.asarray(counts.astype(kind).ravel().view(np.uint8))
 
     def close(self) -> None:
         """Switch it off."""
@@ -153,8 +137,8 @@ class EmulatedSpadArray:
             if command.startswith(b"PU,"):
                 pile_up = command == b"PU,1"
                 said = b"Pile-up correction is " + (b"on" if pile_up else b"off")
-            elif command == INFORMATION_COMMAND and self._must_calibrate:
-                self._must_calibrate = False
+            elif command == INFORMATION_COMMAND and self.must_calibrate:
+                self.must_calibrate = False
                 connection.send(b"The breakdown calibration process will start soon." + self._end)
                 time.sleep(0.3)
                 said = b"The breakdown is around 24.5"
@@ -181,11 +165,9 @@ class EmulatedSpadArray:
         if fault is not None and kind == "stall":
             if fault.amount == 3:
                 connection.send(b"\x81" * 1000)
-            connection.send(
-                ERROR_MARK + b": the FIFO is full.\n" + DONE_MARK
-                if fault.amount == 2
-                else b"The FIFO is full.\n" + ERROR_MARK
-            )
+            is_framed = fault.amount == 2
+            framed = ERROR_MARK + b": the FIFO is full.\n" + DONE_MARK
+            connection.send(framed if is_framed else b"The FIFO is full.\n" + ERROR_MARK)
             return
         time.sleep(pause if kind == "timeout" else 0)
         for number in range(exposure.frames):
@@ -220,61 +202,30 @@ def _suggest_gate(command: bytes) -> bytes:
     return "\n".join(lines).encode()
 
 
-class EmulatedFeed(Spad512Feed):
-    """Pictures of an emulated array, which is switched off when they are closed."""
+@dataclass(frozen=True)
+class EmulationOptions(SpadOptions):
+    """Values of the emulation besides the driver's own."""
 
-    def __init__(
-        self,
-        server: EmulatedSpadArray,
-        ledger: Ledger,
-        exposure: ExposureRequest,
-        patience: float,
-        reconnect: float,
-    ) -> None:
-        self._server = server
-        super().__init__(
-            lambda: TcpLink(HOST, server.port, patience), ledger, exposure, patience, reconnect
-        )
-
-    @property
-    def info(self) -> Info:
-        known = super().info
-        return replace(known, instrument=f"emulated {known.instrument}")
-
-    def close(self) -> None:
-        super().close()
-        self._server.close()
+    seed: int = option(0, least=0)
+    rate: float = option(2e4, least=0, most=1e9)  # photons per second on a white pixel
+    pictures: int = option(FOREVER)  # then it is dark
+    faults: tuple[Fault, ...] = option((), Fault.parse)
 
 
 def open_emulated(uri: Uri) -> StreamSource:
-    """Open ``sim+spad512://?seed=1&rate=20000&faults=...``: an emulated array that sees the
-    demonstration.
-
-    Besides the driver's own (`devices.spad512.OPTIONS`) it takes ``rate`` (photons per
-    second on a white pixel), ``pictures`` (then it is dark) and ``faults`` (as
-    `devices.emulation.faults.Fault.parse` reads them).
+    """Open ``sim+spad512://?seed=1&rate=20000&pictures=N&faults=...``: an emulated array that sees
+    the demonstration.
     """
-    uri.reject_unknown(*OPTIONS, "seed", "rate", "pictures", "faults")
-    seed, rate = uri.value("seed", int, 0), uri.value("rate", float, 2e4)
-    if seed < 0 or not 0 <= rate <= 1e9:
-        raise InputError(f"'{uri.text}': a seed must not be negative, a rate within 0..1e9")
-    (patience, back), exposure, held = (
-        parse_timeouts(uri),
-        parse_exposure(uri),
-        parse_buffer_settings(uri),
-    )
-    pictures = uri.value("pictures", int, UNLIMITED_FRAMES)
+    options = EmulationOptions.from_uri(uri)
     server = EmulatedSpadArray(
-        render_array_light() * rate,
-        seed,
-        pictures,
-        Fault.parse(uri.value("faults", str, "")),
-        None if exposure.gate is None else render_array_delays(),
+        render_array_light() * options.rate,
+        options.seed,
+        options.pictures,
+        options.faults,
+        None if options.gate is None else render_array_delays(),
     )
-    ledger = Ledger()
-    try:
-        feed = EmulatedFeed(server, ledger, exposure, patience, back)
-    except BaseException:
-        server.close()
-        raise
-    return StreamSource(feed, feed.codec, ledger, held)
+
+    def connect() -> TcpLink:
+        return TcpLink(HOST, server.port, options.timeout_s)
+
+    return StreamSource(EmulatedFeed(server, lambda: Spad512Feed(connect, options)), options)

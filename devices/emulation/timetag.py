@@ -1,9 +1,6 @@
-"""A queue of bytes whose cost does not grow with its length.
-
-Light that falls on an emulated time tagger, as its words: even, or of a pulsed scene.
-
-An emulated FX2 time tagger on the virtual USB, as unkind as the real one, with faults to order.
-`devices.timetag` drives it unchanged.
+"""An emulated FX2 time tagger on the virtual USB, as unkind as the real one, with faults to order,
+and the light that falls on it, as its words: even, or of a pulsed scene. `devices.timetag` drives it
+unchanged.
 
 Written from the gateware and the firmware (bgamari/timetag-fpga, bgamari/timetag-fx2), not from the
 driver::
@@ -13,8 +10,6 @@ driver::
 
 When it is opened it is as a killed program left it: a reply that was never fetched waits, records
 of the last session are in the USB chip, and the register manager waits for the end of a command.
-
-Addresses of emulated instruments on the virtual USB.
 """
 
 from __future__ import annotations
@@ -23,7 +18,7 @@ import errno
 import math
 import struct
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic, sleep
 from typing import Protocol
@@ -32,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 from usb.core import USBError
 
-from devices.address import Uri
-from devices.emulation.faults import REPLY_FAULTS, Fault
+from devices.address import Uri, option
+from devices.emulation.harness import FOREVER, REPLY_FAULTS, Fault
 from devices.emulation.scenes import LineLight, simulate_line_light
 from devices.emulation.usb import PACKET_BYTES, VirtualDevice, VirtualUsb, make_usb_error
 from devices.source import ByteView, Records
@@ -43,61 +38,14 @@ from devices.timetag.driver import (
     COMMAND_ENDPOINT,
     DATA_ENDPOINT,
     INSTRUMENT,
-    OPTIONS,
     REPLY_ENDPOINT,
     USB_IDENTITY,
     Capture,
     Register,
+    TimeTagOptions,
     open_on_backend,
 )
 from tofclip.errors import InputError
-
-
-class ByteQueue:
-    """Bytes in the order in which they came, kept in the pieces in which they came."""
-
-    def __init__(self) -> None:
-        self._pieces: deque[memoryview] = deque()
-        self._length = 0
-
-    def __len__(self) -> int:
-        return self._length
-
-    def append(self, piece: ByteView) -> None:
-        """Add bytes at the end; they are not copied."""
-        if len(piece):
-            self._pieces.append(piece.data)
-            self._length += len(piece)
-
-    def read_into(self, buffer: memoryview) -> int:
-        """Move bytes from the front into `buffer`, as many as fit, and return how many."""
-        taken = 0
-        while self._pieces and taken < len(buffer):
-            piece = self._pieces.popleft()
-            part = piece[: len(buffer) - taken]
-            buffer[taken : taken + len(part)] = part
-            taken += len(part)
-            if len(part) < len(piece):
-                # A view of the rest: no bytes are copied.
-                self._pieces.appendleft(piece[len(part) :])
-        self._length -= taken
-        return taken
-
-    def truncate(self, length: int) -> None:
-        """Forget everything behind the first `length` bytes."""
-        while self._length > length:
-            piece = self._pieces.pop()
-            self._length -= len(piece)
-            if self._length < length:
-                kept = piece[: length - self._length]
-                self._pieces.append(kept)
-                self._length += len(kept)
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self._pieces.clear()
-        self._length = 0
-
 
 MAX_TICK = (1 << 62) - 1
 """A tick that never comes."""
@@ -108,11 +56,7 @@ class TagStream(Protocol):
 
     def next_words(self, limit: int, last: int) -> ByteView:
         """Return the next words: `limit` at most, none of them later than tick `last`; fewer is for
-        good.
-
-        Wraps of the counter are among them. How a stream is cut into calls does not change it.
-
-        `limit`: words; `last`: tick. Returns (6 * words,).
+        good. Wraps of the counter are among them. How a stream is cut into calls does not change it.
         """
 
 
@@ -143,10 +87,7 @@ class PoissonStream:
         self._now = np.zeros(1, np.int64)
 
     def next_words(self, limit: int, last: int) -> ByteView:
-        """Return the next words; see `TagStream`.
-
-        Arguments and result are those of `TagStream.next_words`.
-        """
+        """Return the next words; see `TagStream`."""
         from devices.timetag.kernels import fill_poisson_words
 
         words = np.empty(limit * RECORD_BYTES, np.uint8)
@@ -172,8 +113,7 @@ BLOCK_TICKS = (
 
 
 class PulsedSceneStream:
-    """Photons of a line of pixels after each pulse of a laser; see
-    `devices.emulation.timetag.TagStream`.
+    """Photons of a line of pixels after each pulse of a laser; see `TagStream`.
 
     Three detectors stand at a sixth, a half and five sixths of the line. Photons that one of them
     sees within a tick count as one; what several channels see within a tick is one record. Memory:
@@ -203,10 +143,7 @@ class PulsedSceneStream:
         self._words: ByteView = np.empty(0, np.uint8)
 
     def next_words(self, limit: int, last: int) -> ByteView:
-        """Return the next words; see `TagStream`.
-
-        Arguments and result are those of `TagStream.next_words`.
-        """
+        """Return the next words; see `TagStream`."""
         taken, left = [], limit
         while left:
             if not len(self._ticks):
@@ -298,50 +235,37 @@ class GroundTruth:
 
 
 @dataclass(frozen=True)
-class EmulatorSettings:
-    """How the emulated instrument behaves."""
+class EmulationOptions(TimeTagOptions):
+    """Values of the emulation besides the driver's own."""
 
+    seed: int = option(0, least=0, most=(1 << 63) - 1)
+    # even light on all channels, or of a scene behind three of them
+    light: str = option("", choices=("poisson", "scene"))
+    rate: float | None = option(None, float)  # photons per second of its clock
     # photons come when they are due, and are lost while the memory is full. Otherwise time runs as
     # fast as the host reads
-    is_paced: bool = False
-    records: int = MAX_TICK  # photons after which it is dark
-    # size of a packet when it is switched on: 510 bytes, as of the public firmware, each of which
-    # ends a transfer, or 512
-    packet_bytes: int = SHORT_PACKET_BYTES
+    pace: str = option("", choices=("fast", "realtime"))
+    records: int = option(FOREVER, least=0)  # photons after which it is dark
+    # of a packet when it is switched on: 510, as of the public firmware, each of which ends a
+    # transfer, or 512
+    packet_bytes: int = option(SHORT_PACKET_BYTES)
     # what fits into the instrument besides the USB chip. By default far more than into a real one
     # (`BOARD_MEMORY_BYTES`), because it shares the processor with the host, which is not always
     # given its turn in time
-    memory_bytes: int = 64 << 20
-    # register CLEAR holds the memory empty until it is set to 0 again; otherwise any write clears
-    # once
-    clear_is_level: bool = True
-    # the USB chip sends a packet when it is full, or when asked to; otherwise whenever asked
-    holds_packets: bool = True
-    # the request to flush throws an unfinished packet away; otherwise it sends it
-    flush_discards: bool = True
-    # what a killed program left: replies that it never fetched, records in the USB chip and the
-    # memory, and bytes of a command that was cut short
-    stale_replies: int = 1
-    # what a killed program left: replies that it never fetched, records in the USB chip and the
-    # memory, and bytes of a command that was cut short
-    old_records: int = 40
-    # what a killed program left: replies that it never fetched, records in the USB chip and the
-    # memory, and bytes of a command that was cut short
-    jammed_bytes: int = 3
+    memory_mib: float = option(64.0, least=PACKET_BYTES / (1 << 20), most=4096)
+    faults: tuple[Fault, ...] = option((), Fault.parse)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.packet_bytes not in (SHORT_PACKET_BYTES, PACKET_BYTES):
             raise InputError(
                 f"a packet has {SHORT_PACKET_BYTES} or {PACKET_BYTES} bytes, got {self.packet_bytes}"
             )
-        if self.records < 0 or not PACKET_BYTES <= self.memory_bytes <= 1 << 32:
-            raise InputError(
-                "an emulated time tagger needs records >= 0 and a memory of 512 bytes to 4 GiB"
-            )
 
 
 class EmulatedTimeTagger(VirtualDevice):
-    """The instrument.
+    """The instrument. What firmware and killed programs differ in is the class's: subclasses have
+    other habits.
 
     Memory: the larger of its own memory and one transfer.
 
@@ -349,12 +273,20 @@ class EmulatedTimeTagger(VirtualDevice):
     often it was before.
     """
 
+    # register CLEAR holds the memory empty until it is set to 0 again; otherwise any write clears
+    # once
+    clear_is_level = True
+    # the USB chip sends a packet when it is full, or when asked to; otherwise whenever asked
+    holds_packets = True
+    flush_discards = True  # the request to flush throws an unfinished packet away, or sends it
+    # what a killed program left: replies that it never fetched, records in the USB chip and the
+    # memory, and bytes of a command that was cut short
+    stale_replies = 1
+    old_records = 40
+    jammed_bytes = 3
+
     def __init__(
-        self,
-        light: Callable[[int], TagStream],
-        serial: str,
-        setting: EmulatorSettings,
-        faults: Iterable[Fault] = (),
+        self, light: Callable[[int], TagStream], options: EmulationOptions, serial: str = ""
     ) -> None:
         super().__init__(
             USB_IDENTITY,
@@ -362,36 +294,34 @@ class EmulatedTimeTagger(VirtualDevice):
             (COMMAND_ENDPOINT, DATA_ENDPOINT, REPLY_ENDPOINT),
         )
         self.truth = GroundTruth()
-        self.setting = setting
-        self._make_light = light
-        self._light = light(0)
-        self._resets = 0
-        self._registered_before_reset = 0
-        self._faults = {one.transfer: one for one in faults if one.kind not in REPLY_FAULTS}
-        self._reply_faults = {one.transfer: one for one in faults if one.kind in REPLY_FAULTS}
+        self.options = options
+        self._is_paced = options.pace == "realtime"
+        self._make_light, self._light = light, light(0)
+        self._resets = self._registered_before_reset = 0
+        self._faults = {at.transfer: at for at in options.faults if at.kind not in REPLY_FAULTS}
+        self._reply_faults = {at.transfer: at for at in options.faults if at.kind in REPLY_FAULTS}
         self._has_started = False
-        self._transfers = 0
-        self._replies_asked = 0
-        self._reply_delay = 0
-        self._stalls = 0
-        self._records_to_corrupt = 0
+        self._transfers = self._replies_asked = self._reply_delay = 0
+        self._stalls = self._records_to_corrupt = 0
         self._registers = _make_registers()
-        self._command = COMMAND.pack(MAGIC, 0, Register.VERSION, 0)[: setting.jammed_bytes]
-        self._replies = [b"\x2a\0\0\0"] * setting.stale_replies
-        self._stream = ByteQueue()  # what is in the memory and, before that, in the USB chip
-        self._window = setting.packet_bytes
+        self._command = COMMAND.pack(MAGIC, 0, Register.VERSION, 0)[: self.jammed_bytes]
+        self._replies = [b"\x2a\0\0\0"] * self.stale_replies
+        # what is in the memory and, before that, in the USB chip: of a session before this one
+        old = PoissonStream(1e6, CLOCK_HZ, 12345).next_words(self.old_records, MAX_TICK)
+        self._stream = bytearray(old)
+        self._window = options.packet_bytes
         self._unfinished: deque[int] = deque()  # sizes of packets that were finished by request
         self._started = monotonic()
         self._mark_lost = False
-        self._segment_bytes = 0
-        self._reported = 0
-        self._leave_old_records()
+        self._segment_bytes = self._reported = 0
+
+    def open_driver(self) -> StreamSource:
+        """Open the driver on it, on a USB of its own."""
+        return open_on_backend(self.options, self.strings[2], VirtualUsb(self))
 
     def receive(self, endpoint: int, data: bytes) -> None:
         """Take a command of the host, byte by byte as the gateware does, and queue its reply; what is
         not a command is passed over.
-
-        `endpoint`: address.
         """
         if endpoint != COMMAND_ENDPOINT:
             raise make_usb_error(errno.EPIPE)
@@ -408,29 +338,24 @@ class EmulatedTimeTagger(VirtualDevice):
                 return  # what comes with it finds the register manager replying
 
     def control(self, request: int, value: int) -> None:
-        """Set how many bytes make a packet, or send or discard what is unfinished.
-
-        `request`: `SET_SEND_WINDOW` or `FLUSH`; `value`: bytes of a packet.
-        """
-        chip, rest = self._unsent_bytes()
-        if request == SET_SEND_WINDOW:
-            self._unfinished.extend([self._window] * (chip // self._window))
-            self._unfinished.append(rest)
-            self._window = min(max(value, 1), PACKET_BYTES)
-        # What firmware does with a flush differs; the driver must live with both.
-        elif request == FLUSH and self.setting.flush_discards:
-            self._stream.truncate(len(self._stream) - rest)
-        elif request == FLUSH:
-            self._unfinished.extend([self._window] * (chip // self._window))
-            self._unfinished.append(rest)
-        else:
+        """Set how many bytes make a packet (`value`), or send or discard what is unfinished."""
+        # Bytes in the USB chip that belong to no packet which was finished by request.
+        chip = min(len(self._stream), CHIP_PACKETS * self._window)
+        unsent = max(0, chip - sum(self._unfinished))
+        rest = unsent % self._window
+        if request not in (SET_SEND_WINDOW, FLUSH):
             raise make_usb_error(errno.EPIPE)
+        if request == FLUSH and self.flush_discards:
+            del self._stream[len(self._stream) - rest :]
+            return
+        self._unfinished.extend([self._window] * (unsent // self._window))
+        self._unfinished.append(rest)
+        if request == SET_SEND_WINDOW:
+            self._window = min(max(value, 1), PACKET_BYTES)
 
     def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
         """Write a reply or time tags into `buffer`, with the faults that were ordered for this
         transfer.
-
-        `endpoint`: address; `buffer`: overwritten; `timeout`: seconds. Returns bytes.
         """
         if endpoint == REPLY_ENDPOINT:
             return self._send_reply(buffer)
@@ -438,11 +363,9 @@ class EmulatedTimeTagger(VirtualDevice):
             return self._send_data(buffer, timeout)  # what comes is thrown away
         fault = self._faults.get(self._transfers)
         self._transfers += 1
-        return (
-            self._send_data(buffer, timeout)
-            if fault is None
-            else self._apply_fault(fault, buffer, timeout)
-        )
+        if fault is not None:
+            return self._apply_fault(fault, buffer, timeout)
+        return self._send_data(buffer, timeout)
 
     def clear_halt(self, endpoint: int) -> None:
         """End a stall, unless it is to come again."""
@@ -450,11 +373,6 @@ class EmulatedTimeTagger(VirtualDevice):
             self._stalls -= 1
         if endpoint != DATA_ENDPOINT or self._stalls <= 0:
             super().clear_halt(endpoint)
-
-    def _leave_old_records(self) -> None:
-        """Leave what a session before this one did not read."""
-        old = PoissonStream(1e6, CLOCK_HZ, 12345).next_words(self.setting.old_records, MAX_TICK)
-        self._stream.append(old)
 
     def _execute(self, command: bytes) -> None:
         _, what, number, value = COMMAND.unpack(command)
@@ -492,7 +410,7 @@ class EmulatedTimeTagger(VirtualDevice):
         # Read-only.
         if register in (Register.VERSION, Register.CLOCK):
             return
-        is_level = register is Register.CLEAR and self.setting.clear_is_level
+        is_level = register is Register.CLEAR and self.clear_is_level
         if register in (Register.RECORDS, Register.LOST, Register.CLEAR) and not is_level:
             value = 0
         if register is Register.RECORDS:
@@ -527,14 +445,6 @@ class EmulatedTimeTagger(VirtualDevice):
         words[0] = WRAP << 5
         self._store(words)
 
-    def _unsent_bytes(self) -> tuple[int, int]:
-        """Return the bytes in the USB chip that belong to no packet which was finished by request,
-        and how many of them make no full packet.
-        """
-        chip = min(len(self._stream), CHIP_PACKETS * self._window)
-        unsent = max(0, chip - sum(self._unfinished))
-        return unsent, unsent % self._window
-
     def _clear_memory(self) -> None:
         """Forget the memory. The USB chip keeps what it has, and the rest of a record of which it
         has the beginning follows.
@@ -542,9 +452,9 @@ class EmulatedTimeTagger(VirtualDevice):
         self._reported += -(-self._segment_bytes // RECORD_BYTES)
         self._segment_bytes = 0
         chip = 0
-        if self.setting.holds_packets:
+        if self.holds_packets:
             chip = min(len(self._stream), CHIP_PACKETS * self._window)
-        self._stream.truncate(chip + (len(self._stream) - chip) % RECORD_BYTES)
+        del self._stream[chip + (len(self._stream) - chip) % RECORD_BYTES :]
         if not self._stream:
             self._unfinished.clear()
 
@@ -553,11 +463,13 @@ class EmulatedTimeTagger(VirtualDevice):
 
         `in_flight`: bytes that a transfer under way takes besides what the instrument holds.
         """
-        if not self.setting.is_paced or Capture.REGISTER not in self._capture:
+        if not self._is_paced or Capture.REGISTER not in self._capture:
             return
         tick = int((monotonic() - self._started) * CLOCK_HZ)
         # Photons beyond memory, chip and the transfer under way have nowhere to go.
-        capacity = self.setting.memory_bytes + CHIP_PACKETS * self._window + in_flight
+        capacity = (
+            int(self.options.memory_mib * (1 << 20)) + CHIP_PACKETS * self._window + in_flight
+        )
         found = MAX_BATCH_RECORDS
         while found == MAX_BATCH_RECORDS:
             words = self._register_photons(MAX_BATCH_RECORDS, tick)
@@ -569,7 +481,7 @@ class EmulatedTimeTagger(VirtualDevice):
     def _register_photons(self, limit: int, last: int = MAX_TICK) -> ByteView:
         """Return the words of the next photons, at most `limit`."""
         words = self._light.next_words(
-            max(0, min(limit, self.setting.records - self.truth.registered)), last
+            max(0, min(limit, self.options.records - self.truth.registered)), last
         )
         self.truth.registered += len(words) // RECORD_BYTES
         return words
@@ -587,7 +499,7 @@ class EmulatedTimeTagger(VirtualDevice):
         self._records_to_corrupt = 0
         self._registers[Register.RECORDS] += len(words) // RECORD_BYTES
         if not self._is_held_empty:
-            self._stream.append(words)
+            self._stream += words.data
 
     def _discard(self, words: ByteView) -> None:
         lost = len(words) // RECORD_BYTES
@@ -597,7 +509,7 @@ class EmulatedTimeTagger(VirtualDevice):
 
     @property
     def _is_held_empty(self) -> bool:
-        return self.setting.clear_is_level and bool(self._registers[Register.CLEAR] & 1)
+        return self.clear_is_level and bool(self._registers[Register.CLEAR] & 1)
 
     def _send_data(self, buffer: memoryview, timeout: float) -> int:
         """Send packets until the host's buffer is full, a short one ends the transfer, or
@@ -612,8 +524,8 @@ class EmulatedTimeTagger(VirtualDevice):
             if is_over or length == len(buffer):
                 break
             if not self._wait_for_photons(len(buffer) - length, deadline):
-                if not self.setting.holds_packets:
-                    length += self._stream.read_into(buffer[length:])
+                if not self.holds_packets:
+                    length += self._take(buffer[length:])
                 if not length:
                     raise make_usb_error(errno.ETIMEDOUT)
                 break
@@ -631,20 +543,28 @@ class EmulatedTimeTagger(VirtualDevice):
             if size > len(buffer) - taken:
                 return taken, True
             self._unfinished.popleft()
-            taken += self._stream.read_into(buffer[taken : taken + size])
+            taken += self._take(buffer[taken : taken + size])
             if size < PACKET_BYTES:
                 return taken, True
         if self._window == PACKET_BYTES:
             whole = min(len(self._stream), len(buffer) - taken) // PACKET_BYTES * PACKET_BYTES
-            return taken + self._stream.read_into(buffer[taken : taken + whole]), False
+            return taken + self._take(buffer[taken : taken + whole]), False
         if len(self._stream) < self._window:
             return taken, False
         size = min(self._window, len(buffer) - taken)
-        return taken + self._stream.read_into(buffer[taken : taken + size]), True
+        return taken + self._take(buffer[taken : taken + size]), True
+
+    def _take(self, buffer: memoryview) -> int:
+        """Move bytes from the front of the stream into `buffer`, as many as fit."""
+        length = min(len(self._stream), len(buffer))
+        with memoryview(self._stream) as stream:
+            buffer[:length] = stream[:length]
+        del self._stream[:length]
+        return length
 
     def _wait_for_photons(self, room: int, deadline: float) -> bool:
         """Wait for more; False when nothing more comes in time."""
-        if self.setting.is_paced:
+        if self._is_paced:
             if Capture.REGISTER not in self._capture or monotonic() >= deadline:
                 return False
             sleep(min(POLL_INTERVAL_S, max(deadline - monotonic(), 0)))
@@ -665,7 +585,7 @@ class EmulatedTimeTagger(VirtualDevice):
         while len(self._stream) < len(buffer):
             if not self._wait_for_photons(len(buffer), monotonic() + timeout):
                 break
-        length = self._stream.read_into(buffer)
+        length = self._take(buffer)
         rest = length
         while rest and self._unfinished:
             part = min(rest, self._unfinished[0])
@@ -709,7 +629,7 @@ class EmulatedTimeTagger(VirtualDevice):
             self._segment_bytes = 0
             self._stream.clear()
             self._unfinished.clear()
-            self._window = self.setting.packet_bytes
+            self._window = self.options.packet_bytes
             self._replies.clear()
             self._command = b""
             self.truth.lost_power_off += (
@@ -728,48 +648,25 @@ def _make_registers() -> dict[Register, int]:
 
 POISSON_RATE_HZ = 12_800_000.0
 SCENE_RATE_HZ = 1_000_000.0
-EMULATOR_OPTIONS = (
-    "seed",
-    "light",
-    "rate",
-    "pace",
-    "records",
-    "packet_bytes",
-    "memory_mib",
-    "faults",
-)
 
 
 def open_timetag(uri: Uri) -> StreamSource:
     """Open ``sim+timetag://?seed=1``: an emulated time tagger behind the real driver.
 
-    Besides the driver's own (`devices.timetag.driver.OPTIONS`) it takes ``light=poisson|scene``
-    (`PoissonStream` on all channels, or a `PulsedSceneStream`), ``rate`` (photons per second of its
-    clock), ``pace=fast|realtime``, ``records`` (then it is dark), ``packet_bytes=510|512``,
-    ``memory_mib`` and ``faults`` (as `Fault.parse` reads them). The board's own memory, with which
-    it loses what a loaded computer does not fetch within 3 ms, is ``memory_mib=0.01172``.
+    The board's own memory, with which it loses what a loaded computer does not fetch within 3 ms,
+    is ``memory_mib=0.01172``.
     """
-    uri.reject_unknown(*OPTIONS, *EMULATOR_OPTIONS)
-    seed = uri.value("seed", int, 0)
-    if not 0 <= seed < 1 << 63:
-        raise InputError(f"'{uri.text}': a seed must be within 0 and 2**63")
-    standard = EmulatorSettings()
-    setting = EmulatorSettings(
-        uri.choice("pace", "fast", "realtime") == "realtime",
-        uri.value("records", int, standard.records),
-        uri.value("packet_bytes", int, standard.packet_bytes),
-        int(uri.value("memory_mib", float, standard.memory_bytes / (1 << 20)) * (1 << 20)),
-    )
-    serial = uri.location  # the real ones have none
-    instrument = EmulatedTimeTagger(
-        _make_stream(uri, seed), serial, setting, Fault.parse(uri.value("faults", str, ""))
-    )
-    return open_on_backend(uri, serial, VirtualUsb(instrument))
+    options = EmulationOptions.from_uri(uri)
+    make_light = choose_light(options)
+    # The real ones have no serial number.
+    return EmulatedTimeTagger(make_light, options, uri.location).open_driver()
 
 
-def _make_stream(uri: Uri, seed: int) -> Callable[[int], TagStream]:
-    if uri.choice("light", "poisson", "scene") == "poisson":
-        rate = uri.value("rate", float, POISSON_RATE_HZ)
-        return lambda resets: PoissonStream(rate, CLOCK_HZ, seed + resets)
-    scene, scene_rate = simulate_line_light(), uri.value("rate", float, SCENE_RATE_HZ)
-    return lambda resets: PulsedSceneStream(scene, scene_rate, CLOCK_HZ, seed + resets)
+def choose_light(options: EmulationOptions) -> Callable[[int], TagStream]:
+    """Return what makes the light of an address, from how often the counter was reset."""
+    seed = options.seed
+    if options.light == "poisson":
+        even = POISSON_RATE_HZ if options.rate is None else options.rate
+        return lambda resets: PoissonStream(even, CLOCK_HZ, seed + resets)
+    scene, rate = simulate_line_light(), SCENE_RATE_HZ if options.rate is None else options.rate
+    return lambda resets: PulsedSceneStream(scene, rate, CLOCK_HZ, seed + resets)

@@ -1,11 +1,8 @@
-"""The FX2 time tagger's registers: commands on one endpoint, replies on another.
+"""The FX2 time tagger: its registers (commands on one endpoint, replies on another), acquisition and
+recovery from faults, and finding those that are connected.
 
 Sources: the gateware (bgamari/timetag-fpga: ``docs/registers``, ``reg_manager.v``), the firmware of
 its USB chip (bgamari/timetag-fx2) and the makers' own client (bgamari/timetag-tools).
-
-The FX2 time tagger as a feed: acquisition, and recovery from faults.
-
-Open time taggers by their addresses, and list those that are connected.
 """
 
 from __future__ import annotations
@@ -14,15 +11,14 @@ import array
 import contextlib
 import enum
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-from devices.address import Uri
+from devices.address import Uri, option
 from devices.registry import DiscoveredInstrument
 from devices.source import Gap, Info, Ledger
-from devices.stream import STREAM_OPTIONS, StreamSource, Transfer, parse_buffer_settings
+from devices.stream import LiveOptions, StreamSource, Transfer
 from devices.timetag.codec import RECORD_BYTES, TimeTagCodec
 from devices.usb import UsbIdentity, UsbLink, find_devices, read_serial, system_backend
 from tofclip.errors import (
@@ -41,6 +37,7 @@ USB_IDENTITY = UsbIdentity(0x04B4, 0x1004)
 BARE_CHIP_IDENTITY = UsbIdentity(0x04B4, 0x8613)
 """The same chip before its firmware was loaded."""
 
+WITHOUT_FIRMWARE = "a chip without firmware; load the time tagger's into it first"
 INSTRUMENT = "FX2 time tagger"
 COMMAND_ENDPOINT, DATA_ENDPOINT, REPLY_ENDPOINT = 0x02, 0x86, 0x88
 PACKET_BYTES = 512
@@ -248,27 +245,23 @@ FULL_STREAM_BYTES_PER_S = 500_000
 
 
 @dataclass(frozen=True)
-class AcquisitionSettings:
-    """How to acquire."""
+class TimeTagOptions(LiveOptions):
+    """Values of an address that say how to acquire."""
 
-    channels: int = 0xF  # one bit for each channel that registers edges, or levels
-    delta: int = 0  # one bit for each channel that registers edges, or levels
-    # most that one transfer asks for: whole packets of 512 bytes, or a device may send more than
-    # fits
-    transfer_bytes: int = 1 << 19
-    reconnect: float = 5.0  # seconds to wait for an instrument that was unplugged
+    channels: int = option(0xF, least=0, most=15)  # one bit for each that registers edges
+    delta: int = option(0, least=0, most=15)  # one bit for each that registers levels
+    transfer_kib: float = option(512.0, least=0.5, most=1 << 14)  # most that one transfer asks for
 
     def __post_init__(self) -> None:
-        if not (0 <= self.channels <= 0xF and 0 <= self.delta <= 0xF):
-            raise InputError("channels and delta are masks of four bits: 0 to 15")
-        if not 0 < self.transfer_bytes <= 1 << 24 or self.transfer_bytes % PACKET_BYTES:
-            raise InputError(
-                f"a transfer must be a multiple of {PACKET_BYTES} bytes, at most 16 MiB"
-            )
-        if not 0 <= self.reconnect <= 600:
-            raise InputError(
-                "the time to wait for an unplugged instrument must be within 0 s and 600 s"
-            )
+        super().__post_init__()
+        # Or a device may send more than fits.
+        if self.transfer_bytes % PACKET_BYTES:
+            raise InputError(f"a transfer must be a multiple of {PACKET_BYTES} bytes")
+
+    @property
+    def transfer_bytes(self) -> int:
+        """Bytes that one transfer asks for."""
+        return int(self.transfer_kib * 1024)
 
 
 class TimeTaggerFeed:
@@ -284,12 +277,13 @@ class TimeTaggerFeed:
     rates, where a photon would wait for 84 others, packets are made small; see `SendWindow`.
     """
 
-    def __init__(self, link: UsbLink, ledger: Ledger, acquisition: AcquisitionSettings) -> None:
-        self._link = link
-        self._ledger = ledger
-        self._acquisition = acquisition
+    codec = TimeTagCodec()
+
+    def __init__(self, link: UsbLink, options: TimeTagOptions) -> None:
+        self.ledger = Ledger()
+        self._link, self._options = link, options
         self._tagger = TimeTagger(link)
-        self._buffer = array.array("B", bytes(acquisition.transfer_bytes))
+        self._buffer = array.array("B", bytes(options.transfer_bytes))
         self._view = memoryview(self._buffer)
         self._window = SendWindow()
         self._gap = Gap.NONE
@@ -329,7 +323,7 @@ class TimeTaggerFeed:
         self._window.size = PACKET_BYTES
         self._records_received = 0
         self._bytes_since_gap = 0
-        self._tagger.run(self._acquisition.channels, self._acquisition.delta, self._capture_mode)
+        self._tagger.run(self._options.channels, self._options.delta, self._capture_mode)
 
     def pull(self, timeout: float) -> Transfer | None:
         while True:
@@ -345,14 +339,13 @@ class TimeTaggerFeed:
             except DeviceTimeoutError:
                 if self._disconnected_at is not None or not self._send_rest():
                     raise
-                self._ledger.time_out()
+                self.ledger.time_out()
             else:
                 self._set_window(self._window.choose(length, self._window.clock() - begin))
                 if not length:
                     continue  # an empty packet: the chip was asked to send, and had nothing
                 self._bytes_since_gap += length
-                gap = self._gap
-                self._gap = Gap.NONE
+                gap, self._gap = self._gap, Gap.NONE
                 return Transfer(self._view[:length], gap)
 
     def stop(self) -> None:
@@ -421,7 +414,7 @@ class TimeTaggerFeed:
             self._gap = Gap.RESTART
             self.start()
         self._disconnected_at = None
-        self._ledger.reconnect()
+        self.ledger.reconnect()
 
     def _note_disconnect(self, fault: DeviceDisconnectedError) -> None:
         """Note that the instrument is gone; raise if it has been for too long."""
@@ -430,13 +423,13 @@ class TimeTaggerFeed:
         if self._reconnect_time_left <= 0:
             raise DeviceDisconnectedError(
                 f"the time tagger {self._link.serial} was unplugged and did not come back within "
-                f"{self._acquisition.reconnect:g} s"
+                f"{self._options.reconnect_s:g} s"
             ) from fault
 
     @property
     def _reconnect_time_left(self) -> float:
         begin = monotonic() if self._disconnected_at is None else self._disconnected_at
-        return begin + self._acquisition.reconnect - monotonic()
+        return begin + self._options.reconnect_s - monotonic()
 
     def _count_losses(self) -> None:
         """Enter what the instrument counted and this program never saw."""
@@ -446,7 +439,7 @@ class TimeTaggerFeed:
         ) % _COUNTER_MODULUS  # the counts have 32 bits
         if missing >= _COUNTER_MODULUS // 2:
             raise ProtocolError("the time tagger sent more records than it counted")
-        self._ledger.lose(missing + self._tagger.read(Register.LOST))
+        self.ledger.lose(missing + self._tagger.read(Register.LOST))
 
     def _end_segment(self) -> None:
         """Count what arrived without a gap; a record of which only the beginning arrived counts as
@@ -505,43 +498,26 @@ class SendWindow:
         return self.size if is_near else size
 
 
-OPTIONS = ("channels", "delta", "transfer_kib", "reconnect_s", *STREAM_OPTIONS)
-
-
 def open_timetag(uri: Uri) -> StreamSource:
     """Open
     ``timetag://SERIAL?channels=15&delta=0&transfer_kib=512&buffer_mib=64&policy=block&reconnect_s=5``.
     """
-    uri.reject_unknown(*OPTIONS)
-    backend = system_backend()
+    options, backend = TimeTagOptions.from_uri(uri), system_backend()
     try:
-        return open_on_backend(uri, uri.location, backend)
+        return open_on_backend(options, uri.location, backend)
     except DeviceNotFoundError as fault:
         if any(find_devices(BARE_CHIP_IDENTITY, backend)):
             raise DeviceNotFoundError(
-                f"a USB device {BARE_CHIP_IDENTITY} is connected, a chip without firmware; "
-                "load the time tagger's into it first"
+                f"a USB device {BARE_CHIP_IDENTITY} is connected, {WITHOUT_FIRMWARE}"
             ) from fault
         raise
 
 
-def open_on_backend(uri: Uri, serial: str, backend: Any) -> StreamSource:
-    """Open the time tagger behind a backend of pyusb, with the values of an address (`OPTIONS`).
-
-    `serial`: of the instrument; empty: any; `backend`: of pyusb.
-    """
-    standard = AcquisitionSettings()
-    acquisition = AcquisitionSettings(
-        uri.value("channels", int, standard.channels),
-        uri.value("delta", int, standard.delta),
-        int(uri.value("transfer_kib", float, standard.transfer_bytes / 1024) * 1024),
-        uri.value("reconnect_s", float, standard.reconnect),
-    )
-    held, ledger = parse_buffer_settings(uri), Ledger()
+def open_on_backend(options: TimeTagOptions, serial: str, backend: Any) -> StreamSource:
+    """Open the time tagger with a serial number (empty: any) behind a backend of pyusb."""
     link = UsbLink(USB_IDENTITY, serial, backend)
     try:
-        feed = TimeTaggerFeed(link, ledger, acquisition)
-        return StreamSource(feed, TimeTagCodec(), ledger, held)
+        return StreamSource(TimeTaggerFeed(link, options), options)
     except BaseException:
         link.close()
         raise
@@ -551,24 +527,19 @@ def find_timetaggers() -> list[DiscoveredInstrument]:
     """Look for connected time taggers; an empty list where there is no USB to look at."""
     try:
         backend = system_backend()
-        return [*_list_timetaggers(backend), *_list_bare_chips(backend)]
+        return [
+            *(_describe(device) for device in find_devices(USB_IDENTITY, backend)),
+            *(
+                DiscoveredInstrument("timetag://", INSTRUMENT, WITHOUT_FIRMWARE)
+                for _ in find_devices(BARE_CHIP_IDENTITY, backend)
+            ),
+        ]
     except DeviceError:
         return []
 
 
-def _list_timetaggers(backend: Any) -> Iterator[DiscoveredInstrument]:
-    for device in find_devices(USB_IDENTITY, backend):
-        try:
-            serial, note = read_serial(device, USB_IDENTITY), ""
-        except DeviceError as fault:
-            serial, note = "", str(fault)
-        yield DiscoveredInstrument(f"timetag://{serial}", INSTRUMENT, note)
-
-
-def _list_bare_chips(backend: Any) -> Iterator[DiscoveredInstrument]:
-    for _ in find_devices(BARE_CHIP_IDENTITY, backend):
-        yield DiscoveredInstrument(
-            "timetag://",
-            INSTRUMENT,
-            "a chip without firmware; load the time tagger's into it first",
-        )
+def _describe(device: Any) -> DiscoveredInstrument:
+    try:
+        return DiscoveredInstrument(f"timetag://{read_serial(device, USB_IDENTITY)}", INSTRUMENT)
+    except DeviceError as fault:
+        return DiscoveredInstrument("timetag://", INSTRUMENT, str(fault))

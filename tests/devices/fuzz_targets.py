@@ -19,16 +19,17 @@ from devices.remoteex import (
     Answer,
     AnswerCode,
     Command,
-    LiveSettings,
     RemoteExClient,
     RemoteExFeed,
+    StreakOptions,
     parse_data_length,
     parse_integer,
 )
-from devices.source import Codec, Gap, Ledger, as_bytes
-from devices.spad512 import ExposureRequest, Spad512Feed
+from devices.source import Codec, Gap, as_bytes
+from devices.spad512 import ExposureRequest, Spad512Feed, SpadOptions
+from devices.tcp import TcpLink
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec, mark_wraps
-from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError, ProtocolError
+from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError
 from tofclip.io import hamamatsu as hpdta
 
 FILE_SLOWNESS = 20
@@ -121,13 +122,11 @@ def _recording() -> Target:
     return Target(decode, (b"".join(blocks),))
 
 
-class Replayed:
+class Replayed(TcpLink):
     """Stands in for a connection: says what it was given, then hangs up."""
 
-    name = "replayed"
-
     def __init__(self, data: bytes) -> None:
-        self._left = data
+        self.name, self._buffer = "replayed", bytearray(data)
 
     def send(self, data: bytes, timeout: float) -> None:
         pass
@@ -138,29 +137,8 @@ class Replayed:
     def discard_available(self) -> int:
         return 0  # nothing comes before it is asked for
 
-    def read_available(self, limit: int, timeout: float) -> bytes:
-        if not self._left:
-            raise DeviceDisconnectedError("the replay is over")
-        return self._taken(limit)
-
-    def read_exactly(self, length: int, limit: int, timeout: float) -> bytes:
-        if not 0 <= length <= limit:
-            raise ProtocolError("too much")
-        if length > len(self._left):
-            raise DeviceDisconnectedError("the replay is over")
-        return self._taken(length)
-
-    def read_until(self, end: bytes, limit: int, timeout: float) -> bytes:
-        found = self._left.find(end)
-        if found < 0:
-            raise DeviceDisconnectedError("the replay is over")
-        message = self._taken(found)
-        self._taken(len(end))
-        return message
-
-    def _taken(self, length: int) -> bytes:
-        taken, self._left = self._left[:length], self._left[length:]
-        return taken
+    def _fill_buffer(self, deadline: float, timeout: float) -> None:
+        raise DeviceDisconnectedError("the replay is over")
 
 
 def _remoteex_session() -> Target:
@@ -181,7 +159,7 @@ def _remoteex_session() -> Target:
         links = [Replayed(part) for part in both.partition(border)[::2]]
         with mock.patch("devices.remoteex.TcpLink", side_effect=lambda *_: links.pop(0)):
             feed = RemoteExFeed(
-                lambda: RemoteExClient("replayed", 1, 2, 0.01), Ledger(), LiveSettings(reconnect=0)
+                lambda: RemoteExClient("replayed", 1, 2, 0.01), StreakOptions(reconnect_s=0)
             )
             assert feed.calibration is None or feed.info.instrument
         with mock.patch.object(
@@ -198,8 +176,8 @@ def _remoteex_session() -> Target:
 
 def _spad512_session() -> Target:
     """Greeting, two requests of two pictures, the end."""
-    exposure = ExposureRequest(8, 1e-3, 2, 4)
-    pictures = bytes(range(256)) * (exposure.codec.pixel_bytes * 2 // 256)
+    options = SpadOptions(images=2, width=4, timeout_s=1e-9)
+    pictures = bytes(range(256)) * (options.request.codec.pixel_bytes * 2 // 256)
 
     def decode(data: bytes) -> None:
         texts = [b"hello", b"", b"system", b"", b"off", b""]
@@ -212,7 +190,7 @@ def _spad512_session() -> Target:
                 return text
 
         with mock.patch("devices.spad512._SILENCE_S", 0):
-            feed = Spad512Feed(lambda: Server(data), Ledger(), exposure, 0.0, 0.0)  # type: ignore[arg-type,return-value]
+            feed = Spad512Feed(lambda: Server(data), options)
         with mock.patch.object(
             feed, "_reconnect", side_effect=DeviceDisconnectedError("it stays away")
         ):

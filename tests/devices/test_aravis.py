@@ -16,7 +16,7 @@ import pytest
 import devices
 from devices.aravis import UNNUMBERED, find_cameras, load_aravis
 from devices.counted_photons import read_photons
-from devices.emulation.aravis import EmulatedFeed
+from devices.emulation.aravis import EmulatedCamera
 from devices.emulation.scenes import EmulatedLight, draw_exposure, simulate_line_light
 from devices.shot_stream import read_transients
 from devices.source import Source
@@ -61,7 +61,7 @@ def aravis() -> Any:
 def test_the_emulated_camera_loses_nothing(aravis: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of 128 KiB, so that the system's buffer holds one while this process must wait."""
     monkeypatch.setattr(
-        EmulatedFeed, "_prepare_camera", lambda self, camera: camera.set_region(0, 0, 256, 256)
+        EmulatedCamera, "prepare", lambda self, camera: camera.set_region(0, 0, 256, 256)
     )
     address = "sim+aravis://?frame_rate=200&exposure_us=500&gain=2&pixel_format=Mono16"
     with devices.open(address) as source:

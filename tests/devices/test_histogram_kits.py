@@ -14,14 +14,16 @@ from hypothesis import given, settings
 
 import devices
 from devices.counted_photons import read_photons
-from devices.emulation.histogram_kits import compute_zone_ranges
+from devices.emulation.histogram_kits import (
+    compute_zone_ranges,
+    format_tmf8828,
+    format_vl53l8,
+)
 from devices.histogram_kits import (
     KitFrame,
     Parser,
     Tmf8828Parser,
     Vl53l8Parser,
-    format_tmf8828,
-    format_vl53l8,
 )
 from devices.source import Source
 from devices.transients import read_transient
@@ -158,7 +160,7 @@ def test_every_frame_is_accounted_for() -> None:
 def test_a_kit_that_is_unplugged() -> None:
     with devices.open("sim+tmf8828://?seed=1&rate=100&reconnect_s=0.2") as source:
         take(source, 2)
-        source._feed._kit.close()  # type: ignore[attr-defined]
+        source._feed._instrument.close()  # type: ignore[attr-defined]
         with pytest.raises(DeviceDisconnectedError, match="no answer came"):
             take(source, 1000)
     assert source.stats.is_balanced

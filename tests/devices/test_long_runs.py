@@ -17,7 +17,7 @@ import devices
 from devices.linospad2 import LinoSpad2Codec
 from devices.recorder import measure_throughput
 from devices.source import Info, Ledger, as_bytes
-from devices.stream import BufferSettings, StreamSource, Transfer
+from devices.stream import StreamOptions, StreamSource, Transfer
 from devices.timetag.codec import RECORD_BYTES
 from tofclip.storage import Record
 
@@ -61,7 +61,10 @@ class SteadyFeed:
     calibration: Record | None = None
     info = Info("steady words")
 
-    def __init__(self, data: bytes, piece: int, bytes_per_second: float) -> None:
+    def __init__(
+        self, codec: LinoSpad2Codec, data: bytes, piece: int, bytes_per_second: float
+    ) -> None:
+        self.codec, self.ledger = codec, Ledger()
         self._data, self._piece, self._rate = memoryview(data), piece, bytes_per_second
         self._sent, self._total = 0, int(bytes_per_second * SECONDS / piece) * piece
 
@@ -91,9 +94,9 @@ def test_a_minute_of_linospad2_at_half_rate_drops_nothing() -> None:
     data = stream.astype("<u4").tobytes()
     stamps_per_byte = codec.count_records(as_bytes(data)) / len(data)
     codec.decode(as_bytes(data), codec.start)  # loops are compiled before the clock runs
-    feed = SteadyFeed(data, 8 * codec.cycle_bytes, STAMPS_PER_SECOND / stamps_per_byte)
+    feed = SteadyFeed(codec, data, 8 * codec.cycle_bytes, STAMPS_PER_SECOND / stamps_per_byte)
     watch, began, read = MemoryWatch(SECONDS), time.monotonic(), 0
-    with StreamSource(feed, codec, Ledger(), BufferSettings(policy="drop_oldest")) as source:
+    with StreamSource(feed, StreamOptions(policy="drop_oldest")) as source:
         for batch in source:
             read += len(batch.records)
             watch.look(time.monotonic() - began)
@@ -113,7 +116,7 @@ def test_a_minute_of_time_tags_at_half_rate_drops_nothing() -> None:
 
 
 def test_a_thousand_scripts_of_faults_over_tcp() -> None:
-    command = [sys.executable, str(Path(__file__).with_name("test_tcp_fault_scripts.py")), "1000"]
+    command = [sys.executable, str(Path(__file__).with_name("test_faults.py")), "1000"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=1800)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.startswith("1000 scripts, 0 wrong,"), done.stdout[-2000:]

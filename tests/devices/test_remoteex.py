@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 import devices
-from devices.emulation.faults import HOST, Connection, Fault, LoopbackServer
-from devices.emulation.remoteex import Circumstances, EmulatedStreakCamera
+from devices.emulation.harness import HOST, Connection, Fault, LoopbackServer
+from devices.emulation.remoteex import EmulatedStreakCamera
 from devices.emulation.scenes import (
     EmulatedLight,
     simulate_demonstration_light,
     simulate_line_light,
 )
-from devices.remoteex import TERMINATOR, LiveSettings, RemoteExClient
+from devices.remoteex import TERMINATOR, RemoteExClient, StreakOptions
 from devices.source import Source
 from tofclip.camera import Camera
 from tofclip.errors import (
@@ -47,8 +47,8 @@ def camera() -> Iterator[Make]:
     def make(
         *faults: Fault, rate: float = 100.0, frames: int = 1000, **found: object
     ) -> EmulatedStreakCamera:
-        circumstances = Circumstances(**found)  # type: ignore[arg-type]
-        made.append(EmulatedStreakCamera(LIGHT, rate, frames, faults, circumstances))
+        kind = type("Camera", (EmulatedStreakCamera,), found)
+        made.append(kind(LIGHT, rate, frames, faults))
         return made[-1]
 
     yield make
@@ -199,8 +199,8 @@ def test_impossible_emulations_are_refused() -> None:
         EmulatedStreakCamera(LIGHT, 0)
     with pytest.raises(InputError, match="faults are"):
         EmulatedStreakCamera(LIGHT, 1, 5, [Fault(0, "stall")])
-    with pytest.raises(InputError, match="times to wait"):
-        LiveSettings(reconnect=-1)
+    with pytest.raises(InputError, match="reconnect_s must be at least 0 and at most 600, got -1"):
+        StreakOptions(reconnect_s=-1)
 
 
 def scripted(answers: dict[bytes, bytes]) -> Callable[[Connection], None]:
@@ -323,7 +323,7 @@ def test_the_demonstrations_light_comes_with_what_focus_pictures_tell() -> None:
 
 def test_servers_are_for_this_computer_only() -> None:
     with LoopbackServer(lambda connection: None) as server:
-        assert server._listener.getsockname()[0] == "127.0.0.1"
+        assert server.server_address[0] == "127.0.0.1"
         others = {
             str(entry[4][0])
             for entry in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
@@ -354,7 +354,7 @@ def test_hpd_ta_is_started_where_it_is_not_up(camera: Make) -> None:
 
 def test_live_mode_of_an_operator_is_joined_and_goes_on(camera: Make) -> None:
     server = camera(is_live=True, rate=200.0)
-    server._parameters["MCP Gain"] = "13"
+    server.gain = "13"
     time.sleep(0.05)
     with opened(server, mcp_gain=20) as source:
         frames = taken(source, 5)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from devices.emulation.faults import HOST
+from devices.emulation.harness import HOST
 from devices.emulation.remoteex import EmulatedStreakCamera
 from devices.emulation.scenes import EmulatedLight, simulate_line_light
 from devices.recording.check import verify

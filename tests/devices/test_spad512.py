@@ -13,7 +13,7 @@ from hypothesis import given
 import devices
 from devices import counted_photons as photons
 from devices.counted_photons import read_photons
-from devices.emulation.faults import HOST, Connection, Fault, LoopbackServer
+from devices.emulation.harness import HOST, Connection, Fault, LoopbackServer
 from devices.emulation.scenes import render_array_delays, render_array_light
 from devices.emulation.spad512 import EmulatedSpadArray
 from devices.frames import GateScan
@@ -301,8 +301,15 @@ def test_single_bits_lie_as_the_other_depths_do(array: Array) -> None:
     np.testing.assert_array_equal(single > 0, corner > 0)
 
 
+class Unframed(EmulatedSpadArray):
+    """Ends no text."""
+
+    is_framed = False
+
+
 def test_a_server_that_calibrates_itself_first_and_frames_nothing() -> None:
-    server = EmulatedSpadArray(LIGHT, 7, is_framed=False, calibrates=True)
+    server = Unframed(LIGHT, 7)
+    server.must_calibrate = True
     with opened(server) as source:
         assert len(taken(source, 2)) == 2
         finished(source)
@@ -378,7 +385,7 @@ def test_what_counts_no_photons_in_time() -> None:
 
 def test_clients_of_the_vendor_are_answered() -> None:
     """Commands without an end, eight fields, the information first: as others' clients speak."""
-    server = EmulatedSpadArray(LIGHT, 7, delays=np.full((ROWS, ROWS), 8e-9), is_framed=False)
+    server = Unframed(LIGHT, 7, delays=np.full((ROWS, ROWS), 8e-9))
     with TcpLink(HOST, server.port, 5) as link:
         assert link.read_available(8192, 5).split()[0] == b"SPAD512S"
         said = {}

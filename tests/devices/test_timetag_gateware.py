@@ -17,7 +17,7 @@ from devices.emulation.timetag import (
     CLOCK_HZ,
     COMMAND,
     EmulatedTimeTagger,
-    EmulatorSettings,
+    EmulationOptions,
     PoissonStream,
 )
 from devices.emulation.usb import VirtualUsb
@@ -40,9 +40,10 @@ pytestmark = pytest.mark.skipif(
 class Eavesdropper(EmulatedTimeTagger):
     """Notes the commands that it gets."""
 
+    stale_replies = jammed_bytes = old_records = 0
+
     def __init__(self) -> None:
-        kind = EmulatorSettings(stale_replies=0, jammed_bytes=0, old_records=0)
-        super().__init__(lambda _: PoissonStream(1e6, CLOCK_HZ, 1), "", kind)
+        super().__init__(lambda _: PoissonStream(1e6, CLOCK_HZ, 1), EmulationOptions())
         self.heard: list[bytes] = []
 
     def receive(self, endpoint: int, data: bytes) -> None:

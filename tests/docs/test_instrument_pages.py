@@ -7,20 +7,22 @@ from pathlib import Path
 import pytest
 
 import tofclip
-from devices import aravis, remoteex, spad512
-from devices import histogram_kits as kits
-from devices.emulation import linospad2
+from devices.aravis import CameraOptions
+from devices.emulation.linospad2 import SimulationOptions
+from devices.histogram_kits import Tmf8828Options, Vl53l8Options
 from devices.registry import FILE_OPENERS, OPENERS
-from devices.timetag import driver as timetag
+from devices.remoteex import RemoteExOptions
+from devices.spad512 import SpadOptions
+from devices.timetag.driver import TimeTagOptions
 
 DOCS = Path(tofclip.__file__).parents[1] / "docs"
 PAGES = {
-    "timetag": timetag.OPTIONS,
-    "remoteex": remoteex.OPTIONS,
-    "spad512": spad512.OPTIONS,
-    "aravis": aravis.OPTIONS,
-    "histogram_kits": (*kits.TMF8828_OPTIONS, *kits.VL53L8_OPTIONS),
-    "linospad2": linospad2.OPTIONS,
+    "timetag": TimeTagOptions.names(),
+    "remoteex": RemoteExOptions.names(),
+    "spad512": SpadOptions.names(),
+    "aravis": CameraOptions.names(),
+    "histogram_kits": (*Tmf8828Options.names(), *Vl53l8Options.names()),
+    "linospad2": SimulationOptions.names(),
 }
 
 

@@ -1,0 +1,512 @@
+"""Every record is accounted for, whatever goes wrong: random faults against each emulated instrument,
+and a table of the ways in which instruments, their clients, readers and disks go wrong, with the test
+of each: none may be silent, none may hang.
+
+Accounts balance by construction, so balancing alone says nothing: those of the time tagger are
+compared with what the emulator knows. ``python tests/devices/test_faults.py 1000`` runs as many
+scripts of each instrument, and prints how they ended.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+import pytest
+from instruments import joined, make_tagger, true_records
+
+import devices
+from devices.emulation.harness import FAULT_KINDS, HOST, REPLY_FAULTS, Fault, FaultKind
+from devices.emulation.remoteex import EmulatedStreakCamera
+from devices.emulation.scenes import EmulatedLight
+from devices.emulation.spad512 import EmulatedSpadArray
+from devices.emulation.timetag import GroundTruth
+from devices.frames import FrameCodec
+from devices.source import Batch, Info, Ledger, OverflowPolicy, Source, Stats
+from devices.stream import StreamOptions, StreamSource, Transfer
+from devices.timetag.driver import SendWindow
+from tofclip.errors import (
+    BufferOverflowError,
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceStalledError,
+    DeviceTimeoutError,
+    InputError,
+)
+
+FOLDER = Path(__file__).parent
+RECORDS, FRAMES = 8000, 25
+TRANSFERS = 36
+"""Of 512 bytes each: by then the instrument is not dark, even if six faults lose 600 records each."""
+
+LONGEST_S = 60.0
+"""An undisturbed script takes less than one second, each fault adds a few tenths."""
+
+PERMANENT = 1_000_000
+"""Enumerations after which nothing looks any more."""
+
+FATAL = {"corrupt", "overflow", "stall"}
+"""After these a stream of pictures cannot be trusted any more: reading ends with an exception."""
+
+STREAK_KINDS: dict[FaultKind, float] = {
+    "timeout": 0.3,
+    "short": 0.2,
+    "unplug": 0.2,
+    "lost": 0.2,
+    "corrupt": 0.05,
+    "overflow": 0.05,
+}
+ARRAY_KINDS: dict[FaultKind, float] = {
+    "timeout": 0.3,
+    "short": 0.25,
+    "unplug": 0.25,
+    "corrupt": 0.1,
+    "stall": 0.1,
+}
+SCREEN = EmulatedLight(np.full((6, 8), 5.0), np.linspace(0, 5e-11, 6), seed=1)
+ARRAY_LIGHT = np.full((512, 512), 1e5)
+
+
+@dataclass
+class Outcome:
+    """What became of a script."""
+
+    faults: Sequence[Fault]
+    batches: list[Batch] = field(default_factory=list)
+    stats: Stats = field(default_factory=Stats)
+    fault: Exception | None = None
+    truth: GroundTruth = field(default_factory=GroundTruth)
+    gain: str = "0"
+    seconds: float = float("inf")
+
+
+def read_script(source: Source, outcome: Outcome, is_over: Callable[[], bool]) -> None:
+    """Read until it is over, then stop and read the rest, and enter how it ended."""
+    began = monotonic()
+    try:
+        with source:
+            while not is_over():
+                with contextlib.suppress(DeviceTimeoutError):
+                    while (batch := source.read(0.02)) is not None and not (
+                        source.codec.name == "frames" and is_over()  # type: ignore[attr-defined]
+                    ):
+                        outcome.batches.append(batch)
+            source.stop()
+            outcome.batches += list(source)
+    except DeviceError as fault:
+        outcome.fault = fault
+    outcome.stats, outcome.seconds = source.stats, monotonic() - began
+
+
+def draw_tagger_script(seed: int) -> list[Fault]:
+    """Draw up to six faults of any kind, at most one for a transfer."""
+    random = np.random.default_rng(seed)
+    faults = []
+    for transfer in sorted(random.permutation(TRANSFERS)[: random.integers(0, 7)].tolist()):
+        kind = FAULT_KINDS[random.integers(len(FAULT_KINDS))]
+        amount = int(random.integers(0, 600))
+        if kind in ("stall", "unplug", "powerloss"):
+            amount = int(random.choice([1, 2], p=[0.85, 0.15]))
+            # Rarely the instrument never comes back.
+            amount = PERMANENT if amount == 2 and kind != "stall" else amount
+        elif kind in REPLY_FAULTS:
+            amount = int(random.integers(1, 4))
+        faults.append(Fault(transfer, kind, amount))
+    return faults
+
+
+def run_tagger(faults: Sequence[Fault], seed: int) -> Outcome:
+    """Read a time tagger until it is dark or fails, under a watchdog."""
+    instrument = make_tagger(
+        seed=seed, records=RECORDS, faults=tuple(faults), transfer_kib=0.5, reconnect_s=2
+    )
+    outcome = Outcome(faults, truth=instrument.truth)
+    arguments = (instrument, outcome)
+
+    def read(instrument: Any, outcome: Outcome) -> None:
+        is_over = lambda: instrument.truth.registered >= RECORDS  # noqa: E731
+        read_script(instrument.open_driver(), outcome, is_over)
+
+    thread = threading.Thread(target=read, args=arguments, daemon=True)
+    thread.start()
+    thread.join(LONGEST_S)
+    assert not thread.is_alive(), f"hangs with {faults}"
+    return outcome
+
+
+def expect_fault(script: Sequence[Fault]) -> type[DeviceError] | None:
+    """Return the exception that must end a run, which nothing but a lasting stall or absence does."""
+    stalls = {fault.transfer for fault in script if fault.kind == "stall"}
+    for fault in script:
+        if fault.kind == "stall" and (fault.amount > 1 or fault.transfer + 1 in stalls):
+            return DeviceStalledError
+        if fault.kind in ("unplug", "powerloss") and fault.amount >= PERMANENT:
+            return DeviceDisconnectedError
+    return None
+
+
+def require_tagger_account(seed: int, outcome: Outcome) -> None:
+    """What came and what was reported is what happened; nothing is made up or out of order."""
+    stats, truth = outcome.stats, outcome.truth
+    assert type(outcome.fault) is (expect_fault(outcome.faults) or type(None)), outcome.faults
+    assert stats.is_balanced
+    assert stats.delivered == sum(map(len, outcome.batches))
+    assert stats.dropped_host == 0
+    assert truth.corrupted <= stats.malformed  # and records of which a gap has cut off the end
+    if isinstance(outcome.fault, DeviceDisconnectedError):
+        assert stats.acquired <= truth.registered
+    else:
+        assert stats.acquired == truth.registered - truth.lost_power_off
+        assert stats.lost_device >= truth.lost_memory_full or truth.lost_power_off
+    resets, last, after_gap = 0, -1, False
+    known = true_records(seed, RECORDS)["time_ticks"]
+    for batch in outcome.batches:
+        after_gap |= batch.after_gap
+        if not len(batch):
+            continue  # nothing but malformed records
+        ticks = batch.records["time_ticks"]
+        while after_gap and not np.isin(ticks, known).all() and resets < stats.reconnects:
+            resets, last = resets + 1, -1  # the instrument's clock began anew
+            known = true_records(seed, RECORDS, resets)["time_ticks"]
+        assert np.isin(ticks, known).all()
+        assert np.all(np.diff(ticks, prepend=last) > 0)
+        last, after_gap = ticks[-1], False
+
+
+def draw_picture_script(seed: int, kinds: dict[FaultKind, float]) -> list[Fault]:
+    """Draw up to five faults among the first requests; the very first one, with which a source
+    opens, goes well.
+    """
+    random = np.random.default_rng(seed)
+    places = 1 + random.choice(15, random.integers(0, 6), replace=False)
+    drawn = random.choice(len(kinds), len(places), p=list(kinds.values()))
+    return [
+        Fault(int(place), list(kinds)[number], int(random.integers(1, 4)))
+        for place, number in zip(places, drawn, strict=True)
+    ]
+
+
+def run_pictures(seed: int) -> Outcome:
+    """Run a script: a streak camera for odd seeds, an array for even ones."""
+    if seed % 2:
+        faults = draw_picture_script(seed, STREAK_KINDS)
+        server: Any = EmulatedStreakCamera(SCREEN, 200, faults=faults)
+        port, data_port = server.ports
+        place = f"remoteex://{HOST}:{port}?data_port={data_port}"
+        address = f"{place}&timeout_s=0.5&buffers=8&mcp_gain=9"
+    else:
+        faults = draw_picture_script(seed, ARRAY_KINDS)
+        server = EmulatedSpadArray(ARRAY_LIGHT, seed, faults=faults)
+        place = f"spad512://{HOST}:{server.port}"
+        address = f"{place}?width=4&timeout_s=1&images={1 + seed % 3}"
+    outcome, source = Outcome(faults), devices.open(address)
+    read_script(source, outcome, lambda: source.stats.delivered >= FRAMES)
+    server.close()
+    outcome.gain = getattr(server, "gain", "0")
+    return outcome
+
+
+def is_right(outcome: Outcome) -> bool:
+    """Whether nothing of pictures is unaccounted for, the tube is safe, and only a fatal fault has
+    ended the stream.
+    """
+    is_allowed = any(fault.kind in FATAL for fault in outcome.faults)
+    is_balanced = outcome.stats.is_balanced and outcome.stats.unread == 0
+    is_safe = outcome.gain == "0" and outcome.seconds < LONGEST_S
+    return is_balanced and is_safe and (outcome.fault is None or is_allowed)
+
+
+def run_at_once(run: Callable[..., Outcome], *arguments: Any) -> list[Outcome]:
+    """Run scripts, some at once: they wait most of the time."""
+    with ThreadPoolExecutor(12) as pool:
+        return list(pool.map(run, *arguments))
+
+
+@pytest.fixture(autouse=True)
+def own_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the driver measure rates by its own work: the emulated instrument's time runs as fast as it
+    is read, and packets would get smaller while other programs have the processor.
+    """
+    monkeypatch.setattr(SendWindow, "clock", staticmethod(time.thread_time))
+
+
+@pytest.mark.parametrize(
+    "seeds",
+    [range(300), pytest.param(range(300, 1000), marks=pytest.mark.nightly)],
+    ids=["sample", "rest"],
+)
+def test_random_faults_of_a_time_tagger(seeds: range) -> None:
+    outcomes = run_at_once(run_tagger, map(draw_tagger_script, seeds), seeds)
+    for seed, outcome in zip(seeds, outcomes, strict=True):
+        require_tagger_account(seed, outcome)
+
+
+def test_random_faults_of_cameras() -> None:
+    """All kinds of faults came up, some streams went on after a cable was pulled, some ended."""
+    outcomes = run_at_once(run_pictures, range(48))
+    assert [outcome for outcome in outcomes if not is_right(outcome)] == []
+    kinds = {fault.kind for outcome in outcomes for fault in outcome.faults}
+    assert kinds >= {*STREAK_KINDS, *ARRAY_KINDS}
+    assert sum(one.stats.reconnects > 0 and one.fault is None for one in outcomes) > 3
+    assert sum(one.fault is not None for one in outcomes) > 3
+    assert sum(one.stats.lost_device > 0 for one in outcomes) > 3
+
+
+def test_without_faults_everything_arrives_as_it_was() -> None:
+    outcome = run_tagger((), 7)
+    assert outcome.fault is None
+    np.testing.assert_array_equal(joined(outcome.batches), true_records(7, RECORDS))
+    assert outcome.stats.acquired == outcome.stats.delivered == RECORDS
+    firsts = np.cumsum([0, *map(len, outcome.batches)])
+    assert [batch.first for batch in outcome.batches] == firsts[:-1].tolist()
+    assert not any(batch.after_gap for batch in outcome.batches)
+
+
+def test_what_goes_unnoticed() -> None:
+    """Short transfers, single stalls and timeouts lose nothing."""
+    stats = run_tagger(Fault.parse("short@3:7,stall@5,timeout@8,short@9:1"), 1).stats
+    assert (stats.delivered, stats.malformed, stats.lost_device) == (RECORDS, 0, 0)
+    assert stats.timeouts >= 1
+
+
+def test_the_stream_goes_on_after_it_was_unplugged() -> None:
+    outcome = run_tagger(Fault.parse("unplug@10:2"), 2)
+    gaps = [batch for batch in outcome.batches if batch.after_gap]
+    assert (outcome.fault, len(gaps), outcome.stats.reconnects) == (None, 1, 1)
+    # What the instrument held at that moment, a part of one record, is lost; its clock went on.
+    whole = np.delete(true_records(2, RECORDS), gaps[0].first)
+    np.testing.assert_array_equal(joined(outcome.batches), whole)
+    assert (outcome.stats.acquired, outcome.stats.malformed) == (RECORDS, 1)
+
+
+def test_an_instrument_that_lost_its_power_begins_anew() -> None:
+    outcome = run_tagger(Fault.parse("powerloss@10:1"), 3)
+    gap = next(batch for batch in outcome.batches if batch.after_gap)
+    assert outcome.stats.reconnects == 1
+    assert outcome.truth.registered == RECORDS
+    assert outcome.stats.acquired + outcome.truth.lost_power_off == RECORDS
+    assert gap.first > 800  # ten transfers of 85 records
+    assert gap.records["time_ticks"][0] == true_records(3, 1, resets=1)["time_ticks"][0]
+
+
+@pytest.mark.parametrize(
+    ("script", "fault", "said"),
+    [
+        (f"unplug@10:{PERMANENT}", DeviceDisconnectedError, "did not come back within 2 s"),
+        ("stall@10:2", DeviceStalledError, "stalled"),
+    ],
+)
+def test_gone_for_good(script: str, fault: type[DeviceError], said: str) -> None:
+    outcome = run_tagger(Fault.parse(script), 4)
+    assert type(outcome.fault) is fault
+    assert said in str(outcome.fault)
+    assert outcome.stats.delivered == 10 * 512 // 6  # all that came before was read first
+
+
+def test_losses_are_told_apart() -> None:
+    outcome = run_tagger(Fault.parse("lost@4:50,overflow@8,corrupt@12:9"), 5)
+    stats = outcome.stats
+    assert stats.acquired == RECORDS
+    # A transfer of 512 bytes holds 85 or 86 records of which it has the beginning.
+    assert 50 + 85 <= stats.lost_device <= 50 + 87
+    assert 9 <= stats.malformed <= 10
+    assert [batch.after_gap for batch in outcome.batches].count(True) == 1
+
+
+def test_scripts_are_read_from_text() -> None:
+    assert Fault.parse("stall@3,unplug@10:2") == (Fault(3, "stall"), Fault(10, "unplug", 2))
+    for text in ("boom@3", "stall", "stall@x", "stall@3:-1"):
+        with pytest.raises(InputError, match="is not a fault"):
+            Fault.parse(text)
+
+
+FAULTS = {
+    # the file
+    "a second recorder on one path": "test_recording::test_a_second_recorder_is_refused",
+    "the file is removed or replaced": "test_recording::test_a_file_that_is_gone_is_noticed",
+    "the disk is full": "test_recording::test_a_full_disk_keeps_what_was_recorded",
+    "kill -9": "test_recording::test_killed_recorders_leave_what_they_flushed",
+    "a quiet stream's last piece": "test_recording::test_what_a_quiet_stream_brought_is_in_the_file",
+    "bits flipped at 400 places": "test_recording::test_one_flipped_bit_costs_one_block",
+    "truncated at each 1000th byte": (
+        "test_recording::test_a_truncated_recording_is_good_up_to_its_end_and_says_that_it_is_cut"
+    ),
+    "the computer's clock is set": (
+        "test_recording::test_a_clock_that_is_set_does_not_stop_a_replay"
+    ),
+    # the program
+    "SIGINT, SIGTERM, SIGHUP while pieces wait": "test_recording::test_a_signal_stops_and_drains",
+    "SIGINT, SIGTERM, SIGHUP at random moments": (
+        "test_signals::test_whenever_a_signal_comes_the_gain_goes_down"
+    ),
+    "the reading thread fails": "test_recording::test_a_reader_thread_never_dies_silently",
+    "the instrument fails in a recording": (
+        "test_recording::test_an_instrument_that_fails_leaves_a_whole_recording"
+    ),
+    "a reader 64 MiB behind": "test_faults::test_a_reader_64_mib_behind",
+    "a reader slower than the camera": (
+        "test_transients::test_a_slow_viewer_gets_the_newest_picture_and_is_told_of_the_others"
+    ),
+    # RemoteEx
+    "stray bytes on the data port": (
+        "test_remoteex::test_stray_bytes_on_the_data_port_are_thrown_away"
+    ),
+    "sequence numbers restart": "test_remoteex::test_numbers_that_restart_are_followed",
+    "Latin-1": "test_remoteex_protocol::test_text_is_latin_1",
+    "bare carriage returns in errors": (
+        "test_remoteex::test_an_error_of_several_lines_does_not_shift_the_answers"
+    ),
+    "live mode runs already": "test_remoteex::test_live_mode_of_an_operator_is_joined_and_goes_on",
+    "the camera is busy (code 7)": "test_remoteex::test_a_busy_camera_is_waited_for_or_stopped",
+    "HPD-TA is not up": "test_remoteex::test_hpd_ta_is_started_where_it_is_not_up",
+    "an answer comes late": (
+        "test_remoteex::test_a_late_answer_is_waited_for_and_not_asked_for_again"
+    ),
+    "the connection breaks": "test_remoteex::test_after_an_unplugged_cable_the_stream_goes_on",
+    "pictures fall out of the ring buffer": (
+        "test_remoteex::test_pictures_that_fell_out_of_the_ring_are_accounted_for"
+    ),
+    # USB time tagger
+    "CLEAR, stale replies, last session's records": (
+        "test_timetag::test_every_record_of_this_session_and_no_other"
+    ),
+    "replies late, lost or stalled": "test_timetag::test_no_reply_is_taken_for_another",
+    "unplugged and plugged in": "test_timetag::test_a_loose_plug_is_followed",
+    # the others
+    "a SPAD array complains amid a picture": (
+        "test_spad512::test_what_the_server_complains_of_is_passed_on"
+    ),
+    "packets of a GigE frame are missing": "test_aravis::test_identifiers_tell_what_is_missing",
+    "a line of a kit is torn": "test_histogram_kits::test_every_frame_is_accounted_for",
+}
+
+
+@lru_cache
+def list_tests(file: str) -> dict[str, str]:
+    """Return the source of every test of a file, decorators included, by its name."""
+    text = (FOLDER / f"{file}.py").read_text(encoding="utf-8")
+    return {
+        node.name: "\n".join(ast.unparse(part) for part in (*node.decorator_list, node))
+        for node in ast.parse(text).body
+        if isinstance(node, ast.FunctionDef)
+    }
+
+
+def test_there_are_thirty() -> None:
+    assert len(FAULTS) == 30
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_has_a_test_that_runs_with_every_commit(fault: str) -> None:
+    file, _, name = FAULTS[fault].partition("::")
+    body = list_tests(file)[name]
+    assert "assert" in body or "pytest.raises" in body
+    assert "@pytest.mark.nightly" not in body
+
+
+class BoundlessFeed:
+    """Pictures of a mebibyte as fast as they are taken, up to a number."""
+
+    codec = FrameCodec(1024, 1024, 8)
+    info = Info("boundless")
+    calibration = None
+
+    def __init__(self, pictures: int) -> None:
+        self._left, self._number = pictures, 0
+        self._pixels = bytes(self.codec.pixel_bytes)
+        self.ledger = Ledger()
+
+    def start(self) -> None:
+        """Nothing to start."""
+
+    def pull(self, timeout: float) -> Transfer | None:
+        if self._number == self._left:
+            return None
+        self._number += 1
+        packed = self.codec.pack_frame(self._number - 1, self._pixels)
+        return Transfer(memoryview(packed), taken_at=monotonic())
+
+    def stop(self) -> None:
+        self._left = self._number
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+@pytest.mark.parametrize("policy", ["block", "drop_oldest", "fail", "newest"])
+def test_a_reader_64_mib_behind(policy: OverflowPolicy) -> None:
+    """What it gets, what is reported to it, and that the age is among it."""
+    pictures = 80
+    feed = BoundlessFeed(pictures)
+    is_newest = policy == "newest"
+    source = StreamSource(feed, StreamOptions(64.0, "block" if is_newest else policy))
+    if is_newest:
+        source.keep_newest()
+    full = 1 if is_newest else 62
+    deadline = monotonic() + 20
+    while source.stats.acquired < (pictures if is_newest else full) and monotonic() < deadline:
+        pass
+    began = monotonic()
+    numbers = []
+    try:
+        for batch in source:
+            assert 0 < batch.taken_at <= batch.received_at <= monotonic()
+            numbers += batch.records["number"].tolist()
+    except BufferOverflowError:
+        assert policy == "fail"
+    source.close()
+    stats = source.stats
+    assert stats.is_balanced
+    assert stats.delivered == len(numbers)
+    assert np.all(np.diff(numbers) > 0)
+    if policy == "block":
+        assert numbers == list(range(pictures))  # it waits, and nothing is lost
+    elif is_newest:
+        assert numbers[-1] == pictures - 1
+        assert stats.dropped_host == pictures - len(numbers)
+    else:
+        assert stats.dropped_host > 0 or stats.delivered == pictures
+    assert monotonic() - began < 20
+
+
+class ClosingFeed(BoundlessFeed):
+    """Closes its own source after some pictures, as the collector may on the reader's thread."""
+
+    def __init__(self, pictures: int) -> None:
+        super().__init__(pictures)
+        self.source: Future[StreamSource] = Future()
+
+    def pull(self, timeout: float) -> Transfer | None:
+        source = self.source.result()
+        if self._number == 3:
+            source.close()
+        return super().pull(timeout)
+
+
+def test_a_source_that_is_closed_on_its_own_thread_ends_as_any_other() -> None:
+    feed = ClosingFeed(80)
+    source = StreamSource(feed)
+    feed.source.set_result(source)
+    while source._ring.get(5.0) is not None:
+        pass
+    source._thread.join(5.0)
+    assert not source._thread.is_alive()
+
+
+if __name__ == "__main__":
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
+    found = run_at_once(run_pictures, range(count))
+    wrong = [outcome for outcome in found if not is_right(outcome)]
+    slowest = max(outcome.seconds for outcome in found)
+    print(f"{len(found)} scripts, {len(wrong)} wrong, the slowest took {slowest:.1f} s", *wrong)

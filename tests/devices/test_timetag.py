@@ -1,0 +1,437 @@
+"""The time tagger's driver on the emulated instrument: what the address can set, policies, pace, odd
+answers; and, one behaviour at a time, what the real one does and a first driver did not expect. Each
+of these fails `OldTagger`, which is how the first driver was, and passes the driver.
+"""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import errno
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from instruments import KIND, TAGS, finish, joined, make_tagger, read_until_dark, true_records
+
+import devices
+from devices.emulation.harness import Fault
+from devices.emulation.timetag import (
+    BOARD_MEMORY_BYTES,
+    CLOCK_HZ,
+    COMMAND,
+    MAGIC,
+    MAX_TICK,
+    EmulatedTimeTagger,
+    PoissonStream,
+)
+from devices.emulation.usb import VirtualUsb, make_usb_error
+from devices.source import as_bytes
+from devices.timetag import driver
+from devices.timetag.codec import COUNTER_RANGE, WRAP
+from devices.timetag.driver import (
+    COMMAND_ENDPOINT,
+    DATA_ENDPOINT,
+    REPLY_ENDPOINT,
+    USB_IDENTITY,
+    Capture,
+    Register,
+    TimeTagger,
+    TimeTaggerFeed,
+    TimeTagOptions,
+)
+from devices.usb import UsbLink
+from tofclip.errors import (
+    BufferOverflowError,
+    DeviceError,
+    DeviceTimeoutError,
+    InputError,
+    ProtocolError,
+)
+
+RATE = 12_800_000.0
+RECORDS = 2000
+SMALL = "sim+timetag://?seed=3&transfer_kib=8"
+OLD: dict[str, Any] = {"old_records": 400, "holds_packets": True, "flush_discards": False}
+
+
+def link_to(instrument: EmulatedTimeTagger) -> UsbLink:
+    return UsbLink(USB_IDENTITY, "", VirtualUsb(instrument))
+
+
+def make_old_kind(**unlike: Any) -> EmulatedTimeTagger:
+    return make_tagger(**{**KIND, "packet_bytes": 512, "records": RECORDS, **unlike})
+
+
+def read_all(instrument: EmulatedTimeTagger) -> Any:
+    with instrument.open_driver() as source:
+        found = joined(read_until_dark(source))
+    assert source.stats.is_balanced
+    return found
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled() -> None:
+    """Compile what every test needs, so that none of them is late."""
+    assert len(true_records(1, 10)) == 10
+
+
+class OldTagger(TimeTagger):
+    """The first driver: believes every reply, writes CLEAR once, knows nothing of the USB chip."""
+
+    version = 6
+
+    def synchronize(self) -> None:
+        self.version = self._exchange(0, Register.VERSION, 0)
+
+    def _transact(self, what: int, register: Register, value: int) -> int:
+        return self._exchange(what, register, value)
+
+    def clear_memory(self) -> None:
+        self.write(Register.CLEAR, 1)
+
+    def set_send_window(self, size: int) -> bool:
+        return False
+
+    def flush(self) -> bool:
+        return False
+
+
+@pytest.fixture(params=["old", "new"])
+def is_old(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Use the first driver, or this one."""
+    if request.param == "old":
+        monkeypatch.setattr(driver, "TimeTagger", OldTagger)
+    return bool(request.param == "old")
+
+
+def test_what_it_says_of_itself() -> None:
+    with devices.open(SMALL) as source:
+        assert source.info.as_dict() == {
+            "instrument": "FX2 time tagger",
+            "serial": "",  # as of the real ones
+            "version": 6,
+            "clock_hz": CLOCK_HZ,
+            "usb": "04b4:1004",
+        }
+        assert source.calibration is not None
+        assert source.calibration.attribute("tick_s") == 1 / CLOCK_HZ
+        assert (source.is_live, source.is_seekable) == (True, False)
+
+
+@pytest.mark.parametrize("packet", [510, 512])
+def test_packets_of_either_size_carry_the_same_records(packet: int) -> None:
+    with devices.open(f"{SMALL}&records=5000&packet_bytes={packet}") as source:
+        records = joined(read_until_dark(source))
+    words = PoissonStream(RATE, CLOCK_HZ, 3).next_words(5000, MAX_TICK)
+    np.testing.assert_array_equal(records, TAGS.decode(as_bytes(words), TAGS.start).records)
+    assert source.stats.delivered == source.stats.acquired == 5000
+
+
+def test_photons_are_poisson() -> None:
+    words = PoissonStream(RATE, CLOCK_HZ, 8, (1, 2, 3, 4)).next_words(200_000, MAX_TICK)
+    records = TAGS.decode(as_bytes(words), TAGS.start).records
+    gaps = np.diff(records["time_ticks"])
+    # Ten ticks per photon, geometrically distributed; five standard deviations of 200 000.
+    assert abs(gaps.mean() - 10) < 0.11
+    assert abs(gaps.std() - np.sqrt(90)) < 0.2
+    shares = np.bincount(records["channels"], minlength=9)[[1, 2, 4, 8]] / len(records)
+    np.testing.assert_allclose(shares, [0.1, 0.2, 0.3, 0.4], atol=0.005)  # four standard deviations
+
+
+def test_wraps_are_in_the_stream_and_cuts_are_not() -> None:
+    rare = 5.0  # photons per second: the counter wraps every 537 s
+    whole = PoissonStream(rare, CLOCK_HZ, 2).next_words(20_000, MAX_TICK)
+    light = PoissonStream(rare, CLOCK_HZ, 2)
+    pieces = [
+        light.next_words(1, MAX_TICK) if number % 3 else light.next_words(7, COUNTER_RANGE)
+        for number in range(500)
+    ]
+    cut = np.concatenate(pieces)
+    np.testing.assert_array_equal(cut, whole[: len(cut)])
+    found = TAGS.decode(as_bytes(whole), TAGS.start)
+    assert found.malformed == 0
+    marks = found.records[found.records["flags"] == WRAP]["time_ticks"]
+    np.testing.assert_array_equal(marks, COUNTER_RANGE * np.arange(1, len(marks) + 1))
+    assert len(marks) == found.records["time_ticks"][-1] // COUNTER_RANGE > 5
+
+
+def test_a_slow_reader_loses_the_oldest_fails_or_makes_the_instrument_wait() -> None:
+    with devices.open(f"{SMALL}&records=200000&policy=drop_oldest&buffer_mib=0.1") as source:
+        while source.stats.acquired < 199_000:
+            time.sleep(0.01)
+        first, *rest = read_until_dark(source)
+        assert first.after_gap
+    stats = source.stats
+    assert stats.dropped_host > 150_000
+    assert stats.acquired == 200_000
+    assert stats.delivered == len(first) + sum(map(len, rest)) == 200_000 - stats.dropped_host
+
+    with devices.open(f"{SMALL}&policy=fail&buffer_mib=0.1") as source:
+        while source.stats.dropped_host == 0:
+            time.sleep(0.01)
+        with pytest.raises(BufferOverflowError):
+            read_until_dark(source)
+    assert source.stats.is_balanced
+    assert source.stats.lost_device == 0
+
+    with devices.open(f"{SMALL}&buffer_mib=0.1") as source:
+        time.sleep(0.1)
+        assert source.stats.unread <= 100_000 / 6 + 8192
+    assert source.stats.dropped_host == 0
+    assert source.stats.unread > 0
+    assert source.read() is None
+
+
+def test_photons_come_when_they_are_due() -> None:
+    rate, seconds = 1e6, 0.3
+    with devices.open(f"{SMALL}&pace=realtime&rate={rate}") as source:
+        begin = time.monotonic()
+        while time.monotonic() < begin + seconds:
+            source.read()
+        finish(source)
+        took = time.monotonic() - begin
+    assert source.stats.lost_device == 0
+    # Not before their time (five standard deviations), and up to the moment of the stop.
+    assert rate * seconds - 3000 < source.stats.delivered < rate * (took + 0.1) + 3000
+
+
+def test_a_full_memory_loses_photons_and_says_so() -> None:
+    # Photons that a busy machine can draw faster than they fall: a memory for 1 ms of them.
+    instrument = make_tagger(pace="realtime", memory_mib=6000 / (1 << 20), transfer_kib=64)
+    with instrument.open_driver() as source:
+        assert source.read() is not None
+        while instrument.truth.lost_memory_full == 0:
+            time.sleep(0.01)
+            source.read()
+        finish(source)
+    assert source.stats.lost_device == instrument.truth.lost_memory_full > 0
+    assert source.stats.acquired == instrument.truth.registered
+
+
+def test_registers_answer_and_reset() -> None:
+    registers = TimeTagger(link_to(make_tagger()))
+    assert registers.read(Register.CLOCK) == CLOCK_HZ
+    registers.write(Register.CLOCK, 5)
+    assert registers.read(Register.CLOCK) == CLOCK_HZ
+    registers.run(0b101, 0b10)
+    assert registers.read(Register.CAPTURE) == Capture.COUNT | Capture.REGISTER
+    assert (registers.read(Register.STROBE), registers.read(Register.DELTA)) == (0b101, 0b10)
+    registers.reset()
+    assert registers.read(Register.CAPTURE) == Capture.OFF
+
+
+@pytest.mark.parametrize("command", ["", "aa0002", "ab00020000000000"])
+def test_a_wrong_command_is_not_answered(command: str) -> None:
+    link = link_to(make_tagger(stale_replies=0, jammed_bytes=0))
+    link.write(COMMAND_ENDPOINT, bytes.fromhex(command), 0.1)
+    with pytest.raises(DeviceTimeoutError):
+        link.read(REPLY_ENDPOINT, array.array("B", bytes(8)), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("channels=16", "channels must be at least 0 and at most 15"),
+        ("transfer_kib=0.3", "transfer_kib must be at least 0.5"),
+        ("transfer_kib=0.7", "multiple of 512"),
+        ("buffer_mib=0", "buffer_mib must be above 0"),
+        ("policy=hope", "policy must be block or drop_oldest or fail"),
+        ("reconnect_s=-1", "reconnect_s must be at least 0"),
+        ("rate=2e8", "rate must be above 0"),
+        ("seed=-1", "seed must be at least 0"),
+        ("packet_bytes=64", "510 or 512"),
+        ("memory_mib=0", "memory_mib must be at least"),
+        ("colour=red", "'colour' is unknown"),
+        ("faults=boom", "not a fault"),
+    ],
+)
+def test_unusable_values_are_refused(wrong: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        devices.open(f"sim+timetag://?{wrong}")
+
+
+@pytest.mark.parametrize(("length", "said"), [(3, "answered 3 bytes"), (4, "0 Hz")])
+def test_odd_answers_are_refused(length: int, said: str) -> None:
+    with pytest.raises(ProtocolError, match=said):
+        make_tagger(_send_reply=lambda *_: length).open_driver()
+
+
+def test_a_clock_that_cannot_be_is_refused() -> None:
+    instrument = make_old_kind()
+    instrument._registers[Register.CLOCK] = 42
+    with pytest.raises(ProtocolError, match="42 Hz, which cannot be"):
+        instrument.open_driver()
+
+
+@pytest.mark.parametrize("fault", ["unplug@1:2", "powerloss@1:2", "overflow@1"])
+def test_one_that_was_stopped_stays_so_whatever_happens(fault: str) -> None:
+    link = link_to(make_tagger(rate=RATE, faults=Fault.parse(fault)))
+    feed = TimeTaggerFeed(link, TimeTagOptions(transfer_kib=1.0))
+    feed.start()
+    assert feed.pull(0.1) is not None
+    feed.stop()
+    with contextlib.suppress(DeviceTimeoutError):
+        feed.pull(0.5)  # the rest of what was registered before
+    with pytest.raises(DeviceTimeoutError):
+        feed.pull(0.5)
+    assert not TimeTagger(link).read(Register.CAPTURE) & Capture.REGISTER
+
+
+def test_closing_does_not_wait_for_one_that_is_gone() -> None:
+    instrument = make_tagger(transfer_kib=0.5, reconnect_s=600)
+    source = instrument.open_driver()
+    source.read()
+    instrument.unplug(float("inf"))
+    begin = time.monotonic()
+    source.close()
+    assert time.monotonic() - begin < 5
+    assert source.stats.is_balanced
+
+
+def test_a_loose_plug_is_followed() -> None:
+    """It goes again while it is being set up after it came back."""
+
+    class Loose(EmulatedTimeTagger):
+        left = 0
+
+        def receive(self, endpoint: int, data: bytes) -> None:
+            if self.left:
+                self.left -= 1
+                self.unplug(1)
+                raise make_usb_error(errno.ENODEV)
+            super().receive(endpoint, data)
+
+    instrument: Any = make_tagger(Loose, transfer_kib=0.5, reconnect_s=10)
+    with instrument.open_driver() as source:
+        source.read()
+        instrument.left = 3
+        instrument.unplug(1)
+        while not source.read().after_gap:
+            pass
+        assert source.stats.reconnects == 1
+        assert instrument.left == 0
+
+
+def test_a_defect_in_the_thread_reaches_the_reader() -> None:
+    def fail(*_: object) -> int:
+        raise ZeroDivisionError("a defect")
+
+    instrument = make_tagger()
+    with instrument.open_driver() as source:
+        instrument._send_data = fail  # type: ignore[method-assign]
+        with pytest.raises(ZeroDivisionError):
+            list(source)
+
+
+@pytest.mark.parametrize(
+    "unkind",
+    [
+        {"clear_is_level": True},
+        {"stale_replies": 1},
+        {"stale_replies": 2, "jammed_bytes": 5},
+        {"old_records": 40, "holds_packets": True},
+        OLD,
+        {"holds_packets": True, "packet_bytes": 510},
+        {"holds_packets": True, "packet_bytes": 510, "flush_discards": False},
+    ],
+    ids=str,
+)
+def test_every_record_of_this_session_and_no_other(unkind: dict[str, Any], is_old: bool) -> None:
+    instrument = make_old_kind(transfer_kib=4, **unkind)
+    try:
+        ticks = read_all(instrument)["time_ticks"]
+    except DeviceError:
+        assert is_old
+        return
+    assert np.array_equal(ticks, true_records(1, RECORDS)["time_ticks"]) is not is_old
+
+
+@pytest.mark.parametrize("rate", [20.0, 1000.0, 6000.0])
+def test_a_photon_does_not_wait_for_others(rate: float, is_old: bool) -> None:
+    """Age of the oldest record of each batch when it is read, by the instrument's own clock."""
+    kind = {"holds_packets": True, "packet_bytes": 510, "pace": "realtime", "records": 10**9}
+    instrument = make_old_kind(rate=rate, **kind)
+    ages: list[float] = []
+    with instrument.open_driver() as source:
+        end = time.monotonic() + 1.5
+        while time.monotonic() < end:
+            with contextlib.suppress(DeviceTimeoutError):
+                batch = source.read(0.2)
+                if batch is not None and len(batch):
+                    now = time.monotonic() - instrument._started
+                    ages.append(now - batch.records["time_ticks"][0] / CLOCK_HZ)
+    if is_old:
+        assert not ages or (rate < 1700 and np.median(ages) > 0.05) or rate > 1700
+    else:
+        assert len(ages) > 5
+        assert np.median(ages) < 0.05
+
+
+def test_a_full_stream_takes_few_transfers(is_old: bool) -> None:
+    """The board holds 3.4 ms; a transfer for every packet of 510 bytes is too slow under load."""
+    kind = {"holds_packets": True, "packet_bytes": 510, "pace": "realtime", "records": 10**9}
+    instrument = make_old_kind(rate=680_000, memory_mib=BOARD_MEMORY_BYTES / (1 << 20), **kind)
+    with instrument.open_driver() as source:
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            source.read()
+    per_transfer = source.stats.delivered / instrument._transfers
+    assert source.stats.malformed == 0
+    assert source.stats.acquired == instrument.truth.registered
+    assert per_transfer <= 85 if is_old else per_transfer > 2000
+
+
+def test_registration_that_begins_with_the_counter_sees_a_wrap() -> None:
+    """Which is why the driver starts the counter first."""
+    instrument = make_old_kind()
+    instrument._write_register(Register.CAPTURE, Capture.COUNT | Capture.REGISTER)
+    assert instrument.truth.registered == 1
+    assert bytes(instrument._stream) == bytes([0x40, 0, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize("stale", [1, 2])
+def test_a_late_reply_does_not_answer_the_next_request(stale: int) -> None:
+    """What another program asked, and never fetched, comes while this one works."""
+    instrument = make_old_kind()
+    tagger = TimeTagger(link_to(instrument))
+
+    def reply_late() -> None:
+        for _ in range(stale):
+            instrument.receive(COMMAND_ENDPOINT, COMMAND.pack(MAGIC, 0, Register.CLOCK, 0))
+
+    tagger.write(Register.STROBE, 5)
+    reply_late()
+    assert tagger.read(Register.STROBE) == 5
+    reply_late()
+    tagger.write(Register.STROBE, 9)
+    assert tagger.read(Register.STROBE) == 9
+    assert tagger.version == 6
+
+
+@pytest.mark.parametrize("silent", [0, 1, 2])
+def test_records_of_the_last_session_are_thrown_away_though_they_come_slowly(silent: int) -> None:
+    """One request for them is not answered in time."""
+
+    class Slow(EmulatedTimeTagger):
+        requests = 0
+
+        def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
+            if endpoint == DATA_ENDPOINT:
+                self.requests += 1
+                if self.requests == silent + 1:
+                    raise make_usb_error(errno.ETIMEDOUT)
+            return super().fill(endpoint, buffer, timeout)
+
+    instrument = make_old_kind(base=Slow, transfer_kib=4, **OLD)
+    ticks = read_all(instrument)["time_ticks"]
+    np.testing.assert_array_equal(ticks, true_records(1, RECORDS)["time_ticks"])
+
+
+@pytest.mark.parametrize("number", range(12))
+@pytest.mark.parametrize("kind", ["reply_late", "reply_lost", "reply_stall"])
+def test_no_reply_is_taken_for_another(kind: str, number: int) -> None:
+    faults = Fault.parse(f"{kind}@{number}:2,{kind}@{number + 13}:1,{kind}@{number + 40}:3")
+    instrument = make_tagger(records=RECORDS, transfer_kib=4, faults=faults)
+    assert len(read_all(instrument)) == RECORDS
