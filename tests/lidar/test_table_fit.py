@@ -9,14 +9,23 @@ import pytest
 
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, Pulse, depth
-from tofclip.lidar.fit_kernels import fit_lone_returns
+from tofclip.lidar.fit_kernels import fit_returns
 from tofclip.lidar.peak_kernels import (
     CANDIDATE_COLUMNS,
+    FIRST_OFFSET,
     HEIGHT,
+    MOVED,
     OFFSET,
     PEAK_BIN,
+    Room,
 )
-from tofclip.lidar.pulse_tables import MAX_OFFSET_BINS, PHASES_PER_BIN, PhaseTable, TraceBins
+from tofclip.lidar.pulse_tables import (
+    MAX_OFFSET_BINS,
+    PHASES_PER_BIN,
+    PhaseTable,
+    TraceBins,
+    list_windows,
+)
 from tofclip.shots import Frames
 
 BIN, FWHM = 20e-12, 60e-12
@@ -103,34 +112,46 @@ def test_bins_whose_neighbours_are_not_held_are_left_to_the_exact_fit():
 
 @pytest.mark.parametrize(("peak", "there"), [(27, True), (33, True), (56, False)])
 def test_a_return_is_followed_when_it_moves_away_from_its_peak(peak, there):
-    """As far as the bins around it are held; beyond, the exact fit takes over."""
+    """As far as the bins around it are held; beyond, the exact fit takes over, which begins where the
+    return was before any fit.
+    """
     table = PhaseTable.tabulate(Pulse.gaussian(FWHM), TIMES)
     arrival = 30.2 if there else peak + 2.0
     traces = np.zeros((2, 64), np.float32)
     traces[0, :BINS] = 100 * Pulse.gaussian(FWHM)(TIMES - TIMES[0] - BIN * arrival) + 3
     candidates = np.zeros((1, CANDIDATE_COLUMNS))
-    candidates[0, PEAK_BIN] = peak
+    candidates[0, [PEAK_BIN, MOVED, OFFSET, FIRST_OFFSET]] = peak, np.inf, 0.1, 0.1
     rests = np.zeros((1, table.shapes.shape[1]), np.float32)
     rests[0, : 2 * table.half + 1] = np.pad(traces[0] - 3, 9)[9 + peak - table.half :][
         : 2 * table.half + 1
     ]
     even = table.find_even_bins(TraceBins.all_bins(BINS))
-    fit_lone_returns(
-        traces[:1],
-        np.array([[3.0, 1.0]]),
-        even,
-        table.half,
-        candidates,
-        rests,
-        np.zeros(1, np.int64),
-        1,
-        table.shapes,
-        table.slopes,
-        table.sums,
+    nothing, single = np.empty(0), np.empty((1, 0), np.float32)
+    moments = np.array([[3.0, 1.0]])
+    room = Room(
+        *(
+            single[0],
+            np.empty((1, 0), np.int32),
+            single[0],
+            single[0],
+            nothing[:, np.newaxis],
+            moments,
+        ),
+        *(candidates, rests, np.zeros(1, np.int64), nothing[:, np.newaxis], nothing[:, np.newaxis]),
     )
+    fit_returns(traces[:1], table, even, room, 1)
+    assert candidates[0, PEAK_BIN] + candidates[0, FIRST_OFFSET] == pytest.approx(peak + 0.1)
     if there:
         assert candidates[0, PEAK_BIN] + candidates[0, OFFSET] == pytest.approx(30.2, abs=1e-3)
         assert abs(candidates[0, OFFSET]) <= MAX_OFFSET_BINS
         assert candidates[0, HEIGHT] == pytest.approx(100, rel=1e-3)
     else:
         assert np.isnan(candidates[0, HEIGHT])
+
+
+def test_bins_just_as_far_apart_as_the_distance_are_not_too_near():
+    """Of bins 1 s apart those 3 s away are; half a bin more makes them so."""
+    times, scale = np.arange(20.0), (1.0, 0.0, -2.5, 2.5)
+    assert list_windows(times, scale, 3.0)[10].tolist() == [8, 13, 8, 13]
+    assert list_windows(times, scale, 3.5)[10].tolist() == [8, 13, 7, 14]
+    assert list_windows(times, scale, 3.0)[[0, 19], 2:].tolist() == [[0, 3], [17, 20]]

@@ -1,20 +1,20 @@
-"""Peaks of a trace, by the sharp filter: the parts of `tofclip.lidar.peak_kernels`.
+"""The compiled search for candidates: some pixels' traces, one after another, by the steps of
+`tofclip.lidar.search`.
 
-Loops over bins take a vector of them at a time (`tofclip.vectors`): axes are a whole number of
-vectors long (`tofclip.lidar.trace_search`).
-
-The compiled search for candidates: some pixels' traces, one after another.
-
-The steps are those of `tofclip.lidar.search`. Every function is serial and holds no interpreter
-lock; `tofclip.lidar.search` shares the pixels between threads.
+Every function is serial and holds no interpreter lock; pixels are shared between threads. Loops over
+bins take a vector of them at a time (`tofclip.vectors`): axes are a whole number of vectors long
+(`tofclip.lidar.trace_search`).
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.compiling import ONE, SUMS_IN_ANY_ORDER, compile_as_part, compile_loop, inlined
 from tofclip.vectors import (
     LENGTH,
@@ -31,109 +31,119 @@ from tofclip.vectors import (
     sum_vector,
 )
 
+Float32 = NDArray[np.float32]
+
 # Of the share of the strongest return that a candidate needs before the fit, which does not make up
 # for more than the rest.
 PREFIT_THRESHOLD_FACTOR = 0.7
+VECTORS_PER_WORD = 2
+WORD_BINS = VECTORS_PER_WORD * LENGTH  # bins whose maxima are listed together, a bit for each
+NEEDS_EXACT_FIT = -1  # in place of the number of returns of a trace
+
+OFFSET, HEIGHT, MOVED, NOISE, PEAK_BIN, TRACE, FIRST_OFFSET = range(7)
+CANDIDATE_COLUMNS = 8  # a line of the processor's cache
+"""What is known of a candidate: by how many bins it arrives after the bin of its peak, height, by
+how many bins it moved last, noise of its trace, bin of its peak, and its trace's place among those
+searched together; and the first of these again, as it was before any fit."""
 
 search_step = compile_loop(fastmath=SUMS_IN_ANY_ORDER)
 search_part = compile_as_part(fastmath=SUMS_IN_ANY_ORDER, _nrt=False)
 
-VECTORS_PER_WORD = 2
-WORD_BINS = VECTORS_PER_WORD * LENGTH
-"""Bins whose maxima are listed together, a bit for each."""
+
+class Axis(NamedTuple):
+    """The bins of traces and the filters for them."""
+
+    times: FloatArray  # (bins,), s, increasing
+    # (bins,), for how many bins each one stands where background and noise are concerned
+    bin_weights: Float32
+    sharp: Float32  # (width, bins), weight of bin ``j + w - width // 2`` for a return at bin j
+    runs: NDArray[np.int64]  # first bins of the vectors in which it is applied, an even number
+    edges: NDArray[np.int64]  # single bins in which it is applied
+    words: NDArray[np.int64]  # first bins of the words in which maxima are sought
+    matched: Float32  # (bins, width), filters of unit energy, nowhere negative
+    starts: NDArray[np.int64]  # (bins,), first bin that each of them takes
+    sums: FloatArray  # (bins,), over each of them
+    windows: NDArray[np.int32]  # (bins, 4), `tofclip.lidar.pulse_tables.list_windows`
+    even: NDArray[np.bool_]  # (bins,), `tofclip.lidar.pulse_tables.PhaseTable.find_even_bins`
 
 
-@inlined
-def take_strongest_peaks(
-    trace,
-    times,
-    bin_weights,
-    matched,
-    starts,
-    sums,
-    gains,
-    windows,
-    limits,
-    above_centre,
-    listed,
-    places,
-    responses,
-    free,
-    peaks,
-):
-    """Take the highest maxima of the sharp filter's response that might count, in the order of time.
+class Limits(NamedTuple):
+    """What a candidate needs."""
 
-    Peaks are taken from the highest down, until not even bins all as bright as the next one says
-    could count: because of the noise, or beside the strongest return.
+    reach: float  # of two pulses, s
+    signal_to_noise: float
+    pixel_fraction: float  # of the strongest return, with the fall-off with range undone
+    last_instant: float  # at which a return may lie, s
+    sharp_gain: float  # largest sums of the sharp filters and of the matched ones
+    matched_gain: float
+    background_gain: float  # that of the sharp filters, or 0 where nothing is known of interest
+    lowest_response: float  # of interest
+    of_interest: Float32  # (bins + WORD_BINS,), by how much scores exceed that of the background
+    # (bins,), response that a return must exceed; weaker peaks are kept only where one overlaps them
+    least: Float32
 
-    Background and noise are those of the bins that no peak claims. Peaks claim their surroundings
-    from the strongest down, for as long as half of the bins stay free.
 
-    `trace` (bins,); `times, bin_weights, matched, starts, sums, gains, windows, limits, free`: as
-    for `tofclip.lidar.peak_kernels.find_candidates`; `above_centre` (float32, float32, float,
-    float): A brightness, number of bins, and sums over the bins of what is above it and of its
-    square; `listed`: number of maxima; `places` (4, bins): of `list_maxima`; where a peak is taken
-    its zero becomes 1; `responses` (bins,): overwritten at these: response of the matched filter;
-    `peaks` (returns, 2): overwritten: bin, and response less that to the background. Returns
-    `number`: of peaks.
+class Room(NamedTuple):
+    """What a thread's search overwrites, for some pixels of which each has at most `returns`."""
+
+    score: (
+        Float32  # (1 + bins + WORD_BINS + 1,), zero where no sharp filter is applied; one bin late
+    )
+    places: NDArray[np.int32]  # (4, bins), of `list_maxima`; zeros become 1 where a peak is taken
+    responses: Float32  # (bins,), of the matched filter at these maxima
+    free: Float32  # (bins,), as `bin_weights`, before and afterwards
+    peaks: FloatArray  # (returns, 2), bin, and response less that to the background
+    moments: FloatArray  # (pixels, 2), background and noise
+    candidates: FloatArray  # (pixels * returns, CANDIDATE_COLUMNS), a trace's side by side, in time
+    # (pixels * returns, width), trace less background around each peak; zero where that fills up
+    rests: Float32
+    chosen: NDArray[np.int64]  # (pixels * returns,), candidates that the table fits
+    estimates: FloatArray  # (returns, 5), of the exact fit
+    profile: FloatArray  # (bins, 4), of the exact fit
+
+
+@search_step
+def find_candidates(traces, pixels, axis, limits, half, room, counts):
+    """List the peaks of some traces that the matched filter confirms, and cut out the bins around.
+
+    `traces` (n, bins) have memory for another one after the last; `pixels` (n,): their pixels;
+    `half`: of the table of the pulse, which says how far to cut out. `counts` (all pixels,) become 0,
+    or `NEEDS_EXACT_FIT` where a candidate's bins are not all there. Returns how many candidates there
+    are, and how many of them the table fits.
     """
-    centre, all_bins, sum_left, square_left = above_centre
-    bins_left, background, variance = float(all_bins), 0.0, 0.0
-    number, needed, claiming, best = 0, 0.0, True, np.uintp(0)
-    low, high, response = np.int32(0), np.int32(0), np.float32(0)
-    steepest, ratio = limits[1] * limits[1], gains[1] / gains[0]
-    while True:
-        part = 1 / bins_left
-        background = sum_left * part
-        # rounding may leave the difference slightly below zero
-        variance = max(square_left * part - background * background, 0.0)
-        background += centre
-        if number > 0:
-            above = response - background * sums[best]
-            # light falls with the square of the range: strengths count as if all stood at one
-            share = PREFIT_THRESHOLD_FACTOR * limits[2] * above * times[best] * times[best]
-            needed = max(share, needed)
-        height, entry = take_highest(places[0], places[1], listed, low, high)
-        brightest = ratio * height - gains[1] * background
-        dim = height <= 0 or brightest <= limits[4] or brightest * brightest <= steepest * variance
-        if number == len(peaks) or dim or brightest * limits[3] * limits[3] < needed:
-            break
-        best = np.uintp(places[0, entry])
-        response = compute_response(trace, matched[best], starts[best])
-        places[2, entry] = 1
-        responses[entry] = response
-        number += 1
-        low, high = windows[best, 2], windows[best, 3]
-        first, after = np.uintp(windows[best, 0]), np.uintp(windows[best, 1])
-        claiming = claiming and bool(2 * (bins_left - (after - first)) >= all_bins)
-        if claiming:
-            taken, taken_square, taken_bins = claim_bins(trace, centre, free, first, after)
-            sum_left -= taken
-            square_left -= taken_square
-            bins_left -= taken_bins
-    number = 0
-    for k in range(np.uintp(0), np.uintp(listed), STEP):
-        bits = list_set_lanes(load_vector(places[2], k) > fill_vector(np.int32(0)))
-        while bits:
-            entry = k + np.uintp(find_first_bit(bits))
-            bits &= bits - np.uint64(1)
-            best = np.uintp(places[0, entry])
-            above = responses[entry] - background * sums[best]
-            peaks[number, 0] = best
-            peaks[number, 1] = above if above > 0 else 0.0
-            number += 1
-            for i in range(np.uintp(windows[best, 0]), np.uintp(windows[best, 1]), STEP):
-                start = min(i, np.uintp(trace.size) - STEP)
-                store_vector(free, start, load_vector(bin_weights, start))
-    return background, math.sqrt(variance), number
+    listed = fitted = 0
+    candidates = room.candidates
+    all_bins = np.float32(0)
+    for i in range(np.uintp(0), np.uintp(traces.shape[1])):
+        all_bins += axis.bin_weights[i]
+    for place in range(traces.shape[0]):
+        trace, first = traces[place], listed
+        centre, sum_left, square_left = sum_about(trace, axis.bin_weights)
+        apply_filter(trace, axis, room.score)
+        level = np.float32(limits.background_gain) * (centre + np.float32(sum_left) / all_bins)
+        number = list_maxima(room.score, limits.of_interest, axis.words, level, room.places)
+        about = centre, all_bins, sum_left, square_left
+        background, noise, number = take_strongest_peaks(trace, axis, limits, about, number, room)
+        room.moments[place, 0] = background
+        room.moments[place, 1] = noise
+        known = background, noise, place
+        listed = confirm_peaks(trace, axis, limits, known, room.peaks[:number], candidates, first)
+        counts[pixels[place]] = 0
+        for k in range(first, listed):
+            j = int(candidates[k, PEAK_BIN])
+            if not axis.even[j]:
+                counts[pixels[place]] = NEEDS_EXACT_FIT
+                continue
+            cut_out(trace, background, j - half, 2 * half + 1, room.rests[k])
+            room.chosen[fitted] = k
+            fitted += 1
+    return listed, fitted
 
 
 @search_part
 def sum_about(trace, bin_weights):
-    """Sums over the bins, and of squares, of what is above a brightness that is usual there.
-
-    `trace, bin_weights` (bins,). Returns that brightness, and the sums: float32 squares about zero
-    would drown a small noise on a high background.
+    """Sums over the bins, and of squares, of what is above a brightness that is usual there, which comes
+    first: float32 squares about zero would drown a small noise on a high background.
     """
     # what the first bins have
     weights, other = load_vector(bin_weights, np.uintp(0)), load_vector(bin_weights, STEP)
@@ -157,11 +167,9 @@ def sum_about(trace, bin_weights):
 
 
 @search_part
-def apply_filter(trace, sharp, runs, edges, score):
-    """Filter a trace where `runs` and `edges` say.
-
-    `trace, sharp, runs, edges, score`: as for `tofclip.lidar.peak_kernels.find_candidates`.
-    """
+def apply_filter(trace, axis, score):
+    """Write the sharp filter's responses, one bin late, where `runs` and `edges` say."""
+    sharp, runs, edges = axis.sharp, axis.runs, axis.edges
     width = np.uintp(sharp.shape[0])
     half = width // np.uintp(2)
     for r in range(0, runs.size, 2):
@@ -180,84 +188,12 @@ def apply_filter(trace, sharp, runs, edges, score):
         score[j + ONE] = here
 
 
-@inlined
-def make_key(height, entry):
-    """A whole number that is the larger the higher a maximum, to 2e-6 of it, and holds its lane.
-
-    `height`: above zero: such numbers are in the order of their bits; `entry`: place in the list.
-    """
-    lane = np.int32(entry) & (LENGTH - 1)
-    return np.int32((np.float32(height).view(np.int32) & -LENGTH) | lane)
-
-
-@inlined
-def take_highest(bins, keys, listed, low, high):
-    """Return height and place of the highest maximum, without those from bin `low` to before `high`.
-
-    Every peak waits for the one before it, so that what counts is how soon it is found.
-
-    `bins` (n,): of the maxima; `keys` (n,): of `make_key`; those left out are zero from now on.
-    Returns height, or 0 where none is left; and place.
-    """
-    highest, entry, zero = np.int32(0), np.uintp(0), fill_vector(np.int32(0))
-    first, after = fill_vector(low), fill_vector(high)
-    for k in range(np.uintp(0), np.uintp(listed), STEP):
-        where = load_vector(bins, k)
-        left = choose((where >= first) & (after > where), zero, load_vector(keys, k))
-        store_vector(keys, k, left)
-        top = find_highest_lane(left)
-        if top > highest:
-            entry = k + np.uintp(top & (LENGTH - 1))
-            highest = top
-    return np.int32(highest & -LENGTH).view(np.float32), entry
-
-
-@search_part
-def claim_bins(trace, centre, free, first, after):
-    """Take the bins from `first` to before `after`, as far as they are free.
-
-    `trace` (bins,); `free` (bins,): for how many bins each one stands that nothing claims yet;
-    overwritten. Returns sums over them of what is above `centre`, of its square, and their number.
-    """
-    total = square = number = zero = fill_vector(np.float32(0))
-    last = np.uintp(trace.size) - STEP
-    for begin in range(first, after, STEP):
-        start = begin if begin < last else last
-        numbers = number_lanes() + fill_vector(np.int32(start))
-        inside = (numbers >= fill_vector(np.int32(begin))) & (
-            fill_vector(np.int32(after)) > numbers
-        )
-        still_free = load_vector(free, start)
-        taken = choose(inside, still_free, zero)
-        store_vector(free, start, still_free - taken)
-        above = load_vector(trace, start) - fill_vector(centre)
-        total += taken * above
-        square += taken * above * above
-        number += taken
-    return sum_vector(total), sum_vector(square), sum_vector(number)
-
-
-@inlined
-def sum_weighted(trace, bin_weights):
-    """Sum over the bins, each for as many as it stands for.
-
-    `trace, bin_weights` (bins,).
-    """
-    total = others = fill_vector(np.float32(0))
-    for first in range(np.uintp(0), np.uintp(trace.size), STEP + STEP):
-        total += load_vector(bin_weights, first) * load_vector(trace, first)
-        others += load_vector(bin_weights, first + STEP) * load_vector(trace, first + STEP)
-    return sum_vector(total + others)
-
-
 @search_part
 def list_maxima(score, of_interest, words, level, places):
     """List bin and height of the local maxima of interest, in the order of time; return how many.
 
-    `score, of_interest, words`: as for `tofclip.lidar.peak_kernels.find_candidates`. Of a
-    level top the last bin counts; `places` (4, bins): overwritten: bins of the maxima, keys of
-    their scores (`make_key`) with zeros behind the last one, zeros, and what is only needed
-    meanwhile; `level`: score of the background.
+    Of a level top the last bin counts. Rows of `places` get bins, keys (`make_key`) with zeros behind
+    the last one, zeros, and what is only needed meanwhile. `level`: score of the background.
     """
     zero, background, filled, listed = fill_vector(np.float32(0)), fill_vector(level), 0, 0
     for word in range(np.uintp(0), np.uintp(words.size)):
@@ -290,203 +226,161 @@ def list_maxima(score, of_interest, words, level, places):
     return listed
 
 
+@inlined
+def make_key(height, entry):
+    """A whole number that is the larger the higher a maximum, to 2e-6 of it, and holds its lane; heights
+    are above zero: such numbers are in the order of their bits.
+    """
+    lane = np.int32(entry) & (LENGTH - 1)
+    return np.int32((np.float32(height).view(np.int32) & -LENGTH) | lane)
+
+
+@inlined
+def take_strongest_peaks(trace, axis, limits, about, listed, room):
+    """Take the highest maxima of the sharp filter's response that might count, in the order of time.
+
+    Peaks are taken from the highest down, until not even bins all as bright as the next one says
+    could count: because of the noise, or beside the strongest return. Background and noise are those
+    of the bins that no peak claims. Peaks claim their surroundings from the strongest down, for as
+    long as half of the bins stay free.
+
+    `about`: a brightness, number of bins, and sums over the bins of what is above it and of its
+    square; `listed`: number of maxima. Returns background, noise and how many peaks there are.
+    """
+    times, sums, windows, places = axis.times, axis.sums, axis.windows, room.places
+    centre, all_bins, sum_left, square_left = about
+    bins_left, background, variance = float(all_bins), 0.0, 0.0
+    number, needed, claiming, best = 0, 0.0, True, np.uintp(0)
+    low, high, response = np.int32(0), np.int32(0), np.float32(0)
+    steepest = limits.signal_to_noise * limits.signal_to_noise
+    ratio, last = limits.matched_gain / limits.sharp_gain, limits.last_instant
+    while True:
+        part = 1 / bins_left
+        background = sum_left * part
+        # rounding may leave the difference slightly below zero
+        variance = max(square_left * part - background * background, 0.0)
+        background += centre
+        if number > 0:
+            above = response - background * sums[best]
+            # light falls with the square of the range: strengths count as if all stood at one
+            share = PREFIT_THRESHOLD_FACTOR * limits.pixel_fraction * above
+            needed = max(share * times[best] * times[best], needed)
+        height, entry = take_highest(places[0], places[1], listed, low, high)
+        brightest = ratio * height - limits.matched_gain * background
+        dim = height <= 0 or brightest <= limits.lowest_response
+        dim = dim or brightest * brightest <= steepest * variance
+        if number == len(room.peaks) or dim or brightest * last * last < needed:
+            break
+        best = np.uintp(places[0, entry])
+        response = compute_response(trace, axis.matched[best], axis.starts[best])
+        places[2, entry] = 1
+        room.responses[entry] = response
+        number += 1
+        low, high = windows[best, 2], windows[best, 3]
+        first, after = np.uintp(windows[best, 0]), np.uintp(windows[best, 1])
+        claiming = claiming and bool(2 * (bins_left - (after - first)) >= all_bins)
+        if claiming:
+            taken, taken_square, taken_bins = claim_bins(trace, centre, room.free, first, after)
+            sum_left -= taken
+            square_left -= taken_square
+            bins_left -= taken_bins
+    number = 0
+    for k in range(np.uintp(0), np.uintp(listed), STEP):
+        bits = list_set_lanes(load_vector(places[2], k) > fill_vector(np.int32(0)))
+        while bits:
+            entry = k + np.uintp(find_first_bit(bits))
+            bits &= bits - np.uint64(1)
+            best = np.uintp(places[0, entry])
+            above = room.responses[entry] - background * sums[best]
+            room.peaks[number, 0] = best
+            room.peaks[number, 1] = above if above > 0 else 0.0
+            number += 1
+            for i in range(np.uintp(windows[best, 0]), np.uintp(windows[best, 1]), STEP):
+                start = min(i, np.uintp(trace.size) - STEP)
+                store_vector(room.free, start, load_vector(axis.bin_weights, start))
+    return background, math.sqrt(variance), number
+
+
+@inlined
+def take_highest(bins, keys, listed, low, high):
+    """Height (0 where none is left) and place of the highest maximum, without those from bin `low` to
+    before `high`, whose keys become zero.
+
+    Every peak waits for the one before it, so that what counts is how soon it is found.
+    """
+    highest, entry, zero = np.int32(0), np.uintp(0), fill_vector(np.int32(0))
+    first, after = fill_vector(low), fill_vector(high)
+    for k in range(np.uintp(0), np.uintp(listed), STEP):
+        where = load_vector(bins, k)
+        left = choose((where >= first) & (after > where), zero, load_vector(keys, k))
+        store_vector(keys, k, left)
+        top = find_highest_lane(left)
+        if top > highest:
+            entry = k + np.uintp(top & (LENGTH - 1))
+            highest = top
+    return np.int32(highest & -LENGTH).view(np.float32), entry
+
+
 @search_part
 def compute_response(trace, weights, start):
-    """Response of a filter whose first weight is for bin `start`.
-
-    `trace` (bins,); `weights` (width,): of the matched filter.
-    """
+    """Response of a filter whose first weight is for bin `start`."""
     total = fill_vector(np.float32(0))
     for w in range(np.uintp(0), np.uintp(weights.size), STEP):
         total += load_vector(weights, w) * load_vector(trace, np.uintp(start) + w)
     return sum_vector(total)
 
 
-NEEDS_EXACT_FIT = -1
-"""In place of the number of returns of a trace."""
-
-OFFSET, HEIGHT, MOVED, NOISE, PEAK_BIN, TRACE, FIRST_OFFSET = range(7)
-CANDIDATE_COLUMNS = 8  # a line of the processor's cache
-"""What is known of a candidate: by how many bins it arrives after the bin of its peak, height, by
-how many bins it moved last, noise of its trace, bin of its peak, and its trace's place among those
-searched together; and the first of these again, as it was before any fit."""
-
-
-@search_step
-def find_candidates(
-    traces,
-    pixels,
-    times,
-    bin_weights,
-    sharp,
-    runs,
-    edges,
-    words,
-    of_interest,
-    least,
-    matched,
-    starts,
-    sums,
-    gains,
-    windows,
-    limits,
-    even,
-    half,
-    score,
-    places,
-    responses,
-    free,
-    peaks,
-    moments,
-    candidates,
-    rests,
-    counts,
-    lone,
-    crowded,
-):
-    """List the peaks of some traces that the matched filter confirms, and cut out the bins around.
-
-    Peaks of a trace are taken as `take_strongest_peaks` says, judged as `confirm_peaks` says, and
-    cut out as far as the table of the pulse reaches, while the trace is at hand.
-
-    `traces` (n, bins): with memory for another trace after the last one; `pixels` (n,): number of
-    the pixel to which each trace belongs; `times` (bins,): seconds, increasing; `bin_weights`
-    (bins,): for how many bins each one stands where background and noise are concerned; `sharp`
-    (width, bins): entry w holds the weight of bin ``j + w - width // 2`` for a return at bin j;
-    `runs, edges` (some,): first bins of the vectors, an even number of them, and single bins, in
-    which that filter is applied; `words` (some,): first bins of the words in which maxima are
-    sought; `of_interest` (bins + WORD_BINS,): by how much scores of interest exceed that of the
-    background; `least` (bins,): response that a return at each bin must exceed to be of interest;
-    weaker peaks are kept only where such a return overlaps them. 0 where nothing is known;
-    `matched` (bins, width): A filter for each bin, of unit energy and nowhere negative; `starts`
-    (bins,): first bin that each of them takes; `sums` (bins,): over each of them; `gains` (3,): of
-    the sharp filter and of the matched one: largest sums; and the first again for the background's
-    score, or 0 where nothing is known of what is of interest; `windows` (bins, 4): see
-    `tofclip.lidar.pulse_tables.list_windows`; `limits` (5,): reach of two pulses, s, smallest
-    signal-to-noise, smallest fraction of the strongest return, with the fall-off with range undone,
-    the last instant at which a return may lie, s, and the lowest response of interest; `even`
-    (bins,): see `tofclip.lidar.pulse_tables.PhaseTable.find_even_bins`; `half`: see
-    `PhaseTable`; `score` (1 + bins + WORD_BINS + 1,): zero where the sharp filter is not applied;
-    overwritten elsewhere. One bin late; `places` (4, bins): overwritten; `responses` (bins,):
-    overwritten; `free` (bins,): as `bin_weights`, before and afterwards; `peaks` (returns, 2):
-    overwritten; `moments` (n, 2): overwritten: background and noise; `candidates` (n * returns,
-    CANDIDATE_COLUMNS): overwritten; those of one trace side by side, in the order of time; `rests`
-    (n * returns, width): overwritten: trace less background in the bins of the table around each
-    peak; zero in those that fill up its width; `counts` (all pixels,): overwritten where `pixels`
-    says: 0, or `NEEDS_EXACT_FIT` where a candidate's bins are not all there; `lone, crowded` (n *
-    returns,): overwritten: numbers of candidates. Returns how many candidates there are, and how
-    many of them stand alone and do not.
+@search_part
+def claim_bins(trace, centre, free, first, after):
+    """Take the bins from `first` to before `after`, as far as they are free; return sums over them of
+    what is above `centre`, of its square, and their number.
     """
-    listed = alone = others = 0
-    all_bins = np.float32(0)
-    for i in range(np.uintp(0), np.uintp(traces.shape[1])):
-        all_bins += bin_weights[i]
-    for place in range(traces.shape[0]):
-        trace, first = traces[place], listed
-        centre, sum_left, square_left = sum_about(trace, bin_weights)
-        apply_filter(trace, sharp, runs, edges, score)
-        level = np.float32(gains[2]) * (centre + np.float32(sum_left) / all_bins)
-        number = list_maxima(score, of_interest, words, level, places)
-        background, noise, number = take_strongest_peaks(
-            trace,
-            times,
-            bin_weights,
-            matched,
-            starts,
-            sums,
-            gains,
-            windows,
-            limits,
-            (centre, all_bins, sum_left, square_left),
-            number,
-            places,
-            responses,
-            free,
-            peaks,
+    total = square = number = zero = fill_vector(np.float32(0))
+    last = np.uintp(trace.size) - STEP
+    for begin in range(first, after, STEP):
+        start = begin if begin < last else last
+        numbers = number_lanes() + fill_vector(np.int32(start))
+        inside = (numbers >= fill_vector(np.int32(begin))) & (
+            fill_vector(np.int32(after)) > numbers
         )
-        moments[place, 0] = background
-        moments[place, 1] = noise
-        listed = confirm_peaks(
-            trace,
-            times,
-            matched,
-            starts,
-            sums,
-            limits,
-            least,
-            (background, noise, place),
-            peaks[:number],
-            candidates,
-            first,
-        )
-        counts[pixels[place]] = 0
-        for k in range(first, listed):
-            j = int(candidates[k, PEAK_BIN])
-            if not even[j]:
-                counts[pixels[place]] = NEEDS_EXACT_FIT
-                continue
-            cut_out(trace, background, j - half, 2 * half + 1, rests[k])
-            # light that ends before the other's begins, whatever both of them move
-            near = k > 0 and is_near(candidates, k - 1, k, half)
-            if near or (k + 1 < listed and is_near(candidates, k, k + 1, half)):
-                crowded[others] = k
-                others += 1
-            else:
-                lone[alone] = k
-                alone += 1
-    return listed, alone, others
+        still_free = load_vector(free, start)
+        taken = choose(inside, still_free, zero)
+        store_vector(free, start, still_free - taken)
+        above = load_vector(trace, start) - fill_vector(centre)
+        total += taken * above
+        square += taken * above * above
+        number += taken
+    return sum_vector(total), sum_vector(square), sum_vector(number)
 
 
 @inlined
-def cut_out(trace, background, start, held, rest):
-    """Cut bins out of a trace, less its background.
+def confirm_peaks(trace, axis, limits, known, peaks, candidates, listed):
+    """List the peaks of a trace that the matched filter confirms, placed below a bin, from `listed`
+    on; return how many candidates there are now.
 
-    `trace` (bins,): with memory behind its last bin; `start, held`: first bin, and how many; `rest`
-    (width,): overwritten, behind those bins with zero.
+    `known`: background and noise, and place of the trace among those searched together.
     """
-    zero, level, lanes = (
-        fill_vector(np.float32(0)),
-        fill_vector(np.float32(background)),
-        number_lanes(),
-    )
-    for w in range(np.uintp(0), np.uintp(rest.size), STEP):
-        inside = fill_vector(np.int32(held - np.int64(w))) > lanes
-        above = load_vector(trace, np.uintp(start) + w) - level
-        store_vector(rest, w, choose(inside, above, zero))
-
-
-@inlined
-def is_near(candidates, k, other, half):
-    """Whether two candidates are of the same trace and may share bins.
-
-    `candidates` (n, CANDIDATE_COLUMNS); `k, other`: the later one last; `half`: see `PhaseTable`.
-    """
-    apart = candidates[other, PEAK_BIN] - candidates[k, PEAK_BIN]
-    return candidates[other, TRACE] == candidates[k, TRACE] and apart < 2 * half + 1
-
-
-@inlined
-def confirm_peaks(
-    trace, times, matched, starts, sums, limits, least, known, peaks, candidates, listed
-):
-    """List the peaks of a trace that the matched filter confirms, placed below a bin.
-
-    `trace` (bins,); `times, matched, starts, sums, limits, least`: as for `find_candidates`;
-    `known`: background and noise, and place of the trace among those searched together; `peaks` (n,
-    2): of `take_strongest_peaks`; `candidates` (room, CANDIDATE_COLUMNS): overwritten from `listed`
-    on; `listed`: how many there are. Returns how many there are now.
-    """
+    times, sums, matched, starts = axis.times, axis.sums, axis.matched, axis.starts
     background, noise, place = known
     needed = 0.0
     for k in range(len(peaks)):
         best = np.uintp(peaks[k, 0])
-        share = PREFIT_THRESHOLD_FACTOR * limits[2] * peaks[k, 1] * times[best] * times[best]
+        share = PREFIT_THRESHOLD_FACTOR * limits.pixel_fraction * peaks[k, 1]
+        share *= times[best] * times[best]
         needed = share if share > needed else needed
     for k in range(len(peaks)):
         best, strength = np.uintp(peaks[k, 0]), peaks[k, 1]
-        if strength <= limits[1] * noise or strength * times[best] * times[best] < needed:
+        weak = strength <= limits.signal_to_noise * noise
+        if weak or strength * times[best] * times[best] < needed:
             continue
-        if not is_wanted(times, limits[0], least, peaks, k):
+        # a return of interest lies there, or overlaps it
+        wanted = strength >= limits.least[best]
+        if not wanted:
+            for other in range(len(peaks)):
+                j = np.uintp(peaks[other, 0])
+                near = math.fabs(times[j] - times[best]) <= limits.reach
+                wanted = wanted or (near and peaks[other, 1] >= limits.least[j])
+        if not wanted:
             continue
         candidate = candidates[listed]
         before = compute_response(trace, matched[best - ONE], starts[best - ONE])
@@ -508,29 +402,9 @@ def confirm_peaks(
 
 
 @inlined
-def is_wanted(times, reach, least, peaks, k):
-    """Whether a return of interest lies at a peak, or overlaps it.
-
-    `times, least`: as for `find_candidates`; `reach`: of two pulses, s; `peaks` (n, 2): of
-    `take_strongest_peaks`.
-    """
-    best = np.uintp(peaks[k, 0])
-    wanted = peaks[k, 1] >= least[best]
-    if not wanted:
-        for other in range(len(peaks)):
-            j = np.uintp(peaks[other, 0])
-            near = math.fabs(times[j] - times[best]) <= reach
-            wanted = wanted or (near and peaks[other, 1] >= least[j])
-    return wanted
-
-
-@inlined
 def interpolate_peak(before, here, after):
-    """Where between three neighbours a response is highest: by a parabola in its logarithm.
-
-    `before, here, after`: responses, the highest in the middle. Returns after the middle, as a part
-    of the distance between the outer two; 0 where these are not above zero or one of them is
-    higher.
+    """Where between three neighbours a response is highest, after the middle, as a part of the distance
+    between the outer two: by a parabola in its logarithm; 0 where these are not above zero or higher.
     """
     rise = fall = 0.0
     if before > 0 and after > 0 and here >= before and here >= after:
@@ -542,13 +416,29 @@ def interpolate_peak(before, here, after):
     return (rise - fall) / (4 * (rise + fall)) if rise + fall > 0 else 0.0
 
 
+@inlined
+def cut_out(trace, background, start, held, rest):
+    """Cut `held` bins from `start` on out of a trace, less its background, and fill up with zeros. The
+    trace has memory behind its last bin.
+    """
+    zero, level, lanes = (
+        fill_vector(np.float32(0)),
+        fill_vector(np.float32(background)),
+        number_lanes(),
+    )
+    for w in range(np.uintp(0), np.uintp(rest.size), STEP):
+        inside = fill_vector(np.int32(held - np.int64(w))) > lanes
+        above = load_vector(trace, np.uintp(start) + w) - level
+        store_vector(rest, w, choose(inside, above, zero))
+
+
 @compile_loop()
 def pool_significance(pixel, at, distance, own, starts, image_shape, limits, pooled):
     """Add to each candidate's significance those of its neighbours at the same range.
 
-    `pixel` (n,): not decreasing; `at` (n,): range at which neighbours are looked for, m; `distance`
-    (n,): range of each candidate, m; `own` (n,); `starts` (pixels + 1,): first candidate of each
-    pixel; `limits`: radius in pixels, and gate in m for each of them; `pooled` (n,): overwritten.
+    `pixel` (n,) does not decrease; `at, distance` (n,): range at which neighbours are looked for, and
+    their own, m; `starts` (pixels + 1,): first candidate of each pixel; `limits`: radius in pixels,
+    and gate in m for each of them.
     """
     rows, columns = image_shape
     radius, gate = limits

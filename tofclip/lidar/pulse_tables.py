@@ -1,23 +1,11 @@
-"""Where the search for returns takes its traces from: the brightness of each pixel over time, some
-pixels at once.
-
-Which bins a return at each bin reaches, and which are too near it for another one.
-
-A pulse in the bins around its return, tabulated for the part of a bin at which it arrives.
-
-A streak camera's rows last equally long, so that the pulse and its slope in the bins around a
-return depend on one number, by what part of a bin it arrives after the middle of its bin. They are
-tabulated for `PHASES_PER_BIN` such phases; the fit (`tofclip.lidar.fit_kernels`) is then
-products of the table's rows with the trace, in single precision, and the sums that hold no trace
-are in the table as well.
-
-What the search takes from the pulse, for one time axis: filters and tables.
+"""What the search for returns needs to know of traces and of the pulse on one time axis: which bins
+there are, windows, filters, and a table of the pulse.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,28 +44,19 @@ class Traces(Protocol):
     """The bins that they hold."""
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
-        """Write the traces of ``pixels[piece]`` into (n, bins) contiguous memory.
-
-        `piece`: of the pixels; `traces` (n, bins): overwritten.
-        """
+        """Write the traces of ``pixels[piece]`` into (n, bins) contiguous memory."""
         ...
 
 
 class PictureTraces:
-    """Traces of pictures at some bins that are there already.
-
-    `pictures` (bins, rows, columns); `bins`: which ones they show.
-    """
+    """Traces of pictures, (bins, rows, columns), that are there already."""
 
     def __init__(self, pictures: NDArray[np.float32], bins: TraceBins) -> None:
         self._pictures = pictures.reshape(len(pictures), -1).astype(np.float32, copy=False)
         self.pixels, self.bins = np.arange(self._pictures.shape[1]), bins
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
-        """Write traces of neighbours in raster order.
-
-        Arguments and result are those of `Traces.fill`.
-        """
+        """Write traces of neighbours in raster order."""
         from tofclip.solvers.kernels import copy_lanes_to_frames
 
         # contiguous: the loop is compiled for solvers' blocks, and copying short runs costs little
@@ -94,14 +73,13 @@ class FrameTraces(PictureTraces):
 def list_windows(
     times: FloatArray, scale: tuple[float, float, float, float], distance: float
 ) -> NDArray[np.int64]:
-    """List the bins that a return at each bin reaches, and those too near for another return.
+    """List the bins that a return at each bin reaches, and those too near for another return: (bins,
+    4) first bin reached and the one after the last; first bin nearer than `distance`, s, and the one
+    after the last.
 
-    `times` (bins,): seconds, increasing; `scale` (4,): of the pulse; see
-    `tofclip.lidar.Pulse.kernel_table`; `distance`: seconds. Returns (bins, 4): first bin reached
-    and the one after the last; first bin nearer than `distance` and the one after the last.
-
-    Bins are often just `distance` apart; what then is nearer is for the rounding of their
-    difference to say, and not for that of a sum with the distance.
+    `scale`: of the pulse, `tofclip.lidar.Pulse.kernel_table`. Bins are often just `distance` apart;
+    what then is nearer is for the rounding of their difference to say, and not for that of a sum with
+    the distance.
     """
     first = np.searchsorted(times, times - distance)
     last = np.searchsorted(times, times + distance, side="right")
@@ -112,44 +90,34 @@ def list_windows(
 
 
 PHASES_PER_BIN = 64
-MAX_OFFSET_BINS = 1.5
-"""By how much a return may lie away from the bin of its peak; beyond, that bin follows it."""
-
-VECTOR_BINS = 16
-"""The table's width is a multiple of it: a vector's length (`tofclip.vectors`)."""
-
-MAX_UNEVENNESS = 1e-3
-"""Of a bin, over the length of a pulse: moves no return by more."""
+MAX_OFFSET_BINS = 1.5  # of a return from the bin of its peak; beyond, that bin follows it
+VECTOR_BINS = 16  # the table's width is a multiple of a vector's length (`tofclip.vectors`)
+MAX_UNEVENNESS = 1e-3  # of a bin, over the length of a pulse: moves no return by more
 
 
-@dataclass(frozen=True)
-class PhaseTable:
-    """A pulse in the bins around the one in which it has its peak, at each phase."""
+class PhaseTable(NamedTuple):
+    """A pulse in the bins around the one in which it has its peak, at each phase.
 
-    # (phases, width), pulse, and its change from bin to bin; zero where the pulse does not matter
-    # and in the bins that fill up a multiple of `VECTOR_BINS`. Bin w lies ``w - half`` bins after
-    # the peak's
+    A streak camera's rows last equally long, so that the pulse and its slope in the bins around a
+    return depend on one number, by what part of a bin it arrives after the middle of its bin.
+    """
+
+    # (phases, width), pulse, and its change from bin to bin; zero where the pulse does not matter and
+    # in the bins that fill up a whole vector. Bin w lies ``w - half`` bins after the peak's
     shapes: NDArray[np.float32]
-    # (phases, width), pulse, and its change from bin to bin; zero where the pulse does not matter
-    # and in the bins that fill up a multiple of `VECTOR_BINS`. Bin w lies ``w - half`` bins after
-    # the peak's
     slopes: NDArray[np.float32]
-    # (phases, 4 * half + width), pulse, wherever it ends. Bin w lies ``w - 3 * half`` bins after
-    # the peak's
+    # (phases, 4 * half + width), pulse, wherever it ends. Bin w lies ``w - 3 * half`` bins after it
     tails: NDArray[np.float32]
     # (phases, 7), over the bins: of squared pulse, pulse times slope, and squared slope; of the
     # pulse; of the pulse as far as the fit leaves it, and of the pulse times the square of the
     # slope across it (`tofclip.lidar.fit_kernels.estimate_sum_and_deviation`); number of bins
-    sums: NDArray[np.float64]
+    sums: FloatArray
     half: int  # bins on either side. 0: the axis is uneven, and the table empty
-    bin_width: float  # seconds
+    bin_width: float  # s
 
     @classmethod
-    def tabulate(cls, pulse: Pulse, times: NDArray[np.float64]) -> PhaseTable:
-        """Tabulate a pulse for a time axis.
-
-        `times` (bins,): seconds.
-        """
+    def tabulate(cls, pulse: Pulse, times: FloatArray) -> PhaseTable:
+        """Tabulate a pulse for a time axis of instants `times`, s."""
         width = float(times[-1] - times[0]) / (times.size - 1)
         first, last = pulse.support
         half = int(np.ceil(max(-first, last) / width + MAX_OFFSET_BINS))
@@ -191,10 +159,7 @@ class PhaseTable:
         )
 
     def find_even_bins(self, bins: TraceBins) -> NDArray[np.bool_]:
-        """Say around which bins all those of the table are held.
-
-        Returns (bins,).
-        """
+        """Say around which of the bins, (n,), all those of the table are held."""
         even = np.zeros(bins.numbers.size, bool)
         if self.half > 0:
             span = bins.numbers[2 * self.half :] - bins.numbers[: -2 * self.half]
@@ -210,25 +175,21 @@ SHARPENING_FACTOR = 2.0
 class PulseFilters:
     """A pulse as the search for returns on a time axis needs it."""
 
-    # (width, bins), filter that shows candidates, and the one that judges them. Entry w is the
-    # weight of bin ``j + w - width // 2`` for a return at bin j
+    # (width, bins), filter that shows candidates, and the one that judges them. Entry w is the weight
+    # of bin ``j + w - width // 2`` for a return at bin j
     sharp: NDArray[np.float32]
-    # (width, bins), filter that shows candidates, and the one that judges them. Entry w is the
-    # weight of bin ``j + w - width // 2`` for a return at bin j
     matched: NDArray[np.float32]
-    sums: NDArray[np.float64]  # (bins,), of the matched filters
+    sums: FloatArray  # (bins,), of the matched filters
     gains: tuple[float, float]  # (2,), largest sums of either
     table: PhaseTable
     kernel: Table  # (curve, scale), `tofclip.lidar.Pulse.kernel_table`
     fwhm: float  # of the pulse, s
 
     @classmethod
-    def build(cls, pulse: Pulse, times: NDArray[np.float64]) -> PulseFilters:
-        """Work them out.
-
-        `times` (bins,): seconds.
-        """
-        sharp, matched = build_filters(pulse, times)
+    def build(cls, pulse: Pulse, times: FloatArray) -> PulseFilters:
+        """Work them out for instants `times`, s."""
+        sharp = _build_filter(pulse.compress(SHARPENING_FACTOR), times)
+        matched = _build_filter(pulse, times)
         sums = matched.sum(axis=0)
         return cls(
             sharp,
@@ -241,17 +202,7 @@ class PulseFilters:
         )
 
 
-def build_filters(
-    pulse: Pulse, times: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Work out the sharp filter and the matched one of a time axis.
-
-    `times` (bins,): seconds. Returns as for `PulseFilters`.
-    """
-    return _build_filter(pulse.compress(SHARPENING_FACTOR), times), _build_filter(pulse, times)
-
-
-def _build_filter(pulse: Pulse, times: NDArray[np.float64]) -> NDArray[np.float32]:
+def _build_filter(pulse: Pulse, times: FloatArray) -> NDArray[np.float32]:
     """Unit-energy filter for a return at each bin, (width, bins); the time axis may be uneven.
 
     What a measured pulse has below zero is noise and left out. Where the axis cuts off most of the
