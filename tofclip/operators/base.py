@@ -6,9 +6,6 @@ more; nothing is flattened or broadcast behind the caller's back.
 Every operator takes NumPy arrays. Those that are `portable` take the arrays of any library that
 follows the array API standard as well, such as CuPy's and PyTorch's on a GPU, and
 answer in kind; the others refuse them.
-
-Operators made of others, and what is done to all views together: several joined into one, some
-views of a light field, and the part that all measurements of a view have in common weighed down.
 """
 
 from __future__ import annotations
@@ -21,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from tofclip.arrays import Array as Array
 from tofclip.arrays import (
+    Array,
     ComputeDevice,
     PerDevice,
     as_type,
@@ -36,8 +33,7 @@ from tofclip.errors import InputError, ShapeError
 
 Shape = tuple[int, ...]
 
-NORM_ITERATIONS = 15
-"""Of `LinearOperator.squared_norm`: enough for a percent, which a test checks for every camera."""
+NORM_ITERATIONS = 15  # enough for a percent of the norm, which a test checks for every camera
 
 REAL_TYPES = (np.dtype(np.float32), np.dtype(np.float64))
 
@@ -167,14 +163,15 @@ class Composition(LinearOperator):
                 f"cannot compose {outer.dtype} with {inner.dtype}; build both in one type"
             )
         super().__init__(inner.shape_in, outer.shape_out, outer.dtype)
-        self.outer, self.inner = outer, inner
         self._set_parts(outer, inner)
 
     def _forward(self, block: Array) -> Array:
-        return self.outer._forward(self.inner._forward(block))
+        outer, inner = self.parts
+        return outer._forward(inner._forward(block))
 
     def _adjoint(self, block: Array) -> Array:
-        return self.inner._adjoint(self.outer._adjoint(block))
+        outer, inner = self.parts
+        return inner._adjoint(outer._adjoint(block))
 
 
 class Identity(LinearOperator):
@@ -282,36 +279,40 @@ def estimate_squared_norm(operator: LinearOperator, iterations: int = 30, seed: 
     return float(values[-1])
 
 
+def _require_alike(what: str, operators: Sequence[LinearOperator], joined: int) -> LinearOperator:
+    """Return the first of operators whose shapes, but for the first `joined` axes of the result, and
+    types are one.
+    """
+    if not operators:
+        raise InputError(f"{what} needs at least one operator")
+    first = operators[0]
+    for other in operators[1:]:
+        if (other.shape_in, other.shape_out[joined:]) != (first.shape_in, first.shape_out[joined:]):
+            shapes = (f"{one.shape_in} -> {one.shape_out}" for one in (first, other))
+            raise ShapeError(f"every operator of {what}", *shapes)
+        if other.dtype != first.dtype:
+            raise InputError(
+                f"{what} cannot join {first.dtype} with {other.dtype}; build both in one type"
+            )
+    return first
+
+
 class Stack(LinearOperator):
     """Operators on the same input, their results joined along the first axis: ``[A; B; ...] x``."""
 
     def __init__(self, operators: Sequence[LinearOperator]) -> None:
-        if not operators:
-            raise InputError("a stack needs at least one operator")
-        first = operators[0]
-        for other in operators[1:]:
-            if other.shape_in != first.shape_in or other.shape_out[1:] != first.shape_out[1:]:
-                raise ShapeError(
-                    "every operator of a stack",
-                    f"{first.shape_in} -> (any, *{first.shape_out[1:]})",
-                    f"{other.shape_in} -> {other.shape_out}",
-                )
-            if other.dtype != first.dtype:
-                raise InputError(
-                    f"cannot stack {first.dtype} on {other.dtype}; build both in one type"
-                )
-        rows = [operator.shape_out[0] for operator in operators]
-        super().__init__(first.shape_in, (sum(rows), *first.shape_out[1:]), first.dtype)
-        self.operators = tuple(operators)
+        first = _require_alike("a stack", operators, 1)
+        rows = sum(operator.shape_out[0] for operator in operators)
+        super().__init__(first.shape_in, (rows, *first.shape_out[1:]), first.dtype)
         self._set_parts(*operators)
 
     def _forward(self, block: Array) -> Array:
-        return namespace(block).concat([operator._forward(block) for operator in self.operators])
+        return namespace(block).concat([operator._forward(block) for operator in self.parts])
 
     def _adjoint(self, block: Array) -> Array:
-        # The adjoint of a stack adds up: every part has looked at the same input.
+        # every part has looked at the same input
         total = zeros((*self.shape_in, block.shape[-1]), block)
-        for operator, part in _split_rows(self.operators, block):
+        for operator, part in _split_rows(self.parts, block):
             total += operator._adjoint(part)
         return total
 
@@ -325,18 +326,18 @@ class BlockDiagonal(LinearOperator):
     """
 
     def __init__(self, operators: Sequence[LinearOperator]) -> None:
-        stacked = Stack(operators)  # refuses operators that do not fit each other
-        super().__init__((len(operators), *stacked.shape_in), stacked.shape_out, stacked.dtype)
-        self.operators = stacked.operators
+        first = _require_alike("a stack", operators, 1)
+        rows = sum(operator.shape_out[0] for operator in operators)
+        shapes = (len(operators), *first.shape_in), (rows, *first.shape_out[1:])
+        super().__init__(*shapes, first.dtype)
         self._set_parts(*operators)
 
     def _forward(self, block: Array) -> Array:
-        # No part sees the input of another, so that there is nothing to add up in either direction.
-        parts = [operator._forward(block[k, ...]) for k, operator in enumerate(self.operators)]
+        parts = [operator._forward(block[k, ...]) for k, operator in enumerate(self.parts)]
         return namespace(block).concat(parts)
 
     def _adjoint(self, block: Array) -> Array:
-        parts = [operator._adjoint(part) for operator, part in _split_rows(self.operators, block)]
+        parts = [operator._adjoint(part) for operator, part in _split_rows(self.parts, block)]
         return namespace(block).stack(parts)
 
 
@@ -349,31 +350,19 @@ class Integration(LinearOperator):
     """
 
     def __init__(self, operators: Sequence[LinearOperator]) -> None:
-        if not operators:
-            raise InputError("an integration needs at least one operator")
-        first = operators[0]
-        for other in operators[1:]:
-            if (other.shape_in, other.shape_out) != (first.shape_in, first.shape_out):
-                shapes = (f"{kind.shape_in} -> {kind.shape_out}" for kind in (first, other))
-                raise ShapeError("every operator of an integration", *shapes)
-            if other.dtype != first.dtype:
-                raise InputError(
-                    f"cannot add {first.dtype} to {other.dtype}; build both in one type"
-                )
+        first = _require_alike("an integration", operators, 0)
         super().__init__((len(operators), *first.shape_in), first.shape_out, first.dtype)
-        self.operators = tuple(operators)
         self._set_parts(*operators)
 
     def _forward(self, block: Array) -> Array:
         total = zeros((*self.shape_out, block.shape[-1]), block)
-        for k, operator in enumerate(self.operators):
+        for k, operator in enumerate(self.parts):
             total += operator._forward(block[k, ...])
         return total
 
     def _adjoint(self, block: Array) -> Array:
-        # Every entry gets the whole of the measurements back: the sensor did not keep apart what
-        # fell on it.
-        return namespace(block).stack([operator._adjoint(block) for operator in self.operators])
+        # the sensor did not keep apart what fell on it
+        return namespace(block).stack([operator._adjoint(block) for operator in self.parts])
 
 
 def _split_rows(

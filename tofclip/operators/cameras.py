@@ -1,14 +1,10 @@
-"""What every light-field camera has in common.
+"""The cameras of compact light-field photography by name: which nonlocal measurements each view of a
+light field gets, and the models that follow.
 
-Cameras of line sensors: which view gets which lines, CLIP-1D with its line projections, and lines
-behind randomly coded line-shaped point-spread functions (supplement Notes 4 and 6).
-
-Cameras of compressive light-field photography (supplement Note 5), and the single pixel.
-
-Cameras with a mask or a phase plate in the aperture and one area sensor (supplement Note 3).
-
-The cameras of compact light-field photography by name: which nonlocal measurements each view of
-a light field gets.
+Lines: CLIP-1D with its line projections, and coded line-shaped point-spread functions (supplement
+Notes 4 and 6). Masks and the single pixel (Note 5). A mask or a phase plate in the aperture before one
+area sensor (Note 3). Views are (v, u); shears are pixels from one view to the next, and stand for a
+depth.
 """
 
 from __future__ import annotations
@@ -54,31 +50,31 @@ from tofclip.operators.radon import RadonProjection
 from tofclip.operators.shear import LinearShear, View
 
 __all__ = [
-    "CAMERAS",
-    "COMPRESSIVE_CAMERAS",
-    "AshokCamera",
-    "BabacanCamera",
-    "CodedApertureCamera",
-    "CodedLineCamera",
-    "CompressiveCamera",
-    "CubicPhaseCamera",
-    "DiffuserCamera",
-    "EvenAngleLineCamera",
-    "LightFieldCamera",
-    "LineCamera",
-    "MarwahCamera",
-    "MeasuredCamera",
-    "PointSpreadCamera",
-    "SinglePixelCamera",
+    *("CAMERAS", "COMPRESSIVE_CAMERAS", "AshokCamera", "BabacanCamera", "CodedApertureCamera"),
+    *("CodedLineCamera", "CompressiveCamera", "CubicPhaseCamera", "DiffuserCamera"),
+    *("EvenAngleLineCamera", "LightFieldCamera", "LineCamera", "MarwahCamera", "MeasuredCamera"),
+    *("PointSpreadCamera", "SinglePixelCamera"),
 ]
 
 
 class LightFieldCamera(ABC):
     """An encoder A_k for each view, and the two models that follow from them.
 
-    `image_shape`: rows and columns of every view's picture; `views`: (v, u) of every view;
-    `sampling_ratio`: measurements over pixels of one picture; `seed`: of everything random.
-    `used_views`: numbers of the views that get measurements, in the order of the measurements.
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Rows and columns of every view's picture.
+    views : sequence of (float, float)
+        (v, u) of every view.
+    sampling_ratio : float
+        Measurements over pixels of one picture.
+    seed : int
+        Of everything random.
+
+    Attributes
+    ----------
+    used_views : tuple of int
+        Views that get measurements, in the order of the measurements.
     """
 
     name: ClassVar[str]
@@ -97,9 +93,7 @@ class LightFieldCamera(ABC):
 
     @abstractmethod
     def _assign_measurements(self) -> tuple[int, ...]:
-        """Give measurements to views and set `measurements`; return the numbers of the views that
-        get any.
-        """
+        """Set `measurements`; return the numbers of the views that get any."""
 
     @cached_property
     def encoders(self) -> tuple[LinearOperator, ...]:
@@ -107,24 +101,28 @@ class LightFieldCamera(ABC):
         return self._build_encoders()
 
     @abstractmethod
-    def _build_encoders(self) -> tuple[LinearOperator, ...]:
-        """Build A_k of the used views."""
+    def _build_encoders(self) -> tuple[LinearOperator, ...]: ...
 
     @abstractmethod
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d): from the picture refocused at `shear`, seen from `reference`, to the
-        measurements (Eq. 21).
+        """Return F(d), from (rows, columns) pictures to (measurements,) vectors (Eq. 21).
 
-        `shear`: pixels by which a point moves from one view to the next; stands for a depth;
-        `reference`: view (v, u) from which the picture is seen, in view steps. Returns (rows,
-        columns) pictures to (measurements,) vectors.
+        Parameters
+        ----------
+        shear : float
+            That the picture is refocused at, pixels per view step.
+        reference : (float, float)
+            View (v, u) from which the picture is seen, in view steps.
+
+        Returns
+        -------
+        LinearOperator
         """
 
     def weighting(self) -> LinearOperator:
-        """Return the weights W that measurements and model get in a recovery; 1 unless the camera
-        has a reason.
+        """Return the weights W that measurements and model get in a recovery: all alike unless the
+        camera has a reason.
         """
-        # by default every measurement counts alike
         return Identity((self.measurements,))
 
     def light_field_model(self) -> LinearOperator:
@@ -134,26 +132,18 @@ class LightFieldCamera(ABC):
         return BlockDiagonal(self.encoders)
 
 
+# Neighbours on a line detector whose errors are alike: what is out of focus is some ten pixels wide. A
+# weight chosen by leaving out this number together comes nearer to the best one than by leaving out
+# single pixels, which their neighbours betray, or whole lines, which nothing else measures (letters at
+# SR 1 and 0.5: 1.6 and 3.0 % NMSE with angles assigned evenly, against 4.0 and 4.0 % from whole lines).
 CORRELATION_LENGTH_PX = 12
-"""Neighbours on a line detector whose errors are alike: what is out of focus is some ten pixels
-wide.
-
-A weight chosen by leaving out this number together comes nearer to the best one than by leaving out
-single pixels, which their neighbours betray, or whole lines, which nothing else measures (letters
-at SR 1 and 0.5: 1.6 and 3.0 % NMSE with angles assigned evenly, against 4.0 and 4.0 % from whole
-lines).
-"""
 
 AngleAssignment = tuple[tuple[int, ...], list[NDArray[np.float64]]]
 """Numbers of the views that get any directions, and each one's own."""
 
 
 def count_lines(image_shape: tuple[int, int], detector_px: int, sampling_ratio: float) -> int:
-    """Return how many line detectors make up the sampling ratio.
-
-    `image_shape`: rows and columns of a view's picture; `detector_px`: pixels of one line detector;
-    `sampling_ratio`: measurements over pixels of one picture. Returns at least 1.
-    """
+    """Return how many line detectors of `detector_px` make up the sampling ratio, at least 1."""
     count = round(sampling_ratio * image_shape[0] * image_shape[1] / detector_px)
     if count < 1:
         raise InputError(
@@ -165,10 +155,8 @@ def count_lines(image_shape: tuple[int, int], detector_px: int, sampling_ratio: 
 def assign_randomly(
     directions: NDArray[np.float64], views: int, random: np.random.Generator
 ) -> AngleAssignment:
-    """Permute the directions and deal them one by one to the views in random order (supplement Note
-    6).
-
-    `directions` (lines,); `views`: if there are fewer directions than views, some views get none.
+    """Permute the directions, (lines,), and deal them one by one to the views in random order
+    (supplement Note 6); of few directions some views get none.
     """
     shuffled = random.permutation(directions)
     return _group_by_view(shuffled, np.resize(random.permutation(views), directions.size))
@@ -188,9 +176,8 @@ def assign_evenly(
     middle; no view gets two directions more than another. Which views that are is an assignment
     problem.
 
-    `directions` (lines,): ascending, rad; `views`: (v, u) of every view; `cycle`: neighbouring
-    directions that together stand for the aperture, a power of two from 2 on; `random`: of where
-    the cycle starts and of the order of views with the same t.
+    `directions` (lines,) ascend, rad; a `cycle` of them, a power of two from 2 on, stands for the
+    aperture together.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -205,7 +192,6 @@ def assign_evenly(
     )
     # each view may own several lines, but none more than its share
     copies = -(-directions.size // len(views))
-    # the assignment with the least sum of squared distances from the places wanted
     taken, direction = linear_sum_assignment(np.repeat((place - wanted) ** 2, copies, axis=0))
     owners = np.empty(directions.size, np.intp)
     owners[direction] = taken // copies
@@ -241,16 +227,13 @@ class LineCamera(LightFieldCamera):
     def _assign_measurements(self) -> tuple[int, ...]:
         self.detector_px = max(self.image_shape)
         count = count_lines(self.image_shape, self.detector_px, self.sampling_ratio)
-        self.measurements, self.correlation_length = (
-            count * self.detector_px,
-            min(CORRELATION_LENGTH_PX, self.detector_px),
-        )
+        self.measurements = count * self.detector_px
+        self.correlation_length = min(CORRELATION_LENGTH_PX, self.detector_px)
         # half a turn is all: a line turned by 180 degrees measures the same, mirrored
         used, self.angles = self._assign_angles(np.arange(count) * np.pi / count)
         return used
 
     def _assign_angles(self, angles: NDArray[np.float64]) -> AngleAssignment:
-        """Give angles to views."""
         return assign_randomly(angles, len(self.views), np.random.default_rng(self.seed))
 
     def _build_encoders(self) -> tuple[LinearOperator, ...]:
@@ -262,11 +245,7 @@ class LineCamera(LightFieldCamera):
         return RadonProjection(self.image_shape, self.detector_px, angles, offsets_px)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d) as one sparse matrix: a sheared view is one whose detector is offset.
-
-        `shear`: pixels per view step; `reference`: view (v, u) from which the picture is seen, in
-        view steps. Returns (rows, columns) pictures to (measurements,) vectors.
-        """
+        """Return F(d) as one sparse matrix: a sheared view is one whose detector is offset."""
         offsets = []
         for view, angles in zip(self.used_views, self.angles, strict=True):
             down, right = (
@@ -316,11 +295,10 @@ class CodedLineCamera(LightFieldCamera):
     width_px: ClassVar[int] = 1
 
     def _assign_measurements(self) -> tuple[int, ...]:
-        count = count_lines(self.image_shape, self.image_shape[1], self.sampling_ratio)
-        self.measurements, self.correlation_length = (
-            count * self.image_shape[1],
-            min(CORRELATION_LENGTH_PX, self.image_shape[1]),
-        )
+        detector_px = self.image_shape[1]
+        count = count_lines(self.image_shape, detector_px, self.sampling_ratio)
+        self.measurements = count * detector_px
+        self.correlation_length = min(CORRELATION_LENGTH_PX, detector_px)
         random = np.random.default_rng(self.seed)
         angles = MAX_LINE_ANGLE_RAD * (2 * np.arange(count) + 1 - count) / count
         used, dealt = assign_randomly(angles, len(self.views), random)
@@ -336,23 +314,17 @@ class CodedLineCamera(LightFieldCamera):
         return tuple(SliceConvolution(self.image_shape, spreads) for spreads in self._spreads)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d): the lines of each view moved as its picture would be.
-
-        `shear`: pixels per view step; `reference`: view (v, u) from which the picture is seen, in
-        view steps.
-        """
-        moved: list[NDArray[np.float64]] = []
-        for view, spreads in zip(self.used_views, self._spreads, strict=True):
-            moved.append(
-                shear_point_spreads(spreads, [self.views[view]] * len(spreads), shear, reference)
-            )
+        """Return F(d): the lines of each view moved as its picture would be."""
+        moved = [
+            shear_point_spreads(spreads, [self.views[view]] * len(spreads), shear, reference)
+            for view, spreads in zip(self.used_views, self._spreads, strict=True)
+        ]
         return SliceConvolution(self.image_shape, np.concatenate(moved))
 
 
+# Pixels from view to view by which Marwah's mask appears moved: no two views see a pixel through the
+# same cell.
 MASK_SHEAR_PX = 1.0
-"""Pixels from view to view by which Marwah's mask appears moved: no two views see a pixel through
-the same cell.
-"""
 
 
 class CompressiveCamera(LightFieldCamera):
@@ -376,11 +348,7 @@ class CompressiveCamera(LightFieldCamera):
         """Return the map from the views' pictures, (views, rows, columns), to the measurements."""
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d): the light field's model after the shears.
-
-        `shear`: pixels per view step; `reference`: view (v, u) from which the picture is seen, in
-        view steps. Returns (rows, columns) pictures to (measurements,) vectors.
-        """
+        """Return F(d): the light field's model after the shears."""
         return self.light_field_model() @ ShearedViews(
             self.image_shape, self.views, shear, reference
         )
@@ -400,7 +368,6 @@ class ApertureMaskCamera(CompressiveCamera):
         )
 
     def light_field_model(self) -> LinearOperator:
-        """Return Eq. 17 for all exposures."""
         return WeightedViews(self.image_shape, self.weights())
 
 
@@ -427,13 +394,10 @@ class AshokCamera(ApertureMaskCamera):
         """Return the masks."""
         from scipy.linalg import hadamard
 
-        others = (
-            1 + np.random.default_rng(self.seed).permutation(self._order - 1)[: self.exposures - 1]
-        )
+        others = 1 + np.random.default_rng(self.seed).permutation(self._order - 1)
         # row 0 of the Hadamard matrix opens all cells; +-1 become open and closed
-        open_cells: NDArray[np.float64] = (
-            1 + hadamard(self._order)[np.append(0, others), : len(self.views)]
-        ) / 2
+        rows = np.append(0, others[: self.exposures - 1])
+        open_cells: NDArray[np.float64] = (1 + hadamard(self._order)[rows, : len(self.views)]) / 2
         return open_cells
 
 
@@ -477,7 +441,6 @@ class MarwahCamera(CompressiveCamera):
         return tuple(sensor @ Diagonal(code) for code in self.codes())
 
     def light_field_model(self) -> LinearOperator:
-        """Return Eq. 18."""
         return MaskedViews(self.codes())
 
 
@@ -503,11 +466,7 @@ class SinglePixelCamera(LightFieldCamera):
         return tuple(HadamardCodes(self.image_shape, self.codes, int(seed)) for seed in seeds)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d): every view's codes after its shear, stacked.
-
-        `shear`: pixels per view step; `reference`: view (v, u) from which the picture is seen, in
-        view steps.
-        """
+        """Return F(d): every view's codes after its shear, stacked."""
         return Stack(
             [
                 encoder @ LinearShear(self.image_shape, shear, self.views[view], reference)
@@ -543,30 +502,24 @@ class PointSpreadCamera(LightFieldCamera):
         return tuple(int(view) for view in used)
 
     def _build_encoders(self) -> tuple[LinearOperator, ...]:
-        return tuple(self.sensor @ self._make_convolution(spread) for spread in self._spreads)
+        return tuple(self.sensor @ one for one in self._convolutions)
 
-    def _make_convolution(self, spread: np.ndarray) -> PointSpreadConvolution:
-        return PointSpreadConvolution(self.image_shape, spread)
+    @property
+    def _convolutions(self) -> list[PointSpreadConvolution]:
+        return [PointSpreadConvolution(self.image_shape, spread) for spread in self._spreads]
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d): one convolution with the depth's PSF, read by the sensor.
-
-        `shear`: pixels per view step; `reference`: view (v, u) from which the picture is seen, in
-        view steps. Returns (rows, columns) pictures to (measurements,) vectors.
-        """
+        """Return F(d): one convolution with the depth's PSF, read by the sensor."""
         views = [self.views[view] for view in self.used_views]
         # views are moved by the shear and add up on the sensor: one convolution (Eq. 5)
-        return self.sensor @ self._make_convolution(
-            shear_point_spreads(self._spreads, views, shear, reference).sum(axis=0)
-        )
+        spread = shear_point_spreads(self._spreads, views, shear, reference).sum(axis=0)
+        return self.sensor @ PointSpreadConvolution(self.image_shape, spread)
 
     def light_field_model(self) -> LinearOperator:
         """Return the map from the used views' pictures to the measurements: the sum of what each
         puts on the sensor.
         """
-        return self.sensor @ Integration(
-            [self._make_convolution(spread) for spread in self._spreads]
-        )
+        return self.sensor @ Integration(self._convolutions)
 
 
 class CodedApertureCamera(PointSpreadCamera):
@@ -577,7 +530,6 @@ class CodedApertureCamera(PointSpreadCamera):
     name: ClassVar[str] = "coded-aperture"
 
     def make_element(self) -> CodedAperture:
-        """Return the mask; at least one of its cells is open."""
         random = np.random.default_rng(self.seed)
         cells = tuple(len({view[axis] for view in self.views}) for axis in (0, 1))
         code = random.integers(0, 2, cells)
@@ -592,7 +544,6 @@ class CubicPhaseCamera(PointSpreadCamera):
     name: ClassVar[str] = "cubic-phase"
 
     def make_element(self) -> CubicPhasePlate:
-        """Return the phase plate."""
         return CubicPhasePlate(min(self.image_shape) / 5)
 
 
@@ -602,7 +553,6 @@ class DiffuserCamera(PointSpreadCamera):
     name: ClassVar[str] = "diffuser"
 
     def make_element(self) -> Diffuser:
-        """Return the diffuser."""
         return Diffuser(min(self.image_shape) / 9, 0.25, self.seed)
 
 
@@ -633,11 +583,7 @@ class MeasuredCamera:
 
 
 def make_sparse_sensor(image_shape: tuple[int, int], sampling_ratio: float) -> PitchedSensor:
-    """Spread as many pixels evenly over the picture as the sampling ratio asks for.
-
-    `image_shape`: rows and columns of a view's picture; `sampling_ratio`: sensor pixels over
-    picture pixels, above 0 up to 1.
-    """
+    """Spread as many pixels evenly over the picture as the sampling ratio, up to 1, asks for."""
     rows, columns = image_shape
     if not 0 < sampling_ratio <= 1:
         raise InputError(

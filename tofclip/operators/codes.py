@@ -1,9 +1,5 @@
-"""Area sensors: which pixels of the light on the sensor's plane are read.
-
-Codes of a single-pixel camera: sums of the picture under 0/1 masks.
-
-Operators of compressive light-field photography (supplement Note 5): whole light fields on dense
-area sensors.
+"""What turns light into measurements: which pixels of a sensor are read, the codes of a single pixel,
+and how masks weigh the views of a light field (supplement Note 5).
 """
 
 from __future__ import annotations
@@ -13,16 +9,36 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from tofclip.arrays import Array
 from tofclip.errors import InputError, ShapeError
-from tofclip.operators.base import Array, LinearOperator
+from tofclip.operators.base import (
+    Adjoint,
+    Composition,
+    Diagonal,
+    Integration,
+    LinearOperator,
+    Reshape,
+)
 from tofclip.operators.shear import LinearShear, View
 
 
-class _Sensor(LinearOperator):
-    """The measurements of some pixels of a plane; the adjoint leaves the others dark.
+class DenseSensor(Reshape):
+    """Every pixel is read, row by row.
 
-    `plane_shape`: rows and columns of the light on the sensor's plane; `pixels` (measurements,):
-    flat numbers of the pixels that are read, without repeats.
+    Parameters
+    ----------
+    plane_shape : (int, int)
+    dtype : dtype
+        float32 or float64.
+    """
+
+    def __init__(self, plane_shape: tuple[int, int], dtype: DTypeLike = np.float32) -> None:
+        super().__init__(plane_shape, (plane_shape[0] * plane_shape[1],), dtype)
+
+
+class _Sensor(LinearOperator):
+    """The measurements of `pixels`, flat numbers on the sensor's plane; the adjoint leaves the others
+    dark.
     """
 
     def __init__(
@@ -43,26 +59,6 @@ class _Sensor(LinearOperator):
         plane = np.zeros((self.shape_in[0] * self.shape_in[1], block.shape[-1]), self.dtype)
         plane[self.pixels] = block
         return plane.reshape(*self.shape_in, -1)
-
-
-class DenseSensor(_Sensor):
-    """Every pixel is read, row by row.
-
-    Parameters
-    ----------
-    plane_shape : (int, int)
-    dtype : dtype
-        float32 or float64.
-    """
-
-    def __init__(self, plane_shape: tuple[int, int], dtype: DTypeLike = np.float32) -> None:
-        super().__init__(plane_shape, np.arange(plane_shape[0] * plane_shape[1]), dtype)
-
-    def _forward(self, block: Array) -> Array:
-        return block.reshape(-1, block.shape[-1])
-
-    def _adjoint(self, block: Array) -> Array:
-        return block.reshape(*self.shape_in, -1)
 
 
 class PitchedSensor(_Sensor):
@@ -162,11 +158,8 @@ class HadamardCodes(LinearOperator):
     def _forward(self, block: Array) -> Array:
         from tofclip.operators.kernels import transform_walsh_hadamard
 
-        (rows, columns), (padded_rows, padded_columns), batch = (
-            self.shape_in,
-            self._padded,
-            block.shape[-1],
-        )
+        (rows, columns), batch = self.shape_in, block.shape[-1]
+        padded_rows, padded_columns = self._padded
         signed = np.zeros((padded_rows, columns, batch), self.dtype)
         np.multiply(block, self._signs, out=signed[:rows])
         transform_walsh_hadamard(signed.reshape(padded_rows, -1))
@@ -181,11 +174,8 @@ class HadamardCodes(LinearOperator):
     def _adjoint(self, block: Array) -> Array:
         from tofclip.operators.kernels import transform_walsh_hadamard
 
-        (rows, columns), (padded_rows, padded_columns), batch = (
-            self.shape_in,
-            self._padded,
-            block.shape[-1],
-        )
+        (rows, columns), batch = self.shape_in, block.shape[-1]
+        padded_rows, padded_columns = self._padded
         spectrum = np.zeros((padded_columns * padded_rows, batch), self.dtype)
         spectrum[self._chosen] = block
         transform_walsh_hadamard(spectrum.reshape(padded_columns, -1))
@@ -196,34 +186,6 @@ class HadamardCodes(LinearOperator):
         pictures += block.sum(axis=0)
         pictures /= 2
         return pictures
-
-
-class RandomCodes(LinearOperator):
-    """Independent random 0/1 codes, kept as a dense matrix: the reference for `HadamardCodes`.
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-    codes : int
-        Number of measurements.
-    seed : int
-    dtype : dtype
-        float32 or float64.
-    """
-
-    def __init__(
-        self, image_shape: tuple[int, int], codes: int, seed: int, dtype: DTypeLike = np.float32
-    ) -> None:
-        super().__init__(image_shape, (codes,), dtype)
-        drawn = np.random.default_rng(seed).integers(0, 2, (codes, image_shape[0] * image_shape[1]))
-        self._codes = drawn.astype(self.dtype)
-
-    def _forward(self, block: Array) -> Array:
-        coded: Array = self._codes @ block.reshape(-1, block.shape[-1])
-        return coded
-
-    def _adjoint(self, block: Array) -> Array:
-        return (self._codes.T @ block).reshape(*self.shape_in, block.shape[-1])
 
 
 class WeightedViews(LinearOperator):
@@ -266,7 +228,7 @@ class WeightedViews(LinearOperator):
         return spread.reshape(*self.shape_in, -1)
 
 
-class MaskedViews(LinearOperator):
+class MaskedViews(Composition):
     """One exposure through a mask near the sensor: ``y = sum_k C_k P_k``, C_k the mask as view k
     sees it (Eq. 18).
 
@@ -283,25 +245,14 @@ class MaskedViews(LinearOperator):
     """
 
     def __init__(self, codes: ArrayLike, dtype: DTypeLike = np.float32) -> None:
-        self.codes = np.asarray(codes, dtype=dtype)
-        if self.codes.ndim != 3:
-            raise ShapeError("mask codes", "(views, rows, columns)", self.codes.shape)
-        if not np.all(np.isfinite(self.codes)):
-            raise InputError("mask codes must be finite")
-        super().__init__(self.codes.shape, (self.codes.shape[1] * self.codes.shape[2],), dtype)
-
-    def _forward(self, block: Array) -> Array:
-        seen: Array = np.einsum("kyx,kyxb->yxb", self.codes, block)
-        return seen.reshape(*self.shape_out, -1)
-
-    def _adjoint(self, block: Array) -> Array:
-        # A diagonal matrix is its own transpose: light goes back through the same holes.
-        plane = block.reshape(*self.shape_in[1:], -1)
-        spread: Array = self.codes[..., np.newaxis] * plane
-        return spread
+        masks = np.asarray(codes, dtype=dtype)
+        if masks.ndim != 3:
+            raise ShapeError("mask codes", "(views, rows, columns)", masks.shape)
+        plane = Integration([Diagonal(mask, dtype) for mask in masks])
+        super().__init__(DenseSensor(masks.shape[1:], dtype), plane)
 
 
-class ShearedViews(LinearOperator):
+class ShearedViews(Adjoint):
     """All views that a picture at one depth has: ``[B_1; B_2; ...]``, (rows, columns) to (views,
     rows, columns).
 
@@ -327,17 +278,8 @@ class ShearedViews(LinearOperator):
         reference: View = (0.0, 0.0),
         dtype: DTypeLike = np.float32,
     ) -> None:
-        super().__init__(image_shape, (len(views), *image_shape), dtype)
-        self._shears = [LinearShear(image_shape, shear, view, reference, dtype) for view in views]
-
-    def _forward(self, block: Array) -> Array:
-        return np.stack([shear._forward(block) for shear in self._shears])
-
-    def _adjoint(self, block: Array) -> Array:
-        total = np.zeros((*self.shape_in, block.shape[-1]), self.dtype)
-        for shear, part in zip(self._shears, block, strict=True):
-            total += shear._adjoint(part)
-        return total
+        shears = [LinearShear(image_shape, shear, view, reference, dtype) for view in views]
+        super().__init__(Integration([one.H for one in shears]))
 
 
 def make_sheared_mask(
@@ -346,11 +288,8 @@ def make_sheared_mask(
     mask_shear: float,
     random: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Make the codes of a random mask at some distance in front of the sensor.
-
-    `mask_shear`: pixels by which the mask appears moved from view to view: 0 on the sensor, where
-    all views see it alike; `random`: of the mask's transmissions, evenly from 0 to 1. Returns
-    (views, rows, columns).
+    """Make the codes of a random mask at some distance in front of the sensor, (views, rows, columns):
+    from view to view it appears moved by `mask_shear` pixels. Transmissions are evenly from 0 to 1.
     """
     # So much larger that no view looks past the edge of the mask.
     margin = int(np.ceil(abs(mask_shear) * np.abs(np.asarray(views)).max())) + 1

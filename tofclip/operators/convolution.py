@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from tofclip.arrays import Array
 from tofclip.errors import InputError, ShapeError
-from tofclip.operators.base import Array, LinearOperator
+from tofclip.operators.base import LinearOperator
 
 
 class PointSpreadConvolution(LinearOperator):

@@ -12,9 +12,6 @@ both directions share every pixel alike to the last bit.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,20 +25,12 @@ from tofclip.operators.radon import FRACTION_BITS
 from tofclip.threads import LANES
 
 INDEX_TYPE = ir.IntType(64)
-WIDE_LANES = 4 * LANES
 
 
-def _make_row_product(lanes: int, unroll: int) -> Any:
-    """Make the product of a sparse row with the rows of a block.
-
-    `lanes`: numbers of a row of the block that are taken; `unroll`: accumulators for each of them,
-    which hide the latency of the fused multiply-add. Returns ``(result, start, stride, block,
-    columns, values, first, last, onto)``, for compiled loops: ``result[start : start + lanes] =
-    present + sum_q values[q] * block[columns[q], :lanes]`` for q in [first, last), `result` flat.
-    `present` is 0, or what stands there already where the boolean `onto` says so. `stride` is the
-    distance of two rows of the block; a row's elements and the result's lie side by side.
+def _make_rows_product(lanes: int, unroll: int) -> Any:
+    """Make the product of a sparse matrix with some lanes of a block, for compiled loops; `unroll`
+    accumulators for each lane hide the latency of the fused multiply-add.
     """
-    selector = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         def data(k: int) -> Any:
@@ -50,6 +39,7 @@ def _make_row_product(lanes: int, unroll: int) -> Any:
         target, source, index, weight = data(0), data(3), data(4), data(5)
         offset, row_length, begin, end = (arguments[k] for k in (1, 2, 6, 7))
         vector = ir.VectorType(target.type.pointee, lanes)
+        selector = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
         undefined = ir.Constant(vector, ir.Undefined)
 
         def lanes_at(base: Any, place: Any) -> Any:
@@ -73,105 +63,70 @@ def _make_row_product(lanes: int, unroll: int) -> Any:
         accumulators = [cgutils.alloca_once_value(builder, start) for start in starts]
         position = cgutils.alloca_once_value(builder, begin)
         for step in sorted({unroll, 1}, reverse=True):
-            with _emit_while(builder, partial(_emit_fits, builder, position, step, end)):
-                here = builder.load(position)
-                for lane_set in range(step):
-                    accumulate(builder.add(here, INDEX_TYPE(lane_set)), accumulators[lane_set])
-                builder.store(builder.add(here, INDEX_TYPE(step)), position)
+            head, body, after = (
+                builder.append_basic_block(name) for name in ("head", "body", "after")
+            )
+            builder.branch(head)
+            builder.position_at_end(head)
+            here = builder.load(position)
+            next_one = builder.add(here, INDEX_TYPE(step))
+            builder.cbranch(builder.icmp_signed("<=", next_one, end), body, after)
+            builder.position_at_end(body)
+            for number in range(step):
+                accumulate(builder.add(here, INDEX_TYPE(number)), accumulators[number])
+            builder.store(next_one, position)
+            builder.branch(head)
+            builder.position_at_end(after)
         total = builder.load(accumulators[0])
         for accumulator in accumulators[1:]:
             total = builder.fadd(total, builder.load(accumulator))
         builder.store(total, destination).align = 4
         return context.get_dummy_value()
 
-    def emit(
-        typing_context: Any,
-        result: Any,
-        start: Any,
-        stride: Any,
-        block: Any,
-        columns: Any,
-        values: Any,
-        first: Any,
-        last: Any,
-        onto: Any,
-    ) -> Any:
-        return types.void(
-            result, start, stride, block, columns, values, first, last, onto
-        ), generate
+    @intrinsic
+    def add_row_product(typing, result, start, stride, block, columns, values, first, last, onto):
+        """``result[start : start + lanes] = present + sum_q values[q] * block[columns[q], :lanes]`` for
+        q in [first, last), `result` flat and `stride` the distance of two rows of the block.
 
-    return intrinsic(emit)
-
-
-_emit_row_product = _make_row_product(LANES, 2)
-# as many lanes need no second set: there are enough sums that do not wait for each other
-_emit_wide_row_product = _make_row_product(WIDE_LANES, 1)
-
-
-def _emit_fits(builder: Any, position: Any, step: int, end: Any) -> Any:
-    return builder.icmp_signed("<=", builder.add(builder.load(position), INDEX_TYPE(step)), end)
-
-
-@contextlib.contextmanager
-def _emit_while(builder: Any, condition: Callable[[], Any]) -> Iterator[None]:
-    head, body, after = (builder.append_basic_block(name) for name in ("head", "body", "after"))
-    builder.branch(head)
-    builder.position_at_end(head)
-    builder.cbranch(condition(), body, after)
-    builder.position_at_end(body)
-    yield
-    builder.branch(head)
-    builder.position_at_end(after)
-
-
-@compile_loop()
-def multiply_sparse_block(tile_starts, columns, values, block, result):
-    """``result = M @ block`` for a sparse matrix M in column tiles; see
-    `tofclip.operators.sparse.Tiles`.
-
-    `tile_starts` (tiles, rows + 1): where each row's nonzeros begin, tile by tile; `columns`
-    (nonzeros,); `values` (nonzeros,); `block` (M's columns, LANES); `result` (rows, LANES).
-    """
-    for tile in range(tile_starts.shape[0]):
-        # the first tile overwrites the result, the others add to it
-        onto = tile > 0
-        for row in range(tile_starts.shape[1] - 1):
-            first, last = tile_starts[tile, row], tile_starts[tile, row + 1]
-            if first < last or not onto:
-                _emit_row_product(
-                    result, row * LANES, LANES, block, columns, values, first, last, onto
-                )
-
-
-def _make_rows_product(emit_row_product: Any) -> Any:
-    """Make the product of a sparse matrix with some lanes of a block, for compiled loops."""
+        `present` is 0, or what stands there already where the boolean `onto` says so.
+        """
+        given = result, start, stride, block, columns, values, first, last, onto
+        return types.void(*given), generate
 
     @compile_as_part()
     def multiply(tile_starts, columns, values, block, first, result, place):
-        """``result[:, place + j] = (M @ block)[:, first + j]`` for all lanes j; see
-        `multiply_sparse_block`.
+        """``result[:, place + j] = (M @ block)[:, first + j]`` for all lanes j and a sparse matrix M in
+        column tiles; see `tofclip.operators.sparse.Tiles`.
 
-        `tile_starts, columns, values`: as for `multiply_sparse_block`; `block` (M's columns, at
-        least first + lanes): rows that begin at whole cache lines are read 1.6 times as fast; see
-        `tofclip.arrays.empty_aligned`; `result` (rows, at least place + lanes).
+        Rows of the block that begin at whole cache lines are read 1.6 times as fast; see
+        `tofclip.arrays.empty_aligned`.
         """
         lanes, stride = block[:, first:], block.shape[1]
         for tile in range(tile_starts.shape[0]):
+            # the first tile overwrites the result, the others add to it
             onto = tile > 0
             for row in range(tile_starts.shape[1] - 1):
                 begin, end = tile_starts[tile, row], tile_starts[tile, row + 1]
                 if begin < end or not onto:
                     target = row * result.shape[1] + place
-                    emit_row_product(
+                    add_row_product(
                         result, target, stride, lanes, columns, values, begin, end, onto
                     )
 
     return multiply
 
 
-multiply_sparse_rows = _make_rows_product(_emit_row_product)  # `LANES` of them
-# `WIDE_LANES`, for which a nonzero is looked up once
-multiply_sparse_wide_rows = _make_rows_product(_emit_wide_row_product)
+multiply_sparse_rows = _make_rows_product(LANES, 2)
+# A nonzero is looked up once for as many lanes, which takes a fifth less time; there are enough sums
+# that do not wait for each other.
+WIDE_LANES = 4 * LANES
+multiply_sparse_wide_rows = _make_rows_product(WIDE_LANES, 1)
+
+
+@compile_loop()
+def multiply_sparse_block(tile_starts, columns, values, block, result):
+    """``result = M @ block`` for a block of `LANES` frames."""
+    multiply_sparse_rows(tile_starts, columns, values, block, 0, result, 0)
 
 
 FASTMATH = {"contract", "nsz", "arcp", "afn"}
@@ -200,10 +155,6 @@ def project_onto_lines(picture, starts, rightward, downward, lines):
     `starts`, `rightward` and `downward`, (lines,) int64, are the position of the first pixel and
     the steps from pixel to pixel in units of 2^-32 bins; every position and the next bin must lie
     on the line. Two lines at a time keep the processor busy while a sum is on its way to memory.
-
-    `picture` (rows, columns); `starts` (lines,): fixed-point position of the first pixel on each
-    line, 2^-32 bins; `rightward, downward` (lines,): steps to the next column and row, 2^-32 bins;
-    `lines` (lines, bins, 2): added to, in place.
     """
     # Light times 2^-32: the fraction stays a whole number until it is multiplied once.
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
@@ -232,9 +183,6 @@ def project_onto_lines(picture, starts, rightward, downward, lines):
 def back_project_lines(lines, starts, rightward, downward, picture):
     """The adjoint of `project_onto_lines` for lines (lines, bins) of one value a bin; overwrites
     `picture`.
-
-    `lines` (lines, bins); `starts, rightward, downward` (lines,): as for `project_onto_lines`;
-    `picture` (rows, columns): overwritten.
     """
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
     for row in range(picture.shape[0]):
@@ -254,14 +202,8 @@ def back_project_lines(lines, starts, rightward, downward, picture):
 
 @fast_loop
 def count_line_nonzeros(starts, rightward, downward, before, shape, counts):
-    """Count the nonzeros in each row of the matrix that `project_onto_lines` stands for.
-
-    `counts` is (lines, detector pixels), zeros; the detector's first pixel is bin `before`, `shape`
-    the picture's.
-
-    `starts, rightward, downward` (lines,): as for `project_onto_lines`; `before`: bins in front of
-    the detector's first pixel; `shape`: rows and columns of the picture; `counts` (lines, detector
-    pixels): zeros; counted up in place.
+    """Count the nonzeros in each row of the matrix that `project_onto_lines` stands for into `counts`
+    (lines, detector pixels), zeros; `before` bins lie in front of the detector's first pixel.
     """
     for number in range(starts.size):
         for row in range(shape[0]):
@@ -281,11 +223,6 @@ def fill_line_nonzeros(starts, rightward, downward, before, shape, places, colum
 
     `places`, (lines, detector pixels), says where each row of the matrix begins in `columns` and
     `values`, and says afterwards where it ends.
-
-    `starts, rightward, downward` (lines,): as for `project_onto_lines`; `before`: bins in front of
-    the detector's first pixel; `shape`: rows and columns of the picture; `places` (lines, detector
-    pixels): advanced in place; `columns` (nonzeros,): overwritten with raster numbers of pixels;
-    `values` (nonzeros,): overwritten with weights from 0 to 1.
     """
     whole, step = values.dtype.type(1), values.dtype.type(1 / (1 << FRACTION_BITS))
     for number in range(starts.size):
@@ -306,11 +243,7 @@ def fill_line_nonzeros(starts, rightward, downward, before, shape, places, colum
 
 @fast_loop
 def count_tile_nonzeros(row_starts, indices, width, counts):
-    """Count a CSR matrix's nonzeros in each tile of `width` columns and row, (tiles, rows) zeros.
-
-    `row_starts` (rows + 1,): the matrix's ``indptr``; `indices` (nonzeros,): column of each
-    nonzero; `width`: columns of a tile; `counts` (tiles, rows): zeros; counted up in place.
-    """
+    """Count a CSR matrix's nonzeros in each tile of `width` columns and row, (tiles, rows) zeros."""
     for row in range(row_starts.size - 1):
         for entry in range(row_starts[row], row_starts[row + 1]):
             counts[indices[entry] // width, row] += 1
@@ -320,10 +253,6 @@ def count_tile_nonzeros(row_starts, indices, width, counts):
 def sort_into_tiles(row_starts, indices, data, width, places, columns, values):
     """Write a CSR matrix's nonzeros in the order of tile, row and column; `places` as in
     `fill_line_nonzeros`.
-
-    `row_starts` (rows + 1,): the matrix's ``indptr``; `indices, data` (nonzeros,): column and value
-    of each nonzero; `width`: columns of a tile; `places` (tiles, rows): advanced in place;
-    `columns, values` (nonzeros,): overwritten.
     """
     for row in range(row_starts.size - 1):
         for entry in range(row_starts[row], row_starts[row + 1]):
@@ -335,42 +264,23 @@ def sort_into_tiles(row_starts, indices, data, width, places, columns, values):
 
 @fast_loop
 def transform_walsh_hadamard(values):
-    """Multiply (n, columns) values by Sylvester's Hadamard matrix of n = 2^k rows, in place; two
-    stages at a time.
-    """
+    """Multiply (n, columns) values by Sylvester's Hadamard matrix of n = 2^k rows, in place."""
     count, columns = values.shape
     half = 1
-    while 2 * half < count:
-        # two levels of the butterfly at once: half as many passes through memory
-        for start in range(0, count, 4 * half):
+    while half < count:
+        for start in range(0, count, 2 * half):
             for row in range(start, start + half):
                 for column in range(columns):
                     a, b = values[row, column], values[row + half, column]
-                    c, d = values[row + 2 * half, column], values[row + 3 * half, column]
-                    values[row, column] = (a + b) + (c + d)
-                    values[row + half, column] = (a - b) + (c - d)
-                    values[row + 2 * half, column] = (a + b) - (c + d)
-                    values[row + 3 * half, column] = (a - b) - (c - d)
-        half *= 4
-    # an odd number of levels leaves one
-    if half < count:
-        for row in range(half):
-            for column in range(columns):
-                a, b = values[row, column], values[row + half, column]
-                values[row, column] = a + b
-                values[row + half, column] = a - b
+                    values[row, column] = a + b
+                    values[row + half, column] = a - b
+        half *= 2
 
 
 @compile_loop(fastmath=FASTMATH, _nrt=True)
 def shift_linearly(block, down, right, below, beside, shifted):
     """Shift a (rows, columns, lanes) block by ``down + below`` rows and ``right + beside`` columns;
-    dark beyond.
-
-    `down` and `right` are whole numbers, `below` and `beside` the shares of the next row and
-    column, from 0 to 1.
-
-    `block` (rows, columns, lanes); `down, right`: whole pixels; `below, beside`: fractions of a
-    pixel, from 0 to 1; `shifted` (rows, columns, lanes): overwritten.
+    dark beyond. `below` and `beside` are the shares of the next row and column, from 0 to 1.
     """
     rows, columns, lanes = block.shape
     length, whole = columns * lanes, block.dtype.type(1)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,24 +25,15 @@ if TYPE_CHECKING:
 
 Coordinates = NDArray[np.float64]
 
+# Along each side of a view's patch of the aperture: 0.15 million for 8 x 8 views.
 RAYS_PER_SIDE = 48
-"""Rays along each side of a view's patch of the aperture: 0.15 million for 8 x 8 views."""
 
 
-class ApertureElement(Protocol):
-    """A mask or a thin phase plate in the aperture, on pupil coordinates from -1 to 1, v down and u
-    right.
-    """
-
-    def trace_rays(
-        self, v: Coordinates, u: Coordinates
-    ) -> tuple[Coordinates, Coordinates, Coordinates]:
-        """Return what fraction of each ray passes, and by how many pixels it is deflected down and
-        to the right.
-
-        `v, u` (rays, 1): increasing. Returns `transmission, down_px, right_px` (rays, rays).
-        """
-        ...
+Rays = tuple[Coordinates, Coordinates, Coordinates]
+"""(rays, rays) each: what fraction of each ray an element in the aperture passes, and by how many pixels
+it deflects it down and to the right. Pupil coordinates v, (rays, 1), down and u, (1, rays), right go from
+-1 to 1.
+"""
 
 
 @dataclass(frozen=True)
@@ -55,13 +46,8 @@ class CodedAperture:
 
     code: NDArray[Any]  # (rows, columns), transmission of the mask's cells, which fill the aperture
 
-    def trace_rays(
-        self, v: Coordinates, u: Coordinates
-    ) -> tuple[Coordinates, Coordinates, Coordinates]:
-        """Return the rays; see `ApertureElement`. View u looks through the mask at -u, as in Eq. 6.
-
-        Arguments and result are those of `ApertureElement.trace_rays`.
-        """
+    def trace_rays(self, v: Coordinates, u: Coordinates) -> Rays:
+        """View u looks through the mask at -u, as in Eq. 6."""
         cells = [
             np.clip(((1 - place) / 2 * size).astype(int), 0, size - 1)
             for place, size in zip((v, u), self.code.shape, strict=True)
@@ -83,13 +69,7 @@ class CubicPhasePlate:
 
     strength_px: float  # extent of the PSF on either axis
 
-    def trace_rays(
-        self, v: Coordinates, u: Coordinates
-    ) -> tuple[Coordinates, Coordinates, Coordinates]:
-        """Return the rays; see `ApertureElement`.
-
-        Arguments and result are those of `ApertureElement.trace_rays`.
-        """
+    def trace_rays(self, v: Coordinates, u: Coordinates) -> Rays:
         # 1/2 shifts the PSF as a whole, which lies about its own centre then
         down, right = np.broadcast_arrays(
             self.strength_px * (v**2 - 0.5), self.strength_px * (u**2 - 0.5)
@@ -105,13 +85,7 @@ class Diffuser:
     grain: float  # correlation length of the phase on the aperture, whose half width is 1
     seed: int
 
-    def trace_rays(
-        self, v: Coordinates, u: Coordinates
-    ) -> tuple[Coordinates, Coordinates, Coordinates]:
-        """Return the rays; see `ApertureElement`.
-
-        Arguments and result are those of `ApertureElement.trace_rays`.
-        """
+    def trace_rays(self, v: Coordinates, u: Coordinates) -> Rays:
         phase = self._phase
         down, right = phase(v.ravel(), u.ravel(), dx=1), phase(v.ravel(), u.ravel(), dy=1)
         return np.ones(down.shape), down, right
@@ -126,9 +100,8 @@ class Diffuser:
             raise InputError(
                 f"a diffuser's grain must be positive and its spread finite, got {self}"
             )
-        cells = max(
-            16, round(8 / self.grain)
-        )  # four cells a grain, so that the spline adds no wiggles
+        # four cells a grain, so that the spline adds no wiggles
+        cells = max(16, round(8 / self.grain))
         noise = np.random.default_rng(self.seed).standard_normal((cells, cells))
         places = np.linspace(-1, 1, cells)
         # Wrapped around, so that grains at the rim are as strong as in the middle.
@@ -139,6 +112,10 @@ class Diffuser:
         # spot.
         slopes = np.std([surface(sampled, sampled, dx=1), surface(sampled, sampled, dy=1)])
         return RectBivariateSpline(places, places, phase * (self.spread_px / slopes))
+
+
+ApertureElement = CodedAperture | CubicPhasePlate | Diffuser
+"""A mask or a thin phase plate in the aperture."""
 
 
 def trace_view_point_spreads(
@@ -231,9 +208,8 @@ class MeasuredPointSpreads:
         place = float(np.interp(shear, self.shears, np.arange(self.shears.size)))
         below = min(int(place), max(self.shears.size - 2, 0))
         above = min(below + 1, self.shears.size - 1)
-        mixed: NDArray[np.float64] = (1 - place + below) * self.stack[below] + (
-            place - below
-        ) * self.stack[above]
+        part = place - below
+        mixed: NDArray[np.float64] = (1 - part) * self.stack[below] + part * self.stack[above]
         return mixed
 
 

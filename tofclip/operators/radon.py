@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from tofclip.arrays import Array
 from tofclip.errors import InputError, ShapeError
-from tofclip.operators.base import Array, LinearOperator
+from tofclip.operators.base import LinearOperator
 from tofclip.operators.sparse import SparseMatrix
 
 if TYPE_CHECKING:

@@ -9,8 +9,9 @@ from abc import abstractmethod
 import numpy as np
 from numpy.typing import DTypeLike
 
+from tofclip.arrays import Array
 from tofclip.errors import InputError
-from tofclip.operators.base import Array, LinearOperator
+from tofclip.operators.base import LinearOperator
 
 View = tuple[float, float]
 

@@ -1,20 +1,14 @@
-"""Products with a sparse matrix on arrays of other libraries than NumPy, on whatever device they
-are.
-
-PyTorch and CuPy have such products, by the maker of the device (cuSPARSE, MKL). For any other
-library that follows the array API standard the entries are gathered and summed, which every library
-can.
-
-Sparse matrices as linear operators on pictures, and the one that everything begins with: the line
+"""Sparse matrices as linear operators on pictures, and the one that everything begins with: the line
 projection F of a row of cylindrical lenslets.
 """
 
 from __future__ import annotations
 
+import operator
 import warnings
 from collections.abc import Callable
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -27,99 +21,101 @@ from tofclip.threads import LANES, run_blocks, split_blocks
 if TYPE_CHECKING:
     import scipy.sparse
 
+Product = Callable[[Array], Array]
+"""Multiplies a sparse matrix with a (columns, frames) block of its type."""
 
-GATHERED_BYTES = 1 << 28
-"""At most so much is gathered at once."""
-
-
-class Product(Protocol):
-    """The product with one sparse matrix."""
-
-    def __call__(self, block: Array) -> Array:
-        """Multiply a (columns, frames) block of the matrix's type; the result is (rows, frames)."""
-        ...
+GATHERED_NUMBERS = 1 << 25  # gathered at once, at most
+TILE_BYTES = 1 << 19  # half of a present-day core's second-level cache
 
 
-def make_portable_product(matrix: scipy.sparse.csr_array, device: ComputeDevice) -> Product:
-    """Bring a CSR matrix to `device` and return the product with it there.
-
-    `device`: library and device of the arrays to come. Returns takes (columns, frames) arrays on
-    that device.
+class Tiles(NamedTuple):
+    """A CSR matrix cut into groups of neighbouring columns, so that a group's part of the operand
+    stays in cache: nonzeros in the order of tile, row, and their place in the row.
     """
-    kinds: dict[str, Callable[..., Product]] = {"torch": TorchProduct, "cupy": CupyProduct}
-    return kinds.get(device.library, GatheredProduct)(matrix, device)
+
+    starts: NDArray[np.int64]  # (tiles, rows + 1), where each row's nonzeros begin in the other two
+    columns: NDArray[np.uint32]  # (nonzeros,)
+    values: NDArray[Any]  # (nonzeros,)
+
+    @classmethod
+    def from_csr(cls, matrix: scipy.sparse.csr_array) -> Tiles:
+        """Cut so that the rows of `LANES` frames that belong to a tile's columns stay in cache."""
+        from tofclip.operators.kernels import count_tile_nonzeros, sort_into_tiles
+
+        width = max(1, TILE_BYTES // (LANES * matrix.dtype.itemsize))
+        per_row = np.zeros((-(-matrix.shape[1] // width), matrix.shape[0]), np.int64)
+        count_tile_nonzeros(matrix.indptr, matrix.indices, width, per_row)
+        ends = np.cumsum(per_row).reshape(per_row.shape)
+        starts = np.concatenate([ends - per_row, ends[:, -1:]], axis=1)
+        columns, values = np.empty(matrix.nnz, np.uint32), np.empty(matrix.nnz, matrix.dtype)
+        source = matrix.indptr, matrix.indices, matrix.data, width
+        sort_into_tiles(*source, starts[:, :-1].copy(), columns, values)
+        return cls(starts, columns, values)
 
 
-class TorchProduct:
-    """PyTorch's own product with a CSR matrix."""
+def make_product(matrix: scipy.sparse.csr_array, device: ComputeDevice) -> Product:
+    """Bring a CSR matrix to where the arrays to come are.
 
-    def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:
+    NumPy's are multiplied by compiled loops. PyTorch and CuPy have such products, by the maker of the
+    device (cuSPARSE, MKL); any other library gathers a row's entries and sums them.
+    """
+    if device.library == "numpy":
+        return partial(_multiply_tiles, Tiles.from_csr(matrix))
+    if device.library == "torch":
         import torch
 
-        if (
-            not matrix.has_canonical_format
-        ):  # PyTorch wants every entry once and in order, and does not look
+        if not matrix.has_canonical_format:  # every entry once and in order: PyTorch does not look
             matrix = matrix.copy()
             matrix.sum_duplicates()
         parts = (device.put(part) for part in (matrix.indptr, matrix.indices, matrix.data))
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta", UserWarning)
-            self._matrix = torch.sparse_csr_tensor(
-                *parts, size=matrix.shape, check_invariants=False
-            )
-
-    def __call__(self, block: Array) -> Array:
-        """Multiply a (columns, frames) block."""
-        return self._matrix @ block.contiguous()
-
-
-class CupyProduct:
-    """CuPy's own product with a CSR matrix."""
-
-    def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:
+            brought = torch.sparse_csr_tensor(*parts, size=matrix.shape, check_invariants=False)
+        return lambda block: brought @ block.contiguous()
+    if device.library == "cupy":
         from cupyx.scipy.sparse import csr_matrix
 
-        parts = tuple(device.put(part) for part in (matrix.data, matrix.indices, matrix.indptr))
-        self._matrix = csr_matrix(parts, shape=matrix.shape)
-
-    def __call__(self, block: Array) -> Array:
-        """Multiply a (columns, frames) block."""
-        return self._matrix @ block
-
-
-class GatheredProduct:
-    """The sum of what a row's entries gather, by functions of the array API standard alone.
-
-    Every row is filled up with zeros to the longest, so rows of much the same length cost least
-    memory.
-    """
-
-    def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:
-        lengths = np.diff(matrix.indptr)
-        shape = (matrix.shape[0], max(1, int(lengths.max(initial=0))))
-        columns, values = np.zeros(shape, np.int64), np.zeros(shape, matrix.dtype)
-        filled = np.arange(shape[1]) < lengths[:, np.newaxis]
-        columns[filled], values[filled] = matrix.indices, matrix.data
-        self._columns, self._values = device.put(columns), device.put(values[..., np.newaxis])
-        self._itemsize = matrix.dtype.itemsize
-
-    def __call__(self, block: Array) -> Array:
-        """Multiply a (columns, frames) block."""
-        xp = namespace(block)
-        rows, width = self._columns.shape
-        at_once = max(1, GATHERED_BYTES // max(1, width * block.shape[1] * self._itemsize))
-        parts = []
-        for piece in split_blocks(rows, at_once):
-            columns = self._columns[piece, :]
-            gathered = xp.take(block, xp.reshape(columns, (-1,)), axis=0)
-            terms = (
-                xp.reshape(gathered, (*columns.shape, block.shape[1])) * self._values[piece, ...]
-            )
-            parts.append(xp.sum(terms, axis=1))
-        return xp.concat(parts)
+        parts = (device.put(part) for part in (matrix.data, matrix.indices, matrix.indptr))
+        return partial(operator.matmul, csr_matrix(tuple(parts), shape=matrix.shape))
+    # Every row is filled up with zeros to the longest: of much the same length they cost least.
+    lengths = np.diff(matrix.indptr)
+    shape = (matrix.shape[0], max(1, int(lengths.max(initial=0))))
+    columns, values = np.zeros(shape, np.int64), np.zeros(shape, matrix.dtype)
+    filled = np.arange(shape[1]) < lengths[:, np.newaxis]
+    columns[filled], values[filled] = matrix.indices, matrix.data
+    return partial(_multiply_gathered, device.put(columns), device.put(values[..., np.newaxis]))
 
 
-TILE_BYTES = 1 << 19  # half of a present-day core's second-level cache
+def _multiply_tiles(tiles: Tiles, block: NDArray[Any]) -> NDArray[Any]:
+    from tofclip.operators.kernels import multiply_sparse_block
+
+    result = np.empty((tiles.starts.shape[1] - 1, block.shape[-1]), block.dtype)
+    if block.shape[-1] == LANES:
+        multiply_sparse_block(*tiles, block, result)
+        return result
+
+    def work(piece: slice) -> None:
+        lanes = piece.stop - piece.start
+        # the compiled product takes whole blocks only
+        padded = np.zeros((block.shape[0], LANES), block.dtype)
+        padded[:, :lanes] = block[:, piece]
+        product = np.empty((len(result), LANES), block.dtype)
+        multiply_sparse_block(*tiles, padded, product)
+        result[:, piece] = product[:, :lanes]
+
+    run_blocks(work, block.shape[-1])
+    return result
+
+
+def _multiply_gathered(columns: Array, values: Array, block: Array) -> Array:
+    """Functions of the array API standard alone."""
+    xp, (rows, width), frames = namespace(block), columns.shape, block.shape[1]
+    parts = []
+    for piece in split_blocks(rows, max(1, GATHERED_NUMBERS // max(1, width * frames))):
+        gathered = xp.take(block, xp.reshape(columns[piece, :], (-1,)), axis=0)
+        terms = xp.reshape(gathered, (-1, width, frames)) * values[piece, ...]
+        parts.append(xp.sum(terms, axis=1))
+    return xp.concat(parts)
 
 
 class SparseMatrix(LinearOperator):
@@ -147,11 +143,9 @@ class SparseMatrix(LinearOperator):
         if not np.all(np.isfinite(matrix.data)):
             raise InputError("the sparse matrix must be finite")
         # Products wait for memory: half as long an index is a third less to read.
-        short = (
-            matrix.indices.astype(np.int32),
-            matrix.indptr.astype(np.int32 if matrix.nnz < 1 << 31 else np.int64),
-        )
-        self._matrix = type(matrix)((matrix.data, *short), shape=matrix.shape)
+        starts = matrix.indptr.astype(np.int32 if matrix.nnz < 1 << 31 else np.int64)
+        parts = (matrix.data, matrix.indices.astype(np.int32), starts)
+        self._matrix = type(matrix)(parts, shape=matrix.shape)
 
     @cached_property
     def matrix(self) -> scipy.sparse.csr_array:
@@ -159,41 +153,42 @@ class SparseMatrix(LinearOperator):
         return self._matrix
 
     @cached_property
-    def _forward_products(self) -> PerDevice[Product]:
-        return PerDevice(self._make_forward_product)
+    def _products(self) -> tuple[PerDevice[Product], PerDevice[Product]]:
+        """Forward and adjoint. The transpose is a copy: products by rows write each result once,
+        products by columns would scatter.
+        """
+        return PerDevice(self._make_forward), PerDevice(self._make_adjoint)
 
-    @cached_property
-    def _adjoint_products(self) -> PerDevice[Product]:
-        return PerDevice(self._make_adjoint_product)
+    def _make_forward(self, device: ComputeDevice) -> Product:
+        return make_product(self.matrix, device)
 
-    def _make_forward_product(self, device: ComputeDevice) -> Product:
-        return make_product(device, self.matrix)
-
-    def _make_adjoint_product(self, device: ComputeDevice) -> Product:
-        # a transposed copy: products by rows write each result once, products by columns would
-        # scatter
-        return make_product(device, self.matrix.T.tocsr())
+    def _make_adjoint(self, device: ComputeDevice) -> Product:
+        return make_product(self.matrix.T.tocsr(), device)
 
     def _forward(self, block: Array) -> Array:
         if block.shape[-1] == 1 and is_numpy(block):
             return self._forward_single(block[..., 0])[..., np.newaxis]
-        return _apply_product(self._forward_products.get(block), block, self.shape_out)
+        return _apply(self._products[0], block, self.shape_out)
 
     def _adjoint(self, block: Array) -> Array:
         if block.shape[-1] == 1 and is_numpy(block):
             return self._adjoint_single(block[..., 0])[..., np.newaxis]
-        return _apply_product(self._adjoint_products.get(block), block, self.shape_in)
+        return _apply(self._products[1], block, self.shape_in)
 
     def _forward_single(self, picture: Array) -> Array:
-        """Apply to a lone array: there are no neighbouring frames to share a vector instruction
-        with.
-        """
+        """Apply to a lone array: there are no neighbouring frames to share a vector instruction."""
         product: Array = self.matrix @ picture.reshape(-1)
         return product.reshape(self.shape_out)
 
     def _adjoint_single(self, measurements: Array) -> Array:
         product: Array = self.matrix.T @ measurements.reshape(-1)
         return product.reshape(self.shape_in)
+
+
+def _apply(products: PerDevice[Product], block: Array, target: Shape) -> Array:
+    xp = namespace(block)
+    flat = xp.reshape(block, (-1, block.shape[-1]))
+    return xp.reshape(products.get(block)(flat), (*target, -1))
 
 
 class LineProjection(SparseMatrix):
@@ -238,125 +233,24 @@ class LineProjection(SparseMatrix):
         self.gains = np.asarray(gains, dtype=np.float64)
         if not self.centres_px.shape == self.angles.shape == self.gains.shape:
             raise ShapeError("centres, angles and gains", "(views,) each", self.angles.shape)
-        slit, pixel, weight = self._compute_entries(image_shape, slit_width_px)
-        matrix = scipy.sparse.csr_array(
-            (weight.astype(dtype), (slit, pixel)),
-            shape=(slit_width_px, image_shape[0] * image_shape[1]),
-        )
-        super().__init__(matrix, image_shape, (slit_width_px,))
-
-    def _compute_entries(
-        self, image_shape: tuple[int, int], slit_width_px: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Row, column and value of every nonzero."""
         rows, columns = image_shape
         y = (np.arange(rows) - rows // 2)[:, np.newaxis]
-        x = (np.arange(columns) - columns // 2)[np.newaxis, :]
-        # Slit coordinate of a scene point (X, Y) in a view: its centre + X - Y tan(angle), Y
-        # downwards.
-        position = (
-            self.centres_px[:, np.newaxis, np.newaxis]
-            + x
-            - y * np.tan(self.angles)[:, np.newaxis, np.newaxis]
+        x = np.arange(columns) - columns // 2
+        centre, slope = (
+            per_view[:, np.newaxis, np.newaxis]
+            for per_view in (self.centres_px, np.tan(self.angles))
         )
-        entry, slit, weight = split_between_bins(position, slit_width_px)
-        view, pixel = np.divmod(entry, rows * columns)
-        return slit, pixel, self.gains[view] * weight
-
-
-def make_product(device: ComputeDevice, matrix: scipy.sparse.csr_array) -> Product:
-    """Set up the product with `matrix` for the arrays of a device.
-
-    `device`: library and device of the arrays to come. Returns takes (columns, frames) arrays on
-    that device.
-    """
-    return (
-        TiledProduct(matrix) if device.has_compiled_loops else make_portable_product(matrix, device)
-    )
-
-
-def _apply_product(product: Product, block: Array, target: Shape) -> Array:
-    xp = namespace(block)
-    return xp.reshape(product(xp.reshape(block, (-1, block.shape[-1]))), (*target, -1))
-
-
-class TiledProduct:
-    """The product with a CSR matrix on NumPy arrays, by compiled loops on blocks of frames."""
-
-    def __init__(self, matrix: scipy.sparse.csr_array) -> None:
-        self._tiles, self._count = Tiles.from_csr(matrix), matrix.shape[0]
-
-    def __call__(self, block: NDArray[Any]) -> NDArray[Any]:
-        """Multiply a (columns, frames) block."""
-        from tofclip.operators.kernels import multiply_sparse_block
-
-        rows, batch = self._count, block.shape[-1]
-        result = np.empty((rows, batch), block.dtype)
-        if batch == LANES:
-            multiply_sparse_block(*self._tiles, block, result)
-            return result
-
-        def work(piece: slice) -> None:
-            lanes = piece.stop - piece.start
-            # the compiled product takes whole blocks only
-            padded = np.zeros((block.shape[0], LANES), block.dtype)
-            padded[:, :lanes] = block[:, piece]
-            product = np.empty((rows, LANES), block.dtype)
-            multiply_sparse_block(*self._tiles, padded, product)
-            result[:, piece] = product[:, :lanes]
-
-        run_blocks(work, batch)
-        return result
-
-
-class Tiles(NamedTuple):
-    """A CSR matrix cut into groups of neighbouring columns, so that a group's part of the operand
-    stays in cache.
-    """
-
-    # (tiles, rows + 1), where each row's nonzeros begin in the other two, tile by tile
-    starts: NDArray[np.int64]
-    columns: NDArray[np.uint32]  # (nonzeros,)
-    values: NDArray[Any]  # (nonzeros,)
-
-    @classmethod
-    def from_csr(cls, matrix: scipy.sparse.csr_array) -> Tiles:
-        """Sort the nonzeros of `matrix` by tile, then row, then as they stand in the row."""
-        from tofclip.operators.kernels import count_tile_nonzeros, sort_into_tiles
-
-        # as many columns as let their rows of the block stay in cache
-        width = max(1, TILE_BYTES // (LANES * matrix.dtype.itemsize))
-        per_row = np.zeros((-(-matrix.shape[1] // width), matrix.shape[0]), np.int64)
-        count_tile_nonzeros(matrix.indptr, matrix.indices, width, per_row)
-        ends = np.cumsum(per_row).reshape(per_row.shape)
-        starts = np.concatenate([ends - per_row, ends[:, -1:]], axis=1)
-        columns, values = np.empty(matrix.nnz, np.uint32), np.empty(matrix.nnz, matrix.dtype)
-        sort_into_tiles(
-            matrix.indptr,
-            matrix.indices,
-            matrix.data,
-            width,
-            starts[:, :-1].copy(),
-            columns,
-            values,
+        position = centre + x - y * slope
+        left = np.floor(position).astype(np.int64)
+        share = position - left
+        # each pixel's light goes to the two slit pixels nearest to where it falls
+        slit, weight = np.stack([left, left + 1]), np.stack([1.0 - share, share])
+        weight *= self.gains[:, np.newaxis, np.newaxis]
+        # no explicit zeros, which every product would pay for
+        seen = (slit >= 0) & (slit < slit_width_px) & (weight != 0)
+        pixel = np.broadcast_to(np.arange(rows * columns).reshape(image_shape), slit.shape)
+        matrix = scipy.sparse.csr_array(
+            (weight[seen].astype(dtype), (slit[seen], pixel[seen])),
+            shape=(slit_width_px, rows * columns),
         )
-        return cls(starts, columns, values)
-
-
-def split_between_bins(
-    position: NDArray[np.float64], bins: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Share every pixel's light between the two bins nearest to where it falls, by linear
-    interpolation.
-
-    `position` (groups, rows, columns): where each pixel falls among the bins of each group, in
-    bins; `bins`: what falls beyond them is lost. Returns `entry, bin, weight` (nonzeros,): flat
-    index into `position`, the bin, and the fraction of the light that it gets.
-    """
-    left = np.floor(position).astype(np.int64)
-    share = position - left
-    nearest, weight = np.stack([left, left + 1]), np.stack([1.0 - share, share])
-    entry = np.broadcast_to(np.arange(position.size).reshape(position.shape), nearest.shape)
-    # no explicit zeros, which every product would pay for
-    seen = (nearest >= 0) & (nearest < bins) & (weight != 0)
-    return entry[seen], nearest[seen], weight[seen]
+        super().__init__(matrix, image_shape, (slit_width_px,))

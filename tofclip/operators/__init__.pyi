@@ -1,0 +1,28 @@
+# The public names of this package and their homes; they are imported on first use.
+
+from .base import Adjoint as Adjoint
+from .base import BlockDiagonal as BlockDiagonal
+from .base import Composition as Composition
+from .base import Diagonal as Diagonal
+from .base import Identity as Identity
+from .base import Integration as Integration
+from .base import LinearOperator as LinearOperator
+from .base import MeanWeighting as MeanWeighting
+from .base import Reshape as Reshape
+from .base import Stack as Stack
+from .base import ViewSelection as ViewSelection
+from .base import estimate_squared_norm as estimate_squared_norm
+from .codes import DenseSensor as DenseSensor
+from .codes import HadamardCodes as HadamardCodes
+from .codes import MaskedSensor as MaskedSensor
+from .codes import MaskedViews as MaskedViews
+from .codes import PitchedSensor as PitchedSensor
+from .codes import ShearedViews as ShearedViews
+from .codes import WeightedViews as WeightedViews
+from .convolution import PointSpreadConvolution as PointSpreadConvolution
+from .convolution import SliceConvolution as SliceConvolution
+from .radon import RadonProjection as RadonProjection
+from .shear import FourierShear as FourierShear
+from .shear import LinearShear as LinearShear
+from .sparse import LineProjection as LineProjection
+from .sparse import SparseMatrix as SparseMatrix
