@@ -1,7 +1,4 @@
-"""The grid of voxels on which a hidden scene is imaged, and the straight ways that lead to it.
-
-The imaged hidden scene.
-"""
+"""The grid of voxels on which a hidden scene is imaged, and the image."""
 
 from __future__ import annotations
 
@@ -21,7 +18,6 @@ from tofclip.storage import Field, Record
 if TYPE_CHECKING:
     from nlos.capture import Capture
     from nlos.export import Mesh
-    from nlos.plane import VirtualPlane
 
 
 FloatArray = NDArray[np.float64]
@@ -31,15 +27,6 @@ MAX_DEPTH_WALL_WIDTHS = 2.0
 # No computer holds an image of more; the axes themselves would fill its memory before any plan
 # could say so.
 MAX_VOXELS_PER_AXIS = 1 << 20
-# Of the longest way, what a window about wall points holds at least, and how much more for each
-# digit of the tolerance: where the plane stands close to the wall, crossings are wide beside their
-# distance. Measured with noise, which comes by all ways alike; errors of 1e-2 and 1e-3 ask for 0.7
-# and 0.9.
-MIN_WALL_FRACTION, WALL_FRACTION_PER_DIGIT = 0.3, 0.2
-# Of the fade towards the plane's rim, how wide a rim carries too little to be told from an image of
-# it a period away: at most, and how much less for each digit of the tolerance. Measured with noise;
-# none where the error is 1e-3.
-MAX_RIM_FRACTION, RIM_FRACTION, RIM_FRACTION_PER_DIGIT = 0.7, 1.5, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,54 +222,6 @@ def _fill_axis(name: str, side: Sequence[float], voxel: float) -> FloatArray:
             "use larger voxels, and check their unit"
         )
     return (first + last) / 2 + voxel * (np.arange(steps + 1, dtype=np.float64) - steps / 2)
-
-
-@dataclass(frozen=True)
-class StraightWays:
-    """How far across straight ways from wall points to voxels lead, before and behind a virtual plane.
-
-    What the plane carries to a voxel comes from about their crossings: elsewhere the phases of both
-    parts of the way turn, and their sum cancels.
-    """
-
-    wall_to_plane: float  # along the plane, at most, m; with room about the crossings
-    plane_to_voxels: float  # along the plane, at most, m; with room about the crossings
-    # width along y and x of the plane's rim, where little of the field is left, m
-    rim: tuple[float, float]
-    first_depth: float  # z of the nearest voxels, m
-
-    @classmethod
-    def find(
-        cls, points: NDArray[np.float64], plane: VirtualPlane, grid: Grid, tolerance: float
-    ) -> StraightWays | None:
-        """Find the straight ways between wall points and voxels through a plane.
-
-        `points` (n, 3): of the wall, m; `plane`: in front of them; `tolerance`: relative error
-        allowed. Returns none where voxels lie before the plane: no straight way to these crosses
-        it.
-        """
-        first, last = float(grid.z[0]), float(grid.z[-1])
-        if first <= plane.z:
-            return None
-        low, high = points.min(axis=0), points.max(axis=0)
-        longest = np.hypot(
-            max(grid.x[-1] - low[0], high[0] - grid.x[0]),
-            max(grid.y[-1] - low[1], high[1] - grid.y[0]),
-        )
-        # Ways to the nearest voxels from the hindmost points cross the plane latest, those to the
-        # farthest voxels from the foremost points soonest.
-        before = (plane.z - low[2]) / (first - low[2])
-        behind = (last - plane.z) / (last - high[2])
-        room = MIN_WALL_FRACTION + WALL_FRACTION_PER_DIGIT * np.log10(1 / tolerance)
-        rim = RIM_FRACTION + RIM_FRACTION_PER_DIGIT * np.log10(tolerance)
-        rim = np.clip(rim, 0, MAX_RIM_FRACTION)
-        fade_y, fade_x = plane.fade
-        return cls(
-            float(max(before, room) * longest),
-            float(behind * longest),
-            (float(rim * fade_y), float(rim * fade_x)),
-            first,
-        )
 
 
 AXES = ("z", "y", "x")

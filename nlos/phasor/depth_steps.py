@@ -25,8 +25,8 @@ from nlos.phasor.transfer import (
     find_lateral_limits,
     find_min_periods,
 )
-from nlos.plane import Plane, axis_step
-from nlos.volume import Grid, StraightWays
+from nlos.plane import Plane, StraightPaths, axis_step
+from nlos.volume import Grid
 from tofclip.errors import InputError
 from tofclip.threads import split_blocks
 
@@ -200,15 +200,15 @@ class DiffractionPlan:
     strength: FloatArray
     tolerance: float  # relative error allowed
     # the only ones between plane and voxels that carry anything; by default all do
-    ways: StraightWays | None = None
+    paths: StraightPaths | None = None
 
     @cached_property
     def _offsets(self) -> Offsets:
         offsets = Offsets.between(self.plane, self.grid.y, self.grid.x)
         return (
             offsets
-            if self.ways is None
-            else offsets.limit(self.ways.plane_to_voxels, self.ways.rim)
+            if self.paths is None
+            else offsets.limit(self.paths.plane_to_voxels, self.paths.rim)
         )
 
     @cached_property

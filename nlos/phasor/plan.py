@@ -48,8 +48,15 @@ from nlos.phasor.propagate import (
     require_tolerance,
 )
 from nlos.phasor.wall_to_plane import WallBeforePlane
-from nlos.plane import PlanarWall, Plane, WallLattice, choose_virtual_plane, is_evenly_spaced
-from nlos.volume import FloatArray, Grid, StraightWays, Volume
+from nlos.plane import (
+    PlanarWall,
+    Plane,
+    StraightPaths,
+    WallLattice,
+    choose_virtual_plane,
+    is_evenly_spaced,
+)
+from nlos.volume import FloatArray, Grid, Volume
 from tofclip.arrays import Array
 from tofclip.errors import InputError
 
@@ -392,7 +399,7 @@ class PlanarRSD(WaveMethod):
 
 
 # Relative error of the image where one Fresnel zone has room on the virtual plane beside the
-# straight ways; that of n zones is n^3 times less. Measured, for fields that fade as
+# straight paths; that of n zones is n^3 times less. Measured, for fields that fade as
 # `VirtualPlane`'s.
 RIM_ERROR = 0.016
 # Of the error allowed, what the virtual plane's rim, and the way from the wall to it, may take.
@@ -467,9 +474,9 @@ class Hybrid(WaveMethod):
         zones = (RIM_ERROR / (RIM_ERROR_FRACTION * self.tolerance)) ** (1 / 3)
         lattice = WallLattice.find(points)
         plane = choose_virtual_plane(points, grid, waves, zones, self.plane_z, lattice)
-        ways = StraightWays.find(points, plane, grid, self.tolerance)
-        depths = DiffractionPlan(plane, grid, waves, band.strength, self.tolerance, ways)
-        geometry = WallBeforePlane(points, plane, lattice, ways)
+        paths = StraightPaths.find(points, plane, grid, self.tolerance)
+        depths = DiffractionPlan(plane, grid, waves, band.strength, self.tolerance, paths)
+        geometry = WallBeforePlane(points, plane, lattice, paths)
         tolerance = WALL_TO_PLANE_ERROR_FRACTION * self.tolerance
         carry = plan_wall_to_plane(
             capture, geometry, group, band, backend, self.propagation, tolerance

@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 # Transfer functions and illuminations of all depths are kept for the next field if they take no
 # more.
 MAX_CACHE_BYTES = 1 << 30
-# Spectra of the depths that a thread of a solver treats together: few calls, and still in cache;
+# Spectra of the depths that a thread of a solver treats together: few calls, and still in cache.
 SOLVER_BLOCK_BYTES = 2 << 20
 
 

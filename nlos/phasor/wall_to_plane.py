@@ -1,19 +1,15 @@
-"""How waves depend on the depth of the wall point that they come from, as short sums of products.
+"""From a wall in relief to a plane by Fourier transforms: lattices and plane waves, and how waves
+depend on the depth of the wall point that they come from, as short sums of products.
 
-From wall points to the plane waves of a periodic lattice.
-
-What a way from a wall in relief to a plane by Fourier transforms consists of: lattices, plane
-waves, and terms.
-
-From scattered wall points to a plane by Fourier transforms that ask for no lattice.
+A wall whose points stand above a lattice is transformed on it; scattered points by transforms that
+ask for no lattice, if finufft is installed. Where direct sums are faster there is no plan.
 """
 
 from __future__ import annotations
 
 import importlib.util
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +27,7 @@ from nlos.phasor.transfer import (
     find_min_periods,
 )
 from nlos.phasor.wall_kernels import VECTOR_FLOATS
-from nlos.plane import Plane, WallLattice, axis_step
-from nlos.volume import StraightWays
+from nlos.plane import Plane, StraightPaths, WallLattice, axis_step
 from tofclip.threads import run_blocks, split_blocks
 
 if TYPE_CHECKING:
@@ -40,6 +35,8 @@ if TYPE_CHECKING:
 
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+ComplexArray = NDArray[np.complex64]
 
 # Neighbouring frequencies that share their functions of depth.
 FREQUENCIES_PER_GROUP = 6
@@ -52,6 +49,204 @@ MIN_DEPTH_RANGE_M = 1e-5
 CARRIER_FRACTION = 0.4
 # Combinations of depths that hold less than this fraction of the wall points are none.
 EIGENVALUE_CUTOFF = 1e-10
+# Times the shortest period, that a lattice may be longer to suit both wall and plane.
+MAX_PERIOD_RATIO = 1.25
+# Points by which the far end of a plane may be off the lattice.
+WHOLE_PERIOD_TOLERANCE = 1e-3
+# Tolerance down to which Fourier transforms keep it; measured.
+MIN_FOURIER_TOLERANCE = 5e-4
+# Seconds on one core, roughly: for all transfer functions, and per term, lattice place, and term of
+# a direct sum.
+PREPARATION_S, TERM_S, LATTICE_POINT_S, DIRECT_TERM_S = 0.02, 2e-5, 3e-9, 2e-10
+# The same per term for a scattered wall point and for a plane wave of it.
+POINT_S, WAVE_S = 2.5e-8, 9e-9
+# Of the error allowed, what weak plane waves that are left out may hold: most of it passes beside
+# all voxels, or is on the edge of the window. Measured with noise.
+WAVES_ERROR_FRACTION = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class WallBeforePlane:
+    """Points of a wall, and the plane before it that their fields get to."""
+
+    points: FloatArray  # (n, 3), m
+    plane: Plane
+    lattice: WallLattice | None  # that the points stand above; None where there is none
+    # the only ones that the field on the plane is wanted for; by default all of the plane is
+    paths: StraightPaths | None = None
+
+    @classmethod
+    def of(cls, points: FloatArray, plane: Plane) -> WallBeforePlane:
+        """Return any wall before any plane."""
+        return cls(points, plane, WallLattice.find(points))
+
+
+@dataclass(frozen=True, eq=False)
+class WallToPlanePlan:
+    """Tables with which fields get from the points of a wall to a plane by Fourier transforms."""
+
+    geometry: WallBeforePlane
+    # places of the wall's points; of scattered points only where they begin
+    wall: WallLattice
+    tolerance: float  # relative error allowed
+    lattice: tuple[int, int]  # places of the wall in a period along y and x
+    plane_lattice: tuple[float, float]  # points of the plane in a period along y and x
+    steps: tuple[float, float]  # distance of neighbouring plane waves along y and x, rad/m
+    lateral_limits: FloatArray  # (frequencies,), largest that counts at each frequency, rad/m
+    max_indices: tuple[int, int]  # of plane waves along y and x
+    low_rank_transfer: LowRankTransfer  # from all depths
+    # Where waves without negative indices lie among the nodes of the transfer functions: first node
+    # (columns, rows) and the weights (columns, rows, taps) of those from it on.
+    node_interpolation: tuple[IntArray, NDArray[np.float32]]
+
+    @property
+    def plane(self) -> Plane:
+        """Where the field is wanted."""
+        return self.geometry.plane
+
+    def analysis(self, terms: int) -> PlaneWaveAnalysis:
+        """Return what analyses a field on the wall, up to a number of terms at once; not to be
+        shared between threads.
+        """
+        if self.geometry.lattice is not None:
+            return LatticeAnalysis(self.wall, self.lattice, self.max_indices[1], terms)
+        origin, points = (self.wall.x[0], self.wall.y[0]), self.geometry.points
+        along_x, along_y = (self.steps[1 - i] * (points[:, i] - origin[i]) for i in range(2))
+        tall = self.steps[1] / self.steps[0]
+        return ScatteredAnalysis(along_y, along_x, tall, ANALYSIS_ERROR_FRACTION * self.tolerance)
+
+    def max_row_indices(self, frequency: int) -> IntArray:
+        """Return the largest index along y that counts in every column from 0 on."""
+        limit = self.lateral_limits[frequency]
+        across = self.steps[1] * np.arange(int(limit / self.steps[1]) + 1)
+        room = np.sqrt(np.maximum(limit**2 - across**2, 0))
+        return np.asarray(np.minimum(room / self.steps[0], self.max_indices[0]), np.int64)
+
+    def phase_shifts(self) -> tuple[ComplexArray, ComplexArray]:
+        """Return plane waves along y and x at the plane's first point, 0 at the wall's; divided by
+        the lattice's period.
+        """
+        starts = (self.plane.y[0] - self.wall.y[0], self.plane.x[0] - self.wall.x[0])
+        y, x = (
+            step / (2 * np.pi) * np.exp(1j * step * start * np.arange(-reach, reach + 1))
+            for step, start, reach in zip(self.steps, starts, self.max_indices, strict=True)
+        )
+        return y.astype(np.complex64), x.astype(np.complex64)
+
+
+def plan_transforms(
+    geometry: WallBeforePlane,
+    waves: SphericalWaves,
+    strength: FloatArray,
+    tolerance: float,
+    scattered: bool = False,
+) -> WallToPlanePlan | None:
+    """Plan the way from wall points to a plane by Fourier transforms; None where direct sums are
+    faster, or needed.
+
+    `strength` (frequencies,): relative amplitude of each frequency, decides what may be neglected;
+    `tolerance`: relative error allowed; `scattered`: whether points may stand above no lattice.
+    """
+    points, plane, paths = geometry.points, geometry.plane, geometry.paths
+    wall = geometry.lattice
+    if wall is None and scattered:
+        wall = _cover_with_lattice(points, plane)
+    if wall is None:
+        return None
+    offsets = Offsets.between(Plane(wall.x, wall.y, 0.0), plane.y, plane.x)
+    if paths is not None:
+        offsets = offsets.limit(paths.wall_to_plane, paths.rim)
+    (high, tall), (wide, broad) = (
+        find_common_period(side, axis_step(own), axis_step(other), other.size)
+        for side, own, other in zip(
+            find_min_periods(offsets, tolerance),
+            (wall.y, wall.x),
+            (plane.y, plane.x),
+            strict=True,
+        )
+    )
+    periods = high * axis_step(wall.y), wide * axis_step(wall.x)
+    steps = 2 * np.pi / periods[0], 2 * np.pi / periods[1]
+    window = Window.within(offsets, periods, tolerance)
+    # what fades before the nearest voxels is not wanted on the plane either
+    first = plane.z if paths is None else paths.first_depth
+    ahead = first - float(points[:, 2].max())
+    limits = find_lateral_limits(waves, window, strength, ahead, WAVES_ERROR_FRACTION * tolerance)
+    rows, columns = (int(limits[-1] / step) for step in steps)
+    seconds = TERM_S + LATTICE_POINT_S * high * wide
+    if geometry.lattice is None:
+        seconds = TERM_S + POINT_S * len(points) + WAVE_S * 4 * rows * columns
+    if not is_faster_than_direct(geometry, waves, tolerance, seconds):
+        return None
+    distances = plane.z - points[:, 2]
+    finest = max(float(distances.min()), axis_step(wall.x) / 2)
+    transfer = TransferFunction(waves, window, float(limits[-1]), finest)
+    lateral = np.hypot(
+        steps[1] * np.arange(columns + 1)[:, np.newaxis], steps[0] * np.arange(rows + 1)
+    )
+    # The corners beyond the limit are not looked at; the table ends before them.
+    node, weight = transfer.interpolation(np.minimum(lateral, limits[-1]).ravel())
+    return WallToPlanePlan(
+        geometry,
+        wall,
+        tolerance,
+        (high, wide),
+        (tall, broad),
+        steps,
+        limits,
+        (rows, columns),
+        LowRankTransfer.of(transfer, distances, limits, strength, tolerance),
+        (node.reshape(lateral.shape), weight.reshape(*lateral.shape, -1)),
+    )
+
+
+def is_faster_than_direct(
+    geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float, seconds_per_term: float
+) -> bool:
+    """Whether Fourier transforms lead to the plane faster than a direct sum, and within the
+    tolerance.
+    """
+    relief = float(np.ptp(geometry.points[:, 2]))
+    terms = 4 + (waves.first + waves.max_wavenumber) / 2 * relief / (2 * np.pi)
+    layers = PREPARATION_S + waves.count * terms * seconds_per_term
+    direct = DIRECT_TERM_S * waves.count * len(geometry.points) * np.prod(geometry.plane.shape)
+    return tolerance >= MIN_FOURIER_TOLERANCE and bool(layers < direct)
+
+
+def has_finufft() -> bool:
+    """Whether the library for scattered points, finufft, is installed."""
+    return importlib.util.find_spec("finufft") is not None
+
+
+def _cover_with_lattice(points: FloatArray, plane: Plane) -> WallLattice:
+    """A lattice in the steps of the plane that reaches as far as scattered points, none of which
+    need stand on it.
+    """
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    counts = np.maximum(2, np.ceil((high - low) / plane.steps[::-1]).astype(int) + 1)
+    x, y = (low[i] + plane.steps[1 - i] * np.arange(counts[i]) for i in range(2))
+    nowhere = np.zeros(0, np.intp)
+    return WallLattice(x, y, nowhere, nowhere)
+
+
+def find_common_period(side: float, wall: float, plane: float, count: int) -> tuple[int, float]:
+    """Return a period of at least `side` in steps of the wall and in steps of the plane.
+
+    Whole numbers of both if there are such, so that Fourier transforms lead there and back; else of
+    the wall's.
+
+    `side`: shortest period, m; `wall, plane`: steps, m; `count`: steps of the plane over which the
+    misfit adds up. Returns `length`: steps of the wall, of a length that Fourier transforms like;
+    `places`: steps of the plane.
+    """
+    shortest = find_fast_length(side / wall)
+    length = shortest
+    while length * wall <= MAX_PERIOD_RATIO * side:
+        places = length * wall / plane
+        if abs(places - round(places)) * count < WHOLE_PERIOD_TOLERANCE * places:
+            return length, float(round(places))
+        length = find_fast_length(length + 1)
+    return shortest, shortest * wall / plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +256,7 @@ class LowRankTerms:
     # (frequencies, nodes, n), at the nodes of the transfer functions: all real, then all imaginary
     # parts, then 0
     wave_factors: NDArray[np.float32]
-    point_factors: NDArray[np.complex64]  # (m, points)
+    point_factors: ComplexArray  # (m, points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,148 +265,114 @@ class LowRankTransfer:
 
     They are known at Chebyshev nodes of the distance. The fewest products that make them up at the
     distances that occur, weighted as they occur, come from an eigenvalue problem per group of
-    frequencies: about one for each half turn that the waves differ by over the relief, and one for
+    frequencies: about one for each half cycle that the waves differ by over the relief, and one for
     each piece of a wall of flat pieces.
     """
 
-    transfer: TransferFunction
-    distances: FloatArray  # (points,), along z, m
-    # (frequencies,), largest lateral wavenumber that counts at each frequency, rad/m
-    lateral_limits: FloatArray
-    # (frequencies,), how strong the field is at each frequency; decides what may be neglected
-    strength: FloatArray
-    tolerance: float  # relative error allowed
+    groups: list[slice]  # frequencies that are treated together
+    # (n, nodes, frequencies), as combinations of functions of distance that are orthonormal over
+    # the wall's points
+    table: ComplexArray
+    at_points: ComplexArray  # (n, points), these functions
+    combinations: list[ComplexArray]  # (n, m) of every group, of what has to be kept
 
-    @cached_property
-    def groups(self) -> list[slice]:
-        """Frequencies that are treated together."""
-        return list(split_blocks(self.lateral_limits.size, FREQUENCIES_PER_GROUP))
-
-    @cached_property
-    def _distance_span(self) -> tuple[float, float]:
-        """Middle and half the extent of the distances, m."""
-        low, high = float(self.distances.min()), float(self.distances.max())
-        return (low + high) / 2, (high - low) / 2
-
-    @cached_property
-    def nodes(self) -> FloatArray:
-        """Distances at which the transfer functions are sampled, m."""
-        middle, half = self._distance_span
-        if half < MIN_DEPTH_RANGE_M:
-            return np.array([middle])
-        count = count_nodes(
-            self.transfer.waves.wavenumbers,
-            self.strength,
-            middle,
-            half,
-            INTERPOLATION_ERROR_FRACTION * self.tolerance,
+    @classmethod
+    def of(
+        cls,
+        transfer: TransferFunction,
+        distances: FloatArray,
+        lateral_limits: FloatArray,
+        strength: FloatArray,
+        tolerance: float,
+    ) -> LowRankTransfer:
+        """Split the transfer functions from wall points at some distances (points,) along z, m."""
+        groups = list(split_blocks(lateral_limits.size, FREQUENCIES_PER_GROUP))
+        error = INTERPOLATION_ERROR_FRACTION * tolerance
+        nodes, from_nodes, at_points = _find_distance_basis(
+            transfer.waves, distances, strength, error
         )
-        # Chebyshev nodes: interpolation between them is close to the best polynomial's
-        return middle + half * np.cos(np.pi * (np.arange(count) + 0.5) / count)
+        samples = np.empty((nodes.size, transfer.nodes.size, lateral_limits.size), np.complex64)
+        transfer.tabulate()
 
-    @property
-    def _carrier_wavenumber(self) -> float:
-        """Wavenumber along z that is taken out of all waves, rad/m; they have 0 to their own."""
-        return CARRIER_FRACTION * self.transfer.waves.max_wavenumber
-
-    @cached_property
-    def _distance_basis(self) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-        """Functions of distance, orthonormal over the wall's points: from nodes (nodes, n), and at
-        points (n, points).
-
-        A wall of few depths has few.
-        """
-        middle, half = self._distance_span
-        count = self.nodes.size
-        places = (self.distances - middle) / max(half, MIN_DEPTH_RANGE_M)
-        at_nodes = np.cos(np.outer(np.arange(count), np.pi * (np.arange(count) + 0.5) / count)) * (
-            2 / count
-        )
-        at_nodes[0] /= 2
-        # Lagrange polynomials of the nodes, at the points' distances
-        weights = np.polynomial.chebyshev.chebvander(places, count - 1) @ at_nodes
-        # orthogonal combinations: distances where no point lies get no term of their own
-        values, vectors = np.linalg.eigh(weights.T @ weights / len(weights))
-        kept = values > EIGENVALUE_CUTOFF * values[-1]
-        root = np.sqrt(values[kept])
-        # a carrier wave is taken off, so that less phase is left to interpolate
-        from_nodes = (
-            vectors[:, kept]
-            * root
-            * np.exp(-1j * self._carrier_wavenumber * self.nodes)[:, np.newaxis]
-        )
-        at_points = np.ascontiguousarray((weights @ (vectors[:, kept] / root)).T, np.float32)
-        carrier = np.exp(1j * self._carrier_wavenumber * self.distances).astype(np.complex64)
-        return from_nodes.astype(np.complex64), at_points * carrier
-
-    @cached_property
-    def _transfer_table(self) -> NDArray[np.complex64]:
-        """Transfer functions as combinations of `_distance_basis`, shape (n, nodes, frequencies)."""
-        samples = np.empty(
-            (self.nodes.size, self.transfer.nodes.size, self.lateral_limits.size), np.complex64
-        )
-        # computed once here, before threads ask for it
-        _ = self.transfer.bessel_matrix
-
-        def sample(some: slice) -> None:
-            for i in range(some.start, some.stop):
-                parts = self.transfer.evaluate(float(self.nodes[i]), np.zeros(2))
+        def sample(block: slice) -> None:
+            for i in range(block.start, block.stop):
+                parts = transfer.evaluate(float(nodes[i]), np.zeros(2))
                 samples[i].real, samples[i].imag = parts[:, 0], parts[:, 1]
 
         run_blocks(sample, len(samples), size=1)
-        flat = self._distance_basis[0].T @ samples.reshape(len(samples), -1)
-        table: NDArray[np.complex64] = flat.reshape(-1, *samples.shape[1:])
-        return table
+        flat = from_nodes.T @ samples.reshape(len(samples), -1)
+        table: ComplexArray = flat.reshape(-1, *samples.shape[1:])
+        # Energies need no nodes so close. A ring of lateral wavenumbers holds waves in proportion
+        # to its radius.
+        every = int(NODE_OVERSAMPLING)
+        lateral = np.maximum(transfer.nodes[::every], 0)[:, np.newaxis]
+        weights = np.sqrt(lateral * (lateral <= lateral_limits)) * strength
+        coarse, weights = table[:, ::every], weights.astype(np.float32)
+        energies = [(np.empty(0), np.empty((0, 0), np.complex64))] * len(groups)
 
-    def _compute_energies(self, group: slice) -> tuple[FloatArray, NDArray[np.complex64]]:
-        """Energies, increasing, and combinations of `_distance_basis` (n, n) that carry them."""
-        # The nodes are closer than energies need.
-        lateral = np.maximum(self.transfer.nodes[:: int(NODE_OVERSAMPLING)], 0)[:, np.newaxis]
-        # a ring of lateral wavenumbers holds waves in proportion to its radius
-        weights = np.sqrt(lateral * (lateral <= self.lateral_limits[group])) * self.strength[group]
-        weighted = self._transfer_table[:, :: int(NODE_OVERSAMPLING), group] * weights.astype(
-            np.float32
-        )
-        flat = weighted.reshape(len(weighted), -1)
-        values, vectors = np.linalg.eigh(flat.conj() @ flat.T)
-        return np.maximum(values, 0).astype(np.float64), vectors
+        def decompose(block: slice) -> None:
+            for i in range(block.start, block.stop):
+                weighted = coarse[..., groups[i]] * weights[:, groups[i]]
+                flat = weighted.reshape(len(weighted), -1)
+                values, vectors = np.linalg.eigh(flat.conj() @ flat.T)
+                energies[i] = np.maximum(values, 0).astype(np.float64), vectors
 
-    @cached_property
-    def _leading_combinations(self) -> list[NDArray[np.complex64]]:
-        """Combinations (n, m) of every group that have to be kept."""
-        energies = [(np.empty(0), np.empty((0, 0), np.complex64))] * len(self.groups)
-        _ = self._transfer_table
-
-        def decompose(some: slice) -> None:
-            for i in range(some.start, some.stop):
-                energies[i] = self._compute_energies(self.groups[i])
-
-        run_blocks(decompose, len(self.groups), size=1)
-        every = np.sort(np.concatenate([values for values, _ in energies]))
-        allowed = (TERMS_ERROR_FRACTION * self.tolerance) ** 2 * every.sum()
+        run_blocks(decompose, len(groups), size=1)
+        ordered = np.sort(np.concatenate([values for values, _ in energies]))
+        allowed = (TERMS_ERROR_FRACTION * tolerance) ** 2 * ordered.sum()
         # the weakest term kept: all below it hold the allowed energy, over all groups together
-        weakest = every[np.searchsorted(np.cumsum(every), allowed)]
-        return [vectors[:, values >= min(weakest, values[-1])] for values, vectors in energies]
+        weakest = ordered[np.searchsorted(np.cumsum(ordered), allowed)]
+        kept = [vectors[:, values >= min(weakest, values[-1])] for values, vectors in energies]
+        return cls(groups, table, at_points, kept)
 
     @property
     def term_counts(self) -> list[int]:
         """Number of terms of every group."""
-        return [vectors.shape[1] for vectors in self._leading_combinations]
+        return [vectors.shape[1] for vectors in self.combinations]
 
     def terms(self, number: int) -> LowRankTerms:
         """Return the terms of one group."""
-        kept, table = (
-            self._leading_combinations[number],
-            self._transfer_table[..., self.groups[number]],
-        )
+        kept, table = self.combinations[number], self.table[..., self.groups[number]]
         terms = kept.shape[1]
         wave_factors = (kept.T @ table.reshape(len(table), -1)).reshape(terms, *table.shape[1:]).T
         # Padded to whole vectors.
-        parts = np.zeros(
-            (*wave_factors.shape[:-1], -(-2 * terms // VECTOR_FLOATS) * VECTOR_FLOATS), np.float32
-        )
+        padded = -(-2 * terms // VECTOR_FLOATS) * VECTOR_FLOATS
+        parts = np.zeros((*wave_factors.shape[:-1], padded), np.float32)
         parts[..., :terms], parts[..., terms : 2 * terms] = wave_factors.real, wave_factors.imag
-        return LowRankTerms(parts, kept.conj().T @ self._distance_basis[1])
+        return LowRankTerms(parts, kept.conj().T @ self.at_points)
+
+
+def _find_distance_basis(
+    waves: SphericalWaves, distances: FloatArray, strength: FloatArray, error: float
+) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+    """Distances at which waves are sampled (nodes,), m, and functions of distance, orthonormal over
+    the wall's points: from these (nodes, n), and at points (n, points). A wall of few depths has
+    few.
+    """
+    low, high = float(distances.min()), float(distances.max())
+    middle, half = (low + high) / 2, (high - low) / 2
+    nodes = np.array([middle])
+    if half >= MIN_DEPTH_RANGE_M:
+        count = count_nodes(waves.wavenumbers, strength, middle, half, error)
+        # Chebyshev nodes: interpolation between them is close to the best polynomial's
+        nodes = middle + half * np.cos(np.pi * (np.arange(count) + 0.5) / count)
+    count = nodes.size
+    at_nodes = np.cos(np.outer(np.arange(count), np.pi * (np.arange(count) + 0.5) / count))
+    at_nodes *= 2 / count
+    at_nodes[0] /= 2
+    # Lagrange polynomials of the nodes, at the points' distances
+    positions = (distances - middle) / max(half, MIN_DEPTH_RANGE_M)
+    weights = np.polynomial.chebyshev.chebvander(positions, count - 1) @ at_nodes
+    # orthogonal combinations: distances where no point lies get no term of their own
+    values, vectors = np.linalg.eigh(weights.T @ weights / len(weights))
+    kept = values > EIGENVALUE_CUTOFF * values[-1]
+    root = np.sqrt(values[kept])
+    # a carrier wave is taken off, so that less phase is left to interpolate
+    carrier = CARRIER_FRACTION * waves.max_wavenumber
+    from_nodes = vectors[:, kept] * root * np.exp(-1j * carrier * nodes)[:, np.newaxis]
+    at_points = np.ascontiguousarray((weights @ (vectors[:, kept] / root)).T, np.float32)
+    turned = at_points * np.exp(1j * carrier * distances).astype(np.complex64)
+    return nodes, from_nodes.astype(np.complex64), turned
 
 
 def count_nodes(
@@ -222,9 +383,7 @@ def count_nodes(
     Enough for the phase, which runs through ``k * half`` about its middle (Jacobi-Anger expansion),
     and for the fall with distance, which is singular at distance 0.
 
-    `wavenumbers` (frequencies,): rad/m, ascending; `strength` (frequencies,): relative amplitude of
-    each frequency; `middle, half`: middle and half width of the range of distances, m; `error`:
-    relative.
+    `middle, half`: middle and half width of the range of distances, m; `error`: relative.
     """
     from scipy.special import jv
 
@@ -245,21 +404,6 @@ def count_nodes(
 
 # Columns from one plan for Fourier transforms to the next.
 COLUMN_STEP = 8
-
-
-class PlaneWaveAnalysis(Protocol):
-    """Sums ``sum_p values(p) * exp(-1j * q r_p)`` of several terms, on one thread."""
-
-    def spectra(
-        self, values: NDArray[np.complex64], weights: NDArray[np.complex64], reach: int
-    ) -> NDArray[np.complex64]:
-        """Analyse ``values * weights[m]`` up to an index along x, (terms, columns, rows); see
-        `LatticeAnalysis`.
-
-        `values` (points,); `weights` (terms, points); `reach`: largest index along x. Returns
-        (terms, columns, rows).
-        """
-        ...
 
 
 class LatticeAnalysis:
@@ -296,9 +440,8 @@ class LatticeAnalysis:
     def spectra(
         self, values: NDArray[np.complex64], weights: NDArray[np.complex64], reach: int
     ) -> NDArray[np.complex64]:
-        """Analyse ``values * weights[m]`` up to an index along x.
-
-        Arguments and result are those of `PlaneWaveAnalysis.spectra`.
+        """Analyse ``values * weights[m]``, values (points,) and weights (terms, points), up to an
+        index along x; (terms, columns, rows), both in the order of Fourier transforms.
         """
         columns, (rows, wide) = self._count_columns(reach), self._lines.shape
         ends = (
@@ -343,315 +486,12 @@ class LatticeAnalysis:
         return self._along_y[columns]
 
 
-IntArray = NDArray[np.int64]
-
-# Times the shortest period, that a lattice may be longer to suit both wall and plane.
-MAX_PERIOD_RATIO = 1.25
-# Points by which the far end of a plane may be off the lattice.
-WHOLE_PERIOD_TOLERANCE = 1e-3
-# Tolerance down to which Fourier transforms keep it; measured.
-MIN_FOURIER_TOLERANCE = 5e-4
-# Seconds on one core, roughly: for all transfer functions, and per term, lattice place, and term of
-# a direct sum.
-PREPARATION_S, TERM_S, LATTICE_POINT_S, DIRECT_TERM_S = 0.02, 2e-5, 3e-9, 2e-10
-# Of the error allowed, what weak plane waves that are left out may hold: most of it passes beside
-# all voxels, or is on the edge of the window. Measured with noise.
-WAVES_ERROR_FRACTION = 2.0
-
-
-@dataclass(frozen=True, eq=False)
-class WallBeforePlane:
-    """Points of a wall, and the plane before it that their fields get to."""
-
-    points: FloatArray  # (n, 3), m
-    plane: Plane
-    lattice: WallLattice | None  # that the points stand above; None where there is none
-    # the only ones that the field on the plane is wanted for; by default all of the plane is
-    ways: StraightWays | None = None
-
-    @classmethod
-    def of(cls, points: FloatArray, plane: Plane) -> WallBeforePlane:
-        """Return any wall before any plane."""
-        return cls(points, plane, WallLattice.find(points))
-
-
-@dataclass(frozen=True, eq=False)
-class WallToPlanePlan:
-    """How fields get from the points of a wall to a plane before it."""
-
-    geometry: WallBeforePlane
-    wall: WallLattice  # places of the wall's points
-    waves: SphericalWaves
-    # (frequencies,), how strong the field is at each frequency; decides what may be neglected
-    strength: FloatArray
-    tolerance: float  # relative error allowed
-
-    @classmethod
-    def of(
-        cls,
-        geometry: WallBeforePlane,
-        waves: SphericalWaves,
-        strength: FloatArray,
-        tolerance: float,
-    ) -> WallToPlanePlan | None:
-        """Return the plan for wall points, or None if they stand above no lattice.
-
-        `strength` (frequencies,): relative amplitude of each frequency; `tolerance`: relative
-        error.
-        """
-        wall = geometry.lattice
-        return None if wall is None else cls(geometry, wall, waves, strength, tolerance)
-
-    @property
-    def points(self) -> FloatArray:
-        """Of the wall (n, 3), m."""
-        return self.geometry.points
-
-    @property
-    def plane(self) -> Plane:
-        """Where the field is wanted."""
-        return self.geometry.plane
-
-    @cached_property
-    def is_faster_than_direct(self) -> bool:
-        """Whether Fourier transforms lead to the plane faster than a direct sum, and within the
-        tolerance.
-        """
-        relief = float(np.ptp(self._plane_distances))
-        terms = 4 + (self.waves.first + self.waves.max_wavenumber) / 2 * relief / (2 * np.pi)
-        layers = PREPARATION_S + self.waves.count * terms * self.seconds_per_term
-        direct = DIRECT_TERM_S * self.waves.count * len(self.points) * np.prod(self.plane.shape)
-        return self.tolerance >= MIN_FOURIER_TOLERANCE and bool(layers < direct)
-
-    @property
-    def seconds_per_term(self) -> float:
-        """Roughly, on one core."""
-        return TERM_S + LATTICE_POINT_S * float(np.prod(self.lattice))
-
-    def analysis(self, terms: int) -> PlaneWaveAnalysis:
-        """Return what analyses a field on the wall, up to a number of terms at once; not to be
-        shared between threads.
-        """
-        return LatticeAnalysis(self.wall, self.lattice, self.max_indices[1], terms)
-
-    @cached_property
-    def _plane_distances(self) -> FloatArray:
-        distances: FloatArray = self.plane.z - self.points[:, 2]
-        return distances
-
-    @cached_property
-    def _offsets(self) -> Offsets:
-        wall, ways = Plane(self.wall.x, self.wall.y, 0.0), self.geometry.ways
-        offsets = Offsets.between(wall, self.plane.y, self.plane.x)
-        return offsets if ways is None else offsets.limit(ways.wall_to_plane, ways.rim)
-
-    @cached_property
-    def _lattices(self) -> tuple[tuple[int, float], tuple[int, float]]:
-        """Places of the wall and of the plane in a period along y, and along x."""
-        y, x = (
-            find_common_period(side, axis_step(wall), axis_step(plane), plane.size)
-            for side, wall, plane in zip(
-                find_min_periods(self._offsets, self.tolerance),
-                (self.wall.y, self.wall.x),
-                (self.plane.y, self.plane.x),
-                strict=True,
-            )
-        )
-        return y, x
-
-    @cached_property
-    def lattice(self) -> tuple[int, int]:
-        """Places of the wall in a period along y and x."""
-        return self._lattices[0][0], self._lattices[1][0]
-
-    @cached_property
-    def plane_lattice(self) -> tuple[float, float]:
-        """Points of the plane in a period along y and x."""
-        return self._lattices[0][1], self._lattices[1][1]
-
-    @cached_property
-    def steps(self) -> tuple[float, float]:
-        """Distance of neighbouring plane waves along y and x, rad/m."""
-        y, x = (
-            2 * np.pi / (count * axis_step(axis))
-            for count, axis in zip(self.lattice, (self.wall.y, self.wall.x), strict=True)
-        )
-        return y, x
-
-    @cached_property
-    def _window(self) -> Window:
-        y, x = (2 * np.pi / spacing for spacing in self.steps)
-        return Window.within(self._offsets, (y, x), self.tolerance)
-
-    @cached_property
-    def lateral_limits(self) -> FloatArray:
-        """Largest lateral wavenumber that counts at each frequency, rad/m."""
-        ways = self.geometry.ways
-        # what fades before the nearest voxels is not wanted on the plane either
-        first = self.plane.z if ways is None else ways.first_depth
-        return find_lateral_limits(
-            self.waves,
-            self._window,
-            self.strength,
-            first - float(self.points[:, 2].max()),
-            WAVES_ERROR_FRACTION * self.tolerance,
-        )
-
-    @cached_property
-    def max_indices(self) -> tuple[int, int]:
-        """Largest indices of plane waves along y and x."""
-        y, x = (int(self.lateral_limits[-1] / spacing) for spacing in self.steps)
-        return y, x
-
-    @cached_property
-    def low_rank_transfer(self) -> LowRankTransfer:
-        """The transfer functions from all depths."""
-        finest = max(float(self._plane_distances.min()), axis_step(self.wall.x) / 2)
-        transfer = TransferFunction(
-            self.waves, self._window, float(self.lateral_limits[-1]), finest
-        )
-        return LowRankTransfer(
-            transfer, self._plane_distances, self.lateral_limits, self.strength, self.tolerance
-        )
-
-    def max_row_indices(self, frequency: int) -> IntArray:
-        """Largest index along y that counts in every column from 0 on."""
-        columns = int(self.lateral_limits[frequency] / self.steps[1]) + 1
-        rows: IntArray = self._max_row_indices[frequency, :columns]
-        return rows
-
-    @cached_property
-    def _max_row_indices(self) -> IntArray:
-        """Largest index along y that counts, (frequencies, columns)."""
-        across = self.steps[1] * np.arange(self.max_indices[1] + 1)
-        room = np.sqrt(np.maximum(self.lateral_limits[:, np.newaxis] ** 2 - across**2, 0))
-        rows: IntArray = np.minimum(room / self.steps[0], self.max_indices[0]).astype(np.int64)
-        return rows
-
-    @cached_property
-    def node_interpolation(self) -> tuple[IntArray, NDArray[np.float32]]:
-        """Where waves without negative indices lie among the nodes of the transfer functions.
-
-        First node (columns, rows) and the weights (columns, rows, taps) of those from it on.
-        """
-        y, x = (
-            spacing * np.arange(reach + 1)
-            for spacing, reach in zip(self.steps, self.max_indices, strict=True)
-        )
-        lateral = np.hypot(x[:, np.newaxis], y)
-        # The corners beyond the limit are not looked at; the table ends before them.
-        node, weight = self.low_rank_transfer.transfer.interpolation(
-            np.minimum(lateral, self.lateral_limits[-1]).ravel()
-        )
-        return node.reshape(lateral.shape), weight.reshape(*lateral.shape, -1)
-
-    @cached_property
-    def phase_shifts(self) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-        """Plane waves along y and x at the plane's first point, 0 at the wall's; divided by the
-        lattice's period.
-        """
-        y, x = (
-            (
-                spacing
-                / (2 * np.pi)
-                * np.exp(1j * spacing * (plane[0] - wall[0]) * np.arange(-reach, reach + 1))
-            ).astype(np.complex64)
-            for spacing, plane, wall, reach in zip(
-                self.steps,
-                (self.plane.y, self.plane.x),
-                (self.wall.y, self.wall.x),
-                self.max_indices,
-                strict=True,
-            )
-        )
-        return y, x
-
-
-def find_common_period(side: float, wall: float, plane: float, count: int) -> tuple[int, float]:
-    """Return a period of at least `side` in steps of the wall and in steps of the plane.
-
-    Whole numbers of both if there are such, so that Fourier transforms lead there and back; else of
-    the wall's.
-
-    `side`: shortest period, m; `wall, plane`: steps, m; `count`: steps of the plane over which the
-    misfit adds up. Returns `length`: steps of the wall, of a length that Fourier transforms like;
-    `places`: steps of the plane.
-    """
-    shortest = find_fast_length(side / wall)
-    length = shortest
-    while length * wall <= MAX_PERIOD_RATIO * side:
-        places = length * wall / plane
-        if abs(places - round(places)) * count < WHOLE_PERIOD_TOLERANCE * places:
-            return length, float(round(places))
-        length = find_fast_length(length + 1)
-    return shortest, shortest * wall / plane
-
-
 # Of the error allowed, what the transforms of scattered points may take.
 ANALYSIS_ERROR_FRACTION = 0.1
 # Of the transforms' own grids; half as slow as the usual 2 for as few points as walls have.
 UPSAMPLING = 1.25
 # Indices along an axis from one plan to the next: a plan serves several frequencies.
 INDEX_STEP = 8
-# Seconds on one core per term, roughly, for a wall point and for a plane wave.
-POINT_S, WAVE_S = 2.5e-8, 9e-9
-
-
-def has_finufft() -> bool:
-    """Whether the library for them, finufft, is installed."""
-    return importlib.util.find_spec("finufft") is not None
-
-
-class ScatteredWallToPlanePlan(WallToPlanePlan):
-    """How fields get from scattered points to a plane: as from a lattice, but for the first step.
-
-    Parameters are those of `WallToPlanePlan`; no point need stand on the lattice `wall`, which only
-    says where they begin and how long a period is.
-    """
-
-    @classmethod
-    def of(
-        cls,
-        geometry: WallBeforePlane,
-        waves: SphericalWaves,
-        strength: FloatArray,
-        tolerance: float,
-    ) -> WallToPlanePlan:
-        """Return the plan for any wall points, in the steps of the plane.
-
-        `strength` (frequencies,): relative amplitude of each frequency; `tolerance`: relative
-        error.
-        """
-        points, plane = geometry.points, geometry.plane
-        x, y = (
-            low + step * np.arange(max(2, int(np.ceil((high - low) / step)) + 1))
-            for low, high, step in zip(
-                points[:, :2].min(axis=0), points[:, :2].max(axis=0), plane.steps[::-1], strict=True
-            )
-        )
-        nowhere = np.zeros(0, np.intp)
-        return cls(geometry, WallLattice(x, y, nowhere, nowhere), waves, strength, tolerance)
-
-    @property
-    def seconds_per_term(self) -> float:
-        """Roughly, on one core."""
-        y, x = self.max_indices
-        return TERM_S + POINT_S * len(self.points) + WAVE_S * 4 * y * x
-
-    def analysis(self, terms: int) -> ScatteredAnalysis:
-        """Return what analyses a field on the wall; not to be shared between threads."""
-        along_y, along_x = (
-            spacing * (self.points[:, axis] - start)
-            for spacing, axis, start in zip(
-                self.steps, (1, 0), (self.wall.y[0], self.wall.x[0]), strict=True
-            )
-        )
-        return ScatteredAnalysis(
-            along_y,
-            along_x,
-            self.steps[1] / self.steps[0],
-            ANALYSIS_ERROR_FRACTION * self.tolerance,
-        )
 
 
 class ScatteredAnalysis:
@@ -679,11 +519,7 @@ class ScatteredAnalysis:
     def spectra(
         self, values: NDArray[np.complex64], weights: NDArray[np.complex64], reach: int
     ) -> NDArray[np.complex64]:
-        """Analyse ``values * weights[m]`` up to an index along x.
-
-        `values` (points,); `weights` (terms, points). Returns (terms, columns, rows): columns and
-        rows in the order of Fourier transforms, first 0 and last -1.
-        """
+        """Analyse ``values * weights[m]`` up to an index along x; see `LatticeAnalysis.spectra`."""
         # whole steps, so that neighbouring frequencies share a plan
         sizes = (
             2 * INDEX_STEP * (int(largest) // INDEX_STEP + 1)
@@ -711,3 +547,6 @@ class ScatteredAnalysis:
             # Frequencies come in order: only the latest plan will be asked for again.
             self._plans = {(terms, columns, rows): plan}
         return self._plans[terms, columns, rows]
+
+
+PlaneWaveAnalysis = LatticeAnalysis | ScatteredAnalysis

@@ -1,9 +1,10 @@
-"""From a wall to a plane at the band's frequencies, on the arrays of any library."""
+"""From a wall to a plane at the band's frequencies, on the arrays of any library: the counterpart of
+`nlos.phasor.wall_to_plane_compiled`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +14,14 @@ from nlos.phasor.arrays import ArrayLibrary, arrange_on_lattice
 from nlos.phasor.to_depths_kernels import TAPS
 from nlos.phasor.transfer import SphericalWaves
 from nlos.phasor.wall_kernels import MIN_DISTANCE_M
-from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan
+from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, plan_transforms
 from nlos.phasor.wall_to_plane_compiled import STRENGTH_POINTS, estimate_strength
 from nlos.plane import Plane
 from tofclip.arrays import Array, to_numpy
 from tofclip.threads import split_blocks
 
-FloatArray = NDArray[np.float64]
+Propagator = Callable[[Array], Array]
+"""From phasors (n, frequencies) to the field (y, x, frequencies), complex64."""
 
 
 class PortablePropagation:
@@ -46,161 +48,101 @@ class PortablePropagation:
     ) -> None:
         self.geometry, self.waves, self.tolerance = geometry, waves, tolerance
         self.library = library
-        self._propagator: _LowRankPropagator | _DirectPropagator | None = None
+        self._propagate: Propagator | None = None
 
     def field(self, phasors: Array, progress: Progress = ignore_progress) -> Array:
-        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64.
-
-        Progress counts points of the plane times frequencies, all at once.
-
-        `phasors` (n, frequencies). Returns (y, x, frequencies).
+        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64;
+        progress counts its values, all at once.
         """
-        if self._propagator is None:
-            self._propagator = self._choose_propagator(phasors)
-        field = self._propagator.field(phasors)
+        if self._propagate is None:
+            self._propagate = self._choose_propagator(phasors)
+        field = self._propagate(phasors)
         progress(field.shape[0] * field.shape[1] * field.shape[2])
         return field
 
-    def _choose_propagator(self, phasors: Array) -> _LowRankPropagator | _DirectPropagator:
+    def _choose_propagator(self, phasors: Array) -> Propagator:
         some = np.arange(0, phasors.shape[0], phasors.shape[0] // STRENGTH_POINTS + 1)
         sample = to_numpy(self.library.xp.take(phasors, self.library.put(some), axis=0))
-        plan = WallToPlanePlan.of(
-            self.geometry, self.waves, estimate_strength(sample), self.tolerance
-        )
-        if plan is not None and plan.is_faster_than_direct:
-            return _LowRankPropagator(plan, self.library)
-        return _DirectPropagator(
-            self.geometry.points, self.geometry.plane, self.waves, self.library
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _FrequencyGroup:
-    """Some neighbouring frequencies with their terms."""
-
-    frequencies: slice
-    point_factors: Array  # (m, n)
-    node_factors: Array  # (frequencies, nodes, m)
+        strength = estimate_strength(sample)
+        plan = plan_transforms(self.geometry, self.waves, strength, self.tolerance)
+        if plan is not None:
+            return _LowRankPropagator(plan, self.library).field
+        points, plane = self.geometry.points, self.geometry.plane
+        return _DirectPropagator(points, plane, self.waves, self.library).field
 
 
 class _LowRankPropagator:
     """A wall in relief: every term is one flat wall; see `nlos.phasor.wall_to_plane_compiled`."""
 
     def __init__(self, plan: WallToPlanePlan, library: ArrayLibrary) -> None:
-        self.plan, self.library = plan, library
+        self.plan, self.library, put = plan, library, library.put
+        indices = [np.arange(-reach, reach + 1) for reach in plan.max_indices]
+        # Fourier matrices from the wall's rows (waves, rows) and columns (columns, waves), and to
+        # the plane's rows (rows, waves) and columns (waves, columns)
+        from_y, from_x = (
+            np.exp(-2j * np.pi / length * np.outer(index, np.arange(count)))
+            for length, index, count in zip(plan.lattice, indices, plan.wall.shape, strict=True)
+        )
+        to_y, to_x = (
+            np.exp(2j * np.pi / length * np.outer(np.arange(count), index)) * shift
+            for length, index, count, shift in zip(
+                plan.plane_lattice, indices, plan.plane.shape, plan.phase_shifts(), strict=True
+            )
+        )
+        self._from_wall, self._to_plane = (put(from_y), put(from_x.T)), (put(to_y), put(to_x.T))
+        # First node and weights of the waves of one quadrant, and which of these every wave mirrors.
+        node, weight = plan.node_interpolation
+        row, column = (np.abs(index) for index in indices)
+        corner = column * (plan.max_indices[0] + 1) + row[:, np.newaxis]
+        weights = [put(weight[..., tap].reshape(-1, 1)) for tap in range(TAPS)]
+        self._nodes = put(node.ravel()), weights, put(corner.ravel())
+        # 1 where a wave counts at a frequency, else 0, (frequencies, rows, columns)
+        counted = np.zeros((plan.lateral_limits.size, row.size, column.size), np.float32)
+        for frequency, mask in enumerate(counted):
+            tallest = plan.max_row_indices(frequency)
+            tall = np.append(tallest, -1)[np.minimum(column, tallest.size)]
+            mask[:] = row[:, np.newaxis] <= tall
+        self._mask = put(counted)
+        # Frequencies that share their functions of depth, and so few that their spectra fit: with
+        # their terms at points (m, n) and at nodes (frequencies, nodes, m)
+        self._groups: list[tuple[slice, Array, Array]] = []
+        for number, together in enumerate(plan.low_rank_transfer.groups):
+            terms = plan.low_rank_transfer.terms(number)
+            count, parts = len(terms.point_factors), terms.wave_factors
+            at_nodes = parts[..., :count] + 1j * parts[..., count : 2 * count]
+            at_points = put(terms.point_factors)
+            size = library.chunk_bytes // (8 * count * row.size * column.size)
+            for some in split_blocks(len(at_nodes), max(1, size)):
+                frequencies = slice(together.start + some.start, together.start + some.stop)
+                self._groups.append((frequencies, at_points, put(at_nodes[some])))
 
     def field(self, phasors: Array) -> Array:
-        xp, shape = self.library.xp, self.plan.plane.shape
-        field = self.library.zeros((*shape, phasors.shape[1]))
-        for group in self._frequency_groups:
-            values = xp.permute_dims(phasors[:, group.frequencies], (1, 0))
-            field[:, :, group.frequencies] = xp.permute_dims(
-                self._propagate_frequencies(group, values), (1, 2, 0)
-            )
-        return field
-
-    def _propagate_frequencies(self, group: _FrequencyGroup, values: Array) -> Array:
-        """Fields (frequencies, y, x) of phasors (frequencies, n)."""
         xp = self.library.xp
+        field = self.library.zeros((*self.plan.plane.shape, phasors.shape[1]))
         (from_y, from_x), (to_y, to_x) = self._from_wall, self._to_plane
-        on_wall = arrange_on_lattice(
-            values[:, None, :] * group.point_factors, self.plan.wall, self.library
-        )
-        spectra = from_y @ on_wall @ from_x
-        node, weights, corner = self._node_interpolation
-        factors = weights[0] * xp.take(group.node_factors, node, axis=1)
-        for tap in range(1, TAPS):
-            factors = factors + weights[tap] * xp.take(group.node_factors, node + tap, axis=1)
-        wave_factors = xp.permute_dims(xp.take(factors, corner, axis=1), (0, 2, 1))
-        joined = xp.sum(xp.reshape(wave_factors, spectra.shape) * spectra, axis=1)
-        return to_y @ (joined * self._wave_mask[group.frequencies, ...]) @ to_x
-
-    @cached_property
-    def _frequency_groups(self) -> list[_FrequencyGroup]:
-        """All frequencies, in groups that share their functions of depth, and so few that their
-        spectra fit.
-        """
-        low_rank_transfer, put = self.plan.low_rank_transfer, self.library.put
-        rows, columns = (2 * reach + 1 for reach in self.plan.max_indices)
-        groups = []
-        for number, together in enumerate(low_rank_transfer.groups):
-            terms = low_rank_transfer.terms(number)
-            count = len(terms.point_factors)
-            node_factors = (
-                terms.wave_factors[..., :count] + 1j * terms.wave_factors[..., count : 2 * count]
-            )
-            point_factors = put(terms.point_factors)
-            for some in split_blocks(
-                len(node_factors), max(1, self.library.chunk_bytes // (8 * count * rows * columns))
-            ):
-                frequencies = slice(together.start + some.start, together.start + some.stop)
-                groups.append(_FrequencyGroup(frequencies, point_factors, put(node_factors[some])))
-        return groups
-
-    @cached_property
-    def _from_wall(self) -> tuple[Array, Array]:
-        """Fourier matrices from the wall's rows (waves, rows) and columns (columns, waves)."""
-        y, x = (
-            np.exp(-2j * np.pi / length * np.outer(np.arange(-reach, reach + 1), np.arange(count)))
-            for length, reach, count in zip(
-                self.plan.lattice, self.plan.max_indices, self.plan.wall.shape, strict=True
-            )
-        )
-        return self.library.put(y), self.library.put(x.T)
-
-    @cached_property
-    def _to_plane(self) -> tuple[Array, Array]:
-        """Fourier matrices to the plane's rows (rows, waves) and columns (waves, columns)."""
-        y, x = (
-            np.exp(2j * np.pi / length * np.outer(np.arange(count), np.arange(-reach, reach + 1)))
-            * shift
-            for length, reach, count, shift in zip(
-                self.plan.plane_lattice,
-                self.plan.max_indices,
-                self.plan.plane.shape,
-                self.plan.phase_shifts,
-                strict=True,
-            )
-        )
-        return self.library.put(y), self.library.put(x.T)
-
-    @cached_property
-    def _node_interpolation(self) -> tuple[Array, list[Array], Array]:
-        """First node and shares of the waves of one quadrant, and which of these every wave
-        mirrors.
-        """
-        rows, columns = self.plan.max_indices
-        y, x = (
-            spacing * np.arange(n + 1)
-            for spacing, n in zip(self.plan.steps, (rows, columns), strict=True)
-        )
-        # In the corners no wave counts, and no transfer function is known.
-        lateral = np.minimum(np.hypot(y[:, np.newaxis], x), self.plan.lateral_limits[-1])
-        node, weight = self.plan.low_rank_transfer.transfer.interpolation(lateral.ravel())
-        row, column = (np.abs(np.arange(-n, n + 1)) for n in (rows, columns))
-        corner = row[:, np.newaxis] * (columns + 1) + column
-        weights = [self.library.put(weight[:, tap, np.newaxis]) for tap in range(TAPS)]
-        return self.library.put(node), weights, self.library.put(corner.ravel())
-
-    @cached_property
-    def _wave_mask(self) -> Array:
-        """1 where a wave counts at a frequency, else 0, shape (frequencies, rows, columns)."""
-        row, column = (np.abs(np.arange(-n, n + 1)) for n in self.plan.max_indices)
-        counted = np.zeros((self.plan.waves.count, row.size, column.size), np.float32)
-        for frequency in range(len(counted)):
-            tallest = self.plan.max_row_indices(frequency)
-            tall = np.where(
-                column < tallest.size, tallest[np.minimum(column, tallest.size - 1)], -1
-            )
-            counted[frequency] = row[:, np.newaxis] <= tall
-        return self.library.put(counted)
+        node, weights, corner = self._nodes
+        for frequencies, at_points, at_nodes in self._groups:
+            values = xp.permute_dims(phasors[:, frequencies], (1, 0))[:, None, :] * at_points
+            spectra = from_y @ arrange_on_lattice(values, self.plan.wall, self.library) @ from_x
+            factors = weights[0] * xp.take(at_nodes, node, axis=1)
+            for tap in range(1, TAPS):
+                factors = factors + weights[tap] * xp.take(at_nodes, node + tap, axis=1)
+            factors = xp.permute_dims(xp.take(factors, corner, axis=1), (0, 2, 1))
+            joined = xp.sum(xp.reshape(factors, spectra.shape) * spectra, axis=1)
+            on_plane = to_y @ (joined * self._mask[frequencies, ...]) @ to_x
+            field[:, :, frequencies] = xp.permute_dims(on_plane, (1, 2, 0))
+        return field
 
 
 class _DirectPropagator:
     """Every wall point's spherical wave, summed; see `nlos.phasor.wall_to_plane_compiled`."""
 
     def __init__(
-        self, points: FloatArray, plane: Plane, waves: SphericalWaves, library: ArrayLibrary
+        self,
+        points: NDArray[np.float64],
+        plane: Plane,
+        waves: SphericalWaves,
+        library: ArrayLibrary,
     ) -> None:
         self.shape, self.library, self.count = plane.shape, library, waves.count
         targets = plane.points.reshape(-1, 3)

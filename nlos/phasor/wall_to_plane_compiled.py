@@ -21,15 +21,16 @@ from nlos.phasor.wall_kernels import (
     add_spherical_waves,
 )
 from nlos.phasor.wall_to_plane import (
-    ScatteredWallToPlanePlan,
     WallBeforePlane,
     WallToPlanePlan,
     has_finufft,
+    plan_transforms,
 )
 from nlos.plane import Plane
 from tofclip.threads import limit_blas_threads, run_blocks
 
 FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex64]
 
 # Enough wall points to tell the strength of a frequency from.
 STRENGTH_POINTS = 1024
@@ -51,32 +52,24 @@ class CompiledPropagation:
         self._plan: WallToPlanePlan | None = None
         self._planned = False
 
-    def field(
-        self, phasors: NDArray[np.complex64], progress: Progress = ignore_progress
-    ) -> NDArray[np.complex64]:
-        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64.
-
-        Progress counts points of the plane times frequencies.
-
-        `phasors` (n, frequencies). Returns (y, x, frequencies).
+    def field(self, phasors: ComplexArray, progress: Progress = ignore_progress) -> ComplexArray:
+        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies); progress
+        counts its values.
         """
         if not self._planned:
-            self._plan, self._planned = self._choose_plan(phasors), True
+            strength, scattered = estimate_strength(phasors), has_finufft()
+            with limit_blas_threads():
+                self._plan = plan_transforms(
+                    self.geometry, self.waves, strength, self.tolerance, scattered
+                )
+            self._planned = True
         if self._plan is not None:
             return propagate_low_rank(self._plan, phasors, progress)
         points, plane = self.geometry.points, self.geometry.plane
         return propagate_direct(points, phasors, plane, self.waves.wavenumbers, progress)
 
-    def _choose_plan(self, phasors: NDArray[np.complex64]) -> WallToPlanePlan | None:
-        """Return the plan of Fourier transforms; None where direct sums are faster or needed."""
-        wanted = (self.geometry, self.waves, estimate_strength(phasors), self.tolerance)
-        plan = WallToPlanePlan.of(*wanted)
-        if plan is None and has_finufft():
-            plan = ScatteredWallToPlanePlan.of(*wanted)
-        return plan if plan is not None and plan.is_faster_than_direct else None
 
-
-def estimate_strength(phasors: NDArray[np.complex64]) -> NDArray[np.float64]:
+def estimate_strength(phasors: ComplexArray) -> NDArray[np.float64]:
     """Estimate how strong phasors (points, frequencies) are at each frequency, relative to the
     strongest.
     """
@@ -89,29 +82,24 @@ def estimate_strength(phasors: NDArray[np.complex64]) -> NDArray[np.float64]:
 
 
 def propagate_low_rank(
-    plan: WallToPlanePlan, phasors: NDArray[np.complex64], progress: Progress = ignore_progress
-) -> NDArray[np.complex64]:
-    """Return ``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, within the
-    passage's tolerance.
+    plan: WallToPlanePlan, phasors: ComplexArray, progress: Progress = ignore_progress
+) -> ComplexArray:
+    """Return the field (y, x, frequencies) on a plane, within the plan's tolerance; in memory,
+    frequency after frequency.
 
     Per frequency some two to ten Fourier transforms of the wall, weighted by functions of its
     depth, and one back. Memory for the result, for as many transfer functions as depth nodes (10 to
     20 MB for 128 x 128 points and 120 frequencies) and, per thread, for the spectra of one
     frequency's terms.
-
-    `phasors` (n, frequencies); `progress`: called with the number of values just done. Returns (y,
-    x, frequencies): in memory, frequency after frequency.
     """
     field = np.empty((phasors.shape[1], *plan.plane.shape), np.complex64)
     low_rank_transfer = plan.low_rank_transfer
     with limit_blas_threads():
         max_terms = max(low_rank_transfer.term_counts)
-        # Made before threads share them.
-        tables = plan.phase_shifts, plan.node_interpolation
-        spare: list[_Workspace] = []
+        shifts, spare = plan.phase_shifts(), list[_Workspace]()
 
         def process_block(some: slice) -> None:
-            workspace = spare.pop() if spare else _Workspace(plan, max_terms, tables)
+            workspace = spare.pop() if spare else _Workspace(plan, max_terms, shifts)
             for number in range(some.start, some.stop):
                 # High frequencies have most waves: with these first, threads end together.
                 group = len(low_rank_transfer.groups) - 1 - number
@@ -126,9 +114,8 @@ def propagate_low_rank(
 class _Workspace:
     """One thread's memory, and what it does there."""
 
-    def __init__(self, plan: WallToPlanePlan, terms: int, tables: tuple[Any, Any]) -> None:
-        self.plan = plan
-        self.phase_shifts, self.node_interpolation = tables
+    def __init__(self, plan: WallToPlanePlan, terms: int, shifts: tuple[Any, Any]) -> None:
+        self.plan, self.phase_shifts = plan, shifts
         self.analysis = plan.analysis(terms)
         column, row = np.meshgrid(
             *(np.arange(-n, n + 1) for n in plan.max_indices[::-1]), indexing="ij"
@@ -139,14 +126,8 @@ class _Workspace:
             self.inverse.cell_indices[0] - self.inverse.cell_indices[0, 0],
         )
 
-    def propagate_group(
-        self, number: int, phasors: NDArray[np.complex64], field: NDArray[np.complex64]
-    ) -> None:
-        """Propagate one group of frequencies.
-
-        `number`: of the group; `phasors` (points, frequencies); `field` (frequencies, y, x):
-        overwritten at the group's frequencies.
-        """
+    def propagate_group(self, number: int, phasors: ComplexArray, field: ComplexArray) -> None:
+        """Overwrite the field (frequencies, y, x) at one group's frequencies."""
         plan = self.plan
         group, terms = plan.low_rank_transfer.groups[number], plan.low_rank_transfer.terms(number)
         values = np.ascontiguousarray(phasors[:, group].T)
@@ -157,7 +138,7 @@ class _Workspace:
             spectra = self.analysis.spectra(values[i], terms.point_factors, reach.size - 1)
             spectrum[:] = 0
             parts = spectra.view(np.float32)
-            wave_factors = terms.wave_factors[i], *self.node_interpolation
+            wave_factors = terms.wave_factors[i], *plan.node_interpolation
             add_low_rank_terms(parts, *wave_factors, reach, shift_x, shift_y, *self.cells, spectrum)
             self.inverse.transform(slice(0, 1))
             np.multiply(self.inverse.images[0], self.inverse.carrier, out=field[frequency])
@@ -165,32 +146,24 @@ class _Workspace:
 
 def propagate_direct(
     points: FloatArray,
-    phasors: NDArray[np.complex64],
+    phasors: ComplexArray,
     plane: Plane,
     wavenumbers: FloatArray,
     progress: Progress = ignore_progress,
-) -> NDArray[np.complex64]:
-    """Return ``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, (y, x,
-    frequencies) complex64.
-
-    See `sum_spherical_waves`.
-
-    `points` (n, 3): wall points, m; `phasors` (n, frequencies); `wavenumbers` (frequencies,):
-    rad/m; `progress`: called with the number of plane points times frequencies just done. Returns
-    (y, x, frequencies).
-    """
-    return sum_spherical_waves(
-        plane.points.reshape(-1, 3), points, phasors, wavenumbers, progress
-    ).reshape(*plane.shape, -1)
+) -> ComplexArray:
+    """Return the field (y, x, frequencies) on a plane as a direct sum; see `sum_spherical_waves`."""
+    targets = plane.points.reshape(-1, 3)
+    field = sum_spherical_waves(targets, points, phasors, wavenumbers, progress)
+    return field.reshape(*plane.shape, -1)
 
 
 def sum_spherical_waves(
     targets: FloatArray,
     sources: FloatArray,
-    phasors: NDArray[np.complex64],
+    phasors: ComplexArray,
     wavenumbers: FloatArray,
     progress: Progress = ignore_progress,
-) -> NDArray[np.complex64]:
+) -> ComplexArray:
     """Return ``sum_s P_k(s) * exp(1j * k * |t - s|) / |t - s|`` at every target t, in float32.
 
     Good to 1e-5 for points of any place and order; one complex product per pair of points and

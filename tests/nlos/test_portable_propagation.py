@@ -9,8 +9,8 @@ from refusals import find_refusal
 from scene_shapes import shaped_capture, shaped_wall
 
 from nlos import Capture, Grid, Hybrid, propagate
+from nlos.phasor import wall_to_plane
 from nlos.phasor.arrays import ArrayLibrary
-from nlos.phasor.wall_to_plane import WallToPlanePlan
 from tofclip.arrays import ComputeDevice, to_numpy
 from tofclip.errors import InputError
 
@@ -31,7 +31,7 @@ def scene(shape: str, laser: str = "single", count: int = 12) -> Capture:
 @pytest.fixture
 def by_transforms(monkeypatch: pytest.MonkeyPatch) -> None:
     """Walls as small as those of these tests would go by direct sums."""
-    monkeypatch.setattr(WallToPlanePlan, "is_faster_than_direct", True)
+    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
 
 
 @pytest.mark.usefixtures("by_transforms")
@@ -56,7 +56,7 @@ def test_direct_sums_give_the_field_of_the_compiled_loops(
     laser: str, library: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Scattered points stand above no lattice."""
-    monkeypatch.setattr(WallToPlanePlan, "is_faster_than_direct", False)
+    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: False)
     capture = scene("relief", laser)
     wall = capture.wall.copy()
     wall[..., :2] += np.random.default_rng(1).uniform(-0.05, 0.05, (*wall.shape[:-1], 2))
@@ -95,7 +95,7 @@ def test_little_memory_means_smaller_pieces(
 def test_walls_of_many_laser_spots_and_many_captures(
     chosen: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(WallToPlanePlan, "is_faster_than_direct", chosen)
+    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: chosen)
     first = scene("cylinder")
     walls = np.stack([first.wall, first.wall])
     lasers = np.broadcast_to(

@@ -14,8 +14,9 @@ import nlos.phasor.wall_to_plane_compiled
 from nlos import propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
+from nlos.phasor import wall_to_plane
 from nlos.phasor.transfer import SphericalWaves
-from nlos.phasor.wall_to_plane import ScatteredWallToPlanePlan, WallBeforePlane
+from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, plan_transforms
 from nlos.phasor.wall_to_plane_compiled import propagate_direct, propagate_low_rank
 from nlos.plane import Plane
 from nlos.simulate import PointScene
@@ -38,14 +39,19 @@ def phasors(count: int) -> np.ndarray:
     return (values * BAND.weights / BAND.weights.max()).astype(np.complex64)
 
 
+def make_plan(points: np.ndarray, plane: Plane, tolerance: float) -> WallToPlanePlan:
+    """Whether direct sums were faster or not."""
+    wall = WallBeforePlane(points, plane, None)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
+        found = plan_transforms(wall, WAVES, BAND.weights, tolerance, True)
+    assert found is not None
+    return found
+
+
 def error_of(points: np.ndarray, plane: Plane, tolerance: float) -> float:
     values = phasors(len(points))
-    found = propagate_low_rank(
-        ScatteredWallToPlanePlan.of(
-            WallBeforePlane(points, plane, None), WAVES, BAND.weights, tolerance
-        ),
-        values,
-    )
+    found = propagate_low_rank(make_plan(points, plane, tolerance), values)
     exact = propagate_direct(points, values, plane, K)
     assert found.shape == exact.shape
     assert found.dtype == np.complex64
@@ -68,11 +74,7 @@ def test_points_on_a_line_and_points_that_coincide() -> None:
 
 def test_a_flat_cloud_takes_one_term() -> None:
     flat = CLOUD * [1, 1, 0]
-    assert set(
-        ScatteredWallToPlanePlan.of(
-            WallBeforePlane(flat, FINE, None), WAVES, BAND.weights, 1e-2
-        ).low_rank_transfer.term_counts
-    ) == {1}
+    assert set(make_plan(flat, FINE, 1e-2).low_rank_transfer.term_counts) == {1}
     assert error_of(flat, FINE, 1e-2) < 1e-2
 
 
@@ -82,7 +84,7 @@ def test_it_is_taken_where_it_is_quicker_and_installed(monkeypatch: pytest.Monke
     errors = {}
     exact = propagate(capture, FINE, BAND.pulse, tolerance=1e-4).values
     for quicker, installed in ((True, True), (True, False), (False, True)):
-        monkeypatch.setattr(ScatteredWallToPlanePlan, "is_faster_than_direct", quicker)
+        monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_, q=quicker: q)
         monkeypatch.setattr(
             nlos.phasor.wall_to_plane_compiled, "has_finufft", lambda there=installed: there
         )
@@ -98,13 +100,7 @@ def test_large_clouds_take_it_and_small_ones_do_not() -> None:
     waves = SphericalWaves(40.0, 1.0, 100, continued=False)
     for count, expected in ((300, False), (20000, True)):
         points = random.uniform([-1, -1, 0], [1, 1, 0.3], (count, 3))
-        assert (
-            ScatteredWallToPlanePlan.of(
-                WallBeforePlane(points, plane, None), waves, np.ones(100), 1e-2
-            ).is_faster_than_direct
-            == expected
-        )
+        wall = WallBeforePlane(points, plane, None)
+        assert (plan_transforms(wall, waves, np.ones(100), 1e-2, True) is not None) == expected
     points = random.uniform([-1, -1, 0], [1, 1, 0.3], (20000, 3))
-    assert not ScatteredWallToPlanePlan.of(
-        WallBeforePlane(points, plane, None), waves, np.ones(100), 1e-4
-    ).is_faster_than_direct
+    assert plan_transforms(wall, waves, np.ones(100), 1e-4, True) is None

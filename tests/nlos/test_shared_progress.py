@@ -10,8 +10,8 @@ from scene_shapes import shaped_capture
 
 from nlos import Grid, Hybrid
 from nlos.method import SubProgress
+from nlos.phasor import wall_to_plane
 from nlos.phasor.to_depths_compiled import CompiledDiffraction
-from nlos.phasor.wall_to_plane import WallToPlanePlan
 
 GRID = Grid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.5, 0.5, 7), [0.7, 0.9, 1.0])
 pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
@@ -47,7 +47,7 @@ def test_the_way_to_the_plane_has_its_share(
         add(diffraction, values, *rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(CompiledDiffraction, "add", noticed)
-    monkeypatch.setattr(WallToPlanePlan, "is_faster_than_direct", quicker)
+    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: quicker)
     Hybrid(0.25, 4.24, propagation).reconstruct(shaped_capture("wavy", 17), GRID, done.append)
     ((reports, voxels),) = before
     assert reports > 1

@@ -13,10 +13,9 @@ from nlos import Grid, Hybrid
 from nlos.capture import TimeAxis
 from nlos.illumination import build_waves, group_by_illumination
 from nlos.phasor.transfer import Offsets, find_min_periods
-from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan
-from nlos.plane import VirtualPlane
+from nlos.phasor.wall_to_plane import WallBeforePlane, plan_transforms
+from nlos.plane import StraightPaths, VirtualPlane
 from nlos.simulate import PointScene
-from nlos.volume import StraightWays
 
 METHOD = Hybrid(wavelength=0.25, cycles=4.24)
 NEAR = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.8, 9), [0.6, 0.7, 0.9])
@@ -27,7 +26,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarni
 def test_no_straight_way_leads_farther() -> None:
     points = shaped_wall("relief", 9).reshape(-1, 3)
     plane = VirtualPlane(np.linspace(-1.4, 1.4, 30), np.linspace(-1.3, 1.3, 28), 0.35, (0.2, 0.3))
-    ways = StraightWays.find(points, plane, NEAR, 0.1)
+    ways = StraightPaths.find(points, plane, NEAR, 0.1)
     assert ways is not None
     z, y, x = np.meshgrid(NEAR.z, NEAR.y, NEAR.x, indexing="ij")
     voxels = np.stack([x, y, z], axis=-1).reshape(-1, 1, 3)
@@ -39,7 +38,7 @@ def test_no_straight_way_leads_farther() -> None:
         assert farthest <= bound < 1.35 * farthest
     assert ways.rim == pytest.approx((0.14, 0.21))
     assert ways.first_depth == 0.6
-    strict = StraightWays.find(points, plane, NEAR, 1e-3)
+    strict = StraightPaths.find(points, plane, NEAR, 1e-3)
     assert strict is not None
     assert strict.wall_to_plane > ways.wall_to_plane
     assert strict.rim < ways.rim
@@ -48,7 +47,7 @@ def test_no_straight_way_leads_farther() -> None:
 def test_voxels_before_the_plane_leave_no_way_out() -> None:
     points = shaped_wall("planar", 5).reshape(-1, 3)
     plane = VirtualPlane(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9), 0.65)
-    assert StraightWays.find(points, plane, NEAR, 1e-2) is None
+    assert StraightPaths.find(points, plane, NEAR, 1e-2) is None
 
 
 @pytest.mark.parametrize("grid", [NEAR, FAR], ids=["near", "far"])
@@ -81,19 +80,19 @@ def test_lattices_are_as_short_as_the_ways_allow() -> None:
     axis = np.linspace(-1, 1, 64)
     plan = Hybrid(0.125, 4.24).plan(capture, Grid(axis, axis, np.linspace(0.6, 1.6, 4)))
     road = plan.groups[0].plane_to_depths
-    whole = replace(road, ways=None)
+    whole = replace(road, paths=None)
     assert road.lattice == (160, 160)
     assert whole.lattice == (192, 192)
     assert road.plane_wave_count < 0.75 * whole.plane_wave_count
     group = group_by_illumination(capture)[0]
     waves = build_waves(group, plan.band, continued=False)
-    geometry = WallBeforePlane(capture.points, road.plane, None, road.ways)
-    lattice = WallBeforePlane.of(capture.points, road.plane).lattice
-    assert lattice is not None
+    geometry = replace(WallBeforePlane.of(capture.points, road.plane), paths=road.paths)
     narrow, wide = (
-        WallToPlanePlan(some, lattice, waves, np.ones(waves.count), 6e-3)
-        for some in (geometry, replace(geometry, ways=None))
+        plan_transforms(some, waves, np.ones(waves.count), 6e-3)
+        for some in (geometry, replace(geometry, paths=None))
     )
+    assert narrow is not None
+    assert wide is not None
     assert narrow.lattice == (144, 144)
     assert wide.lattice == (192, 192)
     # What fades before it reaches a voxel is left out, which are many waves of low frequencies.
