@@ -37,9 +37,7 @@ LINEAR = "docs/recovery_algorithm.md: ## 5. Frames from f, without: the linear i
 RANGES = "docs/recovery_algorithm.md: ## 6. From frames to ranges"
 SURFACES = "docs/recovery_algorithm.md: ## 7. Surfaces instead of frames"
 SHEARS = "docs/recovery_algorithm.md: ## 3. Which shear each frame has"
-REFOCUS = (
-    "docs/results/reproduction.md: ## Refocusing a recovered light field beside direct recovery, SR = 1"
-)
+REFOCUS = "docs/results/reproduction.md: ## Refocusing a recovered light field beside direct recovery, SR = 1"
 HIDDEN = "docs/nlos.md: ## Which method for which capture"
 REFINED = "docs/nlos.md: ## Refined"
 FEW_PHOTONS = "docs/nlos.md: ## Few photons"

@@ -32,6 +32,9 @@ from tofclip.lidar.peak_kernels import (
     PEAK_BIN,
     TRACE,
     cut_out,
+    find_candidates,
+    is_near,
+    search_part,
     search_step,
 )
 from tofclip.lidar.pulse_tables import MAX_OFFSET_BINS, PHASES_PER_BIN
@@ -48,34 +51,75 @@ loop_part = compile_as_part(_nrt=False)
 
 
 @inlined
-def is_near(candidates, k, other, half):
-    """Whether a candidate and a later one are of the same trace and may share bins."""
-    apart = candidates[other, PEAK_BIN] - candidates[k, PEAK_BIN]
-    return candidates[other, TRACE] == candidates[k, TRACE] and apart < 2 * half + 1
-
-
-@inlined
 def find_phase(offset):
     """Row of the table nearest to an offset in bins."""
     return np.uintp((offset + MAX_OFFSET_BINS) * PHASES_PER_BIN + 0.5)
 
 
 @search_step
-def fit_returns(traces, table, even, room, number):
-    """Fit the first `number` of the chosen candidates, those that overlap by steps on one at a time.
+def search_traces(traces, pixels, axis, limits, table, pulse, room, found, counts):
+    """Find the returns of some traces, (n, bins): all steps, one after the other.
 
-    A return that moved no more and that no moving one reaches is left alone. Heights become 0 or less
-    where there is no pulse, and NaN where a return moved to where the exact fit is needed; `PEAK_BIN`
-    follows one that moves further than `MAX_OFFSET_BINS`. In the end `rests` is what the others leave.
+    `pixels` (n,): to which they belong; `found` (all pixels, most returns, 3) gets instants, s, sums over
+    the bins and standard deviations, s, nearest first, and `counts` (all pixels,) how many.
     """
-    candidates, chosen, half = room.candidates, room.chosen, table.half
+    listed, lone, crowded = find_candidates(traces, pixels, axis, limits, table.half, room, counts)
+    fit_lone_returns(traces, table, axis.even, room, lone)
+    fit_crowded_returns(traces, table, axis.even, room, crowded)
+    least = limits.signal_to_noise
+    measure_returns_by_table(room, listed, least, pixels, axis.times, table, found, counts)
+    exact = False
+    for pixel in pixels:
+        exact = exact or counts[pixel] == NEEDS_EXACT_FIT
+    if exact:
+        fit_returns_exactly(traces, pixels, axis, least, listed, pulse, room, found, counts)
+
+
+@search_step
+def fit_lone_returns(traces, table, even, room, moving):
+    """Fit returns whose bins no other one shares, the first `moving` of `room.lone`: each round takes
+    one step of every return that still moves.
+
+    A step waits for the one before it; those of different returns do not, so that the processor works
+    on several at a time. Heights become 0 or less where there is no pulse, and NaN where a return moved
+    to where the exact fit is needed; `PEAK_BIN` follows one that moves further than `MAX_OFFSET_BINS`.
+    """
+    for _ in range(MAX_FIT_ROUNDS):
+        still = 0
+        for a in range(moving):
+            k = room.lone[a]
+            own, rest = room.candidates[k], room.rests[k]
+            phase = find_phase(own[OFFSET])
+            along_pulse = along_slope = fill_vector(np.float32(0))
+            for w in range(np.uintp(0), np.uintp(rest.size), STEP):
+                left = load_vector(rest, w)
+                along_pulse += left * load_vector(table.shapes[phase], w)
+                along_slope += left * load_vector(table.slopes[phase], w)
+            take_table_step(
+                own, phase, sum_vector(along_pulse), sum_vector(along_slope), table.sums
+            )
+            follow_return(own, rest, traces, room.moments, even, table.half)
+            room.lone[still] = k
+            still += 1 if own[MOVED] >= CONVERGENCE_STEP_BINS else 0
+        moving = still
+        if moving == 0:
+            break
+
+
+@search_part
+def fit_crowded_returns(traces, table, even, room, number):
+    """Fit returns that overlap, the first `number` of `room.crowded`, as `fit_lone_returns` does, by
+    steps on one at a time. In the end `rests` is what the others leave.
+
+    A return that moved no more and that no moving one reaches is left alone.
+    """
+    candidates, crowded, half = room.candidates, room.crowded, table.half
     start = 0
     while start < number:
         end = start + 1
-        # light that ends before the other's begins, whatever both of them move, is fitted apart
-        while end < number and is_near(candidates, chosen[end - 1], chosen[end], half):
+        while end < number and is_near(candidates, crowded[end - 1], crowded[end], half):
             end += 1
-        group = chosen[start:end]
+        group = crowded[start:end]
         for _ in range(MAX_FIT_ROUNDS):
             largest = 0.0
             for k in group:
@@ -98,12 +142,11 @@ def fit_returns(traces, table, even, room, number):
                 largest = own[MOVED] if own[MOVED] > largest else largest
             if largest < CONVERGENCE_STEP_BINS:
                 break
-        if end > start + 1:
-            for k in group:
-                rest = room.rests[k]
-                for w in range(np.uintp(0), np.uintp(rest.size), STEP):
-                    left = subtract_others(load_vector(rest, w), w, candidates, group, k, table)
-                    store_vector(rest, w, left)
+        for k in group:
+            rest = room.rests[k]
+            for w in range(np.uintp(0), np.uintp(rest.size), STEP):
+                left = subtract_others(load_vector(rest, w), w, candidates, group, k, table)
+                store_vector(rest, w, left)
         start = end
 
 
@@ -164,7 +207,7 @@ def subtract_others(rest, w, candidates, group, k, table):
     return rest
 
 
-@search_step
+@search_part
 def measure_returns_by_table(room, listed, least, pixels, times, table, found, counts):
     """Write what is `found` of the returns that respond by `least` deviations: (all pixels, most
     returns, 3) instant, s, sum over the bins, standard deviation, s; nearest first.
@@ -213,7 +256,7 @@ def measure_returns_by_table(room, listed, least, pixels, times, table, found, c
         counts[pixel] = number + 1
 
 
-@search_step
+@search_part
 def fit_returns_exactly(traces, pixels, axis, least, listed, pulse, room, found, counts):
     """Fit and measure the returns of the traces whose `counts` is `NEEDS_EXACT_FIT`; arguments as for
     `measure_returns_by_table`, and the pulse's `curve` and `scale`.
@@ -473,3 +516,17 @@ def estimate_sum_and_deviation(profile, height, noise, pp, pd, dd):
         least = 1e-3 * total
         variance += misfit / (unfitted if unfitted > least else least) * weighted
     return total, math.sqrt(variance) / (across_energy * height)
+
+
+@search_step
+def list_returns(found, counts, pixel, values):
+    """List what was found in all pixels, in their order: its pixel, (n,), and the three values of each
+    return, (3, n).
+    """
+    listed = np.uintp(0)
+    for p in range(counts.size):
+        for k in range(counts[p]):
+            pixel[listed] = p
+            for column in range(3):
+                values[column, listed] = found[p, k, column]
+            listed += ONE

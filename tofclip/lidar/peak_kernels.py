@@ -97,21 +97,22 @@ class Room(NamedTuple):
     candidates: FloatArray  # (pixels * returns, CANDIDATE_COLUMNS), a trace's side by side, in time
     # (pixels * returns, width), trace less background around each peak; zero where that fills up
     rests: Float32
-    chosen: NDArray[np.int64]  # (pixels * returns,), candidates that the table fits
+    lone: NDArray[np.int64]  # (pixels * returns,), candidates whose bins no other one shares
+    crowded: NDArray[np.int64]  # (pixels * returns,), the others that the table fits
     estimates: FloatArray  # (returns, 5), of the exact fit
     profile: FloatArray  # (bins, 4), of the exact fit
 
 
-@search_step
+@search_part
 def find_candidates(traces, pixels, axis, limits, half, room, counts):
     """List the peaks of some traces that the matched filter confirms, and cut out the bins around.
 
     `traces` (n, bins) have memory for another one after the last; `pixels` (n,): their pixels;
     `half`: of the table of the pulse, which says how far to cut out. `counts` (all pixels,) become 0,
     or `NEEDS_EXACT_FIT` where a candidate's bins are not all there. Returns how many candidates there
-    are, and how many of them the table fits.
+    are, and how many of them stand alone and do not.
     """
-    listed = fitted = 0
+    listed = lone = crowded = 0
     candidates = room.candidates
     all_bins = np.float32(0)
     for i in range(np.uintp(0), np.uintp(traces.shape[1])):
@@ -135,9 +136,15 @@ def find_candidates(traces, pixels, axis, limits, half, room, counts):
                 counts[pixels[place]] = NEEDS_EXACT_FIT
                 continue
             cut_out(trace, background, j - half, 2 * half + 1, room.rests[k])
-            room.chosen[fitted] = k
-            fitted += 1
-    return listed, fitted
+            # light that ends before the other's begins, whatever both of them move
+            near = k > 0 and is_near(candidates, k - 1, k, half)
+            if near or (k + 1 < listed and is_near(candidates, k, k + 1, half)):
+                room.crowded[crowded] = k
+                crowded += 1
+            else:
+                room.lone[lone] = k
+                lone += 1
+    return listed, lone, crowded
 
 
 @search_part
@@ -414,6 +421,13 @@ def interpolate_peak(before, here, after):
         rise *= 1 + rise * rise * (1 / 3 + rise * rise / 5)
         fall *= 1 + fall * fall * (1 / 3 + fall * fall / 5)
     return (rise - fall) / (4 * (rise + fall)) if rise + fall > 0 else 0.0
+
+
+@inlined
+def is_near(candidates, k, other, half):
+    """Whether a candidate and a later one are of the same trace and may share bins."""
+    apart = candidates[other, PEAK_BIN] - candidates[k, PEAK_BIN]
+    return candidates[other, TRACE] == candidates[k, TRACE] and apart < 2 * half + 1
 
 
 @inlined

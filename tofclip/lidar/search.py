@@ -16,8 +16,8 @@ The steps, for each pixel (`tofclip.lidar.trace_search` takes some of them at on
 3. Keep those that the matched filter confirms against noise and the pixel's strongest return, and
    place them below a bin (`confirm_peaks`).
 4. Fit arrival and height by Gauss-Newton steps on one return at a time, each against what the
-   others leave: on an even time axis by a table of the pulse (`fit_returns`), elsewhere exactly
-   (`fit_returns_exactly`).
+   others leave: on an even time axis by a table of the pulse (`fit_lone_returns`,
+   `fit_crowded_returns`), elsewhere exactly (`fit_returns_exactly`).
 5. Measure what the fit confirms: sum over the bins and the arrival's standard deviation
    (`measure_returns_by_table`).
 6. Add the recovery's own errors to the deviation, by what neighbours show (`add_recovery_error`).
@@ -109,13 +109,14 @@ class ReturnSearch:
             kept, doubt = judge.judge(pixel, time, signal)
             kept &= time > 0
             false_alarm = doubt[kept]
-        pixel, time = pixel[kept], time[kept]
+        chosen = np.flatnonzero(kept)
+        pixel, time = pixel.take(chosen), time.take(chosen)
         first = np.flatnonzero(np.diff(pixel, prepend=-1))  # of each pixel
         rank = np.arange(pixel.size) - np.repeat(first, np.diff(first, append=pixel.size))
         y, x = np.divmod(pixel.astype(np.int32), np.int32(self.camera.image_shape[1]))
         distance = SPEED_OF_LIGHT / 2 * time
         sigma = add_recovery_error(
-            SPEED_OF_LIGHT / 2 * deviation[kept],
+            SPEED_OF_LIGHT / 2 * deviation.take(chosen),
             distance,
             self._along_axis.take(pixel),
             pixel,
@@ -129,7 +130,7 @@ class ReturnSearch:
                 y=y,
                 x=x,
                 range=distance,
-                intensity=intensity[kept].astype(np.float32),
+                intensity=intensity.take(chosen).astype(np.float32),
                 confidence=sigma.astype(np.float32),
                 return_number=(rank + 1).astype(np.uint8),
                 time=time,

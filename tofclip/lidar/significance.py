@@ -111,12 +111,8 @@ class Detection:
         """
         if pixel.size == 0:
             return np.zeros(0, bool)
-        strongest = find_strongest(pixel, intensity)
-        strong = intensity >= (self.min_pixel_fraction * strongest)[pixel]
-        strong &= intensity >= self.compute_least_intensity(
-            pixel, time, intensity, pulse_width, time
-        )
-        return strong
+        strongest, least = self._compare(pixel, time, intensity, pulse_width, time)
+        return (intensity >= self.min_pixel_fraction * strongest[pixel]) & (intensity >= least)
 
     def compute_least_intensity(
         self,
@@ -140,27 +136,32 @@ class Detection:
         (m,) float64 array
             Brightness with the fall-off with range undone.
         """
+        return self._compare(pixel, time, intensity, pulse_width, at)[1]
+
+    def _compare(
+        self,
+        pixel: NDArray[np.int64],
+        time: FloatArray,
+        intensity: FloatArray,
+        width: float,
+        at: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Largest intensity of each pixel, 0 where there is no candidate, and `compute_least_intensity`."""
+        strongest = np.zeros(int(pixel.max()) + 1)
+        np.maximum.at(strongest, pixel, intensity)
         start, end = min(time.min(), at.min()), max(time.max(), at.max())
 
         def find_slot(instants: FloatArray) -> NDArray[np.int64]:
-            slots = (instants - start) * (SLOTS_PER_WIDTH / pulse_width) + 0.5
+            slots = (instants - start) * (SLOTS_PER_WIDTH / width) + 0.5
             return np.asarray(slots, dtype=np.int64)
 
         brightest = np.zeros(int(find_slot(end)) + 1)
         np.maximum.at(brightest, find_slot(time), intensity)
         around = scipy.ndimage.maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)
-        strongest = find_strongest(pixel, intensity)
         scene = find_quantile_value(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
         needed = np.maximum(self.min_scene_fraction * scene, self.min_time_bin_fraction * around)
         least: FloatArray = needed[find_slot(at)]
-        return least
-
-
-def find_strongest(pixel: NDArray[np.int64], intensity: FloatArray) -> FloatArray:
-    """Largest intensity of each pixel, (last pixel + 1,); 0 where there is no candidate."""
-    strongest = np.zeros(int(pixel.max()) + 1)
-    np.maximum.at(strongest, pixel, intensity)
-    return strongest
+        return strongest, least
 
 
 def find_quantile_value(values: NDArray[np.floating], fraction: float) -> float:

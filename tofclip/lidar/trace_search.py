@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.lidar.fit_kernels import fit_returns, fit_returns_exactly, measure_returns_by_table
+from tofclip.lidar.fit_kernels import list_returns, search_traces
 from tofclip.lidar.peak_kernels import (
     CANDIDATE_COLUMNS,
-    NEEDS_EXACT_FIT,
     WORD_BINS,
     Axis,
     Limits,
     Room,
-    find_candidates,
 )
 from tofclip.lidar.pulse_tables import PulseFilters, Traces, list_windows
 from tofclip.lidar.significance import Detection
@@ -125,8 +123,10 @@ class TraceSearch:
         """List all that was found so far, in raster and time order: numbers of the pixels, and (3, n)
         instants, s, sums of the fitted pulses over the bins, standard deviations of the instants, s.
         """
-        there = np.arange(self._most) < self._counts[:, np.newaxis]
-        return np.repeat(np.arange(self._counts.size), self._counts), self._found[there].T
+        pixel = np.empty(int(self._counts.sum()), np.int64)
+        values = np.empty((3, pixel.size))
+        list_returns(self._found, self._counts, pixel, values)
+        return pixel, values
 
     def _allocate_memory(self) -> Memory:
         length, most, pixels = self._length, self._most, self._pixels
@@ -143,7 +143,8 @@ class TraceSearch:
             moments=np.empty((pixels, 2)),
             candidates=np.empty((listed, CANDIDATE_COLUMNS)),
             rests=np.empty((listed, width), np.float32),
-            chosen=np.empty(listed, np.int64),
+            lone=np.empty(listed, np.int64),
+            crowded=np.empty(listed, np.int64),
             estimates=np.empty((most, 5)),
             profile=np.empty((self._number, 4)),
         )
@@ -151,19 +152,22 @@ class TraceSearch:
         return Memory(handed, traces, room)
 
     def _search_piece(self, piece: slice, memory: Memory) -> None:
-        pixels, room, axis, table = self._source.pixels[piece], memory.room, self._axis, self._table
+        pixels = self._source.pixels[piece]
         handed, traces = memory.handed[: pixels.size], memory.traces[: pixels.size]
         self._source.fill(piece, handed)
         if traces.shape != handed.shape:
             traces[:, : self._number] = handed
-        listed, fitted = find_candidates(
-            traces, pixels, axis, self._limits, table.half, room, self._counts
+        results = self._found, self._counts
+        search_traces(
+            traces,
+            pixels,
+            self._axis,
+            self._limits,
+            self._table,
+            self._pulse,
+            memory.room,
+            *results,
         )
-        fit_returns(traces, table, axis.even, room, fitted)
-        ratio, results = self._limits.signal_to_noise, (self._found, self._counts)
-        measure_returns_by_table(room, listed, ratio, pixels, axis.times, table, *results)
-        if (self._counts[pixels] == NEEDS_EXACT_FIT).any():
-            fit_returns_exactly(handed, pixels, axis, ratio, listed, self._pulse, room, *results)
 
 
 def _place_vectors(
