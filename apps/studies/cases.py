@@ -1,18 +1,23 @@
-"""Cases of CLIP: light fields to look at, measured from their true views, recovered at one depth and
-scored.
+"""What the studies of the paper share: rows of ours beside the paper's figures, pictures in its
+layout, and cases of CLIP, measured from their true views, recovered at one depth and scored.
+
+``paper.csv`` holds the tables' cases with the paper's figures (NMSE in per cent). A study's work
+takes the library of light fields, the number of seeds, and `advance`, which it calls with the
+number of steps just done, and returns an `Outcome`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.studies.outcome import Advance, Panel, Row
 from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field import LightField
@@ -27,6 +32,91 @@ from tofclip.recovery.light_field import ClipRecovery
 from tofclip.simulate.light_fields import CameraArray, render_light_field, render_view
 from tofclip.simulate.scenes import EDITS, edit_scene, make_scene, remove_occluder
 from tofclip.threads import map_parallel
+
+Advance = Callable[[int], None]
+
+CROSS_VALIDATED = "chosen by cross-validation with the first seed, without the truth"
+
+PAPER = Path(__file__).with_name("paper.csv")
+LABEL_SEPARATOR = " | "
+BORDER_PX = 12  # not scored: views leave the picture there
+CAMERA_NAMES = {
+    "line": "CLIP-1D",
+    "line-even": "CLIP-1D, even",
+    "single-pixel": "CLIP-0D",
+    "diffuser": "CLIP-2D",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure of a table."""
+
+    labels: tuple[str, ...]  # one for each of the table's columns
+    ours: tuple[float, ...]  # one for each seed
+    paper: float | None = None  # None: the paper has no such figure
+
+    @property
+    def mean(self) -> float:
+        """Mean over the seeds."""
+        return float(np.mean(self.ours))
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation over the seeds (of a sample; 0 for a single one)."""
+        return float(np.std(self.ours, ddof=1)) if len(self.ours) > 1 else 0.0
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A picture (rows, columns) with its title; brightness from 0, or a map of shears in colours."""
+
+    title: str
+    picture: NDArray[Any]
+    is_map: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Rows and pictures of a study."""
+
+    columns: tuple[str, ...]  # what the rows' labels say
+    figure: str  # what the rows' figures are, with the unit
+    rows: Sequence[Row]
+    panels: Sequence[Sequence[Panel]]  # line by line
+
+
+Work = Callable[["Library", int, Advance], Outcome]
+
+
+@dataclass(frozen=True)
+class Study:
+    """A table or figure of the paper that can be made again."""
+
+    name: str  # what the user types
+    aliases: tuple[str, ...]  # other names: the figures that show the table's pictures
+    title: str
+    note: str  # what differs from the paper
+    seconds: float  # about what a seed costs on two cores
+    steps: int  # advances for each seed
+    work: Work
+    weight: str = CROSS_VALIDATED  # how the prior's weight was chosen: the end of a sentence
+    seeded: bool = True  # False: it has no random choices, more seeds change nothing
+    recording: str | None = None  # file of the folder of recorded data that it needs
+    has_best: bool = False  # rows with a figure of the paper are solved by settings of choice too
+
+
+REGISTERED: list[Study] = []
+
+
+def study(name: str, *aliases: str, **others: Any) -> Callable[[Work], Work]:
+    """Register the decorated work as a `Study`, whose other fields are given by name."""
+
+    def register(work: Work) -> Work:
+        REGISTERED.append(Study(name, aliases, work=work, **others))
+        return work
+
+    return register
 
 
 class Library:
@@ -43,9 +133,9 @@ class Library:
     def light_field(self, name: str) -> LightField:
         """Return the light field of a scene.
 
-        `name`: A name of `tofclip.simulate.light_fields.SCENES`, ``NAME:EDIT`` with an edit of the
-        flip test, ``NAME:4x4`` for its middle sixteen views, ``NAME:flat`` for its reference view
-        as a poster at s = 0, or ``data:NAME`` for a recorded one.
+        `name`: of `tofclip.simulate.light_fields.SCENES`, ``NAME:EDIT`` with an edit of the flip
+        test, ``NAME:4x4`` for its middle sixteen views, ``NAME:flat`` for its reference view as a
+        poster at s = 0, or ``data:NAME`` for a recorded one.
         """
         if name not in self._cache:
             self._cache[name] = self._make_light_field(name)
@@ -71,7 +161,6 @@ class Library:
             return read_light_field(self.recording(f"lightfields/{variant}.npz"))
         if variant == "4x4":
             whole = self.light_field(scene)
-            # The 4 x 4 views in the middle of the array.
             middle = np.all((whole.views >= -2) & (whole.views < 2), axis=1)
             return LightField(whole.pictures[middle], whole.views[middle])
         known = make_scene(scene, self.array)
@@ -79,20 +168,14 @@ class Library:
             views = self.array.views
             poster = render_view(known, self.array, (0.0, 0.0))
             return LightField(np.broadcast_to(poster, (len(views), *poster.shape)), views)
-        return render_light_field(
-            edit_scene(known, variant) if variant in EDITS else known, self.array
-        ).light_field
+        edited = edit_scene(known, variant) if variant in EDITS else known
+        return render_light_field(edited, self.array).light_field
 
 
-BORDER_PX = 12
-"""Pixels that are not scored: views leave the picture there."""
-
-CAMERA_NAMES = {
-    "line": "CLIP-1D",
-    "line-even": "CLIP-1D, even",
-    "single-pixel": "CLIP-0D",
-    "diffuser": "CLIP-2D",
-}
+def find_reference_view(light_field: LightField) -> NDArray[Any]:
+    """Return the picture of the view nearest to the middle of the aperture."""
+    picture: NDArray[Any] = light_field.pictures[np.argmin((light_field.views**2).sum(axis=1))]
+    return picture
 
 
 @dataclass(frozen=True)
@@ -110,6 +193,32 @@ class Case:
     white_noise: float = 0.0  # standard deviation relative to that of the measurements
     data_term: str = "squares"  # of the recovery
 
+    @property
+    def key(self) -> str:
+        """Return what the row is kept by."""
+        return LABEL_SEPARATOR.join(self.labels)
+
+
+def read_cases(name: str) -> list[Case]:
+    """Return the cases of a study, in the order of its table."""
+    with PAPER.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["study"] == name]
+    return [
+        Case(
+            tuple(row["labels"].split(LABEL_SEPARATOR)),
+            row["scene"],
+            row["encoder"],
+            float(row["sampling_ratio"]),
+            float(row["shear"]),
+            float(row["paper"]) if row["paper"] else None,
+            float(row["bad_fraction"]),
+            float(row["photons"]) if row["photons"] else None,
+            float(row["white_noise"]),
+            row["data_term"],
+        )
+        for row in rows
+    ]
+
 
 @dataclass(frozen=True)
 class SolvedCase:
@@ -117,8 +226,8 @@ class SolvedCase:
 
     case: Case
     percent: tuple[float, ...]  # NMSE of each seed
-    picture: NDArray[Any]  # (rows, columns), the first seed's, and shift-and-add of the true views
-    truth: NDArray[Any]  # (rows, columns), the first seed's, and shift-and-add of the true views
+    picture: NDArray[Any]  # (rows, columns), the first seed's
+    truth: NDArray[Any]  # (rows, columns), shift-and-add of the true views
     weight: float  # of the first seed's prior
 
     def row(self) -> Row:
@@ -136,9 +245,6 @@ def solve_cases(
     """Solve every case for every seed, cases on all cores; advances once for each case and seed.
 
     The prior's weight is chosen by cross-validation with the first seed, and kept for the others.
-
-    `library`: light fields by name; `seeds`: repeats with other cameras and noise; `advance`:
-    called with 1 after each case and seed. Returns in the order of the cases.
     """
     # Made once, before the threads start: many cases share a truth, and the library keeps a plain
     # dictionary.
@@ -149,26 +255,40 @@ def solve_cases(
 
     def solve_case(case: Case) -> SolvedCase:
         truth = truths[case.scene, case.shear]
-        recovery, found = ClipRecovery(data_term=case.data_term), []
+        recovery, recovered = ClipRecovery(data_term=case.data_term), []
         for seed in range(seeds):
-            found.append(recovery.recover(measure_case(case, library, seed), case.shear))
-            # The weight chosen with the first seed serves the others.
-            recovery = replace(recovery, weight=found[0].weight)
+            recovered.append(recovery.recover(measure_case(case, library, seed), case.shear))
+            recovery = replace(recovery, weight=recovered[0].weight)
             advance(1)
-        percent = tuple(100 * nmse(recovered.picture, truth, BORDER_PX) for recovered in found)
-        return SolvedCase(case, percent, found[0].picture, truth, found[0].weight)
+        percent = tuple(100 * nmse(each.picture, truth, BORDER_PX) for each in recovered)
+        return SolvedCase(case, percent, recovered[0].picture, truth, recovered[0].weight)
 
     return list(map_parallel(solve_case, cases))
 
 
 def measure_case(case: Case, library: Library, seed: int) -> ClipMeasurement:
-    """Measure the true views as a case asks for.
-
-    `seed`: of camera and noise.
-    """
+    """Measure the true views as a case asks for; `seed`: of camera and noise."""
     setup = CameraSetup(case.encoder, case.sampling_ratio, seed)
     clean = measure(library.light_field(case.scene), setup)
     # another stream of random numbers than the camera's, which starts from the same seed
     noise = np.random.default_rng([seed, 2]).standard_normal(clean.values.size, np.float32)
     noisy = clean.values + np.float32(case.white_noise) * clean.values.std() * noise
     return corrupt_measurement(replace(clean, values=noisy), case.photons, case.bad_fraction)
+
+
+def lay_out_lines(
+    solved: Iterable[SolvedCase],
+    group: Callable[[Case], Any],
+    head: str,
+    title: Callable[[Case], str],
+) -> list[list[Panel]]:
+    """Lay out a line for each run of cases of one group: the truth, then what was recovered.
+
+    `head`: of the truth, filled in from the labels of a line's first case.
+    """
+    lines = []
+    for _, members in groupby(solved, key=lambda one: group(one.case)):
+        line = list(members)
+        true = Panel(f"{head.format(*line[0].case.labels)}\ntrue", line[0].truth)
+        lines.append([true, *(one.panel(title(one.case)) for one in line)])
+    return lines

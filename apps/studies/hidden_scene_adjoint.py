@@ -21,18 +21,16 @@ from nlos.phasor.plan import PlanarRSD
 from nlos.simulate import HiddenScene, Lambert, Surface, add_poisson_noise, build_relay_wall
 from nlos.volume import Grid, Volume
 from tofclip.errors import InputError
+from tofclip.files import atomic_path, translate_read_errors
 from tofclip.operators import RadonProjection
 from tofclip.solvers import Backprojection, LinearInverse
 
+# largest count in the data set at each exposure, as Note 13 gives them
 EXPOSURES = {"20 ms": 19.0, "5 ms": 15.0, "1 ms": 6.0}
-"""Largest count in the data set at each exposure, as Note 13 gives them."""
-
 SAMPLING_RATIOS = (0.1, 0.05)
 WAVELENGTH_M, CYCLES = 0.12, 5.0
 THRESHOLD = 0.15
-PEAK_FRACTION = 0.1
-"""Measurements expected to be weaker than this fraction of the brightest one are never the largest.
-"""
+PEAK_FRACTION = 0.1  # of the brightest: what is expected to be weaker is never the largest
 BISECTION_STEPS = 12
 DOCUMENT_MARK = "<!-- adjoint study -->"
 
@@ -44,18 +42,10 @@ class StudyRow:
     exposure: str
     largest_count: float
     sampling_ratio: float
-    # correlation of the front view with that of all wall points at the same exposure: for recovery
-    # by the adjoint, the same with both volumes cut off at the threshold, and for recovery by the
-    # linear inverse
-    adjoint: float
-    # correlation of the front view with that of all wall points at the same exposure: for recovery
-    # by the adjoint, the same with both volumes cut off at the threshold, and for recovery by the
-    # linear inverse
-    cut: float
-    # correlation of the front view with that of all wall points at the same exposure: for recovery
-    # by the adjoint, the same with both volumes cut off at the threshold, and for recovery by the
-    # linear inverse
-    linear: float
+    # correlation of the front view with that of all wall points at the same exposure
+    adjoint: float  # recovered by the adjoint
+    cut: float  # the same, both volumes cut off at the threshold
+    linear: float  # recovered by the linear inverse
     full: float  # correlation of that reference itself with the noiseless one
 
 
@@ -92,10 +82,8 @@ def build_office_grid() -> Grid:
 
 
 def build_tomography(points: int, sampling_ratio: float) -> RadonProjection:
-    """Line projections of a picture at ``sampling_ratio * points`` angles, evenly over half a turn.
-
-    `points`: wall points along a side; `sampling_ratio`: measurements over wall points. Returns
-    (points, points) pictures to (angles * points,) vectors.
+    """Line projections of a picture at ``sampling_ratio * points`` angles, evenly over half a turn:
+    (points, points) to (angles * points,).
     """
     angles = round(sampling_ratio * points)
     if angles < 1:
@@ -112,14 +100,10 @@ def find_expected_peak(capture: Capture, largest_count: float, seed: int) -> flo
     of all.
 
     With millions of measurements the largest count lies far above the largest expected one: 6 where
-    that is about 1.
-
-    `capture`: expected signal, of any scale; `largest_count`: counts; `seed`: of the Poisson noise.
-    Returns counts, by bisection.
+    that is about 1. Found by bisection; `capture`: expected signal, of any scale.
     """
-    relative = (
-        capture.signal[capture.signal > PEAK_FRACTION * capture.signal.max()] / capture.signal.max()
-    )
+    relative = capture.signal / capture.signal.max()
+    relative = relative[relative > PEAK_FRACTION]
     low, high = 0.0, largest_count
     for _ in range(BISECTION_STEPS):
         middle = (low + high) / 2
@@ -129,19 +113,15 @@ def find_expected_peak(capture: Capture, largest_count: float, seed: int) -> flo
 
 
 def correlate_views(one: Volume, other: Volume) -> float:
-    """Pearson correlation of two volumes' front views.
-
-    `one, other`: on grids of the same lateral shape. Returns -1 to 1.
-    """
+    """Pearson correlation of two volumes' front views, on grids of the same lateral shape."""
     first, second = (volume.maximum_projection().brightness.ravel() for volume in (one, other))
     return float(np.corrcoef(first, second)[0, 1])
 
 
 def run_study(capture: Capture, grid: Grid, solver: Method, seed: int = 0) -> list[StudyRow]:
-    """Image a noiseless capture at every exposure and sampling ratio.
+    """Image a noiseless capture, of as many rows as columns, at every exposure and sampling ratio.
 
-    `capture`: of rows and as many columns; `seed`: of the photons; those of the reference and of
-    the compressed measurements are independent.
+    The photons of the reference and of the compressed measurements are independent.
     """
     # Without noise: what more light could reach at best.
     clean = solver.reconstruct(capture, grid)
@@ -162,13 +142,13 @@ def run_study(capture: Capture, grid: Grid, solver: Method, seed: int = 0) -> li
                 AdjointImaging(solver, method, 0.0).reconstruct(compressed, grid)
                 for method in (Backprojection(), LinearInverse())
             )
-            cut = correlate_views(adjoint.threshold(THRESHOLD), full.threshold(THRESHOLD))
-            agreements = (
-                correlate_views(adjoint, full),
-                cut,
-                correlate_views(linear, full),
-                correlate_views(full, clean),
+            pairs = (
+                (adjoint, full),
+                (adjoint.threshold(THRESHOLD), full.threshold(THRESHOLD)),
+                (linear, full),
+                (full, clean),
             )
+            agreements = (correlate_views(*pair) for pair in pairs)
             rows.append(StudyRow(exposure, largest_count, ratio, *agreements))
     return rows
 
@@ -188,12 +168,7 @@ def format_table(rows: Sequence[StudyRow]) -> str:
 
 
 def replace_between_marks(text: str, document: Path) -> None:
-    """Replace what stands between the two marks of a document.
-
-    `document`: rewritten whole.
-    """
-    from tofclip.files import atomic_path, translate_read_errors
-
+    """Replace what stands between the two marks of a document."""
     with translate_read_errors(document):
         parts = document.read_text().split(DOCUMENT_MARK)
     # Two marks cut the text into three parts.

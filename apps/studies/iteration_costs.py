@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.studies.cases import Library
-from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
+from apps.studies.cases import Advance, Library, Outcome, Panel, Row, study
 from tofclip.light_field import LightField
 from tofclip.operators import LinearOperator, Reshape, estimate_squared_norm
 from tofclip.operators.cameras import CAMERAS, COMPRESSIVE_CAMERAS, LightFieldCamera
@@ -57,13 +56,10 @@ def measure_iteration_costs(
     repeats: int = 5,
 ) -> list[IterationCost]:
     """Time one iteration of every method of Table 1: FISTA with total variation for all of them
-    alike.
+    alike, in memory of about ten light fields in float32.
 
-    `shear`: depth that CLIP refocuses on; `exposures`: r, of Ashok's and Babacan's methods; the
-    others take one; `sampling_ratio`: of CLIP; `repeats`: iterations timed, after a first one that
-    is not.
-
-    Memory is about ten light fields in float32.
+    `shear`, `sampling_ratio`: of CLIP; `exposures`: r, of Ashok's and Babacan's methods;
+    `repeats`: iterations timed, after a first one that is not.
     """
     views = [(v, u) for v, u in light_field.views.tolist()]
     shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])
@@ -122,9 +118,7 @@ def _time_method(
 
 
 def _build_tall_model(camera: LightFieldCamera) -> LinearOperator:
-    """The light field's model for its views one below the other, as the solvers' priors take one
-    picture.
-    """
+    """The light field's model for its views one below the other: priors take one picture."""
     model = camera.light_field_model()
     views, rows, columns = model.shape_in
     return model @ Reshape((views * rows, columns), model.shape_in)
@@ -152,45 +146,23 @@ def _measure_median_seconds(action: Callable[[], object], repeats: int) -> float
 SCENE, SHEAR = "letters", -0.4
 
 
-def run_iteration_table(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Time every method; the repeats stand in for seeds.
-
-    `library`: light fields and recordings by name; `seeds`: repeats with other random numbers;
-    `advance`: called with the number of steps just done. Returns A row of figures for each case,
-    and the pictures to show.
-    """
-    costs = measure_iteration_costs(library.light_field(SCENE), SHEAR, repeats=2 * seeds)
-    advance(1)
-    rows = tuple(
-        Row(
-            (
-                cost.method,
-                cost.recovers,
-                str(cost.measurements),
-                str(cost.unknowns),
-                cost.complexity,
-            ),
-            (1e3 * cost.seconds,),
-        )
-        for cost in costs
-    )
-    truth = library.light_field(SCENE).refocus(SHEAR)
-    return Outcome(
-        ("method", "recovers", "measurements", "unknowns", "operations"),
-        "ms per iteration",
-        rows,
-        ((Panel(f"{SCENE}, s = {SHEAR:g}", truth),),),
-    )
-
-
-STUDY = Study(
+@study(
     "table1",
-    (),
-    "What an iteration costs",
-    "The paper gives the operations; seconds are measured here, on one core, and depend on the machine.",
-    f"fixed at {TV_WEIGHT:g}; the cost of an iteration does not depend on it",
-    5,
-    1,
-    run_iteration_table,
+    title="What an iteration costs",
+    note="The paper gives the operations; seconds are measured here, on one core, and depend on the machine.",
+    weight=f"fixed at {TV_WEIGHT:g}; the cost of an iteration does not depend on it",
+    seconds=5,
+    steps=1,
     seeded=False,
 )
+def run_iteration_table(library: Library, seeds: int, advance: Advance) -> Outcome:
+    """Time every method; the repeats stand in for seeds."""
+    costs = measure_iteration_costs(library.light_field(SCENE), SHEAR, repeats=2 * seeds)
+    advance(1)
+    columns = ("method", "recovers", "measurements", "unknowns", "operations")
+    rows = [
+        Row((*map(str, astuple(cost)[:4]), cost.complexity), (1e3 * cost.seconds,))
+        for cost in costs
+    ]
+    panel = Panel(f"{SCENE}, s = {SHEAR:g}", library.light_field(SCENE).refocus(SHEAR))
+    return Outcome(columns, "ms per iteration", rows, [[panel]])

@@ -7,13 +7,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
+from apps.studies.cases import Advance, Library, Outcome, Panel, Row, study
 from tofclip.camera import Camera, SkewSweep
 from tofclip.lidar import depth
 from tofclip.metrics import nmse
@@ -43,9 +42,6 @@ from tofclip.simulate.patterns import (
     make_stripes,
 )
 from tofclip.units import MILLIMETRE
-
-if TYPE_CHECKING:
-    from apps.studies.cases import Library
 
 METHODS = ("l1", "tv", "surfaces")
 PHOTONS = (2000, 200, 50)  # of the brightest streak pixel
@@ -213,92 +209,71 @@ def score_methods(scene: Scene, instrument: Instrument, seed: int, fit: bool) ->
     return found
 
 
-def _collect_rows(labels: tuple[str, ...], scored: list[dict[str, Scored]]) -> list[Row]:
-    return [
-        Row(
-            (*labels, name, method),
-            tuple(factor * one[method].figures[key] for one in scored),
-        )
+def _score_seeds(
+    title: str,
+    labels: tuple[str, ...],
+    scene: Scene,
+    instrument: Instrument,
+    seeds: int,
+    advance: Advance,
+    fit: bool,
+) -> tuple[list[Row], list[Panel]]:
+    """Rows and pictures of a scene; pictures are the first seed's."""
+    scored = []
+    for seed in range(seeds):
+        scored.append(score_methods(scene, instrument, seed, fit))
+        advance(1)
+    rows = [
+        Row((*labels, name, method), tuple(factor * one[method].figures[key] for one in scored))
         for name, (key, factor) in FIGURES.items()
         for method in METHODS
     ]
-
-
-def _make_panels(
-    title: str, scene: Scene, instrument: Instrument, scored: dict[str, Scored]
-) -> tuple[Panel, ...]:
     truth = render_true_frames(scene, instrument).values.sum(axis=0)
-    others = (
-        Panel(f"{method}\n{100 * one.figures['image_nmse']:.1f} %", one.picture)
-        for method, one in scored.items()
-    )
-    return (Panel(f"{title}\ntruth", truth), *others)
-
-
-def run_demo(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover the demonstration's shot by every method.
-
-    `library`: not needed; `seeds`: of the photon noise; `advance`: called with the number of steps
-    just done.
-    """
-    scene, instrument = make_default_scene(), make_default_instrument()
-    scored = []
-    for seed in range(seeds):
-        scored.append(score_methods(scene, instrument, seed, fit=True))
-        advance(1)
-    panels = (_make_panels("demonstration", scene, instrument, scored[0]),)
-    rows = _collect_rows((), scored)
-    return Outcome(("figure", "method"), "see the rows", tuple(rows), panels)
-
-
-def run_scenes(
-    library: Library,
-    seeds: int,
-    advance: Advance,
-    photons: tuple[int, ...] = PHOTONS,
-) -> Outcome:
-    """Recover every scene at every amount of light by every method; the camera is known.
-
-    `library`: not needed; `seeds`: of the photon noise; `advance`: called with the number of steps
-    just done; `photons`: of the brightest streak pixel.
-    """
-    rows, panels = [], []
-    for name, make_scene in SCENES.items():
-        scene = make_scene()
-        for count in photons:
-            instrument = make_scene_instrument(name, count)
-            scored = []
-            for seed in range(seeds):
-                scored.append(score_methods(scene, instrument, seed, fit=False))
-                advance(1)
-            rows += _collect_rows((name, str(count)), scored)
-            panels.append(_make_panels(f"{name}, {count}", scene, instrument, scored[0]))
-    columns = ("scene", "photons", "figure", "method")
-    return Outcome(columns, "see the rows", tuple(rows), tuple(panels))
+    panels = [Panel(f"{title}\ntruth", truth)]
+    for method, one in scored[0].items():
+        panels.append(Panel(f"{method}\n{100 * one.figures['image_nmse']:.1f} %", one.picture))
+    return rows, panels
 
 
 DEFAULT_WEIGHTS = "as each method has it, for all scenes"
 
-STUDIES = (
-    Study(
-        "surfaces",
-        (),
-        "Surfaces beside frames: the demonstration",
-        "The paper has no such figures; all methods have the same camera, found from the shot.",
-        DEFAULT_WEIGHTS,
-        100,
-        1,
-        run_demo,
-    ),
-    Study(
-        "surface-scenes",
-        (),
-        "Surfaces beside frames: slanted, thin and semi-transparent, at three amounts of light",
-        "The paper has no such figures; the camera is known, and the light is the photons of the brightest "
-        "streak pixel.",
-        DEFAULT_WEIGHTS,
-        120,
-        len(SCENES) * len(PHOTONS),
-        partial(run_scenes, photons=PHOTONS),
-    ),
+
+@study(
+    "surfaces",
+    title="Surfaces beside frames: the demonstration",
+    note="The paper has no such figures; all methods have the same camera, found from the shot.",
+    weight=DEFAULT_WEIGHTS,
+    seconds=100,
+    steps=1,
 )
+def run_demo(library: Library, seeds: int, advance: Advance) -> Outcome:
+    """Recover the demonstration's shot by every method."""
+    shot = (make_default_scene(), make_default_instrument())
+    rows, panels = _score_seeds("demonstration", (), *shot, seeds, advance, fit=True)
+    return Outcome(("figure", "method"), "see the rows", rows, [panels])
+
+
+@study(
+    "surface-scenes",
+    title="Surfaces beside frames: slanted, thin and semi-transparent, at three amounts of light",
+    note="The paper has no such figures; the camera is known, and the light is the photons of the brightest "
+    "streak pixel.",
+    weight=DEFAULT_WEIGHTS,
+    seconds=120,
+    steps=len(SCENES) * len(PHOTONS),
+)
+def run_scenes(library: Library, seeds: int, advance: Advance) -> Outcome:
+    """Recover every scene at every amount of light by every method; the camera is known."""
+    rows, panels = [], []
+    for name, make_scene in SCENES.items():
+        scene = make_scene()
+        for count in PHOTONS:
+            labels = (name, str(count))
+            instrument = make_scene_instrument(name, count)
+            more, line = _score_seeds(
+                ", ".join(labels), labels, scene, instrument, seeds, advance, fit=False
+            )
+            rows += more
+            panels.append(line)
+    columns = ("scene", "photons", "figure", "method")
+    return Outcome(columns, "see the rows", rows, panels)

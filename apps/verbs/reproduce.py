@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,18 +14,20 @@ import typer
 
 from apps.conventions import ClusterOption, JsonOption, make_completer, make_folder, report
 from apps.progress import show_progress
-from apps.reproduction import (
+from apps.sequences import report_summary, run_with_progress
+from apps.studies.best import SEED, SHEAR_RANGE, BestFigure, list_best_cases, solve_best
+from apps.studies.cases import Library
+from apps.studies.report import (
+    STUDIES,
     STUDY_FOLDER,
     add_best,
+    find_studies,
     load_result,
+    make_reproduction_figure,
     make_result,
     write_page,
     write_result,
 )
-from apps.sequences import report_summary, run_with_progress
-from apps.studies.best import SEED, SHEAR_RANGE, from_plain, solve_best, to_plain
-from apps.studies.cases import Library
-from apps.studies.registry import STUDIES, find_studies
 from tofclip import __version__
 from tofclip.errors import InputError
 from tofclip.files import atomic_path, require_apart
@@ -33,9 +36,8 @@ from tofclip.sequences.jobs import Job
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from apps.reproduction import Result
-    from apps.studies.best import BestFigure
-    from apps.studies.outcome import Advance, Study
+    from apps.studies.cases import Advance, Study
+    from apps.studies.report import Result
     from tofclip.sequences.jobs import Summary
 
 
@@ -82,7 +84,8 @@ def reproduce(
     Example: tofclip reproduce table2 --out reproduction --seeds 3
     """
     studies = find_studies(name)
-    _require_folder(data)
+    if data is not None and not data.is_dir():
+        raise InputError(f"{data}: no such folder of recorded data")
     folder = out / STUDY_FOLDER
     require_apart([out, folder], [data])
     make_folder(folder)
@@ -105,11 +108,6 @@ def reproduce(
         report({"seeds": seeds, **figures}, as_json, [page])
         return
     report_summary(summary, len(possible), as_json, page, {"seeds": seeds, **figures})
-
-
-def _require_folder(data: Path | None) -> None:
-    if data is not None and not data.is_dir():
-        raise InputError(f"{data}: no such folder of recorded data")
 
 
 def _is_possible(study: Study, library: Library) -> bool:
@@ -179,8 +177,9 @@ def _load_or_make_result(study: Study, library: Library, seeds: int, folder: Pat
 
 def _add_best(result: Result, study: Study, library: Library, folder: Path) -> Result:
     """Return the result with the best of ours in rows of the paper; what is missing is made now."""
-    if not study.best:
+    if not study.has_best:
         return result
+    cases = list_best_cases(study.name)
     path = folder / f"{study.name}-best.json"
     settings = {
         "name": study.name,
@@ -193,13 +192,16 @@ def _add_best(result: Result, study: Study, library: Library, folder: Path) -> R
 
     def keep(figures: dict[str, BestFigure]) -> None:
         kept.update(
-            settings=settings, figures=to_plain(figures), seconds=time.process_time() - began
+            settings=settings,
+            figures={key: asdict(figure) for key, figure in figures.items()},
+            seconds=time.process_time() - began,
         )
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(kept, indent=1), encoding="utf-8")
 
-    with show_progress(f"{study.name}, best of ours", len(study.best)) as advance:
-        figures = solve_best(study.best, library, from_plain(kept["figures"]), keep, advance)
+    known = {key: BestFigure(**figure) for key, figure in kept["figures"].items()}
+    with show_progress(f"{study.name}, best of ours", len(cases)) as advance:
+        figures = solve_best(cases, library, known, keep, advance)
     full = add_best(result, figures, kept["seconds"])
     write_result(full, folder)
     return full
@@ -211,7 +213,6 @@ def _run_study(
     """Run a study, and write its figure, its tables and, last, the file that marks it as
     finished.
     """
-    from apps.figures.reproduction import make_reproduction_figure
     from apps.figures.style import save_figure, store_picture
 
     started = time.perf_counter()

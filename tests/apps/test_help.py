@@ -20,7 +20,7 @@ from verb_pages import collect_verbs, render_page, write_pages
 import tofclip
 from apps.cli import COMPLETION_VARIABLE, VERB_OVERVIEW
 from apps.help import load_command, split_docstring, wrap_command
-from apps.studies.registry import find_studies
+from apps.studies.report import find_studies
 
 ROOT = Path(tofclip.__file__).parents[1]
 VERBS = collect_verbs()

@@ -50,7 +50,7 @@ def test_a_study_is_written_and_not_made_again(run: Run, tmp_path: Path) -> None
 
 
 def test_a_damaged_or_other_result_is_made_again(tmp_path: Path) -> None:
-    from apps.reproduction import load_result
+    from apps.studies.report import load_result
 
     path = tmp_path / "table7.json"
     assert load_result(path, {"seeds": 1}) is None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apps.studies.light_field_properties import compute_depth_accuracy
+from apps.studies.light_fields import compute_depth_accuracy
 from tofclip.errors import InputError, TofclipError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field import (

@@ -266,7 +266,7 @@ class EvenAngleLineCamera(LineCamera):
     aperture.
 
     What is out of focus is then blurred rather than torn into streaks, and which seed was drawn
-    hardly matters (`apps.studies.refocused_pictures` shows how much better it is than dealing at
+    hardly matters (`apps.studies.pictures` shows how much better it is than dealing at
     random).
     """
 

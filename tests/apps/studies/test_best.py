@@ -5,18 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apps.reproduction import add_best, count_below, render_section, write_page
-from apps.studies.best import (
-    BORDER_PX,
-    SEED,
-    BestFigure,
-    choose_settings,
-    from_plain,
-    solve_best,
-    to_plain,
-)
-from apps.studies.cases import Case, Library, measure_case
-from apps.studies.registry import STUDIES
+from apps.studies.best import SEED, BestFigure, choose_settings, list_best_cases, solve_best
+from apps.studies.cases import BORDER_PX, Case, Library, measure_case
+from apps.studies.report import STUDIES, add_best, count_below, render_section, write_page
 from tofclip.metrics import nmse
 from tofclip.recovery import all_in_focus
 from tofclip.recovery.light_field import ClipRecovery
@@ -31,13 +22,12 @@ def library() -> Library:
 
 
 def test_every_row_of_tables_2_to_10_with_a_figure_of_the_paper_has_its_best():
-    named = {study.name: study for study in STUDIES if study.best}
+    named = {study.name: list_best_cases(study.name) for study in STUDIES if study.has_best}
     assert set(named) == {f"table{number}" for number in range(2, 11)}
-    assert sum(len(study.best) for study in named.values()) == 201
-    for study in named.values():
-        assert len({one.key for one in study.best}) == len(study.best)
-        assert all(one.case.paper is not None for one in study.best)
-        assert all(one.case.encoder != "line" for one in study.best)
+    assert sum(map(len, named.values())) == 201
+    for cases in named.values():
+        assert len({case.key for case in cases}) == len(cases)
+        assert all(case.paper is not None and case.encoder != "line" for case in cases)
 
 
 def test_what_is_known_is_not_solved_again_and_rows_share_a_measurement(library, monkeypatch):
@@ -61,13 +51,11 @@ def test_what_is_known_is_not_solved_again_and_rows_share_a_measurement(library,
     assert kept[-1] == found
     assert found["-1"].setting == "surfaces"
     # the second is not below the paper's, so that the presets are tried
-    measured = measure_case(cases[1].case, library, SEED)
+    measured = measure_case(cases[1], library, SEED)
     truth = library.light_field("letters").refocus(0.2)
     plain = 100 * nmse(ClipRecovery().recover(measured, 0.2).picture, truth, BORDER_PX)
     assert found["0.2"].percent <= plain * 1.001
-    assert (
-        solve_best(cases, library, from_plain(to_plain(found)), kept.append, steps.append) == found
-    )
+    assert solve_best(cases, library, found, kept.append, steps.append) == found
     assert len(runs) == 1
 
 

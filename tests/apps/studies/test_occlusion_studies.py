@@ -7,8 +7,8 @@ import pytest
 
 from apps.occlusion.probe import ProbeResult
 from apps.studies import occlusion
-from apps.studies.cases import Library
-from apps.studies.registry import find_studies
+from apps.studies.cases import Library, read_cases
+from apps.studies.report import find_studies
 from tofclip.simulate.light_fields import CameraArray
 
 FITTED = ProbeResult(0.1, 1.2, 0.9, 7, np.zeros((4, 4)), np.zeros((4, 4)))
@@ -53,8 +53,8 @@ def test_a_fixed_camera_finds_its_own_gates_and_sees_what_the_formula_promises(m
 
 
 def test_knowing_the_occluder_is_what_makes_the_target_bright(monkeypatch):
-    monkeypatch.setattr(occlusion, "FLASH_SCENES", ("plate",))
-    monkeypatch.setattr(occlusion, "FLASH_RATIOS", (1.0,))
+    plates = [one for one in read_cases("table7-flash") if one.scene == "plate"][::2]
+    monkeypatch.setattr(occlusion, "read_cases", lambda _: plates)
     steps: list[int] = []
     small = Library(array=CameraArray((48, 48)))
     outcome = occlusion.run_flash_occlusion(small, 1, steps.append)

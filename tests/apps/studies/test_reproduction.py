@@ -9,11 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apps.studies import light_field_properties, light_field_recovery, refocused_pictures
-from apps.studies.cases import BORDER_PX, Case, Library, measure_case, solve_cases
-from apps.studies.light_field_properties import compute_depth_accuracy
-from apps.studies.outcome import Row
-from apps.studies.registry import STUDIES, find_studies
+from apps.studies import light_fields, pictures
+from apps.studies.cases import (
+    BORDER_PX,
+    Case,
+    Library,
+    Row,
+    measure_case,
+    read_cases,
+    solve_cases,
+)
+from apps.studies.light_fields import compute_depth_accuracy
+from apps.studies.report import STUDIES, find_studies
 from tofclip.errors import InputError
 from tofclip.light_field.measurement import CameraSetup, measure
 from tofclip.metrics import nmse
@@ -128,10 +135,10 @@ def test_the_page_says_of_every_table_how_its_weight_was_chosen():
 
 
 def test_depth_and_viewpoints_of_true_light_fields_are_scored(monkeypatch):
-    monkeypatch.setattr(light_field_properties, "FOCUS_SCENES", ("letters", "blocks"))
+    monkeypatch.setattr(light_fields, "FOCUS_SCENES", ("letters", "blocks"))
     fine = Library(array=CameraArray((64, 64), 8, focal_length_px=80.0, view_step=0.025))
     steps: list[int] = []
-    outcome = light_field_properties.run_light_field_processing(fine, 1, steps.append)
+    outcome = light_fields.run_light_field_processing(fine, 1, steps.append)
     figures = {row.labels: row.mean for row in outcome.rows}
     assert sum(steps) == 2
     assert figures["letters", "right plane, % of textured pixels"] >= 95
@@ -174,7 +181,7 @@ def test_tables_have_a_row_for_each_case_and_count_their_steps(library, name, mo
 def test_a_light_field_recovered_from_many_readings_is_near_the_true_one(library):
     """As many measurements as unknowns would be SR 16; at 8 total variation has little to fill in."""
     case = Case((), "letters", "line", 8.0, 0.0)
-    found = light_field_recovery.recover_light_field(case, library, 0)
+    found = light_fields.recover_light_field(case, library, 0)
     truth = library.light_field("letters")
     np.testing.assert_array_equal(found.views, truth.views)
     assert nmse(found.pictures, truth.pictures, BORDER_PX) < 0.1
@@ -185,7 +192,7 @@ def test_a_glossy_plate_is_uneven_but_keeps_its_place():
     """84 % was measured for both, at full size: wider baselines for the picture's size spoil the
     recovery itself.
     """
-    outcome = light_field_properties.run_glossy_plate(
+    outcome = light_fields.run_glossy_plate(
         Library(array=CameraArray(samples=1)), 1, lambda _: None
     )
     figures = {row.labels: row.mean for row in outcome.rows}
@@ -196,6 +203,7 @@ def test_a_glossy_plate_is_uneven_but_keeps_its_place():
 
 
 def test_dealing_takes_recorded_scenes_only_where_there_are_any(library, monkeypatch):
-    monkeypatch.setattr(refocused_pictures, "ASSIGNMENT_RATIOS", (1.0,))
-    outcome = refocused_pictures.run_angle_assignment(library, 1, lambda _: None)
+    cases = [one for one in read_cases("dealing") if one.sampling_ratio == 1]
+    monkeypatch.setattr(pictures, "read_cases", lambda _: cases)
+    outcome = pictures.run_angle_assignment(library, 1, lambda _: None)
     assert {row.labels[0] for row in outcome.rows} == {"letters", "blocks"}

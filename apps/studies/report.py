@@ -1,5 +1,5 @@
-"""Tables of studies as Markdown and CSV, what is kept of a finished one, and the page that shows
-them all.
+"""The studies by name; their tables as Markdown and CSV, their pictures laid out like the paper's,
+what is kept of a finished one, and the page that shows them all.
 """
 
 from __future__ import annotations
@@ -10,20 +10,43 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+
+from apps.figures.style import DEPTH_COLOURMAP, SMALL_FONT_PT, draw_image, make_figure
+from apps.studies import (  # noqa: F401 - each registers its studies
+    coded_line,
+    diffuser,
+    iteration_costs,
+    light_fields,
+    occlusion,
+    pictures,
+    surfaces,
+)
+from apps.studies.best import BestFigure
+from apps.studies.cases import LABEL_SEPARATOR, REGISTERED, Outcome, Study
+from tofclip.errors import InputError
 from tofclip.files import atomic_path
 
-if TYPE_CHECKING:
-    from apps.studies.best import BestFigure
-    from apps.studies.outcome import Outcome, Study
+ORDER = (
+    *(f"table{number}" for number in range(1, 8)),
+    *("table7-flash", "fig14", "table8", "table9", "table10", "fig4", "fig4d", "fig5"),
+    *("note1", "note2", "dealing", "surfaces", "surface-scenes"),
+)
+STUDIES = tuple(sorted(REGISTERED, key=lambda one: ORDER.index(one.name)))
 
 PAGE_NAME = "reproduction.md"
-STUDY_FOLDER = "reproduction"
-"""Beside the page: what each study made."""
+STUDY_FOLDER = "reproduction"  # beside the page: what each study made
 
 OWN_SETTING = "the table's"
 UNTRIED_SETTING = "the table's (others not tried)"
+
+PANEL_INCHES = 1.5
+WHITE_PERCENTILE = 99.5  # percentile drawn white: a lone bright pixel must not darken the rest
+MIN_SHEAR, MAX_SHEAR = -1.4, 0.8  # shears
+
 
 BEST_NOTE = (
     "Best of ours (tables 2 to 10) is what a user gets who takes the settings of choice: lines at even angles, "
@@ -34,19 +57,23 @@ BEST_NOTE = (
     "cross-validation, without the truth."
 )
 
+# a finished study as `make_result` keeps it
 Result = Mapping[str, Any]
-"""A finished study as it is kept: name, title, note, weight, command, settings, columns, figure,
-rows, seconds.
-"""
+
+
+def find_studies(name: str) -> tuple[Study, ...]:
+    """Return the study of a name, of a figure that shows its pictures, or every one for ``all``."""
+    matching = tuple(study for study in STUDIES if name in ("all", study.name, *study.aliases))
+    if not matching:
+        known = ", ".join(word for study in STUDIES for word in (study.name, *study.aliases))
+        raise InputError(f"unknown study '{name}'; take all or one of {known}")
+    return matching
 
 
 def make_result(
     study: Study, outcome: Outcome, settings: Mapping[str, Any], command: str, seconds: float
 ) -> Result:
-    """Return what is kept of a finished study; plain values only.
-
-    `command`: that makes the study again; `seconds`: that it took.
-    """
+    """Return what is kept of a finished study, plain values only; `command` makes it again."""
     rows = [asdict(row) | {"mean": row.mean, "spread": row.spread} for row in outcome.rows]
     return {
         "name": study.name,
@@ -75,46 +102,37 @@ def load_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
 def add_best(result: Result, figures: Mapping[str, BestFigure], seconds: float | None) -> Result:
     """Return a study's result with what the settings of choice reach in its rows.
 
-    `figures`: by the rows' labels, as `apps.studies.best.solve_best` returns them; rows that are
-    missing are marked as not tried; `seconds`: of processor time, that they took; None: not known.
+    `figures`: by the rows' labels; rows that are missing are marked as not tried; `seconds`: of
+    processor time, that they took; None: not known.
     """
+
+    def identify(row: Mapping[str, Any]) -> list[str]:
+        """Rows that differ in their data term only are settings of one case of the table."""
+        named = zip(result["columns"], row["labels"], strict=True)
+        return [label for column, label in named if column != "data term"]
+
     rows = []
     for row in result["rows"]:
-        # the same case with another data term is one of the table's own settings
-        own = min(
-            one["mean"]
-            for one in result["rows"]
-            if _identify_case(result, one) == _identify_case(result, row)
-        )
-        found = figures.get(" | ".join(row["labels"]))
-        best = None if row["paper"] is None else _choose_better(own, found)
+        best = None
+        if row["paper"] is not None:
+            own = min(one["mean"] for one in result["rows"] if identify(one) == identify(row))
+            figure = figures.get(LABEL_SEPARATOR.join(row["labels"]))
+            best = {"percent": own, "setting": UNTRIED_SETTING if figure is None else OWN_SETTING}
+            if figure is not None and figure.percent < own:
+                best = asdict(figure)
         rows.append(row | {"best": best})
     return {**result, "rows": rows, "best_seconds": seconds}
 
 
-def _identify_case(result: Result, row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what rows share that differ in their data term only."""
-    named = zip(result["columns"], row["labels"], strict=True)
-    return tuple(label for column, label in named if column != "data term")
-
-
-def _choose_better(own: float, found: BestFigure | None) -> dict[str, Any]:
-    """Return the lower figure and its setting."""
-    if found is None:
-        return {"percent": own, "setting": UNTRIED_SETTING}
-    if own <= found.percent:
-        return {"percent": own, "setting": OWN_SETTING}
-    return {"percent": found.percent, "setting": found.setting}
-
-
 def count_below(results: Sequence[Result]) -> tuple[int, int]:
     """Return how many rows the best of ours is below the paper's figure in, and of how many."""
-    compared = [row for result in results for row in result["rows"] if _is_compared(row)]
+    compared = _list_compared(results)
     return sum(row["best"]["percent"] < row["paper"] for row in compared), len(compared)
 
 
-def _is_compared(row: Mapping[str, Any]) -> bool:
-    return row.get("best") is not None and row["paper"] is not None
+def _list_compared(results: Sequence[Result]) -> list[Mapping[str, Any]]:
+    """Rows that have both a figure of the paper and a best of ours."""
+    return [row for result in results for row in result["rows"] if row.get("best") is not None]
 
 
 def write_result(result: Result, folder: Path) -> list[Path]:
@@ -140,33 +158,28 @@ def write_page(results: Sequence[Result], folder: Path) -> Path:
         "prior's weight was chosen is said at each table. Most scenes of the paper are not public: its figures stand "
         "beside ours for other scenes of the same kind, which may be easier or harder.\n"
     )
-    below, compared = count_below(results)
+    compared = _list_compared(results)
     if compared:
-        share = f"{below} of {compared} rows ({100 * below / compared:.0f} %)"
-        head += f"\n{BEST_NOTE} It is below the paper's figure in {share}.\n"
-        untried = sum(
-            _is_compared(row) and row["best"]["setting"] == UNTRIED_SETTING
-            for result in results
-            for row in result["rows"]
-        )
+        below, _ = count_below(results)
+        share = f"{below} of {len(compared)} rows ({100 * below / len(compared):.0f} %)"
+        head += f"\n{BEST_NOTE} It is below the paper's figure in {share}."
+        untried = sum(row["best"]["setting"] == UNTRIED_SETTING for row in compared)
         if untried:
-            head = f"{head.rstrip()} In {untried} rows only the table's own settings were tried.\n"
+            head += f" In {untried} rows only the table's own settings were tried."
     sections = (render_section(result, f"{STUDY_FOLDER}/") for result in results)
     _write_text(folder / PAGE_NAME, "\n\n".join([head.rstrip(), *sections]) + "\n")
     return folder / PAGE_NAME
 
 
 def render_section(result: Result, beside: str = "") -> str:
-    """Return a study's heading, command, table and picture in Markdown; pictures lie in the folder
-    `beside`.
+    """Return a study's heading, command, table and picture in Markdown.
 
-    `beside`: ends in a slash, or is empty.
+    `beside`: folder of the picture; ends in a slash, or is empty.
     """
     names = ", ".join([result["name"], *result["also"]])
     has_best = "best_seconds" in result
     header = [*result["columns"], f"ours ({result['figure']})", "spread", "paper"]
-    if has_best:
-        header += ["best of ours", "by", "against the paper"]
+    header += ["best of ours", "by", "against the paper"] if has_best else []
     cells = (_format_cells(row, has_best) for row in result["rows"])
     lines = [header, ["---"] * len(header), *cells]
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
@@ -188,7 +201,7 @@ def _format_cells(row: Mapping[str, Any], has_best: bool) -> list[str]:
     cells = [*row["labels"], f"{row['mean']:.2f}", spread, paper]
     if not has_best:
         return cells
-    if not _is_compared(row):
+    if row["best"] is None:
         return [*cells, "", "", ""]
     mark = "below" if row["best"]["percent"] < row["paper"] else "above"
     return [*cells, f"{row['best']['percent']:.2f}", row["best"]["setting"], mark]
@@ -196,24 +209,15 @@ def _format_cells(row: Mapping[str, Any], has_best: bool) -> list[str]:
 
 def _render_csv(result: Result) -> str:
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
+    writer = csv.writer(text, lineterminator="\n")  # writes None as an empty cell
     seeds = max(len(row["ours"]) for row in result["rows"])
-    writer.writerow(
-        [
-            *result["columns"],
-            "mean",
-            "spread",
-            "paper",
-            *(("best", "by") if "best_seconds" in result else ()),
-            *(f"seed {number}" for number in range(seeds)),
-        ]
-    )
+    best = ("best", "by") if "best_seconds" in result else ()
+    numbers = (f"seed {number}" for number in range(seeds))
+    writer.writerow([*result["columns"], "mean", "spread", "paper", *best, *numbers])
     for row in result["rows"]:
-        paper = "" if row["paper"] is None else row["paper"]
-        figures = [row["mean"], row["spread"], paper]
-        if "best_seconds" in result:
-            best = row["best"] or {"percent": "", "setting": ""}
-            figures += [best["percent"], best["setting"]]
+        figures = [row["mean"], row["spread"], row["paper"]]
+        if best:
+            figures += (row["best"] or {"percent": "", "setting": ""}).values()
         writer.writerow([*row["labels"], *figures, *row["ours"]])
     return text.getvalue()
 
@@ -221,3 +225,25 @@ def _render_csv(result: Result) -> str:
 def _write_text(path: Path, text: str) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def make_reproduction_figure(title: str, outcome: Outcome) -> Figure:
+    """Draw the panels of an outcome, one line below the other."""
+    lines = outcome.panels
+    columns = max(map(len, lines))
+    figure = make_figure(PANEL_INCHES * columns, (PANEL_INCHES + 0.35) * len(lines) + 0.4)
+    figure.suptitle(title, fontsize=SMALL_FONT_PT + 2)
+    axes = figure.subplots(len(lines), columns, squeeze=False)
+    for row, line in zip(axes, lines, strict=True):
+        for place in row:
+            place.set_axis_off()
+        for place, panel in zip(row, line, strict=False):
+            if panel.is_map:
+                draw_image(
+                    place, panel.picture, cmap=DEPTH_COLOURMAP, vmin=MIN_SHEAR, vmax=MAX_SHEAR
+                )
+            else:
+                brightest = float(np.percentile(panel.picture, WHITE_PERCENTILE)) or 1.0
+                draw_image(place, panel.picture, cmap="gray", vmin=0, vmax=brightest)
+            place.set_title(panel.title, fontsize=SMALL_FONT_PT - 2)
+    return figure
