@@ -1,14 +1,10 @@
-"""Windows of neighbouring measurements, under which the highest value is looked for.
-
-In which frames a pixel stands out, without looking at every pixel of every frame.
+"""The rows of a shot in which something may have come back.
 
 The filter that is matched to a lone pixel is a product with the transpose of the operator, as large
 as the recovery itself. But only whether any pixel reaches a limit is asked for, and of a few
 neighbours in a row it can be said for an eighth of the work that none does: each view's light falls
 between two neighbouring measurements, at nearly the same fraction for all of them, so that none gets
 more than the highest value that interpolation there has in a short window.
-
-The rows of a shot in which something may have come back.
 """
 
 from __future__ import annotations
@@ -28,21 +24,26 @@ from tofclip.operators.sparse import Tiles
 from tofclip.solvers.direct import GROUP_PIXELS, InverseTraces
 from tofclip.threads import LANES, count_block_threads, run_blocks
 
-WINDOW = 4
-"""Measurements under a window: a pair of pairs."""
-
-FRACTIONS = 4
-"""Parts into which the way from a measurement to the next one is cut."""
-
+WINDOW = 4  # measurements under a window: a pair of pairs
+FRACTIONS = 4  # parts into which the way from a measurement to the next one is cut
+# By which each part reaches into its neighbours, relative to its length: pixels whose fractions are
+# alike but for rounding share a window.
 FRACTION_SLACK = 0.01
-"""By which each part reaches into its neighbours, relative to its length: pixels whose fractions are
-alike but for rounding share a window."""
+ROUNDING_MARGIN = 1e-4  # by which a bound is raised: sums in float32 may be off by a tenth of it
 
+# a sum over so much of a Gaussian pulse stands out nearly as far as the matched filter's
+BOX_LENGTH_WIDTHS = 1.7
+DARK_FRACTION, DARKEST_FRACTION = 0.25, 0.05
+MAX_DARK_ENERGY_RATIO, NOISE_ENERGY_RATIO = 1.5, 1.25  # in mean square; noise alone makes a tenth
+THRESHOLD_FACTOR = 1.2  # than the limit has an instant to stand out
+MIN_DARK_ROWS = 24  # dark rows at least, which know the noise of a dark pixel to a seventh
+MAX_ROW_FRACTION = 0.75  # of all rows: what needs more of them is as well searched everywhere
+GAP_INSTANTS = LANES + 16
+"""Places beyond a column's sums: whole vectors need no end of their own, and columns are an odd number
+of cache lines apart, so that neighbours share no place of the cache."""
 
 Mask = NDArray[np.bool_]
-
-ROUNDING_MARGIN = 1e-4
-"""By which a bound is raised: sums in float32 may be off by a tenth of it."""
+FloatImage = NDArray[np.float32]
 
 
 class BrightFrameFinder:
@@ -57,50 +58,45 @@ class BrightFrameFinder:
         if tiles.values.size and tiles.values.min() < 0:
             raise InputError("bright frames are found for operators without negative entries")
         self._tiles, self._group_pixels = tiles, group_pixels
-        pixel, column, weight, fraction = _list_pairs(tiles)
         pixels = tiles.starts.shape[1] - 1
-        entries = np.repeat(np.tile(np.arange(pixels), len(tiles.starts)), _count_entries(tiles))
-        energy = np.bincount(entries, tiles.values.astype(np.float64) ** 2, minlength=pixels)
+        row = np.repeat(
+            np.tile(np.arange(pixels), len(tiles.starts)), np.diff(tiles.starts, axis=1).ravel()
+        )
+        energy = np.bincount(row, tiles.values.astype(np.float64) ** 2, minlength=pixels)
         scales = np.divide(1, np.sqrt(energy), out=np.zeros(pixels), where=energy > 0)
         self._scales = scales.astype(tiles.values.dtype)
+        pixel, column, weight, fraction = _list_pairs(row, tiles)
 
         # Pairs of a group at nearly the same fraction share a window, as far as it reaches.
         group = pixel // group_pixels
         part = np.clip((FRACTIONS * fraction + FRACTION_SLACK).astype(np.int64), 0, FRACTIONS - 1)
         order = np.lexsort((column, part, group))
         group, part, column = group[order], part[order], column[order]
-        run = np.flatnonzero(
-            (np.diff(group, prepend=-1) != 0)
-            | (np.diff(part, prepend=-1) != 0)
-            | (np.diff(column, prepend=0) > WINDOW)
-        )
-        offset = column - np.repeat(column[run], np.diff(run, append=column.size))
-        run_number = np.repeat(np.arange(run.size), np.diff(run, append=column.size))
-        step = offset // WINDOW
-        begins = np.flatnonzero(
-            (np.diff(run_number, prepend=-1) != 0) | (np.diff(step, prepend=-1) != 0)
-        )
-        self._windows = (part[begins] * measurements + column[begins]).astype(np.int32)
-        self._group_starts = np.searchsorted(
-            group[begins], np.arange(-(-pixels // group_pixels) + 1)
-        )
+        begins = (np.diff(group, prepend=-1) != 0) | (np.diff(part, prepend=-1) != 0)
+        run = np.flatnonzero(begins | (np.diff(column, prepend=0) > WINDOW))
+        lengths = np.diff(run, append=column.size)
+        step = (column - np.repeat(column[run], lengths)) // WINDOW
+        run_number = np.repeat(np.arange(run.size), lengths)
+        begins = (np.diff(run_number, prepend=-1) != 0) | (np.diff(step, prepend=-1) != 0)
+        first = np.flatnonzero(begins)
+        windows = (part[first] * measurements + column[first]).astype(np.int32)
+        starts = np.searchsorted(group[first], np.arange(-(-pixels // group_pixels) + 1))
         # the most that a window of ones adds to any pixel of the group
-        window = np.repeat(np.arange(begins.size), np.diff(begins, append=column.size))
+        window = np.repeat(np.arange(first.size), np.diff(first, append=column.size))
         share = np.bincount(
             window * group_pixels + pixel[order] % group_pixels,
             (weight * scales[pixel])[order],
-            minlength=begins.size * group_pixels,
+            minlength=first.size * group_pixels,
         )
         highest = share.reshape(-1, group_pixels).max(axis=1, initial=0)
-        self._weights = (highest * (1 + ROUNDING_MARGIN)).astype(np.float32)
+        self._groups = starts, windows, (highest * (1 + ROUNDING_MARGIN)).astype(np.float32)
 
-    def find(self, readings: NDArray[np.float32], span: slice, limit: float) -> Mask:
-        """Say in which frames a pixel stands out.
+    def find(self, readings: FloatImage, span: slice, limit: float) -> Mask:
+        """Say in which frames of a span a pixel stands out: in which the response ``a'f / |a|`` reaches
+        the limit, a being its column of the operator.
 
-        `readings` (measurements, frames): in units of their noise. Whole blocks of twice `LANES`
-        frames from the first of the span on lie within it; `span`: of the frames; `limit`: response
-        of the filter ``a'f / |a|`` from which a pixel stands out, a being its column of the
-        operator. Returns (frames of the span,).
+        `readings` (measurements, frames) are in units of their noise. Whole blocks of `LANES` frames
+        from the first of the span on lie within them.
         """
         # the compiler takes as long to import as all else
         from tofclip.lidar.signal_row_kernels import find_bright_frames
@@ -108,41 +104,31 @@ class BrightFrameFinder:
         number = span.stop - span.start
         bright = np.full(number, limit <= 0)
         if limit > 0:
-            threads = count_block_threads()
             run_blocks(
                 lambda piece: find_bright_frames(
-                    *self._tiles,
+                    self._tiles,
                     self._scales,
                     self._group_pixels,
-                    self._group_starts,
-                    self._windows,
-                    self._weights,
+                    self._groups,
                     readings,
                     span.start + piece.start,
                     np.float32(limit),
                     bright[piece],
                 ),
                 number,
-                -(-number // (2 * LANES * threads)) * 2 * LANES,
+                _divide_into_lanes(number, count_block_threads()),
             )
         return bright
 
 
-def _count_entries(tiles: Tiles) -> NDArray[np.int64]:
-    """How many entries each row has, tile by tile."""
-    return np.diff(tiles.starts, axis=1).ravel()
-
-
 def _list_pairs(
-    tiles: Tiles,
+    row: NDArray[np.int64], tiles: Tiles
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """List each row's entries two by two, as far as they are neighbours.
+    """List each row's entries two by two, as far as they are neighbours: row, first column, sum of both,
+    and what the second one has of it.
 
-    Returns `row` (pairs,); `column` (pairs,): the first of two; `weight` (pairs,): sum of both;
-    `fraction` (pairs,): what the second one has of it.
+    `row`: of each entry.
     """
-    pixels = tiles.starts.shape[1] - 1
-    row = np.repeat(np.tile(np.arange(pixels), len(tiles.starts)), _count_entries(tiles))
     order = np.lexsort((tiles.columns, row))
     row, column, value = row[order], tiles.columns[order].astype(np.int64), tiles.values[order]
     # the place of each entry in its run of neighbours: the even ones begin a pair
@@ -154,21 +140,6 @@ def _list_pairs(
     weight = value[first] + second
     fraction = np.divide(second, weight, out=np.zeros(weight.size), where=weight > 0)
     return row[first], column[first], weight, fraction
-
-
-FloatImage = NDArray[np.float32]
-
-BOX_LENGTH_WIDTHS = (
-    1.7  # a sum over so much of a Gaussian pulse stands out nearly as far as the matched filter's
-)
-DARK_FRACTION, DARKEST_FRACTION = 0.25, 0.05
-MAX_DARK_ENERGY_RATIO, NOISE_ENERGY_RATIO = 1.5, 1.25  # in mean square; noise alone makes a tenth
-THRESHOLD_FACTOR = 1.2  # than the limit has an instant to stand out
-MIN_DARK_ROWS = 24  # dark rows at least, which know the noise of a dark pixel to a seventh
-MAX_ROW_FRACTION = 0.75  # of all rows: what needs more of them is as well searched everywhere
-GAP_INSTANTS = LANES + 16
-"""Places beyond a column's sums: blocks of twice `LANES` need no end of their own, and columns are an
-odd number of cache lines apart, so that neighbours share no place of the cache."""
 
 
 @dataclass(frozen=True)
@@ -210,8 +181,8 @@ class SignalRowFinder:
         self._step = max(1, round(pulse_rows))
         self._length = min(self.rows, max(1, round(BOX_LENGTH_WIDTHS * pulse_rows)))
         middles: list[NDArray[np.int64]] = []
+        # each operator with its instants, a multiple of `LANES`
         self._owners: list[tuple[BrightFrameFinder, slice]] = []
-        """Each operator with its instants, a multiple of `LANES`."""
         finders: dict[InverseTraces, BrightFrameFinder] = {}
         first = 0
         for place in places:
@@ -265,11 +236,7 @@ class SignalRowFinder:
         """Return the rows worth recovering, and a sample of the dark ones that stands for the rest.
 
         All rows, if a quarter of the shot is not nearly as dark as the darkest twentieth, or if not
-        much would be left out.
-
-        `sums` (columns, instants and some): of `sum_measurements` or `sum_streak`; overwritten.
-
-        Memory: as much as the measurements, divided by the rows of a pulse width.
+        much would be left out. `sums` of `sum_measurements` or `sum_streak` are overwritten.
         """
         lit = self._find_signal_bins(sums)
         searched = self._mark_rows_near(lit, self._step // 2 + 1)
