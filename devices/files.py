@@ -1,20 +1,18 @@
-"""Files of time-correlated single-photon counting: photons one by one (PicoQuant's PTU, Swabian
-Instruments' TTBIN) and whole histograms (PicoQuant's PHU, Becker & Hickl's SDT).
+"""Files as sources: of time-correlated single-photon counting, photons one by one (PicoQuant's PTU,
+Swabian Instruments' TTBIN) and whole histograms (PicoQuant's PHU, Becker & Hickl's SDT); and streak
+images (ITEX, HPD-TA's TIFF), which are one frame.
 
 ::
 
-    file -> reader: pieces of records -> TcspcFile, a source
+    file -> reader: pieces of records -> RecordFile, a source
 
-The libraries `ptufile` and `sdtfile` (extra ``tcspc``) and Swabian Instruments' own read them.
-
-Streak images in files (ITEX, HPD-TA's TIFF) as sources of one frame, next to the cameras that
-took them.
+The libraries `ptufile` and `sdtfile` (extra ``tcspc``) and Swabian Instruments' own read the first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,13 +22,13 @@ from numpy.typing import NDArray
 
 from devices.address import Uri
 from devices.source import READ_TIMEOUT_S, Batch, Info, Ledger, Records, Source, Stats
-from tofclip.errors import FileFormatError, InputError, TofclipError
+from tofclip.errors import FileFormatError, InputError
 from tofclip.files import (
     BoundedFile,
     format_error_line,
+    guard,
     import_file_reader,
     require_bounded_size,
-    translate_read_errors,
 )
 from tofclip.io import read_streak
 from tofclip.io.tcspc import (
@@ -41,7 +39,6 @@ from tofclip.io.tcspc import (
     read_sdt_blocks,
     require_pulses,
 )
-from tofclip.shots import Streak
 from tofclip.storage import Field, Record, Scalar
 
 HISTOGRAM_BYTES = 4
@@ -68,37 +65,34 @@ class Reader(Protocol):
     """A file as pieces of records."""
 
     info: Info
-    attributes: dict[str, Scalar]
-    """Of the calibration."""
-    sizes: list[int]
-    """Records of each piece."""
     lost: int
     """Records that the electronics say they lost."""
+
+    @property
+    def calibration(self) -> Record | None:
+        """What turns records into seconds."""
+
+    @property
+    def sizes(self) -> list[int]:
+        """Records of each piece."""
 
     def decode(self, piece: int) -> Records:
         """Return the records of a piece."""
 
 
-class TcspcFile(Source):
+class RecordFile(Source):
     """A file's records. Memory: one piece of it, decoded.
 
-    The calibration has ``resolution_s``, the width of a bin, and ``channels``; of photons also
-    ``laser_period_s``, of images ``rows`` and ``columns``.
+    The calibration of photons and histograms has ``resolution_s``, the width of a bin, and
+    ``channels``; of photons also ``laser_period_s``, of images ``rows`` and ``columns``.
 
     `open_file`: makes the file's reader.
     """
 
     def __init__(self, path: str | Path, open_file: Callable[[Path], Reader]) -> None:
-        try:
-            with translate_read_errors(path):
-                Path(path).stat()  # some libraries say of an absent file that it is damaged
-                self._reader = open_file(Path(path))
-        except TofclipError:
-            raise
-        except Exception as fault:  # whatever the library stumbles over, the file is damaged
-            raise FileFormatError(
-                path, f"is a damaged or unsupported file ({format_error_line(fault)})"
-            ) from fault
+        with guard(path, "is a damaged or unsupported file"):
+            Path(path).stat()  # some libraries say of an absent file that it is damaged
+            self._reader = open_file(Path(path))
         self._begins = [0, *accumulate(self._reader.sizes)]
         self._closed = False
         self._decoded: tuple[int, Records] | None = None
@@ -109,8 +103,8 @@ class TcspcFile(Source):
         return self._reader.info
 
     @property
-    def calibration(self) -> Record:
-        return Record("tcspc_calibration", attributes=self._reader.attributes)
+    def calibration(self) -> Record | None:
+        return self._reader.calibration
 
     @property
     def stats(self) -> Stats:
@@ -150,17 +144,18 @@ class TcspcFile(Source):
 
 
 @dataclass
-class Histograms:
-    """Whole histograms as one piece; see `Reader`."""
+class WholeRecords:
+    """All records of a file as one piece; see `Reader`."""
 
     records: Records
     info: Info
-    attributes: dict[str, Scalar]
-    sizes: list[int] = field(init=False)
+    calibration: Record | None
     lost: int = 0
 
-    def __post_init__(self) -> None:
-        self.sizes = [len(self.records)]
+    @property
+    def sizes(self) -> list[int]:
+        """Records of the one piece."""
+        return [len(self.records)]
 
     def decode(self, piece: int) -> Records:
         """Return all of them."""
@@ -189,8 +184,8 @@ class PtuPhotons:
             count = self._checkpoints[-1].count
             require_pulses(path, count)
             period = count.period_ticks * events.tick
-        self.attributes = _describe_photons(events.resolution, channels, period, path)
-        self.info = Info(f"TCSPC file ({events.kind})", "", dict(self.attributes))
+        self.calibration = _describe_bins(events.resolution, channels, period, path)
+        self.info = Info(f"TCSPC file ({events.kind})", "", self.calibration.attributes)
 
     def decode(self, piece: int) -> Records:
         """Return the photons of a million events."""
@@ -228,10 +223,10 @@ class SwabianPhotons:
             )
         self._inputs = sorted(inputs)
         self._rewind()
-        self.attributes = _describe_photons(
-            PICOSECOND_S, max(1, len(inputs)), count.period_ticks * PICOSECOND_S, path
-        )
-        details = {**self.attributes, "inputs": ",".join(map(str, self._inputs))}
+        period = count.period_ticks * PICOSECOND_S
+        self.calibration = _describe_bins(PICOSECOND_S, max(1, len(inputs)), period, path)
+        named = {"inputs": ",".join(map(str, self._inputs))}
+        details = {**self.calibration.attributes, **named}
         self.info = Info("time tags (Swabian Instruments)", "", details)
 
     def decode(self, piece: int) -> Records:
@@ -276,43 +271,39 @@ class SwabianPhotons:
         return (pulse[is_photon], delay[is_photon], channel[is_photon]), lost
 
 
-def open_ptu(uri: Uri) -> TcspcFile:
+def open_ptu(uri: Uri) -> RecordFile:
     """Open ``file://run.ptu``; ``sync=N`` where a file in T2 mode has the laser's pulses on an input
     for photons.
     """
     uri.reject_unknown("sync")
     sync = uri.value("sync", int, 0) if "sync" in uri.values else None
-    return TcspcFile(uri.location, lambda path: PtuPhotons(path, sync))
+    return RecordFile(uri.location, lambda path: PtuPhotons(path, sync))
 
 
-def open_ttbin(uri: Uri) -> TcspcFile:
+def open_ttbin(uri: Uri) -> RecordFile:
     """Open ``file://run.ttbin?sync=1``; ``sync`` is the channel of the laser's pulses."""
     uri.reject_unknown("sync")
     if "sync" not in uri.values:
         raise InputError(f"'{uri.text}': name the channel of the laser's pulses: sync=1")
     sync = uri.value("sync", int, 0)
-    return TcspcFile(uri.location, lambda path: SwabianPhotons(path, sync))
+    return RecordFile(uri.location, lambda path: SwabianPhotons(path, sync))
 
 
-def open_phu(uri: Uri) -> TcspcFile:
+def open_phu(uri: Uri) -> RecordFile:
     """Open ``file://run.phu``."""
     uri.reject_unknown()
-    return TcspcFile(uri.location, _read_picoquant_histograms)
+    return RecordFile(uri.location, _read_picoquant_histograms)
 
 
-def open_sdt(uri: Uri) -> TcspcFile:
+def open_sdt(uri: Uri) -> RecordFile:
     """Open ``file://run.sdt``; an image's pixels are its channels, row by row."""
     uri.reject_unknown()
-    return TcspcFile(uri.location, _read_becker_hickl_histograms)
+    return RecordFile(uri.location, _read_becker_hickl_histograms)
 
 
 def compute_photon_times(photons: Records, calibration: Record) -> NDArray[np.float64]:
-    """Return when each photon came, s after the laser's pulse: the beginning of its bin.
-
-    `photons` (n,): with a field ``bin``; `calibration`: gives the resolution, s. Returns (n,).
-    """
-    times: NDArray[np.float64] = photons["bin"] * calibration.number("resolution_s")
-    return times
+    """Return when each photon came, s after the laser's pulse: the beginning of its bin."""
+    return np.asarray(photons["bin"] * calibration.number("resolution_s"))
 
 
 def _make_photons(pulse: Any, delay: Any, channel: Any) -> Records:
@@ -321,49 +312,50 @@ def _make_photons(pulse: Any, delay: Any, channel: Any) -> Records:
     return photons
 
 
-def _describe_photons(
-    resolution: float, channels: int, period: float, path: Path
-) -> dict[str, Scalar]:
-    found: dict[str, Scalar] = {
-        "resolution_s": _require_positive(resolution, path),
-        "channels": channels,
-    }
-    return {**found, "laser_period_s": period} if period else found
+def _describe_bins(
+    resolution: float, channels: int, period: float, path: Path, **shape: int
+) -> Record:
+    """Return the calibration of photons in bins of `resolution`, s."""
+    if not (np.isfinite(resolution) and resolution > 0):
+        raise FileFormatError(path, f"says that its bins last {resolution} s")
+    found: dict[str, Scalar] = {"resolution_s": resolution, "channels": channels, **shape}
+    if period:
+        found["laser_period_s"] = period
+    return Record("tcspc_calibration", attributes=found)
 
 
-def _read_picoquant_histograms(path: Path) -> Histograms:
-    _require_moderate_size(path)
+def _read_picoquant_histograms(path: Path) -> WholeRecords:
+    size = _require_moderate_size(path)
     ptufile = import_file_reader("ptufile", TCSPC)
     with BoundedFile(path) as opened, ptufile.PhuFile(opened) as file:
         bins = np.ravel(file.tags["HistResDscr_HistogramBins"]).tolist()
-        require_bounded_size(
-            path, "histograms", sum(map(abs, bins)) * HISTOGRAM_BYTES, path.stat().st_size
-        )
-        return _make_histograms(
-            file.histograms(), float(file.tcspc_resolution), "PicoQuant histograms", path
-        )
+        require_bounded_size(path, "histograms", sum(map(abs, bins)) * HISTOGRAM_BYTES, size)
+        resolution = float(file.tcspc_resolution)
+        return _stack_histograms(file.histograms(), resolution, "PicoQuant histograms", path)
 
 
-def _read_becker_hickl_histograms(path: Path) -> Histograms:
+def _read_becker_hickl_histograms(path: Path) -> WholeRecords:
     _require_moderate_size(path)
     blocks, resolution = read_sdt_blocks(path)
     curves = [curve for block in blocks for curve in block.reshape(-1, block.shape[-1])]
-    found = _make_histograms(curves, resolution, "Becker & Hickl histograms", path)
+    shape = {}
     if len({block.shape for block in blocks}) == 1 and blocks[0].ndim == 3:
-        rows, columns, _ = blocks[0].shape
-        found.attributes |= {"rows": rows, "columns": columns}
-        found.info = Info(found.info.instrument, "", dict(found.attributes))
-    return found
+        shape = dict(zip(("rows", "columns"), blocks[0].shape, strict=False))
+    return _stack_histograms(curves, resolution, "Becker & Hickl histograms", path, **shape)
 
 
-def _require_moderate_size(path: Path) -> None:
-    if path.stat().st_size > MAX_HISTOGRAM_FILE_BYTES:
+def _require_moderate_size(path: Path) -> int:
+    size = path.stat().st_size
+    if size > MAX_HISTOGRAM_FILE_BYTES:
         raise FileFormatError(
             path, f"is larger than {MAX_HISTOGRAM_FILE_BYTES} bytes; export a part of it"
         )
+    return size
 
 
-def _make_histograms(curves: Any, resolution: float, instrument: str, path: Path) -> Histograms:
+def _stack_histograms(
+    curves: Any, resolution: float, instrument: str, path: Path, **shape: int
+) -> WholeRecords:
     lengths = {len(curve) for curve in curves}
     if len(lengths) != 1 or not 0 < max(lengths) <= MAX_BINS:
         raise FileFormatError(
@@ -372,80 +364,32 @@ def _make_histograms(curves: Any, resolution: float, instrument: str, path: Path
     counts = np.stack(list(curves))
     records = np.zeros(len(counts), [("channel", "<u4"), ("histogram", "<u4", counts.shape[1:])])
     records["channel"], records["histogram"] = np.arange(len(counts)), counts
-    attributes: dict[str, Scalar] = {
-        "resolution_s": _require_positive(resolution, path),
-        "channels": len(counts),
-    }
-    return Histograms(records, Info(instrument, "", dict(attributes)), attributes)
+    known = _describe_bins(resolution, len(counts), 0.0, path, **shape)
+    return WholeRecords(records, Info(instrument, "", known.attributes), known)
 
 
-def _require_positive(resolution: float, path: Path) -> float:
-    """Return a bin's duration, s, if it can be one."""
-    if not (np.isfinite(resolution) and resolution > 0):
-        raise FileFormatError(path, f"says that its bins last {resolution} s")
-    return resolution
-
-
-class StreakFile(Source):
-    """One frame, and the time axis that its file brings."""
-
-    def __init__(self, streak: Streak) -> None:
-        self._streak = streak
-        frame = np.zeros(1, [("number", "<i8"), ("counts", "<f4", streak.counts.shape)])
-        frame["counts"] = streak.counts
-        self._frame = frame
-        self._closed = False
-        self.seek(0)
-
-    @property
-    def info(self) -> Info:
-        rows, columns = self._streak.counts.shape
-        known = self._streak.metadata
-        name = known.get("Camera/CameraName", "")
-        details = {
-            "rows": rows,
-            "columns": columns,
-            "camera": name,
-            "date": known.get("Application/Date", ""),
-        }
-        return Info("streak image in a file", known.get("Camera/SerialNumber", ""), details)
-
-    @property
-    def calibration(self) -> Record | None:
-        """Time of each row in s, where the file has one."""
-        if self._streak.row_times is None:
-            return None
-        return Record(
-            "streak_calibration", {"row_times": Field(self._streak.row_times, "s", ("row",))}
-        )
-
-    @property
-    def stats(self) -> Stats:
-        return self._ledger.stats
-
-    @property
-    def is_seekable(self) -> bool:
-        return True
-
-    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
-        """Return the frame, then None; `timeout` does not matter."""
-        if self._closed or self._ledger.stats.unread == 0:
-            return None
-        self._ledger.deliver(1, 0)
-        return Batch(self._frame)
-
-    def seek(self, record: int) -> None:
-        if record not in (0, 1):
-            raise InputError(f"a picture is one record, there is no number {record}")
-        self._ledger = Ledger()
-        self._ledger.receive(1)
-        self._ledger.deliver(record, 0)
-
-    def close(self) -> None:
-        self._closed = True
-
-
-def open_streak_file(uri: Uri) -> StreakFile:
+def open_streak_file(uri: Uri) -> RecordFile:
     """Open ``file://shot.img`` or ``file://shot.tif``."""
     uri.reject_unknown()
-    return StreakFile(read_streak(uri.location))
+    return RecordFile(uri.location, _read_picture)
+
+
+def _read_picture(path: Path) -> WholeRecords:
+    """Return one frame, and the time axis that its file brings."""
+    streak = read_streak(path)
+    rows, columns = streak.counts.shape
+    frame = np.zeros(1, [("number", "<i8"), ("counts", "<f4", streak.counts.shape)])
+    frame["counts"] = streak.counts
+    said = streak.metadata
+    details: dict[str, Scalar] = {
+        "rows": rows,
+        "columns": columns,
+        "camera": said.get("Camera/CameraName", ""),
+        "date": said.get("Application/Date", ""),
+    }
+    info = Info("streak image in a file", said.get("Camera/SerialNumber", ""), details)
+    known = None
+    if streak.row_times is not None:
+        times = Field(streak.row_times, "s", ("row",))
+        known = Record("streak_calibration", {"row_times": times})
+    return WholeRecords(frame, info, known)

@@ -1,4 +1,7 @@
-"""LinoSPAD2's stream (S. Burri et al., Instruments 2018, 2, 28; layout as the authors' and daplis'
+"""LinoSPAD2's recordings as a source of time stamps: its stream, what a board's calibration knows, and
+what recordings do not say themselves, in a small TOML file beside each of them.
+
+The stream (S. Burri et al., Instruments 2018, 2, 28; layout as the authors' and daplis'
 readers have it).
 
 A stream is a row of *cycles*, little-endian words of 32 bits: where the option is on, two words of
@@ -10,25 +13,19 @@ converters, of which the last serves no pixels. A word::
     bits 27-0   code: 140 codes for each 2500 ps since the cycle began
 
 The stream says neither N, nor which firmware numbered the pixels, nor whether there is a counter.
-
-What a LinoSPAD2 board's calibration knows: how wide each code is, how late each pixel, and which
-pixels are hot.
-
-What LinoSPAD2's recordings do not say themselves, in a small TOML file beside each of them.
-
-LinoSPAD2's recordings as a source of time stamps.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tomllib
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +53,7 @@ from devices.source import (
     as_bytes,
 )
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
-from tofclip.files import format_error_line, translate_read_errors
+from tofclip.files import guard, translate_read_errors
 from tofclip.storage import Record, Scalar, Storable, stored_array
 from tofclip.threads import run_blocks
 
@@ -157,13 +154,12 @@ class LinoSpad2Codec:
 
     def count_records(self, data: ByteView) -> int:
         """Return how many words of `data` are valid."""
-        kept, malformed = self._count_per_cycle(self._view_cycles(data))
-        return int(kept.sum()) + malformed
+        return sum(self.count_stamps(data))
 
-    def count_valid(self, data: ByteView) -> int:
-        """Return how many records `decode` would make of `data`."""
-        kept, _ = self._count_per_cycle(self._view_cycles(data))
-        return int(kept.sum())
+    def count_stamps(self, data: ByteView) -> tuple[int, int]:
+        """Return how many records `decode` would make of `data`, and how many are malformed."""
+        kept, malformed = self._count_per_cycle(self._view_cycles(data))
+        return int(kept.sum()), malformed
 
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
         """Decode whole cycles; `state` is how many came before. Cycles that were lost are not
@@ -184,13 +180,9 @@ class LinoSpad2Codec:
         rows = records.view(_WORD_DTYPE).reshape(total, self.dtype.itemsize // _WORD_DTYPE.itemsize)
 
         def work(block: slice) -> None:
-            first, last = (
-                (int(ends[block.start - 1]) if block.start else 0),
-                int(ends[block.stop - 1]),
-            )
-            decode_stamps(
-                cycles[block], self.header, state + block.start, self.pixel_of, rows[first:last]
-            )
+            first = int(ends[block.start - 1]) if block.start else 0
+            own = rows[first : int(ends[block.stop - 1])]
+            decode_stamps(cycles[block], self.header, state + block.start, self.pixel_of, own)
 
         run_blocks(work, len(cycles), max(1, _BLOCK_BYTES // self.cycle_bytes))
         return DecodeResult(records, malformed, state + len(cycles))
@@ -344,19 +336,18 @@ def load_calibration(
     each line.
     """
     picosecond = 1e-12
-    table = _read_numbers(
-        code_table, lambda path: np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
-    )
+    with _guard_table(code_table):
+        table = np.loadtxt(code_table, delimiter=",", skiprows=1, ndmin=2)
     # Mapped, not read: a header that claims more than the file holds is refused before memory is
     # taken.
-    offsets = _read_numbers(
-        offset_table, lambda path: np.array(np.load(path, mmap_mode="r", allow_pickle=False))
-    )
+    with _guard_table(offset_table):
+        mapped = np.load(offset_table, mmap_mode="r", allow_pickle=False)
+        offsets = np.asarray(mapped, np.float64)
     hot = np.empty(0)
     if hot_pixels is not None:
-        hot = _read_numbers(
-            hot_pixels, lambda path: [int(word) for word in path.read_text("ascii").split()]
-        )
+        with _guard_table(hot_pixels):
+            words = Path(hot_pixels).read_text("ascii").split()
+            hot = np.array([int(word) for word in words], np.float64)
         if np.any((hot < 0) | (hot >= PIXELS)):
             raise FileFormatError(hot_pixels, f"names pixels beyond 0..{PIXELS - 1}")
     if table.ndim != 2 or table.shape[1] != CODES_PER_PERIOD + 1:
@@ -366,26 +357,20 @@ def load_calibration(
     return BoardCalibration(table[:, 1:] * picosecond, offsets * picosecond, hot.astype(np.int64))
 
 
-def _read_numbers(path: str | Path, reader: Callable[[Path], Any]) -> NDArray[np.float64]:
-    with translate_read_errors(path):
+@contextlib.contextmanager
+def _guard_table(path: str | Path) -> Iterator[None]:
+    with guard(path, "holds no table of numbers"):
         size = Path(path).stat().st_size
         if size > _MAX_FILE_BYTES:
             raise FileFormatError(path, f"is larger than any table of LinoSPAD2: {size} bytes")
-        try:
-            return np.asarray(reader(Path(path)), np.float64)
-        except Exception as fault:  # whatever NumPy stumbles over, it is the file that is damaged
-            raise FileFormatError(
-                path, f"holds no table of numbers ({format_error_line(fault)})"
-            ) from fault
+        yield
 
 
 def make_calibration_record(
     board: BoardCalibration, laser_period: float | None, camera: Record | None
 ) -> Record:
-    """Return what turns time stamps into a scene: the board's tables, the laser's period, the
+    """Return what turns time stamps into a scene: the board's tables, the laser's period (s), the
     camera.
-
-    `laser_period`: seconds.
     """
     record = board.to_record()
     attributes = {} if laser_period is None else {"laser_period_s": laser_period}
@@ -393,112 +378,90 @@ def make_calibration_record(
     return Record(record.kind, record.fields, attributes, children)
 
 
-_MAX_FILE_BYTES_SIDECAR = 1 << 16
-_KEY_TYPES: dict[str, type] = {
-    "firmware": str,
-    "timestamps_per_cycle": int,
-    "absolute_counter": bool,
-    "board": str,
-    "code_table": str,
-    "offset_table": str,
-    "hot_pixels": str,
-    "laser_period_ps": float,
-    "camera": str,
-}
-_REQUIRED_KEYS = ("firmware", "timestamps_per_cycle", "absolute_counter")
+_MAX_SIDECAR_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
 class Sidecar:
-    """How to read a recording."""
+    """What the TOML file beside a recording says; names of files are relative to it."""
 
-    codec: LinoSpad2Codec
-    # the board's tables; `BoardCalibration.ideal` where none are named
-    calibration: BoardCalibration
-    board: str = ""  # which board it was; may be empty
-    # time between two laser pulses, s, where pulses were locked to the board's clock
-    laser_period: float | None = None
-    camera: Path | None = None  # file of the camera in front of the line
+    firmware: str  # "2212b" or "2212s"
+    timestamps_per_cycle: int
+    absolute_counter: bool
+    board: str = ""  # which board it was
+    code_table: str = ""
+    offset_table: str = ""
+    hot_pixels: str = ""
+    laser_period_ps: float = 0.0  # where pulses were locked to the board's clock
+    camera: str = ""  # file of the camera in front of the line
+    folder: Path = Path()
+
+    @property
+    def codec(self) -> LinoSpad2Codec:
+        """What reads the recording."""
+        return LinoSpad2Codec(self.firmware, self.timestamps_per_cycle, self.absolute_counter)
+
+    @property
+    def laser_period(self) -> float | None:
+        """Time between two pulses, s."""
+        return self.laser_period_ps * 1e-12 or None
+
+    @cached_property
+    def calibration(self) -> BoardCalibration:
+        """The board's tables; `BoardCalibration.ideal` where none are named."""
+        if bool(self.code_table) != bool(self.offset_table):
+            raise InputError("code_table and offset_table belong together: give both or neither")
+        if self.hot_pixels and not self.code_table:
+            raise InputError("hot_pixels needs code_table and offset_table as well")
+        if not self.code_table:
+            return BoardCalibration.ideal()
+        hot = self.folder / self.hot_pixels if self.hot_pixels else None
+        return load_calibration(self.folder / self.code_table, self.folder / self.offset_table, hot)
 
 
 def read_sidecar(recording: str | Path) -> Sidecar:
-    """Read the TOML file that lies beside `recording` and has its name.
-
-    Its keys are ``firmware`` ("2212b" or "2212s"), ``timestamps_per_cycle`` and
-    ``absolute_counter`` (true or false), and optionally ``board``, ``code_table`` with
-    ``offset_table``, ``hot_pixels``, ``laser_period_ps`` and ``camera``. Names of files are
-    relative to the TOML file.
-    """
+    """Read the TOML file that lies beside `recording` and has its name: the fields of `Sidecar`."""
     path = Path(recording).with_suffix(".toml")
-    values = _check_keys(_parse_toml(path, recording), path)
-    if ("code_table" in values) != ("offset_table" in values):
-        raise FileFormatError(
-            path, "code_table and offset_table belong together: give both or neither"
-        )
-    try:
-        codec = LinoSpad2Codec(
-            values["firmware"], values["timestamps_per_cycle"], values["absolute_counter"]
-        )
-        calibration = _read_calibration(values, path.parent)
-    except InputError as fault:
-        raise FileFormatError(path, str(fault)) from fault
-    period = values.get("laser_period_ps")
-    if period is not None and not 0 < period < float("inf"):
-        raise FileFormatError(path, f"laser_period_ps must be a positive number, found {period}")
-    return Sidecar(
-        codec,
-        calibration,
-        values.get("board", ""),
-        None if period is None else period * 1e-12,
-        path.parent / values["camera"] if "camera" in values else None,
-    )
-
-
-def _parse_toml(path: Path, recording: str | Path) -> dict[str, Any]:
+    kinds = get_type_hints(Sidecar)
+    del kinds["folder"]
+    required = [one.name for one in fields(Sidecar) if one.default is MISSING]
     if not path.exists():
-        keys = ", ".join(_REQUIRED_KEYS)
         raise StorageError(
-            f"{recording}: its format is not in the file itself; write {keys} into {path.name} beside it"
+            f"{recording}: its format is not in the file itself; write {', '.join(required)} into "
+            f"{path.name} beside it"
         )
     with translate_read_errors(path), open(path, "rb") as file:
         # One byte more than allowed shows that there is more, without reading all of it.
-        data = file.read(_MAX_FILE_BYTES_SIDECAR + 1)
-    if len(data) > _MAX_FILE_BYTES_SIDECAR:
+        data = file.read(_MAX_SIDECAR_BYTES + 1)
+    if len(data) > _MAX_SIDECAR_BYTES:
         raise FileFormatError(
             path,
-            f"is larger than any description of a recording: more than {_MAX_FILE_BYTES_SIDECAR} bytes",
+            f"is larger than any description of a recording: more than {_MAX_SIDECAR_BYTES} bytes",
         )
-    try:
-        return tomllib.loads(data.decode())
-    except ValueError as fault:
-        raise FileFormatError(path, f"is not TOML ({fault})") from fault
-
-
-def _check_keys(found: dict[str, Any], path: Path) -> dict[str, Any]:
-    for key in _REQUIRED_KEYS:
+    with guard(path, "is not TOML"):
+        found = tomllib.loads(data.decode())
+    for key in required:
         if key not in found:
             raise FileFormatError(path, f"lacks the key '{key}'")
     for key, value in found.items():
-        if key not in _KEY_TYPES:
+        if key not in kinds:
             raise FileFormatError(
-                path, f"has the unknown key '{key}'; known are {', '.join(_KEY_TYPES)}"
+                path, f"has the unknown key '{key}'; known are {', '.join(kinds)}"
             )
-        kind = _KEY_TYPES[key]
-        # TOML distinguishes 50000 from 50000.0, which people do not. By exact type, because bool is an int in
-        # Python.
-        is_number = kind is float and type(value) is int
-        if type(value) is not kind and not is_number:
+        kind = kinds[key]
+        # TOML distinguishes 50000 from 50000.0, which people do not. By exact type, because bool is
+        # an int in Python.
+        if type(value) is not kind and not (kind is float and type(value) is int):
             raise FileFormatError(path, f"{key} must be a {kind.__name__}, found {value!r}")
-    return found
-
-
-def _read_calibration(values: dict[str, Any], folder: Path) -> BoardCalibration:
-    hot = folder / values["hot_pixels"] if "hot_pixels" in values else None
-    if "code_table" in values:
-        return load_calibration(folder / values["code_table"], folder / values["offset_table"], hot)
-    if hot is not None:
-        raise InputError("hot_pixels needs code_table and offset_table as well")
-    return BoardCalibration.ideal()
+    period = found.get("laser_period_ps")
+    if period is not None and not 0 < period < float("inf"):
+        raise FileFormatError(path, f"laser_period_ps must be a positive number, found {period}")
+    sidecar = Sidecar(**found, folder=path.parent)
+    try:
+        _ = sidecar.codec, sidecar.calibration
+    except InputError as fault:
+        raise FileFormatError(path, str(fault)) from fault
+    return sidecar
 
 
 LIMITATION = "LinoSPAD2's USB commands are not public: its recordings are read, no board is driven"
@@ -547,12 +510,10 @@ class LinoSpad2File(DecodedSource):
 
     @property
     def calibration(self) -> Record:
-        camera = (
-            None if self._sidecar.camera is None else Record.load(self._sidecar.camera, "camera")
-        )
-        return make_calibration_record(
-            self._sidecar.calibration, self._sidecar.laser_period, camera
-        )
+        known, camera = self._sidecar, None
+        if known.camera:
+            camera = Record.load(known.folder / known.camera, "camera")
+        return make_calibration_record(known.calibration, known.laser_period, camera)
 
     @property
     def is_seekable(self) -> bool:
@@ -591,10 +552,9 @@ class LinoSpad2File(DecodedSource):
         """
         good, malformed = [0], [0]
         for number in range(self._pieces):
-            data = as_bytes(self._read_piece(number))
-            kept = self.codec.count_valid(data)
+            kept, strays = self.codec.count_stamps(as_bytes(self._read_piece(number)))
             good.append(good[-1] + kept)
-            malformed.append(malformed[-1] + self.codec.count_records(data) - kept)
+            malformed.append(malformed[-1] + strays)
         return good, malformed
 
     def _seek_to(self, number: int) -> None:

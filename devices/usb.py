@@ -31,7 +31,20 @@ VENDOR_REQUEST = 0x40
 REPLUG_POLL_S = 0.05
 """Seconds between two looks for an instrument that was unplugged."""
 
-_DISCONNECT_ERRNOS = (errno.ENODEV, errno.EIO, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN)
+_UNPLUGGED = (DeviceDisconnectedError, "was unplugged")
+_FAULTS: dict[int, tuple[type[DeviceError], str]] = {
+    errno.ETIMEDOUT: (DeviceTimeoutError, "sent nothing in time"),
+    errno.EBUSY: (DeviceBusyError, "is used by another program; close that first"),
+    errno.EPIPE: (DeviceStalledError, "stalled; unplug it and plug it in again"),
+    errno.EOVERFLOW: (
+        TransferOverflowError,
+        "sent more than was asked for; the transfer is lost",
+    ),
+    **dict.fromkeys(
+        (errno.ENODEV, errno.EIO, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN), _UNPLUGGED
+    ),
+}
+"""What a system error means, and what is said of it."""
 
 
 class UsbIdentity(NamedTuple):
@@ -71,10 +84,7 @@ def system_backend() -> Any:
 
 
 def find_devices(identity: UsbIdentity, backend: Any) -> Iterator[usb.core.Device]:
-    """Yield every connected instrument of that kind.
-
-    `backend`: of pyusb.
-    """
+    """Yield every connected instrument of that kind."""
     import usb.core
 
     with translate_errors(identity):
@@ -84,10 +94,7 @@ def find_devices(identity: UsbIdentity, backend: Any) -> Iterator[usb.core.Devic
 
 
 def read_serial(device: usb.core.Device, identity: UsbIdentity) -> str:
-    """Return the serial number, empty where there is none.
-
-    `identity`: for the message.
-    """
+    """Return the serial number, empty where there is none."""
     with translate_errors(identity):
         return str(device.serial_number or "")
 
@@ -106,9 +113,8 @@ def translate_errors(identity: UsbIdentity) -> Iterator[None]:
     except ValueError as fault:
         if "langid" not in str(fault):
             raise
-        raise _make_permission_error(
-            identity
-        ) from fault  # pyusb says so where it may not open the device
+        # pyusb says so where it may not open the device.
+        raise _make_permission_error(identity) from fault
     except NotImplementedError as fault:
         raise DeviceError(
             f"USB device {identity}: this system's USB library cannot do that ({fault})"
@@ -118,24 +124,11 @@ def translate_errors(identity: UsbIdentity) -> Iterator[None]:
 def _convert_error(fault: usb.core.USBError, identity: UsbIdentity) -> DeviceError:
     import usb.core
 
-    number = fault.errno
-    if isinstance(fault, usb.core.USBTimeoutError) or number == errno.ETIMEDOUT:
-        return DeviceTimeoutError(f"USB device {identity} sent nothing in time")
+    number = errno.ETIMEDOUT if isinstance(fault, usb.core.USBTimeoutError) else fault.errno
     if number == errno.EACCES:
         return _make_permission_error(identity)
-    if number in _DISCONNECT_ERRNOS:
-        return DeviceDisconnectedError(f"USB device {identity} was unplugged")
-    if number == errno.EBUSY:
-        return DeviceBusyError(
-            f"USB device {identity} is used by another program; close that first"
-        )
-    if number == errno.EPIPE:
-        return DeviceStalledError(f"USB device {identity} stalled; unplug it and plug it in again")
-    if number == errno.EOVERFLOW:
-        return TransferOverflowError(
-            f"USB device {identity} sent more than was asked for; the transfer is lost"
-        )
-    return DeviceError(f"USB device {identity}: {' '.join(str(fault).split())}")
+    kind, said = _FAULTS.get(number, (DeviceError, f": {' '.join(str(fault).split())}"))
+    return kind(f"USB device {identity} {said}".replace(" :", ":"))
 
 
 def _make_permission_error(identity: UsbIdentity) -> DevicePermissionError:
@@ -162,18 +155,13 @@ class UsbLink:
     def read(self, endpoint: int, buffer: array.array[int], timeout: float) -> int:
         """Fill `buffer` from a bulk endpoint and return how many bytes came; fewer than fit are no
         fault.
-
-        `endpoint`: address; `buffer`: overwritten; `timeout`: seconds.
         """
         return self._retry_after_halt(
             endpoint, lambda: int(self._device.read(endpoint, buffer, _to_milliseconds(timeout)))
         )
 
     def write(self, endpoint: int, data: bytes, timeout: float) -> None:
-        """Send all of `data` to a bulk endpoint.
-
-        `endpoint`: address; `timeout`: seconds.
-        """
+        """Send all of `data` to a bulk endpoint."""
         sent = self._retry_after_halt(
             endpoint, lambda: int(self._device.write(endpoint, data, _to_milliseconds(timeout)))
         )
@@ -183,10 +171,7 @@ class UsbLink:
             )
 
     def request(self, number: int, value: int, timeout: float) -> None:
-        """Send a vendor request without data to the instrument's firmware.
-
-        `number, value`: the request (``bRequest``) and its ``wValue``; `timeout`: seconds.
-        """
+        """Send a vendor request (``bRequest``, ``wValue``) without data to the firmware."""
         with translate_errors(self.identity):
             self._device.ctrl_transfer(
                 VENDOR_REQUEST, number, value, 0, None, _to_milliseconds(timeout)
@@ -244,9 +229,8 @@ class UsbLink:
         import usb.util
 
         with translate_errors(self.identity):
-            with contextlib.suppress(
-                NotImplementedError
-            ):  # only Linux and macOS have drivers to detach
+            # Only Linux and macOS have drivers to detach.
+            with contextlib.suppress(NotImplementedError):
                 if self._device.is_kernel_driver_active(INTERFACE_NUMBER):
                     self._device.detach_kernel_driver(INTERFACE_NUMBER)
             try:

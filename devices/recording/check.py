@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from devices.recording.read import Block, BlockKind, BlockReader, Damage, Ending, Recording
+from devices.recording.read import BlockKind, Damage, Ending, Recording
 from devices.recording.write import RecordingWriter
-from devices.source import Codec, Gap, Piece, Stats, as_bytes
+from devices.source import Gap, Piece, Stats, as_bytes
 from tofclip.errors import FileFormatError
 
 
@@ -16,21 +18,12 @@ class Findings:
     """What is in a recording."""
 
     bytes: int = 0  # of the instrument, as they came
-    # sound blocks; records that decode, and records that do not; places where the recording says
-    # that something is missing
-    blocks: int = 0
-    # sound blocks; records that decode, and records that do not; places where the recording says
-    # that something is missing
-    records: int = 0
-    # sound blocks; records that decode, and records that do not; places where the recording says
-    # that something is missing
-    malformed: int = 0
-    # sound blocks; records that decode, and records that do not; places where the recording says
-    # that something is missing
-    gaps: int = 0
+    blocks: int = 0  # sound ones
+    records: int = 0  # that decode
+    malformed: int = 0  # records that do not
+    gaps: int = 0  # places where the recording says that something is missing
     # what is not what was written. Bytes behind the last block count as well
     damaged_blocks: int = 0
-    # what is not what was written. Bytes behind the last block count as well
     damaged_bytes: int = 0
     # of these, a last block that was never finished, because the program was killed or the file
     # truncated: no damage to what is before it
@@ -70,10 +63,7 @@ def verify(path: Path) -> Findings:
     Memory: one block and its records.
     """
     with Recording(path) as recording:
-        inspector = _Inspector(recording.codec)
-        for entry in recording.blocks:
-            inspector.inspect(recording.blocks, entry)
-        return inspector.findings
+        return _inspect(recording, lambda piece: None)
 
 
 def repair(path: Path, out: Path) -> Findings:
@@ -82,92 +72,61 @@ def repair(path: Path, out: Path) -> Findings:
 
     `path`: also a recording of version 0.1.0; `out`: replaced if it exists. Returns of `path`.
     """
-    with Recording(path) as recording:
-        inspector = _Inspector(recording.codec)
-        writer = RecordingWriter(out, recording.head, overwrite=True)
-        try:
-            for entry in recording.blocks:
-                piece = inspector.inspect(recording.blocks, entry)
-                if piece is not None:
-                    writer.add(piece)
-            findings = inspector.findings
-            writer.finish(inspector.stats, findings.fault, findings.complete)
-        finally:
-            writer.close()
-    return inspector.findings
+    with (
+        Recording(path) as recording,
+        contextlib.closing(RecordingWriter(out, recording.head, overwrite=True)) as writer,
+    ):
+        found = _inspect(recording, writer.add)
+        acquired = found.records + found.malformed
+        stats = Stats(acquired, found.records, malformed=found.malformed)
+        writer.finish(stats, found.fault, found.complete)
+    return found
 
 
-class _Inspector:
-    """Looks at one block after the other."""
-
-    def __init__(self, codec: Codec) -> None:
-        self.findings = Findings()
-        self._codec = codec
-        self._state = codec.start
-        self._gap = Gap.NONE
-        self._next_number = 0
-        self._holes = 0  # damaged stretches since the last sound header
-        self._is_missing_data = False
-
-    @property
-    def stats(self) -> Stats:
-        """Accounts of what was found, for a recording without its own."""
-        found = self.findings
-        return Stats(found.records + found.malformed, found.records, malformed=found.malformed)
-
-    def inspect(self, blocks: BlockReader, entry: Block | Damage) -> Piece | None:
-        """Enter a block into the findings; return its piece if it is a sound one."""
+def _inspect(recording: Recording, save: Callable[[Piece], None]) -> Findings:
+    """Look at one block after the other, and save every sound piece, with the gaps before it."""
+    found, codec, blocks = Findings(), recording.codec, recording.blocks
+    state, gap, is_missing = codec.start, Gap.NONE, False
+    next_number = holes = 0  # `holes`: damaged stretches since the last sound header
+    for entry in blocks:
+        payload, is_lost = None, False
         if isinstance(entry, Damage):
-            self._holes += 1
-            self._count_damage(entry.length)
-            self.findings.cut_bytes += entry.length if entry.is_cut else 0
-            return None
-        self._count_missing(entry)
-        try:
-            payload = blocks.read_payload(entry)
-        except FileFormatError:
-            self._count_damage(
-                entry.end - entry.position, is_data=entry.header.kind is BlockKind.PIECE
-            )
-            return None
-        self.findings.blocks += 1
+            holes, is_lost = holes + 1, True
+            found.damaged_blocks += 1
+            found.damaged_bytes += entry.length
+            found.cut_bytes += entry.length if entry.is_cut else 0
+        else:
+            header = entry.header
+            if not header.is_legacy:
+                # Whole blocks may be gone. Each damaged stretch stands for one at least, which must
+                # not be counted twice.
+                missing = max(0, header.number - next_number - holes)
+                found.damaged_blocks += missing
+                is_lost, next_number = missing > 0, header.number + 1
+            holes = 0
+            try:
+                payload = blocks.read_payload(entry)
+                found.blocks += 1
+            except FileFormatError:
+                found.damaged_blocks += 1
+                found.damaged_bytes += entry.end - entry.position
+                is_lost |= header.kind is BlockKind.PIECE
+        if is_lost:
+            gap, is_missing, found.complete = Gap.LOSS, True, False
+        if isinstance(entry, Damage) or payload is None:
+            continue
         if entry.header.kind is BlockKind.END:
-            self._read_ending(Ending.from_json(payload, blocks.path))
-        return self._decode_piece(entry, payload) if entry.header.kind is BlockKind.PIECE else None
-
-    def _count_missing(self, block: Block) -> None:
-        """Find whole blocks that are not there, by the numbers of those that are."""
-        if not block.header.is_legacy:
-            # Each damaged stretch stands for one block at least, which must not be counted twice.
-            missing = block.header.number - self._next_number - self._holes
-            if missing > 0:
-                self._count_damage(0)
-                self.findings.damaged_blocks += missing - 1
-            self._next_number = block.header.number + 1
-        self._holes = 0
-
-    def _count_damage(self, length: int, is_data: bool = True) -> None:
-        self.findings.damaged_blocks += 1
-        self.findings.damaged_bytes += length
-        if is_data:
-            self._gap = Gap.LOSS
-            self._is_missing_data = True
-            self.findings.complete = False
-
-    def _read_ending(self, ending: Ending) -> None:
-        self.findings.complete = ending.is_complete and not self._is_missing_data
-        self.findings.stats = ending.stats
-        self.findings.fault = ending.fault
-
-    def _decode_piece(self, block: Block, payload: bytes) -> Piece:
-        piece = Piece(payload, block.header.records, max(block.header.gap, self._gap))
-        self._gap = Gap.NONE
-        if piece.gap is Gap.RESTART:
-            self._state = self._codec.start
-        found = self._codec.decode(as_bytes(payload), self._state, piece.gap is not Gap.NONE)
-        self._state = found.state
-        self.findings.bytes += len(payload)
-        self.findings.records += len(found.records)
-        self.findings.malformed += found.malformed
-        self.findings.gaps += piece.gap is not Gap.NONE
-        return piece
+            ending = Ending.from_json(payload, blocks.path)
+            found.complete = ending.is_complete and not is_missing
+            found.stats, found.fault = ending.stats, ending.fault
+        elif entry.header.kind is BlockKind.PIECE:
+            piece = Piece(payload, entry.header.records, max(entry.header.gap, gap))
+            start = codec.start if piece.gap is Gap.RESTART else state
+            decoded = codec.decode(as_bytes(payload), start, piece.gap is not Gap.NONE)
+            state, gap = decoded.state, Gap.NONE
+            found.bytes += len(payload)
+            found.records += len(decoded.records)
+            found.malformed += decoded.malformed
+            found.gaps += piece.gap is not Gap.NONE
+            save(piece)
+    return found

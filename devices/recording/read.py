@@ -1,6 +1,8 @@
-"""Blocks: pieces of a stream that carry their own length, number and checksums.
+"""Recordings, sound and damaged ones, as sources: the same pieces through the same codec, so the
+same records, bit for bit.
 
-All numbers are little-endian::
+They are a row of blocks: pieces of a stream that carry their own length, number and checksums. All
+numbers are little-endian::
 
     magic  recording  number  kind  gap  time_ns  records  length  payload's  header's  payload
                                                                    CRC-32     CRC-32
@@ -10,10 +12,6 @@ All numbers are little-endian::
 inside a piece of another is not mistaken. ``number`` counts the blocks from 0.
 
 Version 0.1.0 wrote a shorter header without these two (`LEGACY_MAGIC`).
-
-Reading recordings, sound and damaged ones, of this version and of 0.1.0.
-
-Recordings as sources: the same pieces through the same codec, so the same records, bit for bit.
 """
 
 from __future__ import annotations
@@ -27,8 +25,7 @@ import tempfile
 import zlib
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, NamedTuple, Self
@@ -39,7 +36,7 @@ from devices.address import Uri
 from devices.registry import build_codec
 from devices.source import READ_TIMEOUT_S, Batch, Codec, DecodedSource, Gap, Info, Ledger, Piece
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
-from tofclip.files import format_error_line, translate_read_errors
+from tofclip.files import guard, translate_read_errors
 from tofclip.storage import HDF5_SIGNATURE, Record
 
 MAGIC = b"\x89ToFrec\n"
@@ -90,11 +87,7 @@ class BlockHeader:
         number: int = 0,
         recording: int = 0,
     ) -> BlockHeader:
-        """Describe a payload; the parameters are those of the class.
-
-        `time_ns`: ns since 1970; `number`: of the block; `recording`: of the recording, a random
-        number.
-        """
+        """Describe a payload."""
         checksum = zlib.crc32(payload)
         return cls(kind, gap, time_ns, records, len(payload), checksum, number, recording)
 
@@ -110,17 +103,8 @@ class BlockHeader:
 
     def pack(self) -> bytes:
         """Return the header as it lies in the file."""
-        front = _LAYOUT.pack(
-            MAGIC,
-            self.recording,
-            self.number,
-            self.kind,
-            self.gap,
-            self.time_ns,
-            self.records,
-            self.length,
-            self.checksum,
-        )
+        own = (self.kind, self.gap, self.time_ns, self.records, self.length, self.checksum)
+        front = _LAYOUT.pack(MAGIC, self.recording, self.number, *own)
         return front + struct.pack("<I", zlib.crc32(front))
 
     @classmethod
@@ -135,13 +119,8 @@ class BlockHeader:
         # a header that passes by chance is one in 2^32: the search for blocks may rely on it
         if zlib.crc32(front) != int.from_bytes(own, "little"):
             return None
-        recording, number = 0, -1
-        if is_legacy:
-            _, kind, gap, time_ns, records, length, checksum = layout.unpack(front)
-        else:
-            _, recording, number, kind, gap, time_ns, records, length, checksum = layout.unpack(
-                front
-            )
+        _, *names, kind, gap, time_ns, records, length, checksum = layout.unpack(front)
+        recording, number = names or (0, -1)
         if kind not in set(BlockKind) or gap not in set(Gap) or length > MAX_PAYLOAD_BYTES:
             return None
         return cls(BlockKind(kind), Gap(gap), time_ns, records, length, checksum, number, recording)
@@ -200,26 +179,30 @@ class BlockReader:
         self.path = path
         self.length = length
         self._fetch = fetch
+        self._first: BlockHeader | None = None
+        begins = [(self._search(0, magic), magic) for magic in (MAGIC, LEGACY_MAGIC)]
+        begin, self._magic = min(begins)
+        self._first = self._read_header(begin)
+        # Version 0.1.0 put an HDF5 file's beginning before.
+        self._begin = begin if self._first is not None and self._first.is_legacy else 0
 
     def __iter__(self) -> Iterator[Block | Damage]:
         """Yield every block with a sound header, and the damage between them; payloads are not
         looked at.
         """
-        first = self._first_header
-        position = 0
-        if first is not None and first.is_legacy:
-            position = self._find_header(0)  # version 0.1.0 put an HDF5 file's beginning before
+        position = self._begin
         while position < self.length:
-            header = self._read_header(position)
-            if header is None:
-                found = self._find_header(position + 1)
-                is_cut = found == self.length and self._is_cut(position)
-                yield Damage(position, found - position, is_cut)
-                position = found
-            else:
+            header = self._read_header(position) if self._first else None
+            if header is not None:
                 block = Block(position, header)
                 yield block
                 position = block.end
+                continue
+            found = self._search(position + 1, self._magic) if self._first else self.length
+            yield Damage(
+                position, found - position, found == self.length and self._is_cut(position)
+            )
+            position = found
 
     def read_payload(self, block: Block) -> bytes:
         """Return a block's payload."""
@@ -244,24 +227,18 @@ class BlockReader:
                     return entry
         return None
 
-    @cached_property
-    def _first_header(self) -> BlockHeader | None:
-        """The first sound header of either version."""
-        found = [self._search(0, magic, lambda header: True) for magic in (MAGIC, LEGACY_MAGIC)]
-        first = min(found)
-        return self._parse_header(first) if first < self.length else None
-
-    def _parse_header(self, position: int) -> BlockHeader | None:
-        """Read a header, or None if there is none or its payload would not lie within the file."""
+    def _read_header(self, position: int) -> BlockHeader | None:
+        """Read a header of this recording, or None if there is none or its payload would not lie
+        within the file.
+        """
         header = BlockHeader.unpack(self._fetch(position, HEADER_BYTES))
         if header is None or position + header.header_bytes + header.length > self.length:
             return None
-        return header
+        return header if self._belongs(header) else None
 
-    def _read_header(self, position: int) -> BlockHeader | None:
-        """Read a header of this recording, None where there is none."""
-        header = self._parse_header(position)
-        return header if header is not None and self._belongs(header) else None
+    def _belongs(self, header: BlockHeader) -> bool:
+        first = self._first or header
+        return (header.recording, header.is_legacy) == (first.recording, first.is_legacy)
 
     def _is_cut(self, position: int) -> bool:
         """Whether what is left of the file is the beginning of a block."""
@@ -269,30 +246,16 @@ class BlockReader:
         if self.length - position < HEADER_BYTES:
             return data.startswith(MAGIC[: len(data)])
         header = BlockHeader.unpack(data)
-        return header is not None and self._belongs(header)
+        return header is not None and self._first is not None and self._belongs(header)
 
-    def _belongs(self, header: BlockHeader) -> bool:
-        first = self._first_header
-        return (
-            first is not None
-            and header.recording == first.recording
-            and header.is_legacy == first.is_legacy
-        )
-
-    def _find_header(self, position: int) -> int:
+    def _search(self, position: int, magic: bytes) -> int:
         """Return where the next sound header of this recording begins, or the end."""
-        first = self._first_header
-        magic = LEGACY_MAGIC if first is not None and first.is_legacy else MAGIC
-        return self._search(position, magic, self._belongs)
-
-    def _search(self, position: int, magic: bytes, accept: Callable[[BlockHeader], bool]) -> int:
         while position < self.length:
             # Overlaps the next stretch, so that a magic across the border is found.
             stretch = self._fetch(position, SEARCH_BYTES + len(magic) - 1)
             at = stretch.find(magic)
             while at >= 0:
-                header = self._parse_header(position + at)
-                if header is not None and accept(header):
+                if self._read_header(position + at) is not None:
                     return position + at
                 at = stretch.find(magic, at + 1)
             position += SEARCH_BYTES
@@ -316,16 +279,11 @@ class Ending:
 
     @classmethod
     def from_json(cls, payload: bytes, path: Path) -> Ending:
-        """Read the payload of an END block.
-
-        `path`: for the message.
-        """
-        try:
+        """Read the payload of an END block."""
+        with guard(path, "has accounts that cannot be read"):
             known = json.loads(payload)
             stats = {str(name): int(value) for name, value in known["stats"].items()}
             return cls(stats, str(known["fault"]), bool(known.get("complete", True)))
-        except (ValueError, TypeError, KeyError, AttributeError) as fault:
-            raise FileFormatError(path, "has accounts that cannot be read") from fault
 
 
 class Recording:
@@ -348,16 +306,19 @@ class Recording:
     @property
     def codec(self) -> Codec:
         """The codec that its bytes need."""
-        return build_codec_from_head(self.head, self.path)
+        with guard(self.path, "names a codec that this program does not know"):
+            settings = json.loads(str(self.head.attribute("codec_settings")))
+            try:
+                return build_codec(str(self.head.attribute("codec")), settings)
+            except InputError as fault:
+                raise ValueError(fault) from fault
 
     @property
     def info(self) -> Info:
         """What was known about the instrument."""
-        try:
+        with guard(self.path, "does not describe its instrument"):
             known = json.loads(str(self.head.attribute("info")))
             return Info(known.pop("instrument"), known.pop("serial"), known)
-        except (KeyError, TypeError, AttributeError, json.JSONDecodeError) as fault:
-            raise FileFormatError(self.path, "does not describe its instrument") from fault
 
     def close(self) -> None:
         """Close the file; closing twice is fine."""
@@ -375,29 +336,26 @@ class Recording:
             raise FileFormatError(
                 self.path, "is not a recording, or every copy of its head is damaged"
             )
-        return parse_head(self.blocks.read_payload(head), self.path)
+        with tempfile.TemporaryDirectory() as folder:
+            copy = Path(folder, self.path.name)
+            copy.write_bytes(self.blocks.read_payload(head))  # HDF5 reads files, not bytes
+            known = Record.load(copy, RECORD_KIND)
+        return replace(known, fields={}, origin=str(self.path))
 
     def _read_bytes(self, position: int, length: int) -> bytes:
-        return read_at(self._file.fileno(), position, length, self.path)
-
-
-def read_at(file: int, position: int, length: int, path: Path) -> bytes:
-    """Read `length` bytes from `position` on, fewer at the end of the file.
-
-    `file`: descriptor; `position, length`: bytes; `path`: for the message.
-    """
-    pieces: list[bytes] = []
-    while length > 0:
-        try:
-            piece = os.pread(file, length, position)
-        except OSError as fault:
-            raise StorageError(f"{path}: cannot be read: {fault.strerror}") from fault
-        if not piece:
-            break
-        pieces.append(piece)
-        position += len(piece)
-        length -= len(piece)
-    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+        """Read `length` bytes from `position` on, fewer at the end of the file."""
+        pieces: list[bytes] = []
+        while length > 0:
+            try:
+                piece = os.pread(self._file.fileno(), length, position)
+            except OSError as fault:
+                raise StorageError(f"{self.path}: cannot be read: {fault.strerror}") from fault
+            if not piece:
+                break
+            pieces.append(piece)
+            position += len(piece)
+            length -= len(piece)
+        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
 def read_head_if_recording(path: Path) -> Record | None:
@@ -417,33 +375,6 @@ def read_head_if_recording(path: Path) -> Record | None:
     with contextlib.suppress(FileFormatError), Recording(path) as recording:
         return recording.head
     return None
-
-
-def parse_head(image: bytes, path: Path) -> Record:
-    """Read the record that the payload of a HEAD block, an HDF5 file, holds.
-
-    `path`: of the recording.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder, path.name)
-        # HDF5 reads files rather than bytes.
-        copy.write_bytes(image)
-        head = Record.load(copy, RECORD_KIND)
-    return Record(head.kind, {}, head.attributes, head.children, head.provenance, str(path))
-
-
-def build_codec_from_head(head: Record, path: Path) -> Codec:
-    """Build the codec that a recording's head names.
-
-    `path`: for the message.
-    """
-    try:
-        settings = json.loads(str(head.attribute("codec_settings")))
-        return build_codec(str(head.attribute("codec")), settings)
-    except (InputError, json.JSONDecodeError, TypeError) as fault:
-        raise FileFormatError(
-            path, f"names a codec that this program does not know ({format_error_line(fault)})"
-        ) from fault
 
 
 NS_PER_S = 1_000_000_000
@@ -483,9 +414,8 @@ class ReplaySource(DecodedSource):
         self._blocks = list(self._list_blocks())
         self._next = self._skip = 0
         self._last_due: tuple[float, int] | None = None
-        self._checkpoints = [
-            _Checkpoint(self.codec.start, 0, 0)
-        ]  # of every block up to the furthest that was read
+        # of every block up to the furthest that was read
+        self._checkpoints = [_Checkpoint(self.codec.start, 0, 0)]
         self._seek_to(0)
 
     @property

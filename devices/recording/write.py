@@ -8,6 +8,7 @@ import json
 import os
 import secrets
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from time import monotonic, monotonic_ns, time_ns
 from typing import Any
@@ -34,10 +35,8 @@ CHECK_INTERVAL_S = 0.25
 def make_head(
     codec: Codec, info: Info, calibration: Record | None, provenance: dict[str, Any]
 ) -> Record:
-    """Describe an instrument: all of a recording that is known before the first piece.
-
-    `codec`: reads the pieces that are going to be recorded; `provenance`: how the recording came
-    about; any JSON-serialisable tree. Returns for `RecordingWriter`.
+    """Describe an instrument for `RecordingWriter`: all of a recording that is known before the first
+    piece. `provenance`, how it came about, is any JSON-serialisable tree.
     """
     attributes = {
         "codec": codec.name,
@@ -163,53 +162,61 @@ def _render_head(head: Record) -> bytes:
     return content.ljust(sectors * SECTOR_BYTES - HEADER_BYTES, b"\0")
 
 
+@contextlib.contextmanager
+def _explain_refusal(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except StorageError:
+        raise
+    except OSError as fault:
+        said = fault.strerror
+        if isinstance(fault, FileNotFoundError):
+            said = "the folder does not exist; create it first"
+        raise StorageError(f"{path}: cannot be written: {said}") from fault
+
+
+def _refuse_existing(path: Path) -> InputError:
+    return InputError(
+        f"{path}: exists already; choose another name, or replace it (`overwrite=True`)"
+    )
+
+
 def _create_file(path: Path, overwrite: bool, stack: contextlib.ExitStack) -> tuple[int, Path]:
     """Create and lock a file beside `path`, which gets its name when the head is in it.
 
     The lock on a file that exists already is held as long, so that of two recorders one is
     refused.
     """
-    old = _lock_existing(path)
-    if old is not None:
-        stack.callback(os.close, old)
-        if not overwrite:
-            raise InputError(
-                f"{path}: exists already; choose another name, or replace it (`overwrite=True`)"
-            )
-    try:
-        mode = 0o666  # less what the user's umask takes away
+    with _explain_refusal(path):
+        old = _lock_existing(path)
+        if old is not None:
+            stack.callback(os.close, old)
+            if not overwrite:
+                raise _refuse_existing(path)
         temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
-        file = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
-    except OSError as fault:
-        what = (
-            "the folder does not exist; create it first"
-            if isinstance(fault, FileNotFoundError)
-            else fault.strerror
-        )
-        raise StorageError(f"{path}: cannot be written: {what}") from fault
-    stack.callback(temporary.unlink, missing_ok=True)
-    stack.push(lambda kind, *_: os.close(file) if kind is not None else None)
-    _lock(file, path)
+        # 0o666, less what the user's umask takes away.
+        file = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        stack.callback(temporary.unlink, missing_ok=True)
+        stack.push(lambda kind, *_: os.close(file) if kind is not None else None)
+        _lock(file, path)
     return file, temporary
 
 
 def _lock_existing(path: Path) -> int | None:
     """Open and lock the file at `path`; None if there is none."""
     while True:
-        try:
-            file = os.open(path, os.O_RDONLY)
-        except FileNotFoundError:
-            return None
-        except OSError as fault:
-            raise StorageError(f"{path}: cannot be written: {fault.strerror}") from fault
-        try:
+        with contextlib.ExitStack() as opened:
+            try:
+                file = os.open(path, os.O_RDONLY)
+            except FileNotFoundError:
+                return None
+            opened.callback(os.close, file)
             _lock(file, path)
-            if os.path.exists(path) and os.stat(path).st_ino == os.fstat(file).st_ino:
-                return file
-        except BaseException:
-            os.close(file)
-            raise
-        os.close(file)  # somebody replaced it meanwhile
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.stat(path), os.fstat(file)):
+                    opened.pop_all()
+                    return file
+        # Somebody replaced it meanwhile.
 
 
 def _lock(file: int, path: Path) -> None:
@@ -227,17 +234,13 @@ def _lock(file: int, path: Path) -> None:
 
 def _publish(temporary: Path, path: Path, overwrite: bool) -> None:
     """Give the file its name; without `overwrite` never in place of another."""
-    try:
+    with _explain_refusal(path):
+        try:
+            if not overwrite:
+                os.link(temporary, path)
+        except FileExistsError:
+            raise _refuse_existing(path) from None
+        except OSError:  # a file system without links
+            overwrite = True
         if overwrite:
             os.replace(temporary, path)
-            return
-        try:
-            os.link(temporary, path)
-        except FileExistsError:
-            raise InputError(
-                f"{path}: exists already; choose another name, or replace it (`overwrite=True`)"
-            ) from None
-        except OSError:  # a file system without links
-            os.replace(temporary, path)
-    except OSError as fault:
-        raise StorageError(f"{path}: cannot be written: {fault.strerror}") from fault

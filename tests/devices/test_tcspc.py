@@ -147,7 +147,7 @@ def test_what_cannot_be_read(
 )
 def test_histograms_that_cannot_be(curves: list[Any], resolution: float, problem: str) -> None:
     with pytest.raises(FileFormatError, match=problem):
-        tcspc._make_histograms(curves, resolution, "", Path("run.sdt"))
+        tcspc._stack_histograms(curves, resolution, "", Path("run.sdt"))
 
 
 def read_all(address: str) -> Any:
