@@ -7,23 +7,14 @@ over the picture, and an amplitude a_k(p) >= 0; the raw streak image is
     y = sum_k sum_p a_k(p) g_v s_v(p, r_k(p)) h(t - 2 r_k(p) / c),
 
 with the gains g_v of the views, the place s_v of the pixel on the slit at the shear of its range,
-and the pulse h (`model`). With photon weights w the objective is
+and the pulse h. With photon weights w the objective is
 
     J(a, r) = 1/2 |A(r) a - y|^2_w + sum_k weight_k TV(a_k) + 1/2 sum_k |bending of 1/z_k|^2.
 
-The modules in the order of the work:
-
-* `patches` finds surfaces in the returns of a fast recovery of frames, and `refusal` shots without
-  them. Surfaces reach beyond their returns, since the measurements decide where a surface ends;
-  their shapes are sums over a `basis`.
-* `model` is A(r): where points fall (`places`), the pulse (`pulse`), at the `state` of surfaces and
-  camera; `weights` has the measurements. Its loops are in `kernels`.
-* `amplitudes` solves for a by FISTA, with a step size for each surface; `ranges` for the state by
-  Gauss-Newton steps on its `derivatives`, each taken only if it lowers the misfit.
-* `fit` has the order of these, and `returns` lists the points and how far off each may be.
-* `recovery` is the method that `tofclip recover` runs.
-
-docs/recovery_algorithm.md derives it.
+`patches` finds surfaces in the returns of a fast recovery of frames, `pulse` the shot's pulse;
+`model` is A(r) at a state of surfaces and camera, with its loops in `kernels`; `amplitudes` solves for
+a by FISTA, `ranges` for the state by Gauss-Newton steps; `fit` has the order of these and is the method
+that `tofclip recover` runs. docs/recovery_algorithm.md derives it.
 """
 
 from tofclip.recovery.surfaces.fit import SurfaceRecovery

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
-from tofclip.recovery.surfaces.model import FloatArray, Image, SurfaceModel
+from tofclip.recovery.surfaces.model import SurfaceModel
+from tofclip.recovery.surfaces.patches import FloatArray
+from tofclip.recovery.surfaces.pulse import Image
 from tofclip.solvers import Progress
 from tofclip.threads import run_blocks
 
@@ -21,9 +24,8 @@ class AmplitudeSolver:
     Different surfaces hardly share measurements, so that a step for each is as safe as one for all and
     does not hold the bright ones back.
 
-    `amplitude` (points,): start; `weight`: of total variation, in standard deviations of the noise
-    in the misfit's gradient; `earlier`: of the same surfaces, seen by another shot: what it found
-    saves work.
+    `weight`: of total variation, in standard deviations of the noise in the misfit's gradient;
+    `earlier`: of the same surfaces, seen by another shot: what it found saves work.
     """
 
     def __init__(
@@ -36,7 +38,8 @@ class AmplitudeSolver:
         self.model, self.amplitude, self.weight = model, amplitude, weight
         rows, columns = model.camera.image_shape
         self._dual = np.zeros((len(model.masks), 2, rows, columns), np.float32)
-        self._boxes = [find_box(mask) for mask in model.masks]
+        boxes = (scipy.ndimage.find_objects(mask) for mask in model.masks.astype(np.int8))
+        self._boxes = [next(iter(box), (slice(0, 1), slice(0, 1))) for box in boxes]
         self._direction = np.ones(model.surface.size, np.float32)
         self._fresh = True
         self.variance = 1.0
@@ -48,7 +51,15 @@ class AmplitudeSolver:
         """Take some steps; `progress` hears of `frames` after each."""
         model = self.model
         steps = 1 / (NORM_MARGIN * self._estimate_norms())
-        weights = self.weight * self._estimate_gradient_noise()
+        # The gradient A'W(A a - y) has the covariance A'WA times a weighted measurement's variance.
+        information = self.variance * model.gather(model.weights, squared=True)
+        noise = np.array(
+            [
+                np.sqrt(np.median(information[part])) if part.stop > part.start else 1.0
+                for part in model.parts
+            ]
+        )
+        weights = self.weight * noise
         step = steps[model.surface].astype(np.float32)
         ahead, age = self.amplitude, 1.0
         for _ in range(iterations):
@@ -77,20 +88,6 @@ class AmplitudeSolver:
         self._direction, self._fresh = vector, False
         return norms
 
-    def _estimate_gradient_noise(self) -> FloatArray:
-        """Standard deviation of the misfit's gradient that photons make, for each surface.
-
-        The gradient A'W(A a - y) has the covariance A'WA times the variance of a weighted measurement.
-        """
-        model = self.model
-        information = self.variance * model.gather(model.weights, squared=True)
-        return np.array(
-            [
-                np.sqrt(np.median(information[part])) if part.stop > part.start else 1.0
-                for part in model.parts
-            ]
-        )
-
     def _shrink(self, amplitude: Image, weights: FloatArray) -> Image:
         """The proximal step of total variation on each surface."""
         from tofclip.recovery.surfaces.kernels import prox_masked_tv
@@ -113,19 +110,8 @@ class AmplitudeSolver:
         return found
 
 
-def find_box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Return the rows and columns of the smallest box that holds a mask."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if rows.size == 0:
-        return slice(0, 1), slice(0, 1)
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-
-
 def estimate_excess_variance(model: SurfaceModel, amplitude: Image) -> float:
-    """Return the misfit's variance in units of what the weights expect, over lit measurements.
-
-    `amplitude` (points,).
-    """
+    """Return the misfit's variance in units of what the weights expect, over lit measurements."""
     predicted = model.render(amplitude)
     lit = (predicted > 0) & (model.weights > 0)
     if not lit.any():
@@ -134,19 +120,15 @@ def estimate_excess_variance(model: SurfaceModel, amplitude: Image) -> float:
 
 
 def scale_amplitude(model: SurfaceModel, lit: NDArray[np.bool_]) -> Image:
-    """Return scales in which lit amplitudes count alike for the data; 0 for all others, which stay.
-
-    `lit` (points,).
-    """
+    """Return scales in which lit amplitudes count alike for the data; 0 for all others, which stay."""
     diagonal = model.gather(model.weights, squared=True)
     scale = 1 / np.sqrt(np.maximum(diagonal, TINY))
     return np.where(lit & (diagonal > 0), scale, 0).astype(np.float32)
 
 
 def explain_by_amplitude(model: SurfaceModel, image: Image, scale: Image, iterations: int) -> Image:
-    """Return the change of amplitude x that lowers ``|image - A x|_w`` most, by conjugate gradients.
-
-    `image` (rows, columns); `scale` (points,): of `scale_amplitude`.
+    """Return the change of amplitude x that lowers ``|image - A x|_w`` most, by conjugate gradients
+    in the scale of `scale_amplitude`.
     """
     change = np.zeros_like(scale)
     residual = scale * model.gather(model.weights * image)

@@ -1,10 +1,6 @@
-"""Which shots are not of surfaces: smoke, light in flight, relay walls. They are refused.
-
-Finding the surfaces of a shot and fitting them, or those of the shot before, to what it shows.
-
-The returns of fitted surfaces: which points there are, and how far off each may be.
-
-The method "surfaces": surfaces of a whole shot, and frames as their rendering.
+"""The method "surfaces", in the order of docs/recovery_algorithm.md: the surfaces of a shot are found,
+or those of the shot before taken, fitted, and returned as points with the frames that they render.
+What is no shot of surfaces (smoke, light in flight, relay walls) is refused on the way.
 """
 
 from __future__ import annotations
@@ -23,8 +19,6 @@ from tofclip.lidar import Detection, compute_ray_directions, depth
 from tofclip.lidar.range_calibration import correct_returns
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.model import (
-    FloatArray,
-    Image,
     SurfaceModel,
     SurfaceState,
     compare_smoothed,
@@ -32,19 +26,26 @@ from tofclip.recovery.surfaces.model import (
 )
 from tofclip.recovery.surfaces.patches import (
     MARGIN_PX,
-    Patch,
+    FloatArray,
     find_dimmer_patches,
     find_patches,
+    rank_within_pixels,
     reach_further,
 )
-from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, ShotPulse, measure_pulse
+from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, Image, measure_pulse
 from tofclip.recovery.surfaces.ranges import Refinement, refine_state
 from tofclip.shots import Frames, Returns, Streak
 from tofclip.solvers import Method, Progress, Sparse, ignore_progress
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
-FloatArray_refusal = NDArray[np.float64]
+START_ITERATIONS = 25
+MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 4, 10
+# Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
+LAST_STEP_SIGMAS = 0.3
+FOLLOWING_ITERATIONS = 10  # before and after the ranges' step, where the last shot's fit begins
+# Of what surfaces leave unexplained, and beyond: from there on they are not the next shot's.
+CHANGED_RATIO, CHANGED_EXCESS = 1.25, 0.02
 
 # Of the returns' light: below, the shot is not one of surfaces. Simulated shots of surfaces have 0.93
 # or more, recorded ones 0.97; recorded relay walls have 0.50 to 0.79.
@@ -62,16 +63,108 @@ MAX_TAIL_SHARE = 0.3
 STEEP_BINS, MAX_STEEP_SHARE = 10.0, 0.3
 SLOPE_WINDOW_PX = 7
 
+SURE_SIGMAS = 20.0  # points of which a surface certainly consists
+UPPER_QUANTILE = 0.9
+MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
+EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
+NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
+
+
+@dataclass(frozen=True)
+class SurfaceFit:
+    """Surfaces as they were fitted to a shot."""
+
+    model: SurfaceModel
+    solver: AmplitudeSolver
+    refinement: Refinement  # the last one
+    remainder: FloatArray  # (surfaces,), what further steps would still change of ranges, m
+    # what the surfaces left unexplained when they were found, as a fraction of the signal
+    reference: float
+
+
+@limit_blas_threads()  # products of a few dozen columns are too small to share
+def fit_surfaces(
+    streak: Streak,
+    frames: Frames,
+    weight: float,
+    iterations: int,
+    progress: Progress = ignore_progress,
+) -> SurfaceFit:
+    """Find and fit the surfaces of a shot.
+
+    `frames`: A fast recovery of the same shot, with the camera to use; `weight, iterations`: see
+    `SurfaceRecovery`; `progress`: called with the number of frame iterations just done.
+    """
+    camera, count = frames.camera, frames.times.size
+    # 1. Frames by a fast method, whose returns are a picture of ranges. The model explains what was
+    # measured: corrections come when its own returns are listed.
+    found = depth(frames, camera.replace(range_calibration=None))
+    bin_m = SPEED_OF_LIGHT * frames.bin_width / 2
+    directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
+    ray_length = (1 / directions[:, 2]).reshape(camera.image_shape)
+    require_gentle_slopes(found, bin_m)
+
+    # 2. Patches. Weaker returns of a pixel are often the frames' own: they would widen the surfaces.
+    strongest = found.image("range").astype(np.float64).ravel()
+    pixels = np.flatnonzero(np.isfinite(strongest))
+    patches = find_patches(pixels, strongest[pixels], ray_length, bin_m)
+    on_surface = np.zeros(camera.image_shape, bool)
+    for patch in patches:
+        on_surface.ravel()[patch.pixels] = True
+    share = _measure_light(found, on_surface)
+    if share < MIN_SURFACE_SHARE:
+        raise _refuse(f"only {100 * share:.0f} % of the returns' light lies on smooth surfaces")
+    patches += find_dimmer_patches(patches, found, ray_length, bin_m)
+    seen = np.concatenate([patch.pixels for patch in patches])
+    pulse = measure_pulse(frames, seen, strongest[seen])
+    if pulse.tail_share > MAX_TAIL_SHARE:
+        late = f"{100 * pulse.tail_share:.0f} % of each pixel's light"
+        raise _refuse(f"{late} comes long after its peak")
+
+    # 3. A surface may reach beyond its returns: measurements decide where it ends.
+    masks = np.zeros((len(patches), *camera.image_shape), bool)
+    pictures = np.zeros(masks.shape, np.float32)
+    brightness = frames.values.sum(axis=0).ravel()
+    for patch, mask, picture in zip(patches, masks, pictures, strict=True):
+        picture.ravel()[patch.pixels] = brightness[patch.pixels]
+        reached = reach_further(patch, found, bin_m)
+        mask[...] = scipy.ndimage.binary_dilation(reached, np.ones((3, 3)), MARGIN_PX)
+    state = SurfaceState.start([patch.coefficients for patch in patches], camera)
+    model = SurfaceModel(streak, camera, masks, [patch.basis for patch in patches], state, pulse)
+
+    # 4. Amplitudes.
+    solver = AmplitudeSolver(model, pictures[masks], weight)
+    solver.run(START_ITERATIONS, progress, count)
+    _require_explained(solver, frames, streak)
+    model.find_behind(solver.amplitude)
+
+    # 5. Ranges, after splines that are not needed: these take longer to be right, and late views give
+    # way to them.
+    solver = straighten_surfaces(solver)
+    refinement, remainder = _refine(solver, progress, count)
+    solver.run(iterations, progress, count)
+    reference = solver.model.unexplained(solver.amplitude)
+    return SurfaceFit(solver.model, solver, refinement, remainder, reference)
+
+
+def _measure_light(found: Returns, where: NDArray[np.bool_]) -> float:
+    """Fraction of the returns' light in some pixels, (rows, columns)."""
+    light = float(found.intensity.sum())
+    return float(found.intensity[where[found.y, found.x]].sum()) / light if light else 0.0
+
+
+def _refuse(fault: str) -> InputError:
+    """The error of a shot that is not one of surfaces."""
+    return InputError(
+        f"{fault}: this shot's light is not on surfaces (smoke, light in flight, a relay wall); "
+        'choose `method="tv"`'
+    )
+
 
 def require_gentle_slopes(found: Returns, bin_m: float) -> None:
-    """Refuse a shot most of whose light is on surfaces seen nearly edge-on.
-
-    `bin_m`: range of a bin, m.
-    """
+    """Refuse a shot most of whose light is on surfaces seen nearly edge-on."""
     slope, scatter = measure_slopes(found.image("range"))
-    steep = (slope > STEEP_BINS * bin_m) & (scatter < slope)
-    light = float(found.intensity.sum())
-    share = float(found.intensity[steep[found.y, found.x]].sum()) / light if light else 0.0
+    share = _measure_light(found, (slope > STEEP_BINS * bin_m) & (scatter < slope))
     if share > MAX_STEEP_SHARE:
         raise InputError(
             f"{100 * share:.0f} % of the returns' light lies on surfaces that are turned so far that a "
@@ -80,30 +173,23 @@ def require_gentle_slopes(found: Returns, bin_m: float) -> None:
         )
 
 
-def measure_slopes(distance: Image) -> tuple[FloatArray_refusal, FloatArray_refusal]:
-    """Return how far ranges change from pixel to pixel, by a plane through each pixel's
-    surroundings.
-
-    `distance` (rows, columns): ranges, m; NaN where there is none. Returns `slope` (rows, columns):
-    m per pixel; 0 where less than half of the surroundings has a range; `scatter` (rows, columns):
-    root mean square distance of the ranges from the plane, m.
+def measure_slopes(distance: Image) -> tuple[FloatArray, FloatArray]:
+    """Return how far ranges, (rows, columns), m or NaN, change from pixel to pixel, by a plane through
+    each pixel's surroundings; 0 where less than half of these has a range. Also the root mean square
+    distance of the ranges from the plane, m.
     """
     known = np.isfinite(distance)
     place = np.indices(distance.shape).astype(np.float64)
-    y, x = place[0], place[1]
     # differences of large numbers follow: the middle of all is taken off first
     middle = float(np.median(distance[known])) if known.any() else 0.0
-    values: FloatArray_refusal = np.where(known, distance - middle, 0.0).astype(np.float64)
 
-    def average(image: FloatArray_refusal) -> FloatArray_refusal:
-        found: FloatArray_refusal = scipy.ndimage.uniform_filter(
-            np.where(known, image, 0.0), SLOPE_WINDOW_PX, mode="constant"
-        )
-        return found
+    def average(image: FloatArray) -> FloatArray:
+        image = np.where(known, image, 0.0)
+        return np.asarray(scipy.ndimage.uniform_filter(image, SLOPE_WINDOW_PX, mode="constant"))
 
     share = average(np.ones(distance.shape))
     whole = np.maximum(share, SLOPE_WINDOW_PX**-2)
-    columns = (x, y, values)
+    columns = (place[1], place[0], np.where(known, distance - middle, 0.0).astype(np.float64))
     mean = [average(one) / whole for one in columns]
     xx, xy, xr, yy, yr, rr = (
         average(columns[i] * columns[j]) / whole - mean[i] * mean[j]
@@ -116,36 +202,9 @@ def measure_slopes(distance: Image) -> tuple[FloatArray_refusal, FloatArray_refu
     return np.where(share > 0.5, np.hypot(across, down), 0.0), scatter
 
 
-def require_surfaces(found: Returns, patches: list[Patch]) -> None:
-    """Refuse a shot whose returns do not lie side by side on surfaces.
-
-    `patches`: surfaces through them.
-    """
-    on_surface = np.zeros(found.camera.image_shape, bool)
-    for patch in patches:
-        on_surface.ravel()[patch.pixels] = True
-    light = float(found.intensity.sum())
-    share = float(found.intensity[on_surface[found.y, found.x]].sum()) / light if light else 0.0
-    if share < MIN_SURFACE_SHARE:
-        raise _refuse(f"only {100 * share:.0f} % of the returns' light lies on smooth surfaces")
-
-
-def require_short_pulse(pulse: ShotPulse) -> None:
-    """Refuse a shot whose pixels go on receiving light long after the return."""
-    if pulse.tail_share > MAX_TAIL_SHARE:
-        raise _refuse(
-            f"{100 * pulse.tail_share:.0f} % of each pixel's light comes long after its peak"
-        )
-
-
-def require_explained(
-    model: SurfaceModel, amplitude: Image, frames: Frames, streak: Streak
-) -> None:
-    """Refuse a shot that surfaces explain neither well nor as well as its frames do.
-
-    `amplitude` (points,); `frames`: A fast recovery of the same shot.
-    """
-    unexplained = model.unexplained(amplitude)
+def _require_explained(solver: AmplitudeSolver, frames: Frames, streak: Streak) -> None:
+    """Refuse a shot that surfaces explain neither well nor as well as its frames do."""
+    unexplained = solver.model.unexplained(solver.amplitude)
     if unexplained <= MAX_UNEXPLAINED:
         return
     # In little light noise is left over however right the surfaces are, and by frames as well.
@@ -164,99 +223,12 @@ def require_explained(
         )
 
 
-def _refuse(fault: str) -> InputError:
-    """The error of a shot that is not one of surfaces."""
-    return InputError(
-        f"{fault}: this shot's light is not on surfaces (smoke, light in flight, a relay wall); "
-        'choose `method="tv"`'
-    )
-
-
-START_ITERATIONS = 25
-MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 4, 10
-# Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
-LAST_STEP_SIGMAS = 0.3
-FOLLOWING_ITERATIONS = 10  # before and after the ranges' step, where the last shot's fit begins
-# Of what surfaces leave unexplained, and beyond: from there on they are not the next shot's.
-CHANGED_RATIO, CHANGED_EXCESS = 1.25, 0.02
-
-
-@dataclass(frozen=True)
-class SurfaceFit:
-    """Surfaces as they were fitted to a shot."""
-
-    model: SurfaceModel
-    solver: AmplitudeSolver
-    refinement: Refinement  # the last one
-    # (surfaces,), what further steps would still change of each surface's range, m
-    remainder: FloatArray
-    # what the surfaces left unexplained when they were found, as a fraction of the signal
-    reference: float
-
-    def count_iterations(self) -> int:
-        """Return the iterations of FISTA until the ranges were known."""
-        return START_ITERATIONS + self.refinement.steps * REFINEMENT_ITERATIONS
-
-
-@limit_blas_threads()  # products of a few dozen columns are too small to share
-def fit_surfaces(
-    streak: Streak,
-    frames: Frames,
-    weight: float,
-    iterations: int,
-    progress: Progress = ignore_progress,
-) -> SurfaceFit:
-    """Find and fit the surfaces of a shot.
-
-    `frames`: A fast recovery of the same shot, with the camera to use; `weight`: of total
-    variation; see `tofclip.recovery.SurfaceRecovery`; `iterations`: after the ranges are known;
-    `progress`: called with the number of frame iterations just done.
-    """
-    camera, count = frames.camera, frames.times.size
-    # The model explains what was measured: corrections come when its returns are listed.
-    found = depth(frames, camera.replace(range_calibration=None))
-    bin_m = SPEED_OF_LIGHT * frames.bin_width / 2
-    directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
-    ray_length = (1 / directions[:, 2]).reshape(camera.image_shape)
-    require_gentle_slopes(found, bin_m)
-    # Weaker returns of a pixel are often the frames' own: they would widen the surfaces.
-    strongest = found.image("range").astype(np.float64).ravel()
-    pixels = np.flatnonzero(np.isfinite(strongest))
-    patches = find_patches(pixels, strongest[pixels], ray_length, bin_m)
-    require_surfaces(found, patches)
-    patches += find_dimmer_patches(patches, found, ray_length, bin_m)
-    masks = np.zeros((len(patches), *camera.image_shape), bool)
-    pictures = np.zeros(masks.shape, np.float32)
-    brightness = frames.values.sum(axis=0).ravel()
-    for patch, mask, picture in zip(patches, masks, pictures, strict=True):
-        picture.ravel()[patch.pixels] = brightness[patch.pixels]
-        seen = reach_further(patch, found, ray_length, bin_m)
-        mask[...] = scipy.ndimage.binary_dilation(seen, np.ones((3, 3)), MARGIN_PX)
-    state = SurfaceState.start([patch.coefficients for patch in patches], camera)
-    bases = [patch.basis for patch in patches]
-    on_surface = np.concatenate([patch.pixels for patch in patches])
-    pulse = measure_pulse(frames, on_surface, strongest[on_surface])
-    require_short_pulse(pulse)
-    model = SurfaceModel(streak, camera, masks, bases, state, pulse)
-    solver = AmplitudeSolver(model, pictures[masks], weight)
-    solver.run(START_ITERATIONS, progress, count)
-    require_explained(model, solver.amplitude, frames, streak)
-    model.find_behind(solver.amplitude)
-    # before ranges are refined: splines take longer to be right, and views that are late give way
-    solver = straighten_surfaces(solver)
-    refinement, remainder = _refine(solver.model, solver, progress, count)
-    solver.run(iterations, progress, count)
-    reference = solver.model.unexplained(solver.amplitude)
-    return SurfaceFit(solver.model, solver, refinement, remainder, reference)
-
-
 def straighten_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
-    """Replace splines by quadratics that explain the shot at least as well, after a step each.
+    """Replace splines by quadratics that explain the shot at least as well, after a step each; return
+    the same solver where all are needed.
 
     Splines follow the returns of frames, also where these are displaced, as behind gauze; the shot
     itself says whether the surface is bent.
-
-    Returns of the model with those quadratics; the same where all splines are needed.
     """
     bent = [surface for surface, basis in enumerate(solver.model.bases) if not basis.is_quadratic]
     if not bent:
@@ -274,13 +246,41 @@ def straighten_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
     return solver
 
 
+def _refine(
+    solver: AmplitudeSolver, progress: Progress, count: int
+) -> tuple[Refinement, FloatArray]:
+    """Steps on ranges and instrument until they hardly move; the last one, and what more would
+    change of each surface.
+    """
+    model, found, lengths = solver.model, None, []
+    for number in range(MAX_REFINEMENTS):
+        before = model.distance
+        model.find_behind(solver.amplitude)
+        found = refine_state(model, solver.amplitude, found)
+        solver.amplitude = found.amplitude
+        solver.run(REFINEMENT_ITERATIONS, progress, count)
+        moved = model.distance - before
+        lengths.append([np.sqrt(np.mean(moved[part] ** 2)) for part in model.parts])
+        sigmas = moved / model.estimate_deviation(found.covariances)
+        if number + 1 >= MIN_REFINEMENTS and np.sqrt(np.mean(sigmas**2)) < LAST_STEP_SIGMAS:
+            break
+    assert found is not None
+    return found, extrapolate_steps(np.array(lengths))
+
+
+def extrapolate_steps(lengths: FloatArray) -> FloatArray:
+    """Return how far steps, (steps, n), two or more, that shrink as the last two did would still go:
+    the sum of a geometric series; steps that do not shrink count as if they halved.
+    """
+    tiny = np.finfo(np.float64).tiny
+    ratio = np.minimum(lengths[-1] / np.maximum(lengths[-2], tiny), 0.5)
+    return np.asarray(lengths[-1] * ratio / (1 - ratio))
+
+
 @limit_blas_threads()
 def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFit | None:
-    """Fit the surfaces of the shot before to the next one of the same camera.
-
-    `fit`: of the shot before; `weight`: of total variation; see `tofclip.recovery.SurfaceRecovery`.
-    Returns none where these surfaces no longer explain what they did: the scene has changed, and
-    surfaces have to be found anew.
+    """Fit the surfaces of the shot before to the next one of the same camera; None where they no
+    longer explain what they did: the scene has changed, and surfaces have to be found anew.
     """
     model = fit.model.see(streak)
     solver = AmplitudeSolver(model, fit.solver.amplitude, weight, fit.solver)
@@ -295,100 +295,49 @@ def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFi
     return SurfaceFit(model, solver, refinement, fit.remainder, fit.reference)
 
 
-def _refine(
-    model: SurfaceModel, solver: AmplitudeSolver, progress: Progress, count: int
-) -> tuple[Refinement, FloatArray]:
-    """Steps on ranges and instrument until they hardly move; the last one, and what more would
-    change of each surface.
-    """
-    before, changes = model.distance, []
-    found = None
-    for number in range(MAX_REFINEMENTS):
-        model.find_behind(solver.amplitude)
-        found = refine_state(model, solver.amplitude, found)
-        solver.amplitude = found.amplitude
-        solver.run(REFINEMENT_ITERATIONS, progress, count)
-        moved = model.distance - before
-        changes.append([np.sqrt(np.mean(moved[part] ** 2)) for part in model.parts])
-        before = model.distance
-        sigmas = moved / model.estimate_deviation(found.covariances)
-        if number + 1 >= MIN_REFINEMENTS and np.sqrt(np.mean(sigmas**2)) < LAST_STEP_SIGMAS:
-            break
-    assert found is not None
-    return found, extrapolate_steps(np.array(changes))
-
-
-def extrapolate_steps(lengths: FloatArray) -> FloatArray:
-    """Return how far steps that shrink as the last two did would still go.
-
-    `lengths` (steps, n): two steps or more. Returns (n,): the sum of a geometric series; steps that
-    do not shrink count as if they halved.
-    """
-    tiny = np.finfo(np.float64).tiny
-    ratio = np.minimum(lengths[-1] / np.maximum(lengths[-2], tiny), 0.5)
-    left: FloatArray = lengths[-1] * ratio / (1 - ratio)
-    return left
-
-
-SURE_SIGMAS = 20.0  # points of which a surface certainly consists
-UPPER_QUANTILE = 0.9
-MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
-EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
-NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
-
-
 @limit_blas_threads()
 def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float = 0.0) -> Returns:
     """List the points that stand out of the noise and of their neighbourhood, pixel by pixel.
 
-    `detection`: which points are returned; `centre_error_px`: how far off the calibration had each
-    slit centre, as for `tofclip.recovery.Shot`.
+    `centre_error_px`: how far off the calibration had each slit centre, see `tofclip.recovery.Shot`.
     """
     model, solver = fit.model, fit.solver
     camera = model.camera.replace(gains=model.state.gains)
     distance, amplitude = model.distance, solver.amplitude
-    # A pixel alone is hardly above the photons' noise: its neighbours on the surface, which the
-    # prior ties to it, count as well.
+    # 6. Points. A pixel alone is hardly above the photons' noise: its neighbours on the surface,
+    # which the prior ties to it, count as well.
     pictures, information = np.zeros((2, *model.masks.shape), np.float32)
     information[model.masks] = model.gather(model.weights, squared=True)
     pictures[model.masks] = amplitude
     pooled = np.stack([pool_information(*one) for one in zip(information, pictures, strict=True)])
     # running sums may leave a rounding error below nothing
-    pooled = np.maximum(pooled, 0)
-    significance = amplitude * np.sqrt(pooled[model.masks] / solver.variance)
-    deviation = model.estimate_deviation(fit.refinement.covariances)
-    deviation = np.hypot(deviation, fit.remainder[model.surface])
-    displacement = estimate_displacement(camera, centre_error_px)
-    deviation = np.hypot(deviation, np.hypot(*(displacement * model.compute_slopes().T).T))
+    significance = amplitude * np.sqrt(np.maximum(pooled, 0)[model.masks] / solver.variance)
+    limit, surface = detection.signal_to_noise, model.surface
+    usual = [find_usual_brightness(amplitude[p], significance[p], limit) for p in model.parts]
+    least = MIN_BRIGHTNESS_FRACTION * np.array(usual)[surface]
+    bright = np.flatnonzero((significance > limit) & (amplitude > least))
     # brightness is told as the reference view sees it
     intensity = model.shade(model.reference, amplitude) * distance**2
-    limit = detection.signal_to_noise
-    usual = np.zeros(len(model.masks))
-    for one in range(usual.size):
-        own = model.surface == one
-        usual[one] = find_usual_brightness(amplitude[own], significance[own], limit)
-    bright = np.flatnonzero(
-        (significance > limit) & (amplitude > MIN_BRIGHTNESS_FRACTION * usual[model.surface])
-    )
+    time = 2 * distance / SPEED_OF_LIGHT
     strong = detection.find_significant(
-        model.pixel[bright],
-        2 * distance[bright] / SPEED_OF_LIGHT,
-        intensity[bright],
-        camera.pulse_fwhm,
+        model.pixel[bright], time[bright], intensity[bright], camera.pulse_fwhm
     )
     chosen = bright[strong]
-    chosen = chosen[np.lexsort((distance[chosen], model.pixel[chosen]))]
+    order, rank = rank_within_pixels(model.pixel[chosen], distance[chosen])
+    chosen = chosen[order]
+
+    fitted = model.estimate_deviation(fit.refinement.covariances)
+    moved = estimate_displacement(camera, centre_error_px)[:, np.newaxis] * model.compute_slopes()
+    deviation = np.hypot(np.hypot(fitted, fit.remainder[surface]), np.hypot(*moved))
     y, x = np.divmod(model.pixel[chosen], camera.image_shape[1])
-    starts = np.flatnonzero(np.diff(model.pixel[chosen], prepend=-1))
-    rank = np.arange(chosen.size) - np.repeat(starts, np.diff(starts, append=chosen.size)) + 1
     measured = Returns(
         y=y.astype(np.int32),
         x=x.astype(np.int32),
         range=distance[chosen],
         intensity=intensity[chosen].astype(np.float32),
         confidence=deviation[chosen].astype(np.float32),
-        return_number=rank.astype(np.uint8),
-        time=2 * distance[chosen] / SPEED_OF_LIGHT,
+        return_number=(rank + 1).astype(np.uint8),
+        time=time[chosen],
         camera=camera,
         shear=np.asarray(camera.shear_at(distance[chosen])),
     )
@@ -401,24 +350,18 @@ def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
     Of errors e_v a shot shows all but what looks like a displaced picture, ``e_v = dx - dy
     tan(angle_v)``. That part is taken to be that of errors which alternate, as of neighbouring
     lenslets measured in turns; independent ones would leave sqrt(views) as much.
-
-    `centre_error_px`: how far off the calibration had each slit centre, as for
-    `tofclip.recovery.Shot`. Returns (2,).
     """
     in_turns = (-1.0) ** np.arange(camera.views)
     looks = np.stack([np.ones(camera.views), -np.tan(camera.angles)], axis=1)
-    found: FloatArray = np.abs(np.linalg.pinv(looks) @ in_turns) * centre_error_px
-    return found
+    return np.asarray(np.abs(np.linalg.pinv(looks) @ in_turns) * centre_error_px)
 
 
 def pool_information(information: Image, picture: Image) -> Image:
-    """Return the information about each pixel's amplitude, with that of pixels tied to it.
+    """Return the information about each pixel's amplitude, (rows, columns), one over its variance,
+    with that of pixels tied to it.
 
     These are the nearest ones, and those further off that the prior has made as bright: where little
     is known of each pixel it leaves large even pieces, whose amplitude all their pixels determine.
-
-    `information` (rows, columns): of each pixel alone, one over the variance of its amplitude;
-    `picture` (rows, columns): amplitudes. Returns (rows, columns).
     """
 
     def add_up(values: Image, side: int) -> Image:
@@ -426,24 +369,19 @@ def pool_information(information: Image, picture: Image) -> Image:
         return side**2 * mean
 
     pooled = add_up(information, NEIGHBOURHOOD_PX)
-    level = np.zeros(picture.shape, np.intp)
-    lit = picture > 0
+    lit, level = picture > 0, np.zeros(picture.shape, np.intp)
     level[lit] = np.floor(np.log(picture[lit]) / np.log(EVEN_RATIO)).astype(np.intp)
     for one in np.unique(level[lit]):
         even = lit & (np.abs(level - one) <= 1)
         own = lit & (level == one)
         wide = add_up(np.where(even, information, 0), EVEN_PX)
         pooled[own] = np.maximum(pooled[own], wide[own])
-    found: Image = pooled
-    return found
+    return pooled
 
 
 def find_usual_brightness(amplitude: Image, significance: Image, limit: float) -> float:
-    """Return the usual amplitude of the points of which a surface certainly consists.
-
-    `amplitude, significance` (points,): of the surface; significance in standard deviations;
-    `limit`: standard deviations below which there is no point. Returns infinite if no point is
-    sure.
+    """Return the usual amplitude of the points of which a surface certainly consists; infinite if
+    none is that many standard deviations out of the noise.
     """
     if amplitude.size == 0:
         return float("inf")
@@ -541,7 +479,9 @@ class SurfaceRecovery:
         figures: dict[str, Any] = {
             "method": self.name,
             "focus": "depth-locked",
-            "iterations": fit.count_iterations() + self.iterations,
+            "iterations": START_ITERATIONS
+            + fit.refinement.steps * REFINEMENT_ITERATIONS
+            + self.iterations,
             "stopped_because": "iteration limit",
             "relative_residual": residual,
             "surfaces": len(model.masks),

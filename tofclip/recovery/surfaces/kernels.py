@@ -26,10 +26,8 @@ SPLINE_VARIANCE = 0.25  # rows^2, of the samples' spread
 
 
 def split_between_rows(row: NDArray[np.float64]) -> tuple[NDArray[np.int32], Image]:
-    """Put positions between rows: samples of the quadratic B-spline.
-
-    `row` (points,): position of each point; row i reaches from i - 1/2 to i + 1/2. Returns `first`
-    (points,): first of the three rows; `shares` (points, 3).
+    """Put positions, (points,), between rows: the first of three, and samples of the quadratic
+    B-spline there, (points, 3).
     """
     middle = np.floor(row + 0.5)
     off = row - middle
@@ -42,13 +40,10 @@ def split_between_rows(row: NDArray[np.float64]) -> tuple[NDArray[np.int32], Ima
 
 @fast_loop
 def split_over_slit(position, tangent, subrows, first, shares):
-    """Share of a picture pixel that falls on each slit pixel.
+    """Share of a picture pixel that falls on each slit pixel, (points, reach), from `first` on.
 
     A pixel is a square of side 1: its width and the slit pixel's make a triangle, and its height
     spreads it by the tangent of the line's angle, for which `subrows` lines stand.
-
-    `position` (points,): slit position of the pixel's middle; `tangent`: of the view's line angle;
-    `first` (points,); `shares` (points, reach).
     """
     reach = shares.shape[1]
     # a row of the picture is projected to tan(angle) slit pixels
@@ -72,8 +67,7 @@ def split_over_slit(position, tangent, subrows, first, shares):
 def add_light(amplitude, row, row_shares, column, slit_shares, image):
     """Add the light of surface points to the image of a view; all of it must fall inside.
 
-    `amplitude` (points,); `row, column` (points,): first of those that a point reaches;
-    `row_shares` (points, 3); `slit_shares` (points, 4); `image` (rows, columns).
+    `row, column` (points,): first of those that a point reaches; shares: (points, 3) and (points, 4).
     """
     for point in range(amplitude.size):
         # most points of a volume are dark
@@ -89,11 +83,7 @@ def add_light(amplitude, row, row_shares, column, slit_shares, image):
 
 @fast_loop
 def gather_light(image, gain, row, row_shares, column, slit_shares, amplitude):
-    """The adjoint of `add_light`: what each point's light would find in an image.
-
-    `image` (rows, columns); `row, column` (points,); `row_shares` (points, 3); `slit_shares`
-    (points, 4); `amplitude` (points,).
-    """
+    """The adjoint of `add_light`: what each point's light would find in an image."""
     for point in range(amplitude.size):
         top, left = row[point], column[point]
         total = 0.0
@@ -107,11 +97,8 @@ def gather_light(image, gain, row, row_shares, column, slit_shares, amplitude):
 
 @fast_loop
 def smooth_rows(image, kernel, rows, margin, result):
-    """Convolve an image with a kernel along its rows, for some of the rows.
-
-    `image` (rows, columns); `kernel` (2 half + 1,); `rows` (n,): of the result; `margin`: row 0 of
-    the result is this row of the image; what lies outside the image counts as dark; `result` (rows,
-    columns).
+    """Convolve an image with a kernel along its rows, for some of the result's rows, of which row 0 is
+    row `margin` of the image; what lies outside the image counts as dark.
     """
     half = kernel.size // 2
     for number in range(rows.size):
@@ -146,13 +133,11 @@ def prox_masked_tv(
     dual: Image,
     result: Image,
 ) -> None:
-    """Nonnegative proximal step of total variation on a part of a picture.
+    """Nonnegative proximal step of total variation on a part of a picture; 0 outside the mask.
 
     Fast gradient projection on the dual (A. Beck and M. Teboulle, IEEE Trans. Image Process. 18,
-    2419, 2009); neighbours of which one lies outside the mask do not count.
-
-    `picture` (rows, columns); `mask` (rows, columns); `dual` (2, rows, columns): start, and what to
-    start from the next time; `result` (rows, columns): 0 outside the mask.
+    2419, 2009), (2, rows, columns), from which the next step starts; neighbours of which one lies
+    outside the mask do not count.
     """
     ahead, age, weight = dual.copy(), 1.0, float(weight)
     apply_dual(picture, mask, weight, ahead, result)

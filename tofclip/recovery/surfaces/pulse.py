@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.lidar.pulse import Pulse
 from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -55,15 +56,12 @@ class ShotPulse:
         """Rows that the shares reach to either side."""
         return int(np.abs(self.lags).max(initial=0))
 
-    def extend(self, core: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return a core, sampled symmetrically, with all that follows it, `reach` samples longer at
-        either end.
-        """
+    def extend(self, core: Image) -> Image:
+        """Return a core with all that follows it, `reach` samples longer at either end."""
         reach = self.reach
         tail = np.zeros(2 * reach + 1)
         tail[self.lags + reach] = self.shares
-        found: NDArray[np.float32] = np.convolve(core, tail).astype(np.float32)
-        return found
+        return np.asarray(np.convolve(core, tail).astype(np.float32))
 
 
 def measure_pulse(frames: Frames, pixels: NDArray[np.intp], distance: FloatArray) -> ShotPulse:
@@ -78,16 +76,24 @@ def measure_pulse(frames: Frames, pixels: NDArray[np.intp], distance: FloatArray
         return usual
     lags = np.arange(-int(np.ceil(REACH_BEFORE * width)), int(np.ceil(REACH_AFTER * width)) + 1)
     shape = find_usual_course(frames, pixels, distance, lags, width)
-    ratio = measure_width(shape) / width
+    ratio = Pulse(shape, 1.0, 0.0).fwhm / width
     tail = float(shape[lags > TAIL_START * width].sum() / shape.sum())
     if ratio < GAUSSIAN_WIDTH and tail < GAUSSIAN_TAIL:
         return usual
-    sigma, shares = split_core(shape, lags, width)
+    # A Gaussian core at some lags, by non-negative least squares: the widest that explains the pulse
+    # as well as any. One that explains nothing better than the samples' own roundness is too narrow.
+    allowed = lags[lags >= -LAGS_BEFORE * width]
+    cores = CORES * width / FWHM_PER_SIGMA
+    designs = (np.exp(-(((lags[:, np.newaxis] - allowed) / core) ** 2) / 2) for core in cores)
+    fits = [scipy.optimize.nnls(design, shape) for design in designs]
+    enough = CORE_EXCESS * min(misfit for _, misfit in fits) + 1e-9
+    best = max(number for number, (_, misfit) in enumerate(fits) if misfit <= enough)
+    shares = fits[best][0]
     kept = shares > LEAST_SHARE * shares.sum()
-    own = lags[kept]
     # where the pulse is at its peak is its return, as for a search of returns
-    sigma = float(np.sqrt(max(sigma**2 - ROW_VARIANCE, ROW_VARIANCE)))
-    return ShotPulse(sigma, own.astype(np.intp), shares[kept] / shares[kept].sum(), ratio, tail)
+    sigma = float(np.sqrt(max(cores[best] ** 2 - ROW_VARIANCE, ROW_VARIANCE)))
+    own = allowed[kept].astype(np.intp)
+    return ShotPulse(sigma, own, shares[kept] / shares[kept].sum(), ratio, tail)
 
 
 def find_usual_course(
@@ -97,10 +103,8 @@ def find_usual_course(
     lags: NDArray[np.int64],
     width: float,
 ) -> FloatArray:
-    """Return the median course of light about the returns of bright pixels, its peak 1.
-
-    `pixels` (n,); `distance` (n,): m; `lags` (m,): rows after the return; `width`: of the camera's
-    pulse, rows. Returns (m,).
+    """Return the median course of light about the returns of bright pixels, its peak 1, at lags, rows
+    after the return; `width`: of the camera's pulse, rows.
     """
     traces = frames.values.reshape(frames.values.shape[0], -1)
     row = np.interp(2 * distance / SPEED_OF_LIGHT, frames.times, np.arange(frames.times.size))
@@ -110,63 +114,21 @@ def find_usual_course(
     own = pixels[:, np.newaxis]
     light = traces[before, own] * (1 - between) + traces[before + 1, own] * between
     core = light[:, np.abs(lags) <= width].sum(axis=1)
-    bright = core >= max(
-        float(np.quantile(core, BRIGHT_QUANTILE)), float(np.finfo(np.float32).tiny)
-    )
+    usual = float(np.quantile(core, BRIGHT_QUANTILE))
+    bright = core >= max(usual, float(np.finfo(np.float32).tiny))
     shape = np.median(light[bright] / core[bright, np.newaxis], axis=0)
-    found: FloatArray = shape / max(float(shape.max()), float(np.finfo(np.float64).tiny))
-    return found
-
-
-def measure_width(shape: FloatArray) -> float:
-    """Full width at half maximum of a course of light, samples, with linear interpolation."""
-    above = np.flatnonzero(shape >= 0.5 * shape.max())
-    first, last = float(above[0]), float(above[-1])
-    half = 0.5 * shape.max()
-    if above[0] > 0:
-        low, high = shape[above[0] - 1 : above[0] + 1]
-        first -= (high - half) / (high - low)
-    if above[-1] < shape.size - 1:
-        high, low = shape[above[-1] : above[-1] + 2]
-        last += (high - half) / (high - low)
-    return last - first
-
-
-def split_core(
-    shape: FloatArray, lags: NDArray[np.int64], width: float
-) -> tuple[float, FloatArray]:
-    """Explain a pulse as a Gaussian core at some lags, by non-negative least squares.
-
-    `shape` (m,); `lags` (m,): rows after the return; `width`: of the camera's pulse, rows. Returns
-    `sigma`: of the core, rows: the widest that explains the pulse as well as any; `shares` (m,): of
-    the core at each lag.
-    """
-    allowed = np.flatnonzero(lags >= -LAGS_BEFORE * width)
-    found = []
-    for core in CORES * width / FWHM_PER_SIGMA:
-        design = np.exp(-(((lags[:, np.newaxis] - lags[allowed]) / core) ** 2) / 2)
-        shares, misfit = scipy.optimize.nnls(design, shape)
-        found.append((core, shares, misfit))
-    least = min(misfit for _, _, misfit in found)
-    # One that explains nothing better than the samples' own roundness is too narrow to be smooth.
-    sigma, shares, _ = next(one for one in reversed(found) if one[2] <= CORE_EXCESS * least + 1e-9)
-    whole = np.zeros(lags.size)
-    whole[allowed] = shares
-    return float(sigma), whole
+    return np.asarray(shape / max(float(shape.max()), float(np.finfo(np.float64).tiny)))
 
 
 def make_pulse(sigma: float, half: int, variance: float = SPLINE_LEFT_VARIANCE) -> Image:
-    """Return the samples of a Gaussian pulse that are left to smooth with.
-
-    `sigma`: standard deviation of the pulse, rows; `half`: samples to either side; `variance`:
-    already there, rows^2.
+    """Return the samples, so many to either side, of a Gaussian pulse that are left to smooth with,
+    less the variance, rows^2, that is there already; `sigma` is in rows.
     """
     rest = max(sigma**2 - variance, MIN_VARIANCE)
     taps = np.arange(-half, half + 1)
     pulse = np.exp(-(taps**2) / (2 * rest))
     pulse[np.abs(taps) > EXTENT_SIGMAS * np.sqrt(rest) + 1] = 0  # which smoothing skips
-    found: Image = (pulse / pulse.sum()).astype(np.float32)
-    return found
+    return np.asarray((pulse / pulse.sum()).astype(np.float32))
 
 
 def differentiate_pulse(kernel: Image) -> Image:
