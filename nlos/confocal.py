@@ -1,8 +1,6 @@
-"""What light-cone transform and f-k migration need of a capture: its lattice, and its signals from path 0 on.
-
-The light-cone transform: confocal imaging as one deconvolution.
-
-f-k migration: confocal imaging as a wave that runs back into the scene.
+"""Confocal imaging by transforms of the whole scan at once: what both methods need of a capture (its
+lattice, its signals from path 0 on), the light-cone transform, which is one deconvolution, and f-k
+migration, which lets a wave run back into the scene.
 """
 
 from __future__ import annotations
@@ -49,11 +47,7 @@ class ConfocalScan:
     @classmethod
     def of(cls, capture: Capture, grid: Grid) -> ConfocalScan:
         """Sort a capture onto its lattice, from distance 0 as far as any voxel of the grid is from
-        any wall point.
-
-        `capture`: confocal, its wall points on a lattice of a plane; `grid`: says how far the
-        signals are needed. Returns signals (y, x, t) float32; a bin is half as long as the
-        capture's, because it counts distance, not path.
+        any wall point; a bin counts distance, not path, and is half as long as the capture's.
         """
         wall = PlanarWall.of(capture.points, LATTICE_TOLERANCE)
         traces = _shift_to_distance_zero(capture, _count_useful_bins(capture, wall.plane, grid))
@@ -68,23 +62,10 @@ class ConfocalScan:
 
 
 class ConfocalPlan(Plan):
-    """Imaging by transforms of the whole scan at once, ready for captures of one geometry.
+    """Imaging by transforms of the whole scan at once, ready for captures of one geometry: confocal
+    scans of a lattice on a plane z = const, up to half a wall beyond its edges.
 
-    Parameters
-    ----------
-    capture : Capture
-        A confocal scan of a lattice on a plane z = const.
-    grid : Grid
-        Up to half a wall beyond the wall's edges.
-    compute : callable
-        From a scan and the grid to the values (z, y, x).
-    settings : mapping
-        What a volume reports of how it was imaged.
-
-    Raises
-    ------
-    InputError
-        There is no such lattice, the grid reaches too far, or memory does not suffice.
+    `compute`: from a scan and the grid to the values (z, y, x); `settings`: what a volume reports.
     """
 
     def __init__(
@@ -96,14 +77,9 @@ class ConfocalPlan(Plan):
     ) -> None:
         require_numpy_signal("a light-cone transform or f-k migration", capture)
         require_imageable(capture, grid)
-        try:
-            wall = PlanarWall.of(capture.points, LATTICE_TOLERANCE)
-        except InputError as problem:
-            raise InputError(f"a lattice of points on a plane is needed: {problem}") from problem
         super().__init__(capture, grid)
-        _require_confocal(capture, wall.plane)
-        _require_extent(wall.plane, grid)
-        self._memory_bytes = _require_memory(capture, wall.plane) + grid.size * VOXEL_BYTES
+        plane = _require_lattice(capture, grid)
+        self._memory_bytes = _require_memory(capture, plane) + grid.size * VOXEL_BYTES
         self._compute, self.settings = compute, dict(settings)
 
     @property
@@ -126,10 +102,8 @@ def find_padded_length(count: int) -> int:
 def interpolate_axis(
     values: NDArray[np.float32], position: FloatArray, axis: int
 ) -> NDArray[np.float32]:
-    """Read an axis at fractional positions by linear interpolation; it is periodic.
-
-    `values`: any shape; `position` (n,): in steps of the axis. Returns as `values`, with n places
-    along the axis.
+    """Read an axis at fractional positions (n,), in its steps, by linear interpolation; it is
+    periodic.
     """
     below = np.floor(position).astype(np.intp)
     weight = (position - below).astype(np.float32)
@@ -143,22 +117,23 @@ def interpolate_axis(
 def resample_to_grid(
     values: NDArray[np.float32], scan: ConfocalScan, grid: Grid, depth_position: FloatArray
 ) -> NDArray[np.float32]:
-    """Read an image (y, x, depth) on the padded lattice at the voxels of a grid, shape (z, y, x).
-
-    `values` (y, x, depth); `scan`: its plane gives the lattice's first point and steps, m;
-    `depth_position` (z,): the grid's planes in steps of the third axis. Returns (z, y, x).
+    """Read an image (y, x, depth) on the padded lattice at the voxels (z, y, x) of a grid, whose
+    planes are at `depth_position` (z,) in steps of the third axis.
     """
     image = interpolate_axis(values, depth_position, 2)
-    row, column = (
-        (wanted - axis[0]) / axis_step(axis)
-        for wanted, axis in ((grid.y, scan.plane.y), (grid.x, scan.plane.x))
-    )
-    return np.ascontiguousarray(
-        np.moveaxis(interpolate_axis(interpolate_axis(image, column, 1), row, 0), 2, 0)
-    )
+    for number, wanted, axis in ((1, grid.x, scan.plane.x), (0, grid.y, scan.plane.y)):
+        image = interpolate_axis(image, (wanted - axis[0]) / axis_step(axis), number)
+    return np.ascontiguousarray(np.moveaxis(image, 2, 0))
 
 
-def _require_confocal(capture: Capture, plane: Plane) -> None:
+def _require_lattice(capture: Capture, grid: Grid) -> Plane:
+    """Return the plane of the wall; refuse what is no confocal scan of a lattice, and voxels too
+    far beside it.
+    """
+    try:
+        plane = PlanarWall.of(capture.points, LATTICE_TOLERANCE).plane
+    except InputError as problem:
+        raise InputError(f"a lattice of points on a plane is needed: {problem}") from problem
     if len(capture.lasers) != len(capture.points):
         raise InputError(
             "a confocal scan is needed, where every wall point is its own laser spot; use another method"
@@ -169,9 +144,6 @@ def _require_confocal(capture: Capture, plane: Plane) -> None:
             f"a confocal scan is needed, but lasers are up to {apart:.3g} m from their wall points; "
             "use another method"
         )
-
-
-def _require_extent(plane: Plane, grid: Grid) -> None:
     for name, axis, wanted in (("x", plane.x, grid.x), ("y", plane.y, grid.y)):
         # The transforms pad the wall to twice its width: what lies farther out would come in again
         # on the other side.
@@ -182,6 +154,7 @@ def _require_extent(plane: Plane, grid: Grid) -> None:
                 f"the grid's {name} runs from {wanted[0]:.3g} to {wanted[-1]:.3g} m, but this method sees only from "
                 f"{low:.3g} to {high:.3g} m, half a wall beyond the wall"
             )
+    return plane
 
 
 def _require_memory(capture: Capture, plane: Plane) -> int:
@@ -200,9 +173,7 @@ def _require_memory(capture: Capture, plane: Plane) -> int:
 def _count_useful_bins(capture: Capture, plane: Plane, grid: Grid) -> int:
     """Bins from path 0 to the end of the record, or as far as light of the grid can come from."""
     across = [
-        max(
-            abs(voxel - point) for voxel in (wanted[0], wanted[-1]) for point in (axis[0], axis[-1])
-        )
+        float(np.abs(wanted[[0, -1], np.newaxis] - axis[[0, -1]]).max())
         for axis, wanted in ((plane.x, grid.x), (plane.y, grid.y))
     ]
     farthest = float(np.hypot(np.hypot(*across), grid.z[-1] - plane.z))
@@ -227,6 +198,11 @@ def _shift_to_distance_zero(capture: Capture, bins: int) -> NDArray[np.float32]:
     return moved
 
 
+def _require_falloff(falloff: float) -> None:
+    if not (np.isfinite(falloff) and falloff >= 0):
+        raise InputError(f"falloff must be a power of 0 or more, got {falloff}")
+
+
 @dataclass(frozen=True)
 class LightCone(Method):
     """Confocal imaging by the light-cone transform.
@@ -234,7 +210,9 @@ class LightCone(Method):
     With u = z^2 and v = d^2, d half the path, the hyperboloid of a hidden point is ``v = u + x^2 +
     y^2``: the same paraboloid at every depth, so that the picture follows from one
     three-dimensional deconvolution with a Wiener filter. Needs a confocal scan of a lattice on a
-    plane z = const; hidden things must scatter evenly or straight back.
+    plane z = const, without the light that the wall returns at once (see
+    `nlos.preparation.remove_first_bounce`); hidden things must scatter evenly or straight back.
+    Sees up to half a wall beyond the wall's edges.
 
     Memory: for P wall points and T bins, two half spectra of the box padded to twice its size along
     all three axes, some 100 * P * T bytes (0.2 GB for 64 x 64 x 512); time: four transforms of that
@@ -261,85 +239,53 @@ class LightCone(Method):
             raise InputError(
                 f"signal_to_noise must be a positive number, got {self.signal_to_noise}"
             )
-        if not (np.isfinite(self.falloff) and self.falloff >= 0):
-            raise InputError(f"falloff must be a power of 0 or more, got {self.falloff}")
+        _require_falloff(self.falloff)
 
     def plan(self, capture: Capture, grid: Grid) -> ConfocalPlan:
-        """Make the method ready for captures like `capture` on `grid`.
-
-        Parameters
-        ----------
-        capture : Capture
-            A confocal scan of a lattice on a plane z = const, without the light that the wall
-            returns at once; see `nlos.preparation.remove_first_bounce`.
-        grid : Grid
-            Up to half a wall beyond the wall's edges; read by linear interpolation.
-
-        Returns
-        -------
-        ConfocalPlan
-
-        Raises
-        ------
-        InputError
-            The method cannot image such a capture on the grid, or not within memory.
-        """
-        settings = {
-            "method": "lightcone",
-            "signal_to_noise": self.signal_to_noise,
-            "falloff": self.falloff,
-        }
-        return ConfocalPlan(capture, grid, self._compute, settings)
+        settings = {"signal_to_noise": self.signal_to_noise, "falloff": self.falloff}
+        return ConfocalPlan(capture, grid, self._compute, {"method": "lightcone", **settings})
 
     def _compute(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
         """Return the image (z, y, x) of a scan on a grid."""
-        bins = scan.signal.shape[2]
+        from scipy.fft import ifft2, irfft
+
+        bins, workers = scan.signal.shape[2], thread_count()
         # one sample of u = z^2 for each bin, over the same range of depths
         squares = (bins * scan.spacing) ** 2 / bins
-        values = self._deconvolve(scan, squares)
+        spectrum, shape = transform_squared_distances(scan, squares, self.falloff)
+        kernel = _transform_paraboloid(scan, squares, shape)
+        apply_wiener_filter(spectrum, kernel, self.signal_to_noise)
+        spectrum = ifft2(spectrum, axes=(0, 1), workers=workers, overwrite_x=True)
+        values = irfft(spectrum, shape[2], workers=workers, overwrite_x=True)[..., :bins]
         depth_position = (grid.z - scan.plane.z) ** 2 / squares - 0.5
         # Depths between the wall and the first sample read the first.
         image = resample_to_grid(values, scan, grid, np.clip(depth_position, 0, bins - 1))
         return np.maximum(image, 0)
 
-    def _deconvolve(self, scan: ConfocalScan, squares: float) -> NDArray[np.float32]:
-        """Return the image on the padded lattice over samples of u that are `squares` (m^2) apart."""
-        from scipy.fft import ifft2, irfft
 
-        bins, workers = scan.signal.shape[2], thread_count()
-        spectrum, shape = transform_squared_distances(scan, squares, self.falloff)
-        self._apply_wiener_filter(spectrum, _transform_paraboloid(scan, squares, shape))
-        spectrum = ifft2(spectrum, axes=(0, 1), workers=workers, overwrite_x=True)
-        image: NDArray[np.float32] = irfft(spectrum, shape[2], workers=workers, overwrite_x=True)[
-            ..., :bins
-        ]
-        return image
+def apply_wiener_filter(
+    spectrum: NDArray[np.complex64], kernel: NDArray[np.complex64], signal_to_noise: float
+) -> None:
+    """Apply the Wiener filter to a spectrum (y, x, v) in place; the kernel is even in y and x, so
+    that a quarter of its spectrum is enough.
+    """
+    # the gain falls where the kernel is weaker than the noise
+    gain = kernel.conj() / (np.abs(kernel) ** 2 + np.float32(1 / signal_to_noise))
+    row, column = (np.minimum(np.arange(n), n - np.arange(n)) for n in spectrum.shape[:2])
 
-    def _apply_wiener_filter(
-        self, spectrum: NDArray[np.complex64], kernel: NDArray[np.complex64]
-    ) -> None:
-        """Apply the Wiener filter in place; the kernel is even, so that a quarter of its spectrum
-        is enough.
-        """
-        # Wiener: the filter's gain falls where the kernel is weaker than the noise
-        floor = np.float32(1 / self.signal_to_noise)
-        # the kernel is even in x and y, so that a quarter of its spectrum is kept
-        row, column = (np.minimum(np.arange(n), n - np.arange(n)) for n in spectrum.shape[:2])
-        kernel = kernel.conj() / (np.abs(kernel) ** 2 + floor)
+    def process_block(rows: slice) -> None:
+        for r in range(rows.start, rows.stop):
+            spectrum[r] *= gain[row[r], column]
 
-        def process_block(rows: slice) -> None:
-            for r in range(rows.start, rows.stop):
-                spectrum[r] *= kernel[row[r], column]
-
-        run_blocks(process_block, spectrum.shape[0], 8)
+    run_blocks(process_block, spectrum.shape[0], 8)
 
 
 def build_rebinning_matrix(source_edges: FloatArray, target_edges: FloatArray) -> csr_array:
     """Matrix (targets, sources) of the means over target intervals of a function given by its means
     over source ones.
 
-    `source_edges, target_edges` (n + 1,): increasing; intervals of length 0 are allowed. Targets
-    beyond the sources count as 0 there. Returns (targets, sources).
+    The edges (n + 1,) increase; intervals of length 0 are allowed. Targets beyond the sources count
+    as 0 there.
     """
     from scipy.sparse import csr_array
 
@@ -363,8 +309,8 @@ def transform_squared_distances(
     depth has the same kernel.
 
     `squares`: distance of samples of v, m^2; `falloff`: power of the distance by which light is
-    weaker; it is made up for. Returns `spectrum` (y, x, v): half spectrum, padded, so that no
-    convolution wraps around; `shape`: samples along y, x and v with the padding.
+    weaker; it is made up for. Returns the half spectrum (y, x, v), padded, so that no convolution
+    wraps around, and the samples along y, x and v with the padding.
     """
     from scipy.fft import fft2, rfft
 
@@ -429,8 +375,8 @@ class FKMigration(Method):
 
     The signals are taken for a wave that all hidden points sent out at once and that travelled to
     the wall at half the speed of light. A resampling of its spectrum, from frequency to depth
-    wavenumber, gives the wave at that one instant. Needs a confocal scan of a lattice on a plane z
-    = const; copes with glossy and retroreflective things.
+    wavenumber, gives the wave at that one instant. Needs the scans of `LightCone`; copes with
+    glossy and retroreflective things.
 
     The spectrum is interpolated about the middle of the record, where linear interpolation dims
     late signals least.
@@ -452,44 +398,15 @@ class FKMigration(Method):
     falloff: float = 4.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.falloff) and self.falloff >= 0):
-            raise InputError(f"falloff must be a power of 0 or more, got {self.falloff}")
+        _require_falloff(self.falloff)
 
     def plan(self, capture: Capture, grid: Grid) -> ConfocalPlan:
-        """Make the method ready for captures like `capture` on `grid`.
-
-        Parameters
-        ----------
-        capture : Capture
-            A confocal scan of a lattice on a plane z = const, without the light that the wall
-            returns at once; see `nlos.preparation.remove_first_bounce`.
-        grid : Grid
-            Up to half a wall beyond the wall's edges; read by linear interpolation.
-
-        Returns
-        -------
-        ConfocalPlan
-
-        Raises
-        ------
-        InputError
-            The method cannot image such a capture on the grid, or not within memory.
-        """
         settings = {"method": "fk", "falloff": self.falloff}
         return ConfocalPlan(capture, grid, self._compute, settings)
 
     def _compute(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
         """Return the image (z, y, x) of a scan on a grid."""
-        energy = _compute_energy(
-            _migrate_spectrum(self._compute_spectrum(scan), scan), scan.signal.shape[2]
-        )
-        return resample_to_grid(energy, scan, grid, (grid.z - scan.plane.z) / scan.spacing)
-
-    def _compute_spectrum(self, scan: ConfocalScan) -> NDArray[np.complex64]:
-        """Spectrum (ky, kx, frequency >= 0) of the wave's amplitude; its middle in time stands at
-        time 0.
-        """
-        from scipy.fft import fft2, rfft
+        from scipy.fft import fft2, ifft, ifft2, rfft
 
         rows, columns, bins = scan.signal.shape
         brightness = scan.correct_falloff(self.falloff)
@@ -499,47 +416,27 @@ class FKMigration(Method):
         spectrum = rfft(wave, period, workers=workers)
         # the record's middle becomes time zero, about which a spectrum varies slowest from
         # frequency to frequency
-        spectrum *= np.exp(2j * np.pi * (bins // 2) / period * np.arange(spectrum.shape[2])).astype(
-            np.complex64
+        delay = 2 * np.pi * (bins // 2) / period
+        spectrum *= np.exp(1j * delay * np.arange(spectrum.shape[2])).astype(np.complex64)
+        padded = (find_padded_length(rows), find_padded_length(columns))
+        spectrum = fft2(spectrum, padded, axes=(0, 1), workers=workers)
+        ky, kx = (
+            np.fft.fftfreq(n, axis_step(axis)) * period * scan.spacing
+            for n, axis in zip(padded, (scan.plane.y, scan.plane.x), strict=True)
         )
-        lateral: NDArray[np.complex64] = fft2(
-            spectrum,
-            (find_padded_length(rows), find_padded_length(columns)),
-            axes=(0, 1),
-            workers=workers,
-        )
-        return lateral
 
+        def migrate(block: slice) -> None:
+            for r in range(block.start, block.stop):
+                migrate_row(spectrum[r], ky[r], kx, delay)
 
-def _migrate_spectrum(spectrum: NDArray[np.complex64], scan: ConfocalScan) -> NDArray[np.complex64]:
-    """Resample the spectrum from frequency to depth wavenumber, in place."""
-    bins = scan.signal.shape[2]
-    period = find_padded_length(bins)
-    ky, kx = (
-        np.fft.fftfreq(n, axis_step(axis)) * period * scan.spacing
-        for n, axis in zip(spectrum.shape[:2], (scan.plane.y, scan.plane.x), strict=True)
-    )
-    delay = 2 * np.pi * (bins // 2) / period
+        run_blocks(migrate, padded[0], 8)
+        wave = ifft2(spectrum, axes=(0, 1), workers=workers, overwrite_x=True)
+        energy = np.empty((*padded, bins), np.float32)
 
-    def process_block(rows: slice) -> None:
-        for r in range(rows.start, rows.stop):
-            migrate_row(spectrum[r], ky[r], kx, delay)
+        def add_energy(block: slice) -> None:
+            # no negative depth wavenumbers: the wave runs one way
+            field = ifft(wave[block], period)[..., :bins]
+            energy[block] = field.real**2 + field.imag**2
 
-    run_blocks(process_block, spectrum.shape[0], 8)
-    return spectrum
-
-
-def _compute_energy(spectrum: NDArray[np.complex64], bins: int) -> NDArray[np.float32]:
-    """Return the wave's energy (y, x, depth), from its spectrum without negative depth wavenumbers."""
-    from scipy.fft import ifft, ifft2
-
-    workers = thread_count()
-    wave = ifft2(spectrum, axes=(0, 1), workers=workers, overwrite_x=True)
-    energy = np.empty((*wave.shape[:2], bins), np.float32)
-
-    def process_block(rows: slice) -> None:
-        field = ifft(wave[rows], find_padded_length(bins))[..., :bins]
-        energy[rows] = field.real**2 + field.imag**2
-
-    run_blocks(process_block, wave.shape[0], 8)
-    return energy
+        run_blocks(add_energy, padded[0], 8)
+        return resample_to_grid(energy, scan, grid, (grid.z - scan.plane.z) / scan.spacing)

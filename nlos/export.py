@@ -4,7 +4,7 @@ NumPy archives.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -41,23 +41,35 @@ class Mesh:
 
     def save(self, path: str | Path) -> None:
         """Write the mesh as binary PLY, whole or not at all."""
-        require_suffix(path, ".ply")
-        header = [
-            "ply",
-            "format binary_little_endian 1.0",
-            "comment units: m",
-            f"element vertex {len(self.vertices)}",
-            *(f"property float {axis}" for axis in "xyz"),
-            f"element face {len(self.faces)}",
-            "property list uchar int vertex_indices",
-            "end_header",
-        ]
-        rows = np.empty(len(self.faces), np.dtype([("corners", "u1"), ("faces", "<i4", 3)]))
-        rows["corners"], rows["faces"] = 3, self.faces
-        with atomic_path(path) as temporary, open(temporary, "wb") as file:
-            file.write(("\n".join(header) + "\n").encode())
-            file.write(self.vertices.astype("<f4").tobytes())
-            file.write(rows.tobytes())
+        write_ply(path, tuple("xyz"), self.vertices, self.faces)
+
+
+def write_ply(
+    path: str | Path,
+    names: Sequence[str],
+    vertices: NDArray[np.float32],
+    faces: NDArray[np.int32],
+    comment: str = "",
+) -> None:
+    """Write vertices (v, names) and triangles (m, 3) as binary PLY, whole or not at all."""
+    require_suffix(path, ".ply")
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment units: m",
+        *([f"comment {comment}"] if comment else []),
+        f"element vertex {len(vertices)}",
+        *(f"property float {name}" for name in names),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    rows = np.empty(len(faces), np.dtype([("corners", "u1"), ("faces", "<i4", 3)]))
+    rows["corners"], rows["faces"] = 3, faces
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(("\n".join(header) + "\n").encode())
+        file.write(vertices.astype("<f4").tobytes())
+        file.write(rows.tobytes())
 
 
 def extract_surface(volume: Volume, fraction: float) -> Mesh:

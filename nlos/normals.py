@@ -1,6 +1,5 @@
-"""What stands first on every line of sight from the wall: its depth, albedo and normal.
-
-The directional light-cone transform: albedo and normals of a confocal scan by one deconvolution.
+"""What stands first on every line of sight from the wall: its depth, albedo and normal, from a volume
+or, of a confocal scan, by the directional light-cone transform.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ from nlos.confocal import (
     tabulate_powers,
     transform_squared_distances,
 )
+from nlos.export import write_ply
 from nlos.plane import axis_step
 from nlos.volume import FloatArray, Grid, Volume
 from tofclip.arrays import ComputeDevice
 from tofclip.errors import InputError
-from tofclip.files import atomic_path, require_suffix
 from tofclip.threads import run_blocks, thread_count
 
 # Standard deviation of the neighbourhood whose gradients give a normal, voxels.
@@ -73,39 +72,19 @@ class FrontSurface:
         return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).astype(np.int32)
 
     def save(self, path: str | Path) -> None:
-        """Write an oriented cloud that is a mesh as well, as binary PLY, whole or not at all.
-
-        `path`: ends in .ply.
-        """
-        require_suffix(path, ".ply")
-        points, faces = self.points, self.faces if min(self.depth.shape) > 1 else np.empty((0, 3))
+        """Write an oriented cloud that is a mesh as well, as binary PLY, whole or not at all."""
+        faces = self.faces if min(self.depth.shape) > 1 else np.empty((0, 3), np.int32)
+        vertices = [self.points, self.normals[self.seen], self.albedo[self.seen][:, np.newaxis]]
         names = ("x", "y", "z", "nx", "ny", "nz", "brightness")
-        header = [
-            "ply",
-            "format binary_little_endian 1.0",
-            "comment units: m",
-            f"comment normals: {self.source}",
-            f"element vertex {len(points)}",
-            *(f"property float {name}" for name in names),
-            f"element face {len(faces)}",
-            "property list uchar int vertex_indices",
-            "end_header",
-        ]
-        columns = [points, self.normals[self.seen], self.albedo[self.seen][:, np.newaxis]]
-        rows = np.empty(len(faces), np.dtype([("corners", "u1"), ("faces", "<i4", 3)]))
-        rows["corners"], rows["faces"] = 3, faces
-        with atomic_path(path) as temporary, open(temporary, "wb") as file:
-            file.write(("\n".join(header) + "\n").encode())
-            file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
-            file.write(rows.tobytes())
+        write_ply(path, names, np.concatenate(vertices, axis=1), faces, f"normals: {self.source}")
 
 
 def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
-    """Find the front surface of a volume; its normals are the directions in which brightness
-    changes most.
+    """Find the front surface of a volume of at least 3 voxels along every axis; its normals are the
+    directions in which brightness changes most.
 
-    `volume`: at least 3 voxels along every axis; `fraction`: A line of sight shows a surface where
-    its brightest voxel has this fraction of the brightest of all.
+    `fraction`: a line of sight shows a surface where its brightest voxel has this fraction of the
+    brightest of all.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -125,10 +104,8 @@ def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
 
 
 def build_front_surface(volume: Volume, normals: NDArray[Any], fraction: float) -> FrontSurface:
-    """Put together the surface of the brightest voxel on every line of sight.
-
-    `normals` (y, x, 3): of that voxel, of any length and on either side; `fraction`: as of
-    `find_front_surface`.
+    """Put together the surface of the brightest voxel on every line of sight, whose normals (y, x,
+    3) may have any length and point to either side.
     """
     grid, magnitude = volume.grid, volume.magnitude
     albedo = magnitude.max(axis=0)
@@ -145,10 +122,7 @@ def build_front_surface(volume: Volume, normals: NDArray[Any], fraction: float) 
 
 
 def require_surface(magnitude: NDArray[np.floating], fraction: float) -> None:
-    """Refuse volumes that hold no surface, and fractions that are none.
-
-    `magnitude` (z, y, x).
-    """
+    """Refuse volumes that hold no surface, and fractions that are none."""
     if not 0 < fraction < 1:
         raise InputError(
             f"a surface lies where brightness is a fraction from 0 to 1, got {fraction}"
@@ -199,12 +173,7 @@ class DirectionalLightCone:
     def find_front_surface(
         self, capture: Capture, grid: Grid, fraction: float = 0.3
     ) -> FrontSurface:
-        """Find depth, albedo and normal on every line of sight.
-
-        `capture`: as of `LightCone`; `grid`: at least 3 voxels along every axis; `fraction`: A line
-        of sight shows a surface where its brightest voxel has this fraction of the brightest of
-        all.
-        """
+        """Find depth, albedo and normal on every line of sight; see the function of that name."""
         # Refuses what the transform cannot image.
         self.transform.plan(capture, grid)
         scan = ConfocalScan.of(capture, grid)
@@ -283,9 +252,6 @@ def _separate(
 def find_imaged_surface(capture: Capture, volume: Volume, fraction: float = 0.3) -> FrontSurface:
     """Find the front surface of a capture that has been imaged: by the directional light-cone
     transform where it takes the capture, else from the volume's gradients.
-
-    `capture`: that the volume was made of; `volume`: whose voxels are taken; `fraction`: A line of
-    sight shows a surface where its brightest voxel has this fraction of the brightest of all.
     """
     here = volume.on(ComputeDevice())
     require_surface(here.magnitude, fraction)

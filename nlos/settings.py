@@ -153,9 +153,7 @@ class Settings:
         "1", "Error allowed for the sake of speed: rsd, hybrid.", shown="0.01"
     )
     sigma: float | None = _setting(
-        "m",
-        "Width of the Laplacian: filtered-backprojection.",
-        shown="a quarter of the wavelength",
+        "m", "Width of the Laplacian: filtered-backprojection.", shown="a quarter of the wavelength"
     )
     falloff: float | None = _setting(
         "1",

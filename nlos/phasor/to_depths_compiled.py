@@ -584,11 +584,7 @@ class _Workspace:
     """One thread's memory, and what it does there."""
 
     def __init__(
-        self,
-        plan: DiffractionPlan,
-        groups: WaveGroups,
-        interpolation: Interpolation,
-        terms: int,
+        self, plan: DiffractionPlan, groups: WaveGroups, interpolation: Interpolation, terms: int
     ) -> None:
         self.plan, self.groups, self.interpolation = plan, groups, interpolation
         self.max_terms = terms
@@ -670,15 +666,5 @@ class _Workspace:
         laser = np.zeros(3) if source.laser is None else source.laser
         table, carrier = np.ascontiguousarray(light.table.T), self.inverse.carrier
         add_illuminated_terms(
-            images,
-            light.even,
-            x,
-            y,
-            depth,
-            laser,
-            wavenumber,
-            table,
-            light.span,
-            carrier,
-            field,
+            images, light.even, x, y, depth, laser, wavenumber, table, light.span, carrier, field
         )

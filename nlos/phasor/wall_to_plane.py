@@ -159,10 +159,7 @@ def plan_transforms(
     (high, tall), (wide, broad) = (
         find_common_period(side, axis_step(own), axis_step(other), other.size)
         for side, own, other in zip(
-            find_min_periods(offsets, tolerance),
-            (wall.y, wall.x),
-            (plane.y, plane.x),
-            strict=True,
+            find_min_periods(offsets, tolerance), (wall.y, wall.x), (plane.y, plane.x), strict=True
         )
     )
     periods = high * axis_step(wall.y), wide * axis_step(wall.x)

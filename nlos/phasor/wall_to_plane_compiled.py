@@ -20,12 +20,7 @@ from nlos.phasor.wall_kernels import (
     add_low_rank_terms,
     add_spherical_waves,
 )
-from nlos.phasor.wall_to_plane import (
-    WallBeforePlane,
-    WallToPlanePlan,
-    has_finufft,
-    plan_transforms,
-)
+from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, has_finufft, plan_transforms
 from nlos.plane import Plane
 from tofclip.threads import limit_blas_threads, run_blocks
 

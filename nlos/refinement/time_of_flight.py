@@ -10,11 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import Capture
-from nlos.refinement.kernels import (
-    VOXELS_PER_RUN,
-    add_backprojected_light,
-    add_expected_light,
-)
+from nlos.refinement.kernels import VOXELS_PER_RUN, add_backprojected_light, add_expected_light
 from nlos.volume import FloatArray, Grid
 from tofclip.threads import run_blocks, thread_count
 

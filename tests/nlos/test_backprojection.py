@@ -43,10 +43,7 @@ def test_a_hidden_point_comes_back_where_it_is(wall: np.ndarray, laser: str) -> 
 
 @settings(max_examples=15, deadline=None)
 @given(
-    x=st.floats(-0.4, 0.4),
-    y=st.floats(-0.35, 0.35),
-    z=st.floats(0.4, 0.9),
-    confocal=st.booleans(),
+    x=st.floats(-0.4, 0.4), y=st.floats(-0.35, 0.35), z=st.floats(0.4, 0.9), confocal=st.booleans()
 )
 def test_any_hidden_point_is_found_to_the_voxel(
     x: float, y: float, z: float, confocal: bool

@@ -109,9 +109,7 @@ def test_an_empty_band(make: Callable[[float], Any]) -> None:
 
 
 @pulsed_methods
-def test_a_wall_that_is_too_coarse_is_warned_of_in_one_line(
-    make: Callable[[float], Any],
-) -> None:
+def test_a_wall_that_is_too_coarse_is_warned_of_in_one_line(make: Callable[[float], Any]) -> None:
     method, grid = make(0.15), Grid.box((0, 0.05), (0, 0.05), (0.4, 0.45), 0.025)
     capture = seen(method)
     lit = Capture(

@@ -11,7 +11,7 @@ from refusals import find_refusal
 
 from nlos import Capture, FKMigration, Grid, LightCone
 from nlos.capture import TimeAxis
-from nlos.confocal import build_rebinning_matrix
+from nlos.confocal import apply_wiener_filter, build_rebinning_matrix
 from nlos.preparation import rebin_capture, remove_first_bounce
 from nlos.simulate import PointScene
 from tofclip.errors import InputError
@@ -317,7 +317,7 @@ def test_the_filter_is_wiener_s() -> None:
     random = np.random.default_rng(0)
     quarter = random.standard_normal((3, 3, 4)) + 1j * random.standard_normal((3, 3, 4))
     spectrum = np.ones((4, 4, 4), np.complex64)
-    LightCone(signal_to_noise=0.5)._apply_wiener_filter(spectrum, quarter.astype(np.complex64))
+    apply_wiener_filter(spectrum, quarter.astype(np.complex64), 0.5)
     expected = quarter.conj() / (np.abs(quarter) ** 2 + 2)
     np.testing.assert_allclose(spectrum[:3, :3], expected, rtol=1e-5)
     np.testing.assert_allclose(spectrum[3, 3], expected[1, 1], rtol=1e-5)

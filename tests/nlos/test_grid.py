@@ -20,10 +20,7 @@ def test_shape_follows_z_y_x() -> None:
     assert grid.find_nearest((1.9, 0.2, 3.4)) == (2, 0, 2)
 
 
-@given(
-    ends=st.tuples(*[st.tuples(metres, metres)] * 3),
-    voxel=st.floats(0.05, 2),
-)
+@given(ends=st.tuples(*[st.tuples(metres, metres)] * 3), voxel=st.floats(0.05, 2))
 def test_a_box_holds_evenly_spaced_voxels_of_the_size_asked_for(
     ends: tuple[tuple[float, float], ...], voxel: float
 ) -> None:

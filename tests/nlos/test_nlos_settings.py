@@ -14,12 +14,7 @@ from nlos.analysis import choose_wavelength, find_brightest_path, find_first_bou
 from nlos.band import VirtualPulse
 from nlos.capture import TimeAxis
 from nlos.io import read_capture
-from nlos.preparation import (
-    fade_record_end,
-    flip_capture,
-    join_near_lasers,
-    remove_first_bounce,
-)
+from nlos.preparation import fade_record_end, flip_capture, join_near_lasers, remove_first_bounce
 from nlos.settings import complete_settings, is_brightest_on_wall
 from nlos.simulate import PointScene, add_poisson_noise
 from tofclip.errors import InputError
