@@ -12,7 +12,7 @@ from tofclip.camera import (
     estimate_dark_level,
     measure,
 )
-from tofclip.camera.rectifier import MeasurementNoise
+from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import CalibrationError, InputError
 
 WIDTH, ROWS = 61, 80

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tofclip
-from tofclip.camera.rectifier import MeasurementNoise
+from tofclip.camera.noise import MeasurementNoise
 from tofclip.lidar import Pulse
 from tofclip.lidar.significance import find_most_significant, weigh_candidates
 

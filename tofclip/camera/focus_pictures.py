@@ -68,23 +68,13 @@ class FocusCalibration:
         **settings
             Further entries of `Camera`, such as ``time_zero`` or another ``image_shape``.
         """
-        height = int((self.line_rows_px[:, 1] - self.line_rows_px[:, 0]).max()) // 2 * 2
-        width = (
-            int(np.median(np.diff(self.centres_px))) // 2 * 2
-            if self.centres_px.size > 1
-            else height
-        )
-        return Camera(
-            **{
-                "centres_px": self.centres_px,
-                "angles": self.angles,
-                "image_shape": (height, width),
-                "slit_width_px": self.signal.shape[1],
-                "centre_uncertainty_px": self.centre_uncertainty_px,
-                "angle_uncertainty": self.angle_uncertainty,
-                **settings,
-            }
-        )
+        width = height = int(np.ptp(self.line_rows_px, axis=1).max()) // 2 * 2
+        if self.centres_px.size > 1:
+            width = int(np.median(np.diff(self.centres_px))) // 2 * 2
+        names = ("centres_px", "angles", "centre_uncertainty_px", "angle_uncertainty")
+        known = {name: getattr(self, name) for name in names}
+        known |= {"image_shape": (height, width), "slit_width_px": self.signal.shape[1]}
+        return Camera(**known | settings)
 
 
 def calibrate_views(
@@ -122,10 +112,8 @@ def calibrate_views(
     CalibrationError
         Fewer dots than views stand out, or a dot lies on no line.
     """
-    signal, dots = (
-        _subtract_background(line, line_background),
-        _subtract_background(dot, dot_background),
-    )
+    signal = _subtract_background(line, line_background)
+    dots = _subtract_background(dot, dot_background)
     if signal.shape != dots.shape:
         raise ShapeError("the dot pictures", f"{signal.shape} like the line pictures", dots.shape)
     slit_row, columns = _find_dots(dots, views)
@@ -186,27 +174,15 @@ def _fit_view(
     signal: FloatArray, dots: FloatArray, slit_row: int, column: int
 ) -> tuple[float, ...]:
     centre, centre_error = _fit_dot(_crop_slit_band(dots, slit_row).sum(axis=0), column)
-    band = np.maximum(
-        _crop_slit_band(dots, slit_row)[
-            :, column - DOT_HALF_WIDTH_PX : column + DOT_HALF_WIDTH_PX + 1
-        ],
-        0,
-    )
+    around = slice(column - DOT_HALF_WIDTH_PX, column + DOT_HALF_WIDTH_PX + 1)
+    band = np.maximum(_crop_slit_band(dots, slit_row)[:, around], 0)
     rows = np.arange(band.shape[0]) + max(0, slit_row - SLIT_HALF_HEIGHT_PX)
     dot_row = float(np.average(rows, weights=band.sum(axis=1)))
     row, col, brightness = _find_line_pixels(signal, slit_row, column)
     slope, crossing, slope_error = _fit_principal_line(row - dot_row, col, brightness)
-    angle_error = slope_error / (1 + slope**2)
-    return (
-        centre,
-        centre_error,
-        dot_row,
-        float(np.arctan(slope)),
-        angle_error,
-        crossing,
-        row.min(),
-        row.max(),
-    )
+    angle, angle_error = float(np.arctan(slope)), slope_error / (1 + slope**2)
+    ends = row.min(), row.max()
+    return (centre, centre_error, dot_row, angle, angle_error, crossing, *ends)
 
 
 def _fit_dot(profile: FloatArray, column: int) -> tuple[float, float]:

@@ -23,45 +23,14 @@ from tofclip.vectors import (
 fast_loop = compile_loop(fastmath=True)
 
 
-@compile_loop(fastmath=True, _nrt=True)
-def sample_in_time(counts, dark, raw_row, delay, measurements):
-    """Sample every column linearly between two of its rows, and take off the dark level.
-
-    `counts` (raw rows, columns); `raw_row` (some rows, columns): where each rectified pixel lies in
-    the raw image; `delay`: rows to add to all raw rows; `measurements` (some rows, columns): 0
-    beyond the raw image.
-    """
-    rows, columns = counts.shape
-    last, lowest = np.float32(rows - 1), np.int32(max(rows - 2, 0))
-    below, zero = min(1, rows - 1), np.int32(0)
-    tops = np.empty(columns, np.int32)
-    for row in range(raw_row.shape[0]):
-        position, reading = raw_row[row], measurements[row]
-        for column in range(columns):
-            tops[column] = min(max(np.int32(position[column] + delay), zero), lowest)
-        # Runs of columns that come from the same two raw rows: loops over them need no look-ups.
-        first = 0
-        while first < columns:
-            top, end = tops[first], first + 1
-            while end < columns and tops[end] == top:
-                end += 1
-            upper, lower, height = counts[top], counts[top + below], np.float32(top)
-            for column in range(first, end):
-                y = position[column] + delay
-                value = upper[column] + (y - height) * (lower[column] - upper[column]) - dark
-                reading[column] = value if y >= 0 and y <= last else np.float32(0)
-            first = end
-
-
 @inlined
 def sample_row(counts, dark, position, runs, reading):
-    """Sample a row as `sample_in_time` does without a delay, between rows that were looked up
-    beforehand.
+    """Sample every column of a row linearly between two raw rows, and take off the dark level; 0 beyond
+    the raw image.
 
-    `counts` (raw rows, columns); `position` (columns,): where each rectified pixel lies in the raw
-    image; `runs` (n, 3): first column, the one after the last, and the upper of the two raw rows
-    between which all of them lie; from the number of raw rows on, they lie beyond the image;
-    `reading` (columns,): 0 beyond the raw image.
+    `position` (columns,) says where each rectified pixel lies, pixels; `runs` (n, 3) the first column,
+    the one after the last, and the upper of the two raw rows between which all of them lie: from the
+    number of raw rows on, they lie beyond the image.
     """
     rows, columns = np.uintp(counts.shape[0]), np.uintp(counts.shape[1])
     below, level = np.uintp(min(1, counts.shape[0] - 1)), fill_vector(dark)
@@ -87,11 +56,8 @@ def sample_row(counts, dark, position, runs, reading):
 
 @compile_loop(fastmath=True)
 def sample_rows(counts, dark, raw_row, runs, run_starts, numbers, measurements):
-    """Sample some rows; see `sample_row`.
-
-    `counts` (raw rows, columns); `raw_row` (rows, columns): where each rectified pixel lies in the
-    raw image; `runs` (n, 3): of all rows, one after the other; `run_starts` (rows + 1,): where each
-    row's runs begin; `numbers` (some rows,); `measurements` (some rows, columns).
+    """Sample the rows `numbers`; `runs` are those of all rows, one after the other, and row r's begin
+    at ``run_starts[r]``.
     """
     for place in range(numbers.size):
         row = numbers[place]
@@ -132,10 +98,8 @@ def write_transposed(rows, first, columns):
 
 @compile_loop(fastmath=True, _nrt=True)
 def sum_boxes(measurements, starts, length, span, sums):
-    """``sums[c, i] = measurements[starts[i] : starts[i] + length, c].sum()`` for the instants of a span.
-
-    `measurements` (rows, columns); `starts` (instants,); `span`: first instant, and the one after
-    the last: whole vectors of them; `sums` (columns, at least instants).
+    """``sums[c, i] = measurements[starts[i] : starts[i] + length, c].sum()`` for the instants from
+    ``span[0]`` to below ``span[1]``, whole vectors of them.
     """
     room = np.empty((LENGTH, measurements.shape[1]), np.float32)
     for first in range(np.uintp(span[0]), np.uintp(span[1]), STEP):
@@ -149,11 +113,8 @@ def sum_boxes(measurements, starts, length, span, sums):
 def sum_sampled_boxes(
     counts, raw_row, runs, run_starts, starts, length, span, raw_span, sums, row_sums
 ):
-    """Do as `sum_boxes` with rows that are sampled meanwhile, each once, and add up raw rows.
-
-    `counts, raw_row, runs, run_starts`: as for `sample_rows`; no dark level is taken off; `starts,
-    length, span, sums`: as for `sum_boxes`; `raw_span`: raw rows that are added up: about those
-    that the sums look at, which are in the cache then; `row_sums` (raw rows,).
+    """Do as `sum_boxes` with rows that are sampled meanwhile, each once and without a dark level, and
+    add up the raw rows of `raw_span`: about those that the sums look at, which are in the cache then.
     """
     columns = counts.shape[1]
     room, ring = np.empty((LENGTH, columns), np.float32), np.empty((length, columns), np.float32)
@@ -196,11 +157,8 @@ def add_columns(row):
 
 @fast_loop
 def subtract_dark_level(measured, dark, sums, lit):
-    """Take the dark level off sums of rows, as often as each has measurements.
-
-    `measured` (columns, sums): number of rows that were measured; `sums` (columns, at least sums):
-    zero where nothing was measured, and so they stay; `lit` (columns,): whether anything rises
-    above the dark level.
+    """Take the dark level off sums of rows, (columns, sums), as often as each has measurements, and say
+    whether anything of a column rises above it. What was not measured is zero, and stays so.
     """
     for column in range(measured.shape[0]):
         here, number, above = sums[column], measured[column], np.float32(0)
@@ -213,12 +171,8 @@ def subtract_dark_level(measured, dark, sums, lit):
 
 @fast_loop
 def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
-    """Sample bilinearly; see `sample_in_time`.
-
-    `counts` (raw rows, raw columns); `dark`: level that is taken off, counts; `raw_row, raw_column`
-    (some rows, columns): where each measurement lies in the raw image, pixels; `delay`: rows by
-    which the light comes later than the sweep says; `measurements` (some rows, columns):
-    overwritten.
+    """Sample some rows bilinearly at (raw_row + delay, raw_column), pixels of the raw image, and take
+    off the dark level; 0 beyond the raw image.
     """
     rows, columns = counts.shape
     flat, zero, width = counts.reshape(counts.size), np.int32(0), np.int32(columns)
@@ -243,10 +197,8 @@ def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
 
 @compile_loop()
 def mark_valid(bad, raw_row, raw_column, delay, valid):
-    """Mark the measurements that lie within the raw image and to which no bad pixel contributes.
-
-    `bad` (rows, raw columns); `raw_row, raw_column, delay`: as for `sample_bilinear`; `valid` (some
-    rows, columns).
+    """Mark the measurements that lie within the raw image and to which no bad pixel contributes;
+    positions as for `sample_bilinear`.
     """
     rows, columns = bad.shape
     for row in range(valid.shape[0]):

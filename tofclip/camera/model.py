@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ from tofclip.notebook import render_html
 from tofclip.operators import LineProjection
 from tofclip.storage import Record, Storable, stored_array, stored_child, stored_value
 
+# Mean over three set-ups of the same family of instruments (244, 271 and 282 px), fitted to the measured
+# positions of the wall points that their pixels see. A camera with other lenslets needs its own.
 DEFAULT_FOCAL_LENGTH_PX = 265.0
-"""Mean over three set-ups of the same family of instruments (244, 271 and 282 px), fitted to the measured positions of
-the wall points that their pixels see. A camera with other lenslets needs its own."""
 
 
 @dataclass(frozen=True)
@@ -124,28 +125,68 @@ class Camera(Storable):
 
     def __post_init__(self) -> None:
         views = np.size(self.centres_px)
-        # The middle view is the reference, or the right one of the two in the middle.
-        steps = np.arange(views, dtype=np.float64) - views // 2
-        self._set_field("centres_px", self.centres_px)
-        self._set_field("distortion", self.distortion)
-        self._set_field("angles", self.angles)
-        self._set_field("gains", self.gains if np.size(self.gains) else np.ones(views))
-        self._set_field(
-            "view_positions", self.view_positions if np.size(self.view_positions) else steps
-        )
-        for name in ("centre_uncertainty_px", "angle_uncertainty"):
-            known = getattr(self, name)
-            self._set_field(name, known if np.size(known) else np.full(views, np.nan))
+        unknown = np.full(views, np.nan)
+        defaults = {
+            "centres_px": (),
+            "angles": (),
+            "gains": np.ones(views),
+            # The middle view is the reference, or the right one of the two in the middle.
+            "view_positions": np.arange(views) - views // 2,
+            "distortion": (),
+            "centre_uncertainty_px": unknown,
+            "angle_uncertainty": unknown,
+        }
+        for name, default in defaults.items():
+            value = getattr(self, name)
+            # A copy that cannot be written to: operators made from it would go on with the old numbers.
+            array = np.array(value if np.size(value) else default, dtype=np.float64)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
         dead = np.asarray(self.dead_columns, dtype=bool)
-        if dead.size == 0:
-            dead = np.zeros(self.slit_width_px, dtype=bool)
+        dead = dead if dead.size else np.zeros(self.slit_width_px, dtype=bool)
         object.__setattr__(self, "dead_columns", dead)
         if np.size(self.image_shape) != 2:
             raise CalibrationError(f"a picture has two sides, got {self.image_shape}")
-        object.__setattr__(
-            self, "image_shape", (int(self.image_shape[0]), int(self.image_shape[1]))
+        rows, columns = (int(side) for side in self.image_shape)
+        object.__setattr__(self, "image_shape", (rows, columns))
+        for holds, message in self._list_conditions():
+            if not holds:
+                raise CalibrationError(message)
+        if self.range_calibration is not None:
+            self.range_calibration.require_shape(self.image_shape)
+
+    def _list_conditions(self) -> Iterator[tuple[bool | np.bool_, str]]:
+        """What holds of every camera, and what to say where it does not."""
+        views, width, centres = self.views, self.slit_width_px, self.centres_px
+        yield views > 0, "a camera needs at least one view"
+        for name in ("centres_px", "angles", "gains", "view_positions"):
+            values = getattr(self, name)
+            good = values.shape == (views,) and bool(np.all(np.isfinite(values)))
+            yield good, f"{name} must be {views} finite numbers, got {values}"
+        sizes = f"picture {self.image_shape} and slit {width} must not be empty"
+        yield min(*self.image_shape, width) >= 1, sizes
+        off = centres[(centres < 0) | (centres > width - 1)]
+        where = f"lies off the sensor (columns 0..{width - 1})"
+        yield not off.size, f"slit centre {next(iter(off), 0.0):.1f} px {where}"
+        dead = self.dead_columns.shape
+        yield dead == (width,), f"dead_columns must have {width} entries, got {dead}"
+        yield np.all(self.gains > 0), f"view gains must be positive, got {self.gains}"
+        steep = np.abs(self.angles) >= np.pi / 2
+        yield not steep.any(), "line angles must lie within 90 degrees of the vertical"
+        for what, value in (
+            ("pulse width", self.pulse_fwhm),
+            ("focal length", self.focal_length_px),
+        ):
+            yield 0 < value < np.inf, f"the {what} must be a positive number, got {value}"
+        yield np.isfinite(self.time_zero), f"time zero must be finite, got {self.time_zero}"
+        yield (
+            0 <= self.lenslet_pitch < np.inf and self.focus_distance > 0,
+            "the lenslet pitch must not be negative, the focus distance must be positive",
         )
-        self._validate()
+        yield (
+            self.distortion.shape == (5,) and np.all(np.isfinite(self.distortion)),
+            f"lens distortion must be 5 finite numbers, got {self.distortion}",
+        )
 
     def __repr__(self) -> str:
         rows, columns = self.image_shape
@@ -164,61 +205,6 @@ class Camera(Storable):
             "time zero": f"{1e9 * self.time_zero:.3f} ns" if self.time_zero else "not given",
         }
         return render_html("Camera", described, None)
-
-    def _set_field(self, name: str, value: Any) -> None:
-        # A copy that cannot be written to: operators made from it would go on with the old numbers.
-        array = np.array(value, dtype=np.float64)
-        array.flags.writeable = False
-        object.__setattr__(self, name, array)
-
-    def _validate(self) -> None:
-        views = self.centres_px.size
-        if views == 0:
-            raise CalibrationError("a camera needs at least one view")
-        for name in ("centres_px", "angles", "gains", "view_positions"):
-            values = getattr(self, name)
-            if values.shape != (views,) or not np.all(np.isfinite(values)):
-                raise CalibrationError(f"{name} must be {views} finite numbers, got {values}")
-        if min(self.image_shape) < 1 or self.slit_width_px < 1:
-            raise CalibrationError(
-                f"picture {self.image_shape} and slit {self.slit_width_px} must not be empty"
-            )
-        off = self.centres_px[(self.centres_px < 0) | (self.centres_px > self.slit_width_px - 1)]
-        if off.size:
-            raise CalibrationError(
-                f"slit centre {off[0]:.1f} px lies off the sensor (columns 0..{self.slit_width_px - 1})"
-            )
-        if self.dead_columns.shape != (self.slit_width_px,):
-            raise CalibrationError(
-                f"dead_columns must have {self.slit_width_px} entries, got {self.dead_columns.shape}"
-            )
-        self._validate_ranges()
-
-    def _validate_ranges(self) -> None:
-        if np.any(self.gains <= 0):
-            raise CalibrationError(f"view gains must be positive, got {self.gains}")
-        if np.any(np.abs(self.angles) >= np.pi / 2):
-            raise CalibrationError("line angles must lie within 90 degrees of the vertical")
-        for name, value in (
-            ("pulse width", self.pulse_fwhm),
-            ("focal length", self.focal_length_px),
-        ):
-            if not 0 < value < np.inf:
-                raise CalibrationError(f"the {name} must be a positive number, got {value}")
-        if not np.isfinite(self.time_zero):
-            raise CalibrationError(f"time zero must be finite, got {self.time_zero}")
-        if not (
-            np.isfinite(self.lenslet_pitch) and self.lenslet_pitch >= 0 and self.focus_distance > 0
-        ):
-            raise CalibrationError(
-                "the lenslet pitch must not be negative, the focus distance must be positive"
-            )
-        if self.distortion.shape != (5,) or not np.all(np.isfinite(self.distortion)):
-            raise CalibrationError(
-                f"lens distortion must be 5 finite numbers, got {self.distortion}"
-            )
-        if self.range_calibration is not None:
-            self.range_calibration.require_shape(self.image_shape)
 
     @property
     def views(self) -> int:

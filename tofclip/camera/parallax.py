@@ -19,14 +19,10 @@ from tofclip.solvers import Progress, Sparse, ignore_progress, relative_residual
 
 FloatArray = NDArray[np.float64]
 
+# How a gate is recovered to see whether its views agree.
 GATE_METHOD = Sparse(weight=5e-3, iterations=30)
-"""How a gate is recovered to see whether its views agree."""
-
-SIGNIFICANCE = 2.0
-"""Standard deviations by which a parallax must differ from none."""
-
-MIN_CHANGE_PX = 1e-3
-"""Least change of shear over the distances; less is rounding."""
+SIGNIFICANCE = 2.0  # standard deviations by which a parallax must differ from none
+MIN_CHANGE_PX = 1e-3  # of shear over the distances; less is rounding
 
 
 @dataclass(frozen=True)
@@ -121,10 +117,8 @@ def fit_parallax_to_shears(
 
 
 def _require_signal(strength: float, design: FloatArray, squares: float) -> None:
-    """Refuse a strength that could as well be zero, and with it a sign and a focus at random.
-
-    `strength`: of the fit, px m; `design` (n, 2): weighted; its first column is what the strength
-    is multiplied with; `squares`: weighted sum of the squares that the fit leaves.
+    """Refuse a strength, px m, that could as well be zero, and with it a sign and a focus at random,
+    given the fit's weighted design and the squares that it leaves.
     """
     used = design[np.any(design != 0, axis=1)]
     freedom = max(len(used) - 2, 1)  # two shears fit exactly, and say nothing about their errors

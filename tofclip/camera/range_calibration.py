@@ -84,36 +84,41 @@ class RangeCalibration(Storable):
     )
 
     def __post_init__(self) -> None:
-        for name in (
-            "walk",
-            "walk_covariance",
-            "signal_range",
-            "offsets",
-            "offset_sigma",
-            "response",
-        ):
+        pixels = ("offsets", "offset_sigma", "response")
+        for name in ("walk", "walk_covariance", "signal_range", *pixels):
             array = np.array(getattr(self, name), dtype=np.float64)
             array.flags.writeable = False
             object.__setattr__(self, name, array)
             if not np.all(np.isfinite(array)):
                 raise CalibrationError(f"{name} of a range calibration must be finite")
-        order = self.walk.size
-        if self.walk.ndim != 1 or self.walk_covariance.shape != (order, order):
-            raise CalibrationError("the range walk and its covariance must be of one order")
-        if self.offsets.ndim != 2 or self.offsets.shape != self.offset_sigma.shape:
-            raise CalibrationError("the pixels' offsets and their deviations must be of one shape")
-        if self.response.ndim != 2 or np.any(self.response <= 0):
-            raise CalibrationError("the pixels' response must be positive numbers (rows, columns)")
-        if not (
-            self.signal_range.shape == (2,)
-            and 0 < self.signal_range[0] <= self.signal_range[1]
-            and self.reference_signal > 0
-        ):
-            raise CalibrationError(
-                "the signals of a range calibration must be positive, weak first"
-            )
-        if not (np.isfinite(self.time_zero_sigma) and self.time_zero_sigma >= 0):
-            raise CalibrationError("the deviation of time zero must be a number of seconds")
+        order, weakest, strongest = self.walk.size, *np.ravel(self.signal_range)[[0, -1]]
+        conditions = (
+            (
+                self.walk.ndim == 1 and self.walk_covariance.shape == (order, order),
+                "the range walk and its covariance must be of one order",
+            ),
+            (
+                self.offsets.ndim == 2 and self.offsets.shape == self.offset_sigma.shape,
+                "the pixels' offsets and their deviations must be of one shape",
+            ),
+            (
+                self.response.ndim == 2 and np.all(self.response > 0),
+                "the pixels' response must be positive numbers (rows, columns)",
+            ),
+            (
+                self.signal_range.shape == (2,)
+                and 0 < weakest <= strongest
+                and self.reference_signal > 0,
+                "the signals of a range calibration must be positive, weak first",
+            ),
+            (
+                0 <= self.time_zero_sigma < np.inf,
+                "the deviation of time zero must be a number of seconds",
+            ),
+        )
+        for holds, message in conditions:
+            if not holds:
+                raise CalibrationError(message)
 
     def require_shape(self, image_shape: tuple[int, int]) -> None:
         """Raise `CalibrationError` where the pixels are those of another picture."""

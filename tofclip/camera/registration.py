@@ -1,13 +1,9 @@
-"""Time skew of the views, read off the shot itself.
+"""Calibration from the shot itself: the views' time skew first, then skew, gain and centre of every
+view, by lowering the data residual.
 
 Every view sees the same scene, so every view receives the same energy at the same instant: where
 the sweep is skewed, its curve of energy versus row is shifted and stretched against the reference
-view's.
-
-Fine calibration from the shot itself: skew, gain and centre of every view, by lowering the data
-residual.
-
-Recovering the pictures and registering the views to them alternate. Given the pictures, a view's
+view's. Recovering the pictures and registering the views to them alternate. Given the pictures, a view's
 measurements change to first order with its time offset, time stretch, gain and slit centre, so that
 one small least-squares problem a view yields all four; a few rounds suffice because the coarse
 calibration is within a few pixels.
@@ -15,7 +11,6 @@ calibration is within a few pixels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -26,16 +21,14 @@ from tofclip.camera.model import Camera
 from tofclip.camera.rectifier import Measurement, estimate_dark_level, measure, require_width
 from tofclip.camera.sweep import SkewSweep
 from tofclip.errors import CalibrationError
-from tofclip.operators import LineProjection
 from tofclip.solvers import Progress, Sparse, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]
 
 MAX_OFFSET_FRACTION = 0.08  # of the rows; beyond it a picture's start or end would be lost anyway
-TREND_ROWS = (
-    40  # slower changes than this are the scene's fall-off with range, not structure to match
-)
+# Slower changes than this are the scene's fall-off with range, not structure to match.
+TREND_ROWS = 40
 MIN_CORRELATION = 0.6
 
 
@@ -78,16 +71,11 @@ def estimate_skew(counts: NDArray[np.float32], camera: Camera) -> SkewEstimate:
     """
     curves = _extract_structure(sum_view_energies(counts, camera))
     reference = int(np.argmin(np.abs(camera.view_positions)))
-    offsets, stretches, correlations = (
-        np.zeros(camera.views),
-        np.zeros(camera.views),
-        np.ones(camera.views),
-    )
-    for view in range(camera.views):
-        if view != reference:
-            offsets[view], stretches[view], correlations[view] = _match_curves(
-                curves[view], curves[reference]
-            )
+    found = [
+        (0.0, 0.0, 1.0) if view == reference else _match_curves(curve, curves[reference])
+        for view, curve in enumerate(curves)
+    ]
+    offsets, stretches, correlations = np.array(found).T
     worst = int(np.argmin(correlations))
     if not correlations[worst] > MIN_CORRELATION:
         raise CalibrationError(
@@ -98,25 +86,15 @@ def estimate_skew(counts: NDArray[np.float32], camera: Camera) -> SkewEstimate:
 
 
 def sum_view_energies(counts: NDArray[np.float32], camera: Camera) -> FloatArray:
-    """Sum of each row over each view's part of the slit, above the dark level; (views, rows).
-
-    `counts` (rows, columns): raw streak image; `camera`: centres of the views, px. Returns (views,
-    rows): counts above the dark level.
-    """
+    """Sum of each row over each view's part of the slit, above the dark level; (views, rows)."""
     require_width(counts, camera)
     # Without its dark level, which would swamp the correlation with a constant.
     signal = counts - np.float32(estimate_dark_level(counts))
     # No wider than half the way to the neighbour, whose light comes at other rows.
-    half = min(camera.image_shape[1] // 2, _half_pitch_px(camera))
+    pitch = np.diff(np.sort(camera.centres_px)).min(initial=2 * camera.slit_width_px)
+    half = min(camera.image_shape[1] // 2, int(pitch) // 2)
     edges = [(max(0, round(c) - half), round(c) + half + 1) for c in camera.centres_px]
     return np.array([signal[:, first:last].sum(axis=1, dtype=np.float64) for first, last in edges])
-
-
-def _half_pitch_px(camera: Camera) -> int:
-    """Half the distance between neighbouring views, so that the windows do not overlap."""
-    if camera.views == 1:
-        return camera.slit_width_px
-    return int(np.min(np.diff(np.sort(camera.centres_px)))) // 2
 
 
 def _extract_structure(energies: FloatArray) -> FloatArray:
@@ -163,9 +141,8 @@ SETTLED_PX = 0.05  # no centre moves further in a round: enough rounds
 MAX_FRAMES = 96
 # Too few iterations or too strong a prior pull the centres by some hundredths of a pixel.
 REGISTRATION_METHOD = Sparse(weight=3e-4, iterations=30)
-RELAXATION = (
-    1.5  # alternating steps fall short of the joint minimum; a measured speed-up without overshoot
-)
+# Alternating steps fall short of the joint minimum; a measured speed-up without overshoot.
+RELAXATION = 1.5
 # Centres fall shorter than the rest: pictures recovered at wrong centres agree with these in part.
 CENTRE_RELAXATION = 2.5
 CENTRE_PRIOR_PX = 3.0  # how far a slit centre may plausibly be off its calibration
@@ -233,14 +210,14 @@ def register_views(
         chosen = _select_frames(measurement)
         part = Measurement(measurement.values[:, chosen], measurement.valid[:, chosen])
         groups = _group_by_shear(camera, times, chosen)
-        operators = _make_operators(camera, groups)
-        pictures = _recover_groups(operators, part, groups, progress)
-        model = _predict(operators, pictures, groups)
-        residuals.append(_compute_residual(model, part))
+        model = _Model(camera, groups)
+        pictures = model.recover(part, progress)
+        predicted = model.predict(pictures)
+        residuals.append(_compute_residual(predicted, part))
         best = min(best, (residuals[-1], camera), key=lambda pair: pair[0])
         if number == max_rounds or (number >= MIN_ROUND_COUNT and moved_px < SETTLED_PX):
             break
-        evidence = _Evidence(pictures, groups, part.values - model, part.valid, chosen)
+        evidence = _Evidence(pictures, groups, part.values - predicted, part.valid, chosen)
         slope = np.gradient(measurement.values, axis=1)[:, chosen]
         before = camera.centres_px
         camera = _refine_camera(camera, start, evidence, slope, times is not None)
@@ -265,65 +242,41 @@ def _select_frames(measurement: Measurement) -> NDArray[np.intp]:
     return np.unique(np.searchsorted(share, wanted).clip(0, brightness.size - 1))
 
 
-@dataclass(frozen=True)
-class _Group:
-    """Consecutive ones of the chosen frames, recovered at one shear, pixels per view step."""
-
-    frames: slice
-    shear: float
+Groups = list[tuple[slice, float]]
+"""Consecutive ones of the chosen frames, and their shear in pixels per view step."""
 
 
-def _group_by_shear(
-    camera: Camera, times: FloatArray | None, chosen: NDArray[np.intp]
-) -> list[_Group]:
+def _group_by_shear(camera: Camera, times: FloatArray | None, chosen: NDArray[np.intp]) -> Groups:
     """Cut the chosen frames where the shear of their range has changed."""
     if times is None or camera.lenslet_pitch <= 0:
-        return [_Group(slice(0, chosen.size), 0.0)]
+        return [(slice(0, chosen.size), 0.0)]
     distance = np.maximum(SPEED_OF_LIGHT * times[chosen] / 2, MIN_RANGE_M)
     shears = camera.shear_at(distance)
     step = 2 * SHEAR_TOLERANCE_PX / np.abs(camera.view_positions).max(initial=1.0)
     changed = np.diff(np.floor((shears - shears[0]) / step)) != 0
     cuts = np.flatnonzero(np.concatenate([[True], changed, [True]])).tolist()
-    return [
-        _Group(slice(first, last), float(shears[first:last].mean()))
-        for first, last in pairwise(cuts)
-    ]
+    return [(slice(*ends), float(shears[slice(*ends)].mean())) for ends in pairwise(cuts)]
 
 
-def _make_operators(camera: Camera, groups: Sequence[_Group]) -> list[LineProjection]:
-    return [camera.operator(group.shear) for group in groups]
+class _Model:
+    """The operators of a camera for the chosen frames, by groups."""
 
+    def __init__(self, camera: Camera, groups: Groups) -> None:
+        self._parts = [(frames, camera.operator(shear)) for frames, shear in groups]
 
-def _recover_groups(
-    operators: Sequence[LineProjection],
-    part: Measurement,
-    groups: Sequence[_Group],
-    progress: Progress,
-) -> Array:
-    """Recover the chosen frames, (rows, columns, frames)."""
-    pictures = [
-        REGISTRATION_METHOD.recover(
-            operator,
-            np.ascontiguousarray(part.values[:, group.frames]),
-            np.ascontiguousarray(part.valid[:, group.frames]),
-            progress,
-        ).frames
-        for operator, group in zip(operators, groups, strict=True)
-    ]
-    return np.ascontiguousarray(np.moveaxis(np.concatenate(pictures), 0, -1))
+    def recover(self, part: Measurement, progress: Progress) -> Array:
+        """Recover the chosen frames, (rows, columns, frames)."""
+        pictures = []
+        for frames, operator in self._parts:
+            values = np.ascontiguousarray(part.values[:, frames])
+            valid = np.ascontiguousarray(part.valid[:, frames])
+            pictures.append(REGISTRATION_METHOD.recover(operator, values, valid, progress).frames)
+        return np.ascontiguousarray(np.moveaxis(np.concatenate(pictures), 0, -1))
 
-
-def _predict(
-    operators: Sequence[LineProjection], pictures: Array, groups: Sequence[_Group]
-) -> Array:
-    """Return what the camera would measure of the pictures, (columns, frames)."""
-    return np.concatenate(
-        [
-            operator(np.ascontiguousarray(pictures[..., group.frames]))
-            for operator, group in zip(operators, groups, strict=True)
-        ],
-        axis=1,
-    )
+    def predict(self, pictures: Array) -> Array:
+        """Return what the camera would measure of the pictures, (columns, frames)."""
+        seen = [operator(pictures[..., frames]) for frames, operator in self._parts]
+        return np.concatenate(seen, axis=1)
 
 
 def _compute_residual(model: Array, part: Measurement) -> float:
@@ -381,7 +334,7 @@ class _Evidence:
     """What a round knows: pictures, their groups, and the misfit they leave, at the chosen rows."""
 
     pictures: Array
-    groups: Sequence[_Group]
+    groups: Groups
     misfit: Array
     valid: NDArray[np.bool_]
     rows: NDArray[np.intp]
@@ -389,46 +342,36 @@ class _Evidence:
     def solve_corrections(
         self, camera: Camera, view: int, drift: float, slope: Array
     ) -> FloatArray:
-        """Offset (rows), stretch, relative gain and centre (px) that best explain one view's
-        misfit.
+        """Offset (rows), stretch, relative gain and centre (px) that best explain one view's misfit.
 
-        A centre that has drifted far from its calibration is held back by a prior of
-        `CENTRE_PRIOR_PX`.
-
-        `view`: number of the view, from 0; `drift`: how far the centre has moved from its
-        calibration, px; `slope` (columns, frames): of the measurements in time, a row. Returns
-        (4,): offset in rows, stretch, relative gain and centre in px.
+        `slope` (columns, frames) is that of the measurements in time, a row. A centre that has drifted
+        far from its calibration is held back by a prior of `CENTRE_PRIOR_PX`.
         """
-        operators = _make_operators(_select_view(camera, view), self.groups)
-        predicted = _predict(operators, self.pictures, self.groups)
+        one = slice(view, view + 1)
+        alone = camera.replace(
+            centres_px=camera.centres_px[one],
+            angles=camera.angles[one],
+            gains=camera.gains[one],
+            view_positions=camera.view_positions[one],
+            sweep=None,
+            angle_uncertainty=np.empty(0),
+            centre_uncertainty_px=np.empty(0),
+        )
+        predicted = _Model(alone, self.groups).predict(self.pictures)
         half = camera.image_shape[1] // 2
         middle = round(camera.centres_px[view])
         window = slice(max(0, middle - half), middle + half + 1)
         energy = np.sqrt(np.sum(predicted**2, axis=0, dtype=np.float64))
-        weight = self.valid[window] / (
-            # bright columns count as much as dim ones; the floor keeps columns without light from
-            # counting at all
-            energy + FLOOR_FRACTION * energy.max() + np.finfo(np.float64).tiny
-        )
+        # bright columns count as much as dim ones; the floor keeps columns without light from
+        # counting at all
+        floor = FLOOR_FRACTION * energy.max() + np.finfo(np.float64).tiny
+        weight = self.valid[window] / (energy + floor)
         slope, parallax = slope[window], np.gradient(predicted, axis=0)[window]
         effects = [-slope, -slope * self.rows, predicted[window], -parallax]
         design = np.stack(
             [(effect * weight).ravel() for effect in effects], axis=1, dtype=np.float64
         )
         return _solve_least_squares(design, (self.misfit[window] * weight).ravel(), drift)
-
-
-def _select_view(camera: Camera, view: int) -> Camera:
-    one = slice(view, view + 1)
-    return camera.replace(
-        centres_px=camera.centres_px[one],
-        angles=camera.angles[one],
-        gains=camera.gains[one],
-        view_positions=camera.view_positions[one],
-        sweep=None,
-        angle_uncertainty=np.empty(0),
-        centre_uncertainty_px=np.empty(0),
-    )
 
 
 def _solve_least_squares(design: FloatArray, target: FloatArray, drift: float) -> FloatArray:

@@ -9,7 +9,6 @@ slit.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,8 @@ from tofclip.storage import Record, Storable, stored_array
 FloatArray = NDArray[np.float64]
 
 
-class Sweep(Protocol):
+@dataclass(frozen=True)
+class Sweep(Storable):
     """Anything that says where a rectified pixel lies in the raw streak image."""
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -37,15 +37,11 @@ class Sweep(Protocol):
         raw_row, raw_column : float array
             Pixels, of the broadcast shape.
         """
-        ...
-
-    def to_record(self) -> Record:
-        """Return the map's numbers for storage."""
-        ...
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class SkewSweep(Storable):
+class SkewSweep(Sweep):
     """A time skew per view: ``raw row = offset_k + (1 + stretch_k) * row`` at each view's centre.
 
     Between two centres offset and stretch are interpolated linearly, beyond the outer ones they go
@@ -78,18 +74,6 @@ class SkewSweep(Storable):
             raise CalibrationError(f"sweep centres must increase, got {self.centres_px}")
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the raw (row, column) of rectified positions; see `Sweep`.
-
-        Parameters
-        ----------
-        row, column : float array
-            Rectified, pixels.
-
-        Returns
-        -------
-        raw_row, raw_column : float array
-            Pixels, of the broadcast shape.
-        """
         offset = _interpolate_linearly(column, self.centres_px, self.offsets_bin)
         stretch = _interpolate_linearly(column, self.centres_px, self.stretches)
         raw_row, raw_column = np.broadcast_arrays(offset + (1.0 + stretch) * row, column)
@@ -97,7 +81,7 @@ class SkewSweep(Storable):
 
 
 @dataclass(frozen=True)
-class PolynomialSweep(Storable):
+class PolynomialSweep(Sweep):
     """A bivariate quadratic map, as MATLAB's ``fitgeotrans(..., 'polynomial', 2)`` makes it.
 
     ``u = c . [1, x, y, x*y, x^2, y^2]`` in normalised 0-based coordinates, x = column, y = row,
@@ -130,31 +114,19 @@ class PolynomialSweep(Storable):
             raise CalibrationError("a polynomial sweep's scales must not be zero")
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the raw (row, column) of rectified positions; see `Sweep`.
-
-        Parameters
-        ----------
-        row, column : float array
-            Rectified, pixels.
-
-        Returns
-        -------
-        raw_row, raw_column : float array
-            Pixels, of the broadcast shape.
-        """
         # normalised coordinates keep the quadratic terms of the order of 1
         x = (np.asarray(column) - self.rectified_origin[0]) / self.rectified_scale[0]
         y = (np.asarray(row) - self.rectified_origin[1]) / self.rectified_scale[1]
-        u = _evaluate_quadratic(self.column_coefficients, x, y)
-        v = _evaluate_quadratic(self.row_coefficients, x, y)
-        return (
-            v * self.raw_scale[1] + self.raw_origin[1],
-            u * self.raw_scale[0] + self.raw_origin[0],
+        u, v = (
+            c[0] + c[1] * x + c[2] * y + c[3] * x * y + c[4] * x**2 + c[5] * y**2
+            for c in (self.column_coefficients, self.row_coefficients)
         )
+        (x0, y0), (x_scale, y_scale) = self.raw_origin, self.raw_scale
+        return v * y_scale + y0, u * x_scale + x0
 
 
 @dataclass(frozen=True)
-class ProjectiveSweep(Storable):
+class ProjectiveSweep(Sweep):
     """A homography: ``[raw column, raw row, 1] ~ matrix @ [column, row, 1]``, 0-based pixels.
 
     Parameters
@@ -172,23 +144,8 @@ class ProjectiveSweep(Storable):
             raise ShapeError("projective sweep matrix", (3, 3), self.matrix.shape)
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the raw (row, column) of rectified positions; see `Sweep`.
-
-        Parameters
-        ----------
-        row, column : float array
-            Rectified, pixels.
-
-        Returns
-        -------
-        raw_row, raw_column : float array
-            Pixels, of the broadcast shape.
-        """
-        h = self.matrix
-        weight = h[2, 0] * column + h[2, 1] * row + h[2, 2]
-        raw_column = (h[0, 0] * column + h[0, 1] * row + h[0, 2]) / weight
-        raw_row = (h[1, 0] * column + h[1, 1] * row + h[1, 2]) / weight
-        return raw_row, raw_column
+        raw_column, raw_row, weight = (h[0] * column + h[1] * row + h[2] for h in self.matrix)
+        return raw_row / weight, raw_column / weight
 
 
 def sweep_from_record(record: Record) -> Sweep:
@@ -197,11 +154,6 @@ def sweep_from_record(record: Record) -> Sweep:
         if record.kind == kind.RECORD_KIND:
             return kind.from_record(record)
     raise FileFormatError(record.origin, f"holds an unknown sweep '{record.kind}'")
-
-
-def _evaluate_quadratic(c: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    value: FloatArray = c[0] + c[1] * x + c[2] * y + c[3] * x * y + c[4] * x**2 + c[5] * y**2
-    return value
 
 
 def _interpolate_linearly(

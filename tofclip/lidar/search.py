@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
-from tofclip.camera.rectifier import MeasurementNoise
+from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError, ShapeError, require_type
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.pulse import Pulse

@@ -35,7 +35,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray, to_numpy
-from tofclip.camera.rectifier import MeasurementNoise
+from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar.pulse import Pulse
 from tofclip.shots import Frames

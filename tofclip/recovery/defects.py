@@ -18,7 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.camera import Measurement, estimate_dark_level
-from tofclip.camera.rectifier import MeasurementNoise, find_dazzle_limit
+from tofclip.camera.noise import MeasurementNoise, find_dazzle_limit
 from tofclip.shots import Streak
 from tofclip.solvers import ClippedSquares, LeastSquares, Method, ProximalMethod
 from tofclip.storage import Scalar

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy, zeros
 from tofclip.camera import Camera, Measurement, measure
-from tofclip.camera.rectifier import find_dazzled, find_glints
+from tofclip.camera.noise import find_dazzled, find_glints
 from tofclip.camera.registration import count_registration_iterations
 from tofclip.errors import InputError, require_type
 from tofclip.operators import LinearOperator

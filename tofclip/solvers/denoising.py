@@ -17,7 +17,7 @@ from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm, Mask
-from tofclip.solvers.fista import Progress, ProximalMethod, Result, ignore_progress
+from tofclip.solvers.fista import Method, Progress, ProximalMethod, Result, ignore_progress
 from tofclip.threads import limit_blas_threads
 
 Picture = NDArray[Any]
@@ -113,7 +113,7 @@ PEAK_QUANTILE = 0.999
 
 
 @dataclass(frozen=True)
-class PlugAndPlay:
+class PlugAndPlay(Method):
     """Half-quadratic splitting with a denoiser in the place of the prior's proximal map.
 
     ``x = argmin data(A h) + coupling / 2 |h - z|^2``, then ``z = denoise(x)``, a few times, from a
@@ -142,7 +142,6 @@ class PlugAndPlay:
     strength: float = 0.12
     coupling: float = 0.1
     name = "plug-and-play"
-    portable = False
     _returns_fitted = False
 
     def __post_init__(self) -> None:
@@ -158,28 +157,6 @@ class PlugAndPlay:
         valid: Mask = None,
         progress: Progress = ignore_progress,
     ) -> Result:
-        """Recover one picture per column of `measurements`; see `Method`.
-
-        Parameters
-        ----------
-        operator : LinearOperator
-            Pictures (rows, columns) to measurements (measurements,).
-        measurements : (measurements, frames) NumPy array
-        valid : (measurements, frames) bool array, optional
-            Measurements that are False are left out.
-        progress : callable
-            Called with the number of frame iterations and denoiser calls just done.
-
-        Returns
-        -------
-        Result
-            Frames (frames, rows, columns).
-
-        Raises
-        ------
-        InputError
-            The arrays are not NumPy's, or a measurement is NaN or infinite.
-        """
         require_numpy("recovery with a denoiser", measurements)
         started = self.start.recover(operator, measurements, valid, progress)
         coupling = self.coupling * operator.squared_norm
@@ -212,12 +189,6 @@ class PlugAndPlay:
         return fitted if self._returns_fitted else clean
 
     def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most.
-
-        Parameters
-        ----------
-        frames : int
-        """
         return self.start.work(frames) + frames * self.calls
 
 

@@ -29,7 +29,14 @@ from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, SparseMatrix
 from tofclip.operators.sparse import Tiles
 from tofclip.solvers.data_terms import Mask
-from tofclip.solvers.fista import Blocks, Progress, Result, ignore_progress, validate_measurements
+from tofclip.solvers.fista import (
+    Blocks,
+    Method,
+    Progress,
+    Result,
+    ignore_progress,
+    validate_measurements,
+)
 from tofclip.threads import LANES, count_block_threads, limit_blas_threads, run_blocks
 
 # Numbers between rows of weights: at a distance of a power of two they would share few places of the
@@ -38,12 +45,13 @@ ROW_GAP = 16
 
 
 @dataclass(frozen=True)
-class LinearInverse:
+class LinearInverse(Method):
     """The regularised linear inverse ``h = A' (A A' + mu I)^-1 f``.
 
     The small Gram matrix is inverted once (Cholesky, float64); a block then costs one dense product
     of that size and one sparse one. For many shots with one camera, hold on to what `prepare`
-    returns.
+    returns. Measurements that are bad in every frame are left out: a linear map cannot leave out a
+    measurement of one frame only.
 
     Parameters
     ----------
@@ -107,33 +115,6 @@ class LinearInverse:
         valid: Mask = None,
         progress: Progress = ignore_progress,
     ) -> Result:
-        """Recover one picture per column of `measurements`; see `Method`.
-
-        Measurements that are bad in every frame are left out; a linear map cannot leave out a
-        measurement of one frame only.
-
-        Parameters
-        ----------
-        operator : LinearOperator
-            Pictures (rows, columns) to measurements (measurements,).
-        measurements : (measurements, frames) array
-        valid : (measurements, frames) bool array, optional
-            False where a measurement must not be used.
-        progress : callable
-            Called with the number of frames just recovered.
-
-        Returns
-        -------
-        Result
-            Frames (frames, rows, columns), without iterations.
-
-        Raises
-        ------
-        ShapeError
-            `measurements` or `valid` do not fit the operator.
-        InputError
-            A measurement is NaN or infinite.
-        """
         measurements = validate_measurements(operator, measurements, valid)
         started = time.perf_counter()
         prepared = self.prepare(
@@ -141,15 +122,6 @@ class LinearInverse:
         )
         setup_seconds = time.perf_counter() - started
         return replace(prepared.recover(measurements, progress), setup_seconds=setup_seconds)
-
-    def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most.
-
-        Parameters
-        ----------
-        frames : int
-        """
-        return frames
 
 
 @dataclass(frozen=True)
@@ -222,12 +194,12 @@ class PreparedInverse:
 
 
 @dataclass(frozen=True)
-class Backprojection:
+class Backprojection(Method):
     """The adjoint ``h = A'f`` (supplement Note 13, Eq. 22): the fastest look, with streaks around
     every object.
 
     A'f is in no unit of brightness. One factor for the whole shot, the one that leaves the least
-    residual on its brightest frames, makes it one.
+    residual on its brightest frames, makes it one. Bad measurements count as zero.
     """
 
     name = "adjoint"
@@ -240,31 +212,6 @@ class Backprojection:
         valid: Mask = None,
         progress: Progress = ignore_progress,
     ) -> Result:
-        """Recover one picture per column of `measurements`; see `Method`. Bad measurements count as
-        zero.
-
-        Parameters
-        ----------
-        operator : LinearOperator
-            Pictures (rows, columns) to measurements (measurements,).
-        measurements : (measurements, frames) array
-        valid : (measurements, frames) bool array, optional
-            Measurements that are False count as zero.
-        progress : callable
-            Called with the number of frames just recovered.
-
-        Returns
-        -------
-        Result
-            Frames (frames, rows, columns), without iterations.
-
-        Raises
-        ------
-        ShapeError
-            `measurements` or `valid` do not fit the operator.
-        InputError
-            A measurement is NaN or infinite.
-        """
         measurements = validate_measurements(operator, measurements, valid)
         if valid is not None:
             measurements = measurements * namespace(valid).astype(valid, measurements.dtype)
@@ -276,15 +223,6 @@ class Backprojection:
 
         blocks.for_each(solve)
         return Result(blocks.frames)
-
-    def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most.
-
-        Parameters
-        ----------
-        frames : int
-        """
-        return frames
 
 
 def _fit_scale(operator: LinearOperator, measurements: Array) -> float:

@@ -302,8 +302,9 @@ class Method(Protocol):
     """
 
     name: str
-    portable: bool
+    portable: bool = False
 
+    @abstractmethod
     def recover(
         self,
         operator: LinearOperator,
@@ -319,7 +320,7 @@ class Method(Protocol):
             Pictures (rows, columns) to measurements (measurements,).
         measurements : (measurements, frames) array
         valid : (measurements, frames) bool array, optional
-            False where a measurement must not be trusted.
+            False where a measurement must not be trusted: it is left out.
         progress : callable
             Called with the number of frame iterations just done.
 
@@ -327,12 +328,24 @@ class Method(Protocol):
         -------
         Result
             Frames (frames, rows, columns) and how they came about.
+
+        Raises
+        ------
+        ShapeError
+            `measurements` or `valid` do not fit the operator.
+        InputError
+            A measurement is NaN or infinite, or the arrays are not NumPy's and the method is not
+            portable.
         """
-        ...
 
     def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most."""
-        ...
+        """Return how many frame iterations `recover` reports at most.
+
+        Parameters
+        ----------
+        frames : int
+        """
+        return frames
 
 
 def relative_residual(
@@ -633,7 +646,7 @@ NORM_MARGIN = 1.02  # 15 Lanczos iterations may lack so much of the norm; a test
 
 
 @dataclass(frozen=True)
-class ProximalMethod(ABC):
+class ProximalMethod(Method, ABC):
     """FISTA with a prior; what the prior is, subclasses say.
 
     Parameters
@@ -656,12 +669,6 @@ class ProximalMethod(ABC):
     noise_fall : float
         Fall of the objective in an iteration, relative, below which a block of little more than noise
         is done, see `StoppingRule`.
-
-    Attributes
-    ----------
-    name : str
-    portable : bool
-        Whether arrays of any library are taken, or NumPy's only.
     """
 
     weight: float
@@ -671,8 +678,6 @@ class ProximalMethod(ABC):
     gap: float = 1e-3
     further: int = 0
     noise_fall: float = 0.0
-    name = ""
-    portable = False
 
     @abstractmethod
     def _make_regulariser(self, weight: float) -> Regulariser:
@@ -686,32 +691,14 @@ class ProximalMethod(ABC):
         progress: Progress = ignore_progress,
         start: Array | None = None,
     ) -> Result:
-        """Recover one picture per column of `measurements`; see `Method`.
+        """Recover one picture per column of `measurements`; see `Method.recover`.
 
         Parameters
         ----------
-        operator : LinearOperator
-            Pictures (rows, columns) to measurements (measurements,).
-        measurements : (measurements, frames) array
-        valid : (measurements, frames) bool array, optional
-            Measurements that are False are left out.
-        progress : callable
-            Called with the number of frame iterations just done.
+        operator, measurements, valid, progress
+            As there.
         start : (frames, rows, columns) array, optional
             Pictures to begin at, such as those of the shot before; dark ones by default.
-
-        Returns
-        -------
-        Result
-            Frames (frames, rows, columns) and the history of the objective.
-
-        Raises
-        ------
-        ShapeError
-            `measurements`, `valid` or `start` do not fit the operator.
-        InputError
-            A measurement is NaN or infinite, or the arrays are not NumPy's and the prior is not
-            portable.
         """
         expected = (measurements.shape[1], *operator.shape_in)
         if start is not None and start.shape != expected:
@@ -810,12 +797,6 @@ class ProximalMethod(ABC):
         return known
 
     def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most.
-
-        Parameters
-        ----------
-        frames : int
-        """
         return frames * (self.iterations + self.further)
 
 
