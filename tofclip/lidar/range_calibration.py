@@ -1,28 +1,21 @@
-"""Effects that measurements have in common, with those of their shots and of their pixels apart.
-
-A measurement of pixel p in shot s is ``A theta + b_s + o_p + noise``: fixed effects theta, and shots
-and pixels whose own effects are drawn from normal distributions with unknown variances. These
-variances are estimated with the effects (restricted maximum likelihood by the EM algorithm: Laird
-and Ware, Biometrics 38, 963 (1982)), so that an effect that the measurements do not show is pulled
-to zero and standard deviations hold whatever varies.
-
-Returns with the corrections that their camera's range calibration knows.
-
-Time zero, range walk, the pixels' offsets and response, and reflectance, from shots of a target at
-known distances.
+"""Time zero, range walk, the pixels' offsets and response, and reflectance, from shots of a target at
+known distances; and returns corrected by what their camera knows of them.
 
 The target is flat, faces the camera and shows in most pixels. A measured range is
 
     ``R / cos(angle) + time zero + walk(signal) + jitter of the shot + offset of the pixel + noise``
 
-with the distance R along the optical axis. Shots and pixels are effects of their own
-(`tofclip.lidar.range_calibration`), so that standard deviations hold where shots jitter.
+with the distance R along the optical axis. So a measurement of pixel p in shot s is ``A theta + b_s +
+o_p + noise``: fixed effects theta, and shots and pixels whose own effects are drawn from normal
+distributions with unknown variances. These variances are estimated with the effects (restricted maximum
+likelihood by the EM algorithm: Laird and Ware, Biometrics 38, 963 (1982)), so that an effect that the
+measurements do not show is pulled to zero and standard deviations hold whatever varies.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -36,43 +29,67 @@ from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.shots import Returns
 from tofclip.units import MAD_TO_SIGMA, MILLIMETRE, SPEED_OF_LIGHT
 
+# at most: a rough estimate to tell what does not belong, then the one that counts
 EM_ROUNDS = 10, 60
-"""At most: a rough estimate to tell what does not belong, then the one that counts."""
-
-EM_TOLERANCE = 5e-3
-"""Change of the variances below which they are known, relative to themselves or to what the noise
-makes of a shot's or a pixel's mean."""
-
-MAX_FITTED_PIXELS = 4096
-"""That say how large the variances are; all pixels are solved for."""
-
-OUTLIER_SIGMA = 4.5
-"""Standard deviations beyond which a measurement is left out: of normal errors, one in 150,000."""
-
+EM_TOLERANCE = 5e-3  # relative change of the variances below which they are known
+MAX_FITTED_PIXELS = 4096  # that say how large the variances are; all pixels are solved for
+OUTLIER_SIGMA = 4.5  # a measurement beyond is left out: of normal errors, one in 150,000
 CORRELATION_BLOCK_PX = 6
 TINY = 1e-30
+
+MIN_WALK_SHOTS = 3
+# of the returns' intensities, a factor of two; a walk from less would be noise drawn out
+MIN_WALK_SPAN_DECADES = 0.3
+# from here on the walk is a parabola of the decades, below a straight line
+MIN_CURVED_WALK_SHOTS, CURVED_WALK_SPAN_DECADES = 6, 1.0
+SPAN_PERCENTILES = (2.0, 98.0)
+
+WINDOW_PULSES = 0.5  # returns of one surface lie within this many pulse widths
+
+MIN_TARGET_PIXELS = 3
+"""With the target's return. In the dark a detector announces one in a pixel of a hundred, at any
+range: the camera of such a shot would be wrong by the length of the record."""
+
+MIN_TARGET_FRACTION = 0.005
+"""Of the picture's pixels: rays and false alarms agree by chance in patches of a few pixels across."""
+
+MIN_TARGET_BRIGHTNESS = 0.02
+"""Of the whole picture's brightest returns. What is dimmer may be a trace that a recovery leaves of
+them elsewhere: in the dark corners of a recorded scene these had 0.2 to 0.5 % (method tv)."""
+
+BRIGHTEST_PERCENTILE = 99.0
+# Of the returns that are not that dim: a plate is most of what is seen. Cluttered scenes have 0.05 to
+# 0.5.
+MIN_TARGET_SHARE = 0.5
+
+MAX_FLANK_RATIO = 0.25
+"""Returns up to a window's width before and behind the target, over the target's: none beside a plate,
+as many as within on a surface that goes on in depth."""
+
+MAX_ROUGHNESS = 0.2
+"""Median distance from the target's plane in half widths of the window. A plate's noise makes 0.11 of
+it at most (the window holds six deviations), depths that fill the window evenly make 0.5."""
+
+MAX_RIVAL_FRACTION = 0.7  # of the target's returns, that another surface may have
+MAX_SHOT_SPREAD_PULSES = 1.0  # by which the shots' time zeros may differ
+MAX_BRIGHTNESS_RATIO = 1.5  # of shots that are said to show one reflectance
+SHOW_A_PLATE = "show a flat plate that faces the camera, or cut the picture to it (`region`)"
 
 
 @dataclass(frozen=True)
 class Measurements:
     """Measurements of one quantity in many pixels and several shots."""
 
-    value: FloatArray  # (n,), with one standard deviation, right up to a factor
-    sigma: FloatArray  # (n,), with one standard deviation, right up to a factor
+    value: FloatArray  # (n,)
+    sigma: FloatArray  # (n,), one standard deviation, right up to a factor
     design: FloatArray  # (n, effects), fixed effects
     shot: NDArray[np.int64]  # (n,), numbers from 0
     pixel: NDArray[np.int64]  # (n,), numbers from 0
-    place: tuple[NDArray[np.int64], NDArray[np.int64]]  # row and column of the pixel
+    y: NDArray[np.int64]  # (n,), row and column of the pixel
+    x: NDArray[np.int64]
 
     def __getitem__(self, chosen: NDArray[np.bool_]) -> Measurements:
-        return Measurements(
-            self.value[chosen],
-            self.sigma[chosen],
-            self.design[chosen],
-            self.shot[chosen],
-            self.pixel[chosen],
-            (self.place[0][chosen], self.place[1][chosen]),
-        )
+        return Measurements(*(getattr(self, part.name)[chosen] for part in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -81,7 +98,7 @@ class Variances:
 
     noise: float  # factor of the measurements' own variances
     shots: float  # variances of the shots' and the pixels' effects; 0: none
-    pixels: float  # variances of the shots' and the pixels' effects; 0: none
+    pixels: float
 
 
 @dataclass(frozen=True)
@@ -92,7 +109,7 @@ class Effects:
     covariance: FloatArray  # (effects, effects), of the fixed effects
     shots: FloatArray  # (shots,), each shot's own
     pixels: FloatArray  # (pixels,), each pixel's own, and its standard deviation
-    pixel_sigma: FloatArray  # (pixels,), each pixel's own, and its standard deviation
+    pixel_sigma: FloatArray
     variances: Variances
     inliers: NDArray[np.bool_]  # (n,), measurements that were used
 
@@ -102,41 +119,36 @@ class _Solution:
     fixed: FloatArray
     shots: FloatArray
     pixels: FloatArray
-    covariance: FloatArray
+    covariance: FloatArray  # of the fixed effects and the shots'
     pixel_variance: FloatArray
     residual: FloatArray
-    fitted_variance: FloatArray
+    fitted_variance: FloatArray  # of what is fitted to each measurement
 
 
 def fit_effects(data: Measurements, with_shots: bool = True, with_pixels: bool = True) -> Effects:
-    """Estimate all effects and what they vary by.
-
-    `with_shots, with_pixels`: whether shots and pixels have effects of their own.
-    """
-    shots, pixels = int(data.shot.max()) + 1, int(data.pixel.max()) + 1
-    step = -(-pixels // MAX_FITTED_PIXELS)
+    """Estimate all effects and what they vary by; shots and pixels have effects of their own or not."""
+    sizes = int(data.shot.max()) + 1, int(data.pixel.max()) + 1
+    step = -(-sizes[1] // MAX_FITTED_PIXELS)
     inliers = np.ones(data.value.size, bool)
     for rounds in EM_ROUNDS:
         chosen = inliers & (data.pixel % step == 0)
-        variances = _estimate_variances(
-            data[chosen], (shots, pixels), (with_shots, with_pixels), rounds
-        )
-        found = _solve(data[inliers], variances, (shots, pixels))
-        everything = _predict(data, found)
-        distance = np.abs(data.value - everything) / (data.sigma * np.sqrt(variances.noise))
+        variances = _estimate_variances(data[chosen], sizes, (with_shots, with_pixels), rounds)
+        found = _solve(data[inliers], variances, sizes)
+        predicted = data.design @ found.fixed + found.shots[data.shot] + found.pixels[data.pixel]
+        distance = np.abs(data.value - predicted) / (data.sigma * np.sqrt(variances.noise))
         inliers = distance < OUTLIER_SIGMA
     used = data[inliers]
-    found = _solve(used, variances, (shots, pixels))
-    company = measure_correlation(found.residual / (used.sigma * np.sqrt(variances.noise)), used)
+    found = _solve(used, variances, sizes)
+    shared = measure_correlation(found.residual / (used.sigma * np.sqrt(variances.noise)), used)
     # Errors that neighbours share do not average out: as many measurements as are independent.
-    fewer = Variances(variances.noise * company, variances.shots, variances.pixels)
+    fewer = replace(variances, noise=variances.noise * shared)
     effects = data.design.shape[1]
-    covariance = _solve(used, fewer, (shots, pixels)).covariance[:effects, :effects]
+    covariance = _solve(used, fewer, sizes).covariance[:effects, :effects]
     if variances.shots > 0:
         still = replace(fewer, shots=0.0)
-        without = _solve(used, still, (shots, pixels)).covariance[:effects, :effects]
+        without = _solve(used, still, sizes).covariance[:effects, :effects]
         # What a handful of shots say of their own spread is uncertain itself: Student's t.
-        freedom = max(shots - effects, 1)
+        freedom = max(sizes[0] - effects, 1)
         widened = float(scipy.special.stdtrit(freedom, scipy.special.ndtr(1.0))) ** 2
         covariance = without + widened * (covariance - without)
     return Effects(
@@ -151,13 +163,13 @@ def fit_effects(data: Measurements, with_shots: bool = True, with_pixels: bool =
 
 
 def measure_correlation(standardised: FloatArray, data: Measurements) -> float:
-    """Return how many neighbouring pixels share one error: 1 where each has its own.
-
-    `standardised` (n,): residuals in standard deviations. Returns variance of the sums over blocks
-    of pixels, over that of independent errors; 1 where the difference is within chance.
+    """Return how many neighbouring pixels share one error: variance of the sums of residuals, in
+    standard deviations, over blocks of pixels, over that of independent errors; 1 where the difference
+    is within chance.
     """
-    row, column = (place // CORRELATION_BLOCK_PX for place in data.place)
-    blocks = np.stack([data.shot, row, column], axis=1)
+    blocks = np.stack(
+        [data.shot, data.y // CORRELATION_BLOCK_PX, data.x // CORRELATION_BLOCK_PX], axis=1
+    )
     _, block, number = np.unique(blocks, axis=0, return_inverse=True, return_counts=True)
     sums = np.bincount(block.ravel(), standardised)
     large = number > CORRELATION_BLOCK_PX
@@ -175,105 +187,80 @@ def _estimate_variances(
 ) -> Variances:
     """Estimate what varies, from the scatter of the means over shots and over pixels.
 
-    `sizes`: numbers of shots and of pixels; `present`: whether shots and pixels have effects of
-    their own; `rounds`: at most.
+    `sizes`: numbers of shots and of pixels; `present`: whether these have effects of their own.
     """
-    start = _solve(data, Variances(1.0, 0.0, 0.0), sizes)
     if data.value.size <= data.design.shape[1]:
         # Nothing is left over that would tell the noise: the measurements' own deviations hold.
         return Variances(1.0, 0.0, 0.0)
+    start = _solve(data, Variances(1.0, 0.0, 0.0), sizes)
     scatter = float(np.mean(start.residual**2 / data.sigma**2))
     typical = scatter * float(np.median(data.sigma**2))
-    seen = [np.unique(data.shot), np.unique(data.pixel)]
-    # What the noise alone makes of the means over shots and over pixels.
-    least = [typical * one.size / data.value.size for one in seen]
-    groups = zip((data.shot, data.pixel), sizes, seen, least, strict=True)
-    spread = [
-        max(float(np.var(_average(start.residual, group, size)[which])), floor)
-        for group, size, which, floor in groups
-    ]
+    spread = []
+    for group in (data.shot, data.pixel):
+        number = np.bincount(group)
+        seen = number > 0
+        means = np.bincount(group, start.residual)[seen] / number[seen]
+        # at least what the noise alone makes of the means
+        spread.append(max(float(np.var(means)), typical * means.size / group.size))
     now = Variances(max(scatter, TINY), present[0] * spread[0], present[1] * spread[1])
-    effects = data.design.shape[1]
+    seen = np.unique(data.pixel)
     for _ in range(rounds):
         found = _solve(data, now, sizes)
         squares = (found.residual**2 + found.fitted_variance) / data.sigma**2
-        own = np.diagonal(found.covariance)[effects:]
-        later = Variances(
-            max(float(np.mean(squares)), TINY),
-            float(np.mean(found.shots**2 + own)) if present[0] else 0.0,
-            float(np.mean((found.pixels**2 + found.pixel_variance)[seen[1]]))
-            if present[1]
-            else 0.0,
+        own = np.diagonal(found.covariance)[data.design.shape[1] :]
+        before, now = (
+            now,
+            Variances(
+                max(float(np.mean(squares)), TINY),
+                present[0] * float(np.mean(found.shots**2 + own)),
+                present[1] * float(np.mean((found.pixels**2 + found.pixel_variance)[seen])),
+            ),
         )
-        pairs = zip(
-            (later.noise, later.shots, later.pixels),
-            (now.noise, now.shots, now.pixels),
-            strict=True,
-        )
-        settled = all(abs(new - old) <= EM_TOLERANCE * old for new, old in pairs)
-        now = later
-        if settled:
+        if all(
+            abs(getattr(now, part.name) - getattr(before, part.name))
+            <= EM_TOLERANCE * getattr(before, part.name)
+            for part in fields(now)
+        ):
             break
     return now
 
 
-def _average(values: FloatArray, group: NDArray[np.int64], size: int) -> FloatArray:
-    """Mean of the values of each group; 0 of empty ones."""
-    means: FloatArray = np.bincount(group, values, size) / np.maximum(
-        np.bincount(group, minlength=size), 1
-    )
-    return means
-
-
 def _solve(data: Measurements, variances: Variances, sizes: tuple[int, int]) -> _Solution:
-    """Solve for all effects at once; those of pixels are eliminated first.
-
-    `sizes`: numbers of shots and of pixels.
-    """
+    """Solve for all effects at once; those of pixels are eliminated first."""
     shots, pixels = sizes
     weight = 1 / (variances.noise * data.sigma**2)
     effects = data.design.shape[1]
-    columns = [data.design]
-    prior = np.zeros(effects)
+    design, prior = data.design, np.zeros(effects)
     if variances.shots > 0:
-        columns.append((data.shot[:, np.newaxis] == np.arange(shots)).astype(np.float64))
+        design = np.hstack([design, data.shot[:, np.newaxis] == np.arange(shots)])
         prior = np.r_[prior, np.full(shots, 1 / variances.shots)]
-    design = np.concatenate(columns, axis=1)
     weighted = design * weight[:, np.newaxis]
     normal, moment = design.T @ weighted + np.diag(prior), weighted.T @ data.value
-    gather = np.zeros((pixels, design.shape[1]))
+    leverage, own_moment = np.zeros((pixels, design.shape[1])), np.zeros(pixels)
     total = np.full(pixels, np.inf)
-    sums = np.zeros(pixels)
     if variances.pixels > 0:
-        for number, column in enumerate(weighted.T):
-            gather[:, number] = np.bincount(data.pixel, column, pixels)
-        total[:] = np.bincount(data.pixel, weight, pixels) + 1 / variances.pixels
-        sums[:] = np.bincount(data.pixel, weight * data.value, pixels)
-        normal = normal - gather.T @ (gather / total[:, np.newaxis])
-        moment = moment - gather.T @ (sums / total)
+        total = np.bincount(data.pixel, weight, pixels) + 1 / variances.pixels
+        gathered = np.stack([np.bincount(data.pixel, part, pixels) for part in weighted.T], 1)
+        leverage = gathered / total[:, np.newaxis]
+        own_moment = np.bincount(data.pixel, weight * data.value, pixels) / total
+        normal = normal - gathered.T @ leverage
+        moment = moment - gathered.T @ own_moment
     # Columns of very different units are scaled, so that none is lost in rounding.
     scale = 1 / np.sqrt(np.maximum(np.diagonal(normal), TINY))
     inverse = np.linalg.pinv(normal * np.outer(scale, scale), hermitian=True)
     covariance = inverse * np.outer(scale, scale)
     theta = covariance @ moment
-    leverage: FloatArray = gather / total[:, np.newaxis]
-    own = (sums / total) - leverage @ theta
-    shot_effects = theta[effects:] if variances.shots > 0 else np.zeros(shots)
+    own = own_moment - leverage @ theta
     own_variance = 1 / total + np.einsum("pi,ij,pj->p", leverage, covariance, leverage)
-    # The variance of what is fitted to each measurement: effects as they are seen beside its pixel.
+    # effects as they are seen beside the measurement's pixel
     beside = design - leverage[data.pixel]
     fitted = np.einsum("ni,ij,nj->n", beside, covariance, beside) + 1 / total[data.pixel]
     residual = data.value - design @ theta - own[data.pixel]
     if variances.shots == 0:
-        covariance = np.pad(covariance, (0, shots))
-    return _Solution(theta[:effects], shot_effects, own, covariance, own_variance, residual, fitted)
-
-
-def _predict(data: Measurements, found: _Solution) -> FloatArray:
-    predicted: FloatArray = (
-        data.design @ found.fixed + found.shots[data.shot] + found.pixels[data.pixel]
+        theta, covariance = np.pad(theta, (0, shots)), np.pad(covariance, (0, shots))
+    return _Solution(
+        theta[:effects], theta[effects:], own, covariance, own_variance, residual, fitted
     )
-    return predicted
 
 
 def correct_returns(returns: Returns) -> Returns:
@@ -307,11 +294,10 @@ def correct_ranges(
     sigma: FloatArray,
     pixel: tuple[NDArray[np.integer], NDArray[np.integer]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Undo range walk and the pixels' offsets.
+    """Undo range walk and the pixels' offsets; return ranges, counts referred to 1 m, and deviations.
 
-    `distance` (n,): ranges as they were measured, m; `signal` (n,): counts of the returns; `sigma`
-    (n,): one standard deviation of the ranges, m; `pixel`: rows and columns. Returns `distance`
-    (n,): m; `intensity` (n,): counts, referred to a range of 1 m; `sigma` (n,): m.
+    `distance, sigma` (n,): ranges as they were measured and one standard deviation, m; `signal` (n,):
+    counts of the returns; `pixel`: rows and columns.
     """
     excess, further = known.compute_excess(signal, *pixel)
     corrected = distance - excess
@@ -321,53 +307,6 @@ def correct_ranges(
 def square_range(distance: FloatArray) -> FloatArray:
     """Square of measured ranges, by which their intensities were referred to 1 m; never 0."""
     return np.maximum(distance**2, np.finfo(np.float64).tiny)
-
-
-MIN_WALK_SHOTS = 3
-MIN_WALK_SPAN_DECADES = 0.3
-"""Of the returns' intensities, a factor of two; a walk from less would be noise drawn out."""
-
-MIN_CURVED_WALK_SHOTS, CURVED_WALK_SPAN_DECADES = 6, 1.0
-"""From here on the walk is a parabola of the decades, below a straight line."""
-
-SPAN_PERCENTILES = (2.0, 98.0)
-
-WINDOW_PULSES = 0.5
-"""Returns of one surface lie within this many pulse widths."""
-
-MIN_TARGET_PIXELS = 3
-"""With the target's return. In the dark a detector announces one in a pixel of a hundred, at any
-range: the camera of such a shot would be wrong by the length of the record."""
-
-MIN_TARGET_FRACTION = 0.005
-"""Of the picture's pixels: rays and false alarms agree by chance in patches of a few pixels across."""
-
-MIN_TARGET_BRIGHTNESS = 0.02
-"""Of the whole picture's brightest returns. What is dimmer may be a trace that a recovery leaves of
-them elsewhere: in the dark corners of a recorded scene these had 0.2 to 0.5 % (method tv)."""
-
-BRIGHTEST_PERCENTILE = 99.0
-SHOW_A_PLATE = "show a flat plate that faces the camera, or cut the picture to it (`region`)"
-
-MIN_TARGET_SHARE = 0.5
-"""Of the returns that are not that dim: a plate is most of what is seen. Cluttered scenes have 0.05 to 0.5."""
-
-MAX_FLANK_RATIO = 0.25
-"""Returns up to a window's width before and behind the target, over the target's: none beside a plate,
-as many as within on a surface that goes on in depth."""
-
-MAX_ROUGHNESS = 0.2
-"""Median distance from the target's plane in half widths of the window. A plate's noise makes 0.11 of
-it at most (the window holds six deviations), depths that fill the window evenly make 0.5."""
-
-MAX_RIVAL_FRACTION = 0.7
-"""Of the target's returns, that another surface may have."""
-
-MAX_SHOT_SPREAD_PULSES = 1.0
-"""By which the shots' time zeros may differ."""
-
-MAX_BRIGHTNESS_RATIO = 1.5
-"""Of shots that are said to show one reflectance."""
 
 
 @dataclass(frozen=True)
@@ -394,10 +333,7 @@ class TargetShot:
             )
 
     def cut(self, inside: NDArray[np.bool_]) -> TargetShot:
-        """Return the shot with a part of its returns, and what is known of the others.
-
-        `inside` (returns,).
-        """
+        """Return the shot with a part of its returns, and what is known of the others."""
         brightest = self.measure_brightest() if np.isnan(self.brightest) else self.brightest
         return replace(self, returns=self.returns[inside], brightest=brightest)
 
@@ -420,8 +356,8 @@ class RangeFit:
     excess: FloatArray
     target_fraction: float  # of the pixels with a return, those whose return is the target's
     walk_note: str  # why a part was not fitted; empty where it was
-    offsets_note: str  # why a part was not fitted; empty where it was
-    response_note: str  # why a part was not fitted; empty where it was
+    offsets_note: str
+    response_note: str
 
     @property
     def calibration(self) -> RangeCalibration:
@@ -449,16 +385,30 @@ class _Sample:
 def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None) -> RangeFit:
     """Calibrate ranges by shots of a target at known distances.
 
-    `shots`: from three on, of different brightness, they give the range walk; from two on the
-    pixels' offsets and response; `walk`: whether a range walk must be fitted, or must not; by
-    default where the shots can tell it.
+    From three shots on, of different brightness, they give the range walk; from two on the pixels'
+    offsets and response. `walk`: whether it must be fitted, or must not; by default where the shots
+    can tell it.
     """
     if not shots:
         raise InputError("a range calibration needs a shot of a target")
     base = shots[0].returns.camera
     pulse = SPEED_OF_LIGHT / 2 * base.pulse_fwhm
-    _require_reach(shots)
-    sample = _gather([_select_target(shot, base, pulse) for shot in shots])
+    distances = [shot.distance for shot in shots]
+    length = min(shot.record[1] - shot.record[0] for shot in shots) * SPEED_OF_LIGHT / 2
+    if np.ptp(distances) > length:
+        raise CalibrationError(
+            f"the targets lie {np.ptp(distances):.3g} m apart, and the record shows {length:.3g} m: "
+            "one of them is out of the record"
+        )
+    samples = [_select_target(shot, base, pulse) for shot in shots]
+    sample = _Sample(
+        shot=np.repeat(np.arange(len(samples)), [one.y.size for one in samples]),
+        fraction=min(one.fraction for one in samples),
+        **{
+            name: np.concatenate([getattr(one, name) for one in samples])
+            for name in ("y", "x", "pixel", "excess", "sigma", "signal", "cosine")
+        },
+    )
     _require_agreement(shots, sample, pulse)
     span = np.percentile(np.log10(sample.signal), SPAN_PERCENTILES)
     walk_note = _explain_missing_walk(len(shots), span, walk)
@@ -475,7 +425,8 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
         decades[:, np.newaxis] ** np.arange(order + 1),
         sample.shot,
         sample.pixel,
-        (sample.y, sample.x),
+        sample.y,
+        sample.x,
     )
     repeated = len(shots) > 1
     effects = fit_effects(data, repeated, repeated)
@@ -514,22 +465,11 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
     )
 
 
-def _require_reach(shots: Sequence[TargetShot]) -> None:
-    """Refuse targets that lie further apart than the record is long: one of them is not in it."""
-    distances = np.array([shot.distance for shot in shots])
-    length = min(shot.record[1] - shot.record[0] for shot in shots) * SPEED_OF_LIGHT / 2
-    if np.ptp(distances) > length:
-        raise CalibrationError(
-            f"the targets lie {np.ptp(distances):.3g} m apart, and the record shows {length:.3g} m: "
-            "one of them is out of the record"
-        )
-
-
 def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
-    """Keep the strongest return of each pixel where it is the target's.
-
-    `camera`: says where the pixels look; `pulse`: width of a pulse, m. Returns excess over the
+    """Keep the strongest return of each pixel where it is the target's, with its excess over the
     target's range, from the start of the time axis rather than any time zero.
+
+    `pulse`: its width, m.
     """
     if shot.returns.camera.image_shape != camera.image_shape:
         raise CalibrationError(
@@ -646,15 +586,6 @@ def _find_cluster(excess: FloatArray, width: float, name: str) -> NDArray[np.boo
     return target
 
 
-def _gather(samples: Sequence[_Sample]) -> _Sample:
-    """Put the shots' returns side by side, with the shots' numbers."""
-    names = ("y", "x", "pixel", "excess", "sigma", "signal", "cosine")
-    joined = {name: np.concatenate([getattr(one, name) for one in samples]) for name in names}
-    shot = np.repeat(np.arange(len(samples)), [one.y.size for one in samples])
-    fraction = min(one.fraction for one in samples)
-    return _Sample(shot=shot, fraction=fraction, **joined)
-
-
 def _require_agreement(shots: Sequence[TargetShot], sample: _Sample, pulse: float) -> None:
     """Refuse a shot whose target is not where its distance and the other shots put it."""
     places = np.array([np.median(sample.excess[sample.shot == n]) for n in range(len(shots))])
@@ -692,9 +623,8 @@ def _add_brightness(
     effects: Effects,
     camera: Camera,
 ) -> RangeCalibration:
-    """Add the pixels' response and the scale of reflectance, from logarithms of intensities.
-
-    `calibration`: of the ranges; `effects`: of the ranges, which say what belongs to the target.
+    """Add the pixels' response and the scale of reflectance, from logarithms of intensities; `effects`
+    of the ranges say what belongs to the target.
     """
     used = effects.inliers
     shot, pixel = sample.shot[used], sample.pixel[used]
@@ -709,7 +639,8 @@ def _add_brightness(
             (shot[:, np.newaxis] == np.arange(len(shots))).astype(np.float64),
             shot,
             pixel,
-            (sample.y[used], sample.x[used]),
+            sample.y[used],
+            sample.x[used],
         ),
         with_shots=False,
         with_pixels=len(shots) > 1,
