@@ -176,7 +176,7 @@ def _count_useful_bins(capture: Capture, plane: Plane, grid: Grid) -> int:
         float(np.abs(wanted[[0, -1], np.newaxis] - axis[[0, -1]]).max())
         for axis, wanted in ((plane.x, grid.x), (plane.y, grid.y))
     ]
-    farthest = float(np.hypot(np.hypot(*across), grid.z[-1] - plane.z))
+    farthest = float(np.linalg.norm([*across, grid.z[-1] - plane.z]))
     recorded = int(np.ceil(capture.axis.paths[-1] / capture.axis.spacing)) + 1
     return max(2, min(recorded, int(np.ceil(2 * farthest / capture.axis.spacing)) + 2))
 

@@ -1,11 +1,10 @@
-"""Photon noise: what a counter sees of an expected signal.
-
-Hidden points that scatter evenly: the simplest scene, whose image is known exactly.
+"""Hidden points that scatter evenly, the simplest scene, whose image is known exactly; and photon
+noise.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -57,11 +56,8 @@ def add_poisson_noise(
         )
     expected = capture.signal * (peak_counts / brightest) + background
     signal = np.random.default_rng(seed).poisson(expected).astype(np.float32)
-    history = {
-        **capture.provenance,
-        "noise": {"peak_counts": peak_counts, "background": background, "seed": seed},
-    }
-    return Capture(signal, capture.wall, capture.laser, capture.bin_width, capture.start, history)
+    noise = {"peak_counts": peak_counts, "background": background, "seed": seed}
+    return replace(capture, signal=signal, provenance={**capture.provenance, "noise": noise})
 
 
 FloatArray = NDArray[np.float64]

@@ -1,10 +1,5 @@
-"""How hidden surfaces scatter light: bidirectional reflectance for an incoming and an outgoing
-direction.
-
-Hidden surfaces: small flat facets of known place, direction and material, and the triangles that
-hide others.
-
-Hidden scenes of surfaces that hide one another, lit and seen by way of a wall.
+"""Hidden scenes of surfaces that hide one another, lit and seen by way of a wall: small flat facets of
+known place, direction and material, and the triangles that hide others.
 """
 
 from __future__ import annotations
@@ -12,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,91 +21,61 @@ from tofclip.threads import run_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 
-class Material(Protocol):
+@dataclass(frozen=True)
+class Material:
     """Reflectance ``diffuse / pi + retro * exp(-angle^2 / (2 * spread^2)) / (2 * pi * spread^2)``
-    per steradian.
-
-    `angle` is that between the directions towards the light and towards the observer.
-    """
-
-    @property
-    def diffuse(self) -> float:
-        """Share of light that is scattered evenly (Lambert's law)."""
-        ...
-
-    @property
-    def retro(self) -> float:
-        """Share that goes back to where it came from."""
-        ...
-
-    @property
-    def spread(self) -> float:
-        """Standard deviation of the latter about the way back, rad."""
-        ...
-
-
-@dataclass(frozen=True)
-class Lambert:
-    """Scatters evenly: paper, plaster, cloth.
+    per steradian, `angle` that between the directions towards the light and towards the observer.
 
     Parameters
     ----------
-    albedo : float
-        Share of light that comes back, 0 to 1.
-    """
-
-    albedo: float = 1.0
-
-    def __post_init__(self) -> None:
-        _require_albedo(self.albedo)
-
-    @property
-    def diffuse(self) -> float:
-        return self.albedo
-
-    @property
-    def retro(self) -> float:
-        return 0.0
-
-    @property
-    def spread(self) -> float:
-        return 1.0
-
-
-@dataclass(frozen=True)
-class Retroreflector:
-    """Sends light back to where it came from: traffic signs, safety vests.
-
-    Parameters
-    ----------
-    albedo : float
-        Share of light that comes back, 0 to 1.
+    diffuse : float
+        Fraction of light that is scattered evenly (Lambert's law), 0 to 1.
+    retro : float
+        Fraction that goes back to where it came from, 0 to 1.
     spread : float
-        Standard deviation about the way back, rad.
+        Standard deviation of the latter about the way back, rad.
     """
 
-    albedo: float = 1.0
-    spread: float = 0.1
+    diffuse: float = 1.0
+    retro: float = 0.0
+    spread: float = 1.0
 
     def __post_init__(self) -> None:
-        _require_albedo(self.albedo)
+        for albedo in (self.diffuse, self.retro):
+            if not 0 <= albedo <= 1:
+                raise InputError(f"an albedo is a share between 0 and 1, got {albedo}")
         if not (np.isfinite(self.spread) and self.spread > 0):
             raise InputError(
                 f"the spread of a retroreflector must be a positive angle, got {self.spread}"
             )
 
-    @property
-    def diffuse(self) -> float:
-        return 0.0
 
-    @property
-    def retro(self) -> float:
-        return self.albedo
+class Lambert(Material):
+    """Scatters evenly: paper, plaster, cloth.
+
+    Parameters
+    ----------
+    albedo : float
+        Fraction of light that comes back, 0 to 1.
+    """
+
+    def __init__(self, albedo: float = 1.0) -> None:
+        super().__init__(albedo)
 
 
-def _require_albedo(albedo: float) -> None:
-    if not 0 <= albedo <= 1:
-        raise InputError(f"an albedo is a share between 0 and 1, got {albedo}")
+class Retroreflector(Material):
+    """Sends light back to where it came from: traffic signs, safety vests.
+
+    Parameters
+    ----------
+    albedo : float
+        Fraction of light that comes back, 0 to 1.
+    spread : float
+        Standard deviation about the way back, rad.
+    """
+
+    def __init__(self, albedo: float = 1.0, spread: float = 0.1) -> None:
+        super().__init__(0.0, albedo, spread)
 
 
 FloatArray = NDArray[np.float64]
@@ -325,21 +290,16 @@ def _subdivide_triangles(
         # Corners are renamed so that the longest side is from a to b, in the same sense of turning:
         # normals keep their side.
         turn = (longest[~small, np.newaxis] + np.arange(3)) % 3
-        a, b, c = np.moveaxis(
-            np.take_along_axis(pending[~small], turn[..., np.newaxis], axis=1), 1, 0
-        )
+        a, b, c = np.take_along_axis(pending[~small], turn[..., np.newaxis], 1).swapaxes(0, 1)
         middle = (a + b) / 2
-        pending = np.concatenate(
-            [np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)]
-        )
-    small_triangles = np.concatenate(finished)
-    crosses = np.cross(
-        small_triangles[:, 1] - small_triangles[:, 0], small_triangles[:, 2] - small_triangles[:, 0]
-    )
+        halves = np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)
+        pending = np.concatenate(halves)
+    facets = np.concatenate(finished)
+    crosses = np.cross(facets[:, 1] - facets[:, 0], facets[:, 2] - facets[:, 0])
     areas = np.linalg.norm(crosses, axis=1) / 2
     # Facets without area, of meshes with repeated corners, have no normal.
     flat = areas > 0
-    return small_triangles[flat].mean(axis=1), crosses[flat], areas[flat]
+    return facets[flat].mean(axis=1), crosses[flat], areas[flat]
 
 
 def _rasterize_letters(text: str, height: float, spacing: float) -> tuple[FloatArray, FloatArray]:
@@ -456,10 +416,18 @@ class HiddenScene:
         margin = int(np.ceil(RESPONSE_SIGMAS * sigma / axis.spacing)) + 1
         start = axis.start - margin * axis.spacing - (BIN_OVERSAMPLING - 1) / 2 * fine
         traces = np.empty((len(capture.points), axis.bins), np.float32)
+        triangles = np.concatenate([surface.triangles for surface in self.surfaces])
+        laser_normals = np.ascontiguousarray(laser_normals)
 
         def process_block(some: slice) -> None:
             bins = np.zeros((some.stop - some.start, (axis.bins + 2 * margin) * BIN_OVERSAMPLING))
-            self._add_facet_light(capture, normals, laser_normals, some, (start, fine), bins)
+            own = slice(None) if len(capture.lasers) == 1 else some
+            spots = capture.points[some], normals[some], capture.lasers[own], laser_normals[own]
+            for surface in self.surfaces:
+                stuff = surface.material
+                material = np.array([stuff.diffuse, stuff.retro, stuff.spread])
+                facets = surface.positions, surface.normals, surface.areas
+                add_facet_light(*spots, *facets, material, triangles, start, fine, bins)
             seen = gaussian_filter1d(
                 bins, sigma / fine, axis=1, mode="constant", truncate=RESPONSE_SIGMAS
             )
@@ -469,34 +437,3 @@ class HiddenScene:
 
         run_blocks(process_block, len(traces), POINTS_PER_BLOCK)
         return traces
-
-    def _add_facet_light(
-        self,
-        capture: Capture,
-        normals: FloatArray,
-        laser_normals: FloatArray,
-        some: slice,
-        time: tuple[float, float],
-        bins: FloatArray,
-    ) -> None:
-        triangles = np.ascontiguousarray(
-            np.concatenate([surface.triangles for surface in self.surfaces])
-        )
-        own = slice(None) if len(capture.lasers) == 1 else some
-        lasers, spots = capture.lasers[own], np.ascontiguousarray(laser_normals[own])
-        for surface in self.surfaces:
-            material = np.array(
-                [surface.material.diffuse, surface.material.retro, surface.material.spread]
-            )
-            facets = (surface.positions, surface.normals, surface.areas)
-            add_facet_light(
-                capture.points[some],
-                normals[some],
-                lasers,
-                spots,
-                *facets,
-                material,
-                triangles,
-                *time,
-                bins,
-            )
