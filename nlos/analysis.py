@@ -1,5 +1,5 @@
-"""What a capture says about itself before it is imaged: whether a picture can come of it, which light
-is the wall's own, which waves its points and its noise leave to see.
+"""What a capture says about itself before it is imaged: whether a picture can come of it, which
+light is the wall's own, which waves its points and its noise leave to see.
 """
 
 from __future__ import annotations

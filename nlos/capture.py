@@ -1,7 +1,7 @@
 """A capture: transients on a relay wall, with the geometry and the time axis that they belong to.
 
-From frames of a camera that looks at the relay wall to a capture: taking off the ways between
-wall and camera.
+From frames of a camera that looks at the relay wall to a capture: taking off the ways between wall
+and camera.
 """
 
 from __future__ import annotations

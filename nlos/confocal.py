@@ -1,6 +1,6 @@
-"""Confocal imaging by transforms of the whole scan at once: what both methods need of a capture (its
-lattice, its signals from path 0 on), the light-cone transform, which is one deconvolution, and f-k
-migration, which lets a wave run back into the scene.
+"""Confocal imaging by transforms of the whole scan at once: what both methods need of a capture
+(its lattice, its signals from path 0 on), the light-cone transform, which is one deconvolution, and
+f-k migration, which lets a wave run back into the scene.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The parts of a capture that one illumination made, which of laser spots and wall points to take for
-lasers, a band in which no voxel sees an echo of the record, and whether the wall is sampled finely
-enough for it.
+"""The parts of a capture that one illumination made, which of laser spots and wall points to take
+for lasers, a band in which no voxel sees an echo of the record, and whether the wall is sampled
+finely enough for it.
 """
 
 from __future__ import annotations

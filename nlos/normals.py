@@ -1,5 +1,5 @@
-"""What stands first on every line of sight from the wall: its depth, albedo and normal, from a volume
-or, of a confocal scan, by the directional light-cone transform.
+"""What stands first on every line of sight from the wall: its depth, albedo and normal, from a
+volume or, of a confocal scan, by the directional light-cone transform.
 """
 
 from __future__ import annotations

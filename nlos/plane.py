@@ -139,8 +139,8 @@ class VirtualPlane(Plane):
 
     @property
     def weights(self) -> NDArray[np.float32]:
-        """What each point stands for in an integral over the plane: area times fade, m^2, shape
-        (y, x).
+        """What each point stands for in an integral over the plane: area times fade, m^2, shape (y,
+        x).
         """
         along_y, along_x = (
             step * _fade_out(axis, width)

@@ -72,8 +72,8 @@ METHOD_CLASSES = {
 }
 # They give the same picture; the later one takes more walls and lasers, and more time.
 METHODS_BY_SPEED = ("rsd", "hybrid", "backprojection")
-# An image by waves takes as long as to back-project this many pairs of spots; measured. One is
-# made for every laser spot, or two for every wall point that sees many.
+# An image by waves takes as long as to back-project this many pairs of spots; measured. One is made
+# for every laser spot, or two for every wall point that sees many.
 MIN_PAIRS_PER_IMAGE = 250
 # They see no finer than the wall's lattice and the time bins, whatever the wavelength.
 TRANSFORM_METHODS = ("lct", "fk")
@@ -178,8 +178,8 @@ class Settings:
     ) -> Capture:
         """Mirror coordinates, blank the wall's own light and put time bins together, as settings say.
 
-        Of laser spots and wall points the fewer come as laser spots: a wave is imaged for each,
-        and seen from a lone detector all of its surroundings would be bright.
+        Of laser spots and wall points the fewer come as laser spots: a wave is imaged for each, and
+        seen from a lone detector all of its surroundings would be bright.
 
         Parameters
         ----------

@@ -324,8 +324,8 @@ MAX_EVEN_BINS_RATIO = 8
 
 
 def read_numpy_archive(fields: NamedArrays) -> Capture:
-    """Read ``H`` (t, ...), ``wall_xyz`` (..., 3), ``laser_xyz`` ((3,) or (..., 3)), and of the
-    time axis either ``delta_t_s`` or ``delta_t_m`` and ``t_start_m``, 0 where it is absent, or the
+    """Read ``H`` (t, ...), ``wall_xyz`` (..., 3), ``laser_xyz`` ((3,) or (..., 3)), and of the time
+    axis either ``delta_t_s`` or ``delta_t_m`` and ``t_start_m``, 0 where it is absent, or the
     middle of every bin in ``t_s`` or ``t_m``.
 
     Lengths in m, durations in s; bin 0 holds the path ``t_start_m`` from the laser spot to the wall

@@ -1,7 +1,7 @@
 """The laser's wave on a depth plane, as a short sum over what all frequencies have in common.
 
-From a plane to the voxels of many depths: a periodic lattice, its plane waves, the plan that
-holds both, and which depths have to be computed.
+From a plane to the voxels of many depths: a periodic lattice, its plane waves, the plan that holds
+both, and which depths have to be computed.
 """
 
 from __future__ import annotations
@@ -291,10 +291,10 @@ class DiffractionPlan:
         return max(float(np.abs(self.grid.z - self.plane.z).min()), axis_step(self.plane.x) / 2)
 
 
-# Along z an image without the laser's carrier is a sum of waves exp(1j * f * z) with
-# f = k * cos(theta) + (k - k_0) * cos(alpha): theta the angle at which the field's plane waves
-# travel, alpha that of the laser's wave. A band has few f, so that depths finer than half their
-# period are redundant: they follow from their neighbours, with an error that theory gives.
+# Along z an image without the laser's carrier is a sum of waves exp(1j * f * z) with f = k *
+# cos(theta) + (k - k_0) * cos(alpha): theta the angle at which the field's plane waves travel,
+# alpha that of the laser's wave. A band has few f, so that depths finer than half their period are
+# redundant: they follow from their neighbours, with an error that theory gives.
 
 # Spacings of computed depths that are tried, relative to that of the wanted ones.
 SPACING_RATIOS = (4.0, 3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5)

@@ -344,10 +344,9 @@ class PlanarRSD(WaveMethod):
     path by way of the voxels, in noise as well; nearer to the wall, waves that fade within a
     wavelength are missing. Light or background that the record's end cuts off adds an error that no
     tolerance makes smaller: 0.3 % for points on a background, 1.2 % for an even background alone.
-    Holds the wall's spectrum, 8 bytes per plane wave and
-    frequency (60 MB for 128 x 128 points and 120 frequencies), the volume, and per thread the waves
-    of all terms of two depths (30 MB). A capture of another library's arrays is imaged in that
-    library; see `nlos.portable`.
+    Holds the wall's spectrum, 8 bytes per plane wave and frequency (60 MB for 128 x 128 points and
+    120 frequencies), the volume, and per thread the waves of all terms of two depths (30 MB). A
+    capture of another library's arrays is imaged in that library; see `nlos.portable`.
 
     Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
     imaging systems", Nat. Commun. 11, 1645 (2020).

@@ -1,12 +1,8 @@
-"""Plane waves in groups of a size that vector instructions like.
+"""Plane waves carried to every depth by compiled loops, where they meet the laser's wave.
 
-From plane waves to the voxels of a plane: inverse Fourier transforms without the parts that are
-0 or unwanted.
-
-Plane waves carried to every depth, where they meet the laser's wave.
-
-The laser's wave on a depth plane is a short sum over its frequencies' common part, so that few
-inverse transforms per depth replace one per frequency.
+Waves come in groups of a size that vector instructions like. The laser's wave on a depth plane is a
+short sum over its frequencies' common part, so that few inverse transforms per depth replace one
+per frequency; these leave out what is 0 or unwanted.
 """
 
 from __future__ import annotations
@@ -14,7 +10,6 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -239,39 +234,11 @@ WaveIndices = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Of plane waves along y and x, in arrays of one shape; these reach as far below 0 as above."""
 
 
-class Inverse(Protocol):
-    """From the spectra of several terms to their images, with memory of its own; not to be shared
-    between threads.
-    """
-
-    cell_indices: NDArray[np.int64]
-    """Where in a spectrum every plane wave goes, in the shape of its indices."""
-
-    spare: int
-    """A cell that belongs to no wave."""
-
-    carrier: NDArray[np.complex64]
-    """What every column of an image has still to be multiplied by."""
-
-    spectra: NDArray[np.complex64]
-    """Room for some spectra (n, cells), to be transformed at a time; 0 where no plane wave goes."""
-
-    images: NDArray[np.complex64]
-    """Room for the images of all terms, (terms, y, x)."""
-
-    def transform(self, terms: slice) -> None:
-        """Turn the first spectra into the images of these terms."""
-        ...
-
-
 def choose_inverse(
     waves: WaveIndices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int
-) -> Inverse:
+) -> InverseProduct | InverseTransform:
     """Choose the quicker way: few voxels of a long period by matrix products, many by Fourier
-    transforms.
-
-    Parameters are those of `InverseTransform`; a period that is not a whole number of voxels leaves
-    matrix products only.
+    transforms; a period that is not a whole number of voxels leaves matrix products only.
 
     `waves` (rows, columns): indices along y and x; `lattice`: voxels in a period along y and x;
     `wanted`: voxels wanted along y and x, from the origin on; `terms`: maximum number of spectra.
@@ -292,10 +259,7 @@ def choose_inverse(
 
 
 class InverseProduct:
-    """Inverse transforms of several spectra as two matrix products each.
-
-    Parameters are those of `InverseTransform`.
-    """
+    """Inverse transforms of several spectra as two matrix products each; see `InverseTransform`."""
 
     def __init__(
         self, waves: WaveIndices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int
@@ -323,14 +287,14 @@ class InverseProduct:
 
 
 class InverseTransform:
-    """Inverse transforms of several spectra by pruned Fourier transforms.
+    """Inverse transforms of several spectra by pruned Fourier transforms, with memory of its own;
+    not to be shared between threads.
 
-    Along y only the columns that plane waves fall into are transformed, along x only the rows that
-    voxels lie in. Where voxels are too coarse for the finest waves, these are folded into the
-    lattice, as the voxels see them.
-
-    `waves` (rows, columns): indices along y and x; `lattice`: voxels in a period along y and x;
-    `wanted`: voxels wanted along y and x, from the origin on; `terms`: spectra at most.
+    Plane waves go to `cell_indices` of `spectra` (n, cells), `spare` being a cell that belongs to
+    none; `images` (terms, y, x) have still to be multiplied by `carrier`, column by column. Along y
+    only the columns that plane waves fall into are transformed, along x only the rows that voxels
+    lie in. Where voxels are too coarse for the finest waves, these are folded into the lattice, as
+    the voxels see them.
     """
 
     def __init__(
@@ -426,6 +390,11 @@ class LaserSource:
             return 0.0
         return float(np.average(self.wavenumbers, weights=self.strength**2))
 
+    @property
+    def position(self) -> FloatArray:
+        """The spot (3,), m; anything without one, since its wavenumber is 0."""
+        return np.zeros(3) if self.laser is None else self.laser
+
     def choose_depths(self, plan: DiffractionPlan) -> DepthInterpolation:
         """Choose which depths are computed, and how the others follow from these without the
         laser's carrier.
@@ -440,11 +409,7 @@ class LaserSource:
         return choose_depths(plan.grid.z, spectrum, DEPTH_ERROR_FRACTION * plan.tolerance)
 
     def illuminate_plane(self, plan: DiffractionPlan, depth: float) -> Illumination:
-        """Split the illumination of the plane at one depth.
-
-        `plan`: its grid and tolerance; `depth`: z of the plane, m. Returns with ``span``, the
-        smallest and largest distance of the spot from the plane's voxels, m.
-        """
+        """Split the illumination of the plane at one depth, m."""
         if self.laser is None:
             return build_constant_illumination(self.wavenumbers.size)
         y, x = (
@@ -452,21 +417,18 @@ class LaserSource:
             for axis, spot in ((plan.grid.y, self.laser[1]), (plan.grid.x, self.laser[0]))
         )
         span = np.sqrt(np.array(y) ** 2 + np.array(x) ** 2 + (depth - self.laser[2]) ** 2)
-        # One split serves all depths that differ by little: it takes as long as a small image.
-        # rounded up to a geometric series of half ranges, so that one split serves many depths
+        # Rounded up to a geometric series of half ranges, so that one split, which takes as long as
+        # a small image, serves many depths.
         half = HALF_RANGE_RATIO ** np.ceil(
             np.log(max(np.ptp(span) / 2, MIN_HALF_RANGE_M)) / np.log(HALF_RANGE_RATIO)
         )
-        light = self._split_range(float(half), ILLUMINATION_ERROR_FRACTION * plan.tolerance)
+        key = float(half), ILLUMINATION_ERROR_FRACTION * plan.tolerance
+        light = self.splits.get(key)
+        if light is None:
+            offsets = self.wavenumbers - self.centre_wavenumber
+            light = split_illumination(offsets, self.strength, *key)
+            light = self.splits.setdefault(key, light)  # one step, as threads share the dictionary
         return replace(light, span=span.mean() + light.span)
-
-    def _split_range(self, half: float, tolerance: float) -> Illumination:
-        key = half, tolerance
-        if found := self.splits.get(key):
-            return found
-        offsets = self.wavenumbers - self.centre_wavenumber
-        made = split_illumination(offsets, self.strength, half, tolerance)
-        return self.splits.setdefault(key, made)  # one step, as threads share the dictionary
 
 
 class CompiledDiffraction:
@@ -501,11 +463,8 @@ class CompiledDiffraction:
         total: NDArray[np.complex64],
         progress: Progress = ignore_progress,
     ) -> None:
-        """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r, S_k the field carried
-        there from the plane.
-
-        `values` (y, x, frequencies): on the plan's plane; `total` (z, y, x): added to; `progress`:
-        called with the number of voxels just done.
+        """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r of `total` (z, y, x), S_k
+        the field (y, x, frequencies) carried there from the plane; progress counts voxels.
         """
         plan = self.plan
         with limit_blas_threads():
@@ -535,18 +494,11 @@ class CompiledDiffraction:
 
     def _interpolate(self, block: InterpolatedBlock, computed: Field, total: Field) -> None:
         """Add some depths that follow from computed ones without the laser's carrier."""
-        grid, shape = self.plan.grid, (-1, *total.shape[1:])
+        grid, source, part = self.plan.grid, self.source, total[block.depths]
         known = computed[block.nodes].reshape(block.nodes.stop - block.nodes.start, -1)
-        laser = np.zeros(3) if self.source.laser is None else self.source.laser
-        add_with_carrier(
-            (block.weights @ known).reshape(shape),
-            grid.x,
-            grid.y,
-            grid.z[block.depths],
-            laser,
-            self.source.centre_wavenumber,
-            total[block.depths],
-        )
+        values = (block.weights @ known).reshape(part.shape)
+        axes = grid.x, grid.y, grid.z[block.depths]
+        add_with_carrier(values, *axes, source.position, source.centre_wavenumber, part)
 
     @cached_property
     def _depths(self) -> DepthInterpolation:
@@ -608,20 +560,22 @@ class _Workspace:
         total: Field,
         without_carrier: bool,
     ) -> None:
-        """Add a few depth planes.
-
-        `spectrum`: plane waves of the wall's field at all frequencies; `lights`: one for each
-        plane; `depths` (z,): m; `total` (z, y, x): added to, in place; `without_carrier`: leave out
-        the laser's carrier wave.
+        """Add a few depth planes to `total` (z, y, x), with or without the laser's carrier wave, of
+        the plane waves of the wall's field at all frequencies.
         """
         wavenumber = 0.0 if without_carrier else source.centre_wavenumber
+        grid, inverse = self.plan.grid, self.inverse
         carried = self._propagate_terms(spectrum, source, lights, depths)
         for terms, light, depth, image in zip(carried, lights, depths, total, strict=True):
             count = light.coefficients.shape[1]
-            for some in split_blocks(count, len(self.inverse.spectra)):
-                scatter_terms(terms[some], self.cell_indices, self.folded, self.inverse.spectra)
-                self.inverse.transform(some)
-            self._illuminate(self.inverse.images[:count], source, light, depth, wavenumber, image)
+            for some in split_blocks(count, len(inverse.spectra)):
+                scatter_terms(terms[some], self.cell_indices, self.folded, inverse.spectra)
+                inverse.transform(some)
+            place = grid.x, grid.y, depth, source.position, wavenumber
+            functions = np.ascontiguousarray(light.table.T), light.span
+            add_illuminated_terms(
+                inverse.images[:count], light.even, *place, *functions, inverse.carrier, image
+            )
 
     def _propagate_terms(
         self,
@@ -631,19 +585,15 @@ class _Workspace:
         depths: FloatArray,
     ) -> FloatParts:
         """Return the plane waves of all terms, (depths, m, groups, 2, MIRRORED, LANES)."""
-        leading_zeros, between = self.groups.leading_zeros, self.interpolation
+        zeros, between = self.groups.leading_zeros, self.interpolation
         max_terms = max(light.coefficients.shape[1] for light in lights)
         # The compiled loop takes two terms at a time.
-        coefficients = np.zeros(
-            (len(lights), max_terms + max_terms % 2, spectrum.shape[1]), np.float32
-        )
-        nodes = []
+        padded = (len(lights), max_terms + max_terms % 2, spectrum.shape[1])
+        coefficients, nodes = np.zeros(padded, np.float32), []
         for own, light, depth in zip(coefficients, lights, depths, strict=True):
-            own[: light.coefficients.shape[1], leading_zeros:] = light.coefficients.T
+            own[: light.coefficients.shape[1], zeros:] = light.coefficients.T
             delay = np.array([light.span.mean(), source.centre_wavenumber])
-            nodes.append(
-                self.plan.transfer.evaluate(depth - self.plan.plane.z, delay, leading_zeros)
-            )
+            nodes.append(self.plan.transfer.evaluate(depth - self.plan.plane.z, delay, zeros))
         shape = (*coefficients.shape[:2], *self.groups.shape)
         terms = self._term_buffer[: int(np.prod(shape))].reshape(shape)
         weights = (between.begin, between.offset, between.weights)
@@ -651,20 +601,3 @@ class _Workspace:
             spectrum, self.groups.first_frequency, np.stack(nodes), *weights, coefficients, terms
         )
         return terms
-
-    def _illuminate(
-        self,
-        images: Field,
-        source: LaserSource,
-        light: Illumination,
-        depth: float,
-        wavenumber: float,
-        field: Field,
-    ) -> None:
-        """Let the laser's wave meet the images of one depth plane."""
-        x, y = self.plan.grid.x, self.plan.grid.y
-        laser = np.zeros(3) if source.laser is None else source.laser
-        table, carrier = np.ascontiguousarray(light.table.T), self.inverse.carrier
-        add_illuminated_terms(
-            images, light.even, x, y, depth, laser, wavenumber, table, light.span, carrier, field
-        )

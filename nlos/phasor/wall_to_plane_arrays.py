@@ -1,5 +1,5 @@
-"""From a wall to a plane at the band's frequencies, on the arrays of any library: the counterpart of
-`nlos.phasor.wall_to_plane_compiled`.
+"""From a wall to a plane at the band's frequencies, on the arrays of any library: the counterpart
+of `nlos.phasor.wall_to_plane_compiled`.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class PortablePropagation:
     """``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, within a tolerance.
 
     By Fourier matrices where the compiled loops take Fourier transforms, with the same terms of the
-    wall's relief (see `nlos.phasor.wall_to_plane`), else by direct sums. The terms are chosen for the
-    spectrum of the first phasors that come; they stay for later ones, so that a sequence of like
-    signals is planned once.
+    wall's relief (see `nlos.phasor.wall_to_plane`), else by direct sums. The terms are chosen for
+    the spectrum of the first phasors that come; they stay for later ones, so that a sequence of
+    like signals is planned once.
 
     Memory beyond phasors and result: for the terms, some 8 bytes per wall point, term and six
     frequencies (20 MB for 128 x 128 points and 120 frequencies); and four chunks

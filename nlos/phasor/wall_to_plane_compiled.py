@@ -1,7 +1,7 @@
 """From wall points to a plane by compiled loops: by Fourier transforms, or by direct sums.
 
-The counterpart of `nlos.phasor.wall_to_plane_arrays`. Either way returns
-``S_k(r_v) = sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|``.
+The counterpart of `nlos.phasor.wall_to_plane_arrays`. Either way returns ``S_k(r_v) = sum_p
+P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|``.
 """
 
 from __future__ import annotations

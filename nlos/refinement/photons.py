@@ -399,8 +399,7 @@ class PhotonRefinement(Method):
     of photons that it sent to the wall, whose noise is the same near and far; it is shown with the
     sharpness that instrument and wall give it, as CLEAN's components are with its beam.
 
-    Of the instrument's responses and the falls with the angle that may be, the likeliest are
-    taken.
+    Of the instrument's responses and the falls with the angle that may be, the likeliest are taken.
 
     A tenth of the photons is set aside first and judges the fit of the others: unless these are
     likelier under it than under light as bright as in the linear image, and than under background

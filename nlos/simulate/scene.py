@@ -1,5 +1,5 @@
-"""Hidden scenes of surfaces that hide one another, lit and seen by way of a wall: small flat facets of
-known place, direction and material, and the triangles that hide others.
+"""Hidden scenes of surfaces that hide one another, lit and seen by way of a wall: small flat facets
+of known place, direction and material, and the triangles that hide others.
 """
 
 from __future__ import annotations
