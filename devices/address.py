@@ -5,8 +5,8 @@ ignored; and `Options`, by which an instrument declares once what values its add
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
-from math import inf
+from dataclasses import Field, dataclass, field, fields
+from math import inf, isfinite
 from typing import Any, Self, TypeVar
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -106,31 +106,36 @@ def option(
 @dataclass(frozen=True)
 class Options:
     """Values of an address: every field made by `option` is one, by its own name, in the unit that
-    its name ends in. A default of None is out of bounds: the value is not given.
+    its name ends in. None means that the value is not given.
     """
 
     def __post_init__(self) -> None:
-        for one in fields(self):
+        for one in self.declared():
             value, known = getattr(self, one.name), one.metadata
             if value is None or not isinstance(value, int | float):
                 continue
             least, above, most = known["least"], known["above"], known["most"]
-            if not (least <= value <= most and above < value):
-                low = f"above {above:g}" if above > -inf else f"at least {least:g}"
+            if not (least <= value <= most and above < value and isfinite(value)):
+                low = "positive" if above == 0 else f"at least {least:g}"
                 high = f" and at most {most:g}" if most < inf else ""
                 raise InputError(f"{one.name} must be {low}{high}, got {value:g}")
 
     @classmethod
+    def declared(cls) -> list[Field[Any]]:
+        """Return the fields that are values of an address."""
+        return [one for one in fields(cls) if "kind" in one.metadata]
+
+    @classmethod
     def names(cls) -> tuple[str, ...]:
         """Return the names of all values."""
-        return tuple(one.name for one in fields(cls))
+        return tuple(one.name for one in cls.declared())
 
     @classmethod
     def from_uri(cls, uri: Uri, *others: str) -> Self:
         """Read an address, which has no values but these and `others`."""
         uri.reject_unknown(*cls.names(), *others)
         found: dict[str, Any] = {}
-        for one in fields(cls):
+        for one in cls.declared():
             kind, choices = one.metadata["kind"], one.metadata["choices"]
             if one.name not in uri.values:
                 continue

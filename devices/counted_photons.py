@@ -1,13 +1,9 @@
 """From an instrument's address to photons counted in time for each pixel, (t, y, x): what
 `tofclip lidar photons` takes.
 
-Besides what a source itself takes, its address may say how to gather (`GATHERING_OPTIONS`):
-
-* ``scans``: whole scans of a gate, or whole histograms, to add up; 1 by default;
-* ``binning``: pixels along each side of a square that count as one; 1 by default.
-
-Photons with a time stamp each, as of a LinoSPAD2's recording, are counted in bins, for which
-`devices.transients.ACCUMULATION_OPTIONS` are taken; the line of pixels is a picture of one row.
+Besides what a source itself takes, its address may say how to gather (`ScanOptions`). Photons with a
+time stamp each, as of a LinoSPAD2's recording, are counted in bins, for which the values of
+`devices.transients.Accumulation` are taken; the line of pixels is a picture of one row.
 """
 
 from __future__ import annotations
@@ -19,14 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.address import Uri
+from devices.address import Options, Uri, option
 from devices.linospad2 import BoardCalibration
 from devices.recording.read import read_head_if_recording
 from devices.registry import open as open_source
 from devices.source import Source
 from devices.transients import (
-    ACCUMULATION_OPTIONS,
-    AccumulationSettings,
+    Accumulation,
     accumulate_streak,
     read_batches,
     strip_options,
@@ -36,7 +31,6 @@ from tofclip.lidar import Pulse
 from tofclip.lidar.photons import PhotonImage
 from tofclip.storage import Record
 
-GATHERING_OPTIONS = ("scans", "binning")
 MAX_CUBE_BYTES = 1 << 32
 STAMPS_SUFFIX = ".dat"
 STAMP_SCHEMES = ("file", "linospad2", "sim+linospad2")
@@ -44,6 +38,14 @@ STAMP_SCHEMES = ("file", "linospad2", "sim+linospad2")
 
 EDGE_S = 1e-10
 """Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s."""
+
+
+@dataclass(frozen=True)
+class ScanOptions(Options):
+    """Values of an address that say how to gather."""
+
+    scans: int = option(1, above=0)  # whole scans of a gate, or whole histograms, to add up
+    binning: int = option(1, above=0)  # pixels along each side of a square that count as one
 
 
 @dataclass(frozen=True)
@@ -80,17 +82,15 @@ def read_photons(address: str, bin_width: float | None = None) -> CountedPhotons
 
     Memory: the counts, and one batch of the source.
 
-    `address`: as `devices.open` takes it, with `GATHERING_OPTIONS` where wanted; `bin_width`:
+    `address`: as `devices.open` takes it, with the values of `ScanOptions` where wanted; `bin_width`:
     duration of a bin, s, in which photons with a time stamp each are counted, 20 ps by default;
     other instruments know their own.
     """
     uri = Uri.parse(address)
-    scans, binning = uri.value("scans", int, 1), uri.value("binning", int, 1)
-    if scans < 1 or binning < 1:
-        raise InputError(f"'{address}': scans and binning must be positive")
-    gathering = AccumulationSettings.from_uri(uri, bin_width)
-    counting = ACCUMULATION_OPTIONS if uri.scheme in STAMP_SCHEMES else ()
-    with open_source(strip_options(uri, GATHERING_OPTIONS + counting)) as source:
+    scanning = ScanOptions.from_uri(uri, *uri.values)
+    gathering = Accumulation.of(uri, bin_width)
+    counting = Accumulation.names() if uri.scheme in STAMP_SCHEMES else ()
+    with open_source(strip_options(uri, ScanOptions.names() + counting)) as source:
         known = source.calibration
         axis = _find_time_axis(known)
         if known is not None and known.kind == BoardCalibration.RECORD_KIND:
@@ -105,17 +105,15 @@ def read_photons(address: str, bin_width: float | None = None) -> CountedPhotons
         times = known.array(axis, np.float64, 1, "s")
         pulse = None
         if axis == "bin_times":
-            counts = _add_histograms(source, scans) * known.number("count_scale")
+            counts = _add_histograms(source, scanning.scans) * known.number("count_scale")
         else:
-            counts = _add_scans(source, len(times), scans, binning)
+            counts = _add_scans(source, len(times), scanning.scans, scanning.binning)
             pulse = _make_gate_response(known, times)
-        source.stop()
-        while source.read() is not None:
-            pass
+        source.drain()
     return CountedPhotons(counts, times, pulse)
 
 
-def _count_stamps(source: Source, known: Record, gathering: AccumulationSettings) -> CountedPhotons:
+def _count_stamps(source: Source, known: Record, gathering: Accumulation) -> CountedPhotons:
     """Count a line's photons, each of which has a time stamp, in bins; hot pixels are left dark."""
     streak = accumulate_streak(read_batches(source, gathering.seconds), known, gathering)
     counts = streak.counts

@@ -1,6 +1,5 @@
-"""Recording a source: its bytes are tapped before they are decoded, and written while it is read.
-
-How fast and how well a source delivers.
+"""Recording a source: its bytes are tapped before they are decoded, and written while it is read; and
+measuring how fast and how well a source delivers.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from types import FrameType
 from typing import Any
 
 from devices.recording.write import RecordingWriter, make_head
-from devices.source import Batch, DecodedSource, Piece, Source, Stats
+from devices.source import DecodedSource, Piece, Source, Stats
 from tofclip.errors import DeviceTimeoutError, InputError, TofclipError
 
 POLL_INTERVAL_S = 0.25
@@ -99,9 +98,7 @@ def _read_all(
         with contextlib.suppress(DeviceTimeoutError):
             if source.read(min(left, POLL_INTERVAL_S)) is None:
                 return
-    source.stop()
-    while source.read() is not None:
-        pass
+    source.drain()
 
 
 @contextlib.contextmanager
@@ -163,44 +160,26 @@ def measure_throughput(
     """
     if not 0 < seconds < math.inf:
         raise InputError(f"a trial takes a positive, finite number of seconds, got {seconds:g}")
-    meter = _ByteMeter()
+    read = 0
+
+    def count(piece: Piece) -> None:
+        nonlocal read
+        read += len(piece.data)
+
     with source:
-        meter.attach(source)
+        is_tapped = isinstance(source, DecodedSource)
+        if isinstance(source, DecodedSource):
+            source.tap = count
         begin = now = monotonic()
         while now < begin + seconds:
             watch(now - begin)
             with contextlib.suppress(DeviceTimeoutError):
-                if meter.read(source, min(POLL_INTERVAL_S, begin + seconds - now)) is None:
+                batch = source.read(min(POLL_INTERVAL_S, begin + seconds - now))
+                if batch is None:
                     break
+                read += 0 if is_tapped else batch.records.nbytes
             now = monotonic()
         # Measured before draining, whose bytes would flatter the rate.
-        took, read = max(monotonic() - begin, 1e-9), meter.bytes
-        source.stop()
-        while source.read() is not None:
-            pass
-    return Throughput(took, read, source.stats)
-
-
-class _ByteMeter:
-    """Counts bytes: tapped where they are bytes, else those of the records."""
-
-    def __init__(self) -> None:
-        self.bytes = 0
-        self._is_tapped = False
-
-    def attach(self, source: Source) -> None:
-        if isinstance(source, DecodedSource):
-            self._is_tapped, source.tap = True, self._tap
-
-    def read(self, source: Source, timeout: float) -> Batch | None:
-        """Read a batch and count its bytes.
-
-        `timeout`: seconds.
-        """
-        batch = source.read(timeout)
-        if batch is not None and not self._is_tapped:
-            self.bytes += batch.records.nbytes
-        return batch
-
-    def _tap(self, piece: Piece) -> None:
-        self.bytes += len(piece.data)
+        took, measured = max(monotonic() - begin, 1e-9), read
+        source.drain()
+    return Throughput(took, measured, source.stats)

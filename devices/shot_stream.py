@@ -23,7 +23,7 @@ from devices.registry import open as open_source
 from devices.source import Batch, Source, Stats
 from devices.stream import InstrumentClock, StreamSource
 from devices.transients import (
-    AccumulationSettings,
+    Accumulation,
     accumulate_streak,
     read_batches,
     read_camera,
@@ -99,7 +99,7 @@ class TransientStream(Iterator[Streak]):
 
     def __init__(self, address: str, bin_width: float | None = None) -> None:
         self._uri = Uri.parse(address)
-        self._gathering = AccumulationSettings.from_uri(self._uri, bin_width)
+        self._gathering = Accumulation.of(self._uri, bin_width)
         self._source: Source | None = None
         self._shots = self._read()
         self._records_per_shot = 1
@@ -254,9 +254,7 @@ class TrackedShots(Iterator[Streak | TofclipError]):
             close()
 
 
-def _split_shots(
-    batches: Iterator[Batch], gathering: AccumulationSettings
-) -> Iterator[tuple[int, Batch]]:
+def _split_shots(batches: Iterator[Batch], gathering: Accumulation) -> Iterator[tuple[int, Batch]]:
     """Cut batches where shots end, and say to which shot each part belongs.
 
     Pictures carry the instrument's number, in which those that were lost have been counted; where
@@ -276,14 +274,8 @@ def _split_shots(
             end = min(len(batch), start + size - done % size)
             if done % size == 0:
                 number = (done if own is None else base + int(own[start])) // size
-            yield (
-                number,
-                replace(
-                    batch,
-                    records=batch.records[start:end],
-                    first=batch.first + start,
-                    after_gap=batch.after_gap and start == 0,
-                ),
-            )
+            after_gap, first = batch.after_gap and start == 0, batch.first + start
+            part = batch.records[start:end]
+            yield number, replace(batch, records=part, first=first, after_gap=after_gap)
             done += end - start
             start = end

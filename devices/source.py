@@ -1,17 +1,11 @@
-"""What a codec is: an instrument's bytes to records and back, with no instrument in sight.
+"""One interface for instruments that are connected, recorded or simulated: codecs, accounts of
+records, the bounded buffer between an instrument and its reader, and sources.
 
-A codec never reads from anywhere and keeps nothing between calls. What a decoder has to remember
-from one piece of the stream to the next (how often a counter has wrapped) is an explicit *state*
-that goes in and comes out; bytes of a record that is not complete yet stay with the caller, which
-asks `Codec.count_complete_bytes` how far the complete ones reach.
-
-Book-keeping of records: every change moves records from one account to another, so the accounts
-always balance.
-
-The bounded buffer between the thread that empties an instrument and the reader of records.
-
-One interface for instruments that are connected, recorded or simulated, and what sources share
-whose records come out of bytes, which can be tapped before they are decoded.
+A codec turns an instrument's bytes into records and back, with no instrument in sight. It never reads
+from anywhere and keeps nothing between calls. What a decoder has to remember from one piece of the
+stream to the next (how often a counter has wrapped) is an explicit *state* that goes in and comes
+out; bytes of a record that is not complete yet stay with the caller, which asks
+`Codec.count_complete_bytes` how far the complete ones reach.
 """
 
 from __future__ import annotations
@@ -474,6 +468,12 @@ class Source(abc.ABC):
         Where nothing waits to be read this is the same as `close`.
         """
         self.close()
+
+    def drain(self) -> None:
+        """Stop, and read what is left, so that the accounts are final."""
+        self.stop()
+        while self.read() is not None:
+            pass
 
     @abc.abstractmethod
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """From a source's address to the streak image that recovery takes: photons histogrammed, frames
 added up.
 
-Besides what a source itself takes, its address may say how to gather (`ACCUMULATION_OPTIONS`), e.g.
+Besides what a source itself takes, its address may say how to gather (`Accumulation`), e.g.
 ``file://run.h5?seconds=2&bins=576``:
 
 * ``seconds``: of reading, at most; a live source that never ends needs it, 10 by default;
@@ -15,9 +15,9 @@ Besides what a source itself takes, its address may say how to gather (`ACCUMULA
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
-from math import inf
 from pathlib import Path
 from time import monotonic
 from urllib.parse import quote, urlencode
@@ -25,7 +25,7 @@ from urllib.parse import quote, urlencode
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.address import Uri
+from devices.address import Options, Uri, option, parse_integers
 from devices.files import compute_photon_times
 from devices.histogram import BinAxis, StampHistogram, TagHistogram, TimeHistogram
 from devices.linospad2 import BoardCalibration
@@ -36,16 +36,6 @@ from tofclip.errors import DeviceTimeoutError, InputError
 from tofclip.shots import Streak
 from tofclip.storage import Record, collect_provenance
 
-ACCUMULATION_OPTIONS = (
-    "seconds",
-    "frames",
-    "bins",
-    "start_ps",
-    "period_ps",
-    "records",
-    "sync",
-    "pixels",
-)
 BIN_WIDTH_S = 20e-12
 """Width of a histogram's bins where no other is given, s."""
 
@@ -53,51 +43,32 @@ PICOSECOND_S = 1e-12
 
 
 @dataclass(frozen=True)
-class AccumulationSettings:
+class Accumulation(Options):
     """How records become a streak image; see the module's text."""
 
-    seconds: float = 10.0
-    frames: int = 1
-    bins: int | None = None  # none: as many as fit into the laser's period
-    start: float = 0.0  # s
-    period: float | None = None  # s. None: as the source says
-    sync: int = 0
-    pixels: tuple[int, ...] = (1, 2, 3)
+    seconds: float = option(10.0, above=0)
+    frames: int = option(1, above=0)
+    bins: int | None = option(None, int)  # None: as many as fit into the laser's period
+    start_ps: float = option(0.0)
+    period_ps: float | None = option(None, float)  # None: as the source says
+    records: int = option(100_000, above=0)
+    sync: int = option(0)
+    pixels: tuple[int, ...] = option((1, 2, 3), parse_integers)
     # s. None: `BIN_WIDTH_S` for photons, and the camera's own time axis for frames
     bin_width: float | None = None
-    records: int = 100_000
 
     @classmethod
-    def from_uri(cls, uri: Uri, bin_width: float | None) -> AccumulationSettings:
-        """Read the values of an address that say how to gather.
-
-        `bin_width`: seconds.
-        """
-        standard = cls()
-        pixels = uri.value("pixels", _parse_integers, standard.pixels)
-        found = cls(
-            uri.value("seconds", float, standard.seconds),
-            uri.value("frames", int, standard.frames),
-            uri.value("bins", int, 0) if "bins" in uri.values else None,
-            uri.value("start_ps", float, 0.0) * PICOSECOND_S,
-            uri.value("period_ps", float, 0.0) * PICOSECOND_S
-            if "period_ps" in uri.values
-            else None,
-            uri.value("sync", int, standard.sync),
-            pixels,
-            bin_width,
-            uri.value("records", int, standard.records),
-        )
-        if not (0 < found.seconds < inf and found.frames >= 1 and found.records >= 1):
-            raise InputError(f"'{uri.text}': seconds, frames and records must be positive")
-        return found
+    def of(cls, uri: Uri, bin_width: float | None) -> Accumulation:
+        """Read the values of an address that say how to gather; the others are the source's."""
+        return replace(cls.from_uri(uri, *uri.values), bin_width=bin_width)
 
     def axis(self, known_period: float | None) -> BinAxis:
         """Return the bins of a histogram of photons."""
         width = BIN_WIDTH_S if self.bin_width is None else self.bin_width
-        period = self.period or known_period
+        start = self.start_ps * PICOSECOND_S
+        period = self.period_ps * PICOSECOND_S if self.period_ps else known_period
         if self.bins is not None:
-            return BinAxis(width, self.bins, self.start, period)
+            return BinAxis(width, self.bins, start, period)
         if period is None:
             raise InputError(
                 "the laser's period is not known: add period_ps=... or bins=... to the address"
@@ -106,7 +77,7 @@ class AccumulationSettings:
             raise InputError(
                 f"bins must be longer than 0 and shorter than the laser's period, got {width} s"
             )
-        return BinAxis(width, int(period / width * (1 + 1e-9)), self.start, period)
+        return BinAxis(width, int(period / width * (1 + 1e-9)), start, period)
 
 
 def read_transient(address: str, bin_width: float | None = None) -> Streak:
@@ -117,7 +88,7 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
     Parameters
     ----------
     address : str
-        As `devices.open` takes it, with `ACCUMULATION_OPTIONS`'s values where needed.
+        As `devices.open` takes it, with the values of `Accumulation` where needed.
     bin_width : float, optional
         Width of a photon histogram's bins, s, 20 ps by default; of a camera's rows instead of its
         own time axis.
@@ -136,50 +107,41 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
         The instrument failed before there was anything to gather.
     """
     uri = Uri.parse(address)
-    gathering = AccumulationSettings.from_uri(uri, bin_width)
+    gathering = Accumulation.of(uri, bin_width)
     with open_source(strip_options(uri)) as source:
-        streak = accumulate_streak(
-            read_batches(source, gathering.seconds), source.calibration, gathering
-        )
         known = source.calibration
+        streak = accumulate_streak(read_batches(source, gathering.seconds), known, gathering)
         past = {
             **collect_provenance({"address": address, "bin_width_s": bin_width}),
             "source": source.info.as_dict(),
         }
-        source.stop()
-        while source.read() is not None:
-            pass
+        source.drain()
     past["stats"] = source.stats.as_dict()
     return replace(streak, camera=read_camera(known), source=address, provenance=past)
 
 
 def accumulate_streak(
-    batches: Iterator[Batch], calibration: Record | None, gathering: AccumulationSettings
+    batches: Iterator[Batch], calibration: Record | None, gathering: Accumulation
 ) -> Streak:
-    """Make one streak image of everything that comes.
-
-    `calibration`: the source's.
-    """
+    """Make one streak image of everything that comes."""
     first = next(batches, None)
     if first is None:
         raise InputError("the source ended before it gave anything")
+    known = calibration or Record("none")
     names = first.records.dtype.names or ()
     if "counts" in names:
         return _sum_frames(first, batches, calibration, gathering)
     if "histogram" in names:
-        return _stack_histograms([first, *batches], calibration or Record("none"), gathering)
-    histogram = _make_histogram(names, calibration, gathering)
-    while first is not None:
+        return _stack_histograms([first, *batches], known, gathering)
+    histogram = _make_histogram(names, known, gathering)
+    for batch in itertools.chain([first], batches):
+        records = batch.records
         if isinstance(histogram, TagHistogram):
-            histogram.add(first.records, first.after_gap)
+            histogram.add(records, batch.after_gap)
         elif isinstance(histogram, TimeHistogram):
-            histogram.add(
-                first.records["channel"],
-                compute_photon_times(first.records, calibration or Record("none")),
-            )
+            histogram.add(records["channel"], compute_photon_times(records, known))
         else:
-            histogram.add(first.records)
-        first = next(batches, None)
+            histogram.add(records)
     return histogram.to_streak()
 
 
@@ -199,10 +161,9 @@ def read_batches(source: Source, seconds: float) -> Iterator[Batch]:
 
 
 def _make_histogram(
-    names: tuple[str, ...], calibration: Record | None, gathering: AccumulationSettings
+    names: tuple[str, ...], known: Record, gathering: Accumulation
 ) -> StampHistogram | TagHistogram | TimeHistogram:
     """Return an empty histogram for records of this kind."""
-    known = calibration or Record("none")
     if names[-2:] == ("code", "pixel"):
         period = known.number("laser_period_s", 0.0) or None
         return StampHistogram(gathering.axis(period), BoardCalibration.from_record(known))
@@ -215,9 +176,7 @@ def _make_histogram(
     raise InputError(f"records of {', '.join(names)} are not photons of a line of pixels")
 
 
-def _stack_histograms(
-    batches: list[Batch], calibration: Record, gathering: AccumulationSettings
-) -> Streak:
+def _stack_histograms(batches: list[Batch], calibration: Record, gathering: Accumulation) -> Streak:
     """Return histograms that the instrument has made itself, a channel in each column."""
     counts = np.concatenate([batch.records["histogram"] for batch in batches]).T
     times: NDArray[np.float64] = np.float64(calibration.number("resolution_s")) * (
@@ -231,22 +190,20 @@ def _sum_frames(
     first: Batch,
     batches: Iterator[Batch],
     calibration: Record | None,
-    gathering: AccumulationSettings,
+    gathering: Accumulation,
 ) -> Streak:
     """Add up a camera's frames; a pixel that reached its limit in one of them is not to be trusted."""
     kind = first.records.dtype["counts"].base
     limit = np.iinfo(kind).max if kind.kind in "ui" else np.inf
     total: NDArray[np.float64] = np.zeros(first.records.dtype["counts"].shape)
-    saturated, left, batch = np.zeros(total.shape, bool), gathering.frames, first
-    while True:
+    saturated, left = np.zeros(total.shape, bool), gathering.frames
+    for batch in itertools.chain([first], batches):
         pictures = batch.records["counts"][:left]
         total += pictures.sum(axis=0, dtype=np.float64)
         saturated |= (pictures == limit).any(axis=0)
         left -= len(pictures)
-        following = next(batches, None) if left else None
-        if following is None:
+        if not left:
             break
-        batch = following
     times = None
     for name in ("row_times", "bin_times"):  # of a sweep, or of histograms of zones
         if calibration is not None and name in calibration.fields:
@@ -261,17 +218,10 @@ def read_camera(calibration: Record | None) -> Camera | None:
     return None if known is None else Camera.from_record(known)
 
 
-def strip_options(uri: Uri, names: Collection[str] = ACCUMULATION_OPTIONS) -> str:
-    """Return the address without what says how to gather.
-
-    `names`: options to leave out.
-    """
+def strip_options(uri: Uri, names: Collection[str] = Accumulation.names()) -> str:
+    """Return the address without what says how to gather."""
     # Files of photon counters need the channel of the laser's pulses themselves.
     own = {"sync"} if Path(uri.location).suffix.lower() in (".ptu", ".ttbin") else set()
     values = {k: v for k, v in uri.values.items() if k not in names or k in own}
     place = quote(uri.location, safe="/:@[]~ ")
     return f"{uri.scheme}://{place}" + (f"?{urlencode(values)}" if values else "")
-
-
-def _parse_integers(text: str) -> tuple[int, ...]:
-    return tuple(int(word) for word in text.split(","))

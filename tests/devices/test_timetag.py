@@ -236,7 +236,7 @@ def test_a_wrong_command_is_not_answered(command: str) -> None:
         ("channels=16", "channels must be at least 0 and at most 15"),
         ("transfer_kib=0.3", "transfer_kib must be at least 0.5"),
         ("transfer_kib=0.7", "multiple of 512"),
-        ("buffer_mib=0", "buffer_mib must be above 0"),
+        ("buffer_mib=0", "buffer_mib must be positive"),
         ("policy=hope", "policy must be block or drop_oldest or fail"),
         ("reconnect_s=-1", "reconnect_s must be at least 0"),
         ("rate=2e8", "rate must be above 0"),
