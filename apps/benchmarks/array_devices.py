@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.benchmarks.harness import Case, PreparedCase
+from apps.benchmarks.harness import Prepare, PreparedCase
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
 from nlos.illumination import AliasingWarning
@@ -35,7 +35,6 @@ VIEWS, FRAMES, ITERATIONS = 7, 1016, 30
 BIN_S, FIRST_BIN_S = 20e-12, 10e-9
 NOISE, PEAK = 3.0, 100.0
 CARDS = 8  # a side
-SIDES_PX, WALL_SIDES = (64, 128), (16, 32)
 HIDDEN_POINTS_M = [[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4], [-0.6, -0.6, 1.1]]
 LASER_M = [0.1, 0.05, 0.02]
 WALL_WIDTH_M = 2.0
@@ -74,11 +73,7 @@ def wait_for(result: Array) -> Array:
 def compare_devices(
     work: Callable[[Any], Array], given: Any, moved: Any, amount: float
 ) -> PreparedCase:
-    """The work on the device against the same work by the compiled loops.
-
-    `work`: from the input to an array; `given, moved`: the input for the compiled loops, and on the
-    device; `amount`: of work, in the unit of the figures.
-    """
+    """The work on the input that was moved to the device, against the same by the compiled loops."""
 
     def judge() -> dict[str, float]:
         expected, found = to_numpy(work(given)), to_numpy(work(moved))
@@ -93,10 +88,7 @@ def compare_devices(
 
 
 def prepare_recovery(method: str, side: int) -> PreparedCase:
-    """Frames from a shot's measurements.
-
-    `method`: ``l1``, ``tv`` or ``linear``; `side`: pixels of the picture.
-    """
+    """Frames from a shot's measurements by ``l1``, ``tv`` or ``linear``."""
     camera, measurements = make_shot(side)
     operator = camera.operator()
     inverse = LinearInverse().prepare(operator)
@@ -124,10 +116,8 @@ def prepare_ranging(side: int) -> PreparedCase:
 def prepare_imaging(
     make_method: Callable[[float], Method], shape: str, confocal: bool, side: int
 ) -> PreparedCase:
-    """A hidden volume from a simulated capture.
-
-    `make_method`: from a wavelength in m to a method; `shape`: A wall of `build_relay_wall`;
-    `side`: wall points along a side.
+    """A hidden volume from a simulated capture of a wall of some shape; `make_method`: from a
+    wavelength in m.
     """
     warnings.simplefilter("ignore", AliasingWarning)
     wavelength = WALL_POINTS_PER_WAVELENGTH * WALL_WIDTH_M / (side - 1)
@@ -145,57 +135,13 @@ def prepare_imaging(
     return compare_devices(image, capture, capture.on(find_device()), 1)
 
 
-FLOOR_TEXT = "the compiled loops on the CPU"
-
-CASES = (
-    *(
-        Case(
-            f"device-{name}",
-            f"{name}, {FRAMES} frames",
-            "pixels a side",
-            SIDES_PX,
-            "frames",
-            FLOOR_TEXT,
-            partial(prepare_recovery, name),
-        )
-        for name in ("l1", "tv", "linear")
+PREPARE: dict[str, Prepare] = {
+    **{f"device-{name}": partial(prepare_recovery, name) for name in ("l1", "tv", "linear")},
+    "device-depth": prepare_ranging,
+    "device-rsd": partial(prepare_imaging, PlanarRSD, "planar", False),
+    "device-rsd-confocal": partial(prepare_imaging, lambda w: PlanarRSD(2 * w), "planar", True),
+    "device-hybrid": partial(prepare_imaging, Hybrid, "cylinder", False),
+    "device-backprojection": partial(
+        prepare_imaging, lambda w: Backprojection(2 * w), "cylinder", False
     ),
-    Case(
-        "device-depth",
-        "ranges of all returns",
-        "pixels a side",
-        SIDES_PX,
-        "pixels",
-        FLOOR_TEXT,
-        prepare_ranging,
-    ),
-    *(
-        Case(
-            f"device-{name}",
-            title,
-            "wall points a side",
-            WALL_SIDES,
-            "volumes",
-            FLOOR_TEXT,
-            partial(prepare_imaging, make_method, shape, confocal),
-        )
-        for name, title, make_method, shape, confocal in (
-            ("rsd", "planar wall, one laser spot", PlanarRSD, "planar", False),
-            (
-                "rsd-confocal",
-                "planar wall, confocal",
-                lambda wavelength: PlanarRSD(2 * wavelength),
-                "planar",
-                True,
-            ),
-            ("hybrid", "curved wall, one laser spot", Hybrid, "cylinder", False),
-            (
-                "backprojection",
-                "back-projection, curved wall",
-                lambda wavelength: Backprojection(2 * wavelength),
-                "cylinder",
-                False,
-            ),
-        )
-    ),
-)
+}

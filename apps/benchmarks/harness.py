@@ -1,17 +1,12 @@
-"""What a benchmark consists of.
+"""How benchmarks are run: what a case is, one size of it in a fresh process, other programs that do
+the same, all sizes of many cases, and the page of their figures.
 
-What figures were measured on, without the name of any machine or person.
-
-Run one case at one size in this process, which is fresh: time, memory, floor and peers.
-
-Other programs that do the same. They run in a Python of their own, named by `--peers`, where
-they are installed.
-
-Run cases, each size and number of threads in a fresh process, and put the figures together.
+``cases.csv`` says what is measured, in which module; that module's ``PREPARE`` makes the inputs.
 """
 
 from __future__ import annotations
 
+import csv
 import importlib
 import importlib.metadata
 import json
@@ -23,27 +18,22 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofclip import __version__
+from tofclip.errors import InputError
 from tofclip.sequences.jobs import measure_peak_memory_bytes
 from tofclip.threads import THREADS_VARIABLE, thread_count
 
-if TYPE_CHECKING:
-    from nlos import Capture, Grid
-
-
 Action = Callable[[], object]
+# seconds that the work alone takes another program; raises `PeerUnavailableError`
 Peer = Callable[[], float]
-"""Does the same with another program, and returns the seconds of its work alone; raises
-`PeerUnavailableError`.
-"""
 
 
 class PeerUnavailableError(Exception):
@@ -57,14 +47,14 @@ class PreparedCase:
     action: Action  # what is measured
     floor: Action  # what it cannot do without, on the same data and threads
     amount: float  # how much one action does, in the case's unit
-    # the same by other programs, by their names
-    peers: Mapping[str, Peer] = field(default_factory=dict)
-    # part of the floor that `floor` does, where all of it would take too long; above 1 where it
-    # does more
+    peers: Mapping[str, Peer] = field(default_factory=dict)  # by their names
+    # part of the floor that `floor` does, where all of it takes too long; above 1: it does more
     floor_fraction: float = 1.0
-    # what else is to be said of this size, by names that end in their unit: errors, latencies.
-    # Called once, after the times were taken
+    # what else is to be said of this size, by names that end in their unit; called last
     figures: Callable[[], Mapping[str, float]] = dict
+
+
+Prepare = Callable[[int], PreparedCase]
 
 
 @dataclass(frozen=True)
@@ -78,7 +68,7 @@ class Case:
     sizes: tuple[int, ...]
     unit: str  # what `PreparedCase.amount` counts
     floor: str  # what it is held against, in words
-    prepare: Callable[[int], PreparedCase]  # makes the inputs of a size
+    prepare: Prepare  # makes the inputs of a size
 
     @property
     def group(self) -> str:
@@ -86,26 +76,98 @@ class Case:
         return self.name.partition("-")[0]
 
 
+PAGE_GROUPS = {
+    "recovery": "Recovery of shots (7 views, 1344 slit pixels, 174 x 174 pixels)",
+    "clip": "Rendered light fields from few measurements of their true views (8 x 8 views)",
+    "depth": "Ranges (the demo's instrument)",
+    "streaming": "Shots to clouds (the demo's instrument)",
+    "rsd": "Around the corner: phasor fields",
+    "propagation": "Around the corner: propagation",
+    "confocal": "Around the corner: confocal",
+    "backprojection": "Around the corner: back-projection",
+    "decode": "Instruments",
+}
+# by name only: they need an extra program, recorded data, another device or much time
+STUDY_GROUPS = {
+    "camera": "Light-field cameras: one model each way",
+    "quality": "Quality of pictures of recorded light fields",
+    "accuracy": "Ranges from counted photons",
+    "device": "The same on another device",
+    "corner": "Around the corner: beyond lattices",
+    "sequence": "Many shots",
+    "driver": "Instruments, the whole path",
+    "viewer": "The viewer in a browser",
+}
+TABLE = Path(__file__).with_name("cases.csv")
+
+
+def find_cases(name: str) -> tuple[Case, ...]:
+    """Return the case of a name, those of a group, or the page's (some ten minutes) for ``all``."""
+    with TABLE.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    cases = []
+    for row in rows:
+        group = row["name"].partition("-")[0]
+        if name in (row["name"], group) or (name == "all" and group in PAGE_GROUPS):
+            sizes = tuple(map(int, row["sizes"].split()))
+            text = (row["name"], row["title"], row["size"])
+            prepare = _load_prepare(row["module"], row["name"])
+            cases.append(Case(*text, sizes, row["unit"], row["floor"], prepare))
+    if not cases:
+        groups = ", ".join([*PAGE_GROUPS, *STUDY_GROUPS])
+        raise InputError(
+            f"unknown benchmark '{name}'; take all, a group ({groups}) or one of a group, as recovery-l1"
+        )
+    return tuple(cases)
+
+
+def _load_prepare(module: str, name: str) -> Prepare:
+    try:
+        made: dict[str, Prepare] = importlib.import_module(f"apps.benchmarks.{module}").PREPARE
+    except ImportError as absence:
+        missing = f"the benchmark '{name}' needs {absence.name}: pip install {absence.name}"
+        raise InputError(missing) from absence
+    return made[name]
+
+
+def main() -> None:
+    """Print the figures of one case at one size, which the command line names, as JSON."""
+    name, size = sys.argv[1:]
+    print(json.dumps(measure_case(find_cases(name)[0], int(size))))
+
+
 LIBRARIES = ("numpy", "scipy", "numba", "pyfftw", "h5py", "scikit-image")
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return processor, cores, memory, devices and versions."""
+    """Return processor, cores, memory, devices and versions; no name of a machine or person.
+
+    ``load``: how many other processes wanted a core, on average over the last minute; what the
+    system does not report is None.
+    """
+    memory = _ask_system(lambda: os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30)
     return {
-        "processor": read_processor(),
+        "processor": _read_processor(),
         "cores": thread_count(),
-        "memory_gib": read_memory_gib(),
+        "memory_gib": memory,
         "system": f"{platform.system()} {platform.machine()}",
-        "devices": find_devices(),
-        "load": read_load(),
+        "devices": _find_devices(),
+        "load": _ask_system(lambda: os.getloadavg()[0]),
         "python": platform.python_version(),
         "tofclip": __version__,
         "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
     }
 
 
-def read_processor() -> str:
-    """Return the model of the processor, as the system calls it."""
+def _ask_system(question: Callable[[], float]) -> float | None:
+    try:
+        return round(question(), 1)
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def _read_processor() -> str:
+    """The model of the processor, as the system calls it."""
     known = Path("/proc/cpuinfo")
     if known.is_file():
         for line in known.read_text().splitlines():
@@ -114,46 +176,22 @@ def read_processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def read_memory_gib() -> float | None:
-    """Return the memory of the machine; None where the system does not report it."""
+def _find_devices() -> list[str]:
+    """What arrays can be computed on: the processor, and what CuPy finds beside it."""
+    devices = ["cpu"]
     try:
-        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / (1 << 30), 1)
-    except (AttributeError, ValueError, OSError):
-        return None
-
-
-def read_load() -> float | None:
-    """Return how many other processes wanted a core, on average over the last minute; None where it
-    is not reported.
-    """
-    try:
-        return round(os.getloadavg()[0], 1)
-    except (AttributeError, OSError):
-        return None
-
-
-def find_devices() -> list[str]:
-    """Return what arrays can be computed on: the processor, and what CuPy finds beside it."""
-    try:
-        cupy: Any = importlib.import_module("cupy")
-        runtime = cupy.cuda.runtime
-        numbers = range(runtime.getDeviceCount())
-        return [
-            "cpu",
-            *(f"cuda:{n} {runtime.getDeviceProperties(n)['name'].decode()}" for n in numbers),
-        ]
+        runtime = importlib.import_module("cupy").cuda.runtime
+        for number in range(runtime.getDeviceCount()):
+            name = runtime.getDeviceProperties(number)["name"].decode()
+            devices.append(f"cuda:{number} {name}")
     except Exception:  # no CuPy, no driver, no device: all the same here
         return ["cpu"]
+    return devices
 
 
 MIN_REPEATS, MAX_REPEATS = 3, 31
-REPEAT_TIME_S = 1.0
-"""Repeats go on for so long, or until there are `MAX_REPEATS`."""
-
-SLOW_TIME_S = 2.0
-"""What takes longer is measured once."""
-
-FLOOR_TIME_S = 0.3
+REPEAT_TIME_S, FLOOR_TIME_S = 1.0, 0.3  # repeats go on for so long
+SLOW_TIME_S = 2.0  # what takes longer is measured once
 BYTES_PER_MIB = 1 << 20
 
 
@@ -192,23 +230,19 @@ def measure_case(case: Case, size: int) -> dict[str, Any]:
 
 
 def time_repeats(action: Action, seconds: float) -> list[float]:
-    """Time an action again and again.
-
-    `seconds`: stop when the repeats took this long; from `MIN_REPEATS` to `MAX_REPEATS` of them.
-    Returns seconds.
-    """
-    found: list[float] = []
-    while len(found) < MAX_REPEATS:
+    """Time an action again and again, until the repeats took so many seconds."""
+    times: list[float] = []
+    while len(times) < MAX_REPEATS:
         began = time.perf_counter()
         action()
-        found.append(time.perf_counter() - began)
-        enough = len(found) >= MIN_REPEATS or found[0] > SLOW_TIME_S
-        if enough and sum(found) >= seconds:
+        times.append(time.perf_counter() - began)
+        enough = len(times) >= MIN_REPEATS or times[0] > SLOW_TIME_S
+        if enough and sum(times) >= seconds:
             break
-    return found
+    return times
 
 
-def _time_peer(peer: Any) -> dict[str, Any]:
+def _time_peer(peer: Peer) -> dict[str, Any]:
     try:
         return {"seconds": peer()}
     except PeerUnavailableError as absence:
@@ -216,8 +250,7 @@ def _time_peer(peer: Any) -> dict[str, Any]:
 
 
 PEERS_VARIABLE = "TOFCLIP_PEERS"
-PEER_TIMEOUT_S = 900
-"""A cube of 128^3 voxels, the page's largest, takes some of them minutes."""
+PEER_TIMEOUT_S = 900  # a cube of 128^3 voxels, the page's largest, takes some of them minutes
 
 YTAL_SCRIPT = """
 import sys, time
@@ -271,62 +304,19 @@ print("seconds", seconds)
 """
 
 
-@dataclass
-class LenslessPeer:
-    """LenslessPiCam's FISTA on a sensor's picture of a known point-spread function."""
-
-    spread: NDArray[np.float32]  # (rows, columns)
-    readings: NDArray[np.float32]  # (rows, columns)
-    iterations: int
-    picture: NDArray[Any] | None = None  # (rows, columns), what it made, once it was timed
-    _seconds: float = 0.0
-
-    def __call__(self) -> float:
-        """Return the seconds of its iterations alone; it runs once."""
-        if self.picture is not None:
-            return self._seconds
-        with tempfile.TemporaryDirectory() as folder:
-            path, made = Path(folder) / "readings.npz", Path(folder) / "picture.npy"
-            np.savez(path, spread=self.spread, readings=self.readings, iterations=self.iterations)
-            self._seconds = run_peer(LENSLESS_SCRIPT, "LenslessPiCam", str(path), str(made))
-            self.picture = np.load(made)
-        return self._seconds
-
-
-def time_astra(picture: NDArray[np.float32], angles: NDArray[np.float64]) -> float:
-    """Seconds of ASTRA's parallel projections of a picture, linear interpolation, processor.
-
-    `picture` (rows, columns); `angles` (angles,): rad. Returns seconds.
+def ask_peer(name: str, script: str, **arrays: Any) -> tuple[float, NDArray[Any] | None]:
+    """Run a script in the peers' Python on arrays: the seconds that its last lines report, and the
+    array that it saved, if any.
     """
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "picture.npz"
-        np.savez(path, picture=picture, angles=angles)
-        return run_peer(ASTRA_SCRIPT, "ASTRA", str(path))
-
-
-def time_ytal(capture: Capture, grid: Grid, wavelength: float, cycles: float) -> float:
-    """Seconds of y-tal's phasor fields on the same arrays, its solve call alone.
-
-    `wavelength`: metres. Returns seconds.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "capture.npz"
-        arrays: dict[str, Any] = {
-            "signal": capture.signal,
-            "wall": capture.wall,
-            "laser": capture.laser,
-        }
-        arrays |= {"x": grid.x, "y": grid.y, "z": grid.z}
-        arrays |= {"spacing": capture.axis.spacing, "wavelength": wavelength, "cycles": cycles}
+        path, saved = Path(folder) / "arrays.npz", Path(folder) / "result.npy"
         np.savez(path, **arrays)
-        return run_peer(YTAL_SCRIPT, "y-tal", str(path))
+        seconds = run_peer(script, name, str(path), str(saved))
+        return seconds, np.load(saved) if saved.exists() else None
 
 
 def run_peer(script: str, name: str, *words: str) -> float:
-    """Run a script in the peers' Python and return the seconds that its last lines report.
-
-    `name`: of the peer, for the message; `*words`: the script's arguments. Returns seconds.
-    """
+    """Run a script in the peers' Python and return the seconds that its last lines report."""
     python = os.environ.get(PEERS_VARIABLE)
     if not python:
         raise PeerUnavailableError(f"{name}: --peers names no Python that has it")
@@ -345,92 +335,68 @@ def run_peer(script: str, name: str, *words: str) -> float:
     return float(reported[-1][1])
 
 
-CASE_TIMEOUT_S = 120
+# What has not begun by then is left out, so that a run has an end on any machine: twice what two
+# slow cores take. The time of processes that ask other programs as well does not count.
 TOTAL_TIMEOUT_S = 1200
-"""What has not begun by then is left out, so that a run has an end on any machine: twice what two
-slow cores take. The time of processes that ask other programs as well does not count.
-"""
-
-
-class TimeBudget:
-    """Counts down `TOTAL_TIMEOUT_S`."""
-
-    def __init__(self) -> None:
-        self.remaining_s = float(TOTAL_TIMEOUT_S)
-        """Seconds that are left, not negative."""
-
-    def spend(self, seconds: float) -> None:
-        """Take off what a process took."""
-        self.remaining_s = max(0.0, self.remaining_s - seconds)
+CASE_TIMEOUT_S = 120
 
 
 def run_cases(
     cases: Sequence[Case], peers: str | None, advance: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Measure cases one after the other.
+    """Measure cases one after the other; `advance` is called with 1 after each process.
 
-    `peers`: python in which other programs are installed; `advance`: called with 1 after each
-    process; there are `count_processes` of them. Returns ``describe_machine`` and ``entries``, one
+    `peers`: Python in which other programs are installed. Returns ``machine`` and ``entries``, one
     for each case.
     """
     machine = describe_machine()  # before anything is measured: its load is that of others
-    clock = TimeBudget()
-    return {
-        "machine": machine,
-        "entries": [_run_case(case, peers, clock, advance) for case in cases],
-    }
+    remaining_s = [float(TOTAL_TIMEOUT_S)]
+    entries = [_run_case(case, peers, remaining_s, advance) for case in cases]
+    return {"machine": machine, "entries": entries}
 
 
 def count_processes(cases: Sequence[Case]) -> int:
     """Return how many processes `run_cases` starts."""
-    return sum(len(case.sizes) + len(list_thread_counts()) - 1 for case in cases)
+    return sum(len(case.sizes) + len(_list_thread_counts()) - 1 for case in cases)
 
 
-def list_thread_counts() -> list[int]:
-    """Return the numbers of threads that are compared: 1 and all, which is 2 on the smallest
-    machines.
-    """
+def _list_thread_counts() -> list[int]:
+    """The numbers of threads that are compared: 1 and all."""
     return sorted({1, thread_count()})
 
 
 def _run_case(
-    case: Case, peers: str | None, clock: TimeBudget, advance: Callable[[int], None]
+    case: Case, peers: str | None, remaining_s: list[float], advance: Callable[[int], None]
 ) -> dict[str, Any]:
-    *fewer, most = list_thread_counts()
+    *fewer, most = _list_thread_counts()
     runs = []
     for size in case.sizes:
         for count in [*fewer, most] if size == case.sizes[-1] else [most]:
-            wanted = peers if count == most else None  # a peer is asked once for each size
-            figures = _run_process(case, (size, count), wanted, clock)
-            if wanted != peers and "peers" in figures:
+            asked = peers if count == most else None  # a peer is asked once for each size
+            figures = _run_process(case, (size, count), asked, remaining_s)
+            if asked != peers and "peers" in figures:
                 figures["peers"] = {}  # not asked: that says nothing of the Python that was named
             runs.append({"size": size, "threads": count, **figures})
             advance(1)
-    return {
-        "name": case.name,
-        "title": case.title,
-        "size": case.size,
-        "unit": case.unit,
-        "floor": case.floor,
-        "runs": runs,
-        "growth": _fit_growth(runs, most),
-    }
+    texts = {key: getattr(case, key) for key in ("name", "title", "size", "unit", "floor")}
+    return {**texts, "runs": runs, "growth": _fit_growth(runs, most)}
 
 
 def _run_process(
-    case: Case, extent: tuple[int, int], peers: str | None, clock: TimeBudget
+    case: Case, extent: tuple[int, int], peers: str | None, remaining_s: list[float]
 ) -> dict[str, Any]:
     """Figures of a fresh process for a size and a number of threads, or ``problem``: why there are
-    none.
+    none. The time it took is taken off what remains.
     """
-    size, count = extent
-    if clock.remaining_s == 0:
+    if remaining_s[0] <= 0:
         return {"problem": f"left out: the others took {TOTAL_TIMEOUT_S} s"}
     longest = CASE_TIMEOUT_S + (PEER_TIMEOUT_S if peers else 0)  # what has begun may finish
     # with this program's own path: another one may lie in the folder that the user is in
-    code = f"import sys; sys.path[:] = {sys.path!r}; import apps.benchmarks.__main__ as one; one.main()"
-    command = [sys.executable, "-c", code, case.name, str(size)]
-    environment = {**os.environ, THREADS_VARIABLE: str(count), PEERS_VARIABLE: peers or ""}
+    code = (
+        f"import sys; sys.path[:] = {sys.path!r}; from apps.benchmarks.harness import main; main()"
+    )
+    command = [sys.executable, "-c", code, case.name, str(extent[0])]
+    environment = {**os.environ, THREADS_VARIABLE: str(extent[1]), PEERS_VARIABLE: peers or ""}
     began = time.monotonic()
     try:
         done = subprocess.run(
@@ -440,13 +406,10 @@ def _run_process(
         return {"problem": f"took more than {longest:.0f} s"}
     finally:
         if not peers:
-            clock.spend(time.monotonic() - began)
+            remaining_s[0] -= time.monotonic() - began
     if done.returncode:
-        return {
-            "problem": (
-                done.stderr.strip().splitlines() or [f"ended with status {done.returncode}"]
-            )[-1]
-        }
+        complaints = done.stderr.strip().splitlines() or [f"ended with status {done.returncode}"]
+        return {"problem": complaints[-1]}
     figures: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return figures
 
@@ -459,3 +422,115 @@ def _fit_growth(runs: Sequence[dict[str, Any]], count: int) -> float | None:
     first, last = known[0], known[-1]
     times = last["seconds"]["median"] / first["seconds"]["median"]
     return math.log(times) / math.log(last["size"] / first["size"])
+
+
+PAGE_HEADER = """\
+# Benchmarks
+
+Made by `{command}`; do not edit. Every figure comes from one run on one machine:
+
+* {processor}, {cores} cores, {memory_gib} GiB, {system}
+* devices: {device_list}
+* other processes that wanted a core in the minute before: {load}
+* tofclip {tofclip}, Python {python}, {library_list}
+
+Each size and number of threads is a fresh process. Times are medians after one warm-up, with the least and the greatest
+of the repeats; memory is the peak of the process with its libraries and inputs, and how much of it the work itself
+added. *Floor* is what the work cannot do without, measured beside it on the same data and threads; *growth* the power
+of the size with which the time grows between the first and the last size."""
+
+TABLE_COLUMNS = ("", "size", "threads", "time", "rate", "memory", "floor", "x floor", "growth")
+
+
+def render_page(figures: Mapping[str, Any], command: str) -> str:
+    """Return the page, in Markdown, of the figures that a run of `command` gave."""
+    known = figures["machine"]
+    libraries = ", ".join(f"{name} {version}" for name, version in known["libraries"].items())
+    devices = ", ".join(known["devices"])
+    parts = [
+        PAGE_HEADER.format(command=command, library_list=libraries, device_list=devices, **known)
+    ]
+    for group, title in {**PAGE_GROUPS, **STUDY_GROUPS}.items():
+        entries = [one for one in figures["entries"] if one["name"].partition("-")[0] == group]
+        if entries:
+            parts.append(_format_section(title, entries))
+    return "\n\n".join(parts) + "\n"
+
+
+def _format_section(title: str, entries: Iterable[Mapping[str, Any]]) -> str:
+    lines, notes = [_format_row(TABLE_COLUMNS), _format_row(["---"] * len(TABLE_COLUMNS))], []
+    for entry in entries:
+        lines.extend(_format_row(_format_cells(entry, run)) for run in entry["runs"])
+        notes.append(
+            f"* {entry['title']}: sizes are {entry['size']}, the floor is {entry['floor']}."
+            f"{_format_peers(entry)}{_format_figures(entry)}"
+        )
+    return "\n".join([f"## {title}", "", *lines, "", *notes])
+
+
+def _format_row(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _format_cells(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]:
+    first = [entry["title"], str(run["size"]), str(run["threads"])]
+    if "problem" in run:
+        return [*first, run["problem"], "", "", "", "", ""]
+    time = run["seconds"]
+    median, least, greatest = (
+        _format_seconds(time[name]) for name in ("median", "least", "greatest")
+    )
+    spread = f"{median} ({least} to {greatest})"
+    last = run is entry["runs"][-1]
+    return [
+        *first,
+        spread,
+        f"{_format_digits(run['per_second'])} {entry['unit']}/s",
+        f"{run['peak_mib']:.0f} MiB, own {run['own_mib']:.0f}",
+        _format_seconds(run["floor_seconds"]),
+        f"{run['times_floor']:.2f}",
+        f"{entry['growth']:.1f}" if last and entry["growth"] is not None else "",
+    ]
+
+
+def _format_peers(entry: Mapping[str, Any]) -> str:
+    """Sentences about other programs, of the runs in which they were asked for."""
+    comparisons: dict[str, list[str]] = {}
+    absent: dict[str, str] = {}
+    for run in entry["runs"]:
+        for name, answer in run.get("peers", {}).items():
+            if "absent" in answer:
+                absent[name] = answer["absent"]
+                continue
+            ratio = answer["seconds"] / run["seconds"]["median"]
+            extent = f"{run['size']}, {run['threads']} thread{'s' if run['threads'] > 1 else ''}"
+            comparisons.setdefault(name, []).append(
+                f"{_format_seconds(answer['seconds'])} at {extent} ({ratio:.1f} times ours)"
+            )
+    sentences = [f" {name}: {'; '.join(texts)}." for name, texts in comparisons.items()]
+    sentences += [
+        f" Not compared: {reason}." for name, reason in absent.items() if name not in comparisons
+    ]
+    return "".join(sentences)
+
+
+def _format_figures(entry: Mapping[str, Any]) -> str:
+    """A sentence about each size that has more to say than its times."""
+    sentences = []
+    for run in entry["runs"]:
+        texts = [f"{name} {value:.3g}" for name, value in run.get("figures", {}).items()]
+        if texts:
+            sentences.append(f" At {run['size']}, threads {run['threads']}: {', '.join(texts)}.")
+    return "".join(sentences)
+
+
+def _format_seconds(value: float) -> str:
+    for unit, scale in (("s", 1.0), ("ms", 1e-3)):
+        if value >= scale:
+            return f"{_format_digits(value / scale)} {unit}"
+    return f"{_format_digits(value / 1e-6)} us"
+
+
+def _format_digits(value: float) -> str:
+    """Three digits that count, without powers of ten."""
+    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"

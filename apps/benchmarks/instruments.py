@@ -1,31 +1,35 @@
-"""Benchmarks: an instrument's bytes to records, photons to histograms; the floor is a copy of the bytes."""
+"""Instruments: their bytes to records and photons to histograms, against a copy of the bytes, and the
+whole path (emulator, driver, ring, decoder, file), against decoding alone.
+"""
 
 from __future__ import annotations
 
+import atexit
+import itertools
+import tempfile
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.benchmarks.harness import Case, PreparedCase
+import devices
+from apps.benchmarks.harness import Action, Prepare, PreparedCase
 from devices.emulation.linospad2 import LASER_PERIOD_S, draw_uneven_calibration
+from devices.emulation.timetag import CLOCK_HZ, MAX_TICK, PoissonStream
 from devices.histogram import BinAxis, StampHistogram, TagHistogram
 from devices.linospad2 import STAMP_DTYPE, LinoSpad2Codec
-from devices.source import Records, as_bytes
-from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
+from devices.recorder import record_source
+from devices.source import Records, Source, as_bytes
+from devices.timetag.codec import RECORD_BYTES, RECORD_DTYPE, TimeTagCodec
 
 MEGA = 10**6
-CYCLES = (60, 240)
-FILL_FRACTION = 0.5
-"""Share of LinoSPAD2's words that hold a time stamp."""
-
-PHOTON_MILLIONS = (2, 8)  # millions
+FILL_FRACTION = 0.5  # of LinoSPAD2's words hold a time stamp
 
 
-def prepare_copy(data: NDArray[np.generic]) -> PreparedCase:
-    """Return a floor alone: copies of some bytes."""
-    target = np.empty_like(data)
-    return PreparedCase(lambda: None, lambda: np.copyto(target, data), 1)
+def make_copy(data: NDArray[np.generic]) -> Action:
+    """The floor: a copy of the same bytes."""
+    return partial(np.copyto, np.empty_like(data), data)
 
 
 def prepare_board_decoding(cycles: int) -> PreparedCase:
@@ -35,16 +39,14 @@ def prepare_board_decoding(cycles: int) -> PreparedCase:
     stream |= (random.random(stream.shape) < FILL_FRACTION).astype(np.uint32) << 31
     stream[:, 64 * codec.timestamps :] = 0
     data = as_bytes(stream.astype("<u4").tobytes())
-    return PreparedCase(partial(codec.decode, data, 0), prepare_copy(data).floor, len(data) / MEGA)
+    return PreparedCase(partial(codec.decode, data, 0), make_copy(data), len(data) / MEGA)
 
 
 def prepare_tag_decoding(millions: int) -> PreparedCase:
     """Words of the time tagger to tags."""
     codec = TimeTagCodec()
     data = as_bytes(codec.encode(make_tags(millions)))
-    return PreparedCase(
-        partial(codec.decode, data, codec.start), prepare_copy(data).floor, len(data) / MEGA
-    )
+    return PreparedCase(partial(codec.decode, data, codec.start), make_copy(data), len(data) / MEGA)
 
 
 def make_tags(millions: int) -> Records:
@@ -64,53 +66,96 @@ def prepare_stamp_histogram(millions: int) -> PreparedCase:
     histogram = StampHistogram(
         BinAxis(20e-12, 576, 0.0, LASER_PERIOD_S), draw_uneven_calibration(0)
     )
-    return PreparedCase(lambda: histogram.add(records), prepare_copy(records).floor, millions)
+    return PreparedCase(lambda: histogram.add(records), make_copy(records), millions)
 
 
 def prepare_tag_histogram(millions: int) -> PreparedCase:
     """Time tags into histograms of three detectors."""
     records = make_tags(millions)
     histogram = TagHistogram(BinAxis(1e-9, 512), 0, (1, 2, 3), 1 / 128e6)
-    return PreparedCase(lambda: histogram.add(records), prepare_copy(records).floor, millions)
+    return PreparedCase(lambda: histogram.add(records), make_copy(records), millions)
 
 
-FLOOR_TEXT = "a copy of the same bytes"
+ADDRESS = "sim+timetag://?seed=1"
+PIECE_BYTES = (1 << 19) // RECORD_BYTES * RECORD_BYTES
+RATE_HZ = 1.28e7
 
-CASES = (
-    Case(
-        "decode-linospad2",
-        "LinoSPAD2 words to time stamps",
-        "cycles",
-        CYCLES,
-        "MB",
-        FLOOR_TEXT,
-        prepare_board_decoding,
-    ),
-    Case(
-        "decode-timetag",
-        "time tagger's words to tags",
-        "million tags",
-        PHOTON_MILLIONS,
-        "MB",
-        FLOOR_TEXT,
-        prepare_tag_decoding,
-    ),
-    Case(
-        "decode-stamps",
-        "time stamps into histograms",
-        "million photons",
-        PHOTON_MILLIONS,
-        "million photons",
-        FLOOR_TEXT,
-        prepare_stamp_histogram,
-    ),
-    Case(
-        "decode-tags",
-        "time tags into histograms",
-        "million photons",
-        PHOTON_MILLIONS,
-        "million photons",
-        FLOOR_TEXT,
-        prepare_tag_histogram,
-    ),
-)
+
+def read_records(source: Source, size_mb: int) -> None:
+    """Read and decode a source until `size_mb` megabytes have come, and close it."""
+    wanted, records = size_mb * MEGA // RECORD_BYTES, 0
+    with source:
+        while records < wanted:
+            batch = source.read()
+            if batch is None:
+                break
+            records += len(batch.records)
+        source.stop()
+
+
+def make_decoding(size_mb: int) -> Action:
+    """The bare decoder on as many bytes, in pieces as the driver hands them over."""
+    codec = TimeTagCodec()
+    count = PIECE_BYTES // RECORD_BYTES
+    words = as_bytes(PoissonStream(RATE_HZ, CLOCK_HZ, 1).next_words(count, MAX_TICK))
+    pieces = size_mb * MEGA // PIECE_BYTES
+
+    def decode() -> None:
+        for _ in range(pieces):
+            codec.decode(words, codec.start)
+
+    return decode
+
+
+def prepare_driver(size_mb: int) -> PreparedCase:
+    """From the emulated instrument through pyusb's own code to records."""
+    return PreparedCase(
+        lambda: read_records(devices.open(ADDRESS), size_mb), make_decoding(size_mb), size_mb
+    )
+
+
+def make_recording(size_mb: int) -> Path:
+    """A recording of so much, in a folder that goes when the process ends."""
+    folder = tempfile.TemporaryDirectory()
+    atexit.register(folder.cleanup)
+    path, source = Path(folder.name) / "run.h5", devices.open(ADDRESS)
+
+    def stop_when_enough(_: float) -> None:
+        if path.stat().st_size > size_mb * MEGA:
+            source.stop()
+
+    record_source(source, path, watch=stop_when_enough)
+    return path
+
+
+def prepare_recorder(size_mb: int) -> PreparedCase:
+    """A source of bytes, here a recording, into a file."""
+    path, number = make_recording(size_mb), itertools.count()
+
+    def record() -> None:
+        copy = path.with_name(f"copy{next(number)}.h5")
+        record_source(devices.open(f"file://{path}"), copy)
+        copy.unlink()
+
+    return PreparedCase(record, make_decoding(size_mb), size_mb)
+
+
+def prepare_replay(size_mb: int) -> PreparedCase:
+    """A recording to its records."""
+    path = make_recording(size_mb)
+    return PreparedCase(
+        lambda: read_records(devices.open(f"file://{path}"), size_mb),
+        make_decoding(size_mb),
+        size_mb,
+    )
+
+
+PREPARE: dict[str, Prepare] = {
+    "decode-linospad2": prepare_board_decoding,
+    "decode-timetag": prepare_tag_decoding,
+    "decode-stamps": prepare_stamp_histogram,
+    "decode-tags": prepare_tag_histogram,
+    "driver-timetag": prepare_driver,
+    "driver-record": prepare_recorder,
+    "driver-replay": prepare_replay,
+}

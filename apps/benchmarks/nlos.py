@@ -1,4 +1,6 @@
-"""Imaging around corners, against bare Fourier transforms, bare copies, and y-tal."""
+"""Imaging around corners, against bare Fourier transforms, bare copies, and y-tal; and walls beyond the
+page's: propagation in time, scattered wall points, and one large capture.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import numpy as np
 import pyfftw
 import scipy.fft
 
-from apps.benchmarks.harness import Action, Case, PreparedCase, time_ytal
+from apps.benchmarks.harness import YTAL_SCRIPT, Action, Prepare, PreparedCase, ask_peer
 from nlos import Backprojection, Capture, FKMigration, Grid, Hybrid, LightCone, PlanarRSD, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
@@ -25,7 +27,6 @@ BINS, BIN_WIDTH_S = 512, 32e-12
 LASER_M = np.array([0.1, 0.05, 0.02])
 HIDDEN_POINTS_M = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4]])
 RELIEF_M = 0.3
-WALL_SIDES = (64, 128)
 COPY_BYTES = 1 << 25
 
 warnings.simplefilter("ignore", AliasingWarning)  # what is imaged does not matter here
@@ -33,10 +34,7 @@ warnings.simplefilter("ignore", AliasingWarning)  # what is imaged does not matt
 
 def make_scene(count: int, relief: float) -> tuple[Capture, Grid, float]:
     """A capture of ``count ** 2`` points, a grid of ``count ** 3`` voxels, and a wavelength of four
-    wall points.
-
-    `count`: points along a side; `relief`: depth of the wall's shape, m; 0: a plane. Returns
-    `wavelength`: metres.
+    wall points, m. `relief`: depth of the wall's shape, m; 0: a plane.
     """
     axis = np.linspace(-1, 1, count)
     x, y = np.meshgrid(axis, axis)
@@ -50,21 +48,14 @@ def make_scene(count: int, relief: float) -> tuple[Capture, Grid, float]:
 def make_transforms(side: int, number: int) -> tuple[Action, float]:
     """Inverse transforms of the doubled plane, a hundredth of `number` or more, and which fraction
     of it that is.
-
-    `side`: points along a side of the plane; `number`: transforms that the method needs.
     """
     threads = thread_count()
     each = max(1, number // (100 * threads))
+    how = {"axes": (0, 1), "direction": "FFTW_BACKWARD", "flags": ("FFTW_MEASURE",)}
     plans = []
     for _ in range(threads):
-        source, target = (
-            pyfftw.zeros_aligned((2 * side, 2 * side), np.complex64) for _ in range(2)
-        )
-        plans.append(
-            pyfftw.FFTW(
-                source, target, axes=(0, 1), direction="FFTW_BACKWARD", flags=("FFTW_MEASURE",)
-            )
-        )
+        arrays = (pyfftw.zeros_aligned((2 * side, 2 * side), np.complex64) for _ in range(2))
+        plans.append(pyfftw.FFTW(*arrays, **how))
 
     def work(piece: slice) -> None:
         for _ in range(piece.start, piece.stop):
@@ -78,18 +69,20 @@ def prepare_planar(count: int) -> PreparedCase:
     capture, grid, wavelength = make_scene(count, 0.0)
     method = PlanarRSD(wavelength, CYCLES)
     floor, share = make_transforms(count, count * Band(method.pulse, capture.axis).wavenumbers.size)
-    peers = {"y-tal": partial(time_ytal, capture, grid, wavelength, CYCLES)}
+    arrays = {"signal": capture.signal, "wall": capture.wall, "laser": capture.laser}
+    arrays |= {"x": grid.x, "y": grid.y, "z": grid.z}
+    numbers = {"spacing": capture.axis.spacing, "wavelength": wavelength, "cycles": CYCLES}
+    peers = {"y-tal": lambda: ask_peer("y-tal", YTAL_SCRIPT, **arrays, **numbers)[0]}
     return PreparedCase(lambda: method.reconstruct(capture, grid), floor, 1, peers, share)
 
 
 def prepare_hybrid(count: int) -> PreparedCase:
     """A curved wall, by way of a virtual plane."""
     capture, grid, wavelength = make_scene(count, RELIEF_M)
-    method = Hybrid(wavelength, CYCLES)
-    floor, share = make_transforms(
-        count, count * Band(VirtualPulse(wavelength, CYCLES), capture.axis).wavenumbers.size
-    )
-    return PreparedCase(lambda: method.reconstruct(capture, grid), floor, 1, floor_fraction=share)
+    pulse = VirtualPulse(wavelength, CYCLES)
+    floor, share = make_transforms(count, count * Band(pulse, capture.axis).wavenumbers.size)
+    work = partial(Hybrid(wavelength, CYCLES).reconstruct, capture, grid)
+    return PreparedCase(work, floor, 1, floor_fraction=share)
 
 
 def prepare_propagation(count: int) -> PreparedCase:
@@ -104,8 +97,6 @@ def prepare_propagation(count: int) -> PreparedCase:
 def prepare_confocal(method: Method, count: int) -> PreparedCase:
     """A confocal scan of a planar wall; the floor is a transform of its doubled box, there and
     back.
-
-    `count`: points along a side.
     """
     wall = build_relay_wall("planar", count)
     capture = Capture(
@@ -135,10 +126,7 @@ def make_exhaustive_capture(count: int) -> Capture:
 
 
 def prepare_backprojection(capture_of: Callable[[int], Capture], count: int) -> PreparedCase:
-    """Point by point; the floor copies a complex number for each look-up.
-
-    `capture_of`: from the number of points along a side to a capture.
-    """
+    """Point by point; the floor copies a complex number for each look-up."""
     capture, axis = capture_of(count), np.linspace(-1, 1, count)
     grid = Grid(axis, axis, np.linspace(0.6, 1.6, count // 4))
     method = Backprojection(0.6, CYCLES)
@@ -155,72 +143,72 @@ def prepare_backprojection(capture_of: Callable[[int], Capture], count: int) -> 
     return PreparedCase(work, copies, lookups / 1e6, floor_fraction=source.size / lookups)
 
 
-FLOOR_TEXT = "the inverse transforms of a plane for each frequency and depth alone"
-SIZE_TEXT = "wall points a side"
-COPY_FLOOR_TEXT = "a copied complex number for each look-up"
+STRICT_TOLERANCE = 1e-4  # one that only direct sums keep
+ROWS_IN_TIME = 2
+ROW_STEP = 8
+LARGE_WAVELENGTH_M = 0.048
 
-CASES = (
-    Case(
-        "rsd-planar",
-        "planar wall to a cube (N x N points, N^3 voxels)",
-        SIZE_TEXT,
-        WALL_SIDES,
-        "volumes",
-        FLOOR_TEXT,
-        prepare_planar,
+
+def prepare_propagation_in_time(count: int) -> PreparedCase:
+    """A few rows of the plane in time; the floor takes all of them spectrally."""
+    capture, grid, wavelength = make_scene(count, RELIEF_M)
+    pulse, distance = VirtualPulse(wavelength, CYCLES), RELIEF_M + 0.1
+    few, every = Plane(grid.x, grid.y[:ROWS_IN_TIME], distance), Plane(grid.x, grid.y, distance)
+    return PreparedCase(
+        lambda: propagate(capture, few, pulse, "time"),
+        lambda: propagate(capture, every, pulse),
+        ROWS_IN_TIME / count,
+        floor_fraction=count / ROWS_IN_TIME,
+    )
+
+
+def prepare_scattered(count: int) -> PreparedCase:
+    """Scattered wall points by non-uniform transforms; the floor sums directly for some rows."""
+    wall = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, RELIEF_M], (count**2, 3))
+    capture = PointScene(HIDDEN_POINTS_M).simulate_capture(
+        wall, LASER_M, TimeAxis(512, 32e-12), 60e-12
+    )
+    pulse, axis = VirtualPulse(8 / count, CYCLES), np.linspace(-1, 1, count)
+    plane, some = (Plane(axis, rows, RELIEF_M + 0.1) for rows in (axis, axis[::ROW_STEP]))
+    return PreparedCase(
+        lambda: propagate(capture, plane, pulse),
+        lambda: propagate(capture, some, pulse, tolerance=STRICT_TOLERANCE),
+        1,
+        floor_fraction=1 / ROW_STEP,
+    )
+
+
+def prepare_large(count: int) -> PreparedCase:
+    """A relief of 0.15 m and 1016 bins of 4.6 ps to 100^3 voxels; the floor is a planar wall."""
+    x, y = np.meshgrid(np.linspace(-0.69, 0.69, count), np.linspace(-0.65, 0.65, count))
+    axis = 0.006 * (np.arange(100, dtype=np.float64) - 49.5)
+    grid = Grid(axis, axis, 0.16 + 0.004 * np.arange(100, dtype=np.float64))
+
+    def capture_of(relief: float) -> Capture:
+        wall = np.stack([x, y, relief / 2 * np.sin(2 * x + y)], axis=-1)
+        laser = LASER_M / 2 * [1, 1, relief > 0]
+        scene = PointScene(np.array([[0.1, -0.05, 0.35]]))
+        return scene.simulate_capture(wall, laser, TimeAxis(1016, 4.6e-12, 0.14), 20e-12)
+
+    curved, planar = capture_of(0.15), capture_of(0.0)
+    return PreparedCase(
+        lambda: Hybrid(LARGE_WAVELENGTH_M).reconstruct(curved, grid),
+        lambda: PlanarRSD(LARGE_WAVELENGTH_M).reconstruct(planar, grid),
+        1,
+    )
+
+
+PREPARE: dict[str, Prepare] = {
+    "rsd-planar": prepare_planar,
+    "rsd-hybrid": prepare_hybrid,
+    "propagation-spectral": prepare_propagation,
+    "confocal-lct": partial(prepare_confocal, LightCone()),
+    "confocal-fk": partial(prepare_confocal, FKMigration()),
+    "backprojection-single": partial(
+        prepare_backprojection, lambda count: make_scene(count, 0.0)[0]
     ),
-    Case(
-        "rsd-hybrid",
-        "curved wall to a cube (N x N points, N^3 voxels)",
-        SIZE_TEXT,
-        WALL_SIDES,
-        "volumes",
-        FLOOR_TEXT,
-        prepare_hybrid,
-    ),
-    Case(
-        "propagation-spectral",
-        "curved wall's field onto a plane",
-        SIZE_TEXT,
-        WALL_SIDES,
-        "fields",
-        "a transform of a plane for each frequency alone",
-        prepare_propagation,
-    ),
-    Case(
-        "confocal-lct",
-        f"light-cone transform, {BINS} bins",
-        SIZE_TEXT,
-        (32, 64),
-        "volumes",
-        "a transform of the doubled box, there and back",
-        partial(prepare_confocal, LightCone()),
-    ),
-    Case(
-        "confocal-fk",
-        f"f-k migration, {BINS} bins",
-        SIZE_TEXT,
-        (32, 64),
-        "volumes",
-        "a transform of the doubled box, there and back",
-        partial(prepare_confocal, FKMigration()),
-    ),
-    Case(
-        "backprojection-single",
-        "single laser, N x N points to N x N x N/4 voxels",
-        SIZE_TEXT,
-        (32, 64),
-        "million look-ups",
-        COPY_FLOOR_TEXT,
-        partial(prepare_backprojection, lambda count: make_scene(count, 0.0)[0]),
-    ),
-    Case(
-        "backprojection-exhaustive",
-        "9 laser spots, N x N points each to N x N x N/4 voxels",
-        SIZE_TEXT,
-        (16, 32),
-        "million look-ups",
-        COPY_FLOOR_TEXT,
-        partial(prepare_backprojection, make_exhaustive_capture),
-    ),
-)
+    "backprojection-exhaustive": partial(prepare_backprojection, make_exhaustive_capture),
+    "corner-time": prepare_propagation_in_time,
+    "corner-scattered": prepare_scattered,
+    "corner-large": prepare_large,
+}

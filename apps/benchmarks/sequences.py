@@ -15,12 +15,13 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from distributed import LocalCluster
 
-from apps.benchmarks.harness import Case, PreparedCase
-from apps.benchmarks.ranging import bring_shots, make_instrument
+from apps.benchmarks.harness import Prepare, PreparedCase
+from apps.benchmarks.shots import bring_shots, make_instrument
 from tofclip.sequences import RangingSettings, list_shots
 from tofclip.sequences.jobs import Summary, run_jobs
 from tofclip.sequences.ranger import RangingPipeline
@@ -28,8 +29,7 @@ from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Streak
 from tofclip.simulate import make_default_scene, simulate_shot
 
-RATE_FRACTION = 0.75
-"""Of the rate that a stream reaches, the pace at which latency is measured."""
+RATE_FRACTION = 0.75  # of the rate that a stream reaches: the pace at which latency is measured
 
 DISTINCT_SHOTS = 3
 ROWS, SMALL_ROWS, CLUSTER_ROWS = 1016, 576, 254
@@ -44,10 +44,7 @@ def make_streaks(rows: int) -> list[Streak]:
 
 
 def prepare_stream(rows: int, shots: int) -> PreparedCase:
-    """Shots as fast as they are taken, then at three quarters of that rate.
-
-    `rows, shots`: rows of a streak image, and number of shots.
-    """
+    """Shots as fast as they are taken, then at three quarters of that rate."""
     streaks = make_streaks(rows)
     pipeline = RangingPipeline.for_shot(streaks[0])
 
@@ -103,10 +100,7 @@ def record_shots(folder: Path, number: int) -> Path:
 
 
 def make_clouds(shots: Path, out: Path, cluster: str | None) -> Summary:
-    """Make the clouds of all shots.
-
-    `shots, out`: folders; `cluster`: see `tofclip.sequences.jobs.run_jobs`.
-    """
+    """Make the clouds of all shots of a folder."""
     jobs = RangingSettings(shots.parent / "camera.h5").jobs(list_shots(shots), out, SUFFIX)
     return run_jobs(jobs, cluster)
 
@@ -144,36 +138,8 @@ def prepare_cluster(number: int) -> PreparedCase:
     )
 
 
-def _prepare_small_stream(shots: int) -> PreparedCase:
-    return replace(prepare_stream(SMALL_ROWS, shots), figures=dict)
-
-
-CASES = (
-    Case(
-        "sequence-latency",
-        f"a stream of shots of {ROWS} time bins to clouds",
-        "shots",
-        (20, 60),
-        "shots",
-        "as many single shots",
-        lambda shots: prepare_stream(ROWS, shots),
-    ),
-    Case(
-        "sequence-memory",
-        f"a long stream of shots of {SMALL_ROWS} time bins, whose memory must not grow",
-        "shots",
-        (20, 200),
-        "shots",
-        "as many single shots",
-        _prepare_small_stream,
-    ),
-    Case(
-        "sequence-cluster",
-        "files to clouds on two workers",
-        "shots",
-        (40, 400),
-        "shots",
-        "half of the time of one worker",
-        prepare_cluster,
-    ),
-)
+PREPARE: dict[str, Prepare] = {
+    "sequence-latency": partial(prepare_stream, ROWS),
+    "sequence-memory": lambda shots: replace(prepare_stream(SMALL_ROWS, shots), figures=dict),
+    "sequence-cluster": prepare_cluster,
+}

@@ -16,6 +16,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import numpy as np
 from playwright.sync_api import sync_playwright
 from viser import _messages
 
-from apps.benchmarks.harness import Case, PreparedCase
+from apps.benchmarks.harness import Prepare, PreparedCase
 from apps.viewer.drawing import DetailChooser
 from apps.viewer.page import Page
 from apps.viewer.session import Session
@@ -73,11 +74,9 @@ class WholeDetail(DetailChooser):
 
 
 def make_echo_request(server: Any, answered: Callable[[], None]) -> Callable[[], None]:
-    """Return a function that asks the page to answer once all that was sent so far is drawn.
+    """Return a function that asks the page to call back once all that was sent so far is drawn.
 
     It reaches into viser's inner messages, which only a measurement may do.
-
-    `answered`: called when the page has answered.
     """
     names = (f"tofclip-drawn-{number % 4}" for number in itertools.count())
 
@@ -144,16 +143,6 @@ def open_sheet(points: int, whole: bool) -> tuple[Page, Callable[[], None]]:
     return page, wait
 
 
-def prepare_frames(points: int) -> PreparedCase:
-    """Clouds of a moving sheet, one after the other, each when the one before is drawn."""
-    return play_sheet(points, whole=False)
-
-
-def prepare_whole_frames(points: int) -> PreparedCase:
-    """The same with all points of each."""
-    return play_sheet(points, whole=True)
-
-
 def play_sheet(points: int, whole: bool) -> PreparedCase:
     """Show frame after frame as if it were played, in as much detail as the page chooses or whole."""
     page, wait = open_sheet(points, whole)
@@ -173,16 +162,6 @@ def play_sheet(points: int, whole: bool) -> PreparedCase:
         wait()
 
     return PreparedCase(show_frame, wait, 1)
-
-
-def prepare_orbit(points: int) -> PreparedCase:
-    """A sheet that is turned, step by step, each when the one before is drawn."""
-    return orbit_sheet(points, whole=False)
-
-
-def prepare_whole_orbit(points: int) -> PreparedCase:
-    """The same with all points at every step."""
-    return orbit_sheet(points, whole=True)
 
 
 def orbit_sheet(points: int, whole: bool) -> PreparedCase:
@@ -222,50 +201,10 @@ def prepare_large_cloud(points: int) -> PreparedCase:
     return PreparedCase(show_file, path.read_bytes, 1)
 
 
-CASES = (
-    Case(
-        "viewer-frames",
-        "a moving cloud, frame after frame",
-        "points",
-        (15_625, 2_000_000),
-        "frames",
-        "a question and its answer",
-        prepare_frames,
-    ),
-    Case(
-        "viewer-whole_frames",
-        "the same with all points of every frame",
-        "points",
-        (125_000, 2_000_000),
-        "frames",
-        "a question and its answer",
-        prepare_whole_frames,
-    ),
-    Case(
-        "viewer-orbit",
-        "a cloud that is turned, thinned meanwhile",
-        "points",
-        (15_625, 2_000_000),
-        "updates",
-        "a question and its answer",
-        prepare_orbit,
-    ),
-    Case(
-        "viewer-whole_orbit",
-        "a cloud that is turned, all points at every step",
-        "points",
-        (15_625, 2_000_000),
-        "updates",
-        "a question and its answer",
-        prepare_whole_orbit,
-    ),
-    Case(
-        "viewer-file",
-        "a PLY file until it is drawn",
-        "points",
-        (100_000, 1_000_000),
-        "files",
-        "reading the file",
-        prepare_large_cloud,
-    ),
-)
+PREPARE: dict[str, Prepare] = {
+    "viewer-frames": partial(play_sheet, whole=False),
+    "viewer-whole_frames": partial(play_sheet, whole=True),
+    "viewer-orbit": partial(orbit_sheet, whole=False),
+    "viewer-whole_orbit": partial(orbit_sheet, whole=True),
+    "viewer-file": prepare_large_cloud,
+}

@@ -48,9 +48,7 @@ def bench(
 
     Example: tofclip bench --page benchmarks.md --json
     """
-    from apps.benchmarks.harness import count_processes, run_cases
-    from apps.benchmarks.page import render_page
-    from apps.benchmarks.registry import find_cases
+    from apps.benchmarks.harness import count_processes, find_cases, render_page, run_cases
 
     cases = find_cases(name)
     if page is not None:
@@ -70,12 +68,12 @@ def bench(
 
 def _format_summary(figures: Mapping[str, Any]) -> dict[str, str]:
     """One line for each case, of its greatest size on all threads."""
-    found = {}
+    lines = {}
     for entry in figures["entries"]:
         # Sizes and threads rise, so that the last run is the largest.
         run = entry["runs"][-1]
-        found[entry["name"]] = run.get("problem") or (
+        lines[entry["name"]] = run.get("problem") or (
             f"{run['seconds']['median']:.4g} s at {run['size']} {entry['size']}, {run['times_floor']:.2f} times "
             f"{entry['floor']}, {run['peak_mib']:.0f} MiB"
         )
-    return found
+    return lines
