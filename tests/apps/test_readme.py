@@ -17,7 +17,7 @@ from devices import aravis
 from nlos import backprojection
 from nlos.phasor import arrays as library
 from nlos.phasor import to_depths as diffraction
-from tofclip.solvers import fista
+from tofclip.solvers import methods
 
 ROOT = Path(tofclip.__file__).parents[1]
 README = ROOT / "README.md"
@@ -47,7 +47,7 @@ def write_photons(path: Path) -> None:
 
 MEMORY = re.compile(r"(?<![\d.])(\d[\d.,]*)\s+([KMG]i?B)\b(?!/s)")
 LIMITS = {
-    "docs/gpu.md": {"2 GiB": fista.WORKING_BYTES},
+    "docs/gpu.md": {"2 GiB": methods.WORKING_BYTES},
     "docs/nlos.md": {
         "32 MiB": backprojection.TABLE_BYTES,
         "8 MiB": library.CPU_CHUNK_BYTES,

@@ -25,7 +25,7 @@ from tofclip.solvers import (
     ignore_progress,
     iterate,
 )
-from tofclip.solvers.fista import (
+from tofclip.solvers.methods import (
     GAP_INTERVAL,
     MIN_FURTHER_FALL,
     NOISE_FRACTION,

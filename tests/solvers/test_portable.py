@@ -27,9 +27,9 @@ from tofclip.solvers import (
     StoppingRule,
     TotalVariation,
     Wavelets,
-    fista,
     ignore_progress,
     iterate,
+    methods,
     relative_residual,
 )
 from tofclip.solvers.cross_validation import choose_weight
@@ -107,8 +107,8 @@ def test_pieces_make_no_difference(device, method, monkeypatch):
     """
     measurements, valid = (device.put(array) for array in letters(5))
     whole = to_numpy(method.recover(projection(), measurements, valid).frames)
-    monkeypatch.setattr(fista, "WORKING_BYTES", 2 * fista.WORKING_PICTURES * 24 * 23 * 4)
-    assert fista.frames_per_block(projection(), measurements) == 2
+    monkeypatch.setattr(methods, "WORKING_BYTES", 2 * methods.WORKING_PICTURES * 24 * 23 * 4)
+    assert methods.frames_per_block(projection(), measurements) == 2
     found = to_numpy(method.recover(projection(), measurements, valid).frames)
     assert difference(found, whole) < ROUNDING[np.float32]
 

@@ -2,22 +2,6 @@
 everything in focus.
 """
 
-from tofclip.light_field.depth import (
-    FocalStack,
-    compute_image_energy,
-    compute_modified_laplacian,
-    estimate_depth_from_focus,
-    find_smooth_labels,
-    make_focal_stack,
-)
-from tofclip.light_field.views import LightField
+import lazy_loader as lazy
 
-__all__ = [
-    "FocalStack",
-    "LightField",
-    "compute_image_energy",
-    "compute_modified_laplacian",
-    "estimate_depth_from_focus",
-    "find_smooth_labels",
-    "make_focal_stack",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

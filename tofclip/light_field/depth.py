@@ -1,8 +1,5 @@
-"""Labels for pixels, each with its own costs, such that neighbours agree: belief propagation on the
-pixel grid.
-
-Depth from focus: refocus on many depths and find, for each pixel, the one where it is sharp
-(supplement Note 2).
+"""Depth from focus: refocus on many depths and find, for each pixel, the one where it is sharp
+(supplement Note 2), such that neighbours agree.
 """
 
 from __future__ import annotations
@@ -20,8 +17,7 @@ from tofclip.light_field.views import LightField
 Array = NDArray[Any]
 
 MAX_ITERATIONS = 40
-MAX_LABEL_STEP = 3
-"""Labels this number of steps apart cost no more: depth may jump at an object's border."""
+MAX_LABEL_STEP = 3  # labels farther apart cost no more: depth may jump at an object's border
 
 
 def find_smooth_labels(
@@ -64,30 +60,22 @@ def find_smooth_labels(
     messages = np.zeros((4, *own.shape), np.float32)  # from above, below, left, right
     for _ in range(iterations if smoothness > 0 else 0):
         belief = own + messages.sum(axis=0)
-        for towards, back, (pixels, neighbours) in zip(
-            range(4), (1, 0, 3, 2), _NEIGHBOUR_SLICES, strict=True
-        ):
+        for towards in range(4):
             # what a pixel passes to a neighbour leaves out what came from that neighbour
-            said = _pass_message(belief - messages[back], np.float32(smoothness))
-            # half of the step: undamped messages may oscillate
-            messages[towards][neighbours] += (said[pixels] - messages[towards][neighbours]) / 2
+            said = _pass_message(belief - messages[towards ^ 1], np.float32(smoothness))
+            ends = slice(None, -1), slice(1, None)
+            pixels, neighbours = ends if towards % 2 == 0 else ends[::-1]
+            if towards < 2:
+                said, heard = said[:, pixels], messages[towards, :, neighbours]
+            else:
+                said, heard = said[..., pixels], messages[towards, ..., neighbours]
+            heard += (said - heard) / 2  # half of the step: undamped messages may oscillate
     chosen: NDArray[np.int64] = (own + messages.sum(axis=0)).argmin(axis=0)
     return chosen
 
 
-_ALL, _FIRST, _LAST = slice(None), slice(None, -1), slice(1, None)
-_NEIGHBOUR_SLICES = (
-    ((_ALL, _FIRST, _ALL), (_ALL, _LAST, _ALL)),
-    ((_ALL, _LAST, _ALL), (_ALL, _FIRST, _ALL)),
-    ((_ALL, _ALL, _FIRST), (_ALL, _ALL, _LAST)),
-    ((_ALL, _ALL, _LAST), (_ALL, _ALL, _FIRST)),
-)
-
-
 def _pass_message(costs: Array, price: np.float32) -> Array:
-    """Cheapest cost of each label at the neighbour, given the costs here: min over k of costs(k) +
-    price(|l - k|).
-    """
+    """Cheapest cost of each label l at the neighbour: min over k of ``costs(k) + price(|l - k|)``."""
     cheapest = costs.min(axis=0)
     # truncated: from here on a jump costs the same, however far
     found = np.minimum(costs, cheapest + MAX_LABEL_STEP * price)
@@ -97,8 +85,6 @@ def _pass_message(costs: Array, price: np.float32) -> Array:
     relative: Array = found - cheapest
     return relative
 
-
-FocusMeasure = Callable[[Array], Array]
 
 TYPICAL_QUANTILE = 0.9  # quantile of the best sharpness: what a textured pixel has
 SMOOTHNESS = 0.1
@@ -198,7 +184,7 @@ def compute_image_energy(pictures: Array) -> Array:
 
 def estimate_depth_from_focus(
     stack: FocalStack,
-    measure: FocusMeasure = compute_image_energy,
+    measure: Callable[[Array], Array] = compute_image_energy,
     window_px: float = WINDOW_PX,
     smoothness: float = SMOOTHNESS,
 ) -> NDArray[np.int64]:

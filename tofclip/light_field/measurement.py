@@ -39,10 +39,7 @@ class CameraSetup:
             object.__setattr__(self, "encoder", EvenAngleLineCamera.name)
 
     def camera(self, image_shape: tuple[int, int], views: NDArray[np.float64]) -> LightFieldCamera:
-        """Build the camera; the same setup builds the same one again.
-
-        `image_shape`: rows and columns of a view's picture; `views` (views, 2): view steps (v, u).
-        """
+        """Build the camera of views (v, u), (views, 2); the same setup builds the same one again."""
         if self.encoder not in CAMERAS:
             raise InputError(f"unknown encoder '{self.encoder}'; take one of {', '.join(CAMERAS)}")
         return CAMERAS[self.encoder](
@@ -94,10 +91,7 @@ class ClipMeasurement(Storable):
 
 
 def measure(light_field: LightField, setup: CameraSetup) -> ClipMeasurement:
-    """Encode the true views, each by its own A_k: no model of refocusing takes part.
-
-    `light_field`: pictures (views, rows, columns). Returns without noise.
-    """
+    """Encode the true views, each by its own A_k and without noise: no model of refocusing takes part."""
     shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])
     camera = setup.camera(shape, light_field.views)
     measurements = camera.light_field_model()(light_field.pictures[list(camera.used_views)])
@@ -107,9 +101,8 @@ def measure(light_field: LightField, setup: CameraSetup) -> ClipMeasurement:
 def corrupt_measurement(
     measurement: ClipMeasurement, photons: float | None, bad_fraction: float
 ) -> ClipMeasurement:
-    """Add photon noise, then set a fraction of all measurements to 0 or to the largest, at random.
-
-    `photons`: photons of the largest measurement; None: no noise; `bad_fraction`: between 0 and 1.
+    """Add the noise of so many photons of the largest measurement, None: no noise; then set a fraction
+    of all measurements to 0 or to the largest, at random.
     """
     if not 0 <= bad_fraction <= 1:
         raise InputError(
@@ -122,9 +115,8 @@ def corrupt_measurement(
     largest = measurements.max()
     per_unit = 0.0 if photons is None else float(photons / largest)
     if photons is not None:
-        measurements = (random.poisson(np.maximum(measurements, 0) * per_unit) / per_unit).astype(
-            np.float32
-        )
+        counted = random.poisson(np.maximum(measurements, 0) * per_unit)
+        measurements = (counted / per_unit).astype(np.float32)
     bad = random.permutation(measurements.size)[: round(bad_fraction * measurements.size)]
     measurements[bad] = random.choice(np.array([0, largest], np.float32), bad.size)
     return replace(measurement, values=measurements, photons_per_unit=per_unit)

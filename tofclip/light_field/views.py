@@ -43,14 +43,11 @@ class LightField(Storable):
     views: NDArray[np.float64] = field(metadata=stored_array("", "view", "vu"))
 
     def __post_init__(self) -> None:
-        if self.pictures.ndim != 3:
-            raise ShapeError(
-                "the pictures of a light field", "(views, rows, columns)", self.pictures.shape
-            )
-        if self.views.shape != (len(self.pictures), 2):
-            raise ShapeError(
-                "the views of a light field", (len(self.pictures), 2), self.views.shape
-            )
+        shape, expected = self.pictures.shape, (len(self.pictures), 2)
+        if len(shape) != 3:
+            raise ShapeError("the pictures of a light field", "(views, rows, columns)", shape)
+        if self.views.shape != expected:
+            raise ShapeError("the views of a light field", expected, self.views.shape)
         if not np.all(np.isfinite(self.pictures)):
             raise InputError("a light field must not hold NaN or infinity")
         if np.ptp(self.pictures) == 0:
@@ -91,14 +88,11 @@ MIN_WEIGHT = 0.05  # of a surface's own pixels around a point; below, the point 
 
 
 def make_view_warp(labels: Labels, shears: FloatArray, views: list[View]) -> SparseMatrix:
-    """Return the map from the reference view's picture to the pictures of all views.
+    """Return the map from the reference view's picture, (rows, columns), to the pictures of all views.
 
-    A view's pixel takes the light of the reference pixels that its own surface has there, ``h(x - s
-    u, y - s v)`` with the shear s of what the view sees, between pixels linearly.
-
-    `labels` (rows, columns): which of the shears each pixel of the reference view has; `shears`
-    (depths,): pixels per view step, ascending: the farther, the larger; `views`: (v, u) from the
-    reference view. Returns (rows, columns) pictures to (views, rows, columns).
+    `labels` (rows, columns) say which of the ascending shears each pixel of the reference view has. A
+    view's pixel takes the light of the reference pixels that its own surface has there, ``h(x - s u, y
+    - s v)`` with the shear s of what the view sees, between pixels linearly.
     """
     if labels.ndim != 2 or min(labels.shape) < 2:
         raise ShapeError("a map of depths", "(rows, columns), two or more of either", labels.shape)
@@ -120,11 +114,7 @@ def make_view_warp(labels: Labels, shears: FloatArray, views: list[View]) -> Spa
 
 
 def find_view_labels(labels: Labels, shears: FloatArray, view: View) -> Labels:
-    """Return which shear each pixel of another view has, (rows, columns).
-
-    `labels, shears`: as for `make_view_warp`; `view`: (v, u) from the reference view. Returns
-    (rows, columns).
-    """
+    """Return which shear each pixel of another view has, (rows, columns)."""
     seen = np.full(labels.shape, -1, np.int64)
     for label in np.unique(labels)[::-1]:  # nearer surfaces are painted over farther ones
         shift = (shears[label] * view[0], shears[label] * view[1])

@@ -48,7 +48,7 @@ from tofclip.solvers import (
     ignore_progress,
     relative_residual,
 )
-from tofclip.solvers.fista import frames_per_block
+from tofclip.solvers.methods import frames_per_block
 from tofclip.storage import Scalar, collect_provenance
 from tofclip.threads import split_blocks
 

@@ -14,23 +14,21 @@ from numpy.typing import NDArray
 from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator
-from tofclip.solvers.fista import Progress, ProximalMethod, ignore_progress
+from tofclip.solvers.fista import ProximalMethod
+from tofclip.solvers.methods import Progress, ignore_progress
 from tofclip.threads import map_parallel
 
-INITIAL_WEIGHT = 10**-1.75
-"""Relative weight that is tried first."""
+INITIAL_WEIGHT = 10**-1.75  # relative weight that is tried first
 
-WEIGHT_RATIO = 10**0.375
-"""Between one trial and the next."""
+WEIGHT_RATIO = 10**0.375  # between one trial and the next
 
-MAX_TRIALS = 10
-"""Maximum number: from the first weight this reaches three decades up or down."""
+MAX_TRIALS = 10  # maximum number: from the first weight this reaches three decades up or down
 
+# Parts that the measurements are assigned to; each is predicted from the other seven.
 FOLD_COUNT = 8
-"""Parts that the measurements are assigned to; each is predicted from the other seven."""
 
+# Runs of measurements of which one fold alone is a fair sample: the others are not tried.
 SINGLE_FOLD_RUNS = 4096
-"""Runs of measurements of which one fold alone is a fair sample: the others are not tried."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +41,8 @@ class WeightChoice:
     errors: NDArray[np.float64]
 
 
+# Recoveries that a choice of a weight takes at most, and that it reports when it is done.
 MAX_WEIGHT_WORK = MAX_TRIALS * FOLD_COUNT
-"""Recoveries that a choice of a weight takes at most, and that it reports when it is done."""
 
 
 def choose_weight(
@@ -66,13 +64,11 @@ def choose_weight(
     the first weight until the minimum is bracketed; a parabola in the weight's logarithm refines
     it.
 
-    `method`: its own weight does not matter; `operator`: pictures (rows, columns) to measurements
-    (measurements,); `measurements` (measurements,): of one picture; `run`: consecutive measurements
-    that are left out together: neighbours on a detector hardly differ, so that single ones would be
-    predicted by their neighbours' errors; `seed`: of the assignment; `progress`: called with the
-    number of recoveries just done, of `MAX_WEIGHT_WORK`; those that are not needed count as done at
-    the end; `first`: weight that is tried first; `max_folds`: of the eight, that are tried; fewer
-    take less time and know the error less well.
+    `measurements` (measurements,) are of one picture; `run` consecutive ones are left out together:
+    neighbours on a detector hardly differ, so that single ones would be predicted by their neighbours'
+    errors. The method's own weight does not matter. `progress` is called with the number of recoveries
+    just done, of `MAX_WEIGHT_WORK`; those that are not needed count as done at the end. With fewer than
+    eight folds it takes less time and knows the error less well.
     """
     require_numpy("the choice of a prior's weight", measurements)
     held = assign_folds(measurements.size, run, seed)[:, :max_folds]

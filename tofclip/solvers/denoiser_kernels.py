@@ -132,20 +132,18 @@ def _wiener_gain(centred, variance):
 
 
 @fast_njit
-def _average_members(group, mean):
+def _subtract_mean(alike, seen, mean):
+    """Take the mean of the members of one group off those of both."""
     mean[:] = 0
-    for member in range(group.shape[0]):
+    for member in range(alike.shape[0]):
         for pixel in range(mean.size):
-            mean[pixel] += group[member, pixel]
+            mean[pixel] += alike[member, pixel]
     for pixel in range(mean.size):
-        mean[pixel] /= np.float32(group.shape[0])
-
-
-@fast_njit
-def _subtract_mean(group, mean):
-    for member in range(group.shape[0]):
+        mean[pixel] /= np.float32(alike.shape[0])
+    for member in range(alike.shape[0]):
         for pixel in range(mean.size):
-            group[member, pixel] -= mean[pixel]
+            alike[member, pixel] -= mean[pixel]
+            seen[member, pixel] -= mean[pixel]
 
 
 @fast_njit
@@ -164,13 +162,8 @@ def filter_patch_groups(noisy, pilot, deviation, settings):
     """Filter groups of similar patches and average where they overlap, steadier groups counting
     more.
 
-    `settings` is (side of a patch, stride, reach of the search, patches in a group); pictures are
-    float32.
-
-    `noisy` (rows, columns); `pilot` (rows, columns): A first estimate, in which similar patches are
-    looked for and the filter's gain is found; `deviation`: standard deviation of the noise, in the
-    pictures' unit; `settings`: side of a patch and stride in pixels, reach of the search in pixels,
-    patches in a group. Returns (rows, columns): weighted average of the overlapping patches.
+    `settings` are the side of a patch and the stride in pixels, the reach of the search in pixels, and
+    the patches in a group. Groups and the filter's gain are found in the pilot. Pictures are float32.
     """
     patch, stride, reach, wanted = settings
     rows, columns = noisy.shape
@@ -193,9 +186,7 @@ def filter_patch_groups(noisy, pilot, deviation, settings):
             _gather_patches(noisy, corners, patch, seen)
             # The gain is found on the pilot and applied to the noisy patches: their own noise would
             # look like signal.
-            _average_members(alike, mean)
-            _subtract_mean(alike, mean)
-            _subtract_mean(seen, mean)
+            _subtract_mean(alike, seen, mean)
             gain = _wiener_gain(alike, variance)
             clean = np.dot(seen, gain)
             # The trace is the number of unknowns that the filter lets through, beside the mean; the

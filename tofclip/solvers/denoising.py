@@ -17,7 +17,8 @@ from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm, Mask
-from tofclip.solvers.fista import Method, Progress, ProximalMethod, Result, ignore_progress
+from tofclip.solvers.fista import ProximalMethod
+from tofclip.solvers.methods import Method, Progress, Result, ignore_progress
 from tofclip.threads import limit_blas_threads
 
 Picture = NDArray[Any]

@@ -29,7 +29,7 @@ from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, SparseMatrix
 from tofclip.operators.sparse import Tiles
 from tofclip.solvers.data_terms import Mask
-from tofclip.solvers.fista import (
+from tofclip.solvers.methods import (
     Blocks,
     Method,
     Progress,

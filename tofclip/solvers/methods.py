@@ -1,0 +1,462 @@
+"""What every method that turns measurements into pictures has in common: its interface, its result, the
+loop around an iterative solver, and the blocks of frames that it works on.
+
+A method holds its settings and has one `recover`. It takes NumPy arrays; those that are `portable`
+take the arrays of any library that follows the array API standard as well, and return the same kind,
+on the same device. Memory beyond the result is bounded: frames are worked on in `Blocks`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import prod
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.arrays import Array, as_type, is_numpy, namespace, to_numpy, zeros
+from tofclip.errors import InputError, ShapeError
+from tofclip.operators import LinearOperator
+from tofclip.solvers.data_terms import Mask
+from tofclip.threads import LANES, run_blocks, split_blocks
+
+Progress = Callable[[int], None]
+"""Called with the number of frame iterations just done; may raise to interrupt."""
+
+
+def ignore_progress(_: int) -> None:
+    """Report nothing."""
+
+
+GAP_INTERVAL = 10  # iterations between looks at the duality gap: each costs half an iteration
+# Of a block's energy: what is left of it beyond is noise, since no model of a camera misses as much.
+NOISE_FRACTION = 0.1
+# Of the objective. Between iterations 30 and 40 it falls by 0.9 to 3.6 % in shots whose thin bars have
+# a rim of false points by then, and by 0.1 to 0.2 % in dark ones, in which more iterations only follow
+# the noise.
+MIN_FURTHER_FALL = 6e-3
+
+
+@dataclass(frozen=True)
+class StoppingRule:
+    """When a block of frames is done.
+
+    Parameters
+    ----------
+    iterations : int
+        Maximum number.
+    tolerance : float
+        Stop as soon as the block's objective changes by less than this fraction in an iteration in
+        which no frame's step was refused. 0 runs all iterations.
+    gap : float
+        Stop, too, as soon as every frame's duality gap is at most this fraction of its objective,
+        for solvers that know one. It is looked at every `GAP_INTERVAL` iterations.
+    further : int
+        Iterations that may follow, in steps of `GAP_INTERVAL`, as long as the last step took more
+        than `MIN_FURTHER_FALL` off the block's objective.
+    noise_fall : float
+        Stop, too, where more than `NOISE_FRACTION` of the objective at zero is left and an iteration
+        takes less than this fraction off: what it fits is noise. 0: never.
+    """
+
+    iterations: int
+    tolerance: float = 0.0
+    gap: float = 0.0
+    further: int = 0
+    noise_fall: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise InputError(f"at least one iteration is needed, got {self.iterations}")
+        for name in ("tolerance", "gap", "noise_fall"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(f"{name} must be finite and not negative, got {value}")
+        if self.further < 0:
+            raise InputError(f"further iterations must not be negative, got {self.further}")
+
+    def follows_noise(self, objective: Sequence[Array]) -> bool:
+        """Say whether a block of little more than noise has come as near to it as it should.
+
+        Parameters
+        ----------
+        objective : sequence of scalars
+            Of the block before the first and after every iteration.
+        """
+        before, last = objective[-2], objective[-1]
+        noisy = last > NOISE_FRACTION * objective[0]
+        return bool(noisy & (before - last < self.noise_fall * last))
+
+    def continues(self, objective: Sequence[Array]) -> bool:
+        """Say whether a block goes on after its iterations.
+
+        Parameters
+        ----------
+        objective : sequence of scalars
+            Of the block before the first and after every iteration.
+        """
+        done = len(objective) - 1
+        if not (done >= GAP_INTERVAL and self.iterations <= done < self.iterations + self.further):
+            return False
+        fall = objective[-1 - GAP_INTERVAL] - objective[-1]
+        return bool(fall > MIN_FURTHER_FALL * objective[-1])
+
+
+class IterativeSolver(Protocol):
+    """What the loop needs to know of a solver."""
+
+    objective: Array
+    rejected: Array
+
+    def step(self) -> None:
+        """Advance by one iteration."""
+        ...
+
+    def duality_gap(self) -> Array | None:
+        """Return how far each frame's objective is above the least one at most, where that is
+        known.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class IterationHistory:
+    """What a run left behind.
+
+    Parameters
+    ----------
+    objective : (iterations + 1,) array
+        Sum over the frames before the first and after every iteration.
+    converged : bool
+        Whether the tolerance, the gap or the noise ended it.
+    gap : float
+        How far the last objective is above the least one at most; NaN where that is not known.
+    """
+
+    objective: NDArray[np.float64]
+    converged: bool
+    gap: float = float("nan")
+
+    @property
+    def iterations(self) -> int:
+        """Iterations done."""
+        return self.objective.size - 1
+
+
+def iterate(
+    solver: IterativeSolver, stopping: StoppingRule, progress: Progress, frames: int
+) -> IterationHistory:
+    """Run `solver` until `stopping` says that it is done.
+
+    A device is waited for once in an iteration if there is a tolerance or `noise_fall`, and not at all
+    if there is neither.
+
+    Parameters
+    ----------
+    solver : IterativeSolver
+        Advanced in place.
+    stopping : StoppingRule
+        Maximum number of iterations, what may follow them, and the tolerance.
+    progress : callable
+        Called with the number of frame iterations just done; those that are saved are reported too.
+    frames : int
+        Number of frames that an iteration counts for.
+
+    Returns
+    -------
+    IterationHistory
+        Objective of the whole block before the first iteration and after each.
+    """
+    xp = namespace(solver.objective)
+    # Sums stay where the arrays are: reading one back from a GPU would make every iteration wait.
+    objective = [xp.sum(solver.objective)]
+    converged, gap = False, None
+    done, limit, most = 0, stopping.iterations, stopping.iterations + stopping.further
+    while done < limit:
+        done += 1
+        solver.step()
+        objective.append(xp.sum(solver.objective))
+        if stopping.tolerance > 0:
+            # a refused step changes nothing, which does not mean that the block has converged
+            little = objective[-2] - objective[-1] < stopping.tolerance * objective[-1]
+            converged = bool(little & ~xp.any(solver.rejected))
+        if stopping.noise_fall > 0:
+            converged |= stopping.follows_noise(objective)
+        if stopping.gap > 0 and (converged or done == limit or done % GAP_INTERVAL == 0):
+            gap = solver.duality_gap()
+            if gap is not None:
+                converged |= bool(xp.all(gap <= stopping.gap * solver.objective))
+        if converged:
+            # The iterations that were saved count as done, so that a progress bar ends at its end.
+            progress(frames * (most - done + 1))
+            break
+        progress(frames)
+        if done == limit:
+            if stopping.continues(objective):
+                limit = min(done + GAP_INTERVAL, most)
+            elif done < most:
+                progress(frames * (most - done))
+    excess = float("nan") if gap is None else float(xp.sum(gap))
+    return IterationHistory(to_numpy(xp.stack(objective)), converged, excess)
+
+
+@dataclass(frozen=True)
+class Result:
+    """Recovered pictures and how they came about.
+
+    Parameters
+    ----------
+    frames : (frames, rows, columns) array
+        Where the measurements were.
+    iterations : int
+        Of the block that took most; 0 for direct methods.
+    objective : (iterations + 1,) array
+        Sum over all frames; blocks that stopped early count with their last value. Empty for direct
+        methods.
+    stop_reason : str
+        ``"converged"``, ``"iteration limit"`` or ``"direct method"``.
+    setup_seconds : float
+        Time spent on what depends on the operator only and on loading compiled loops, not on the
+        measurements.
+    duality_gap : float
+        The last objective is above the least one by at most this fraction of it; NaN where that is
+        not known.
+    """
+
+    frames: Array
+    iterations: int = 0
+    objective: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    stop_reason: str = "direct method"
+    setup_seconds: float = 0.0
+    duality_gap: float = float("nan")
+
+    @classmethod
+    def from_blocks(
+        cls, frames: Array, histories: list[IterationHistory], setup_seconds: float = 0.0
+    ) -> Result:
+        """Join the histories of all blocks.
+
+        Parameters
+        ----------
+        frames : (frames, rows, columns) array
+            Results of all blocks.
+        histories : list of IterationHistory
+            One for each block.
+        setup_seconds : float
+            Time before the first iteration.
+
+        Returns
+        -------
+        Result
+            Objectives are added up; a block that ended early counts with its last one.
+        """
+        longest = max(history.iterations for history in histories)
+        total = np.zeros(longest + 1)
+        for history in histories:
+            # a block that ended early keeps its last objective
+            kept_on = np.full(longest - history.iterations, history.objective[-1])
+            total += np.concatenate([history.objective, kept_on])
+        converged = all(history.converged for history in histories)
+        gap = sum(history.gap for history in histories)
+        return cls(
+            frames,
+            longest,
+            total,
+            "converged" if converged else "iteration limit",
+            setup_seconds,
+            gap / total[-1] if total[-1] > 0 else gap,
+        )
+
+
+class Method(Protocol):
+    """Anything that recovers pictures from measurements.
+
+    Attributes
+    ----------
+    name : str
+    portable : bool
+        Whether arrays of any library are taken, or NumPy's only.
+    """
+
+    name: str
+    portable: bool = False
+
+    @abstractmethod
+    def recover(
+        self,
+        operator: LinearOperator,
+        measurements: Array,
+        valid: Mask = None,
+        progress: Progress = ignore_progress,
+    ) -> Result:
+        """Recover one picture per column of `measurements`.
+
+        Parameters
+        ----------
+        operator : LinearOperator
+            Pictures (rows, columns) to measurements (measurements,).
+        measurements : (measurements, frames) array
+        valid : (measurements, frames) bool array, optional
+            False where a measurement must not be trusted: it is left out.
+        progress : callable
+            Called with the number of frame iterations just done.
+
+        Returns
+        -------
+        Result
+            Frames (frames, rows, columns) and how they came about.
+
+        Raises
+        ------
+        ShapeError
+            `measurements` or `valid` do not fit the operator.
+        InputError
+            A measurement is NaN or infinite, or the arrays are not NumPy's and the method is not
+            portable.
+        """
+
+    def work(self, frames: int) -> int:
+        """Return how many frame iterations `recover` reports at most.
+
+        Parameters
+        ----------
+        frames : int
+        """
+        return frames
+
+
+def relative_residual(
+    operator: LinearOperator, frames: Array, measurements: Array, valid: Mask = None
+) -> float:
+    """``|A h - f| / |f|`` over all good measurements of all frames.
+
+    Parameters
+    ----------
+    operator : LinearOperator
+    frames : (frames, rows, columns) array
+    measurements : (measurements, frames) array
+    valid : (measurements, frames) bool array, optional
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    InputError
+        Every valid measurement is zero.
+    """
+    # Block by block: predictions of all frames at once would double the memory.
+    misfit = energy = 0.0
+    xp = namespace(frames, measurements)
+    for piece in split_blocks(frames.shape[0], frames_per_block(operator, measurements)):
+        seen = measurements[:, piece]
+        mask = 1.0 if valid is None else xp.astype(valid[:, piece], seen.dtype)
+        residual = (operator(xp.moveaxis(frames[piece, ...], 0, -1)) - seen) * mask
+        misfit += float(xp.sum(residual**2, dtype=xp.float64))
+        energy += float(xp.sum((seen * mask) ** 2, dtype=xp.float64))
+    if energy == 0:
+        raise InputError("every valid measurement is zero; there is nothing to compare with")
+    return float(np.sqrt(misfit / energy))
+
+
+def validate_measurements(operator: LinearOperator, measurements: Array, valid: Mask) -> Array:
+    """Return (measurements, frames) values contiguous and in the operator's type, refusing wrong
+    shapes, NaN and infinity.
+    """
+    xp = namespace(measurements) if valid is None else namespace(measurements, valid)
+    if measurements.ndim != 2 or measurements.shape[:1] != operator.shape_out:
+        raise ShapeError(
+            "measurements", f"({operator.shape_out[0]}, frames)", tuple(measurements.shape)
+        )
+    if valid is not None and valid.shape != measurements.shape:
+        raise ShapeError(
+            "the mask of valid measurements", tuple(measurements.shape), tuple(valid.shape)
+        )
+    if not xp.all(xp.isfinite(measurements)):
+        raise InputError("measurements must not hold NaN or infinity; mark bad ones in `valid`")
+    return as_type(measurements, operator.dtype)
+
+
+WORKING_BYTES = 1 << 31  # what a solver may take for the frames that it works on at once
+# Arrays of the frames' size that total variation, which needs most, has at once: solution, dual,
+# gradient and their temporaries.
+WORKING_PICTURES = 16
+
+
+def frames_per_block(operator: LinearOperator, measurements: Array) -> int:
+    """`LANES` for NumPy's (measurements, frames), or one if it is alone; for others as many as
+    `WORKING_BYTES` hold.
+    """
+    if is_numpy(measurements):
+        return LANES if measurements.shape[1] > 1 else 1
+    picture = prod(operator.shape_in) * operator.dtype.itemsize
+    return max(1, WORKING_BYTES // (WORKING_PICTURES * picture))
+
+
+class Blocks:
+    """The frames of (measurements, frames) values, cut into blocks that are worked on together, and
+    their pictures, `frames`.
+
+    NumPy's blocks stay in cache, and threads share them. All have one width, because compiled loops
+    unroll it, and so no frame's result depends on its neighbours; zeros fill the last one. Other
+    libraries' blocks fill the memory of their device, one after the other.
+    """
+
+    def __init__(self, operator: LinearOperator, measurements: Array) -> None:
+        self._compiled = is_numpy(measurements)
+        self.size = frames_per_block(operator, measurements)
+        number = measurements.shape[1]
+        shape = number, *operator.shape_in
+        # not zeros: NumPy asks for large pages of memory for empty arrays only
+        self.frames = (
+            np.empty(shape, operator.dtype) if self._compiled else zeros(shape, measurements)
+        )
+        self._order = np.arange(number)
+
+    def leave_out(self, dark: NDArray[np.bool_]) -> None:
+        """Make the frames that are dark zero; pieces count the others only."""
+        if self._compiled:
+            self.frames[dark] = 0
+        self._order = np.flatnonzero(~dark)
+
+    def for_each(self, work: Callable[[slice], None]) -> None:
+        """Call `work` on every piece; the first exception is raised."""
+        if self._compiled:
+            run_blocks(work, self._order.size, self.size)
+        else:
+            for piece in split_blocks(self._order.size, self.size):
+                work(piece)
+
+    def take(self, values: Array, piece: slice) -> Array:
+        """Copy a piece's columns of (n, frames) values."""
+        if not self._compiled:
+            return namespace(values).concat([values[:, run] for run in self._runs(piece)], axis=1)
+        chosen = self._order[piece]
+        block = np.zeros((values.shape[0], self.size), values.dtype)
+        block[:, : chosen.size] = values[:, chosen]
+        return block
+
+    def write(self, block: Array, piece: slice) -> None:
+        """Put a piece's (..., frames) pictures where they belong."""
+        done = 0
+        for run in self._runs(piece):
+            lanes = slice(done, done + run.stop - run.start)
+            done = lanes.stop
+            if self._compiled:
+                from tofclip.solvers.kernels import copy_lanes_to_frames
+
+                size = run.stop - run.start
+                flat = block.reshape(-1, block.shape[-1])
+                copy_lanes_to_frames(flat, lanes.start, self.frames[run].reshape(size, -1))
+            else:
+                self.frames[run, ...] = namespace(block).moveaxis(block[..., lanes], -1, 0)
+
+    def _runs(self, piece: slice) -> list[slice]:
+        """Neighbouring frames of a piece, which a slice can name on any device."""
+        chosen = self._order[piece]
+        runs = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
+        return [slice(int(run[0]), int(run[-1]) + 1) for run in runs]
