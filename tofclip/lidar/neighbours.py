@@ -18,14 +18,12 @@ recorded shot's geometry and one by another forward model, with total variation 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.compiling import ONE, compile_as_part, compile_loop, inlined
-from tofclip.lidar.significance import find_quantile_value
+from tofclip.compiling import compile_as_part, compile_loop, inlined
 from tofclip.threads import run_blocks
 from tofclip.units import MAD_TO_SIGMA
 from tofclip.vectors import (
@@ -43,38 +41,27 @@ from tofclip.vectors import (
 
 plane_part = compile_as_part(fastmath=True, _nrt=False)
 
+# neighbours that share a plane, and their distance: errors of adjacent pixels are much alike
 REACH_PX, STRIDE_PX = 8, 2
-"""Neighbours that share a plane, and their distance: errors of adjacent pixels are much alike."""
-
+# distance of the pixels whose returns have planes of their own; those between take over what is known
+# of one within a plane's reach on the same surface
 PLANE_STEP_PX = 4
-"""Distance of the pixels whose returns have planes of their own; those between take over what is
-known of one within a plane's reach on the same surface."""
-
+# variance of the recovery's errors, relative to what a plane of this reach leaves of it
 PLANE_SHARE = 1.5
-"""Variance of the recovery's errors, relative to what a plane of this reach leaves of it."""
-
-FIT_ROUNDS = 4
-MIN_NEIGHBOURS = 8
-OUTLIER_DEVIATIONS = 3.0
-MIN_KNOWN = 20
-"""Returns with enough neighbours that say how far the others are off."""
-
+FIT_ROUNDS, MIN_NEIGHBOURS, OUTLIER_DEVIATIONS = 4, 8, 3.0
+MIN_KNOWN = 20  # returns with enough neighbours that say how far the others are off
 MEDIAN_PRECISION = 1e-4
-RETURNS_PER_BLOCK = 2048
-"""About 3 ms of planes: less than that is done before other threads have begun."""
+INTERPOLATED_LOOKS = 5  # for a median, before intervals are halved: most often that is enough
+RETURNS_PER_BLOCK = 2048  # about 3 ms of planes: less is done before other threads have begun
 
 MARGIN = REACH_PX // STRIDE_PX
-SIDE = 2 * MARGIN + 1
-"""Places for neighbours in a row of a window, and rows of a window."""
+SIDE = 2 * MARGIN + 1  # places for neighbours in a row of a window, and rows of a window
+NEIGHBOURS = 96  # room for the SIDE^2 = 81 neighbours, in whole vectors
+FAR = 1e20  # nearness of a neighbour that is not there, 1/m
 
-NEIGHBOURS = 96
-"""Room for the SIDE^2 = 81 neighbours, in whole vectors."""
-
-FAR = 1e20
-"""Nearness of a neighbour that is not there, 1/m."""
-
-INTERPOLATED_LOOKS = 5
-"""At residuals, for their median, before intervals are halved: most often that is enough."""
+# The rows of a window, (5, NEIGHBOURS): columns and rows away, by how much further off each neighbour
+# is, m, whether it is used, 1 or 0, and how far from the plane, m.
+RIGHT, DOWN, OFF, USED, RESIDUAL = range(5)
 
 
 def add_recovery_error(
@@ -85,19 +72,19 @@ def add_recovery_error(
     image_shape: tuple[int, int],
     gate: float,
 ) -> FloatArray:
-    """Return the deviation of ranges with the recovery's own errors.
+    """Return one standard deviation of ranges, m, with the recovery's own errors.
 
-    `sigma` (n,): deviation that the noise in each pixel's trace explains, m; `distance` (n,):
-    range, m; `along_axis` (n,): depth along the optical axis for a range of 1: the direction's z;
-    `pixel` (n,): number of the pixel, not decreasing; `gate`: A neighbour that is further away than
-    this, m, is on another surface. Returns (n,): one standard deviation, m. Returns with few
-    neighbours get what is usual for the others.
+    `sigma` (n,): deviation that the noise in each pixel's trace explains, m; `distance` (n,): range, m;
+    `along_axis` (n,): depth along the optical axis for a range of 1; `pixel` (n,): number of the pixel,
+    not decreasing. A neighbour that is further away than `gate`, m, is on another surface. Returns with
+    few neighbours get what is usual for the others.
     """
     total = np.array(sigma, dtype=np.float64)
     if pixel.size == 0:
         return total
-    starts = np.empty(image_shape[0] * image_shape[1] + 1, np.int64)
-    most = count_returns(pixel, starts)
+    rows, columns = image_shape
+    each = np.bincount(pixel, minlength=rows * columns)  # returns of each pixel
+    starts, most = np.append(0, np.cumsum(each)), int(each.max())
     nearness = 1 / (distance * along_axis)
     metres = distance / nearness
     layers = layer_returns(nearness, pixel, starts, image_shape)
@@ -105,46 +92,28 @@ def add_recovery_error(
 
     def fit_planes(chosen: NDArray[np.int64]) -> None:
         def fit(piece: slice) -> None:
-            scatter_about_planes(
-                nearness,
-                metres,
-                pixel,
-                image_shape[1],
-                layers,
-                gate,
-                chosen[piece],
-                allocate_window(),
-                scatter,
-            )
+            returns = nearness, metres, pixel
+            window = allocate_window()
+            scatter_about_planes(*returns, columns, layers, gate, chosen[piece], window, scatter)
 
         run_blocks(fit, chosen.size, RETURNS_PER_BLOCK)
 
     # neighbours have nearly the same returns around them: one plane in sixteen does
-    fit_planes(np.flatnonzero(_mark_own_planes(image_shape).take(pixel)))
+    own = np.zeros(image_shape, bool)
+    own[::PLANE_STEP_PX, ::PLANE_STEP_PX] = True
+    fit_planes(np.flatnonzero(own.ravel().take(pixel)))
     # zeros, since numbers too small to be normal take a hundred times as long
-    cell = np.zeros((3, _fill_up(PLANE_STEP_PX**2 * most)), np.float32)
+    cell = np.zeros((3, -(-(PLANE_STEP_PX**2) * most // LENGTH) * LENGTH), np.float32)
     borrow_scatter(nearness, metres, starts, image_shape, gate, cell, scatter)
     fit_planes(np.flatnonzero(np.isnan(scatter)))
-    ratios = np.empty(total.size, np.float32)
-    known = widen_deviations(scatter, total, ratios)
-    if known < MIN_KNOWN:
-        return np.array(sigma, dtype=np.float64)
-    if known < total.size:
-        total[scatter < 0] *= find_quantile_value(ratios[:known], 0.5)
+    known = scatter >= 0
+    if np.count_nonzero(known) < MIN_KNOWN:
+        return total
+    noise = total[known]
+    total[known] = np.sqrt(noise**2 + PLANE_SHARE * np.maximum(scatter[known] ** 2 - noise**2, 0.0))
+    if noise.size < total.size:
+        total[~known] *= np.median(total[known] / noise)
     return total
-
-
-def _fill_up(number: int) -> int:
-    """The least number of whole vectors' lanes that is not smaller."""
-    return -(-number // LENGTH) * LENGTH
-
-
-@lru_cache(maxsize=4)
-def _mark_own_planes(image_shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which pixels' returns have planes of their own."""
-    y, x = np.indices(image_shape).reshape(2, -1)
-    marked: NDArray[np.bool_] = (y % PLANE_STEP_PX == 0) & (x % PLANE_STEP_PX == 0)
-    return marked
 
 
 def layer_returns(
@@ -153,78 +122,42 @@ def layer_returns(
     starts: NDArray[np.int64],
     image_shape: tuple[int, int],
 ) -> NDArray[np.float32]:
-    """Lay out the returns so that those at the neighbours' distance lie side by side.
-
-    `nearness` (n,): inverse depth along the optical axis, 1/m; `pixel` (n,): not decreasing;
-    `starts` (pixels + 1,): first return of each pixel. Returns (most returns of a pixel, 4, rows,
-    columns): `nearness` of each pixel's first, second, ... returns, `FAR` where there is none; of
-    pixels of even rows and columns, even rows and odd columns, and so on, within a margin.
+    """Lay out the returns so that those at the neighbours' distance lie side by side: (most returns of a
+    pixel, 4, rows, columns) of `nearness` of each pixel's first, second, ... returns, `FAR` where there is
+    none; of pixels of even rows and columns, even rows and odd columns, and so on, within a margin.
     """
     rows, columns = (-(-size // STRIDE_PX) + 2 * MARGIN for size in image_shape)
     shape = (int(np.diff(starts).max()), STRIDE_PX**2, rows, columns + LENGTH - SIDE)
     layers = np.full(shape, FAR, np.float32)
-    fill_layers(nearness, pixel, starts, image_shape[1], layers)
+    y, x = np.divmod(pixel.astype(np.int32), np.int32(image_shape[1]))
+    rank = np.arange(pixel.size) - starts.take(pixel)
+    part = y % STRIDE_PX * STRIDE_PX + x % STRIDE_PX
+    layers[rank, part, y // STRIDE_PX + MARGIN, x // STRIDE_PX + MARGIN] = nearness
     return layers
 
 
 def allocate_window() -> NDArray[np.float32]:
-    """Return the memory of `scatter_about_planes`: columns and rows away, how much further off, whether
-    it is used, and how far from the plane, in m, of each neighbour.
-    """
+    """Return the memory of `scatter_about_planes`; its first two rows stay as they are."""
     window = np.zeros((5, NEIGHBOURS), np.float32)
     away = STRIDE_PX * np.arange(-MARGIN, MARGIN + 1)
-    window[0, : SIDE**2], window[1, : SIDE**2] = np.tile(away, SIDE), np.repeat(away, SIDE)
-    window[2] = FAR
+    window[RIGHT, : SIDE**2], window[DOWN, : SIDE**2] = np.tile(away, SIDE), np.repeat(away, SIDE)
+    window[OFF] = FAR
     return window
-
-
-@compile_loop()
-def count_returns(pixel, starts):
-    """List the first return of each pixel; return how many the pixel has that has most.
-
-    `pixel` (n,): not decreasing; `starts` (pixels + 1,): overwritten.
-    """
-    most = number = np.uintp(0)
-    for p in range(starts.size):
-        starts[p] = number
-        while number < np.uintp(pixel.size) and pixel[number] == p:
-            number += ONE
-        most = max(most, number - np.uintp(starts[p]))
-    return np.int64(most)
-
-
-@compile_loop()
-def fill_layers(nearness, pixel, starts, columns, layers):
-    """Lay out the returns in `layers`.
-
-    `nearness, pixel, starts, layers`: as for `layer_returns`; those of `layers` in which returns
-    lie are overwritten; `columns`: of the picture.
-    """
-    y = row_start = 0
-    for number in range(pixel.size):
-        # pixels come in their order: a division for each would take as long as all else
-        while pixel[number] >= row_start + columns:
-            y += 1
-            row_start += columns
-        x = pixel[number] - row_start
-        part = y % STRIDE_PX * STRIDE_PX + x % STRIDE_PX
-        down, right = y // STRIDE_PX + MARGIN, x // STRIDE_PX + MARGIN
-        layers[number - starts[pixel[number]], part, down, right] = nearness[number]
 
 
 @compile_loop(fastmath=True)
 def scatter_about_planes(nearness, metres, pixel, columns, layers, gate, chosen, memory, scatter):
-    """Robust deviation of the returns around each from a plane through them, -1 if they are few.
+    """Robust deviation of the returns around each from a plane through them, m; -1 if they are few.
 
-    `nearness` (n,): inverse depth along the optical axis, 1/m; `metres` (n,): change of a return's
-    range for a change of its nearness, m^2; `pixel` (n,); `columns`: of the picture; `layers` (most
-    returns of a pixel, 4, rows, columns): see `layer_returns`; `gate`: m; `chosen` (k,): numbers of
-    the returns; `memory` (5, NEIGHBOURS): as `allocate_window` returns it; all but the first two
-    rows are overwritten; `scatter` (n,): overwritten at the chosen: m.
+    `nearness` (n,): inverse depth along the optical axis, 1/m; `metres` (n,): change of a return's range
+    for a change of its nearness, m^2; `pixel` (n,); `layers`: see `layer_returns`; `gate`: m; `chosen`
+    (k,): returns for which `scatter` (n,) is overwritten; `memory`: of `allocate_window`.
     """
     for own in chosen:
         y, x = pixel[own] // columns, pixel[own] % columns
-        take_nearest(layers, (y, x), np.float32(nearness[own]), np.float32(metres[own]), memory[2])
+        take_nearest(
+            layers, (y, x), np.float32(nearness[own]), np.float32(metres[own]), memory[OFF]
+        )
         deviation, most, a, b, c, count = -1.0, gate, 0.0, 0.0, 0.0, 0
         median = np.float32(0)
         for rounds in range(FIT_ROUNDS + 1):
@@ -247,12 +180,8 @@ def scatter_about_planes(nearness, metres, pixel, columns, layers, gate, chosen,
 
 @inlined
 def take_nearest(layers, own, nearness, metres, off):
-    """Of each pixel around, take the return that is nearest in range.
-
-    `layers` (most returns of a pixel, 4, rows, columns): see `layer_returns`; `own`: row and column
-    of the pixel in the middle; `nearness, metres`: of its return, 1/m, and change of its range for
-    a change of that, m^2; `off` (NEIGHBOURS,): overwritten: by how much further each neighbour is,
-    m; beyond any gate where there is none.
+    """Of each pixel around (row, column) `own`, take the return that is nearest in range to one of this
+    `nearness`, and enter by how much further it is, m; beyond any gate where there is none.
     """
     top, left = own[0] // STRIDE_PX, np.uintp(own[1] // STRIDE_PX)
     part = own[0] % STRIDE_PX * STRIDE_PX + own[1] % STRIDE_PX
@@ -272,11 +201,8 @@ def take_nearest(layers, own, nearness, metres, off):
 
 @inlined
 def measure_offsets(memory, a, b, c):
-    """Distance of each neighbour from the plane ``a * right + b * down + c``.
-
-    `memory` (5, NEIGHBOURS): see `scatter_about_planes`; the last row is overwritten, m.
-    """
-    right, down, off, residual = memory[0], memory[1], memory[2], memory[4]
+    """Enter the distance, m, of each neighbour from the plane ``a * right + b * down + c``."""
+    right, down, off, residual = memory[RIGHT], memory[DOWN], memory[OFF], memory[RESIDUAL]
     slope, fall = fill_vector(np.float32(a)), fill_vector(np.float32(b))
     level, zero = fill_vector(np.float32(c)), fill_vector(np.float32(0))
     for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
@@ -287,12 +213,8 @@ def measure_offsets(memory, a, b, c):
 
 @inlined
 def mark_near(memory, most):
-    """Use the neighbours that are off by at most so much; return whether others were used before.
-
-    `memory` (5, NEIGHBOURS): see `scatter_about_planes`; 1 or 0 is written to the row that says
-    which are used; `most`: m.
-    """
-    used, residual = memory[3], memory[4]
+    """Use the neighbours that are off by at most so much, m; return whether others were used before."""
+    used, residual = memory[USED], memory[RESIDUAL]
     farthest, changed = fill_vector(np.float32(most)), np.uint64(0)
     one, zero = fill_vector(np.float32(1)), fill_vector(np.float32(0))
     for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
@@ -304,10 +226,8 @@ def mark_near(memory, most):
 
 @inlined
 def find_median(memory, count, guess):
-    """Return the median of what is used, by narrowing an interval: each step is one look at all.
-
-    `memory` (5, NEIGHBOURS): see `scatter_about_planes`; `count`: of those used, at least one;
-    `guess`: where the first look is; not above zero where nothing is known. Returns to
+    """Median of what is used, `count` numbers of which there is at least one, by narrowing an interval:
+    each step is one look at all, the first one at a `guess` above zero. It is right to
     `MEDIAN_PRECISION` of the largest where some in the middle are that close together.
     """
     low, high = np.float32(0), find_residuals_beside(memory, np.float32(FAR))[0]
@@ -337,11 +257,8 @@ def find_median(memory, count, guess):
 
 @inlined
 def count_used_below(memory, limit):
-    """How many of those used are off by at most `limit`.
-
-    `memory` (5, NEIGHBOURS): see `scatter_about_planes`.
-    """
-    used, residual, below = memory[3], memory[4], 0
+    """How many of those used are off by at most `limit`."""
+    used, residual, below = memory[USED], memory[RESIDUAL], 0
     most, zero = fill_vector(limit), fill_vector(np.float32(0))
     for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
         near = most >= load_vector(residual, t)
@@ -351,11 +268,10 @@ def count_used_below(memory, limit):
 
 @plane_part
 def find_residuals_beside(memory, limit):
-    """The largest residual of those used that is at most `limit`, and the smallest above it.
-
-    `memory, limit`: as for `count_used_below`. Returns 0 and `FAR` where there is none.
+    """The largest residual of those used that is at most `limit`, or 0, and the smallest above it, or
+    `FAR`.
     """
-    used, residual = memory[3], memory[4]
+    used, residual = memory[USED], memory[RESIDUAL]
     most, zero = fill_vector(limit), fill_vector(np.float32(0))
     last, first = zero, fill_vector(np.float32(FAR))
     for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
@@ -367,12 +283,10 @@ def find_residuals_beside(memory, limit):
 
 @plane_part
 def fit_plane_around(memory):
-    """Least-squares plane ``a * right + b * down + c`` through the neighbours that are used.
-
-    `memory` (5, NEIGHBOURS): see `scatter_about_planes`. Returns `count`: neighbours used; 0 if
-    they lie in one line, which says nothing of the slope across it.
+    """Least-squares plane ``a * right + b * down + c`` through the neighbours that are used, and their
+    number; 0 if they lie in one line, which says nothing of the slope across it.
     """
-    right, down, off, used = memory[0], memory[1], memory[2], memory[3]
+    right, down, off, used = memory[RIGHT], memory[DOWN], memory[OFF], memory[USED]
     number = total = along = across = zero = fill_vector(np.float32(0))
     xx = xy = yy = xv = yv = zero
     for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
@@ -405,16 +319,12 @@ def fit_plane_around(memory):
 
 @compile_loop()
 def borrow_scatter(nearness, metres, starts, image_shape, gate, memory, scatter):
-    """Take over what is known of the return nearest in range, on the same surface, of those within
-    a plane's reach whose row and column `PLANE_STEP_PX` divides.
+    """Take over what is known of the return nearest in range, on the same surface, of those within a
+    plane's reach whose row and column `PLANE_STEP_PX` divides; NaN where there is none or it has few
+    neighbours. All returns of a cell of ``PLANE_STEP_PX**2`` pixels have the same ones around them.
 
-    All returns of a cell of ``PLANE_STEP_PX**2`` pixels have the same ones around them.
-
-    `nearness, metres, gate`: as for `scatter_about_planes`; `starts` (pixels + 1,): first return of
-    each pixel; `memory` (3, whole vectors of PLANE_STEP_PX**2 * most returns of a pixel):
-    overwritten: nearness of a cell's returns, how far off the nearest is, and its scatter;
-    `scatter` (n,): known of the pixels whose row and column `PLANE_STEP_PX` divides; overwritten
-    elsewhere: m, NaN where there is no such return or it has few neighbours.
+    `starts` (pixels + 1,): first return of each pixel; `memory` (3, whole vectors of a cell's returns):
+    nearness of a cell's returns, how far off the nearest is, and its scatter.
     """
     rows, columns = image_shape
     step, zero = PLANE_STEP_PX, fill_vector(np.float32(0))
@@ -448,10 +358,8 @@ def borrow_scatter(nearness, metres, starts, image_shape, gate, memory, scatter)
 
 @inlined
 def open_cell(nearness, starts, columns, cell, memory):
-    """Return how many returns a cell has, and list their nearness.
-
-    `nearness, starts, memory`: as for `borrow_scatter`; `columns`: of the picture; `cell`: first
-    row and the one after the last, first column and the one after the last.
+    """Return how many returns a cell has, and list their nearness; `cell`: first row and the one after
+    the last, first column and the one after the last.
     """
     own, least, held = memory[0], memory[1], memory[2]
     top, below, left, right = cell
@@ -461,22 +369,3 @@ def open_cell(nearness, starts, columns, cell, memory):
             own[number], least[number], held[number] = nearness[k], np.inf, np.nan
             number += 1
     return number
-
-
-@compile_loop()
-def widen_deviations(scatter, total, ratios):
-    """Add what planes show of the recovery's errors to the deviations; return of how many.
-
-    `scatter` (n,): of `scatter_about_planes`, m; negative where it is not known; `total` (n,):
-    deviation that the noise explains, m; overwritten where `scatter` is known; `ratios` (n,): its
-    beginning is overwritten: by what factor those became larger.
-    """
-    known = 0
-    for number in range(total.size):
-        if scatter[number] >= 0:
-            own = total[number]
-            excess = PLANE_SHARE * (scatter[number] * scatter[number] - own * own)
-            total[number] = math.sqrt(own * own + (excess if excess > 0 else 0.0))
-            ratios[known] = total[number] / own
-            known += 1
-    return known
