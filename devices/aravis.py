@@ -36,19 +36,12 @@ from tofclip.errors import (
 from tofclip.storage import Field, Record
 
 PIXEL_BITS = {"Mono8": 8, "Mono10": 16, "Mono12": 16, "Mono14": 16, "Mono16": 16}
-FRAME_ID_RANGE = 0xFFFF
-"""GigE Vision's 16-bit identifiers go from 1 to this, and then to 1 again."""
-
-UNNUMBERED = (1 << 64) - 1
-"""An identifier that no frame has."""
-
+FRAME_ID_RANGE = 0xFFFF  # GigE Vision's 16-bit identifiers go from 1 to this, and then to 1 again
+UNNUMBERED = (1 << 64) - 1  # An identifier that no frame has
 HELD_BYTES, HELD_FRAMES = 64 << 20, (16, 256)
+# What is asked for; the system gives less (``net.core.rmem_max`` of Linux)
 SOCKET_BUFFER_BYTES = 16 << 20
-"""What is asked for; the system gives less (``net.core.rmem_max`` of Linux)."""
-
-PACKET_HEADER_BYTES = 36
-"""Of IP, UDP and GVSP, in each packet."""
-
+PACKET_HEADER_BYTES = 36  # Of IP, UDP and GVSP, in each packet
 SYSTEM_PACKAGES = ("/usr/lib/python3/dist-packages",)
 NANOSECOND_S, PICOSECOND_S = 1e-9, 1e-12
 

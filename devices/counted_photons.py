@@ -33,11 +33,10 @@ from tofclip.storage import Record
 
 MAX_CUBE_BYTES = 1 << 32
 STAMPS_SUFFIX = ".dat"
+# Of addresses whose photons may have a time stamp each; other instruments have bins of their own
 STAMP_SCHEMES = ("file", "linospad2", "sim+linospad2")
-"""Of addresses whose photons may have a time stamp each; other instruments have bins of their own."""
-
+# Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s
 EDGE_S = 1e-10
-"""Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s."""
 
 
 @dataclass(frozen=True)

@@ -41,23 +41,18 @@ from tofclip.io.tcspc import (
 )
 from tofclip.storage import Field, Record, Scalar
 
-HISTOGRAM_BYTES = 4
-"""Of one bin in a PHU file."""
+HISTOGRAM_BYTES = 4  # Of one bin in a PHU file
 
+# `sync`: number of the laser's pulse. `bin`: time after it, in the file's resolution. `channel`:
+# from 0.
 PHOTON_DTYPE = np.dtype([("sync", "<u8"), ("bin", "<u4"), ("channel", "<u4")])
-"""`sync`: number of the laser's pulse. `bin`: time after it, in the file's resolution. `channel`:
-from 0.
-"""
-
 BATCH_RECORDS = 1 << 16
+# Larger files of histograms are not read: they would not fit into memory four times over
 MAX_HISTOGRAM_FILE_BYTES = 1 << 31
-"""Larger files of histograms are not read: they would not fit into memory four times over."""
-
 MAX_BINS = 1 << 20
 SWABIAN_CHUNK_TAGS = 1 << 20
+# Types of Swabian Instruments' events: a time tag, and a number of tags that were lost
 SWABIAN_TAG, SWABIAN_MISSED = 0, 4
-"""Types of Swabian Instruments' events: a time tag, and a number of tags that were lost."""
-
 PICOSECOND_S = 1e-12
 
 
@@ -65,8 +60,7 @@ class Reader(Protocol):
     """A file as pieces of records."""
 
     info: Info
-    lost: int
-    """Records that the electronics say they lost."""
+    lost: int  # Records that the electronics say they lost
 
     @property
     def calibration(self) -> Record | None:

@@ -77,9 +77,7 @@ class GatedOptions(LiveOptions):
         return found
 
 
-MAX_FRAME_BYTES = 1 << 26
-"""No camera here has larger pictures: 16 megapixels of 32 bits."""
-
+MAX_FRAME_BYTES = 1 << 26  # No camera here has larger pictures: 16 megapixels of 32 bits
 _NUMBER_DTYPE = np.dtype("<i8")
 _PIXEL_DTYPES = {1: "u1", 8: "u1", 16: "<u2", 32: "<u4"}
 
@@ -100,8 +98,7 @@ class FrameCodec:
     quarter_turns: int = 0
 
     name: ClassVar[str] = "frames"
-    start: ClassVar[int] = -1
-    """Number of the last frame."""
+    start: ClassVar[int] = -1  # Number of the last frame
 
     def __post_init__(self) -> None:
         if self.bits not in _PIXEL_DTYPES:

@@ -30,15 +30,11 @@ __all__ = [
 ]
 
 
-MAX_CELLS = 1 << 26
-"""Bins of all pixels together: half a gigabyte for each thread."""
+MAX_CELLS = 1 << 26  # Bins of all pixels together: half a gigabyte for each thread
 
+# Bins over which a photon is shared out at least; a step of no width would be infinitely high
 MIN_WIDTH_BINS = 1e-3
-"""Bins over which a photon is shared out at least; a step of no width would be infinitely high."""
-
-ROUNDING_PHOTONS = 1e-6
-"""Photons in a bin that are rounding errors of adding up steps, not photons."""
-
+ROUNDING_PHOTONS = 1e-6  # Photons in a bin that are rounding errors of adding up steps, not photons
 _MIN_PIECE = 1 << 16
 
 

@@ -43,15 +43,11 @@ from tofclip.storage import Field, Record
 MAX_LINE_BYTES = 1 << 13
 TMF_BINS, TMF_CHANNELS, TMF_LANES = 128, 10, 30
 TMF_CAPTURES, TMF_NUMBERS = 4, 256
-TMF_TICK_S = 2e-7
-"""s; the sensor's clock of 5 MHz."""
-
+TMF_TICK_S = 2e-7  # s; the sensor's clock of 5 MHz
 TMF_ZONES = (64, 9)
-VL53_NATIVE_BIN_S = 2 * 37.5348e-3 / 299_792_458
-"""s; of the 37.5348 mm that ST gives for a bin."""
+VL53_NATIVE_BIN_S = 2 * 37.5348e-3 / 299_792_458  # s; of the 37.5348 mm that ST gives for a bin
 
-VL53_SCALE = 10
-"""Counts are sent with one digit after the point."""
+VL53_SCALE = 10  # Counts are sent with one digit after the point
 
 
 @dataclass(frozen=True)

@@ -59,17 +59,13 @@ from tofclip.threads import run_blocks
 
 PIXELS = PIXEL_CONVERTERS * ADDRESSES
 FIRMWARES = ("2212b", "2212s")
+# Time stamps per converter and cycle at most; the boards' memory ends far below
 MAX_TIMESTAMPS = 1 << 14
-"""Time stamps per converter and cycle at most; the boards' memory ends far below."""
-
+# `cycle`: from 0. `code`: time since the cycle began, 140 for each 2500 ps. `pixel`: place on the
+# line, 0..255.
 STAMP_DTYPE = np.dtype([("cycle", "<u4"), ("code", "<u4"), ("pixel", "<u4")])
-"""`cycle`: from 0. `code`: time since the cycle began, 140 for each 2500 ps. `pixel`: place
-on the line, 0..255.
-"""
-
+# As `STAMP_DTYPE`, with the absolute time at which the cycle began, in ticks of 7.5 ns
 STAMP_WITH_COUNTER_DTYPE = np.dtype([("counter", "<u8"), *STAMP_DTYPE.descr])
-"""As `STAMP_DTYPE`, with the absolute time at which the cycle began, in ticks of 7.5 ns."""
-
 COUNTER_WORDS = 2
 _WORD_DTYPE = np.dtype("<u4")
 _MAX_ENCODED_BYTES = 1 << 30
@@ -96,8 +92,7 @@ class LinoSpad2Codec:
     counter: bool = False  # whether every cycle begins with the absolute counter
 
     name: ClassVar[str] = "linospad2"
-    start: ClassVar[int] = 0
-    """Cycles decoded so far."""
+    start: ClassVar[int] = 0  # Cycles decoded so far
 
     def __post_init__(self) -> None:
         if self.firmware not in FIRMWARES:
@@ -241,12 +236,8 @@ class LinoSpad2Codec:
             )
 
 
-CODES_PER_PERIOD = 140
-"""Codes in one period of the board's clock."""
-
-CLOCK_PERIOD_S = 2500e-12
-"""Period of the board's clock, s."""
-
+CODES_PER_PERIOD = 140  # Codes in one period of the board's clock
+CLOCK_PERIOD_S = 2500e-12  # Period of the board's clock, s
 _MAX_FILE_BYTES = 1 << 23
 _ROUNDING_S = 1e-6 * CLOCK_PERIOD_S
 
@@ -465,8 +456,7 @@ def read_sidecar(recording: str | Path) -> Sidecar:
 
 
 LIMITATION = "LinoSPAD2's USB commands are not public: its recordings are read, no board is driven"
-PIECE_BYTES = 1 << 20
-"""Bytes that are read and decoded at once, or one cycle where that is longer."""
+PIECE_BYTES = 1 << 20  # Bytes that are read and decoded at once, or one cycle where that is longer
 
 
 class LinoSpad2File(DecodedSource):

@@ -18,8 +18,7 @@ ADDRESSES = 4
 CODE_MASK = np.uint32(0x0FFFFFFF)
 VALID_BIT = np.uint32(0x80000000)
 
-ENCODED_OK, OUT_OF_ORDER, OVERFULL, COUNTERS_DIFFER = 0, 1, 2, 3
-"""Outcomes of encoding."""
+ENCODED_OK, OUT_OF_ORDER, OVERFULL, COUNTERS_DIFFER = 0, 1, 2, 3  # Outcomes of encoding
 
 
 compiled = compile_and_keep(error_model="numpy")

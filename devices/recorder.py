@@ -19,9 +19,8 @@ from devices.recording.write import RecordingWriter, make_head
 from devices.source import DecodedSource, Piece, Source, Stats
 from tofclip.errors import DeviceTimeoutError, InputError, TofclipError
 
+# Seconds after which the recorder looks at the clock and at its file, though nothing came
 POLL_INTERVAL_S = 0.25
-"""Seconds after which the recorder looks at the clock and at its file, though nothing came."""
-
 END_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
 ProgressCallback = Callable[[float], None]

@@ -17,6 +17,7 @@ from devices.source import Codec, Source
 from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
+# Scheme of an address -> function ``(Uri) -> Source``
 OPENERS: dict[str, str] = {
     "aravis": "devices.aravis:open_aravis",
     "linospad2": "devices.linospad2:open_recording",
@@ -33,8 +34,7 @@ OPENERS: dict[str, str] = {
     "vl53l8": "devices.histogram_kits:open_vl53l8",
     "sim+timetag": "devices.emulation.timetag:open_timetag",
 }
-"""Scheme of an address -> function ``(Uri) -> Source``."""
-
+# Ending of a file's name, lower case -> function ``(Uri) -> Source``, for addresses ``file://PATH``
 FILE_OPENERS: dict[str, str] = {
     ".dat": "devices.linospad2:open_recording",
     ".img": "devices.files:open_streak_file",
@@ -47,24 +47,18 @@ FILE_OPENERS: dict[str, str] = {
     ".h5": "devices.recording.read:open_recording",
     ".hdf5": "devices.recording.read:open_recording",
 }
-"""Ending of a file's name, lower case -> function ``(Uri) -> Source``, for addresses
-``file://PATH``.
-"""
-
+# Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail,
+# without hardware.
 FINDERS: tuple[str, ...] = (
     "devices.timetag.driver:find_timetaggers",
     "devices.aravis:find_cameras",
 )
-"""Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail,
-without hardware.
-"""
-
+# Name of a codec -> its class; a recording names the codec that its bytes need
 CODECS: dict[str, str] = {
     "frames": "devices.frames:FrameCodec",
     "linospad2": "devices.linospad2:LinoSpad2Codec",
     "timetag": "devices.timetag.codec:TimeTagCodec",
 }
-"""Name of a codec -> its class; a recording names the codec that its bytes need."""
 
 
 class Opener(Protocol):

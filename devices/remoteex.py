@@ -45,13 +45,9 @@ from tofclip.storage import Field, Record, Scalar
 
 COMMAND_PORT, DATA_PORT = 1001, 1002
 TERMINATOR = b"\r"
-ENCODING = "latin-1"
-"""Of all text: HPD-TA writes "µ" as one byte."""
-
+ENCODING = "latin-1"  # Of all text: HPD-TA writes "µ" as one byte
 GREETING, DATA_GREETING = "RemoteEx Ready", "RemoteEx Data Ready"
-ANNOUNCEMENT = "Livemonitor"
-"""What a message about a new picture is called."""
-
+ANNOUNCEMENT = "Livemonitor"  # What a message about a new picture is called
 MAX_MESSAGE_BYTES = 1 << 16
 
 _COMMAND = re.compile(r"([A-Za-z]\w*)\((.*)\)", re.ASCII)
@@ -189,8 +185,7 @@ def _decode_text(message: bytes) -> str:
 
 MAX_TABLE_BYTES = 1 << 20
 _COMMANDS_WITH_DATA = ("ImgRingBufferGet", "ImgDataGet")
-MAX_MESSAGES = 4096
-"""Messages that are kept until they are asked for; the oldest go first."""
+MAX_MESSAGES = 4096  # Messages that are kept until they are asked for; the oldest go first
 
 
 @dataclass(frozen=True)
@@ -413,9 +408,8 @@ STREAK_TUBE = "TD"
 GAIN_PARAMETER = "MCP Gain"
 APPLICATION_START_S = 30.0
 POLL_INTERVAL_S = 0.05
+# Of the scaling table where the time range is a mere number, as of synchroscan units
 SYNCHROSCAN_UNIT_S = 1e-12
-"""Of the scaling table where the time range is a mere number, as of synchroscan units."""
-
 _PARAMETERS = {"time_range": "Time Range", "mode": "Mode", "mcp_gain": GAIN_PARAMETER}
 
 ConnectFunction = Callable[[], RemoteExClient]

@@ -32,8 +32,7 @@ from devices.transients import (
 from tofclip.errors import TofclipError
 from tofclip.shots import Streak
 
-MAX_STAMPS = 10_000
-"""Shots on their way whose stamps are kept."""
+MAX_STAMPS = 10_000  # Shots on their way whose stamps are kept
 
 
 @dataclass(frozen=True)

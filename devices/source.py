@@ -25,11 +25,10 @@ from numpy.typing import NDArray
 from tofclip.errors import BufferOverflowError, DeviceTimeoutError, InputError
 from tofclip.storage import Record, Scalar
 
-Records = NDArray[Any]
-"""One-dimensional NumPy structured array, one row per record."""
+Records = NDArray[Any]  # One-dimensional NumPy structured array, one row per record
 
+# One-dimensional bytes. `as_bytes` makes one of anything that holds bytes, without a copy.
 ByteView = NDArray[np.uint8]
-"""One-dimensional bytes. `as_bytes` makes one of anything that holds bytes, without a copy."""
 
 
 def as_bytes(data: bytes | bytearray | memoryview | ByteView) -> ByteView:
@@ -63,8 +62,8 @@ class Codec(Protocol):
     stated multiple of the bytes that it was given.
     """
 
+    # Name in `devices.registry.CODECS`; a recording keeps it together with `settings`
     name: ClassVar[str]
-    """Name in `devices.registry.CODECS`; a recording keeps it together with `settings`."""
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -218,10 +217,8 @@ class Gap(enum.IntEnum):
     """What is missing right before a piece of a stream."""
 
     NONE = 0
-    LOSS = 1
-    """Records; the instrument's clock went on."""
-    RESTART = 2
-    """The instrument itself: it was away and may have begun anew."""
+    LOSS = 1  # Records; the instrument's clock went on
+    RESTART = 2  # The instrument itself: it was away and may have begun anew
 
 
 @dataclass(frozen=True)
@@ -338,8 +335,7 @@ class RingBuffer:
             self._lost_before_next = max(self._lost_before_next, gap)
 
 
-READ_TIMEOUT_S = 5.0
-"""Seconds that an iteration waits for the next batch of a live instrument."""
+READ_TIMEOUT_S = 5.0  # Seconds that an iteration waits for the next batch of a live instrument
 
 
 @dataclass(frozen=True)

@@ -42,9 +42,7 @@ IMAGE_WIDTHS_PX = (4, 8, 16, 32, 64, 128, 256, 512)
 SINGLE_BIT_QUARTER_TURNS = 1
 MAX_TEXT_BYTES = 1 << 13
 MAX_IMAGES = 1 << 16
-GATE_STEP_PS = 18
-"""ps by which the gate moves at least."""
-
+GATE_STEP_PS = 18  # ps by which the gate moves at least
 INFORMATION_COMMAND = b"D"
 BREAKDOWN_BEGINS, BREAKDOWN_ENDS = "The breakdown calibration process", "The breakdown is around"
 
@@ -178,11 +176,10 @@ class SpadOptions(GatedOptions):
         return ExposureRequest(*exposure, self.width, self.pile_up, self.gate)
 
 
-_SILENCE_S = 0.2
-"""Seconds after which a text of unknown length has ended."""
+_SILENCE_S = 0.2  # Seconds after which a text of unknown length has ended
 
+# Seconds that the server may calibrate itself when it is first asked
 BREAKDOWN_CALIBRATION_S = 60.0
-"""Seconds that the server may calibrate itself when it is first asked."""
 
 
 class Spad512Feed(FrameFeed):

@@ -41,10 +41,9 @@ from tofclip.errors import (
 )
 from tofclip.storage import Record
 
+# s of the computer's clock after which old messages say nothing any more: two quartzes part by some
+# 3 ms a minute
 WINDOW_S = 30.0
-"""s of the computer's clock after which old messages say nothing any more: two quartzes part by
-some 3 ms a minute.
-"""
 
 
 class InstrumentClock:
@@ -88,18 +87,13 @@ class InstrumentClock:
         return stamp + offset if offset < float("inf") else 0.0
 
 
+# Seconds after which the thread looks whether it should stop, though nothing came
 POLL_INTERVAL_S = 0.1
-"""Seconds after which the thread looks whether it should stop, though nothing came."""
-
+# Seconds in which a stopped instrument must have handed over what it still holds
 DRAIN_TIMEOUT_S = 3.0
-"""Seconds in which a stopped instrument must have handed over what it still holds."""
-
+# Seconds that `StreamSource.close` waits for the thread, which never takes so long
 STOP_TIMEOUT_S = 15.0
-"""Seconds that `StreamSource.close` waits for the thread, which never takes so long."""
-
-RETRY_INTERVAL_S = 0.1
-"""Seconds between two attempts to reach an instrument that went away."""
-
+RETRY_INTERVAL_S = 0.1  # Seconds between two attempts to reach an instrument that went away
 _MEBIBYTE = 1 << 20
 _Connected = TypeVar("_Connected")
 
@@ -119,8 +113,7 @@ class Transfer:
 class Feed(Protocol):
     """Where a stream's bytes come from. Every method is called from one thread, never two at once."""
 
-    ledger: Ledger
-    """Where the feed enters losses and reconnections."""
+    ledger: Ledger  # Where the feed enters losses and reconnections
 
     @property
     def codec(self) -> Codec:

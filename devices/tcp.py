@@ -19,8 +19,7 @@ from tofclip.errors import (
     ProtocolError,
 )
 
-RECEIVE_BYTES = 1 << 18
-"""Most bytes taken from the system at once."""
+RECEIVE_BYTES = 1 << 18  # Most bytes taken from the system at once
 
 
 class TcpLink:

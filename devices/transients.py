@@ -36,9 +36,7 @@ from tofclip.errors import DeviceTimeoutError, InputError
 from tofclip.shots import Streak
 from tofclip.storage import Record, collect_provenance
 
-BIN_WIDTH_S = 20e-12
-"""Width of a histogram's bins where no other is given, s."""
-
+BIN_WIDTH_S = 20e-12  # Width of a histogram's bins where no other is given, s
 PICOSECOND_S = 1e-12
 
 

@@ -25,13 +25,10 @@ if TYPE_CHECKING:
     import usb.core
 
 INTERFACE_NUMBER = 0
-VENDOR_REQUEST = 0x40
-"""Type of a control request of the maker's own, from host to device."""
-
-REPLUG_POLL_S = 0.05
-"""Seconds between two looks for an instrument that was unplugged."""
-
+VENDOR_REQUEST = 0x40  # Type of a control request of the maker's own, from host to device
+REPLUG_POLL_S = 0.05  # Seconds between two looks for an instrument that was unplugged
 _UNPLUGGED = (DeviceDisconnectedError, "was unplugged")
+# What a system error means, and what is said of it
 _FAULTS: dict[int, tuple[type[DeviceError], str]] = {
     errno.ETIMEDOUT: (DeviceTimeoutError, "sent nothing in time"),
     errno.EBUSY: (DeviceBusyError, "is used by another program; close that first"),
@@ -44,7 +41,6 @@ _FAULTS: dict[int, tuple[type[DeviceError], str]] = {
         (errno.ENODEV, errno.EIO, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN), _UNPLUGGED
     ),
 }
-"""What a system error means, and what is said of it."""
 
 
 class UsbIdentity(NamedTuple):

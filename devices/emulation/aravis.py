@@ -21,10 +21,10 @@ from tofclip.errors import DeviceNotFoundError, MissingDependencyError
 from tofclip.storage import Field, Record
 
 LIBRARY_FILE = "libaravis-0.8.so.0"
+# ``(buffer, nothing, exposure_us, gain, pixel_format)``, called in the camera's own thread
 FillPattern = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
 )
-"""``(buffer, nothing, exposure_us, gain, pixel_format)``, called in the camera's own thread."""
 
 
 class EmulatedCamera:

@@ -78,12 +78,8 @@ def index_faults(faults: Sequence[Fault], kinds: Collection[str]) -> dict[int, F
 
 
 HOST = "127.0.0.1"
-FOREVER = 1 << 62
-"""Pictures or records after which it is dark: never."""
-
-FAULT_DELAY_S = 0.1
-"""Seconds by which a fault of amount 1 delays an answer."""
-
+FOREVER = 1 << 62  # Pictures or records after which it is dark: never
+FAULT_DELAY_S = 0.1  # Seconds by which a fault of amount 1 delays an answer
 MAX_REQUEST_BYTES = 1 << 16
 
 

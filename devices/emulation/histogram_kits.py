@@ -34,8 +34,7 @@ from tofclip.units import SPEED_OF_LIGHT
 
 LineFormatter = Callable[[NDArray[np.uint32], int, int], list[bytes]]
 PEAK_COUNTS, BACKGROUND_COUNTS = 400.0, 4.0
-PULSE_BINS = 1.5
-"""Standard deviation of the emulated pulse."""
+PULSE_BINS = 1.5  # Standard deviation of the emulated pulse
 
 
 def format_tmf8828(counts: NDArray[Any], number: int, tick: int) -> list[bytes]:

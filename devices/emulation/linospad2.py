@@ -33,9 +33,7 @@ from tofclip.storage import Record
 
 INSTRUMENT = "simulated LinoSPAD2"
 LASER_PERIOD_S = 25e-9
-CYCLE_TIME_S = 4e-3
-"""A cycle lasts as long, s; a code has room for 4.8 ms."""
-
+CYCLE_TIME_S = 4e-3  # A cycle lasts as long, s; a code has room for 4.8 ms
 COUNTER_TICK_S = 7.5e-9
 
 

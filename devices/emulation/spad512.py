@@ -40,12 +40,10 @@ from tofclip.errors import ProtocolError, ShapeError
 SUPPORTED_FAULTS = ("timeout", "short", "unplug", "corrupt", "stall")
 GREETING = b"SPAD512S emulated server, ready\n"
 LASER_PERIOD_S = 25e-9
-GATE_EDGE_S = 1e-10
-"""Standard deviation of the laser's pulse and the gate's edges together."""
+GATE_EDGE_S = 1e-10  # Standard deviation of the laser's pulse and the gate's edges together
+AMBIENT_FRACTION = 0.02  # Of a white pixel's light: what comes at any time
 
-AMBIENT_FRACTION = 0.02
-"""Of a white pixel's light: what comes at any time."""
-
+# Questions that have one answer
 TEXTS = {
     INFORMATION_COMMAND: (
         b"Master FPGA serial: EMULATED-1\nSlave FPGA serial: EMULATED-2\n"
@@ -55,8 +53,6 @@ TEXTS = {
     b"V": b"20.0,3.0",
     b"R": b"40.0,40.0,35.0,20.0,40000000.0,100.0",
 }
-"""Questions that have one answer."""
-
 CONFIRMED_COMMANDS = (b"V,", b"D,", b"AE,", b"S,", b"CALIB,", b"Ga,")
 
 

@@ -47,8 +47,7 @@ from devices.timetag.driver import (
 )
 from tofclip.errors import InputError
 
-MAX_TICK = (1 << 62) - 1
-"""A tick that never comes."""
+MAX_TICK = (1 << 62) - 1  # A tick that never comes
 
 
 class TagStream(Protocol):
@@ -97,9 +96,7 @@ class PoissonStream:
         return words[: written * RECORD_BYTES]
 
 
-SYNC_MASK = 1
-"""Channel 0 sees the laser."""
-
+SYNC_MASK = 1  # Channel 0 sees the laser
 PIXEL_MASKS = np.array([2, 4, 8], np.uint32)
 PERIOD_TICKS = 1 << 7
 PULSES_PER_BLOCK = 1 << 13
@@ -207,18 +204,15 @@ CLOCK_HZ = 128_000_000
 VERSION = 6
 SHORT_PACKET_BYTES = 510
 CHIP_PACKETS = 3
-MAX_REPLIES = 3
-"""Two in the USB chip, one in the register manager, which then hears no commands."""
-
+MAX_REPLIES = 3  # Two in the USB chip, one in the register manager, which then hears no commands
 SET_SEND_WINDOW, FLUSH = 1, 2
 NO_SUCH_REGISTER = 0xFFFFFFFF
+# What the gateware has: with the USB chip's packets, 3.4 ms at 680,000 records a second
 BOARD_MEMORY_BYTES = 2048 * RECORD_BYTES
-"""What the gateware has: with the USB chip's packets, 3.4 ms at 680,000 records a second."""
-
 UNUSED_BITS = 0x1F
 MAX_BATCH_RECORDS = 1 << 14
+# Seconds after which an instrument whose time is not the clock's says that nothing comes
 DARK_WAIT_S = 5e-3
-"""Seconds after which an instrument whose time is not the clock's says that nothing comes."""
 POLL_INTERVAL_S = 4e-3
 
 

@@ -41,9 +41,7 @@ from tofclip.storage import HDF5_SIGNATURE, Record
 
 MAGIC = b"\x89ToFrec\n"
 LEGACY_MAGIC = b"TFcB"
-MAX_PAYLOAD_BYTES = 1 << 28
-"""No block is larger; a length beyond it is damage."""
-
+MAX_PAYLOAD_BYTES = 1 << 28  # No block is larger; a length beyond it is damage
 _LAYOUT = struct.Struct("<8sQQHHqQQI")
 _LEGACY_LAYOUT = struct.Struct("<4sHHqQQI")
 _CHECKSUM_BYTES = 4
@@ -54,12 +52,9 @@ LEGACY_HEADER_BYTES = _LEGACY_LAYOUT.size + _CHECKSUM_BYTES
 class BlockKind(enum.IntEnum):
     """What a block's payload is."""
 
-    HEAD = 1
-    """An HDF5 record: all that was known before the first piece."""
-    PIECE = 2
-    """Whole records as they came from the instrument."""
-    END = 3
-    """JSON: the accounts, written when the recording was ended in order."""
+    HEAD = 1  # An HDF5 record: all that was known before the first piece
+    PIECE = 2  # Whole records as they came from the instrument
+    END = 3  # JSON: the accounts, written when the recording was ended in order
 
 
 @dataclass(frozen=True)
@@ -132,8 +127,7 @@ class BlockHeader:
 
 RECORD_KIND = "recording"
 RECORDING_SUFFIXES = (".h5", ".hdf5")
-SEARCH_BYTES = 1 << 20
-"""Bytes in which the next sound block is searched at once."""
+SEARCH_BYTES = 1 << 20  # Bytes in which the next sound block is searched at once
 
 
 @dataclass(frozen=True)
@@ -378,10 +372,9 @@ def read_head_if_recording(path: Path) -> Record | None:
 
 
 NS_PER_S = 1_000_000_000
+# Longest pause between two pieces that is replayed: where the computer's clock was set while it
+# recorded, the times of the pieces may be years apart
 MAX_PAUSE_S = 10.0
-"""Longest pause between two pieces that is replayed: where the computer's clock was set while it
-recorded, the times of the pieces may be years apart.
-"""
 
 
 class _Checkpoint(NamedTuple):

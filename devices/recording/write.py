@@ -23,13 +23,10 @@ try:
 except ImportError:  # Windows: there, nothing keeps a second recorder away
     fcntl = None  # type: ignore[assignment]
 
-HEAD_INTERVAL_BYTES = 64 << 20
-"""Payload after which the head is written once more."""
-
+HEAD_INTERVAL_BYTES = 64 << 20  # Payload after which the head is written once more
 SECTOR_BYTES = 4096
 
-CHECK_INTERVAL_S = 0.25
-"""Seconds after which the writer looks whether its file is still there."""
+CHECK_INTERVAL_S = 0.25  # Seconds after which the writer looks whether its file is still there
 
 
 def make_head(

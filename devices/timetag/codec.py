@@ -49,16 +49,13 @@ HALF_RANGE = 1 << (TIME_BITS - 1)
 DELTA, WRAP, LOST = 1, 2, 4
 
 
-COUNTER_RANGE = 1 << TIME_BITS
-"""Ticks after which the counter begins at zero again."""
-
+COUNTER_RANGE = 1 << TIME_BITS  # Ticks after which the counter begins at zero again
 CHANNEL_MASK = 0xF
 FLAG_MASK = DELTA | WRAP | LOST
 
+# `time_ticks`: since the counter was reset, wraps added up. `channels`: one bit each. `flags`:
+# DELTA, WRAP, LOST.
 RECORD_DTYPE = np.dtype([("time_ticks", np.int64), ("channels", np.uint32), ("flags", np.uint32)])
-"""`time_ticks`: since the counter was reset, wraps added up. `channels`: one bit each. `flags`:
-DELTA, WRAP, LOST.
-"""
 
 
 class CounterState(NamedTuple):

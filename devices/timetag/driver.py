@@ -34,26 +34,19 @@ from tofclip.errors import (
 from tofclip.storage import Record, Scalar
 
 USB_IDENTITY = UsbIdentity(0x04B4, 0x1004)
-BARE_CHIP_IDENTITY = UsbIdentity(0x04B4, 0x8613)
-"""The same chip before its firmware was loaded."""
-
+BARE_CHIP_IDENTITY = UsbIdentity(0x04B4, 0x8613)  # The same chip before its firmware was loaded
 WITHOUT_FIRMWARE = "a chip without firmware; load the time tagger's into it first"
 INSTRUMENT = "FX2 time tagger"
 COMMAND_ENDPOINT, DATA_ENDPOINT, REPLY_ENDPOINT = 0x02, 0x86, 0x88
 PACKET_BYTES = 512
 REPLY_TIMEOUT_S = 0.5
-DRAIN_TIMEOUT_S = 0.02
-"""Seconds after which an endpoint that sent nothing is taken to be empty."""
-
-MAX_DRAINED = 16
-"""Transfers that are thrown away at once; one that sends more has another defect."""
-
+DRAIN_TIMEOUT_S = 0.02  # Seconds after which an endpoint that sent nothing is taken to be empty
+MAX_DRAINED = 16  # Transfers that are thrown away at once; one that sends more has another defect
 ATTEMPTS = 4
 
 _MAGIC, _READ, _WRITE = 0xAA, 0, 1
 _SET_SEND_WINDOW, _FLUSH = 1, 2
-_UNJAM = 0
-"""A register that is not there: writing it completes a command that was cut short."""
+_UNJAM = 0  # A register that is not there: writing it completes a command that was cut short
 
 
 class Register(enum.IntEnum):
@@ -64,12 +57,9 @@ class Register(enum.IntEnum):
     CAPTURE = 3
     STROBE = 4
     DELTA = 5
-    RECORDS = 6
-    """Records that went into the memory; any write sets it to zero."""
-    LOST = 7
-    """Records that found the memory full; any write sets it to zero."""
-    CLEAR = 8
-    """1 holds the memory empty, 0 lets it fill."""
+    RECORDS = 6  # Records that went into the memory; any write sets it to zero
+    LOST = 7  # Records that found the memory full; any write sets it to zero
+    CLEAR = 8  # 1 holds the memory empty, 0 lets it fill
 
 
 class Capture(enum.IntFlag):
@@ -234,13 +224,11 @@ class TimeTagger:
 
 _COUNTER_MODULUS = 1 << 32
 
+# Whatever the gateware was built for, its clock is within these
 MIN_CLOCK_HZ, MAX_CLOCK_HZ = 1_000_000, 1_000_000_000
-"""Whatever the gateware was built for, its clock is within these."""
-
 PACKET_INTERVAL_S = 0.015
+# Seconds after which a transfer is ended, and a chip that holds part of a packet is asked to send
 LATENCY_S = 0.02
-"""Seconds after which a transfer is ended, and a chip that holds part of a packet is asked to send."""
-
 FULL_STREAM_BYTES_PER_S = 500_000
 
 
@@ -457,8 +445,7 @@ class SendWindow:
     which do not end a transfer.
     """
 
-    clock = staticmethod(monotonic)
-    """By which rates are measured, s."""
+    clock = staticmethod(monotonic)  # By which rates are measured, s
 
     def __init__(self) -> None:
         self.size = PACKET_BYTES
