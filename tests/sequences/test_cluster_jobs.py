@@ -181,7 +181,7 @@ def test_workers_that_are_gone_for_good_are_not_waited_for_for_ever(monkeypatch,
     monkeypatch.setattr(jobs_module, "RECOUNT_INTERVAL_S", 0.01)
     monkeypatch.setattr(jobs_module, "MAX_WORKERLESS_S", 0.1)
     with pytest.raises(InputError, match="no worker for"):
-        next(jobs_module.JobPool(Scheduler())._iterate_finished(Finished()))
+        next(jobs_module._iterate_finished(Scheduler(), Finished()))
 
 
 @pytest.mark.parametrize("size", [10, MAX_HASHED_BYTES + 1])

@@ -1,11 +1,8 @@
-"""A folder of results belongs to one set of settings, so that no run goes on with the results of
-another.
+"""Many jobs that each make a file: here, on workers started for them on this machine, or on those
+of a scheduler that is there already.
 
-Where jobs run: on workers started for them on this machine, or on those of a scheduler that is
-there already.
-
-A job, how it is attempted, how many are run here or on the workers of a cluster, and what is
-reported of them.
+A folder of results belongs to one set of settings and inputs, so that no run goes on with the
+results of another.
 """
 
 from __future__ import annotations
@@ -21,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,17 +42,6 @@ from tofclip.version import __version__
 
 if TYPE_CHECKING:
     from distributed import Client, Future, as_completed
-
-__all__ = [
-    "Failure",
-    "Job",
-    "Report",
-    "Summary",
-    "lock_output_folder",
-    "run_jobs",
-    "select_unfinished",
-]
-
 
 SETTINGS_NAME = "settings.json"
 INPUTS_KEY = "inputs"
@@ -90,23 +77,31 @@ def lock_output_folder(
     wanted = {
         name: str(value) if isinstance(value, Path) else value for name, value in settings.items()
     }
-    marks = _identify_files(inputs or {})
+    # the shots of a stack share a file, which is read once
+    identities = {file: identify_file(file) for file in set((inputs or {}).values())}
+    marks = {name: identities[file] for name, file in (inputs or {}).items()}
     if not path.exists():
         _write_settings(path, wanted, marks)
         return
-    known = _read_settings(path)
-    noted = known.pop(INPUTS_KEY, {})
+    try:
+        with translate_read_errors(path):
+            known = json.loads(path.read_text("utf-8"))
+        noted = known.pop(INPUTS_KEY, {})
+    except (ValueError, AttributeError, TypeError) as fault:
+        raise FileFormatError(
+            path, "holds no settings; remove it if the results beside it are to be made again"
+        ) from fault
     # Settings that only one side knows count as None on the other, so that a new setting with the
     # default None fits folders written before it.
-    names = [name for name in {**known, **wanted} if known.get(name) != wanted.get(name)]
-    if names:
-        reported = ", ".join(
-            f"{name} {known.get(name)} instead of {wanted.get(name)}" for name in names
-        )
+    reported = ", ".join(
+        f"{name} {known.get(name)} instead of {wanted.get(name)}"
+        for name in {**known, **wanted}
+        if known.get(name) != wanted.get(name)
+    )
+    if reported:
         raise InputError(
             f"{folder}: holds results of other settings ({reported}); choose another folder or remove it"
         )
-
     # A file without a result may change: a damaged shot is replaced, and its run goes on.
     changed = [
         name
@@ -122,34 +117,12 @@ def lock_output_folder(
         _write_settings(path, known, {**noted, **marks})
 
 
-def _identify_files(inputs: Mapping[str, Path]) -> dict[str, str]:
-    # the shots of a stack share a file, which is read once
-    marks = {file: identify_file(file) for file in set(inputs.values())}
-    return {name: marks[file] for name, file in inputs.items()}
-
-
 def _write_settings(path: Path, settings: Mapping[str, Any], marks: Mapping[str, str]) -> None:
     content = {**settings, INPUTS_KEY: dict(marks)} if marks else dict(settings)
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def _read_settings(path: Path) -> dict[str, Any]:
-    try:
-        with translate_read_errors(path):
-            found = json.loads(path.read_text("utf-8"))
-    except ValueError as fault:
-        raise FileFormatError(
-            path, "is not JSON; remove it if the results beside it are to be made again"
-        ) from fault
-    if not isinstance(found, dict):
-        raise FileFormatError(
-            path, "holds no settings; remove it if the results beside it are to be made again"
-        )
-    return found
-
-
-LOCAL = "local"
 ADDRESS_SCHEMES = ("tcp://", "tls://")
 WAIT_SECONDS = 30.0
 
@@ -170,78 +143,71 @@ def connect_workers(where: str) -> Iterator[Client]:
         raise MissingDependencyError(
             "a cluster needs dask.distributed: pip install 'tofclip[cluster]'"
         ) from fault
-    opened = (
-        _start_local_cluster(distributed, number)
-        if number
-        else _connect_scheduler(distributed, where)
-    )
-    with opened as client:
-        yield client
+    # What matters is in the summary: the library's log stays off the screen.
+    logger = logging.getLogger("distributed")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        with contextlib.ExitStack() as running:
+            if not number:
+                client = running.enter_context(_connect_scheduler(distributed, where))
+            else:
+                # Processes of one job at a time that share the cores, each minded by another that
+                # replaces it if it dies. Only while they start; a Ctrl-C of that time comes then.
+                with _shield_children_from_interrupt():
+                    cluster = distributed.LocalCluster(
+                        n_workers=number,
+                        threads_per_worker=1,
+                        processes=True,
+                        dashboard_address="127.0.0.1:0",  # no one else may look
+                        silence_logs=logging.CRITICAL,
+                        env={THREADS_VARIABLE: str(max(1, thread_count() // number))},
+                    )
+                    running.enter_context(cluster)
+                client = running.enter_context(distributed.Client(cluster))
+            yield client
+    finally:
+        logger.setLevel(level)
 
 
 def count_local_workers(where: str) -> int:
     """Return how many workers to start on this machine; 0: none, `where` is an address."""
     name, separator, number = where.partition(":")
-    if name == LOCAL and not separator:
+    if name == "local" and not separator:
         return thread_count()
-    if name == LOCAL and number.isdecimal() and int(number) >= 1:
+    if name == "local" and number.isdecimal() and int(number) >= 1:
         return int(number)
     if where.startswith(ADDRESS_SCHEMES) and len(where.split("://")[1]) > 0:
         return 0
     raise InputError(f"no cluster is called '{where}'; use local, local:N or tcp://HOST:PORT")
 
 
-@contextlib.contextmanager
-def _start_local_cluster(distributed: Any, number: int) -> Iterator[Client]:
-    """Start processes of one job at a time that share the cores, each minded by another that
-    replaces it if it dies.
-    """
-    threads = str(max(1, thread_count() // number))
-    with _silence_log(), contextlib.ExitStack() as running:
-        # Only while processes start; a Ctrl-C of that time comes at the end of the shield.
-        with _shield_children_from_interrupt():
-            cluster = running.enter_context(
-                distributed.LocalCluster(
-                    n_workers=number,
-                    threads_per_worker=1,
-                    processes=True,
-                    dashboard_address="127.0.0.1:0",  # no one else may look
-                    silence_logs=logging.CRITICAL,
-                    env={THREADS_VARIABLE: threads},
-                )
-            )
-        yield running.enter_context(distributed.Client(cluster))
-
-
-@contextlib.contextmanager
-def _connect_scheduler(distributed: Any, where: str) -> Iterator[Client]:
+def _connect_scheduler(distributed: Any, where: str) -> Client:
+    """Refuse a cluster without workers, or with workers that have not this version of this program."""
     try:
-        client = distributed.Client(where, timeout=WAIT_SECONDS)
+        client: Client = distributed.Client(where, timeout=WAIT_SECONDS)
     except (OSError, ValueError) as fault:
         raise InputError(
             f"{where}: no scheduler answers; start one with 'dask scheduler'"
         ) from fault
-    with _silence_log(), client:
-        _check_workers(client, where)
-        yield client
-
-
-def _check_workers(client: Client, where: str) -> None:
-    """Refuse a cluster without workers, or with workers that have not this version of this program."""
+    problem = ""
     try:
         client.wait_for_workers(1, timeout=WAIT_SECONDS)
-        found = set(client.run(_version).values())
-    except TimeoutError as fault:
-        raise InputError(
-            f"{where}: the scheduler has no worker; start some with 'dask worker {where}'"
-        ) from fault
+        versions = set(client.run(_version).values())
+    except TimeoutError:
+        problem = f"the scheduler has no worker; start some with 'dask worker {where}'"
     except Exception as fault:
-        raise InputError(f"{where}: its workers have no tofclip {__version__}: {fault}") from fault
-    if found != {__version__}:
-        versions = ", ".join(sorted(found))
-        raise InputError(
-            f"{where}: its workers have tofclip {versions}, this is {__version__}; install the same"
-        )
+        problem = f"its workers have no tofclip {__version__}: {fault}"
+    else:
+        if versions != {__version__}:
+            problem = (
+                f"its workers have tofclip {', '.join(sorted(versions))}, this is {__version__}; "
+                "install the same"
+            )
+    if problem:
+        client.close()
+        raise InputError(f"{where}: {problem}")
+    return client
 
 
 def _version() -> str:
@@ -264,18 +230,6 @@ def _shield_children_from_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextlib.contextmanager
-def _silence_log() -> Iterator[None]:
-    """Keep the library's log off the screen: what matters is in the summary."""
-    logger = logging.getLogger("distributed")
-    before = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
 
 
 @dataclass(frozen=True)
@@ -356,33 +310,6 @@ class Summary:
     peak_bytes: int
     seconds: float
 
-    @classmethod
-    def from_reports(cls, reports: Iterable[Report], started: float) -> Summary:
-        """Sum up reports as they come.
-
-        Parameters
-        ----------
-        reports : iterable of Report
-        started : float
-            Value of `time.perf_counter` when the first job began.
-
-        Returns
-        -------
-        Summary
-        """
-        done, failures, processes, peak = 0, [], set(), 0
-        for report in reports:
-            if report.problem:
-                failures.append(Failure(report.name, report.problem))
-            else:
-                done += 1
-            processes.add(report.process)
-            peak = max(peak, report.peak_bytes)
-        failures.sort(key=lambda failure: failure.name)
-        return cls(
-            done, tuple(failures), len(processes - {""}), peak, time.perf_counter() - started
-        )
-
 
 def select_unfinished(jobs: Iterable[Job]) -> list[Job]:
     """Return the jobs whose result is not there yet."""
@@ -422,99 +349,9 @@ def measure_peak_memory_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
-JOBS_PER_THREAD = 2
-"""For each thread of the workers: one under way, and one so that it need not wait for the next."""
-
-RECOUNT_INTERVAL_S = 1.0
-POLL_INTERVAL_S = 0.01
-MAX_WORKERLESS_S = 120.0
-"""Workers that died are started again within seconds, or by a queue of a computing centre."""
-
-
-class JobPool:
-    """The workers of a cluster.
-
-    The scheduler knows only as many jobs as there are threads, twice: a sequence of millions costs
-    it no memory, and few are blamed for a worker's death.
-
-    `on_killed`: called with a job whose workers died too often, in place of a report of failure.
-    """
-
-    def __init__(self, client: Client, on_killed: Callable[[Job], object] | None = None) -> None:
-        self._client, self._on_killed = client, on_killed
-        self._slots, self._counted_at_s = 1, 0.0
-
-    def run_all(self, jobs: Sequence[Job]) -> Iterator[Report]:
-        """Do all jobs, and yield the reports as they come."""
-        from distributed import as_completed
-
-        waiting = iter(jobs)
-        running: dict[Future[Any], Job] = {}
-        finished = as_completed(raise_errors=False)
-
-        def submit() -> None:
-            while len(running) < self._count_slots() and (job := next(waiting, None)) is not None:
-                # Not pure: Dask would otherwise give the earlier answer to an equal job.
-                future = self._client.submit(run_job, job, pure=False)
-                running[future] = job
-                finished.add(future)
-
-        submit()
-        try:
-            for future in self._iterate_finished(finished):
-                report = self._collect_report(future, running.pop(future))
-                submit()
-                if report is not None:
-                    yield report
-        finally:
-            # Reached early when the caller stops iterating or is interrupted; otherwise nothing is
-            # left.
-            if running:
-                self._client.cancel(list(running))
-
-    def _iterate_finished(self, finished: as_completed) -> Iterator[Future[Any]]:
-        """Yield futures as they finish, while there are workers to finish them."""
-        counted_at_s = had_workers_at_s = time.monotonic()
-        while not finished.is_empty():
-            now = time.monotonic()
-            if finished.has_ready():
-                had_workers_at_s = now
-                yield next(finished)
-                continue
-            if now > counted_at_s + RECOUNT_INTERVAL_S:
-                counted_at_s = now
-                had_workers_at_s = now if self._client.nthreads() else had_workers_at_s
-            if now > had_workers_at_s + MAX_WORKERLESS_S:
-                raise InputError(
-                    f"the cluster has had no worker for {MAX_WORKERLESS_S:.0f} s; start some and "
-                    "run this again: what is done stays"
-                )
-            time.sleep(POLL_INTERVAL_S)
-
-    def _count_slots(self) -> int:
-        """Return how many jobs may be under way; workers are counted once a second."""
-        now = time.monotonic()
-        if now > self._counted_at_s + RECOUNT_INTERVAL_S:
-            self._slots = JOBS_PER_THREAD * max(1, sum(self._client.nthreads().values()))
-            self._counted_at_s = now
-        return self._slots
-
-    def _collect_report(self, future: Future[Any], job: Job) -> Report | None:
-        """Return a job's own report, or say what kept it from making one."""
-        from distributed import KilledWorker
-
-        try:
-            report: Report = future.result()
-        except KilledWorker:
-            if self._on_killed is None:
-                return Report(job.name, "each worker that tried it died; is there enough memory?")
-            # Jobs queued on a worker that dies are blamed with it, so that this one may be
-            # innocent.
-            self._on_killed(job)
-            return None
-        except Exception as fault:
-            return Report(job.name, f"the cluster did not do it: {type(fault).__name__} {fault}")
-        return report
+MAX_SUBMITTED = 1000  # jobs that the scheduler knows: a sequence of millions costs it no memory
+RECOUNT_INTERVAL_S, POLL_INTERVAL_S = 1.0, 0.01
+MAX_WORKERLESS_S = 120.0  # those that died start again, or by a queue of a computing centre
 
 
 def run_jobs(
@@ -528,7 +365,7 @@ def run_jobs(
     Parameters
     ----------
     jobs : sequence of Job
-        Independent of each other. `unfinished` leaves out those whose result is there.
+        Independent of each other. `select_unfinished` leaves out those whose result is there.
     cluster : str, optional
         ``local``, ``local:N`` or ``tcp://HOST:PORT``, see
         `tofclip.sequences.jobs.connect_workers`; by default one job after the other in this
@@ -551,31 +388,92 @@ def run_jobs(
     Memory here: a few hundred bytes for each job. A worker holds what one job needs.
     """
     started = time.perf_counter()
+    done, peak = 0, 0
+    failures: list[Failure] = []
+    processes: set[str] = set()
     try:
-        return Summary.from_reports(
-            _notify_each(_iterate_reports(jobs, cluster), on_report), started
-        )
+        for report in map(run_job, jobs) if cluster is None else _run_on_cluster(jobs, cluster):
+            if on_report is not None:
+                on_report(report)
+            if report.problem:
+                failures.append(Failure(report.name, report.problem))
+            done += not report.problem
+            processes.add(report.process)
+            peak = max(peak, report.peak_bytes)
     finally:
         # Also after an interrupt: workers that were killed could not clean up themselves.
         remove_temporary_files(path for job in jobs for path in (job.result, *job.extra_outputs))
+    failures.sort(key=lambda failure: failure.name)
+    seconds = time.perf_counter() - started
+    return Summary(done, tuple(failures), len(processes - {""}), peak, seconds)
 
 
-def _notify_each(
-    reports: Iterator[Report], on_report: Callable[[Report], object] | None
-) -> Iterator[Report]:
-    for report in reports:
-        if on_report is not None:
-            on_report(report)
-        yield report
+def _run_on_cluster(jobs: Sequence[Job], cluster: str) -> Iterator[Report]:
+    if not jobs:
+        return
+    with connect_workers(cluster) as client:
+        suspects: list[Job] = []
+        yield from _run_on_workers(client, jobs, suspects)
+        # One at a time, so that a death can be blamed on no other job.
+        for job in suspects:
+            killers: list[Job] = []
+            yield from _run_on_workers(client, [job], killers)
+            if killers:
+                problem = "each worker that tried it died; is there enough memory?"
+                yield Report(job.name, problem)
 
 
-def _iterate_reports(jobs: Sequence[Job], cluster: str | None) -> Iterator[Report]:
-    if cluster is None:
-        yield from map(run_job, jobs)
-    elif jobs:
-        with connect_workers(cluster) as client:
-            suspects: list[Job] = []
-            yield from JobPool(client, suspects.append).run_all(jobs)
-            # One at a time, so that a death can be blamed on no other job.
-            for job in suspects:
-                yield from JobPool(client).run_all([job])
+def _run_on_workers(client: Client, jobs: Sequence[Job], killers: list[Job]) -> Iterator[Report]:
+    """Do all jobs, and yield the reports as they come; `killers` gets those whose workers died too
+    often.
+    """
+    from distributed import KilledWorker, as_completed
+
+    waiting = iter(jobs)
+    running: dict[Future[Any], Job] = {}
+    finished = as_completed(raise_errors=False)
+
+    def submit(count: int) -> None:
+        for job in islice(waiting, count):
+            # Not pure: Dask would otherwise give the earlier answer to an equal job.
+            future = client.submit(run_job, job, pure=False)
+            running[future] = job
+            finished.add(future)
+
+    submit(MAX_SUBMITTED)
+    try:
+        for future in _iterate_finished(client, finished):
+            job = running.pop(future)
+            fault = future.exception()
+            if isinstance(fault, KilledWorker):
+                killers.append(job)
+            elif fault is not None:
+                problem = f"the cluster did not do it: {type(fault).__name__} {fault}"
+                yield Report(job.name, problem)
+            else:
+                yield future.result()
+            submit(1)
+    finally:
+        # Reached early when the caller stops iterating or is interrupted; otherwise nothing is left.
+        if running:
+            client.cancel(list(running))
+
+
+def _iterate_finished(client: Client, finished: as_completed) -> Iterator[Future[Any]]:
+    """Yield futures as they finish, while there are workers to finish them."""
+    counted_s = had_workers_s = time.monotonic()
+    while not finished.is_empty():
+        now = time.monotonic()
+        if finished.has_ready():
+            had_workers_s = now
+            yield next(finished)
+            continue
+        if now > counted_s + RECOUNT_INTERVAL_S:
+            counted_s = now
+            had_workers_s = now if client.nthreads() else had_workers_s
+        if now > had_workers_s + MAX_WORKERLESS_S:
+            raise InputError(
+                f"the cluster has had no worker for {MAX_WORKERLESS_S:.0f} s; start some and "
+                "run this again: what is done stays"
+            )
+        time.sleep(POLL_INTERVAL_S)
