@@ -44,10 +44,14 @@ class _CachedCamera(Camera):
     def __hash__(self) -> int:
         return hash(self._digest)
 
-    @lru_cache(maxsize=MAX_CACHED_OPERATORS)  # noqa: B019 - a camera is small
     def operator(self, shear: float = 0.0, dtype: DTypeLike = np.float32) -> LineProjection:
         """Return F(d), see `Camera.operator`; the same object for the same arguments."""
-        return super().operator(shear, dtype)
+        return _make_operator(self, float(shear), np.dtype(dtype).str)
+
+
+@lru_cache(maxsize=MAX_CACHED_OPERATORS)
+def _make_operator(camera: _CachedCamera, shear: float, dtype: str) -> LineProjection:
+    return Camera.operator(camera, shear, dtype)
 
 
 def get_cached_camera(camera: Camera) -> Camera:

@@ -14,8 +14,7 @@ from tofclip.errors import InputError, ShapeError
 Array = NDArray[Any]
 Vector = tuple[float, float, float]
 
-AMBIENT_FRACTION = 0.4
-"""Share of the light that comes from everywhere."""
+AMBIENT_FRACTION = 0.4  # of the light, that comes from everywhere
 
 
 @dataclass(frozen=True)
@@ -42,18 +41,8 @@ class Shape(ABC):
 
     @abstractmethod
     def intersect(self, origin: Array, directions: Array) -> Hits:
-        """Return where rays from (3,) `origin` along (rays, 3) `directions` first meet the surface.
-
-        Parameters
-        ----------
-        origin : (3,) array
-            Metres, in the shape's own coordinates.
-        directions : (rays, 3) array
-            Of any length; distances are counted in it.
-
-        Returns
-        -------
-        Hits
+        """Return where rays from (3,) `origin`, m, first meet the surface along (rays, 3)
+        `directions`, in whose lengths distances are counted.
         """
 
     @property
@@ -81,16 +70,11 @@ class Rectangle(Shape):
         return np.array([self.width, self.height, 0.0]) / 2
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
-        """Return where rays meet the plate, from either side.
-
-        Arguments and result are those of `Shape.intersect`.
-        """
+        """Return where rays meet the plate, from either side; see `Shape.intersect`."""
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = -origin[2] / directions[:, 2]
-            place = (origin[:2] + distance[:, np.newaxis] * directions[:, :2]) / (
-                self.width,
-                self.height,
-            ) + 0.5
+            met_at = origin[:2] + distance[:, np.newaxis] * directions[:, :2]
+            place = met_at / (self.width, self.height) + 0.5
             right, down = place.T
             met = (distance > 0) & (right >= 0) & (right < 1) & (down >= 0) & (down < 1)
         normal = np.zeros_like(directions)
@@ -116,10 +100,7 @@ class Sphere(Shape):
         return np.full(3, self.radius)
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
-        """Return where rays from outside meet the ball.
-
-        Arguments and result are those of `Shape.intersect`.
-        """
+        """Return where rays from outside meet the ball; see `Shape.intersect`."""
         along, square = directions @ origin, np.einsum("ij,ij->i", directions, directions)
         # roots of |origin + t direction|^2 = radius^2; the smaller one is the near side
         below_root = along**2 - square * (origin @ origin - self.radius**2)
@@ -151,12 +132,10 @@ class Box(Shape):
         return np.array([self.width, self.height, self.thickness]) / 2
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
-        """Return where rays from outside meet the block.
+        """Return where rays from outside meet the block; see `Shape.intersect`.
 
         A ray is inside the block where it is inside all three pairs of faces: between the last
         entry and the first exit (slab method).
-
-        Arguments and result are those of `Shape.intersect`.
         """
         half = self.half_extent
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -211,19 +190,10 @@ class Lambertian:
         return np.isfinite(self.reflectance(place))
 
     def radiance(self, place: Array, normal: Array, directions: Array, light: Array) -> Array:
-        """Return the light that goes back along rays.
+        """Return the light that goes back along rays, (points,).
 
-        Parameters
-        ----------
-        place : (points, 2) array
-        normal, directions : (points, 3) arrays
-            Of the surface, length 1; of the rays towards it, any length.
-        light : (3,) array
-            Towards the lamp, length 1.
-
-        Returns
-        -------
-        (points,) array
+        `normal` of the surface and `light` towards the lamp have length 1, `directions` towards the
+        surface any.
         """
         lit: Array = AMBIENT_FRACTION + (1 - AMBIENT_FRACTION) * np.maximum(normal @ light, 0)
         return self.reflectance(place) * lit
@@ -246,23 +216,7 @@ class Specular(Lambertian):
     exponent: float = 200.0
 
     def radiance(self, place: Array, normal: Array, directions: Array, light: Array) -> Array:
-        """Return the light that goes back along rays; arguments as for a matt surface.
-
-        Parameters
-        ----------
-        place : (rays, 2) array
-            On the pattern, from 0 to 1.
-        normal : (rays, 3) array
-            Of length 1, towards the viewer.
-        directions : (rays, 3) array
-            From the viewer to the surface.
-        light : (3,) array
-            Of length 1, towards the lamp.
-
-        Returns
-        -------
-        (rays,) array
-        """
+        """Return the light that goes back along rays; arguments as for a matt surface."""
         matt = super().radiance(place, normal, directions, light)
         unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         mirrored = unit - 2 * np.einsum("ij,ij->i", unit, normal)[:, np.newaxis] * normal
@@ -270,8 +224,7 @@ class Specular(Lambertian):
         return matt + shine
 
 
-Material = Lambertian
-"""Any of the two."""
+Material = Lambertian  # any of the two
 
 
 @dataclass(frozen=True)
@@ -294,9 +247,8 @@ class Body:
     axes: Array = field(default_factory=lambda: np.eye(3))
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
-        """Return where rays meet the body; holes of its pattern let them pass.
-
-        Arguments and result are those of `Shape.intersect`.
+        """Return where rays meet the body, holes of whose pattern let them pass; see
+        `Shape.intersect`.
         """
         found = self.shape.intersect((origin - self.centre) @ self.axes, directions @ self.axes)
         solid = self.material.is_solid(found.pattern_position)
@@ -307,24 +259,11 @@ class Body:
         )
 
     def select_candidate_rays(self, origin: Array, directions: Array) -> Array:
-        """Return the numbers of those rays, all forward, that may meet the body; most of a
+        """Return the numbers of those rays, all with positive z, that may meet the body; most of a
         picture's do not.
-
-        Parameters
-        ----------
-        origin : (3,) array
-            Metres.
-        directions : (rays, 3) array
-            With positive z.
-
-        Returns
-        -------
-        (n,) int array
         """
-        (x, y, z), (width, height, thickness) = (
-            self.centre - origin,
-            np.abs(self.axes) @ self.shape.half_extent,
-        )
+        x, y, z = self.centre - origin
+        width, height, thickness = np.abs(self.axes) @ self.shape.half_extent
         if z <= thickness:
             return np.arange(len(directions))
         # slopes x / z under which the near face of the bounding box can still be seen
@@ -338,37 +277,26 @@ class Body:
         )
 
     def shift(self, x: float, y: float, z: float = 0.0) -> Body:
-        """Return the body moved by metres.
-
-        Parameters
-        ----------
-        x, y, z : float
-            Metres, right, down and away.
-
-        Returns
-        -------
-        Body
-        """
+        """Return the body moved by metres to the right, down and away."""
         return replace(self, centre=self.centre + np.array([x, y, z]))
 
     def flip(self) -> Body:
         """Return the body mirrored left to right in its own middle."""
-        return replace(self, axes=np.diag([-1.0, 1.0, 1.0]) @ self.axes)
+        return self._turn(np.diag([-1.0, 1.0, 1.0]))
 
     def rotate(self, angle: float) -> Body:
         """Return the body turned clockwise, as seen, about its middle and the line of sight;
         `angle` in rad.
         """
         cosine, sine = np.cos(angle), np.sin(angle)
-        return replace(
-            self, axes=np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ self.axes
-        )
+        return self._turn([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
     def tilt(self, angle: float) -> Body:
         """Return the body turned about the upright line through its middle, its right side away;
         `angle` in rad.
         """
         cosine, sine = np.cos(angle), np.sin(angle)
-        return replace(
-            self, axes=np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ self.axes
-        )
+        return self._turn([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
+
+    def _turn(self, matrix: Any) -> Body:
+        return replace(self, axes=np.array(matrix) @ self.axes)

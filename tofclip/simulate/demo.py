@@ -7,6 +7,8 @@ the views by up to 16 rows. Its exposure gives the brightest streak pixel 2000 p
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from tofclip.camera import Camera, SkewSweep
@@ -70,33 +72,18 @@ def make_default_instrument() -> Instrument:
 
 def make_default_scene() -> Scene:
     """Return four cut-out letters and three textured plates between 1.7 and 3.2 m."""
-    return Scene(
-        (
-            _place_plate(
-                cut_pattern(make_letter("U"), make_plain_pattern(0.8)), (-25, -24), 34, 1.75
-            ),
-            _place_plate(
-                cut_pattern(make_letter("C"), make_plain_pattern(0.8)),
-                (23, -27),
-                34,
-                2.05,
-                yaw=0.15,
-            ),
-            _place_plate(
-                cut_pattern(make_letter("L"), make_plain_pattern(0.8)), (-24, 22), 32, 2.35
-            ),
-            _place_plate(
-                cut_pattern(make_letter("A"), make_plain_pattern(0.8)),
-                (22, 20),
-                36,
-                2.62,
-                pitch=-0.15,
-            ),
-            _place_plate(make_checkerboard(4, 0.3, 0.9), (2, -2), 36, 2.85, yaw=-0.3),
-            _place_plate(make_rings(3, 0.3, 0.9), (-2, 36), 36, 3.0),
-            _place_plate(make_stripes(4, 0.3, 0.9), (0, 0), 96, 3.18),
-        )
+    letters = {name: cut_pattern(make_letter(name), make_plain_pattern(0.8)) for name in "UCLA"}
+    # pattern, middle and side in pixels, depth in m, yaw and pitch in rad
+    plates: tuple[tuple[Pattern, Any, float, float, float, float], ...] = (
+        (letters["U"], (-25, -24), 34, 1.75, 0.0, 0.0),
+        (letters["C"], (23, -27), 34, 2.05, 0.15, 0.0),
+        (letters["L"], (-24, 22), 32, 2.35, 0.0, 0.0),
+        (letters["A"], (22, 20), 36, 2.62, 0.0, -0.15),
+        (make_checkerboard(4, 0.3, 0.9), (2, -2), 36, 2.85, -0.3, 0.0),
+        (make_rings(3, 0.3, 0.9), (-2, 36), 36, 3.0, 0.0, 0.0),
+        (make_stripes(4, 0.3, 0.9), (0, 0), 96, 3.18, 0.0, 0.0),
     )
+    return Scene(tuple(_place_plate(*plate) for plate in plates))
 
 
 def _place_plate(
@@ -104,8 +91,8 @@ def _place_plate(
     middle_px: tuple[float, float],
     side_px: float,
     depth: float,
-    yaw: float = 0.0,
-    pitch: float = 0.0,
+    yaw: float,
+    pitch: float,
 ) -> Body:
     """Square plate that appears around pixel offset `middle_px` (x, y) from the optical axis,
     `side_px` wide.

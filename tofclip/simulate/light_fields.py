@@ -1,10 +1,5 @@
-"""A grid of pinhole cameras, all looking the same way, their pictures shifted to agree at one
-distance.
-
-Light fields under a distant lamp: what each camera of an array sees of a scene.
-
-Time of flight in light fields: which instant brings which light to which pixel of each view,
-lamps and shadows included.
+"""Light fields of a simulated scene: a grid of pinhole cameras that all look the same way, their
+pictures shifted to agree at one distance, under a distant lamp or under lamps that flash.
 
 Light goes from a lamp to a surface and on to a view; a lamp that something else shades adds
 nothing. Interreflections are left out.
@@ -12,6 +7,7 @@ nothing. Interreflections are left out.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,17 +30,9 @@ from tofclip.simulate.rays import (
 from tofclip.threads import limit_blas_threads, run_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
-__all__ = [
-    "CameraArray",
-    "PulsedScene",
-    "RenderedLightField",
-    "TimeAxis",
-    "render_flash",
-    "render_flash_view",
-    "render_light_field",
-    "render_shear_map",
-    "render_view",
-]
+Array = NDArray[Any]
+
+LIGHT_DIRECTION = (-0.35, -0.45, -0.82)  # towards the lamp: over the viewer's left shoulder
 
 
 @dataclass(frozen=True)
@@ -120,13 +108,7 @@ class CameraArray:
         return shear
 
     def depth(self, shear: float) -> float:
-        """Distance along z, in metres, of points with a shear.
-
-        Raises
-        ------
-        InputError
-            They would lie beyond infinity.
-        """
+        """Distance along z, m, of points with a shear; `InputError` where it lies beyond infinity."""
         inverse = 1 / self.focus - shear / (self.focal_length_px * self.view_step)
         if not inverse > 0:
             raise InputError(
@@ -135,62 +117,28 @@ class CameraArray:
         return 1 / inverse
 
     def point(self, x: float, y: float, shear: float) -> NDArray[np.float64]:
-        """The point (x, y, z) in metres that the reference view sees `x`, `y` pixels off its centre
-        at a shear.
-
-        Parameters
-        ----------
-        x, y : float
-            Pixels off the centre, right and down.
-        shear : float
-            Pixels per view step.
-
-        Returns
-        -------
-        (3,) float64 array
+        """The point (x, y, z), m, that the reference view sees `x` pixels right and `y` down of its
+        centre at a shear, in pixels per view step.
         """
         depth = self.depth(shear)
         return np.array([x / self.focal_length_px * depth, y / self.focal_length_px * depth, depth])
 
     def rays(self, view: View, samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Rays of one camera.
-
-        Parameters
-        ----------
-        view : (float, float)
-            (v, u); fractions are cameras between those of the grid.
-        samples : int
-            Rays on a side of each pixel.
-
-        Returns
-        -------
-        origin : (3,) array
-        directions : (rows * samples * columns * samples, 3) array
-            As long as the way from the camera to the plane in focus.
+        """Rays of one camera at (v, u), `samples` on a side of each pixel: the origin (3,), m, and
+        directions (rows * samples * columns * samples, 3), as long as the way to the plane in focus.
         """
         rows, columns = self.image_shape
         origin = self.position(view)
+        # in pixels from the middle of the picture's central pixel, number n // 2
         y, x = (
-            _sample_positions(count, samples) * self.focus / self.focal_length_px
-            for count in (rows, columns)
+            ((np.arange(n * samples) + 0.5) / samples - 0.5 - n // 2)
+            * self.focus
+            / self.focal_length_px
+            for n in (rows, columns)
         )
         # all views' pictures agree on the plane in focus: rays of one pixel meet there
         at_focus = np.stack(np.broadcast_arrays(x, y[:, np.newaxis], self.focus), axis=-1)
         return origin, at_focus.reshape(-1, 3) - origin
-
-
-def _sample_positions(pixels: int, samples: int) -> NDArray[np.float64]:
-    """Places of the samples in pixels from the middle of the picture's central pixel, number n //
-    2.
-    """
-    places: NDArray[np.float64] = (np.arange(pixels * samples) + 0.5) / samples - 0.5 - pixels // 2
-    return places
-
-
-Array = NDArray[Any]
-
-LIGHT_DIRECTION = (-0.35, -0.45, -0.82)
-"""Towards the lamp: over the viewer's left shoulder."""
 
 
 @dataclass(frozen=True)
@@ -231,45 +179,31 @@ class RenderedLightField:
 
 
 def render_light_field(scene: Scene, array: CameraArray) -> RenderedLightField:
-    """Render every view of an array; memory is about 200 bytes for each ray of one view and thread.
-
-    Parameters
-    ----------
-    scene : Scene
-    array : CameraArray
-
-    Returns
-    -------
-    RenderedLightField
-        Pictures (views, rows, columns) float32 and the reference view's map of shears.
+    """Render every view of an array, and the reference view's map of shears; memory is about 200
+    bytes for each ray of one view and thread.
     """
     views = array.views
     pictures = np.empty((len(views), *array.image_shape), np.float32)
 
-    def some(which: slice) -> None:
-        for number in range(which.start, which.stop):
-            v, u = views[number]
-            pictures[number] = render_view(scene, array, (float(v), float(u)))
-
-    with limit_blas_threads():  # the threads are used for views
-        run_blocks(some, len(views), 1)
+    _for_each_view(array, pictures, lambda view: render_view(scene, array, view))
     return RenderedLightField(LightField(pictures, views), render_shear_map(scene, array))
+
+
+def _for_each_view(array: CameraArray, pictures: Array, render: Callable[[View], Array]) -> None:
+    """Fill `pictures` (views, ...); the threads are used for views."""
+
+    def fill(piece: slice) -> None:
+        for number in range(piece.start, piece.stop):
+            v, u = array.views[number].tolist()
+            pictures[number] = render((v, u))
+
+    with limit_blas_threads():
+        run_blocks(fill, len(pictures), 1)
 
 
 def render_view(scene: Scene, array: CameraArray, view: View) -> Array:
     """Return what the camera at (v, u) sees, (rows, columns) float32; fractions are cameras between
     the array's.
-
-    Parameters
-    ----------
-    scene : Scene
-    array : CameraArray
-    view : (float, float)
-        View steps down and to the right.
-
-    Returns
-    -------
-    (rows, columns) float32 array
     """
     origin, directions = array.rays(view, array.samples)
     _, brightness = _shade_rays(scene, origin, directions)
@@ -280,20 +214,8 @@ def render_view(scene: Scene, array: CameraArray, view: View) -> Array:
 
 
 def render_shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) -> Array:
-    """Return the shear of what a view sees in the middle of each pixel, (rows, columns) float32;
-    infinite: nothing.
-
-    Parameters
-    ----------
-    scene : Scene
-    array : CameraArray
-    view : (float, float)
-        View steps down and to the right.
-
-    Returns
-    -------
-    (rows, columns) float32 array
-        Pixels per view step.
+    """Return the shear of what a view sees in the middle of each pixel, (rows, columns) float32,
+    pixels per view step; infinite where it sees nothing.
     """
     origin, directions = array.rays(view, 1)
     distance, _ = _shade_rays(scene, origin, directions)
@@ -379,28 +301,12 @@ class TimeAxis:
 
     @classmethod
     def for_ranges(cls, near: float, far: float, bin_width: float, pulse_fwhm: float) -> TimeAxis:
-        """Return a time axis for surfaces from `near` to `far` metres away, lamps beside the views.
-
-        Parameters
-        ----------
-        near, far : float
-            Metres.
-        bin_width : float
-            Seconds.
-        pulse_fwhm : float
-            Full width at half maximum of the instrument's response, seconds.
-
-        Returns
-        -------
-        TimeAxis
+        """Return a time axis for surfaces from `near` to `far` metres away, lamps beside the views;
+        `bin_width` and `pulse_fwhm` in s.
         """
         start = 2 * near / SPEED_OF_LIGHT
-        return cls(
-            start,
-            bin_width,
-            int(np.ceil(2 * (far - near) / SPEED_OF_LIGHT / bin_width)) + 1,
-            pulse_fwhm,
-        )
+        bins = int(np.ceil(2 * (far - near) / SPEED_OF_LIGHT / bin_width)) + 1
+        return cls(start, bin_width, bins, pulse_fwhm)
 
 
 def render_flash(
@@ -411,49 +317,18 @@ def render_flash(
     A surface of reflectance 1 that faces all lamps from the distance of the array's focus has
     brightness 1, summed over time. Memory beyond the result is about 1 kB for each ray of a view
     and thread.
-
-    Parameters
-    ----------
-    scene : PulsedScene
-        Bodies and lamps.
-    array : CameraArray
-    time_axis : TimeAxis
-
-    Returns
-    -------
-    (views, rows, columns, bins) float32 array
     """
     views = array.views
     pictures = np.empty((len(views), *array.image_shape, time_axis.bins), np.float32)
 
-    def some(which: slice) -> None:
-        for number in range(which.start, which.stop):
-            pictures[number] = render_flash_view(
-                scene, array, time_axis, (views[number, 0], views[number, 1])
-            )
-
-    with limit_blas_threads():  # the threads are used for views
-        run_blocks(some, len(views), 1)
+    _for_each_view(array, pictures, lambda view: render_flash_view(scene, array, time_axis, view))
     return pictures
 
 
 def render_flash_view(
     scene: PulsedScene, array: CameraArray, time_axis: TimeAxis, view: View
 ) -> Array:
-    """Return what the camera at (v, u) sees in every time bin.
-
-    Parameters
-    ----------
-    scene : PulsedScene
-    array : CameraArray
-    time_axis : TimeAxis
-    view : (float, float)
-        View steps down and to the right.
-
-    Returns
-    -------
-    (rows, columns, bins) float32 array
-    """
+    """Return what the camera at (v, u) sees in every time bin, (rows, columns, bins) float32."""
     origin, directions = array.rays(view, array.samples)
     sight = cast_rays(scene.bodies, origin, directions)
     seen = np.flatnonzero(sight.body != NO_BODY)

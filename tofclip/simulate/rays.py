@@ -20,9 +20,7 @@ from tofclip.simulate.bodies import Body
 Array = NDArray[Any]
 
 NO_BODY = -1
-SHADOW_MARGIN = (
-    1e-6  # relative; nearer to its lamp than this, rounding makes a surface shade itself
-)
+SHADOW_MARGIN = 1e-6  # relative; with less, rounding makes a surface shade itself
 FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
 EXTENT_SIGMAS = 5.0  # a Gaussian leaves 6e-7 of its energy outside
 
@@ -38,9 +36,8 @@ class FirstHits:
 
 
 def cast_rays(bodies: Sequence[Body], origin: Array, directions: Array) -> FirstHits:
-    """Follow rays to the nearest surface.
-
-    `origin` (3,): where all rays start, m; `directions` (rays, 3): of any length, all with z > 0.
+    """Follow rays from (3,) `origin`, m, along (rays, 3) `directions`, all with z > 0, to the nearest
+    surface.
     """
     count = len(directions)
     nearest, number = np.full(count, np.inf), np.full(count, NO_BODY, np.intp)
@@ -57,10 +54,7 @@ def cast_rays(bodies: Sequence[Body], origin: Array, directions: Array) -> First
 
 
 def look_up_reflectance(bodies: Sequence[Body], hits: FirstHits) -> Array:
-    """Return the pattern's value where each ray hits, (rays,) float64; 0 where it hits nothing.
-
-    `hits`: numbers of the bodies, and the places on their patterns. Returns (rays,).
-    """
+    """Return the pattern's value where each ray hits, (rays,) float64; 0 where it hits nothing."""
     found = np.zeros(hits.body.size)
     for number, one in enumerate(bodies):
         own = hits.body == number
@@ -69,11 +63,8 @@ def look_up_reflectance(bodies: Sequence[Body], hits: FirstHits) -> Array:
 
 
 def compute_irradiance(bodies: Sequence[Body], lamp: Array, points: Array, normal: Array) -> Array:
-    """Return how strongly a lamp lights points: cosine over distance squared, nothing in shadow.
-
-    `bodies`: what may stand between lamp and points; `lamp` (3,): m; all points lie at larger z;
-    `points, normal` (points, 3): on surfaces, m; and where these face, length 1. Returns (points,):
-    1 / m^2 for a lamp of unit power per solid angle.
+    """Return how strongly a lamp lights points (points, 3), all of larger z, on surfaces that face
+    along `normal`: cosine over distance squared, 1 / m^2, nothing in the shadow of a body.
     """
     rays = points - lamp
     distance = np.linalg.norm(rays, axis=1)
@@ -89,31 +80,25 @@ def compute_irradiance(bodies: Sequence[Body], lamp: Array, points: Array, norma
 
 
 def number_ray_pixels(image_shape: tuple[int, int], rays_per_side: int) -> NDArray[np.intp]:
-    """Return the raster number of the pixel to which each ray belongs.
-
-    `image_shape`: rows and columns of the picture; `rays_per_side`: rays along each side of a
-    pixel. Returns (rows * columns * rays_per_side**2,): rays are in raster order over the whole
-    picture.
+    """Return the raster number of the pixel to which each ray belongs, in raster order of rays over
+    the whole picture.
     """
     numbers = np.arange(int(np.prod(image_shape))).reshape(image_shape)
     return numbers.repeat(rays_per_side, axis=0).repeat(rays_per_side, axis=1).ravel()
 
 
 def accumulate_cells(cell: NDArray[np.intp], amount: Array, shape: tuple[int, ...]) -> Array:
-    """Add each amount to its cell, numbered in raster order, of a float64 array of `shape`.
-
-    `cell` (n,); `amount` (n,); `shape`: of the result.
-    """
+    """Add each amount to its cell, numbered in raster order, of a float64 array of `shape`."""
     total: Any = np.bincount(cell.ravel(), amount.ravel(), minlength=int(np.prod(shape)))
     return np.asarray(total, dtype=np.float64).reshape(shape)
 
 
 def spread_pulse(position: Array, sigma: Array) -> tuple[NDArray[np.intp], Array]:
-    """Integrate a Gaussian pulse over the bins around it.
+    """Integrate Gaussian pulses at `position` (n,), in bins, over the bins around them; bin i
+    reaches from i - 1/2 to i + 1/2.
 
-    `position` (n,): middle of each pulse, in bins; bin i reaches from i - 1/2 to i + 1/2; `sigma`
-    (n,): standard deviations, in bins. Returns `first` (n,): first bin of each pulse; `shares` (n,
-    reach): fraction of the pulse's energy in that bin and those after it.
+    Returns the first bin of each pulse, and (n, reach) fractions of its energy in that bin and those
+    after it.
     """
     if position.size == 0:
         return np.zeros(0, dtype=np.intp), np.zeros((0, 1))
@@ -128,11 +113,8 @@ def spread_pulse(position: Array, sigma: Array) -> tuple[NDArray[np.intp], Array
 def bin_by_time(
     pixel: NDArray[np.intp], position: Array, light: Array, sigma: float, shape: tuple[int, int]
 ) -> Array:
-    """Add the light of rays to the bins of their pixels, each spread over its pulse.
-
-    `pixel` (rays,); `position` (rays,): arrival, in bins; light outside of the axis is lost;
-    `light` (rays,); `sigma`: standard deviation of the Gaussian pulse, in bins; `shape`: pixels and
-    bins. Returns (pixels, bins).
+    """Add the light of rays to the bins of their pixels, (pixels, bins), each spread over its pulse
+    about its arrival, in bins; light outside of the axis is lost.
     """
     first, shares = spread_pulse(position, np.full(position.shape, sigma))
     bins = first[:, np.newaxis] + np.arange(shares.shape[1])

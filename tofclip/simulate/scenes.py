@@ -6,13 +6,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from tofclip.errors import InputError
-from tofclip.simulate.bodies import Body, Box, Lambertian, Material, Rectangle, Specular, Sphere
+from tofclip.simulate.bodies import (
+    Body,
+    Box,
+    Lambertian,
+    Material,
+    Rectangle,
+    Shape,
+    Specular,
+    Sphere,
+)
 from tofclip.simulate.light_fields import CameraArray, Scene
 from tofclip.simulate.patterns import (
+    Pattern,
     cut_pattern,
     make_checkerboard,
     make_letter,
@@ -23,18 +34,35 @@ from tofclip.simulate.patterns import (
     make_text_pattern,
 )
 
-DESIGN_WIDTH_PX = (
-    128  # places and sizes below are pixels of a picture so wide, seen from the reference view
-)
+# Places and sizes below are pixels of a picture so wide, seen from the reference view; depths are
+# shears, pixels per view step.
+DESIGN_WIDTH_PX = 128
 OCCLUDER_SHEAR = -3.0
 BLACK_MATERIAL = Lambertian(make_plain_pattern(0.0))
 
 
 @dataclass(frozen=True)
 class _SceneBuilder:
-    """Places bodies by what the reference view should see: pixels off the centre, and a shear."""
+    """Places bodies by what the reference view should see: pixels right and down of the centre, and
+    a shear.
+    """
 
     array: CameraArray
+
+    def _place(
+        self,
+        shape: Callable[..., Shape],
+        place: tuple[float, float],
+        sides: tuple[float, ...],
+        shear: float,
+        material: Material,
+    ) -> Body:
+        scale = min(self.array.image_shape) / DESIGN_WIDTH_PX
+        lengths = (
+            side * scale / self.array.focal_length_px * self.array.depth(shear) for side in sides
+        )
+        centre = self.array.point(scale * place[0], scale * place[1], shear)
+        return Body(shape(*lengths), material, centre)
 
     def plate(
         self,
@@ -43,23 +71,14 @@ class _SceneBuilder:
         shear: float,
         material: Material,
     ) -> Body:
-        """Return a flat plate that faces the cameras.
-
-        `place`: pixels right and down of the centre of the reference view; `size`: width and height
-        as the reference view sees them, pixels; `shear`: depth, as pixels per view step.
-        """
-        width, height = (self._length(side, shear) for side in size)
-        return Body(Rectangle(width, height), material, self._point(place, shear))
+        """Return a flat plate that faces the cameras, `size` wide and high."""
+        return self._place(Rectangle, place, size, shear, material)
 
     def ball(
         self, place: tuple[float, float], radius: float, shear: float, material: Material
     ) -> Body:
-        """Return a ball whose centre lies at a shear.
-
-        `place`: pixels right and down of the centre of the reference view; `radius`: pixels of the
-        reference view; `shear`: depth, as pixels per view step.
-        """
-        return Body(Sphere(self._length(radius, shear)), material, self._point(place, shear))
+        """Return a ball whose centre lies at a shear."""
+        return self._place(Sphere, place, (radius,), shear, material)
 
     def block(
         self,
@@ -68,50 +87,17 @@ class _SceneBuilder:
         shear: float,
         material: Material,
     ) -> Body:
-        """Return a block as thick as it is wide.
+        """Return a block as thick as it is wide."""
+        return self._place(Box, place, (*size, size[0]), shear, material)
 
-        `place`: pixels right and down of the centre of the reference view; `size`: width and
-        height, pixels of the reference view; `shear`: depth, as pixels per view step.
-        """
-        width, height = (self._length(side, shear) for side in size)
-        return Body(Box(width, height, width), material, self._point(place, shear))
-
-    def backdrop(self, shear: float, material: Material) -> Body:
-        """Return a plate that fills every view.
-
-        `shear`: depth, as pixels per view step.
-        """
-        return self.plate((0, 0), (2.2 * DESIGN_WIDTH_PX,) * 2, shear, material)
-
-    def _length(self, pixels: float, shear: float) -> float:
-        return pixels * self._scale() / self.array.focal_length_px * self.array.depth(shear)
-
-    def _point(self, place: tuple[float, float], shear: float) -> np.ndarray:
-        x, y = (self._scale() * side for side in place)
-        return self.array.point(x, y, shear)
-
-    def _scale(self) -> float:
-        return min(self.array.image_shape) / DESIGN_WIDTH_PX
+    def scene(self, shear: float, backdrop: Pattern, *bodies: Body) -> Scene:
+        """Return a scene before a plate that fills every view."""
+        sides = (2.2 * DESIGN_WIDTH_PX,) * 2
+        return Scene((self.plate((0, 0), sides, shear, Lambertian(backdrop)), *bodies))
 
 
 def make_scene(name: str, array: CameraArray) -> Scene:
-    """Return a scene of `SCENES`, sized for a camera array.
-
-    Parameters
-    ----------
-    name : str
-        A key of `SCENES`.
-    array : CameraArray
-
-    Returns
-    -------
-    Scene
-
-    Raises
-    ------
-    InputError
-        No scene has that name.
-    """
+    """Return a scene of `SCENES`, sized for a camera array."""
     if name not in SCENES:
         raise InputError(f"unknown scene '{name}'; take one of {', '.join(SCENES)}")
     return SCENES[name](_SceneBuilder(array))
@@ -149,109 +135,79 @@ EDITS: dict[str, Callable[[Body], Body]] = {
 
 
 def _make_still_life(stage: _SceneBuilder) -> Scene:
-    wall = stage.backdrop(0.5, Lambertian(make_mottled_pattern(0.1, 0.6, 18, seed=1)))
-    board = stage.plate(
-        (26, -14), (52, 52), -0.1, Lambertian(make_text_pattern("TOF\nCLIP", 0.05, 0.9))
-    ).tilt(0.3)
-    ball = stage.ball((-30, 18), 24, -0.8, Lambertian(make_checkerboard(12, 0.15, 0.95)))
-    return Scene((wall, board, ball))
+    text, squares = make_text_pattern("TOF\nCLIP", 0.05, 0.9), make_checkerboard(12, 0.15, 0.95)
+    board = stage.plate((26, -14), (52, 52), -0.1, Lambertian(text)).tilt(0.3)
+    ball = stage.ball((-30, 18), 24, -0.8, Lambertian(squares))
+    return stage.scene(0.5, make_mottled_pattern(0.1, 0.6, 18, seed=1), board, ball)
 
 
 def _make_blocks(stage: _SceneBuilder) -> Scene:
-    wall = stage.backdrop(0.8, Lambertian(make_stripes(18, 0.15, 0.45)))
-    block = stage.block(
-        (24, 16), (40, 44), 0.0, Lambertian(make_rings(4, 0.2, 0.9)[38:154, 38:154])
-    ).tilt(-0.5)
-    card = stage.plate(
-        (-26, -14),
-        (50, 56),
-        -0.6,
-        Lambertian(cut_pattern(make_letter("A"), make_plain_pattern(0.9))),
-    )
-    return Scene((wall, block, card))
+    rings = Lambertian(make_rings(4, 0.2, 0.9)[38:154, 38:154])
+    block = stage.block((24, 16), (40, 44), 0.0, rings).tilt(-0.5)
+    card = stage.plate((-26, -14), (50, 56), -0.6, _cut_letter("A"))
+    return stage.scene(0.8, make_stripes(18, 0.15, 0.45), block, card)
 
 
 def _make_letters(stage: _SceneBuilder) -> Scene:
-    wall = stage.backdrop(0.5, Lambertian(make_plain_pattern(0.02)))
+    letters = (("C", (-38, -22), -1.0), ("L", (0, 2), -0.4), ("A", (38, 26), -0.1))
     plates = (
-        stage.plate(
-            place,
-            (36, 44),
-            shear,
-            Lambertian(cut_pattern(make_letter(name), make_plain_pattern(0.9))),
-        )
-        for name, place, shear in (
-            ("C", (-38, -22), -1.0),
-            ("L", (0, 2), -0.4),
-            ("A", (38, 26), -0.1),
-        )
+        stage.plate(place, (36, 44), shear, _cut_letter(name)) for name, place, shear in letters
     )
-    return Scene((wall, *plates))
+    return stage.scene(0.5, make_plain_pattern(0.02), *plates)
 
 
 def _make_slanted_text(stage: _SceneBuilder) -> Scene:
-    wall = stage.backdrop(0.5, Lambertian(make_plain_pattern(0.02)))
-    text = Lambertian(make_text_pattern("LIGHT\nFIELD\nVIEWS", 0.03, 0.85))
-    sheet = stage.plate((-8, 0), (110, 84), -0.45, text).tilt(
-        0.84
-    )  # from s = -1 on the left to 0.3 on the right
-    return Scene((wall, sheet))
+    text = _print_text("LIGHT\nFIELD\nVIEWS", 0.03, 0.85)
+    # from s = -1 on the left to 0.3 on the right
+    sheet = stage.plate((-8, 0), (110, 84), -0.45, text).tilt(0.84)
+    return stage.scene(0.5, make_plain_pattern(0.02), sheet)
 
 
 def _make_bolt_and_letters(stage: _SceneBuilder) -> Scene:
-    wall = stage.backdrop(0.5, Lambertian(make_plain_pattern(0.03)))
     metal = Specular(make_stripes(10, 0.1, 0.35), gloss=0.8, exponent=60)
     head = stage.ball((-34, 14), 18, -1.0, metal)
     shank = stage.block((-30, -24), (16, 40), -0.9, metal).tilt(0.6)
-    near = stage.plate((8, 24), (30, 36), -0.5, Lambertian(make_text_pattern("B", 0.9)))
-    far = stage.plate((40, -16), (40, 44), 0.2, Lambertian(make_text_pattern("T", 0.8)))
-    return Scene((wall, far, near, shank, head))
+    near = stage.plate((8, 24), (30, 36), -0.5, _print_text("B", 0.9))
+    far = stage.plate((40, -16), (40, 44), 0.2, _print_text("T", 0.8))
+    return stage.scene(0.5, make_plain_pattern(0.03), far, near, shank, head)
 
 
 def _make_printed_words(stage: _SceneBuilder) -> Scene:
-    wall = stage.backdrop(1.0, Lambertian(make_plain_pattern(0.02)))
+    words = (("NEAR", -1.0), ("CLIP", -0.3), ("VIEW", 0.3), ("FAR", 0.99))
     lines = (
-        stage.plate((0, -45 + 30 * row), (96, 26), shear, Lambertian(make_text_pattern(word, 0.85)))
-        for row, (word, shear) in enumerate(
-            (("NEAR", -1.0), ("CLIP", -0.3), ("VIEW", 0.3), ("FAR", 0.99))
-        )
+        stage.plate((0, -45 + 30 * row), (96, 26), shear, _print_text(word, 0.85))
+        for row, (word, shear) in enumerate(words)
     )
-    return Scene((wall, *lines))
+    return stage.scene(1.0, make_plain_pattern(0.02), *lines)
 
 
 def _make_printed_letters(stage: _SceneBuilder) -> Scene:
-    wall = stage.backdrop(1.0, Lambertian(make_plain_pattern(0.02)))
-    near = stage.plate((-26, -16), (44, 60), -0.3, Lambertian(make_text_pattern("U", 0.85)))
-    far = stage.plate((28, 18), (44, 56), 0.3, Lambertian(make_text_pattern("L", 0.85)))
-    return Scene((wall, near, far))
+    near = stage.plate((-26, -16), (44, 60), -0.3, _print_text("U", 0.85))
+    far = stage.plate((28, 18), (44, 56), 0.3, _print_text("L", 0.85))
+    return stage.scene(1.0, make_plain_pattern(0.02), near, far)
 
 
-def _make_word(stage: _SceneBuilder) -> Body:
-    return stage.plate((0, 0), (100, 40), -0.4, Lambertian(make_text_pattern("CLIP", 0.9)))
+def _make_occluded_scene(stage: _SceneBuilder, target: str, occluder: str) -> Scene:
+    """A figure or a word behind black bars or plates."""
+    if target == "word":
+        bodies = [stage.plate((0, 0), (100, 40), -0.4, _print_text("CLIP", 0.9))]
+    else:
+        skin = Lambertian(make_mottled_pattern(0.5, 0.95, 10, seed=3))
+        # trunk, arms and legs
+        parts = (((0, 2), (26, 46)), ((0, -12), (70, 9)), ((-8, 40), (9, 36)), ((8, 40), (9, 36)))
+        bodies = [stage.ball((0, -34), 11, -0.4, skin)]
+        bodies += [stage.plate(place, size, -0.4, skin) for place, size in parts]
+    width, places = (9, (-45, -15, 15, 45)) if occluder == "bars" else (14, (-20, 26))
+    bodies += [stage.plate((x, 0), (width, 200), OCCLUDER_SHEAR, BLACK_MATERIAL) for x in places]
+    return stage.scene(0.5, make_plain_pattern(0.01), *bodies)
 
 
-def _make_figure(stage: _SceneBuilder) -> tuple[Body, ...]:
-    skin = Lambertian(make_mottled_pattern(0.5, 0.95, 10, seed=3))
-    head, trunk = stage.ball((0, -34), 11, -0.4, skin), stage.plate((0, 2), (26, 46), -0.4, skin)
-    arms = stage.plate((0, -12), (70, 9), -0.4, skin)
-    legs = (stage.plate((side, 40), (9, 36), -0.4, skin) for side in (-8, 8))
-    return (head, trunk, arms, *legs)
+def _cut_letter(name: str) -> Lambertian:
+    return Lambertian(cut_pattern(make_letter(name), make_plain_pattern(0.9)))
 
 
-def _make_bars(stage: _SceneBuilder) -> tuple[Body, ...]:
-    return tuple(
-        stage.plate((x, 0), (9, 200), OCCLUDER_SHEAR, BLACK_MATERIAL) for x in (-45, -15, 15, 45)
-    )
-
-
-def _make_dark_plates(stage: _SceneBuilder) -> tuple[Body, ...]:
-    return tuple(stage.plate((x, 0), (14, 200), OCCLUDER_SHEAR, BLACK_MATERIAL) for x in (-20, 26))
-
-
-def _make_occluded_scene(
-    target: tuple[Body, ...], occluder: tuple[Body, ...], stage: _SceneBuilder
-) -> Scene:
-    return Scene((stage.backdrop(0.5, Lambertian(make_plain_pattern(0.01))), *target, *occluder))
+def _print_text(text: str, ink: float, paper: float = float("nan")) -> Lambertian:
+    return Lambertian(make_text_pattern(text, ink, paper))
 
 
 SCENES: dict[str, Callable[[_SceneBuilder], Scene]] = {
@@ -262,16 +218,11 @@ SCENES: dict[str, Callable[[_SceneBuilder], Scene]] = {
     "bolt-and-letters": _make_bolt_and_letters,
     "printed-words": _make_printed_words,
     "printed-letters": _make_printed_letters,
-    "figure-behind-bars": lambda stage: _make_occluded_scene(
-        _make_figure(stage), _make_bars(stage), stage
-    ),
-    "figure-behind-plates": lambda stage: _make_occluded_scene(
-        _make_figure(stage), _make_dark_plates(stage), stage
-    ),
-    "word-behind-bars": lambda stage: _make_occluded_scene(
-        (_make_word(stage),), _make_bars(stage), stage
-    ),
-    "word-behind-plates": lambda stage: _make_occluded_scene(
-        (_make_word(stage),), _make_dark_plates(stage), stage
-    ),
+    **{
+        f"{target}-behind-{occluder}": partial(
+            _make_occluded_scene, target=target, occluder=occluder
+        )
+        for target in ("figure", "word")
+        for occluder in ("bars", "plates")
+    },
 }

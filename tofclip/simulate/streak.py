@@ -1,15 +1,9 @@
-"""What stands in front of a streak camera: bodies, most of them flat plates, and one pulsed lamp.
-
-The simulated instrument: lenslets with a baseline, a sweep, and a detector that counts photons.
-
-From a scene to the expected streak image, ray by ray.
+"""Simulated streak images: a scene of bodies and one pulsed lamp, lenslets with a baseline, a sweep
+and a detector that counts photons, in the order in which light goes through them; and what a
+perfect instrument would see, with which returns are compared.
 
 Nothing here uses the projection operator that recovery inverts: rays are cast from each lenslet,
 and each ray's light is put on the slit where the ray falls and when it arrives.
-
-What a perfect instrument would see from the reference viewpoint, and how near returns come to it.
-
-One simulated shot: the streak image with everything that is known about it.
 """
 
 from __future__ import annotations
@@ -94,24 +88,13 @@ def make_plate(
 
 
 class RayCast(NamedTuple):
-    """What the rays of one viewpoint see, ray by ray.
+    """What the rays of one viewpoint see, ray by ray."""
 
-    Parameters
-    ----------
-    body : (n,) int array
-        Number of the body; `NO_BODY` where the ray meets none.
-    path : (n,) array
-        Half of the path of the light from the lamp over the surface to the viewpoint, m.
-    distance : (n,) array
-        Distance of the surface from the lamp, m.
-    reflectance : (n,) array
-        Diffuse reflectance times the cosine of incidence; 0 in shadow.
-    """
-
-    body: NDArray[np.intp]
+    body: NDArray[np.intp]  # number of the body; `NO_BODY` where the ray meets none
+    # half of the path of the light from the lamp over the surface to the viewpoint, m
     path: FloatArray
-    distance: FloatArray
-    reflectance: FloatArray
+    distance: FloatArray  # of the surface from the lamp, m
+    reflectance: FloatArray  # diffuse, times the cosine of incidence; 0 in shadow
 
 
 @dataclass(frozen=True)
@@ -139,18 +122,8 @@ class Scene:
             raise InputError("a scene needs at least one body")
 
     def trace(self, viewpoint: FloatArray, directions: FloatArray) -> RayCast:
-        """Follow rays to the nearest surface and from there to the lamp.
-
-        Parameters
-        ----------
-        viewpoint : (3,) float array
-            m.
-        directions : (n, 3) float array
-            All with z > 0.
-
-        Returns
-        -------
-        RayCast
+        """Follow rays from (3,) `viewpoint`, m, along (n, 3) `directions`, all with z > 0, to the
+        nearest surface and from there to the lamp.
         """
         first, lamp = cast_rays(self.bodies, viewpoint, directions), np.asarray(self.lamp)
         seen = first.body != NO_BODY
@@ -216,25 +189,13 @@ class StreakDetector:
     @property
     def row_times(self) -> NDArray[np.float64]:
         """Instant of each row's middle on the streak's own time axis, s; the first is 0."""
-        times: NDArray[np.float64] = np.arange(self.rows) * np.float64(self.bin_width)
-        return times
+        return np.arange(self.rows, dtype=np.float64) * self.bin_width
 
     def expose(
         self, signal: NDArray[np.float64], noise: np.random.Generator
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Draw one shot: measurements in photons, and which of them saturated.
-
-        Parameters
-        ----------
-        signal : (rows, columns) array
-            Expected signal, photons.
-        noise : numpy.random.Generator
-
-        Returns
-        -------
-        counts : float32 array
-            Photons, none above full scale.
-        saturated : bool array
+        """Draw one shot of an expected signal, (rows, columns): measurements in photons, none above
+        full scale, and which of them saturated.
         """
         # Background is light as well, so that it brings photon noise of its own.
         photons = noise.poisson(signal + self.background_photons)
@@ -272,40 +233,25 @@ class Instrument:
         """Rays of a picture: X and Y from the optical axis in pixels, flat, sub-pixel by sub-pixel
         in raster order.
         """
-        (rows, columns), (axis_row, axis_column) = (
-            self.camera.image_shape,
-            self.camera.optical_axis_px,
-        )
-        y, x = np.meshgrid(
-            self._samples(rows) - axis_row, self._samples(columns) - axis_column, indexing="ij"
-        )
-        return x.ravel(), y.ravel()
-
-    def _samples(self, pixels: int) -> NDArray[np.float64]:
         side = self.rays_per_pixel_side
         # Middles of the sub-pixels; pixel centres are whole numbers, hence the half taken off.
-        samples: NDArray[np.float64] = (np.arange(pixels * side) + 0.5) / side - 0.5
-        return samples
+        down, across = (
+            (np.arange(pixels * side) + 0.5) / side - 0.5 - axis
+            for pixels, axis in zip(
+                self.camera.image_shape, self.camera.optical_axis_px, strict=True
+            )
+        )
+        x, y = np.meshgrid(across, down)
+        return x.ravel(), y.ravel()
 
     def directions(
         self, x: NDArray[np.float64], y: NDArray[np.float64], position: float = 0.0
     ) -> NDArray[np.float64]:
-        """Directions (n, 3), with z = 1, in which the view at `position` sees its picture points
-        (x, y).
+        """Directions (n, 3), with z = 1, in which the view at `position` view steps sees its picture
+        points (x, y), in pixels from the optical axis.
 
         A view's picture is laid so that a point at the focus distance appears at the same place in
         all views.
-
-        Parameters
-        ----------
-        x, y : (n,) float64 array
-            Picture points in pixels from the centre.
-        position : float
-            Of the view, in view steps.
-
-        Returns
-        -------
-        (n, 3) float64 array
         """
         focal = self.camera.focal_length_px
         # Turned towards the point on the axis at the focus distance, where all views coincide.
@@ -317,18 +263,14 @@ class RayBundle(NamedTuple):
     """The light that one view receives."""
 
     x: FloatArray  # (n,), where the rays fall in the view's picture, pixels from its optical axis
-    y: FloatArray  # (n,), where the rays fall in the view's picture, pixels from its optical axis
+    y: FloatArray
     time: FloatArray  # (n,), arrival, s after time zero
     # (n,), arbitrary units, the same for all views; proportional to reflectance / range^2
     brightness: FloatArray
 
 
 def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundle:
-    """Cast the rays of the view at `position` view steps; those that bring no light are left out.
-
-    `position`: of the view, in view steps. Returns picture point in pixels, time of flight in
-    seconds and brightness of each ray.
-    """
+    """Cast the rays of the view at `position` view steps; those that bring no light are left out."""
     x, y = instrument.pixel_grid()
     hits = scene.trace(instrument.viewpoint(position), instrument.directions(x, y, position))
     bright = (hits.body != NO_BODY) & (hits.reflectance > 0)
@@ -344,17 +286,19 @@ def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> Ray
 
 def render_streak(rays: RayBundle, view: int, instrument: Instrument) -> FloatArray:
     """Put one view's light on the streak image: (rows, columns), in the units of the rays'
-    brightness.
-
-    `rays`: of the view, from `cast_view_rays`; `view`: number of the lenslet, counted from 0.
-    Returns (rows, columns): time runs along the rows.
+    brightness; views are counted from 0.
     """
     camera, detector = instrument.camera, instrument.detector
     # a cylindrical lenslet turned by the angle images a point as a slanted line, which crosses the
     # slit here
     slit = camera.centres_px[view] + rays.x - rays.y * np.tan(camera.angles[view])
     row = (rays.time + camera.time_zero) / detector.bin_width
-    row, slit, stretch = _apply_sweep(camera, row, slit)
+    stretch = np.ones_like(row)
+    if camera.sweep is not None:
+        # raw rows for one rectified row, which lengthen the pulse as well
+        late, early = (camera.sweep.raw_position(row + half, slit)[0] for half in (0.5, -0.5))
+        stretch = late - early
+        row, slit = camera.sweep.raw_position(row, slit)
     ray, column, light = _split_over_columns(
         slit, camera.gains[view] * rays.brightness, instrument.rays_per_pixel_side
     )
@@ -362,9 +306,8 @@ def render_streak(rays: RayBundle, view: int, instrument: Instrument) -> FloatAr
     reach, width = pulse.shape[1], camera.slit_width_px
     seen = (first[ray] > -reach) & (first[ray] < detector.rows) & (column >= 0) & (column < width)
     ray, column, light = ray[seen], column[seen], light[seen]
-    rows = first[ray][:, np.newaxis] + np.arange(
-        reach, 2 * reach
-    )  # the screen has a margin for pulses it cuts off
+    # the screen has a margin for pulses it cuts off
+    rows = first[ray][:, np.newaxis] + np.arange(reach, 2 * reach)
     amount = light[:, np.newaxis] * pulse[ray]
     with_margin = accumulate_cells(
         rows * width + column[:, np.newaxis], amount, (detector.rows + 2 * reach, width)
@@ -372,29 +315,12 @@ def render_streak(rays: RayBundle, view: int, instrument: Instrument) -> FloatAr
     return with_margin[reach:-reach]
 
 
-def _apply_sweep(
-    camera: Camera, row: FloatArray, slit: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Raw row and column of rectified positions, and how many raw rows a rectified one takes there."""
-    if camera.sweep is None:
-        return row, slit, np.ones_like(row)
-    raw_row, raw_column = camera.sweep.raw_position(row, slit)
-    # raw rows for one rectified row, which lengthen the pulse as well
-    stretch = (
-        camera.sweep.raw_position(row + 0.5, slit)[0]
-        - camera.sweep.raw_position(row - 0.5, slit)[0]
-    )
-    return raw_row, raw_column, stretch
-
-
 def _split_over_columns(
     position: FloatArray, light: FloatArray, side: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
     """Split each ray, 1/side of a pixel wide, exactly between the one or two slit pixels that it
-    covers.
-
-    Slit pixel j reaches from j - 1/2 to j + 1/2. Returns ray number, slit pixel and amount of
-    light, piece by piece.
+    covers; slit pixel j reaches from j - 1/2 to j + 1/2. Returns ray number, slit pixel and amount
+    of light, piece by piece.
     """
     left_edge = position - 0.5 / side
     column = np.floor(left_edge + 0.5)
@@ -440,24 +366,16 @@ class GroundTruth:
 
     @classmethod
     def from_scene(cls, scene: Scene, instrument: Instrument) -> GroundTruth:
-        """Look at `scene` from the reference viewpoint.
-
-        Parameters
-        ----------
-        scene : Scene
-        instrument : Instrument
-            Its reference view, rays per pixel and detector.
-
-        Returns
-        -------
-        GroundTruth
-        """
+        """Look at `scene` from the reference viewpoint of an instrument."""
         x, y = instrument.pixel_grid()
         hits = scene.trace(instrument.viewpoint(0.0), instrument.directions(x, y))
-        plate, path, reflectance = (
-            _group_by_pixel(values, instrument)
-            for values in (hits.body, hits.path, hits.reflectance)
-        )
+        (rows, columns), side = instrument.camera.image_shape, instrument.rays_per_pixel_side
+
+        def group_by_pixel(values: NDArray[Any]) -> NDArray[Any]:
+            by_side = values.reshape(rows, side, columns, side)
+            return by_side.swapaxes(1, 2).reshape(rows, columns, side**2)
+
+        plate, path, reflectance = map(group_by_pixel, (hits.body, hits.path, hits.reflectance))
         filled = np.stack(
             [np.mean(plate == number, axis=-1) for number in range(len(scene.bodies))]
         )
@@ -501,12 +419,8 @@ def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1
     hits = scene.trace(instrument.viewpoint(0.0), instrument.directions(x, y))
     pixel = number_ray_pixels(camera.image_shape, instrument.rays_per_pixel_side)
     seen = hits.body != NO_BODY
-    brightness = (
-        exposure
-        / instrument.rays_per_pixel_side**2
-        * hits.reflectance[seen]
-        / hits.distance[seen] ** 2
-    )
+    brightness = hits.reflectance[seen] / hits.distance[seen] ** 2
+    brightness *= exposure / instrument.rays_per_pixel_side**2
     row = (2 * hits.path[seen] / SPEED_OF_LIGHT + camera.time_zero) / detector.bin_width
     shape = (int(np.prod(camera.image_shape)), detector.rows)
     sigma = compute_pulse_sigma_bins(instrument)
@@ -521,14 +435,7 @@ def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1
     return Frames(values, times, camera, shears=shears)
 
 
-def _group_by_pixel(values: NDArray[Any], instrument: Instrument) -> NDArray[Any]:
-    """Sort flat sub-pixel values into (rows, columns, rays of the pixel)."""
-    (rows, columns), side = instrument.camera.image_shape, instrument.rays_per_pixel_side
-    return values.reshape(rows, side, columns, side).swapaxes(1, 2).reshape(rows, columns, side**2)
-
-
-MEDIAN_PER_SIGMA = 0.6745
-"""Median of the absolute value of a normal variate in units of its deviation."""
+MEDIAN_PER_SIGMA = 0.6745  # of the absolute value of a normal variate, in its deviation
 
 
 def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
@@ -564,9 +471,7 @@ def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
     if not found.any():
         raise InputError("no target pixel of the truth has a return")
     sigma = returns.image("confidence")[truth.target]
-    surest = np.finfo(np.float32).tiny
-    ratio = error[found] / np.maximum(sigma[found], surest)
-    z = float(np.median(ratio) / MEDIAN_PER_SIGMA)
+    ratio = error[found] / np.maximum(sigma[found], np.finfo(np.float32).tiny)
     bin_m = SPEED_OF_LIGHT * truth.bin_width / 2
     # a return beside a border may belong to either side
     near_anything = scipy.ndimage.binary_dilation(np.isfinite(truth.range), np.ones((3, 3)))
@@ -575,7 +480,7 @@ def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
         "share_within_one_bin": float(np.mean(error <= bin_m)),
         "share_with_return": float(np.mean(found)),
         "false_return_share": float(np.mean(~near_anything[returns.y, returns.x])),
-        "range_z": z,
+        "range_z": float(np.median(ratio) / MEDIAN_PER_SIGMA),
         "bin_m": bin_m,
     }
 
