@@ -43,6 +43,16 @@ from tofclip.version import __version__
 if TYPE_CHECKING:
     from distributed import Client, Future, as_completed
 
+__all__ = [
+    "Failure",
+    "Job",
+    "Report",
+    "Summary",
+    "lock_output_folder",
+    "run_jobs",
+    "select_unfinished",
+]
+
 SETTINGS_NAME = "settings.json"
 INPUTS_KEY = "inputs"
 
