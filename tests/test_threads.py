@@ -15,9 +15,7 @@ from tofclip.errors import InputError
 from tofclip.threads import (
     LANES,
     THREADS_VARIABLE,
-    count_block_threads,
     limit_blas_threads,
-    limit_to_calling_thread,
     map_parallel,
     run_blocks,
     split_blocks,
@@ -45,22 +43,6 @@ def test_every_block_runs_on_no_more_threads_than_allowed(monkeypatch, threads):
     run_blocks(work, 10 * LANES)
     assert sorted(seen) == list(range(0, 10 * LANES, LANES))
     assert len(names) <= int(threads)
-
-
-def test_a_thread_may_keep_its_blocks_to_itself(monkeypatch):
-    monkeypatch.setenv(THREADS_VARIABLE, "2")
-    names: set[str] = set()
-
-    def work(_: slice) -> None:
-        names.add(threading.current_thread().name)
-
-    with limit_to_calling_thread():
-        run_blocks(work, 10 * LANES)
-        assert count_block_threads() == 1
-    assert names == {threading.current_thread().name}
-    assert count_block_threads() == 2
-    run_blocks(work, 10 * LANES)
-    assert len(names) > 1
 
 
 @pytest.mark.parametrize("threads", ["1", "2"])
@@ -139,23 +121,13 @@ def test_a_forgotten_map_may_be_closed_while_this_thread_holds_the_lock():
     assert next(coming) == 0
 
     def close_as_the_collector_might() -> None:
-        with threads_module._blas_limit.lock:
+        with threads_module._blas_lock:
             coming.close()
 
     closing = threading.Thread(target=close_as_the_collector_might, daemon=True)
     closing.start()
     closing.join(30)
     assert not closing.is_alive()
-
-
-def test_work_on_this_thread_stays_there_when_a_part_of_it_asks_for_the_same(monkeypatch):
-    monkeypatch.setenv(THREADS_VARIABLE, "2")
-    names: set[str] = set()
-    with limit_to_calling_thread():
-        with limit_to_calling_thread():
-            pass
-        run_blocks(lambda _: names.add(threading.current_thread().name), 8 * LANES)
-    assert names == {threading.current_thread().name}
 
 
 def _blas_threads() -> list[int]:

@@ -37,29 +37,6 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-__all__ = [
-    "BufferOverflowError",
-    "CalibrationError",
-    "DeviceBusyError",
-    "DeviceDisconnectedError",
-    "DeviceError",
-    "DeviceNotFoundError",
-    "DevicePermissionError",
-    "DeviceStalledError",
-    "DeviceTimeoutError",
-    "FileFormatError",
-    "InputError",
-    "MissingDependencyError",
-    "MissingTimeAxisError",
-    "ProtocolError",
-    "ShapeError",
-    "StorageError",
-    "TofclipError",
-    "TransferOverflowError",
-    "UsbBackendError",
-    "require_type",
-]
-
 
 class TofclipError(Exception):
     """Root of the exception tree."""

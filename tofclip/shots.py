@@ -11,12 +11,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
-from tofclip.errors import (
-    InputError,
-    MissingTimeAxisError,
-    ShapeError,
-    require_type,
-)
+from tofclip.errors import InputError, MissingTimeAxisError, ShapeError, require_type
 from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
 from tofclip.storage import (
     Field,
@@ -34,13 +29,9 @@ from tofclip.storage import (
 )
 from tofclip.units import SPEED_OF_LIGHT, require_credible_bin_width
 
-__all__ = ["Frames", "Returns", "Streak"]
-
-RETURN_CHOICES = ("first", "strongest", "last", "all")
-"""Which return of a pixel counts."""
-
-MAX_ROW_S = 1e-3
-"""s; the slowest sweeps of streak cameras last milliseconds in all."""
+RETURN_CHOICES = ("first", "strongest", "last", "all")  # which return of a pixel counts
+MAX_ROW_S = 1e-3  # the slowest sweeps of streak cameras last milliseconds in all
+PICTURE_COLUMNS = ("range", "intensity", "confidence", "return_number", "time")
 
 
 @dataclass(frozen=True)
@@ -95,9 +86,7 @@ class Streak(Storable):
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
 
     def __post_init__(self) -> None:
-        with np.errstate(
-            over="ignore"
-        ):  # too large for float32 becomes infinite, which is refused below
+        with np.errstate(over="ignore"):  # too large becomes infinite, which is refused below
             counts = np.ascontiguousarray(self.counts, dtype=np.float32)
         object.__setattr__(self, "counts", counts)
         if counts.ndim != 2 or counts.size == 0:
@@ -112,7 +101,16 @@ class Streak(Storable):
         if self.saturated is not None and self.saturated.shape != counts.shape:
             raise ShapeError("saturated", counts.shape, self.saturated.shape)
         if self.row_times is not None:
-            object.__setattr__(self, "row_times", self._check_times(self.row_times))
+            times = np.asarray(self.row_times, dtype=np.float64)
+            if times.shape != counts.shape[:1]:
+                raise ShapeError(f"{self.source}: the time axis", counts.shape[:1], times.shape)
+            if not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
+                raise InputError(
+                    f"{self.source}: the time axis must be finite and increase row by row"
+                )
+            if times.size > 1:
+                require_credible_bin_width(float(np.diff(times).mean()), longest=MAX_ROW_S)
+            object.__setattr__(self, "row_times", times)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(self.counts, dtype=dtype)
@@ -140,32 +138,10 @@ class Streak(Storable):
         return f"{1e9 * self.row_times[0]:.3f} to {1e9 * self.row_times[-1]:.3f} ns"
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the counts.
-
-        Parameters
-        ----------
-        ax : matplotlib Axes, optional
-            Where to draw; by default the current figure's.
-
-        Returns
-        -------
-        matplotlib Axes
-        """
+        """Draw the counts into matplotlib Axes `ax`, by default the current figure's; return them."""
         ax = plot_picture(self.counts, f"streak image, {self._time_text}", ax)
         ax.set(xlabel="slit column (px)", ylabel="time (rows)")
         return ax
-
-    def _check_times(self, times: Any) -> NDArray[np.float64]:
-        checked = np.asarray(times, dtype=np.float64)
-        if checked.shape != (self.counts.shape[0],):
-            raise ShapeError(
-                f"{self.source}: the time axis", (self.counts.shape[0],), checked.shape
-            )
-        if not np.all(np.isfinite(checked)) or np.any(np.diff(checked) <= 0):
-            raise InputError(f"{self.source}: the time axis must be finite and increase row by row")
-        if checked.size > 1:
-            require_credible_bin_width(float(np.diff(checked).mean()), longest=MAX_ROW_S)
-        return checked
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -198,10 +174,8 @@ def outline_streak(
     camera: Camera | None = None,
     attachments: Mapping[str, Record] | None = None,
 ) -> Record:
-    """Describe a streak image whose pixels are not read; see `tofclip.storage.read_outline`.
-
-    `shape`: rows and columns; `has_times, has_limit`: whether the instants of its rows, and the
-    limit of its pixels, are known. Returns with the fields and children of a `Streak`'s.
+    """Describe a streak image of rows and columns whose pixels are not read, as `read_outline`
+    does; whether the instants of its rows, and the limit of its pixels, are known.
     """
     axes = ("time", "column")
     fields = {"counts": Field(make_stand_in(shape, np.float32), "count", axes)}
@@ -264,22 +238,17 @@ class Returns(Storable):
     )
 
     def __post_init__(self) -> None:
-        if self.shear.size == 0:
-            object.__setattr__(self, "shear", np.zeros(self.y.shape))
-        if self.false_alarm.size == 0:
-            object.__setattr__(self, "false_alarm", np.full(self.y.shape, np.nan))
-        for name in (
-            "x",
-            "range",
-            "intensity",
-            "confidence",
-            "return_number",
-            "time",
-            "shear",
-            "false_alarm",
-        ):
-            if getattr(self, name).shape != self.y.shape:
-                raise ShapeError(f"{name} of the returns", self.y.shape, getattr(self, name).shape)
+        for name, unknown in (("shear", 0.0), ("false_alarm", np.nan)):
+            if getattr(self, name).size == 0:
+                object.__setattr__(self, name, np.full(self.y.shape, unknown))
+        for name, column in self._columns.items():
+            if column.shape != self.y.shape:
+                raise ShapeError(f"{name} of the returns", self.y.shape, column.shape)
+
+    @property
+    def _columns(self) -> dict[str, NDArray[Any]]:
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {name: one for name, one in values.items() if isinstance(one, np.ndarray)}
 
     def __len__(self) -> int:
         return self.y.size
@@ -308,12 +277,7 @@ class Returns(Storable):
 
     def __getitem__(self, chosen: NDArray[Any]) -> Returns:
         """Return some of the returns, by a mask or by numbers."""
-        columns = {
-            one.name: getattr(self, one.name)[chosen]
-            for one in fields(self)
-            if isinstance(getattr(self, one.name), np.ndarray)
-        }
-        return replace(self, **columns)
+        return replace(self, **{name: column[chosen] for name, column in self._columns.items()})
 
     def select(self, which: str) -> Returns:
         """Return one return of each pixel, or all of them.
@@ -346,15 +310,10 @@ class Returns(Storable):
         return self[np.sort(order[first_of_pixel])]
 
     def image(self, name: str) -> NDArray[np.float32]:
-        """Picture (y, x) of one property of each pixel's most intense return; NaN where nothing
-        came back.
-
-        Parameters
-        ----------
-        name : str
-            ``"range"``, ``"intensity"``, ``"confidence"``, ``"return_number"`` or ``"time"``.
+        """Picture (y, x) of one of `PICTURE_COLUMNS` of each pixel's most intense return; NaN where
+        nothing came back.
         """
-        if name not in ("range", "intensity", "confidence", "return_number", "time"):
+        if name not in PICTURE_COLUMNS:
             raise InputError(f"returns have no property '{name}' to show as a picture")
         picture = np.full(self.camera.image_shape, np.nan, dtype=np.float32)
         upwards = np.argsort(self.intensity, kind="stable")  # the last one written wins
@@ -469,10 +428,6 @@ class Frames(Storable):
         time : (float, float), optional
             First and last time of flight, s.
 
-        Returns
-        -------
-        Frames
-
         Raises
         ------
         InputError
@@ -497,47 +452,34 @@ class Frames(Storable):
         """Said beside ranges, which are right up to a constant where no time zero was given."""
         return "" if self.camera.time_zero else " up to a constant, no time zero given"
 
+    @property
+    def _range_text(self) -> str:
+        near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
+        return f"{near:.3g} to {far:.3g} m{self.time_zero_note}"
+
     def __repr__(self) -> str:
         frames, rows, columns = self.values.shape
-        near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
-        return (
-            f"Frames({frames} frames of {rows} x {columns} pixels, range {near:.3g} to {far:.3g} m"
-            f"{self.time_zero_note})"
-        )
+        return f"Frames({frames} frames of {rows} x {columns} pixels, range {self._range_text})"
 
     def _repr_html_(self) -> str:
-        near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
         rows = {
             "values (time, y, x)": " x ".join(map(str, self.values.shape)),
             "time of flight": f"{1e9 * self.times[0]:.3f} to {1e9 * self.times[-1]:.3f} ns",
-            "range": f"{near:.3f} to {far:.3f} m{self.time_zero_note}",
+            "range": self._range_text,
             "method": str(self.figures.get("method", "unknown")),
         }
         return render_html("Frames", rows, np.asarray(self).max(axis=0))
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the sum of all frames.
-
-        Parameters
-        ----------
-        ax : matplotlib Axes, optional
-            Where to draw; by default the current figure's.
-
-        Returns
-        -------
-        matplotlib Axes
+        """Draw the sum of all frames into matplotlib Axes `ax`, by default the current figure's;
+        return them.
         """
-        near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
-        title = f"{len(self)} frames, {near:.3g} to {far:.3g} m{self.time_zero_note}"
+        title = f"{len(self)} frames, {self._range_text}"
         return plot_picture(np.asarray(self).sum(axis=0), title, ax)
 
     def to_xarray(self) -> Any:
-        """Return an `xarray.DataArray` (time, y, x), times in s and pixels as coordinates.
-
-        Raises
-        ------
-        MissingDependencyError
-            xarray is not installed.
+        """Return an `xarray.DataArray` (time, y, x), times in s and pixels as coordinates;
+        `MissingDependencyError` where xarray is not installed.
         """
         _, rows, columns = self.values.shape
         axes = {
@@ -548,12 +490,8 @@ class Frames(Storable):
         return make_data_array(np.asarray(self), axes, "brightness", "counts")
 
     def to_torch(self) -> Any:
-        """Return the values as a PyTorch tensor (time, y, x), which shares NumPy's memory.
-
-        Raises
-        ------
-        MissingDependencyError
-            PyTorch is not installed.
+        """Return the values as a PyTorch tensor (time, y, x), which shares NumPy's memory;
+        `MissingDependencyError` where PyTorch is not installed.
         """
         return require_package("torch").as_tensor(np.asarray(self))
 

@@ -25,12 +25,13 @@ if TYPE_CHECKING:
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
+# Frames per block: a row of a block is two full vectors of 512 bits, and a 174 x 174 picture stays in
+# cache.
 LANES = 32
-"""Frames per block: a row of a block is two full vectors of 512 bits, and a 174 x 174 picture stays
-in cache.
-"""
 
 THREADS_VARIABLE = "TOFCLIP_THREADS"
+# Of others, that bring a linear-algebra library of their own, or load the system's.
+BLAS_PACKAGES = ("cupy", "cv2", "jax", "mkl", "open3d", "sklearn", "tensorflow", "torch")
 
 
 def thread_count() -> int:
@@ -46,27 +47,12 @@ def thread_count() -> int:
     return int(wanted)
 
 
-_thread_state = threading.local()
+_worker = threading.local()
 
 
-@contextmanager
-def limit_to_calling_thread() -> Iterator[None]:
-    """Let `map_parallel` and `run_blocks` work on the calling thread alone."""
-    before = _is_limited()
-    _thread_state.alone = True
-    try:
-        yield
-    finally:
-        _thread_state.alone = before
-
-
-def _is_limited() -> bool:
-    return getattr(_thread_state, "alone", False)
-
-
-def _limit_worker() -> None:
+def _mark_worker() -> None:
     """Make a worker keep to itself: a job within a job would only wait for the same cores."""
-    _thread_state.alone = True
+    _worker.alone = True
 
 
 @contextmanager
@@ -78,7 +64,7 @@ def open_worker_pool(threads: int | None = None) -> Iterator[Executor]:
 
     `threads`: `thread_count` by default.
     """
-    pool = ThreadPoolExecutor(threads or thread_count(), "tofclip", _limit_worker)
+    pool = ThreadPoolExecutor(threads or thread_count(), "tofclip", _mark_worker)
     with limit_blas_threads():
         try:
             yield pool
@@ -88,7 +74,7 @@ def open_worker_pool(threads: int | None = None) -> Iterator[Executor]:
 
 def count_block_threads() -> int:
     """Return on how many threads `map_parallel` and `run_blocks` work when they are called here."""
-    return 1 if _is_limited() else thread_count()
+    return 1 if getattr(_worker, "alone", False) else thread_count()
 
 
 def map_parallel(
@@ -146,19 +132,11 @@ def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> 
         pass
 
 
-class _BlasLimit:
-    """What `limit_blas_threads` has changed in this process, for all its threads."""
-
-    def __init__(self) -> None:
-        # The collector may close a forgotten `map_parallel` at any time, also on the thread that
-        # holds the lock.
-        self.lock = threading.RLock()
-        self.open_blocks = 0
-        self.limited: dict[str, tuple[LibController, int]] = {}
-        """By file: a library that has one number of threads for the process, and what it had."""
-
-
-_blas_limit = _BlasLimit()
+# The collector may close a forgotten `map_parallel` at any time, also on the thread that holds it.
+_blas_lock = threading.RLock()
+_open_blocks = 0
+# By file: libraries that have one number of threads for the process, and what they had.
+_limited: dict[str, tuple[LibController, int]] = {}
 
 
 @contextmanager
@@ -170,27 +148,32 @@ def limit_blas_threads() -> Iterator[None]:
     several threads are counted, the first one sets the limit and the last one restores what was
     there before. Libraries that run on OpenMP have a number for each calling thread.
     """
-    shared, per_thread = _blas_libraries(len(sys.modules))
-    own_before = [(library, library.get_num_threads()) for library in per_thread]
-    with _blas_limit.lock:
-        _blas_limit.open_blocks += 1
-        for library in shared:  # also those that were loaded while another block was open
-            if library.filepath not in _blas_limit.limited:
-                _blas_limit.limited[library.filepath] = library, library.get_num_threads()
+    global _open_blocks
+    libraries = _find_blas_libraries(tuple(name in sys.modules for name in BLAS_PACKAGES))
+    own = {
+        library: library.get_num_threads()
+        for library in libraries
+        if getattr(library, "threading_layer", "") == "openmp"
+    }
+    with _blas_lock:
+        _open_blocks += 1
+        for library in libraries:  # also those that were loaded while another block was open
+            if library not in own and library.filepath not in _limited:
+                _limited[library.filepath] = library, library.get_num_threads()
                 _set_blas_threads(library, 1)
-    for library in per_thread:
+    for library in own:
         _set_blas_threads(library, 1)
     try:
         yield
     finally:
-        for library, number in own_before:
+        for library, number in own.items():
             _set_blas_threads(library, number)
-        with _blas_limit.lock:
-            _blas_limit.open_blocks -= 1
-            if _blas_limit.open_blocks == 0:
-                for library, number in _blas_limit.limited.values():
+        with _blas_lock:
+            _open_blocks -= 1
+            if _open_blocks == 0:
+                for library, number in _limited.values():
                     _set_blas_threads(library, number)
-                _blas_limit.limited.clear()
+                _limited.clear()
 
 
 def _set_blas_threads(library: LibController, number: int) -> None:
@@ -203,20 +186,17 @@ def _set_blas_threads(library: LibController, number: int) -> None:
 
 
 @lru_cache(maxsize=1)
-def _blas_libraries(modules: int) -> tuple[list[LibController], list[LibController]]:
-    """Return the linear-algebra libraries that are loaded: those with one number of threads for the
-    process, and those with one for each thread.
+def _find_blas_libraries(imported: tuple[bool, ...]) -> list[LibController]:
+    """Return the linear-algebra libraries that are loaded.
 
-    Looking for them takes as long as a small image, so it is done again only where `modules`, the
-    number of imported modules, says that a package may have brought one of its own since.
+    To look for them takes almost a millisecond, a tenth of all time where surfaces are fitted: it is
+    done again where one of `BLAS_PACKAGES` has been imported since.
     """
     import scipy.linalg  # noqa: F401 - brings one of its own beside NumPy's
     from threadpoolctl import ThreadpoolController
 
-    found = [
+    return [
         library
         for library in ThreadpoolController().lib_controllers
         if library.user_api == "blas" and library.get_num_threads() is not None
     ]
-    own = [library for library in found if getattr(library, "threading_layer", "") == "openmp"]
-    return [library for library in found if library not in own], own
