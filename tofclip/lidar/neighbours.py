@@ -79,16 +79,15 @@ def add_recovery_error(
     not decreasing. A neighbour that is further away than `gate`, m, is on another surface. Returns with
     few neighbours get what is usual for the others.
     """
-    total = np.array(sigma, dtype=np.float64)
     if pixel.size == 0:
-        return total
+        return np.array(sigma)
     rows, columns = image_shape
     each = np.bincount(pixel, minlength=rows * columns)  # returns of each pixel
     starts, most = np.append(0, np.cumsum(each)), int(each.max())
     nearness = 1 / (distance * along_axis)
     metres = distance / nearness
     layers = layer_returns(nearness, pixel, starts, image_shape)
-    scatter = np.full(total.size, np.nan)
+    scatter = np.full(pixel.size, np.nan)
 
     def fit_planes(chosen: NDArray[np.int64]) -> None:
         def fit(piece: slice) -> None:
@@ -108,11 +107,11 @@ def add_recovery_error(
     fit_planes(np.flatnonzero(np.isnan(scatter)))
     known = scatter >= 0
     if np.count_nonzero(known) < MIN_KNOWN:
-        return total
-    noise = total[known]
-    total[known] = np.sqrt(noise**2 + PLANE_SHARE * np.maximum(scatter[known] ** 2 - noise**2, 0.0))
-    if noise.size < total.size:
-        total[~known] *= np.median(total[known] / noise)
+        return np.array(sigma)
+    total: FloatArray = np.sqrt(sigma**2 + PLANE_SHARE * np.maximum(scatter**2 - sigma**2, 0.0))
+    alone = np.flatnonzero(~known)
+    if alone.size:
+        total[alone] = sigma[alone] * np.median(total[known] / sigma[known])
     return total
 
 
