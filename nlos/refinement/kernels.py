@@ -15,9 +15,7 @@ MIN_WIDTH_BINS = 1.0
 
 
 @compiled
-def _place_light(
-    wall, laser, cell, start, per_metre, obliquity, x, y, z, bins, begins, ends, rates
-):
+def _place_light(wall, laser, cell, start, per_metre, obliquity, voxels, bins, light):
     """When and how strongly the light of some voxels arrives by way of one pair of spots.
 
     A voxel's light is spread evenly over a time whose variance is that of the paths by way of its
@@ -25,11 +23,12 @@ def _place_light(
 
     `wall, laser` (3,): m; `cell` (3,): extent of a voxel along x, y and z, m; `start`: path at
     which the first bin begins, m; `per_metre`: bins per metre of path; `obliquity`: power of the
-    cosines of both legs with z that light falls by: 0, 1 or 2; `x, y, z` (n,): voxels; `begins,
-    ends` (n,): written: when the light begins and ends, in bins from the record's beginning, cut to
-    it; `rates` (n,): written: light per bin between the edges, of a voxel of albedo 1.
+    cosines of both legs with z that light falls by: 0, 1 or 2; `voxels`: x, y and z (n,), m;
+    `light`: overwritten: when it begins and ends (n,), in bins from the record's beginning, cut to
+    it, and light per bin between the edges, of a voxel of albedo 1.
     """
     nearest = np.float32(MIN_DISTANCE_M * MIN_DISTANCE_M)
+    (x, y, z), (begins, ends, rates) = voxels, light
     for i in range(x.size):
         out_x, out_y, out_z = x[i] - laser[0], y[i] - laser[1], z[i] - laser[2]
         back_x, back_y, back_z = x[i] - wall[0], y[i] - wall[1], z[i] - wall[2]
@@ -64,40 +63,25 @@ def add_expected_light(walls, lasers, cell, start, per_metre, obliquity, voxels,
     the light in every bin.
     """
     bins = changes.shape[1] - 2
-    begins, ends, rates = (
-        np.empty(VOXELS_PER_RUN, np.float32),
-        np.empty(VOXELS_PER_RUN, np.float32),
-        np.empty(VOXELS_PER_RUN, np.float32),
-    )
+    begins = np.empty(VOXELS_PER_RUN, np.float32)
+    ends, rates = np.empty_like(begins), np.empty_like(begins)
+    light = (begins, ends, rates)
     for p in range(walls.shape[0]):
         laser = lasers[min(p, lasers.shape[0] - 1)]
         for first in range(0, voxels.shape[1], VOXELS_PER_RUN):
             last = min(first + VOXELS_PER_RUN, voxels.shape[1])
-            _place_light(
-                walls[p],
-                laser,
-                cell,
-                start,
-                per_metre,
-                obliquity,
-                voxels[0, first:last],
-                voxels[1, first:last],
-                voxels[2, first:last],
-                bins,
-                begins,
-                ends,
-                rates,
-            )
+            some = voxels[0, first:last], voxels[1, first:last], voxels[2, first:last]
+            _place_light(walls[p], laser, cell, start, per_metre, obliquity, some, bins, light)
             for i in range(last - first):
-                light = np.float64(albedo[first + i] * rates[i])
+                sent = np.float64(albedo[first + i] * rates[i])
                 begin, end = np.int32(begins[i]), np.int32(ends[i])
-                after = np.float64(begins[i] - np.float32(begin)) * light
+                after = np.float64(begins[i] - np.float32(begin)) * sent
                 # Only the two edges of the box are written, each shared between two bins; the
                 # running sum afterwards fills what lies between, however wide.
-                changes[p, begin] += light - after
+                changes[p, begin] += sent - after
                 changes[p, begin + 1] += after
-                after = np.float64(ends[i] - np.float32(end)) * light
-                changes[p, end] -= light - after
+                after = np.float64(ends[i] - np.float32(end)) * sent
+                changes[p, end] -= sent - after
                 changes[p, end + 1] -= after
 
 
@@ -114,30 +98,15 @@ def add_backprojected_light(
     `total` (n,): added to.
     """
     bins = sums.shape[1] - 2
-    begins, ends, rates = (
-        np.empty(VOXELS_PER_RUN, np.float32),
-        np.empty(VOXELS_PER_RUN, np.float32),
-        np.empty(VOXELS_PER_RUN, np.float32),
-    )
+    begins = np.empty(VOXELS_PER_RUN, np.float32)
+    ends, rates = np.empty_like(begins), np.empty_like(begins)
+    light = (begins, ends, rates)
     for first in range(0, voxels.shape[1], VOXELS_PER_RUN):
         last = min(first + VOXELS_PER_RUN, voxels.shape[1])
         for p in range(walls.shape[0]):
             laser = lasers[min(p, lasers.shape[0] - 1)]
-            _place_light(
-                walls[p],
-                laser,
-                cell,
-                start,
-                per_metre,
-                obliquity,
-                voxels[0, first:last],
-                voxels[1, first:last],
-                voxels[2, first:last],
-                bins,
-                begins,
-                ends,
-                rates,
-            )
+            some = voxels[0, first:last], voxels[1, first:last], voxels[2, first:last]
+            _place_light(walls[p], laser, cell, start, per_metre, obliquity, some, bins, light)
             for i in range(last - first):
                 begin, end = np.int32(begins[i]), np.int32(ends[i])
                 after = begins[i] - np.float32(begin)

@@ -1,8 +1,7 @@
-"""Photons that a wall counted: read from a capture, set apart, and explained by light and background.
+"""Refinement by photons: the hidden albedo that explains a few photons best, photon by photon.
 
-Albedo and background fitted to photons by expectation maximisation.
-
-Refinement by photons: the hidden albedo that explains a few photons best, photon by photon.
+Counts are read from a capture and some set apart to judge by; albedo and background are fitted to
+the others by expectation maximisation, on coarse voxels first.
 """
 
 from __future__ import annotations
@@ -52,10 +51,7 @@ class CountedPhotons:
 
     @classmethod
     def of(cls, capture: Capture, blank: float = 0.0, ramp: float = 0.0) -> CountedPhotons:
-        """Read the counts of a capture.
-
-        `blank, ramp`: see `PhotonRefinement`.
-        """
+        """Read the counts of a capture; `blank` and `ramp` as of `PhotonRefinement`."""
         counts = np.ascontiguousarray(capture.traces())
         if counts.min() < 0:
             raise InputError(
@@ -82,11 +78,8 @@ class CountedPhotons:
         )
 
     def hold_out(self, fraction: float, seed: int) -> tuple[CountedPhotons, NDArray[np.float32]]:
-        """Set some photons aside, each with the same chance.
-
-        Both parts follow Poisson's law, and one says nothing of the other's noise.
-
-        `fraction`: the chance, 0 to 1. Returns `held` (points, bins): photons that were set aside.
+        """Set some photons aside, (points, bins), each with the same chance: both parts follow
+        Poisson's law, and one says nothing of the other's noise.
         """
         lit, held = self.counts > 0, np.zeros_like(self.counts)
         counts = np.rint(self.counts[lit]).astype(np.int64)
@@ -101,20 +94,19 @@ class CountedPhotons:
 
 
 def improve_background(background: Array, mean: float, ratios: Array, seen: Array) -> Array:
-    """One step of expectation maximisation of every wall point's background, drawn to the mean.
+    """One step of expectation maximisation of some wall points' background (n,), photons per bin,
+    drawn to the mean of all wall points.
 
-    `background` (n,): photons per bin of some wall points, to begin with; `mean`: mean background
-    of all wall points; `ratios` (n, bins): what was counted over what is expected; `seen` (n,):
-    bins that are taken into account. Returns (n,).
+    `ratios` (n, bins): what was counted over what is expected; `seen` (n,): bins that are taken
+    into account.
     """
     drawn = background * ratios.sum(axis=1) + BACKGROUND_PHOTONS
     return np.asarray(np.maximum(drawn / (seen + BACKGROUND_PHOTONS / mean), MIN_BACKGROUND))
 
 
 def fit_brightness(photons: CountedPhotons, light: Array) -> Array:
-    """Explain photons by light of a given shape, as bright as suits them, and background.
-
-    `light` (points, bins): on any scale. Returns (points, bins): expected photons.
+    """Expected photons (points, bins) by light of a given shape, as bright as suits them, and
+    background.
     """
     counts, observed = photons.counts, photons.observed
     seen, lit = observed.sum(axis=1), float(light[observed].sum())
@@ -141,11 +133,7 @@ class LikelihoodGain:
 
     @classmethod
     def of(cls, photons: Array, expected: Array, other: Array, observed: Array) -> LikelihoodGain:
-        """Compare two expectations of the same photons.
-
-        `photons, expected, other` (points, bins); `observed` (points, bins): bins that are taken
-        into account.
-        """
+        """Compare two expectations of the same photons, all (points, bins), where observed."""
         counted, first, second = (
             one[observed].astype(np.float64) for one in (photons, expected, other)
         )
@@ -192,12 +180,12 @@ class PhotonFit:
         self._seen = photons.observed.sum(axis=1)
         ones = photons.observed.astype(np.float32)
         self._sensitivity = np.maximum(model.backproject(ones, voxels, self._everyone), 1e-30)
-        # As if half of all photons were background: either share is soon put right.
+        # As if half of all photons were background: either part is soon put right.
         half = 0.5 * float(photons.counts.sum())
         total = float(np.sum(self._sensitivity * albedo))
         self.albedo = (albedo * (half / total)).astype(np.float32)
         self.background = np.full(len(ones), half / max(self._seen.sum(), 1), np.float32)
-        self._price: Array = np.zeros(len(voxels), np.float32)
+        self._penalty: Array = np.zeros(len(voxels), np.float32)
 
     @property
     def expected_photons(self) -> Array:
@@ -211,10 +199,7 @@ class PhotonFit:
         return volume.reshape(self.model.grid.shape)
 
     def run(self, iterations: int, report_pass: Callable[[], None]) -> str:
-        """Improve the albedo until the likelihood hardly grows; return why it ended.
-
-        `iterations`: passes at most; `report_pass`: called after every pass.
-        """
+        """Improve the albedo until the likelihood hardly grows; return why it ended."""
         for number in range(iterations):
             before = self.likelihood
             self.improve(FINE_SUBSETS[number] if number < len(FINE_SUBSETS) else 1)
@@ -224,14 +209,11 @@ class PhotonFit:
         return "iteration limit"
 
     def improve(self, subsets: int, prior_weight: float | None = None) -> None:
-        """Improve albedo and background once by every subset of the wall points.
-
-        `prior_weight`: the fit's own by default.
-        """
+        """Improve albedo and background once by every subset of the wall points."""
         subsets = max(1, min(subsets, len(self._everyone) // MIN_POINTS_PER_SUBSET))
         weight = self.prior_weight if prior_weight is None else prior_weight
         if weight > 0:
-            self._price = weight * self._compute_price()
+            self._penalty = weight * self._compute_penalty()
         self.likelihood = sum(
             self._improve_by(self._everyone[first::subsets], subsets) for first in range(subsets)
         )
@@ -246,8 +228,8 @@ class PhotonFit:
         own = self._sensitivity
         if subsets > 1:
             own = self.model.backproject(observed.astype(np.float32), self.voxels, points)
-        share = len(points) / len(self._everyone)
-        self.albedo *= seen / np.maximum(own + share * self._price, 1e-30)
+        fraction = len(points) / len(self._everyone)
+        self.albedo *= seen / np.maximum(own + fraction * self._penalty, 1e-30)
         self.background[points] = improve_background(
             self.background[points], float(self.background.mean()), ratios, self._seen[points]
         )
@@ -266,7 +248,7 @@ class PhotonFit:
         self.albedo *= np.float32(more)
         self.background *= np.float32(more)
 
-    def _compute_price(self) -> Array:
+    def _compute_penalty(self) -> Array:
         """What a voxel pays for its albedo: one standard deviation of what noise brings it, and
         less where its neighbourhood is bright.
         """
@@ -285,13 +267,11 @@ class PhotonFit:
         return np.asarray(np.sqrt(np.maximum(information, 0)))
 
     def with_likeliest_model(self, sigmas: tuple[float, ...]) -> PhotonFit:
-        """Return the same fit with the response and the fall with the angle under which the photons
-        are likeliest.
-
-        `sigmas`: standard deviations of responses, bins.
+        """Return the same fit with the response, of these standard deviations in bins, and the fall
+        with the angle under which the photons are likeliest.
         """
         some = self._everyone[:: max(1, len(self._everyone) // 512)]
-        best: tuple[float, PhotonFit] | None = None
+        found, best = self, -np.inf
         for obliquity in OBLIQUITIES:
             bare = replace(self.model, response=np.ones(1), obliquity=obliquity)
             fit = PhotonFit(self.photons, bare, self.voxels, self.albedo, self.prior_weight)
@@ -303,13 +283,10 @@ class PhotonFit:
                 expected = bare.spread(light, response) + self.background[some, np.newaxis]
                 terms = self.photons.counts[some] * np.log(np.maximum(expected, MIN_BACKGROUND))
                 likelihood = float(np.sum((terms - expected)[self.photons.observed[some]]))
-                if best is None or likelihood > best[0]:
-                    chosen = fit
-                    chosen.model = replace(bare, response=response)
-                    chosen.response_sigma = sigma
-                    best = likelihood, chosen
-        assert best is not None
-        found = best[1]
+                if likelihood > best:
+                    found, best = fit, likelihood
+                    found.model = replace(bare, response=response)
+                    found.response_sigma = sigma
         found.albedo *= np.float32(
             self.expected_photons.sum() / max(float(found.expected_photons.sum()), 1e-30)
         )
@@ -320,8 +297,6 @@ class PhotonFit:
 def compute_beam(fit: PhotonFit) -> FloatArray:
     """Return the standard deviations along z, y and x, m, to which arrival times tell the place of
     a thing in the middle of the light.
-
-    Returns (3,).
     """
     capture, grid = fit.photons.capture, fit.model.grid
     volume = fit.place(fit.expected_photons).astype(np.float64)
@@ -419,10 +394,6 @@ class PhotonRefinement(Method):
     response_sigma: float | None = None
 
     def plan(self, capture: Capture, grid: Grid) -> PhotonPlan:
-        """Make the refinement ready for captures like `capture` on `grid`.
-
-        `capture`: counts, or multiples of one step; any wall and lasers that `linear` can image.
-        """
         require_numpy_signal("refining by photons", capture)
         needed = 4 * VOLUME_COPIES * grid.size + 16 * capture.signal.size
         if needed > MEMORY_LIMIT_BYTES:
@@ -435,10 +406,7 @@ class PhotonRefinement(Method):
 
 
 class PhotonPlan(Plan):
-    """A refinement by photons, ready for captures of one geometry.
-
-    `linear`: of the image to begin with.
-    """
+    """A refinement by photons, ready for captures of one geometry; begins with a linear image."""
 
     def __init__(
         self, capture: Capture, grid: Grid, method: PhotonRefinement, linear: Plan
@@ -541,16 +509,14 @@ class PhotonPlan(Plan):
 
 def judge(fit: PhotonFit, linear_light: Array, held: Array) -> LikelihoodGain:
     """Compare a fit with light as bright as in the linear image, and with background alone, by
-    photons that neither has seen.
+    photons that neither has seen; return the gain over the better of the two.
 
-    `fit`: of the photons that were kept; `linear_light` (points, bins): on any scale; `held`
-    (points, bins): photons that were set aside, `HELD_OUT_FRACTION` of all. Returns over the better
-    of the two.
+    `linear_light` (points, bins): on any scale; `held` (points, bins): `HELD_OUT_FRACTION` of all.
     """
-    share, photons = HELD_OUT_FRACTION / (1 - HELD_OUT_FRACTION), fit.photons
-    expected = share * fit.expect()
+    ratio, photons = HELD_OUT_FRACTION / (1 - HELD_OUT_FRACTION), fit.photons
+    expected = ratio * fit.expect()
     gains = [
-        LikelihoodGain.of(held, expected, share * fit_brightness(photons, light), photons.observed)
+        LikelihoodGain.of(held, expected, ratio * fit_brightness(photons, light), photons.observed)
         for light in (linear_light, np.zeros_like(linear_light))
     ]
     return min(gains, key=lambda gain: gain.nats)
@@ -558,10 +524,7 @@ def judge(fit: PhotonFit, linear_light: Array, held: Array) -> LikelihoodGain:
 
 def show_with_beam(fit: PhotonFit, linear: Array) -> Array:
     """Return the photons that every voxel sent to the wall, with the sharpness that response, wall
-    and voxels give them.
-
-    `linear` (z, y, x): image in whose order voxels stand that the photons decide nothing about.
-    Returns (z, y, x).
+    and voxels give them; where photons decide nothing, voxels stand in the order of `linear`.
     """
     from scipy.ndimage import gaussian_filter
 

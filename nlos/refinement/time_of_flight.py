@@ -38,10 +38,8 @@ class TimeOfFlight:
     obliquity: int = 0
 
     def compute_light(self, albedo: Array, voxels: Array, points: Array) -> Array:
-        """Return the light (points, bins) of some voxels at some wall points.
-
-        `albedo` (n,); `voxels` (n,): flat indices into the grid; `points` (m,): indices into the
-        capture's points. Returns (m, bins).
+        """Return the light (m, bins) of some voxels (n,), flat indices into the grid, at some of the
+        capture's points (m,).
         """
         light = np.empty((len(points), self._bins), np.float32)
         places, albedo = np.take(self._places, voxels, axis=1), np.asarray(albedo, np.float32)
@@ -57,12 +55,10 @@ class TimeOfFlight:
     def backproject(
         self, values: Array, voxels: Array, points: Array, squared: bool = False
     ) -> Array:
-        """Return what some voxels (n,) see of values (points, bins): the adjoint of
-        `compute_light`.
+        """Return what some voxels (n,) see of values (m, bins): the adjoint of `compute_light`.
 
-        `values` (m, bins); `voxels` (n,); `points` (m,); `squared`: weight by the square of the
-        light instead: with the inverse of the expected counts this is what they tell of a voxel,
-        Fisher's information. Returns (n,).
+        `squared`: weight by the square of the light instead: with the inverse of the expected
+        counts this is what they tell of a voxel, Fisher's information.
         """
         # Running sums from the end on: a box of light is the difference of two, see the kernel. The
         # response is turned around, as the adjoint of a convolution asks for.
@@ -109,10 +105,7 @@ class TimeOfFlight:
         )
 
     def spread(self, values: Array, response: FloatArray) -> Array:
-        """Convolve values (points, bins) with a response in time, whose middle stands for no delay.
-
-        `values` (m, bins); `response` (n,). Returns (m, bins).
-        """
+        """Convolve values (m, bins) with a response (n,) in time, whose middle is no delay."""
         if response.size == 1:
             return np.asarray(values, np.float32)
         from scipy.ndimage import convolve1d
