@@ -13,12 +13,14 @@ import scipy.sparse
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LineProjection, SparseMatrix, estimate_squared_norm
 from tofclip.solvers import (
+    DataTerm,
     Fista,
     Huber,
     LeastSquares,
     NonnegativeSparsity,
     NonnegativeTotalVariation,
     ProximalStep,
+    Regulariser,
     Sparse,
     StoppingRule,
     TotalVariation,
@@ -46,6 +48,16 @@ def projection() -> LineProjection:
     return LineProjection(
         (12, 11), 40, [8.2, 20.0, 31.5], [-0.7, 0.05, 0.6], [1.0, 0.8, 1.1], np.float64
     )
+
+
+def begin(data_term: DataTerm, prior: Regulariser) -> Fista:
+    """A block of `LANES` frames of `projection`, at darkness."""
+    operator = projection()
+    return Fista(operator, data_term, prior, 1 / estimate_squared_norm(operator, 99), LANES)
+
+
+def noise(seed: int, frames: int = 5) -> np.ndarray:
+    return np.abs(np.random.default_rng(seed).standard_normal((40, frames)))
 
 
 def test_sparsity_on_the_identity_is_soft_thresholding():
@@ -76,7 +88,7 @@ def test_total_variation_on_the_identity_moves_two_levels_together():
 
 @pytest.mark.parametrize("method", [Sparse(2e-2, 40), TotalVariation(2e-2, 40)], ids=["l1", "tv"])
 def test_a_shot_of_any_brightness_gives_the_same_pictures(method):
-    measurements = np.abs(np.random.default_rng(5).standard_normal((40, 5)))
+    measurements = noise(5)
     dim, bright = (method.recover(projection(), f * measurements).frames for f in (1, 1000))
     np.testing.assert_allclose(
         bright, 1000 * dim, rtol=1e-6, atol=1e-6 * bright.max(), err_msg=WEIGHT_RULE
@@ -88,13 +100,7 @@ def test_without_a_weight_it_solves_nonnegative_least_squares():
     truth = np.maximum(np.random.default_rng(1).standard_normal((12, 11)), 0)
     measurements = operator(truth) + 0.1 * np.random.default_rng(2).standard_normal(40)
     _, expected = scipy.optimize.nnls(operator.matrix.toarray(), measurements)
-    solver = Fista(
-        operator,
-        LeastSquares(_lanes(measurements)),
-        NonnegativeSparsity(0),
-        1 / estimate_squared_norm(operator, 99),
-        LANES,
-    )
+    solver = begin(LeastSquares(_lanes(measurements)), NonnegativeSparsity(0))
     iterate(solver, StoppingRule(4000), ignore_progress, LANES)
     assert np.sqrt(2 * solver.objective[0]) == pytest.approx(expected, rel=1e-6)
 
@@ -106,13 +112,7 @@ def test_optimality_of_sparse_solutions():
     truth[3:5, 4:8] = [[1, 2, 1, 3], [2, 2, 1, 1]]
     measurements = operator(truth)
     weight = 0.02
-    solver = Fista(
-        operator,
-        LeastSquares(_lanes(measurements)),
-        NonnegativeSparsity(weight),
-        1 / estimate_squared_norm(operator, 99),
-        LANES,
-    )
+    solver = begin(LeastSquares(_lanes(measurements)), NonnegativeSparsity(weight))
     iterate(solver, StoppingRule(6000), ignore_progress, LANES)
     picture = solver.current[..., 0]
     pull = operator.adjoint(measurements - operator(picture))
@@ -121,16 +121,9 @@ def test_optimality_of_sparse_solutions():
 
 
 def test_the_objective_never_rises():
-    operator = projection()
-    measurements = np.abs(np.random.default_rng(3).standard_normal((40, LANES)))
+    measurements = noise(3, LANES)
     for prior in (NonnegativeSparsity(0.01), NonnegativeTotalVariation(0.05)):
-        solver = Fista(
-            operator,
-            LeastSquares(measurements),
-            prior,
-            1 / estimate_squared_norm(operator, 99),
-            LANES,
-        )
+        solver = begin(LeastSquares(measurements), prior)
         before = solver.objective
         rejected = 0
         for _ in range(150):
@@ -143,14 +136,8 @@ def test_the_objective_never_rises():
 
 def test_what_a_refused_frame_reports_belongs_to_its_picture():
     operator = projection()
-    measurements = np.abs(np.random.default_rng(4).standard_normal((40, LANES)))
-    solver = Fista(
-        operator,
-        LeastSquares(measurements),
-        NonnegativeSparsity(0.01),
-        1 / estimate_squared_norm(operator, 99),
-        LANES,
-    )
+    measurements = noise(4, LANES)
+    solver = begin(LeastSquares(measurements), NonnegativeSparsity(0.01))
     for _ in range(60):
         solver.step()
         if solver.rejected.any():
@@ -165,7 +152,7 @@ def test_what_a_refused_frame_reports_belongs_to_its_picture():
 @pytest.mark.parametrize("method", [Sparse(1e-2, 40), TotalVariation(1e-2, 40)], ids=["l1", "tv"])
 def test_a_frame_does_not_depend_on_its_neighbours(method):
     operator = projection()
-    measurements = np.abs(np.random.default_rng(5).standard_normal((40, 50)))
+    measurements = noise(5, 50)
     measurements[:, 17] *= 3  # the brightest: it sets the scale of the weight in both runs
     whole = method.recover(operator, measurements)
     part = method.recover(operator, measurements[:, 15:20])
@@ -177,7 +164,7 @@ def test_a_frame_does_not_depend_on_its_neighbours(method):
 @pytest.mark.parametrize("method", [Sparse(2e-3, 25), TotalVariation(2e-3, 25)], ids=["l1", "tv"])
 def test_runs_repeat_to_the_last_bit_and_on_any_number_of_threads(method, monkeypatch):
     operator = LineProjection((12, 11), 40, [8.2, 20.0, 31.5], [-0.7, 0.05, 0.6], [1.0, 0.8, 1.1])
-    measurements = np.abs(np.random.default_rng(6).standard_normal((40, 100))).astype(np.float32)
+    measurements = noise(6, 100).astype(np.float32)
     monkeypatch.setenv("TOFCLIP_THREADS", "1")
     first = method.recover(operator, measurements)
     monkeypatch.setenv("TOFCLIP_THREADS", "3")
@@ -210,7 +197,7 @@ def test_results_have_the_operator_s_type(dtype):
 
 def test_tolerance_stops_and_says_so():
     operator = projection()
-    measurements = np.abs(np.random.default_rng(7).standard_normal((40, 5)))
+    measurements = noise(7)
     limited = Sparse(1e-2, 5).recover(operator, measurements)
     assert (limited.iterations, limited.stop_reason) == (5, "iteration limit")
     assert limited.objective.size == 6
@@ -252,10 +239,9 @@ def test_after_a_refused_step_the_momentum_starts_anew():
     both the size that the solver says.
     """
     operator = projection()
-    measurements = np.abs(np.random.default_rng(3).standard_normal((40, LANES)))
+    measurements = noise(3, LANES)
     regulariser = NonnegativeSparsity(1e-3)
-    safe = 1 / estimate_squared_norm(operator, 99)
-    solver = Fista(operator, LeastSquares(measurements), regulariser, safe, LANES)
+    solver = begin(LeastSquares(measurements), regulariser)
     checked = 0
     for _ in range(200):
         solver.step()
@@ -287,13 +273,7 @@ def test_steps_grow_as_far_as_they_are_safe_and_save_iterations():
     truth = np.zeros((12, 11))
     truth[3:5, 4:8] = [[1, 2, 1, 3], [2, 2, 1, 1]]
     solvers = [
-        Fista(
-            operator,
-            LeastSquares(_lanes(operator(truth))),
-            regulariser,
-            1 / estimate_squared_norm(operator, 99),
-            LANES,
-        )
+        begin(LeastSquares(_lanes(operator(truth))), regulariser)
         for regulariser in (NonnegativeSparsity(0.02), _WithoutDistance(0.02))
     ]
     for solver, iterations in zip(solvers, (40, 60), strict=True):
@@ -312,16 +292,9 @@ class _WithoutDistance(NonnegativeSparsity):
 
 
 def test_the_duality_gap_bounds_what_is_left():
-    operator = projection()
-    measurements = np.abs(np.random.default_rng(8).standard_normal((40, LANES)))
+    measurements = noise(8, LANES)
     for data_term in (LeastSquares(measurements), Huber(measurements, threshold=0.5)):
-        solver = Fista(
-            operator,
-            data_term,
-            NonnegativeSparsity(0.1),
-            1 / estimate_squared_norm(operator, 99),
-            LANES,
-        )
+        solver = begin(data_term, NonnegativeSparsity(0.1))
         gaps, objectives = [], []
         for _ in range(6):
             for _ in range(200):
@@ -336,7 +309,7 @@ def test_the_duality_gap_bounds_what_is_left():
 
 def test_the_gap_ends_a_run_and_is_told():
     operator = projection()
-    measurements = np.abs(np.random.default_rng(7).standard_normal((40, 5)))
+    measurements = noise(7)
     limited = Sparse(0.1, 10).recover(operator, measurements)
     assert (limited.stop_reason, limited.iterations) == ("iteration limit", 10)
     done = Sparse(0.1, 3000).recover(operator, measurements)
@@ -351,7 +324,7 @@ def test_the_gap_ends_a_run_and_is_told():
 
 def test_further_iterations_follow_only_while_the_objective_falls():
     operator, reported = projection(), []
-    measurements = np.abs(np.random.default_rng(7).standard_normal((40, 5)))
+    measurements = noise(7)
     short = Sparse(1e-3, 10, gap=0.0)
     limited = short.recover(operator, measurements)
     method = replace(short, further=3000)
@@ -394,7 +367,7 @@ def test_noise_is_not_followed_and_light_is() -> None:
 def test_dark_frames_are_zero_and_cost_nothing(method, data_term):
     """The others are what they are without them, and the objective and the work count them all."""
     operator = projection()
-    measurements = np.abs(np.random.default_rng(9).standard_normal((40, 50)))
+    measurements = noise(9, 50)
     dark = np.zeros(50, bool)
     dark[[0, 1, 7, 30, 48, 49]] = True
     measurements[:, dark] *= -1e-3
