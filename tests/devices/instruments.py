@@ -56,6 +56,16 @@ def take(source: Source, records: int) -> list[Any]:
     return found
 
 
+def read_gaps(source: Source, records: int) -> list[bool]:
+    """Read so many records; return of each batch whether something is missing before it."""
+    gaps = []
+    while source.stats.delivered < records:
+        batch = source.read(10)
+        assert batch is not None
+        gaps.append(batch.after_gap)
+    return gaps
+
+
 def finish(source: Source) -> None:
     """Stop, read the rest and close; the accounts balance."""
     source.stop()

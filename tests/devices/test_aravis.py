@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from instruments import finish, take
 
 import devices
 from devices.aravis import UNNUMBERED, find_cameras, load_aravis
@@ -19,7 +20,6 @@ from devices.counted_photons import read_photons
 from devices.emulation.aravis import EmulatedCamera
 from devices.emulation.scenes import EmulatedLight, draw_exposure, simulate_line_light
 from devices.shot_stream import read_transients
-from devices.source import Source
 from devices.transients import read_transient
 from tofclip.errors import (
     DeviceDisconnectedError,
@@ -31,23 +31,6 @@ from tofclip.errors import (
 from tofclip.recovery import FixedFocus
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
-
-
-def finish(source: Source) -> None:
-    source.stop()
-    while source.read(5) is not None:
-        pass
-    source.close()
-    assert source.stats.is_balanced, source.stats
-
-
-def take(source: Source, frames: int) -> list[Any]:
-    found: list[Any] = []
-    while len(found) < frames:
-        batch = source.read(10)
-        assert batch is not None
-        found += list(batch.records)
-    return found
 
 
 @pytest.fixture

@@ -363,7 +363,7 @@ FAULTS = {
         "test_remoteex::test_stray_bytes_on_the_data_port_are_thrown_away"
     ),
     "sequence numbers restart": "test_remoteex::test_numbers_that_restart_are_followed",
-    "Latin-1": "test_remoteex_protocol::test_text_is_latin_1",
+    "Latin-1": "test_remoteex::test_text_is_latin_1",
     "bare carriage returns in errors": (
         "test_remoteex::test_an_error_of_several_lines_does_not_shift_the_answers"
     ),

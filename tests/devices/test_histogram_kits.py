@@ -11,6 +11,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from instruments import take
 
 import devices
 from devices.counted_photons import read_photons
@@ -25,7 +26,6 @@ from devices.histogram_kits import (
     Tmf8828Parser,
     Vl53l8Parser,
 )
-from devices.source import Source
 from devices.transients import read_transient
 from tofclip.errors import (
     DeviceDisconnectedError,
@@ -107,15 +107,6 @@ def test_compact_histograms_of_each_zone() -> None:
     assert parse(parser, torn)[0].counts is None
     less_than_nothing = torn[1].replace(b"Bins: ", b"Bins: -").strip()
     assert parser.parse_line(less_than_nothing) is None
-
-
-def take(source: Source, frames: int) -> list[Any]:
-    found: list[Any] = []
-    while len(found) < frames:
-        batch = source.read(10)
-        assert batch is not None
-        found += list(batch.records)
-    return found
 
 
 @pytest.mark.parametrize(

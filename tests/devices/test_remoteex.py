@@ -7,8 +7,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+import hypothesis.strategies as st
 import numpy as np
 import pytest
+from hypothesis import given
+from instruments import finish, read_gaps, take
 
 import devices
 from devices.emulation.harness import HOST, Connection, Fault, LoopbackServer
@@ -18,16 +21,89 @@ from devices.emulation.scenes import (
     simulate_demonstration_light,
     simulate_line_light,
 )
-from devices.remoteex import TERMINATOR, RemoteExClient, StreakOptions
+from devices.remoteex import (
+    REFUSAL_REASONS,
+    TERMINATOR,
+    Answer,
+    AnswerCode,
+    Command,
+    RemoteExClient,
+    StreakOptions,
+)
 from devices.source import Source
 from tofclip.camera import Camera
 from tofclip.errors import (
+    DeviceBusyError,
     DeviceDisconnectedError,
+    DeviceError,
     DeviceNotFoundError,
     DeviceTimeoutError,
     InputError,
     ProtocolError,
 )
+
+names = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,20}", fullmatch=True)
+arguments = st.lists(
+    st.text(
+        st.characters(codec="latin-1", exclude_characters=",()", exclude_categories=["Cc"]),
+        max_size=9,
+    ),
+    max_size=5,
+).filter(lambda words: words != [""])
+
+
+@given(names, arguments)
+def test_commands_come_back(name: str, words: list[str]) -> None:
+    command = Command(name, tuple(words))
+    assert Command.decode(command.encode().removesuffix(TERMINATOR)) == command
+
+
+def test_text_is_latin_1() -> None:
+    assert Answer.decode(b"0,DevParamGet,10 \xb5s").arguments == ("10 µs",)
+    assert Command("DevParamSet", ("TD", "Time Range", "10 µs")).encode().endswith(b"10 \xb5s)\r")
+    with pytest.raises(InputError):
+        Command("DevParamSet", ("Ω",)).encode()
+
+
+@given(st.sampled_from(AnswerCode), names, arguments)
+def test_answers_come_back(code: AnswerCode, name: str, words: list[str]) -> None:
+    answer = Answer(code, name, tuple(words))
+    assert Answer.decode(answer.encode().removesuffix(TERMINATOR)) == answer
+
+
+def test_messages_as_the_handbook_writes_them() -> None:
+    assert (
+        Command("DevParamSet", ("TD", "MCP Gain", "0")).encode() == b"DevParamSet(TD,MCP Gain,0)\r"
+    )
+    assert Command("AcqStop").encode() == b"AcqStop()\r"
+    assert Answer.decode(b"0,ImgRingBufferGet,672,508,2,0,14,1234") == Answer(
+        AnswerCode.DONE, "ImgRingBufferGet", ("672", "508", "2", "0", "14", "1234")
+    )
+
+
+@pytest.mark.parametrize("words", [("a,b",), ("(",), ("a\r",), ("",)])
+def test_what_the_protocol_cannot_carry(words: tuple[str, ...]) -> None:
+    with pytest.raises(InputError):
+        Command("AcqStart", words).encode()
+    with pytest.raises(InputError):
+        Answer(AnswerCode.DONE, "Acq Start").encode()
+
+
+@pytest.mark.parametrize(
+    "message",
+    [b"", b"0", b"0,", b"11,Name", b"x,Name", b"-1,Name", b"\xff\xfe", b"\xb2,Name", b"0,A\nB"],
+)
+def test_answers_that_are_none(message: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        Answer.decode(message)
+
+
+@pytest.mark.parametrize("code", REFUSAL_REASONS)
+def test_every_refusal_is_explained(code: AnswerCode) -> None:
+    with pytest.raises(DeviceError, match=r"refused AcqStart\(Live\): .*\(why\)") as caught:
+        Answer(code, "AcqStart", ("why",)).require_done(Command("AcqStart", ("Live",)))
+    assert isinstance(caught.value, DeviceBusyError) == (code is AnswerCode.NOT_NOW)
+
 
 LIGHT = EmulatedLight(
     np.random.default_rng(1).uniform(0, 50, (12, 20)),
@@ -62,32 +138,13 @@ def opened(server: EmulatedStreakCamera, **values: object) -> Source:
     return devices.open(f"remoteex://{HOST}:{port}?data_port={data_port}{query}")
 
 
-def taken(source: Source, frames: int) -> list[np.ndarray]:
-    """Read so many frames, then stop."""
-    found: list[np.ndarray] = []
-    while len(found) < frames:
-        batch = source.read(10)
-        assert batch is not None
-        found += list(batch.records)
-    return found
-
-
-def require_balance(source: Source) -> None:
-    while source.read(10) is not None:
-        pass
-    source.close()
-    assert source.stats.is_balanced, source.stats
-    assert source.stats.unread == 0
-
-
 def test_pictures_come_in_order_and_bit_for_bit(camera: Make) -> None:
     server = camera()
     with opened(server, mcp_gain=30) as source:
         assert server.gain == "30"
         assert source.is_live
-        frames = taken(source, 12)
-        source.stop()
-        require_balance(source)
+        frames = take(source, 12)
+        finish(source)
     numbers = [int(frame["number"]) for frame in frames]
     assert numbers == list(range(numbers[0], numbers[0] + 12))
     for frame in frames:
@@ -110,20 +167,15 @@ def test_what_is_known_of_the_camera(camera: Make) -> None:
 def test_the_gain_goes_down_even_if_the_stream_has_failed(camera: Make) -> None:
     server = camera(Fault(3, "corrupt"))
     with opened(server, mcp_gain=20) as source, pytest.raises(ProtocolError):
-        taken(source, 100)
+        take(source, 100)
     assert server.gain == "0"
     assert source.stats.is_balanced
 
 
 def test_pictures_that_fell_out_of_the_ring_are_accounted_for(camera: Make) -> None:
     with opened(camera(Fault(4, "lost", 7))) as source:
-        gaps = []
-        while source.stats.delivered < 20:
-            batch = source.read(10)
-            assert batch is not None
-            gaps.append(batch.after_gap)
-        source.stop()
-        require_balance(source)
+        gaps = read_gaps(source, 20)
+        finish(source)
     assert source.stats.lost_device >= 7
     assert any(gaps)
 
@@ -133,9 +185,8 @@ def test_a_late_answer_is_waited_for_and_not_asked_for_again(camera: Make) -> No
     for it.
     """
     with opened(camera(Fault(3, "timeout", 5), Fault(6, "short", 5)), timeout_s=0.2) as source:
-        frames = taken(source, 15)
-        source.stop()
-        require_balance(source)
+        frames = take(source, 15)
+        finish(source)
     assert source.stats.timeouts >= 2
     for frame in frames:
         np.testing.assert_array_equal(frame["counts"], LIGHT.draw_frame(int(frame["number"])))
@@ -143,13 +194,8 @@ def test_a_late_answer_is_waited_for_and_not_asked_for_again(camera: Make) -> No
 
 def test_after_an_unplugged_cable_the_stream_goes_on(camera: Make) -> None:
     with opened(camera(Fault(5, "unplug"))) as source:
-        gaps = []
-        while source.stats.delivered < 20:
-            batch = source.read(10)
-            assert batch is not None
-            gaps += [batch.after_gap]
-        source.stop()
-        require_balance(source)
+        gaps = read_gaps(source, 20)
+        finish(source)
     assert source.stats.reconnects == 1
     assert gaps.count(True) == 1
 
@@ -157,19 +203,19 @@ def test_after_an_unplugged_cable_the_stream_goes_on(camera: Make) -> None:
 def test_a_camera_that_stays_away(camera: Make) -> None:
     server = camera()
     with opened(server, reconnect_s=0.3) as source:
-        taken(source, 3)
+        take(source, 3)
         server.close()
         with pytest.raises(DeviceDisconnectedError, match=r"no answer came for 0\.3 s"):
-            taken(source, 100)
+            take(source, 100)
     assert source.stats.is_balanced
 
 
-def test_a_picture_larger_than_any_is_refused_before_memory_is_taken(camera: Make) -> None:
+def test_a_picture_larger_than_any_is_refused_before_memory_is_take(camera: Make) -> None:
     with (
         opened(camera(Fault(2, "overflow"))) as source,
         pytest.raises(ProtocolError, match="at most"),
     ):
-        taken(source, 100)
+        take(source, 100)
 
 
 def test_nobody_there() -> None:
@@ -289,9 +335,8 @@ def test_an_emulated_camera_sees_a_scene() -> None:
     with devices.open(
         "sim+remoteex://?seed=4&scene=small&frame_rate=100&frames=4&mcp_gain=5"
     ) as source:
-        frames, known, info = taken(source, 4), source.calibration, source.info
-        source.stop()
-        require_balance(source)
+        frames, known, info = take(source, 4), source.calibration, source.info
+        finish(source)
     assert info.instrument.startswith("emulated Hamamatsu")
     assert known is not None
     assert Camera.from_record(known.child("camera", "camera")).slit_width_px == 256
@@ -337,7 +382,7 @@ def test_no_thread_is_left_behind(camera: Make) -> None:
     before = threading.active_count()
     server = camera()
     with opened(server) as source:
-        taken(source, 3)
+        take(source, 3)
     server.close()
     deadline = time.monotonic() + 5
     while threading.active_count() > before and time.monotonic() < deadline:
@@ -348,7 +393,7 @@ def test_no_thread_is_left_behind(camera: Make) -> None:
 def test_hpd_ta_is_started_where_it_is_not_up(camera: Make) -> None:
     server = camera(is_application_up=False)
     with opened(server, mcp_gain=9) as source:
-        assert len(taken(source, 3)) == 3
+        assert len(take(source, 3)) == 3
         assert server.gain == "9"
 
 
@@ -357,7 +402,7 @@ def test_live_mode_of_an_operator_is_joined_and_goes_on(camera: Make) -> None:
     server.gain = "13"
     time.sleep(0.05)
     with opened(server, mcp_gain=20) as source:
-        frames = taken(source, 5)
+        frames = take(source, 5)
         assert server.gain == "20"
     assert frames[0]["number"] > 0
     assert server.is_running
@@ -368,7 +413,7 @@ def test_a_busy_camera_is_waited_for_or_stopped(camera: Make) -> None:
     for busy_for in (3, 10**9):
         server = camera(busy_for=busy_for)
         with opened(server, timeout_s=0.5) as source:
-            assert len(taken(source, 3)) == 3
+            assert len(take(source, 3)) == 3
 
 
 def test_numbers_that_restart_are_followed(camera: Make) -> None:
@@ -412,7 +457,7 @@ def test_the_time_range_can_be_set(camera: Make) -> None:
 def test_stray_bytes_on_the_data_port_are_thrown_away(camera: Make) -> None:
     server = camera(stray_bytes=1000)
     with opened(server) as source:
-        for frame in taken(source, 3):
+        for frame in take(source, 3):
             np.testing.assert_array_equal(frame["counts"], LIGHT.draw_frame(int(frame["number"])))
 
 

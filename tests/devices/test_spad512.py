@@ -9,6 +9,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given
+from instruments import finish, read_gaps, take
 
 import devices
 from devices import counted_photons as photons
@@ -130,23 +131,6 @@ def opened(server: EmulatedSpadArray | LoopbackServer, **values: object) -> Sour
     return devices.open(f"spad512://{HOST}:{server.port}?{query}")
 
 
-def taken(source: Source, frames: int) -> list[Any]:
-    found: list[Any] = []
-    while len(found) < frames:
-        batch = source.read(10)
-        assert batch is not None
-        found += list(batch.records)
-    return found
-
-
-def finished(source: Source) -> None:
-    source.stop()
-    while source.read(10) is not None:
-        pass
-    source.close()
-    assert source.stats.is_balanced, source.stats
-
-
 @pytest.mark.parametrize(
     "values",
     [
@@ -159,9 +143,9 @@ def finished(source: Source) -> None:
 def test_pictures_come_bit_for_bit(array: Array, values: dict[str, int]) -> None:
     server = array()
     with opened(server, **values) as source:
-        frames = taken(source, 5)
+        frames = take(source, 5)
         info = source.info.as_dict()
-        finished(source)
+        finish(source)
     images = values.get("images", 1)
     exposure = ExposureRequest(
         values["bits"],
@@ -199,26 +183,22 @@ def test_pixels_that_spell_the_end_are_pixels() -> None:
             connection.send(b"DONE")
 
     with LoopbackServer(serve) as server, opened(server, width=4) as source:
-        for frame in taken(source, 3):
+        for frame in take(source, 3):
             np.testing.assert_array_equal(frame["counts"].ravel(), pixels)
 
 
 def test_slow_answers_are_waited_for(array: Array) -> None:
     with opened(array(Fault(1, "timeout", 3), Fault(2, "short", 3))) as source:
-        numbers = [int(frame["number"]) for frame in taken(source, 5)]
-        finished(source)
+        numbers = [int(frame["number"]) for frame in take(source, 5)]
+        finish(source)
     assert numbers == [0, 1, 2, 3, 4]
     assert source.stats.timeouts >= 2
 
 
 def test_after_an_unplugged_cable_the_pictures_go_on(array: Array) -> None:
     with opened(array(Fault(2, "unplug")), images=2) as source:
-        gaps = []
-        while source.stats.delivered < 9:
-            batch = source.read(10)
-            assert batch is not None
-            gaps += [batch.after_gap]
-        finished(source)
+        gaps = read_gaps(source, 9)
+        finish(source)
     assert (source.stats.reconnects, source.stats.malformed, gaps.count(True)) == (1, 1, 1)
 
 
@@ -229,7 +209,7 @@ def test_what_the_server_complains_of_is_passed_on(array: Array, amount: int, to
         opened(array(Fault(1, "stall", amount))) as source,
         pytest.raises(DeviceError, match=r"he FIFO is full\."),
     ):
-        taken(source, 5)
+        take(source, 5)
     assert source.stats.is_balanced
     assert (source.stats.delivered, source.stats.malformed) == (1, 1)
 
@@ -246,24 +226,24 @@ def test_an_answer_of_another_length_is_noticed(array: Array) -> None:
         opened(array(Fault(1, "corrupt"))) as source,
         pytest.raises(ProtocolError, match="ended in b'GONE'"),
     ):
-        taken(source, 5)
+        take(source, 5)
     assert source.stats.is_balanced
 
 
 def test_a_silent_server_counts_as_gone(array: Array) -> None:
     with opened(array(Fault(1, "timeout", 20)), timeout_s=0.3, reconnect_s=0.1) as source:
-        taken(source, 4)
-        finished(source)
+        take(source, 4)
+        finish(source)
     assert source.stats.reconnects == 1
 
 
 def test_a_server_that_stays_away(array: Array) -> None:
     server = array()
     with opened(server, reconnect_s=0.2) as source:
-        taken(source, 1)
+        take(source, 1)
         server.close()
         with pytest.raises(DeviceDisconnectedError, match="no answer came"):
-            taken(source, 10_000)
+            take(source, 10_000)
     assert source.stats.is_balanced
 
 
@@ -281,10 +261,10 @@ def test_nobody_there_and_values_that_cannot_be() -> None:
 
 def test_the_emulated_array_looks_at_the_demonstration() -> None:
     with devices.open("sim+spad512://?seed=3&width=128&bits=8") as source:
-        counts = taken(source, 1)[0]["counts"]
+        counts = take(source, 1)[0]["counts"]
         with pytest.raises(InputError):
             source.seek(0)
-        finished(source)
+        finish(source)
     assert counts.shape == (512, 128)
     assert 0 < counts.mean() < 20  # 20 photons in a millisecond on a white pixel
     with pytest.raises(InputError, match="seed"):
@@ -296,8 +276,8 @@ def test_single_bits_lie_as_the_other_depths_do(array: Array) -> None:
     corner = np.zeros((ROWS, ROWS))
     corner[:100, :50] = 1e9
     with opened(array(light=corner), bits=1, width=512) as source:
-        single = taken(source, 1)[0]["counts"]
-        finished(source)
+        single = take(source, 1)[0]["counts"]
+        finish(source)
     np.testing.assert_array_equal(single > 0, corner > 0)
 
 
@@ -311,8 +291,8 @@ def test_a_server_that_calibrates_itself_first_and_frames_nothing() -> None:
     server = Unframed(LIGHT, 7)
     server.must_calibrate = True
     with opened(server) as source:
-        assert len(taken(source, 2)) == 2
-        finished(source)
+        assert len(take(source, 2)) == 2
+        finish(source)
     server.close()
 
 
@@ -357,7 +337,7 @@ def test_a_scan_that_was_cut_is_left_out(array: Array) -> None:
     address = f"spad512://{HOST}:{server.port}?mode=gated&gate_steps=4&gate_step_ps=1500"
     counted = read_photons(f"{address}&scans=2&binning=16")
     with devices.open(address) as source:
-        numbers = [int(frame["number"]) for frame in taken(source, 4)]
+        numbers = [int(frame["number"]) for frame in take(source, 4)]
     server.close()
     assert numbers == [0, 1, 2, 3]
     sums = counted.counts.sum(axis=(1, 2))

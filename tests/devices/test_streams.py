@@ -1,0 +1,279 @@
+"""What every stream rests on: the ring between the instrument and a slow reader with its accounts, an
+instrument's clock estimated from messages that are delayed, and a connection that misbehaves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from devices.source import OVERFLOW_POLICIES, Gap, Ledger, OverflowPolicy, Piece, RingBuffer, Stats
+from devices.stream import WINDOW_S, InstrumentClock
+from devices.tcp import TcpLink
+from tofclip.errors import (
+    BufferOverflowError,
+    DeviceDisconnectedError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    ProtocolError,
+)
+
+SOON, LONG = 0.02, 5.0
+
+
+class RingMachine(RuleBasedStateMachine):
+    """Pieces put and taken in any order: acquired = delivered + unread + dropped + lost + malformed,
+    at every moment, and what is dropped is marked at the next piece by the worst that it was.
+    """
+
+    @initialize(policy=st.sampled_from(OVERFLOW_POLICIES), capacity=st.sampled_from([10, 30]))
+    def begin(self, policy: OverflowPolicy, capacity: int) -> None:
+        self.policy, self.capacity, self.ledger = policy, capacity, Ledger()
+        self.ring = RingBuffer(capacity, policy, self.ledger)
+        self.held: list[tuple[int, Gap, int]] = []  # name, gap, records
+        self.counts = dict.fromkeys(("acquired", "delivered", "dropped", "lost"), 0)
+        self.names, self.has_failed = 0, False
+
+    def has_room(self) -> bool:
+        return not self.held or 10 * len(self.held) + 10 <= self.capacity
+
+    @precondition(lambda self: not self.has_failed)
+    @rule(records=st.integers(1, 5), gap=st.sampled_from(Gap))
+    def put(self, records: int, gap: Gap) -> None:
+        if self.policy == "block" and not self.has_room():
+            return  # would wait
+        self.counts["acquired"] += records
+        piece = Piece(bytes([self.names % 256]) * 10, records, gap)
+        if self.policy == "fail" and not self.has_room():
+            with pytest.raises(BufferOverflowError, match="policy=drop_oldest"):
+                self.ring.put(piece)
+            self.counts["dropped"] += records
+            self.has_failed = True
+            return
+        self.ring.put(piece)
+        self.held.append((self.names % 256, gap, records))
+        self.names += 1
+        while 10 * len(self.held) > self.capacity:
+            _, lost_gap, dropped = self.held.pop(0)
+            self.counts["dropped"] += dropped
+            name, gap, kept = self.held[0]
+            self.held[0] = (name, max(gap, lost_gap, Gap.LOSS), kept)
+
+    @rule(malformed=st.integers(0, 1))
+    def take(self, malformed: int) -> None:
+        if not self.held:
+            fault = BufferOverflowError if self.has_failed else DeviceTimeoutError
+            with pytest.raises(fault):
+                self.ring.get(1e-4)
+            return
+        name, gap, records = self.held.pop(0)
+        piece = self.ring.get(SOON)
+        assert piece is not None
+        assert (piece.data[0], piece.gap, piece.records) == (name, gap, records)
+        self.ledger.deliver(records - malformed, malformed)
+        self.counts["delivered"] += records
+
+    @rule(records=st.integers(0, 9))
+    def lose(self, records: int) -> None:
+        self.ledger.lose(records)
+        self.counts["lost"] += records
+        self.counts["acquired"] += records
+
+    @invariant()
+    def accounts_balance(self) -> None:
+        stats = self.ledger.stats
+        assert stats.is_balanced
+        assert stats.acquired == self.counts["acquired"]
+        assert stats.delivered + stats.malformed == self.counts["delivered"]
+        assert (stats.dropped_host, stats.lost_device) == (
+            self.counts["dropped"],
+            self.counts["lost"],
+        )
+        assert stats.unread == sum(records for _, _, records in self.held)
+
+
+TestRing = RingMachine.TestCase
+TestRing.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)
+
+
+def test_one_piece_always_fits() -> None:
+    ring = RingBuffer(1, "fail", Ledger())
+    ring.put(Piece(b"larger than that", 1))
+    ring.end()
+    assert ring.get(SOON) is not None
+    assert ring.get(SOON) is None
+
+
+def test_a_writer_waits_for_room_or_the_end() -> None:
+    ledger = Ledger()
+    ring = RingBuffer(10, "block", ledger)
+    ring.put(Piece(b"0" * 10, 1))
+    for free in (lambda: ring.get(SOON), ring.end):
+        writer = threading.Thread(target=ring.put, args=(Piece(b"1" * 10, 1),))
+        writer.start()
+        writer.join(SOON)
+        assert writer.is_alive()
+        free()
+        writer.join(LONG)
+        assert not writer.is_alive()
+    assert ledger.stats.dropped_host == 0
+    assert [ring.get(SOON) is not None for _ in range(3)] == [True, True, False]
+
+
+def test_the_first_fault_counts() -> None:
+    ring = RingBuffer(10, "block", Ledger())
+    with pytest.raises(DeviceTimeoutError, match=r"for 0\.02 s"):
+        ring.get(SOON)
+    ring.fail(DeviceDisconnectedError("first"))
+    ring.fail(DeviceDisconnectedError("second"))
+    with pytest.raises(DeviceDisconnectedError, match="first"):
+        ring.get(SOON)
+
+
+def test_every_change_moves_records_between_accounts() -> None:
+    ledger = Ledger()
+    ledger.receive(10)
+    ledger.deliver(4, 1)
+    ledger.drop(2)
+    ledger.truncate()
+    ledger.lose(5)
+    ledger.time_out()
+    ledger.reconnect()
+    assert ledger.stats == Stats(16, 4, 3, 2, 5, 2, timeouts=1, reconnects=1)
+    assert ledger.stats.is_balanced
+
+
+def test_changes_at_the_same_time_all_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another thread gets its turn between reading the accounts and writing them."""
+
+    def replace_slowly(stats: Stats, **changes: Any) -> Stats:
+        time.sleep(1e-3)
+        return dataclasses.replace(stats, **changes)
+
+    monkeypatch.setattr("devices.source.replace", replace_slowly)
+    ledger, started = Ledger(), threading.Barrier(4)
+
+    def enter() -> None:
+        started.wait()
+        for _ in range(5):
+            ledger.receive(1)
+
+    threads = [threading.Thread(target=enter) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert ledger.stats.acquired == ledger.stats.unread == 20
+
+
+def test_the_least_delay_remains_in_the_estimate_and_nothing_else() -> None:
+    random, clock = np.random.default_rng(0), InstrumentClock()
+    assert clock.to_host(1.0) == 0.0  # nothing known yet
+    delays = 0.002 + random.exponential(0.05, 500)
+    for number, delay in enumerate(delays):
+        clock.observe(number * 0.01, 1000 + number * 0.01 + delay)
+    assert clock.to_host(2.5) == pytest.approx(1002.5 + delays.min())
+
+
+def test_quartzes_that_part_are_followed() -> None:
+    clock, drift = InstrumentClock(), 50e-6
+    for second in range(600):
+        clock.observe(second * (1 + drift), second + 0.001)
+    # An estimate from the first second would be wrong by 30 ms, one of two windows by 3 at most.
+    assert clock.to_host(600 * (1 + drift)) == pytest.approx(600, abs=2 * WINDOW_S * drift + 0.001)
+
+
+@pytest.mark.parametrize(
+    ("messages", "asked"),
+    [
+        # A stamp that goes back begins anew.
+        ([(100.0, 5.0), (0.0, 6.0)], (1.0, 7.0)),
+        # A new window, late from its first message on: the one before it still counts,
+        ([(0.0, 1.0), (WINDOW_S, WINDOW_S + 1.5)], (40.0, 41.0)),
+        # and then is forgotten.
+        (
+            [(0.0, 1.0), (WINDOW_S, WINDOW_S + 1.5), (2 * WINDOW_S + 1, 2 * WINDOW_S + 2.8)],
+            (80.0, 81.5),
+        ),
+    ],
+)
+def test_what_a_clock_forgets(
+    messages: list[tuple[float, float]], asked: tuple[float, float]
+) -> None:
+    clock = InstrumentClock()
+    for stamp, arrived_at in messages:
+        clock.observe(stamp, arrived_at)
+    assert clock.to_host(asked[0]) == pytest.approx(asked[1])
+
+
+Ends = tuple[TcpLink, socket.socket]
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        TcpLink("127.0.0.1", server.getsockname()[1], LONG) as link,
+        server.accept()[0] as other,
+    ):
+        yield link, other
+
+
+def test_messages_are_cut_where_they_end(ends: Ends) -> None:
+    link, other = ends
+    other.sendall(b"RemoteEx Ready\r0,App")
+    assert link.read_until(b"\r", 100, LONG) == b"RemoteEx Ready"
+    assert link.read_exactly(2, 10, LONG) == b"0,"
+    assert link.read_available(2, LONG) == b"Ap"
+    assert link.read_available(100, LONG) == b"p"
+    link.send(b"x", LONG)
+    assert other.recv(10) == b"x"
+
+
+def test_what_came_before_a_timeout_is_kept(ends: Ends) -> None:
+    link, other = ends
+    other.sendall(b"half")
+    with pytest.raises(DeviceTimeoutError):
+        link.read_exactly(8, 8, SOON)
+    with pytest.raises(DeviceTimeoutError):
+        link.read_until(b"!", 100, SOON)
+    other.sendall(b"done!")
+    assert link.read_until(b"!", 100, LONG) == b"halfdone"
+    with pytest.raises(DeviceTimeoutError):
+        link.read_available(1, SOON)
+
+
+def test_lengths_from_the_wire_are_bounded(ends: Ends) -> None:
+    link, other = ends
+    for length in (-1, 11, 1 << 60):
+        with pytest.raises(ProtocolError, match="at most 10"):
+            link.read_exactly(length, 10, LONG)
+    other.sendall(b"x" * 500)
+    with pytest.raises(ProtocolError, match="without the end"):
+        link.read_until(b"\r", 100, LONG)
+
+
+def test_a_server_that_leaves_or_is_not_there(ends: Ends) -> None:
+    link, other = ends
+    other.close()
+    with pytest.raises(DeviceDisconnectedError, match="closed"):
+        link.read_available(1, LONG)
+    link.close()
+    with pytest.raises(DeviceDisconnectedError):
+        link.send(b"x", LONG)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(DeviceNotFoundError, match=f"127.0.0.1:{port}"):
+        TcpLink("127.0.0.1", port, LONG)
+    with pytest.raises(DeviceNotFoundError):
+        TcpLink("no.such.host.invalid", 1001, LONG)
