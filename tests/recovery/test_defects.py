@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from three_view_shot import CAMERA
 
+from tofclip.camera.rectifier import MeasurementNoise
 from tofclip.lidar import depth
 from tofclip.recovery import open_shot, recover
 from tofclip.recovery.defects import estimate_noise, find_clipping_level, find_defects
@@ -15,7 +16,7 @@ from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.demo import make_default_camera
 from tofclip.simulate.patterns import make_plain_pattern
-from tofclip.solvers import TotalVariation
+from tofclip.solvers import PlugAndPlay, TotalVariation
 
 PULSE_ROWS = 3.0
 
@@ -150,7 +151,12 @@ def test_what_strikes_the_sensor_is_not_taken_for_the_lights_own_noise() -> None
     assert beside == pytest.approx(gain, rel=0.25)
 
 
-def test_light_that_is_cut_off_is_recovered_whatever_the_dark_level_is() -> None:
+@pytest.mark.parametrize(
+    "method",
+    [TotalVariation(iterations=300), PlugAndPlay(TotalVariation(iterations=300), calls=1)],
+    ids=lambda method: method.name,
+)
+def test_light_that_is_cut_off_is_recovered_whatever_the_dark_level_is(method) -> None:
     """Where the sensor ends there is as much light or more: a picture is not flattened to it."""
     picture = np.zeros((16, 16), np.float32)
     picture[3:13, 6:10] = 1
@@ -162,7 +168,9 @@ def test_light_that_is_cut_off_is_recovered_whatever_the_dark_level_is() -> None
     for dark, most in ((0, np.inf), (0, limit), (800, limit)):
         counts = (np.minimum(light, most) + dark).astype(np.float32)
         streak = Streak(counts, camera=CAMERA).with_bin_width(20e-12)
-        found.append(recover(streak, method=TotalVariation(iterations=300)).values.max())
+        frames = recover(streak, method=method)
+        assert MeasurementNoise.from_figures(frames.figures) is not None
+        found.append(frames.values.max())
     whole, cut, raised = found
     assert cut == pytest.approx(whole, rel=0.1)
     assert raised == pytest.approx(cut, rel=0.01)

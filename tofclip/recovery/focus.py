@@ -1,15 +1,12 @@
-"""The camera's parallax from an ordinary shot: time gives the range of each gate, agreement of the
-views its shear.
-
-At which shear each frame is recovered: one for all, the one that its time of flight says, or
-the sharpest.
+"""At which shear each frame is recovered: one for all, the one that its time of flight says, or the
+sharpest; and the camera's parallax from an ordinary shot: time gives the range of each gate, agreement
+of the views its shear.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +28,216 @@ from tofclip.units import SPEED_OF_LIGHT
 FloatArray = NDArray[np.float64]
 
 MIN_GATES = 3
+MIN_RANGE_M = 0.2  # in front of it the shear would change from bin to bin; such light is stray
+SEGMENT_RANGE_RATIO = 1.25  # light from there is weaker by a third
+GATE_BINS = 64
+
+
+@dataclass(frozen=True)
+class FrameSegment:
+    """Successive frames that share an operator.
+
+    Parameters
+    ----------
+    frames : slice
+    shear : float
+        Pixels per view step.
+    brightness : float
+        How bright a surface appears there, relative to the other pieces: a prior weighs in
+        proportion.
+    """
+
+    frames: slice
+    shear: float
+    brightness: float = 1.0
+
+    @property
+    def size(self) -> int:
+        """Number of frames."""
+        return int(self.frames.stop - self.frames.start)
+
+
+class Focus:
+    """Anything that says at which shear each frame is recovered."""
+
+    def plan_segments(
+        self,
+        camera: Camera,
+        times: FloatArray,
+        measurement: Measurement,
+        progress: Progress = ignore_progress,
+    ) -> list[FrameSegment]:
+        """Cut the frames at `times` (s of flight) into pieces, in order and without gaps.
+
+        Parameters
+        ----------
+        camera : Camera
+        times : (frames,) float array
+            Times of flight, s.
+        measurement : Measurement
+            Of the same frames.
+        progress : callable
+            Called with the number of frame iterations just done, `work` of them.
+
+        Returns
+        -------
+        list of FrameSegment
+        """
+        raise NotImplementedError
+
+    def check_camera(self, camera: Camera) -> None:
+        """Raise `CalibrationError` if the camera does not know enough; by default it does."""
+
+    def work(self, frames: int) -> int:
+        """Frame iterations that `plan_segments` reports; by default nothing has to be tried."""
+        return 0
+
+
+@dataclass(frozen=True)
+class FixedFocus(Focus):
+    """One shear for all frames, in pixels per view step."""
+
+    shear: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.shear):
+            raise InputError(f"a shear must be finite, got {self.shear}")
+
+    def __str__(self) -> str:
+        return f"fixed:{self.shear:g}"
+
+    def plan_segments(
+        self,
+        camera: Camera,
+        times: FloatArray,
+        measurement: Measurement,
+        progress: Progress = ignore_progress,
+    ) -> list[FrameSegment]:
+        """Return a single piece."""
+        return [FrameSegment(slice(0, times.size), self.shear)]
+
+
+@dataclass(frozen=True)
+class DepthLockedFocus(Focus):
+    """Every frame at the shear of the range that its time of flight says, s(c t / 2).
+
+    Frames whose shears put no view further off the slit than the tolerance share an operator. The
+    light of a frame is expected to fall off as 1/range^2, and the prior's weight with it.
+
+    Parameters
+    ----------
+    tolerance_px : float
+        Largest error of a view's place on the slit.
+    """
+
+    tolerance_px: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.tolerance_px) and self.tolerance_px > 0):
+            raise InputError(
+                f"the tolerance must be a positive number of pixels, got {self.tolerance_px}"
+            )
+
+    def __str__(self) -> str:
+        return "depth-locked"
+
+    def check_camera(self, camera: Camera) -> None:
+        """Ask for a known parallax."""
+        if camera.lenslet_pitch <= 0:
+            raise CalibrationError(
+                "the camera does not know its lenslet pitch, so that range says nothing about shear: calibrate it "
+                "(tofclip.camera.parallax) or choose another `focus`, fixed:S or stack:S0:S1:N"
+            )
+
+    def plan_segments(
+        self,
+        camera: Camera,
+        times: FloatArray,
+        measurement: Measurement,
+        progress: Progress = ignore_progress,
+    ) -> list[FrameSegment]:
+        """Cut where the shear has changed by twice the tolerance, or light is a third weaker."""
+        distance = np.maximum(SPEED_OF_LIGHT * times / 2, MIN_RANGE_M)
+        shears = camera.shear_at(distance)
+        # a piece reaches the tolerance to either side of its mean shear at the outermost view
+        step = 2 * self.tolerance_px / np.abs(camera.view_positions).max(initial=1.0)
+        number = np.floor((shears - shears[0]) / step).astype(np.int64)
+        octave = np.floor(np.log(distance / distance[0]) / np.log(SEGMENT_RANGE_RATIO))
+        changed = (np.diff(number) != 0) | (np.diff(octave) != 0)
+        cuts = np.flatnonzero(np.concatenate([[True], changed, [True]]))
+        parts = [slice(int(first), int(last)) for first, last in pairwise(cuts)]
+        return [
+            FrameSegment(part, float(shears[part].mean()), float(np.mean(distance[part] ** -2.0)))
+            for part in parts
+        ]
+
+
+@dataclass(frozen=True)
+class SharpestFocus(Focus):
+    """Every gate of 64 frames at that shear, of a stack, at which its pictures are sharpest.
+
+    Parameters
+    ----------
+    first, last : float
+        Ends of the stack, pixels per view step.
+    number : int
+        Shears tried.
+    """
+
+    first: float
+    last: float
+    number: int
+
+    def __post_init__(self) -> None:
+        if not (np.all(np.isfinite([self.first, self.last])) and self.first < self.last) or (
+            self.number < 2
+        ):
+            raise InputError(f"a focus stack needs two or more rising shears, got {self}")
+
+    def __str__(self) -> str:
+        return f"stack:{self.first:g}:{self.last:g}:{self.number}"
+
+    def plan_segments(
+        self,
+        camera: Camera,
+        times: FloatArray,
+        measurement: Measurement,
+        progress: Progress = ignore_progress,
+    ) -> list[FrameSegment]:
+        """Try all shears on each gate."""
+        starts = range(0, times.size, GATE_BINS)
+        gates = [slice(start, min(start + GATE_BINS, times.size)) for start in starts]
+        shears = np.linspace(self.first, self.last, self.number)
+        found = find_sharpest_shears(measurement, camera, gates, shears, progress).shears
+        return [FrameSegment(gate, float(shear)) for gate, shear in zip(gates, found, strict=True)]
+
+    def work(self, frames: int) -> int:
+        """Each frame is recovered once for each shear."""
+        return self.number * GATE_METHOD.work(frames)
+
+
+DEFAULT_FOCUS = FixedFocus()
+
+
+def parse_focus(text: str) -> Focus:
+    """Read ``depth-locked``, ``fixed:S`` or ``stack:S0:S1:N``.
+
+    Raises
+    ------
+    InputError
+        Anything else.
+    """
+    name, *numbers = text.split(":")
+    try:
+        if name == "depth-locked" and not numbers:
+            return DepthLockedFocus()
+        if name == "fixed" and len(numbers) == 1:
+            return FixedFocus(float(numbers[0]))
+        if name == "stack" and len(numbers) == 3:
+            return SharpestFocus(float(numbers[0]), float(numbers[1]), int(numbers[2]))
+    except ValueError as fault:
+        raise InputError(f"focus '{text}': {fault}") from fault
+    raise InputError(f"focus '{text}' is none of depth-locked, fixed:S and stack:S0:S1:N")
 
 
 @dataclass(frozen=True)
@@ -121,11 +328,8 @@ def count_parallax_work(shot: Shot, shears: tuple[float, float, int]) -> int:
 def split_gates_by_brightness(
     measurement: Measurement, times: FloatArray, number: int
 ) -> tuple[list[slice], FloatArray]:
-    """Cut the frames into gates of equal brightness (root of the light); also their light's mean
-    range, m.
-
-    `times` (frames,): times of flight, s; `number`: gates asked for; where light is concentrated
-    there may be fewer. Returns `ranges` (gates,): metres.
+    """Cut the frames into gates of equal brightness (root of the light), fewer where it is concentrated;
+    also their light's mean range, m.
     """
     light = np.maximum((measurement.values * measurement.valid).sum(axis=0, dtype=np.float64), 0)
     # the root, so that a bright near surface does not take all gates
@@ -139,246 +343,3 @@ def split_gates_by_brightness(
         for gate in gates
     ]
     return gates, SPEED_OF_LIGHT * np.array(instants) / 2
-
-
-# m; in front of it the shear would change from bin to bin, and light of such ranges is stray
-MIN_RANGE_M = 0.2
-SEGMENT_RANGE_RATIO = 1.25  # light from there is weaker by a third
-GATE_BINS = 64
-
-
-@dataclass(frozen=True)
-class FrameSegment:
-    """Successive frames that share an operator.
-
-    Parameters
-    ----------
-    frames : slice
-    shear : float
-        Pixels per view step.
-    brightness : float
-        How bright a surface appears there, relative to the other pieces: a prior weighs in
-        proportion.
-    """
-
-    frames: slice
-    shear: float
-    brightness: float = 1.0
-
-    @property
-    def size(self) -> int:
-        """Number of frames."""
-        return int(self.frames.stop - self.frames.start)
-
-
-class Focus(Protocol):
-    """Anything that says at which shear each frame is recovered."""
-
-    def check_camera(self, camera: Camera) -> None:
-        """Raise `CalibrationError` if the camera does not know enough."""
-        ...
-
-    def plan_segments(
-        self,
-        camera: Camera,
-        times: FloatArray,
-        measurement: Measurement,
-        progress: Progress = ignore_progress,
-    ) -> list[FrameSegment]:
-        """Cut the frames at `times` (s of flight) into pieces, in order and without gaps.
-
-        Parameters
-        ----------
-        camera : Camera
-        times : (frames,) float array
-            Times of flight, s.
-        measurement : Measurement
-            Of the same frames.
-        progress : callable
-            Called with the number of frame iterations just done.
-
-        Returns
-        -------
-        list of FrameSegment
-        """
-        ...
-
-    def work(self, frames: int) -> int:
-        """Frame iterations that `plan_segments` reports."""
-        ...
-
-
-@dataclass(frozen=True)
-class FixedFocus:
-    """One shear for all frames, in pixels per view step."""
-
-    shear: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not np.isfinite(self.shear):
-            raise InputError(f"a shear must be finite, got {self.shear}")
-
-    def __str__(self) -> str:
-        return f"fixed:{self.shear:g}"
-
-    def check_camera(self, camera: Camera) -> None:
-        """Ask for nothing."""
-
-    def plan_segments(
-        self,
-        camera: Camera,
-        times: FloatArray,
-        measurement: Measurement,
-        progress: Progress = ignore_progress,
-    ) -> list[FrameSegment]:
-        """Return a single piece.
-
-        Arguments and result are those of `Focus.plan_segments`.
-        """
-        return [FrameSegment(slice(0, times.size), self.shear)]
-
-    def work(self, frames: int) -> int:
-        """Nothing has to be tried."""
-        return 0
-
-
-@dataclass(frozen=True)
-class DepthLockedFocus:
-    """Every frame at the shear of the range that its time of flight says, s(c t / 2).
-
-    Frames whose shears put no view further off the slit than the tolerance share an operator. The
-    light of a frame is expected to fall off as 1/range^2, and the prior's weight with it.
-
-    Parameters
-    ----------
-    tolerance_px : float
-        Largest error of a view's place on the slit.
-    """
-
-    tolerance_px: float = 0.25
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.tolerance_px) and self.tolerance_px > 0):
-            raise InputError(
-                f"the tolerance must be a positive number of pixels, got {self.tolerance_px}"
-            )
-
-    def __str__(self) -> str:
-        return "depth-locked"
-
-    def check_camera(self, camera: Camera) -> None:
-        """Ask for a known parallax."""
-        if camera.lenslet_pitch <= 0:
-            raise CalibrationError(
-                "the camera does not know its lenslet pitch, so that range says nothing about shear: calibrate it "
-                "(tofclip.camera.parallax) or choose another `focus`, fixed:S or stack:S0:S1:N"
-            )
-
-    def plan_segments(
-        self,
-        camera: Camera,
-        times: FloatArray,
-        measurement: Measurement,
-        progress: Progress = ignore_progress,
-    ) -> list[FrameSegment]:
-        """Cut where the shear has changed by twice the tolerance, or the light has become a third
-        weaker.
-
-        Arguments and result are those of `Focus.plan_segments`.
-        """
-        distance = np.maximum(SPEED_OF_LIGHT * times / 2, MIN_RANGE_M)
-        shears = camera.shear_at(distance)
-        # a piece reaches the tolerance to either side of its mean shear at the outermost view
-        step = 2 * self.tolerance_px / np.abs(camera.view_positions).max(initial=1.0)
-        number = np.floor((shears - shears[0]) / step).astype(np.int64)
-        octave = np.floor(np.log(distance / distance[0]) / np.log(SEGMENT_RANGE_RATIO))
-        changed = (np.diff(number) != 0) | (np.diff(octave) != 0)
-        cuts = np.flatnonzero(np.concatenate([[True], changed, [True]]))
-        parts = [slice(int(first), int(last)) for first, last in pairwise(cuts)]
-        return [
-            FrameSegment(part, float(shears[part].mean()), float(np.mean(distance[part] ** -2.0)))
-            for part in parts
-        ]
-
-    def work(self, frames: int) -> int:
-        """Nothing has to be tried."""
-        return 0
-
-
-@dataclass(frozen=True)
-class SharpestFocus:
-    """Every gate of 64 frames at that shear, of a stack, at which its pictures are sharpest.
-
-    Parameters
-    ----------
-    first, last : float
-        Ends of the stack, pixels per view step.
-    number : int
-        Shears tried.
-    """
-
-    first: float
-    last: float
-    number: int
-
-    def __post_init__(self) -> None:
-        if not (
-            np.isfinite(self.first)
-            and np.isfinite(self.last)
-            and self.first < self.last
-            and self.number >= 2
-        ):
-            raise InputError(f"a focus stack needs two or more rising shears, got {self}")
-
-    def __str__(self) -> str:
-        return f"stack:{self.first:g}:{self.last:g}:{self.number}"
-
-    def check_camera(self, camera: Camera) -> None:
-        """Ask for nothing."""
-
-    def plan_segments(
-        self,
-        camera: Camera,
-        times: FloatArray,
-        measurement: Measurement,
-        progress: Progress = ignore_progress,
-    ) -> list[FrameSegment]:
-        """Try all shears on each gate.
-
-        Arguments and result are those of `Focus.plan_segments`.
-        """
-        starts = range(0, times.size, GATE_BINS)
-        gates = [slice(start, min(start + GATE_BINS, times.size)) for start in starts]
-        shears = np.linspace(self.first, self.last, self.number)
-        found = find_sharpest_shears(measurement, camera, gates, shears, progress).shears
-        return [FrameSegment(gate, float(shear)) for gate, shear in zip(gates, found, strict=True)]
-
-    def work(self, frames: int) -> int:
-        """Each frame is recovered once for each shear."""
-        from tofclip.camera.parallax import GATE_METHOD
-
-        return self.number * GATE_METHOD.work(frames)
-
-
-DEFAULT_FOCUS = FixedFocus()
-
-
-def parse_focus(text: str) -> Focus:
-    """Read ``depth-locked``, ``fixed:S`` or ``stack:S0:S1:N``.
-
-    Raises
-    ------
-    InputError
-        Anything else.
-    """
-    name, *numbers = text.split(":")
-    try:
-        if name == "depth-locked" and not numbers:
-            return DepthLockedFocus()
-        if name == "fixed" and len(numbers) == 1:
-            return FixedFocus(float(numbers[0]))
-        if name == "stack" and len(numbers) == 3:
-            return SharpestFocus(float(numbers[0]), float(numbers[1]), int(numbers[2]))
-    except ValueError as fault:
-        raise InputError(f"focus '{text}': {fault}") from fault
-    raise InputError(f"focus '{text}' is none of depth-locked, fixed:S and stack:S0:S1:N")

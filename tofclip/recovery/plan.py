@@ -1,10 +1,9 @@
-"""Recovering frames segment by segment, each with the operator of its own shear.
-
-From a streak image and a camera to transient frames: a shot is opened, planned and run.
+"""From a streak image and a camera to transient frames: a shot is opened, planned and run.
 
 The three steps, in this order: `open_shot` settles which camera took the shot and where its time
 zero lies, `plan_recovery` checks method, focus and device against it, and `RecoveryPlan.run` does
-the work. `recover` is the three in one call. docs/recovery_algorithm.md has the equations.
+the work, segment by segment, each with the operator of its own shear. `recover` is the three in one
+call. docs/recovery_algorithm.md has the equations.
 """
 
 from __future__ import annotations
@@ -24,9 +23,8 @@ from tofclip.camera import Camera, Measurement, measure
 from tofclip.camera.noise import find_dazzled, find_glints
 from tofclip.camera.registration import count_registration_iterations
 from tofclip.errors import InputError, require_type
-from tofclip.operators import LinearOperator
 from tofclip.recovery.defects import (
-    adapt_to_clipping,
+    clip_from_below,
     count_defects,
     describe_noise,
     find_clipping_level,
@@ -41,7 +39,6 @@ from tofclip.solvers import (
     LinearInverse,
     Method,
     Progress,
-    ProximalMethod,
     Result,
     Sparse,
     TotalVariation,
@@ -52,186 +49,17 @@ from tofclip.solvers.methods import frames_per_block
 from tofclip.storage import Scalar, collect_provenance
 from tofclip.threads import split_blocks
 
-
-def recover_segments(
-    method: Method,
-    camera: Camera,
-    measurement: Measurement,
-    segments: Sequence[FrameSegment],
-    progress: Progress = ignore_progress,
-) -> Result:
-    """Recover all frames, each segment with the operator of its own shear.
-
-    A prior's weight is relative to the brightest of the frames it is given. For segments to be
-    treated alike, it is made relative to what a surface like the shot's brightest would send back
-    from each segment's range.
-
-    `measurement`: its arrays may be of any library that the method takes; the frames are where they
-    are; `segments`: all frames, in order; `progress`: called with the number of frame iterations
-    just done. Returns frames (frames, rows, columns).
-
-    Memory: the frames, and one operator at a time.
-    """
-    if len(segments) == 1:
-        operator = camera.operator(segments[0].shear)
-        return method.recover(operator, measurement.values, measurement.valid, progress)
-    peaks = np.array(
-        [
-            _find_backprojection_peak(
-                camera.operator(segment.shear), _slice_measurement(measurement, segment)
-            )
-            for segment in segments
-        ]
-    )
-    expected = np.array([segment.brightness for segment in segments])
-    # the shot's brightest surface, as each segment's range would show it
-    scale = (np.maximum(peaks, 0) / expected).max() * expected
-    frames = zeros((measurement.values.shape[1], *camera.image_shape), measurement.values)
-    results = []
-    for segment, peak, bright in zip(segments, peaks, scale, strict=True):
-        if peak <= 0:
-            progress(method.work(segment.size))  # dark: nothing to recover
-            continue
-        part = _slice_measurement(measurement, segment)
-        weighted = (
-            # a prior's weight is relative to the brightest frame of what the solver is given
-            replace(method, weight=method.weight * bright / peak)
-            if isinstance(method, ProximalMethod)
-            else method
-        )
-        result = weighted.recover(camera.operator(segment.shear), part.values, part.valid, progress)
-        frames[segment.frames, ...] = result.frames
-        results.append(replace(result, frames=frames[segment.frames, ...]))
-    return _join_results(frames, results)
-
-
-def recover_glints(
-    frames: NDArray[np.float32],
-    method: Method,
-    camera: Camera,
-    measurement: Measurement,
-    segments: Sequence[FrameSegment],
-    dazzled: NDArray[np.bool_],
-    device: ComputeDevice,
-) -> NDArray[np.float32]:
-    """Return the frames with the pixels that dazzled measurements alone see.
-
-    `frames` (frames, rows, columns): recovered without the dazzled measurements; `measurement`:
-    NumPy arrays; `dazzled` (readings, frames); `device`: where the method runs. Returns (frames,
-    rows, columns).
-    """
-    complete = frames.copy()
-    for segment in segments:
-        own = np.arange(dazzled.shape[1])[segment.frames]
-        some = own[dazzled[:, own].any(axis=0)]
-        if not some.size:
-            continue
-        operator = camera.operator(segment.shear)
-        whole = method.recover(
-            operator,
-            device.put(np.ascontiguousarray(measurement.values[:, some])),
-            device.put(np.ascontiguousarray(measurement.valid[:, some])),
-        )
-        glints = find_glints(operator, dazzled[:, some])
-        complete[some] = np.where(glints, to_numpy(whole.frames), complete[some])
-    return complete
-
-
-def compute_segments_residual(
-    camera: Camera, frames: Array, measurement: Measurement, segments: Sequence[FrameSegment]
-) -> float:
-    """Return ``|F h - f| / |f|`` over all valid measurements, each frame with its own operator.
-
-    `frames` (frames, rows, columns): recovered; `segments`: without gaps; each has its shear.
-    Returns 0 is a perfect fit.
-    """
-    misfit = energy = 0.0
-    for segment in segments:
-        part = _slice_measurement(measurement, segment)
-        xp = namespace(part.values)
-        own = float(xp.sum(_zero_invalid(part) ** 2, dtype=xp.float64))
-        if own > 0:
-            operator = camera.operator(segment.shear)
-            misfit += (
-                own
-                * relative_residual(operator, frames[segment.frames, ...], part.values, part.valid)
-                ** 2
-            )
-            energy += own
-    return float(np.sqrt(misfit / energy))
-
-
-def _slice_measurement(measurement: Measurement, segment: FrameSegment) -> Measurement:
-    columns = segment.frames
-    return Measurement(measurement.values[:, columns], measurement.valid[:, columns])
-
-
-def _zero_invalid(part: Measurement) -> Array:
-    """Return the measurements, zero where they are not valid."""
-    return namespace(part.values, part.valid).where(part.valid, part.values, 0.0)
-
-
-def _find_backprojection_peak(operator: LinearOperator, part: Measurement) -> float:
-    """Return the largest value of F'f over the valid measurements."""
-    xp, measurements = namespace(part.values), _zero_invalid(part)
-    blocks = split_blocks(measurements.shape[1], frames_per_block(operator, measurements))
-    return max(float(xp.max(operator.adjoint(measurements[:, block]))) for block in blocks)
-
-
-def _join_results(frames: Array, results: list[Result]) -> Result:
-    """Join what is known about the segments; those that stopped early count with their last
-    objective.
-    """
-    longest = max(result.objective.size for result in results)
-    objective = np.zeros(longest)
-    for result in results:
-        if result.objective.size:
-            # a segment that ended early keeps its last objective
-            objective += np.pad(result.objective, (0, longest - result.objective.size), "edge")
-    reasons = {result.stop_reason for result in results}
-    return Result(
-        frames,
-        max(result.iterations for result in results),
-        objective,
-        "iteration limit" if "iteration limit" in reasons else results[0].stop_reason,
-        sum(result.setup_seconds for result in results),
-        _join_gaps(results),
-    )
-
-
-def _join_gaps(results: list[Result]) -> float:
-    """The duality gap of all segments as a fraction of all their objectives; NaN where one has none."""
-    last = [result.objective[-1] if result.objective.size else np.nan for result in results]
-    excess = sum(result.duality_gap * value for result, value in zip(results, last, strict=True))
-    return float(excess / sum(last)) if sum(last) > 0 else float("nan")
-
-
 AnyMethod = Method | SurfaceRecovery
 
-FURTHER_SPARSE_ITERATIONS = 40
-"""Of `l1` where their number is not given: a bright shot needs more of them than a dark one."""
-
-SPARSE_NOISE_FALL = 2e-3
-"""Of `l1` where iterations are not given. In shots with 20 photons in the brightest pixel the solution
-without negative values turns the noise into single bright pixels, and empties those between: after
-25 iterations 25 and 34 % of two scenes' pixels are missed, after 40 33 and 41 %. Noise alone falls as
-slowly from the 19th iteration on."""
-
-
-def make_sparse(**settings: Any) -> Sparse:
-    """Make the method `l1`, which goes on while its objective falls, and ends before it follows the
-    noise, unless iterations are given.
-    """
-    if "iterations" in settings:
-        return Sparse(**settings)
-    return Sparse(
-        **{"further": FURTHER_SPARSE_ITERATIONS, "noise_fall": SPARSE_NOISE_FALL, **settings}
-    )
-
+# Of `l1` where iterations are not given: a bright shot needs more of them than a dark one. In shots with
+# 20 photons in the brightest pixel the solution without negative values turns the noise into single
+# bright pixels, and empties those between: after 25 iterations 25 and 34 % of two scenes' pixels are
+# missed, after 40 33 and 41 %. Noise alone falls as slowly from the 19th iteration on.
+SPARSE_SETTINGS = {"further": 40, "noise_fall": 2e-3}
 
 METHODS: dict[str, Callable[..., AnyMethod]] = {
     "tv": TotalVariation,
-    "l1": make_sparse,
+    "l1": Sparse,
     "linear": LinearInverse,
     "adjoint": Backprojection,
     "surfaces": SurfaceRecovery,
@@ -262,8 +90,9 @@ def make_method(name: str, **settings: Any) -> AnyMethod:
     if name not in METHODS:
         raise InputError(f"unknown method '{name}'; choose one of {', '.join(METHODS)}")
     given = {setting: value for setting, value in settings.items() if value is not None}
+    usual = SPARSE_SETTINGS if name == "l1" and "iterations" not in given else {}
     try:
-        return METHODS[name](**given)
+        return METHODS[name](**{**usual, **given})
     except TypeError as fault:
         raise InputError(f"method '{name}' does not take {', '.join(given)}") from fault
 
@@ -327,7 +156,7 @@ class RecoveryPlan:
             return self._recover_surfaces(shot, self.method, progress, started)
         streak, camera = shot.streak, shot.camera
         measurement = measure(streak.counts, streak.saturated, camera)
-        noise = describe_noise(streak, measurement) if self.has_prior else None
+        noise = describe_noise(streak, measurement) if self.method.has_prior else None
         solving = time.perf_counter()
         segments = self.focus.plan_segments(camera, shot.times, measurement, progress)
         dazzled = None if noise is None else find_dazzled(measurement, noise)
@@ -335,7 +164,7 @@ class RecoveryPlan:
         with self.device.activate():
             on_device = Measurement(self.device.put(measurement.values), self.device.put(used))
             clipping = find_clipping_level(streak.counts)
-            method = adapt_to_clipping(self.method, streak, clipping)
+            method = self.method.with_data_term(clip_from_below(streak, clipping))
             result = recover_segments(method, camera, on_device, segments, progress)
             values = to_numpy(result.frames)
             if dazzled is not None and dazzled.any():
@@ -371,11 +200,6 @@ class RecoveryPlan:
             attachments=streak.attachments,
             provenance={**streak.provenance, "objective": result.objective.tolist()},
         )
-
-    @property
-    def has_prior(self) -> bool:
-        """Whether the method has a prior, and fits the measurements as well as noise allows."""
-        return isinstance(self.method, ProximalMethod)
 
     def _recover_surfaces(
         self, shot: Shot, method: SurfaceRecovery, progress: Progress, started: float
@@ -512,3 +336,123 @@ def recover(
     require_type(streak, Streak, "recover takes a Streak, see tofclip.read_streak")
     shot = open_shot(streak, camera)
     return plan_recovery(shot, method, focus or DEFAULT_FOCUS, device).run(progress)
+
+
+def recover_segments(
+    method: Method,
+    camera: Camera,
+    measurement: Measurement,
+    segments: Sequence[FrameSegment],
+    progress: Progress = ignore_progress,
+) -> Result:
+    """Recover all frames, of arrays of any library that the method takes, each segment with the
+    operator of its own shear.
+
+    A prior's weight is relative to the brightest of the frames it is given. For segments to be
+    treated alike, it is made relative to what a surface like the shot's brightest would send back
+    from each segment's range. Memory: the frames, and one operator at a time.
+    """
+    if len(segments) == 1:
+        operator = camera.operator(segments[0].shear)
+        return method.recover(operator, measurement.values, measurement.valid, progress)
+    peaks = np.array([_find_peak(camera, measurement, segment) for segment in segments])
+    expected = np.array([segment.brightness for segment in segments])
+    # the shot's brightest surface, as each segment's range would show it
+    scale = (np.maximum(peaks, 0) / expected).max() * expected
+    frames = zeros((measurement.values.shape[1], *camera.image_shape), measurement.values)
+    results = []
+    for segment, peak, bright in zip(segments, peaks, scale, strict=True):
+        if peak <= 0:
+            progress(method.work(segment.size))  # dark: nothing to recover
+            continue
+        part, operator = _slice_measurement(measurement, segment), camera.operator(segment.shear)
+        weighted = method.scale_weight(float(bright / peak))
+        result = weighted.recover(operator, part.values, part.valid, progress)
+        frames[segment.frames, ...] = result.frames
+        results.append(replace(result, frames=frames[segment.frames, ...]))
+    return _join_results(frames, results)
+
+
+def _slice_measurement(measurement: Measurement, segment: FrameSegment) -> Measurement:
+    columns = segment.frames
+    return Measurement(measurement.values[:, columns], measurement.valid[:, columns])
+
+
+def _zero_invalid(part: Measurement) -> Array:
+    return namespace(part.values, part.valid).where(part.valid, part.values, 0.0)
+
+
+def _find_peak(camera: Camera, measurement: Measurement, segment: FrameSegment) -> float:
+    """Largest value of F'f over a segment's valid measurements."""
+    operator = camera.operator(segment.shear)
+    measurements = _zero_invalid(_slice_measurement(measurement, segment))
+    xp = namespace(measurements)
+    blocks = split_blocks(measurements.shape[1], frames_per_block(operator, measurements))
+    return max(float(xp.max(operator.adjoint(measurements[:, block]))) for block in blocks)
+
+
+def _join_results(frames: Array, results: list[Result]) -> Result:
+    """Join what is known about the segments; those that stopped early count with their last
+    objective, and the duality gap is a fraction of all objectives, NaN where one has none.
+    """
+    longest = max(result.objective.size for result in results)
+    objective, excess, whole = np.zeros(longest), 0.0, 0.0
+    for result in results:
+        last = result.objective[-1] if result.objective.size else np.nan
+        excess, whole = excess + result.duality_gap * last, whole + last
+        if result.objective.size:
+            objective += np.pad(result.objective, (0, longest - result.objective.size), "edge")
+    reasons = {result.stop_reason for result in results}
+    return Result(
+        frames,
+        max(result.iterations for result in results),
+        objective,
+        "iteration limit" if "iteration limit" in reasons else results[0].stop_reason,
+        sum(result.setup_seconds for result in results),
+        float(excess / whole) if whole > 0 else float("nan"),
+    )
+
+
+def recover_glints(
+    frames: NDArray[np.float32],
+    method: Method,
+    camera: Camera,
+    measurement: Measurement,
+    segments: Sequence[FrameSegment],
+    dazzled: NDArray[np.bool_],
+    device: ComputeDevice,
+) -> NDArray[np.float32]:
+    """Return frames that were recovered without dazzled measurements, (measurements, frames), with the
+    pixels that these alone see.
+    """
+    complete = frames.copy()
+    for segment in segments:
+        own = np.arange(dazzled.shape[1])[segment.frames]
+        some = own[dazzled[:, own].any(axis=0)]
+        if not some.size:
+            continue
+        operator = camera.operator(segment.shear)
+        whole = method.recover(
+            operator,
+            device.put(np.ascontiguousarray(measurement.values[:, some])),
+            device.put(np.ascontiguousarray(measurement.valid[:, some])),
+        )
+        glints = find_glints(operator, dazzled[:, some])
+        complete[some] = np.where(glints, to_numpy(whole.frames), complete[some])
+    return complete
+
+
+def compute_segments_residual(
+    camera: Camera, frames: Array, measurement: Measurement, segments: Sequence[FrameSegment]
+) -> float:
+    """Return ``|F h - f| / |f|`` over all valid measurements, each frame with its own operator."""
+    misfit = energy = 0.0
+    for segment in segments:
+        part = _slice_measurement(measurement, segment)
+        xp = namespace(part.values)
+        own = float(xp.sum(_zero_invalid(part) ** 2, dtype=xp.float64))
+        if own > 0:
+            operator, pictures = camera.operator(segment.shear), frames[segment.frames, ...]
+            left = relative_residual(operator, pictures, part.values, part.valid)
+            misfit, energy = misfit + own * left**2, energy + own
+    return float(np.sqrt(misfit / energy))

@@ -18,7 +18,14 @@ from numpy.typing import DTypeLike, NDArray
 from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
 from tofclip.operators import LinearOperator, LineProjection
-from tofclip.solvers import LinearInverse, PreparedInverse, Progress, Result, ignore_progress
+from tofclip.solvers import (
+    LinearInverse,
+    Method,
+    PreparedInverse,
+    Progress,
+    Result,
+    ignore_progress,
+)
 from tofclip.storage import Record
 
 # Frames at more shears than that make the further operators anew. Twice as many operators, so that
@@ -90,7 +97,7 @@ def _prepare(method: LinearInverse, operator: Any, alive: bytes) -> PreparedInve
 
 
 @dataclass(frozen=True, repr=False)
-class CachedInverse:
+class CachedInverse(Method):
     """The linear inverse, whose Gram matrices are inverted once for each operator that is kept."""
 
     method: LinearInverse

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.operators import LinearOperator
-from tofclip.solvers.data_terms import DataTerm, Mask
+from tofclip.solvers.data_terms import DataTerm, DataTermMaker, Mask
 from tofclip.solvers.fista import ProximalMethod
 from tofclip.solvers.methods import Method, Progress, Result, ignore_progress
 from tofclip.threads import limit_blas_threads
@@ -191,6 +191,19 @@ class PlugAndPlay(Method):
 
     def work(self, frames: int) -> int:
         return self.start.work(frames) + frames * self.calls
+
+    @property
+    def has_prior(self) -> bool:
+        """True: the denoiser stands for one."""
+        return True
+
+    def with_data_term(self, data_term: DataTermMaker) -> Self:
+        """Return this method with another misfit, if its start has least squares."""
+        return replace(self, start=self.start.with_data_term(data_term))
+
+    def scale_weight(self, factor: float) -> Self:
+        """Return this method with its start's weight multiplied."""
+        return replace(self, start=self.start.scale_weight(factor))
 
 
 @dataclass(frozen=True)

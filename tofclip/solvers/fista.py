@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import log
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,6 +248,19 @@ class ProximalMethod(Method, ABC):
     @abstractmethod
     def _make_regulariser(self, weight: float) -> Regulariser:
         """Make the prior for one block with an absolute weight."""
+
+    @property
+    def has_prior(self) -> bool:
+        """True: see `Method`."""
+        return True
+
+    def with_data_term(self, data_term: DataTermMaker) -> Self:
+        """Return this method with another misfit, if it has least squares."""
+        return replace(self, data_term=data_term) if self.data_term is LeastSquares else self
+
+    def scale_weight(self, factor: float) -> Self:
+        """Return this method with its weight multiplied."""
+        return replace(self, weight=self.weight * factor)
 
     def recover(
         self,

@@ -12,7 +12,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import prod
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import Array, as_type, is_numpy, namespace, to_numpy, zeros
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
-from tofclip.solvers.data_terms import Mask
+from tofclip.solvers.data_terms import DataTermMaker, Mask
 from tofclip.threads import LANES, run_blocks, split_blocks
 
 Progress = Callable[[int], None]
@@ -326,6 +326,19 @@ class Method(Protocol):
         frames : int
         """
         return frames
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether there is a prior, so that measurements are fitted as well as noise allows."""
+        return False
+
+    def with_data_term(self, data_term: DataTermMaker) -> Self:
+        """Return this method with another misfit in the place of least squares, where it has these."""
+        return self
+
+    def scale_weight(self, factor: float) -> Self:
+        """Return this method with its prior weighing by so much more, where it has one."""
+        return self
 
 
 def relative_residual(
