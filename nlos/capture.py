@@ -161,19 +161,9 @@ class Capture:
         if self.laser.shape == (3,) and not np.all(np.isfinite(self.laser)):
             raise InputError(f"the laser spot must be finite, got {self.laser}")
         TimeAxis(self.signal.shape[0], self.bin_width, self.start)
-        self._validate_units()
-        if not np.any(self.valid):
-            raise InputError("every wall point is NaN: nothing is left to image with")
-        bad = _count_non_finite(self.signal, self.valid)
-        if bad:
-            raise InputError(
-                f"{bad} samples of the signal are NaN or infinite; set them to 0, or their wall points to NaN"
-            )
-
-    def _validate_units(self) -> None:
         require_credible_bin_width(self.bin_width)
         if not np.any(self.valid):
-            return
+            raise InputError("every wall point is NaN: nothing is left to image with")
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         extent = float((high - low).max())
         if extent > MAX_WALL_EXTENT_M:
@@ -183,6 +173,11 @@ class Capture:
             raise InputError(
                 f"the laser spot lies {behind:.3g} m behind the hindmost wall point: give the spot on the wall, not "
                 "the device, and z growing from the wall into the hidden scene"
+            )
+        bad = _count_non_finite(self.signal, self.valid)
+        if bad:
+            raise InputError(
+                f"{bad} samples of the signal are NaN or infinite; set them to 0, or their wall points to NaN"
             )
 
     @classmethod
@@ -225,10 +220,8 @@ class Capture:
         >>> len(Capture.exhaustive(signal, wall, laser, bin_width=10e-12).points)
         6
         """
-        wall, laser = (
-            _to_real_array(wall, np.float64, "wall"),
-            _to_real_array(laser, np.float64, "laser"),
-        )
+        wall = _to_real_array(wall, np.float64, "wall")
+        laser = _to_real_array(laser, np.float64, "laser")
         shape = (*laser.shape[:-1], *wall.shape[:-1], 3)
         every_laser = laser.reshape(*laser.shape[:-1], *[1] * (wall.ndim - 1), laser.shape[-1])
         if wall.shape[-1:] != (3,) or laser.shape[-1:] != (3,):
@@ -282,11 +275,8 @@ class Capture:
         places = np.unique(self.points, axis=0)
         if len(places) == 1:
             return float("inf")
-        return float(
-            np.median(
-                cKDTree(places).query(places[:: len(places) // MAX_SPACING_POINTS + 1], 2)[0][:, 1]
-            )
-        )
+        some = places[:: len(places) // MAX_SPACING_POINTS + 1]
+        return float(np.median(cKDTree(places).query(some, 2)[0][:, 1]))
 
     def traces(self, selection: slice = slice(None)) -> NDArray[np.float32]:
         """Signals of some valid wall points, in the order of `points`, shape (points, t).
@@ -318,7 +308,7 @@ class Capture:
             The frames carry no relay wall, the wall does not fit into the picture, or the frames
             are not evenly spaced in time.
         """
-        return extract_wall_capture(frames)
+        return _extract_wall_capture(frames)
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
@@ -396,8 +386,7 @@ ATTACHMENT_NAME = "relay_wall"
 STEP_TOLERANCE = 1e-3
 
 
-def extract_wall_capture(frames: Frames) -> Capture:
-    """Do what `Capture.from_frames` describes."""
+def _extract_wall_capture(frames: Frames) -> Capture:
     require_type(frames, Frames, "a capture is made of Frames, see tofclip.recover")
     record = frames.attachments.get(ATTACHMENT_NAME)
     if record is None or record.kind != ATTACHMENT_NAME:
@@ -423,63 +412,54 @@ def extract_wall_capture(frames: Frames) -> Capture:
 def unwarp_signal(
     signal: Any, wall: Any, camera: Any, laser: Any, bin_width: float
 ) -> NDArray[np.float32]:
-    """Shift every wall point's signal earlier by ``(|r_p - camera| - |laser - camera|) / c``.
+    """Shift every wall point's signal (t, ...) earlier by ``(|r_p - camera| - |laser - camera|) /
+    c``; wherever it is, the result is NumPy's.
 
     Afterwards light of one path laser spot -> hidden point -> wall point stands in the same bin for
     all wall points. Between bins the signal is interpolated linearly; before the first and after
-    the last bin it is 0.
-
-    `signal` (t, ...): as the camera saw it; fetched from wherever it is; `wall` (..., 3): wall
-    points, m; the signal of a point with NaN becomes 0; `camera, laser` (3,): position of the
-    camera and of the laser spot on the wall, m; `bin_width`: duration of a time bin, s. Returns (t,
-    ...).
+    the last bin, and where a wall point (..., 3) is NaN, it is 0.
     """
-    signal, wall = (
-        np.asarray(to_numpy(signal), dtype=np.float32),
-        np.asarray(wall, dtype=np.float64),
-    )
-    camera, laser = np.asarray(camera, dtype=np.float64), np.asarray(laser, dtype=np.float64)
+    signal = np.asarray(to_numpy(signal), dtype=np.float32)
+    wall = np.asarray(wall, dtype=np.float64)
+    camera, laser = (_require_position(*one) for one in (("camera", camera), ("laser", laser)))
     if signal.shape[1:] != wall.shape[:-1] or wall.shape[-1:] != (3,):
         raise ShapeError("wall", (*signal.shape[1:], 3), wall.shape)
-    for name, place in (("camera", camera), ("laser", laser)):
-        if place.shape != (3,) or not np.all(np.isfinite(place)):
-            raise InputError(f"the {name} position must be three finite numbers, got {place}")
-    return_leg = np.linalg.norm(wall - camera, axis=-1) - np.linalg.norm(laser - camera)
-    delay_bins = return_leg / (SPEED_OF_LIGHT * bin_width)
-    # A shift by the whole record reads nothing but zeros.
-    delay_bins = np.nan_to_num(delay_bins, nan=signal.shape[0] + 1.0)
-    flat = np.ascontiguousarray(signal.reshape(signal.shape[0], -1))
-    shifted: NDArray[np.float32] = shift_signals(flat, delay_bins.ravel()).reshape(signal.shape)
-    return shifted
+    leg = np.linalg.norm(wall - camera, axis=-1) - np.linalg.norm(laser - camera)
+    return _shift_earlier(signal, leg / (SPEED_OF_LIGHT * bin_width))
 
 
 def remove_device_legs(capture: Capture, source: Any, camera: Any) -> Capture:
-    """Take the ways device -> laser spot and wall point -> camera off a capture that still holds
+    """Take the legs device -> laser spot and wall point -> camera off a capture that still holds
     them.
 
     Every wall point's signal is moved earlier by ``(|r_L - source| + |r_p - camera|) / c``, by
     linear interpolation; the part that is common to all goes into the start.
 
-    `capture`: its bins stand for the whole way source -> laser spot -> hidden point -> wall point
-    -> camera; `source, camera` (3,): position of the laser device and of the camera, m.
+    `source, camera` (3,): position of the laser device and of the camera, m.
     """
-    source, camera = np.asarray(source, dtype=np.float64), np.asarray(camera, dtype=np.float64)
-    for name, place in (("source", source), ("camera", camera)):
-        if place.shape != (3,) or not np.all(np.isfinite(place)):
-            raise InputError(f"the {name} position must be three finite numbers, got {place}")
+    source, camera = (_require_position(*one) for one in (("source", source), ("camera", camera)))
     require_numpy("unwarping", capture.signal)
-    legs = np.linalg.norm(capture.laser - source, axis=-1) + np.linalg.norm(
-        capture.wall - camera, axis=-1
-    )
+    outward = np.linalg.norm(capture.laser - source, axis=-1)
+    legs = outward + np.linalg.norm(capture.wall - camera, axis=-1)
     # shifts from the shortest leg on cut off as little of the record as possible
     common = float(legs[capture.valid].min())
-    delay_bins = np.nan_to_num((legs - common) / capture.axis.spacing, nan=capture.axis.bins + 1.0)
-    flat = np.ascontiguousarray(capture.signal.reshape(capture.axis.bins, -1))
-    signal = shift_signals(np.nan_to_num(flat), delay_bins.ravel()).reshape(capture.signal.shape)
-    start = capture.start - common
-    return Capture(
-        signal, capture.wall, capture.laser, capture.bin_width, start, capture.provenance
-    )
+    signal = _shift_earlier(np.nan_to_num(capture.signal), (legs - common) / capture.axis.spacing)
+    return replace(capture, signal=signal, start=capture.start - common)
+
+
+def _require_position(name: str, position: Any) -> FloatArray:
+    place = np.asarray(position, dtype=np.float64)
+    if place.shape != (3,) or not np.all(np.isfinite(place)):
+        raise InputError(f"the {name} position must be three finite numbers, got {place}")
+    return place
+
+
+def _shift_earlier(signal: NDArray[np.float32], bins: FloatArray) -> NDArray[np.float32]:
+    # A shift by the whole record reads nothing but zeros.
+    delay = np.nan_to_num(bins, nan=signal.shape[0] + 1.0).ravel()
+    flat = np.ascontiguousarray(signal.reshape(signal.shape[0], -1))
+    shifted: NDArray[np.float32] = shift_signals(flat, delay).reshape(signal.shape)
+    return shifted
 
 
 def _require_even_bin_width(frames: Frames) -> float:
@@ -497,16 +477,10 @@ def _cut_wall_window(
     values: NDArray[np.float32], record: Record, wall_shape: tuple[int, ...]
 ) -> NDArray[np.float32]:
     row, column = int(record.number("row_offset")), int(record.number("column_offset"))
-    rows, columns = wall_shape[:2]
-    fits = (
-        row >= 0
-        and column >= 0
-        and row + rows <= values.shape[1]
-        and column + columns <= values.shape[2]
-    )
-    if not fits:
+    (rows, columns), (high, wide) = wall_shape[:2], values.shape[1:]
+    if min(row, column) < 0 or row + rows > high or column + columns > wide:
         raise InputError(
             f"a wall of {rows} x {columns} points from pixel ({row}, {column}) on does not fit into frames of "
-            f"{values.shape[1]} x {values.shape[2]} pixels"
+            f"{high} x {wide} pixels"
         )
     return values[:, row : row + rows, column : column + columns]

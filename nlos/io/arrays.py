@@ -67,7 +67,9 @@ def read_matlab(path: str | Path) -> NamedArrays:
 
     Axes are in MATLAB's order, whatever the version.
     """
-    if _is_hdf5(path):
+    with translate_read_errors(path), open(path, "rb") as file:
+        start = file.read(MATLAB_HEADER_BYTES + len(HDF5_SIGNATURE))
+    if start[MATLAB_HEADER_BYTES:] == HDF5_SIGNATURE:
         return NamedArrays(path, lambda opened: _list_hdf5_entries(opened, True))
     return NamedArrays(path, _list_mat_entries)
 
@@ -114,15 +116,3 @@ def _list_mat_entries(path: Path) -> Entries:
         )
         for name, entry in list_mat_entries(path).items()
     }
-
-
-def _is_hdf5(path: str | Path) -> bool:
-    return (
-        _read_start(path, MATLAB_HEADER_BYTES + len(HDF5_SIGNATURE))[MATLAB_HEADER_BYTES:]
-        == HDF5_SIGNATURE
-    )
-
-
-def _read_start(path: str | Path, count: int) -> bytes:
-    with translate_read_errors(path), open(path, "rb") as file:
-        return file.read(count)

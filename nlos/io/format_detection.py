@@ -7,20 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from nlos.capture import Capture
+from nlos.io import labs
 from nlos.io.arrays import NamedArrays, read_hdf5, read_matlab
-from nlos.io.labs import (
-    read_curvelet_data,
-    read_general_data,
-    read_lift_archive,
-    read_light_cone_data,
-    read_migration_data,
-    read_numpy_archive,
-    read_phasor_field_data,
-    read_rectified_data,
-    read_surface_optimisation_data,
-    read_tal,
-    read_zaragoza,
-)
 from nlos.io.pictures import read_streak_folder
 from tofclip.errors import FileFormatError
 from tofclip.files import translate_read_errors
@@ -56,23 +44,21 @@ Reader = Callable[[NamedArrays], Capture]
 
 # A file is known by the names of its fields; the first format whose fields are all there is taken.
 ARCHIVE_FORMATS: Mapping[tuple[str, ...], Reader] = {
-    ("H", "wall_xyz", "laser_xyz", "delta_t_s"): read_numpy_archive,
-    ("H", "wall_xyz", "laser_xyz", "t_s"): read_numpy_archive,
-    ("H", "wall_xyz", "laser_xyz", "t_m"): read_numpy_archive,
-    ("H", "wall_xyz", "laser_xyz", "delta_t_m"): read_numpy_archive,
+    ("H", "wall_xyz", "laser_xyz", time): labs.read_numpy_archive
+    for time in ("delta_t_s", "t_s", "t_m", "delta_t_m")
 }
 HDF5_FORMATS: Mapping[tuple[str, ...], Reader] = {
-    ("H", "H_format", "sensor_grid_xyz", "laser_grid_xyz"): read_tal,
-    ("data", "cameraGridPositions", "laserGridPositions", "deltaT"): read_zaragoza,
+    ("H", "H_format", "sensor_grid_xyz", "laser_grid_xyz"): labs.read_tal,
+    ("data", "cameraGridPositions", "laserGridPositions", "deltaT"): labs.read_zaragoza,
 }
 MATLAB_FORMATS: Mapping[tuple[str, ...], Reader] = {
-    ("rect_data", "ts", "sampling_spacing"): read_rectified_data,
-    ("rect_data", "width"): read_light_cone_data,
-    ("dataset.data", "dataset.laserPos", "dataset.cameraPos"): read_phasor_field_data,
-    ("transient", "lighting"): read_surface_optimisation_data,
-    ("sub_Sig",): read_curvelet_data,
-    ("meas",): read_migration_data,
-    ("data",): read_general_data,
+    ("rect_data", "ts", "sampling_spacing"): labs.read_rectified_data,
+    ("rect_data", "width"): labs.read_light_cone_data,
+    ("dataset.data", "dataset.laserPos", "dataset.cameraPos"): labs.read_phasor_field_data,
+    ("transient", "lighting"): labs.read_surface_optimisation_data,
+    ("sub_Sig",): labs.read_curvelet_data,
+    ("meas",): labs.read_migration_data,
+    ("data",): labs.read_general_data,
 }
 
 
@@ -125,11 +111,9 @@ def _read_file(path: str | Path) -> Capture:
         raise FileFormatError(path, "is empty")
     if start.startswith(ZIP_SIGNATURE):
         archive = NamedArrays(path)
-        return (
-            read_lift_archive(path)
-            if "streak_raw" in archive
-            else _read_fields(archive, ARCHIVE_FORMATS)
-        )
+        if "streak_raw" in archive:
+            return labs.read_lift_archive(path)
+        return _read_fields(archive, ARCHIVE_FORMATS)
     if start.startswith(MATLAB_SIGNATURE):
         return _read_fields(read_matlab(path), MATLAB_FORMATS)
     if start == HDF5_SIGNATURE:

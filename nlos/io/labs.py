@@ -1,4 +1,5 @@
-"""Turning a capture so that the hidden scene lies at larger z.
+"""Captures of eleven formats, each by its own reader, and turned so that the hidden scene lies at
+larger z.
 
 Pairs of CC-SOCR, whose points are numbers of a lattice that a MATLAB script beside them scales.
 
@@ -58,6 +59,7 @@ import ast
 import operator
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,23 +85,17 @@ def rotate_to_scene(capture: Capture, towards_scene: NDArray[np.float64]) -> Cap
 
     `towards_scene` (3,): from the wall into the hidden scene; of any length but 0.
     """
-    turn = _build_rotation(towards_scene)
-    laser, wall = capture.laser @ turn.T, capture.wall @ turn.T
-    return Capture(
-        capture.signal, wall, laser, capture.bin_width, capture.start, capture.provenance
-    )
-
-
-def _build_rotation(towards_scene: NDArray[np.float64]) -> NDArray[np.float64]:
     length = float(np.linalg.norm(towards_scene))
     if not (np.isfinite(length) and length > 0):
         raise InputError(f"the direction towards the scene must not be 0, got {towards_scene}")
     forward = np.asarray(towards_scene, dtype=np.float64) / length
     if abs(forward[2]) > MIN_Z_COSINE:
-        return np.diag([np.sign(forward[2]), 1.0, np.sign(forward[2])])
-    down = forward * forward[2] - [0.0, 0.0, 1.0]
-    down /= np.linalg.norm(down)
-    return np.stack([np.cross(down, forward), down, forward])
+        turn = np.diag([np.sign(forward[2]), 1.0, np.sign(forward[2])])
+    else:
+        down = forward * forward[2] - [0.0, 0.0, 1.0]
+        down /= np.linalg.norm(down)
+        turn = np.stack([np.cross(down, forward), down, forward])
+    return replace(capture, wall=capture.wall @ turn.T, laser=capture.laser @ turn.T)
 
 
 SETUP_FILE = "experimental_setup.m"
@@ -132,7 +128,8 @@ def read_curvelet_data(fields: NamedArrays) -> Capture:
     """
     counts = fields.array("sub_Sig", None, None)
     laser, wall = (_read_points(fields, name, len(counts)) for name in ("C_i.mat", "C_d.mat"))
-    script = _find_script(fields.path)
+    folders = (fields.path.parent, fields.path.resolve().parent.parent)
+    script = next((f / SETUP_FILE for f in folders if (f / SETUP_FILE).is_file()), None)
     if script is not None:
         found = parse_setup(script)
         steps = np.array([found[name] for name in STEP_NAMES])
@@ -141,7 +138,8 @@ def read_curvelet_data(fields: NamedArrays) -> Capture:
         if speed < MIN_SPEED_IN_SECONDS:
             bin_width *= speed / SPEED_OF_LIGHT
         return Capture(counts.T, wall, laser, bin_width)
-    if _are_lattice_numbers(wall):
+    whole = bool(np.all(wall == np.round(wall)))
+    if whole and float(np.ptp(wall, axis=0).max()) >= MIN_LATTICE_EXTENT:
         raise FileFormatError(
             fields.path,
             f"has pairs counted in steps of a lattice; it needs {SETUP_FILE} beside it or in the "
@@ -153,9 +151,8 @@ def read_curvelet_data(fields: NamedArrays) -> Capture:
 
 
 def parse_setup(path: str | Path) -> Mapping[str, float]:
-    """Read the first value of each of `SETUP_NAMES` in a MATLAB script.
-
-    `path`: assignments of sums and products of numbers, and of names set before.
+    """Read the first value of each of `SETUP_NAMES` in a MATLAB script: a sum or product of numbers
+    and of names set before.
     """
     with translate_read_errors(path), open(path, "rb") as file:
         text = file.read(MAX_SCRIPT_BYTES).decode(errors="replace")
@@ -184,16 +181,6 @@ def _evaluate(text: str, known: Mapping[str, float]) -> float:
         return value_of(ast.parse(text, mode="eval").body)
     except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError):
         return np.nan
-
-
-def _find_script(path: Path) -> Path | None:
-    folders = (path.parent, path.resolve().parent.parent)
-    return next((f / SETUP_FILE for f in folders if (f / SETUP_FILE).is_file()), None)
-
-
-def _are_lattice_numbers(points: NDArray[np.float64]) -> bool:
-    whole = bool(np.all(points == np.round(points)))
-    return whole and float(np.ptp(points, axis=0).max()) >= MIN_LATTICE_EXTENT
 
 
 def _read_points(fields: NamedArrays, name: str, pairs: int) -> NDArray[np.float64]:
@@ -290,11 +277,7 @@ def match_lasers_to_sensors(
     bin_width: float,
     start: float,
 ) -> Capture:
-    """Find out by the shapes which laser points belong to which sensor points.
-
-    `fields`: for the error message; `signal` (t, sensors...); `sensor, laser` (..., 3): m;
-    `bin_width, start`: s and m.
-    """
+    """Find out by the shapes which laser points belong to which sensor points, both (..., 3)."""
     sensors, lasers = sensor.shape[:-1], laser.shape[:-1]
     if not signal.ndim:
         raise FileFormatError(fields.path, "holds a signal without a time axis")
@@ -346,11 +329,8 @@ def read_numpy_archive(fields: NamedArrays) -> Capture:
         signal, start, spacing = resample_evenly(fields, signal, paths)
         return match_lasers_to_sensors(fields, signal, wall, laser, spacing / SPEED_OF_LIGHT, start)
     start = fields.number("t_start_m") if "t_start_m" in fields else 0.0
-    bin_width = (
-        fields.number("delta_t_s")
-        if "delta_t_s" in fields
-        else fields.number("delta_t_m") / SPEED_OF_LIGHT
-    )
+    unit, per_second = ("s", 1.0) if "delta_t_s" in fields else ("m", SPEED_OF_LIGHT)
+    bin_width = fields.number(f"delta_t_{unit}") / per_second
     return match_lasers_to_sensors(fields, signal, wall, laser, bin_width, start)
 
 
@@ -359,11 +339,9 @@ def resample_evenly(
 ) -> tuple[NDArray[Any], float, float]:
     """Put counts of time bins that need not be even into even ones; no photon is lost or doubled.
 
-    The light of a bin is taken to be spread evenly over it; an even bin is as wide as the median.
-
-    `fields`: for the error message; `signal` (t, ...); `paths` (t,): path at the middle of every
-    bin, m. Returns `signal` (t, ...): the same one where bins are even; `start, spacing`: path of
-    the first bin and from one to the next, m.
+    The light of a bin, whose middle stands for one of `paths` (t,), m, is taken to be spread evenly
+    over it; an even bin is as wide as the median. Returns with the signal (t, ...) the path of the
+    first bin and from one to the next, m.
     """
     widths = np.diff(paths)
     if len(paths) < 2 or not widths.min() > 0:
@@ -445,10 +423,14 @@ def read_phasor_field_data(fields: NamedArrays) -> Capture:
     """Read a scene of the data set of 2019; coordinates are turned so that the wall's normal
     becomes +z.
     """
-    wall, spots = (
-        _read_points_wisconsin(fields, f"dataset.{name}Pos") for name in ("laser", "camera")
-    )
-    signal = np.ascontiguousarray(_read_signal(fields))
+    wall, spots = (_read_spots(fields, f"dataset.{name}Pos") for name in ("laser", "camera"))
+    data = fields.read_numbers("dataset.data").T
+    if "dataset.t" in fields and data.shape[0] != fields.number("dataset.t"):
+        raise FileFormatError(
+            fields.path,
+            f"'dataset.data' must end with {fields.number('dataset.t'):g} bins, found {data.T.shape}",
+        )
+    signal = np.ascontiguousarray(data, np.float32)
     bin_width = fields.number("dataset.deltat") / SPEED_OF_LIGHT
     start = fields.number("dataset.t0") if "dataset.t0" in fields else 0.0
     capture = match_lasers_to_sensors(fields, signal, wall, spots, bin_width, start)
@@ -457,9 +439,7 @@ def read_phasor_field_data(fields: NamedArrays) -> Capture:
     capture = remove_device_legs(capture, source, eye)
     if "dataset.laserNorm" not in fields:
         return capture
-    return rotate_to_scene(
-        capture, _read_points_wisconsin(fields, "dataset.laserNorm").mean(axis=0)
-    )
+    return rotate_to_scene(capture, _read_spots(fields, "dataset.laserNorm").mean(axis=0))
 
 
 def read_rectified_data(fields: NamedArrays) -> Capture:
@@ -478,17 +458,7 @@ def read_rectified_data(fields: NamedArrays) -> Capture:
     return Capture(np.moveaxis(counts, 2, 0), wall, wall[row, column], fields.number("ts"))
 
 
-def _read_signal(fields: NamedArrays) -> NDArray[np.float32]:
-    data = fields.read_numbers("dataset.data").T
-    if "dataset.t" in fields and data.shape[0] != fields.number("dataset.t"):
-        raise FileFormatError(
-            fields.path,
-            f"'dataset.data' must end with {fields.number('dataset.t'):g} bins, found {data.T.shape}",
-        )
-    return data.astype(np.float32)
-
-
-def _read_points_wisconsin(fields: NamedArrays, name: str) -> NDArray[np.float64]:
+def _read_spots(fields: NamedArrays, name: str) -> NDArray[np.float64]:
     """Points (n, 3), whichever way round they are stored."""
     points = np.atleast_2d(fields.read_numbers(name)).astype(np.float64)
     points = points.T if points.shape[0] == 3 and points.shape[1] != 3 else points
@@ -513,7 +483,7 @@ def read_zaragoza(fields: NamedArrays) -> Capture:
     lies; coordinates are turned so that it lies at larger z.
     """
     first = fields.read_numbers("cameraGridPositions").shape[0] == 3
-    signal = _read_signal_zaragoza(fields, first)
+    signal = _add_up_bounces(fields, first)
     camera, laser = (
         _read_point_grid(fields, f"{name}GridPositions", first) for name in ("camera", "laser")
     )
@@ -531,7 +501,7 @@ def read_zaragoza(fields: NamedArrays) -> Capture:
     )
 
 
-def _read_signal_zaragoza(fields: NamedArrays, first: bool) -> NDArray[np.float32]:
+def _add_up_bounces(fields: NamedArrays, first: bool) -> NDArray[np.float32]:
     """Signal (t, lasers..., points...) summed over colours and bounces; a lone laser's axes are
     left out.
     """
