@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from three_view_shot import CAMERA
 
-from tofclip.camera.rectifier import MeasurementNoise
+from tofclip.camera.noise import MeasurementNoise
 from tofclip.lidar import depth
 from tofclip.recovery import open_shot, recover
 from tofclip.recovery.defects import estimate_noise, find_clipping_level, find_defects
