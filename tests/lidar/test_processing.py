@@ -1,8 +1,7 @@
-"""Clouds of known surfaces: cleaned, thinned, measured, laid over each other; and the lens undone."""
+"""Clouds of known surfaces: cleaned, thinned, measured, laid over each other, and cut into objects."""
 
 from __future__ import annotations
 
-import struct
 import sys
 
 import numpy as np
@@ -10,20 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tofclip.camera import Camera
 from tofclip.errors import (
-    CalibrationError,
-    FileFormatError,
     InputError,
     MissingDependencyError,
     ShapeError,
 )
-from tofclip.lidar import PointCloud, Returns, compute_ray_directions, point_cloud, save_depth
-from tofclip.lidar.geometry import distort_directions
+from tofclip.lidar import PointCloud
 from tofclip.lidar.processing import (
     align_clouds,
     downsample_cloud,
     estimate_normals,
+    find_objects,
     fit_plane,
     remove_outliers,
     select_points,
@@ -145,6 +141,10 @@ def test_unusable_requests_are_refused(monkeypatch):
         lambda: fit_plane(few, 0.1),
         lambda: align_clouds(few, cloud, 0.1),
         lambda: transform_cloud(cloud, 2 * np.eye(4)),
+        lambda: transform_cloud(cloud, np.diag([-1.0, 1.0, 1.0, 1.0])),  # a mirror
+        lambda: find_objects(cloud, 0.0, 1),
+        lambda: find_objects(cloud, np.nan, 1),
+        lambda: find_objects(cloud, 0.1, 0),
     ):
         with pytest.raises(InputError):
             call()
@@ -153,168 +153,6 @@ def test_unusable_requests_are_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(MissingDependencyError, match="Open3D"):
         estimate_normals(cloud)
-    monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(MissingDependencyError, match=r"tofclip\[las\]"):
-        cloud.save("scene.las")
-
-
-@settings(max_examples=30, deadline=None)
-@given(
-    k=st.tuples(*[st.floats(-0.2, 0.2)] * 2, *[st.floats(-0.01, 0.01)] * 2, st.floats(-0.05, 0.05)),
-    row=st.floats(0, 127),
-    column=st.floats(0, 95),
-)
-def test_the_lens_is_undone(k, row, column):
-    camera = Camera(
-        np.array([60.0]),
-        np.array([0.0]),
-        (128, 96),
-        200,
-        focal_length_px=200.0,
-        distortion=np.array(k),
-    )
-    x, y, z = compute_ray_directions(camera, [row], [column])[0]
-    right, down = distort_directions(np.array([x / z]), np.array([y / z]), np.array(k))
-    assert right[0] * 200 + 48 == pytest.approx(column, abs=1e-6)
-    assert down[0] * 200 + 64 == pytest.approx(row, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("coefficients", "expected"),
-    [
-        # OpenCV's order k1, k2, p1, p2, k3; by hand, at x = 0.3, y = -0.2, r^2 = 0.13
-        ((1.0, 0, 0, 0, 0), (0.3 * 1.13, -0.2 * 1.13)),
-        ((0, 1.0, 0, 0, 0), (0.3 * (1 + 0.13**2), -0.2 * (1 + 0.13**2))),
-        ((0, 0, 1.0, 0, 0), (0.3 - 0.12, -0.2 + 0.13 + 0.08)),
-        ((0, 0, 0, 1.0, 0), (0.3 + 0.13 + 0.18, -0.2 - 0.12)),
-        ((0, 0, 0, 0, 1.0), (0.3 * (1 + 0.13**3), -0.2 * (1 + 0.13**3))),
-    ],
-)
-def test_each_coefficient_of_the_lens_bends_as_published(coefficients, expected):
-    found = distort_directions(np.array([0.3]), np.array([-0.2]), np.array(coefficients))
-    assert np.ravel(found) == pytest.approx(expected, abs=1e-12)
-
-
-def test_impossible_lenses_are_refused(tmp_path):
-    camera = Camera(
-        np.array([60.0]), np.array([0.0]), (128, 96), 200, distortion=np.array([-9.0, 0, 0, 0, 0])
-    )
-    with pytest.raises(CalibrationError, match="too strong"):
-        compute_ray_directions(camera, [0], [0])
-    camera.save(tmp_path / "camera.h5")
-    assert Camera.load(tmp_path / "camera.h5").distortion.tolist() == [-9, 0, 0, 0, 0]
-    for wrong in (np.zeros(4), np.full(5, np.nan)):
-        with pytest.raises(CalibrationError, match="5 finite numbers"):
-            camera.replace(distortion=wrong)
-
-
-def las_points(path) -> tuple[np.ndarray, list[str], np.ndarray]:
-    """Positions, extra columns' names and raw extra bytes, read by the LAS 1.4 specification alone."""
-    content = path.read_bytes()
-    assert content[:4] == b"LASF"
-    start, records = struct.unpack_from("<II", content, 96)
-    layout, size = struct.unpack_from("<BH", content, 104)
-    scale, offset = np.array(struct.unpack_from("<6d", content, 131)).reshape(2, 3)
-    (number,) = struct.unpack_from("<Q", content, 247)
-    assert layout == 6
-    at, names = struct.unpack_from("<H", content, 94)[0], []
-    for _ in range(records):
-        user, kind, length = struct.unpack_from("<16sHH", content, at + 2)
-        if user.rstrip(b"\0") == b"LASF_Spec" and kind == 4:
-            described = content[at + 54 : at + 54 + length]
-            names = [
-                described[i + 4 : i + 36].rstrip(b"\0").decode() for i in range(0, length, 192)
-            ]
-        at += 54 + length
-    rows = np.frombuffer(content, np.uint8, number * size, start).reshape(number, size)
-    return np.ascontiguousarray(rows[:, :12]).view("<i4") * scale + offset, names, rows[:, 30:]
-
-
-def test_las_holds_micrometres_and_all_columns(tmp_path):
-    cloud = cloud_of(plane_points(50, 4))
-    cloud.save(tmp_path / "scene.las")
-    xyz, names, extra = las_points(tmp_path / "scene.las")
-    np.testing.assert_allclose(xyz, cloud.xyz, atol=0.51e-6)
-    assert names == [
-        f"tofclip_{name}" for name in ("intensity", "range_sigma", "range", "return_number", "time")
-    ]
-    raw = np.ascontiguousarray(extra)
-    np.testing.assert_array_equal(
-        np.ascontiguousarray(raw[:, 0:4]).view("<f4")[:, 0], cloud.intensity
-    )
-    np.testing.assert_array_equal(np.ascontiguousarray(raw[:, 8:12]).view("<f4")[:, 0], cloud.range)
-    np.testing.assert_array_equal(raw[:, 12], cloud.return_number)
-
-
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_las_and_laz_are_read_by_laspy_and_by_us(tmp_path, suffix):
-    laspy = pytest.importorskip("laspy")
-    path = tmp_path / f"scene{suffix}"
-    cloud = cloud_of(plane_points(500, 4))
-    cloud.save(path)
-    seen, back = laspy.read(path), PointCloud.load(path)
-    np.testing.assert_allclose(np.stack([seen.x, seen.y, seen.z], axis=-1), cloud.xyz, atol=0.51e-6)
-    units = {
-        d.name: bytes(d.description.encode()).rstrip(b"\0")
-        for d in seen.point_format.extra_dimensions
-    }
-    assert (units["tofclip_range"], units["tofclip_time"]) == (b"m", b"s")
-    assert seen.header.are_points_compressed == (suffix == ".laz")
-    assert seen.intensity.max() == 65535
-    np.testing.assert_allclose(back.xyz, cloud.xyz, atol=0.7e-6)
-    for name in ("intensity", "range_sigma", "range", "return_number", "time"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(cloud, name))
-    content = path.read_bytes()
-    for length in (0, 300, len(content) // 2, len(content) - 60):
-        path.write_bytes(content[:length])
-        with pytest.raises(FileFormatError, match="LAS"):
-            PointCloud.load(path)
-    far = cloud_of(np.array([[0.0, 0.0, 3000.0]]))
-    with pytest.raises(InputError, match="2147 m"):
-        far.save(path)
-
-
-def exr_channels(path) -> dict[str, np.ndarray]:
-    """An uncompressed scan-line OpenEXR file of 32-bit channels, read by the format's specification
-    alone.
-    """
-    content = path.read_bytes()
-    assert struct.unpack_from("<I", content)[0] == 20000630
-    at, header = 8, {}
-    while content[at]:
-        name, kind, rest = content[at:].split(b"\0", 2)
-        length = struct.unpack_from("<i", rest)[0]
-        at += len(name) + len(kind) + 6
-        header[name.decode()] = content[at : at + length]
-        at += length
-    names = [
-        entry.split(b"\0")[0].decode()
-        for entry in (header["channels"][i : i + 18] for i in (0, 18))
-    ]
-    left, top, right, bottom = struct.unpack("<4i", header["dataWindow"])
-    rows, columns = bottom - top + 1, right - left + 1
-    lines = struct.unpack_from(f"<{rows}Q", content, at + 1)
-    values = np.stack([np.frombuffer(content, "<f4", 2 * columns, line + 8) for line in lines])
-    return {name: values[:, i * columns : (i + 1) * columns] for i, name in enumerate(names)}
-
-
-def test_depth_pictures_hold_metres_along_the_axis(tmp_path):
-    camera = Camera(np.array([20.0]), np.array([0.1]), (6, 9), 41, focal_length_px=10.0)
-    y, x = np.array([0, 2, 2, 5]), np.array([8, 4, 4, 1])
-    distance = np.array([2.0, 1.5, 3.0, 2.5])
-    bright = np.array([5.0, 1.0, 7.0, 2.0], np.float32)
-    number = np.array([1, 1, 2, 1], np.uint8)
-    returns = Returns(y, x, distance, bright, bright, number, distance / 1.5e8, camera)
-    save_depth(returns, tmp_path / "depth.exr")
-    seen = exr_channels(tmp_path / "depth.exr")
-    assert sorted(seen) == ["Y", "Z"]
-    xyz = point_cloud(returns).xyz
-    assert seen["Z"][0, 8] == pytest.approx(xyz[0, 2])
-    assert seen["Z"][2, 4] == pytest.approx(
-        3.0 * 10 / np.hypot(10, 1)
-    )  # one row above the axis; the brighter return
-    assert (seen["Y"][2, 4], seen["Y"][5, 1], seen["Y"][3, 3]) == (7, 2, 0)
-    assert np.isinf(seen["Z"]).sum() == 6 * 9 - 3
 
 
 def test_the_mean_of_points_is_known_better_than_each():
@@ -323,6 +161,38 @@ def test_the_mean_of_points_is_known_better_than_each():
     assert sigma == pytest.approx(0.5e-3)
 
 
-def test_a_mirror_is_not_a_pose():
-    with pytest.raises(InputError):
-        transform_cloud(cloud_of(np.eye(3)), np.diag([-1.0, 1.0, 1.0, 1.0]))
+def test_objects_are_listed_from_the_nearest_with_their_size():
+    y, x = np.mgrid[-10:11, -15:16].reshape(2, -1) * 0.01
+    far = np.stack([x + 0.4, y, np.full(x.size, 3.0)], axis=-1)
+    near = np.stack([2 * x, y / 2, np.full(x.size, 1.5)], axis=-1)
+    stray = np.array([[0.0, 0.5, 2.0], [0.1, -0.5, 2.0]])
+    found = find_objects(cloud_of(np.concatenate([far, stray, near])), reach=0.03)
+    assert [one.points.size for one in found] == [651, 651]
+    first, second = found
+    assert first.centre == pytest.approx((0.0, 0.0, 1.5))
+    assert second.centre == pytest.approx((0.4, 0.0, 3.0), abs=1e-6)
+    # the inner nine tenths of 31 columns and 21 rows
+    assert (first.width, first.height) == (
+        pytest.approx(0.54, abs=0.03),
+        pytest.approx(0.09, abs=0.006),
+    )
+    assert (second.width, second.height) == (
+        pytest.approx(0.27, abs=0.02),
+        pytest.approx(0.18, abs=0.011),
+    )
+    assert first.range == pytest.approx(1.51, abs=0.01)
+    assert first.range_sigma == pytest.approx(1e-3)
+    assert first.intensity > second.intensity  # they are numbered
+    assert find_objects(cloud_of(np.empty((0, 3))), 0.1) == []
+    assert find_objects(cloud_of(np.eye(3)), 0.1) == []
+    assert first.scatter < 0.02
+
+
+def test_scatter_is_a_standard_deviation_that_strays_do_not_raise():
+    random = np.random.default_rng(0)
+    direction = random.normal([0, 0, 1], 0.02, (3000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    distance = 2 + random.normal(0, 0.01, 3000)
+    distance[:60] += 0.08
+    (found,) = find_objects(cloud_of(direction * distance[:, np.newaxis]), reach=0.2)
+    assert found.scatter == pytest.approx(0.01, rel=0.1)

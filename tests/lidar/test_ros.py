@@ -1,0 +1,109 @@
+"""Clouds with stamps, read by programs of others."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+
+import numpy as np
+import pytest
+
+from tofclip.errors import InputError, MissingDependencyError, StorageError
+from tofclip.lidar import PointCloud
+from tofclip.lidar.ros import StampedCloud, write_bag
+
+pytest.importorskip("rosbags")
+
+
+def make_cloud(xyz: np.ndarray, seed: int = 0, **others) -> PointCloud:
+    random = np.random.default_rng(seed)
+    columns = random.uniform(0.1, 5, (4, len(xyz))).astype(np.float32)
+    number = random.integers(1, 4, len(xyz)).astype(np.uint8)
+    return PointCloud(xyz, *columns[:3], number, 1e-9 * columns[3], **others)
+
+
+@pytest.fixture(scope="module")
+def cloud() -> PointCloud:
+    return make_cloud(np.random.default_rng(1).normal(size=(40, 3)))
+
+
+def test_mcap_reads_the_stamps_and_the_points(cloud, tmp_path) -> None:
+    reading = pytest.importorskip("mcap_ros2.reader")
+    doubt = {name: np.linspace(0, 0.5, 7) for name in ("false_alarm", "reflectance")}
+    other = make_cloud(cloud.xyz[:7], 3, **doubt)
+    stamps = (1_700_000_000_000_000_123, 1_700_000_000_100_000_000)
+    clouds = [StampedCloud(cloud, stamps[0]), StampedCloud(other, stamps[1])]
+    assert write_bag(clouds, tmp_path / "sequence.mcap") == 2
+    assert [entry.name for entry in tmp_path.iterdir()] == ["sequence.mcap"]
+    seen = list(reading.read_ros2_messages(tmp_path / "sequence.mcap"))
+    assert [one.log_time_ns for one in seen] == list(stamps)
+    for one, stamped in zip(seen, clouds, strict=True):
+        message = one.ros_msg
+        assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamped.stamp_ns
+        assert (message.height, message.width) == (1, len(stamped.cloud))
+        # The layout as the message itself describes it; 7 and 2 are ROS's float32 and uint8.
+        layout = np.dtype(
+            {
+                "names": [field.name for field in message.fields],
+                "formats": [{7: "<f4", 2: "u1"}[field.datatype] for field in message.fields],
+                "offsets": [field.offset for field in message.fields],
+                "itemsize": message.point_step,
+            }
+        )
+        rows = np.frombuffer(bytes(message.data), layout)
+        np.testing.assert_array_equal(rows["y"], stamped.cloud.xyz[:, 1])
+        np.testing.assert_array_equal(rows["return_number"], stamped.cloud.return_number)
+        np.testing.assert_array_equal(rows["time_of_flight"], stamped.cloud.time)
+        # Programs would take it for the instant at which a scanner saw the point.
+        assert "time" not in layout.names
+    np.testing.assert_array_equal(rows["false_alarm"], other.false_alarm)
+    np.testing.assert_array_equal(rows["reflectance"], other.reflectance)
+
+
+def test_sqlite_and_the_standard_show_what_is_in_a_bag(cloud, tmp_path) -> None:
+    assert write_bag([StampedCloud(cloud, 5)], tmp_path / "bag") == 1
+    assert "sensor_msgs/msg/PointCloud2" in (tmp_path / "bag" / "metadata.yaml").read_text()
+    (database,) = (tmp_path / "bag").glob("*.db3")
+    with sqlite3.connect(database) as connection:
+        ((stamp, data),) = connection.execute("select timestamp, data from messages")
+    assert stamp == 5
+    # CDR, little endian: the header's seconds and nanoseconds follow the four bytes of the encoding.
+    assert data[:2] == b"\x00\x01"
+    assert np.frombuffer(data[4:12], "<u4").tolist() == [0, 5]
+    with pytest.raises(StorageError, match="new folder"):
+        write_bag([StampedCloud(cloud, 5)], tmp_path / "bag")
+
+
+def test_recordings_that_cannot_be_are_refused(cloud, tmp_path, monkeypatch) -> None:
+    with pytest.raises(InputError, match="no cloud"):
+        write_bag([], tmp_path / "none.mcap")
+    with pytest.raises(InputError, match="stamps"):
+        write_bag([StampedCloud(cloud, 5), StampedCloud(cloud, 4)], tmp_path / "back.mcap")
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(MissingDependencyError, match=r"tofclip\[exchange\]"):
+        write_bag([StampedCloud(cloud, 5)], tmp_path / "absent.mcap")
+
+
+def test_kiss_icp_follows_a_moving_camera(tmp_path, monkeypatch) -> None:
+    """Its own reader of ROS 2 bags and its own pipeline, as they are."""
+    loading = pytest.importorskip("kiss_icp.datasets.rosbag")
+    pipeline = pytest.importorskip("kiss_icp.pipeline")
+    random = np.random.default_rng(2)
+    # A corner of a room, seen from a camera that goes forward.
+    walls = [random.uniform(-6, 6, (3000, 3)) for _ in range(3)]
+    for axis, wall in enumerate(walls):
+        wall[:, axis] = (6, 2, 14)[axis]
+    room = np.concatenate(walls) + np.array([0, 0, 2.0])
+    step = np.array([0.05, 0.0, 0.2])
+    clouds = [
+        StampedCloud(
+            make_cloud(room - number * step + random.normal(0, 0.01, room.shape)), number * 10**8
+        )
+        for number in range(6)
+    ]
+    write_bag(clouds, tmp_path / "drive")
+    odometry = pipeline.OdometryPipeline(loading.RosbagDataset(tmp_path / "drive", ""))
+    monkeypatch.chdir(tmp_path)  # it writes its results beside where it runs
+    odometry.run()
+    np.testing.assert_allclose(odometry.poses[:, :3, 3], np.arange(6)[:, None] * step, atol=0.05)
