@@ -54,9 +54,8 @@ class AllInFocus:
     seconds: float
 
     def render_views(self, views: ArrayLike) -> LightField:
-        """Return what other views see of the picture, each pixel moved by its own shear.
-
-        `views` (views, 2): (v, u) in view steps.
+        """Return what views, (views, 2) of (v, u) in view steps, see of it: each pixel is moved by its
+        own shear.
         """
         wanted = np.asarray(views, np.float64)
         depths, labels = np.unique(self.shears, return_inverse=True)
@@ -69,10 +68,8 @@ class AllInFocus:
 def make_shear_range(
     nearest: float, farthest: float, views: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return shears to look for surfaces at, as close as the views can tell them apart.
-
-    `nearest, farthest`: pixels per view step; `views` (views, 2): (v, u) in view steps. Returns
-    (depths,).
+    """Return shears, (depths,), to look for surfaces at between two of them, pixels per view step, as
+    close as the views, (views, 2) of (v, u) in view steps, can tell them apart.
     """
     if not (np.isfinite([nearest, farthest]).all() and nearest < farthest):
         raise InputError(
@@ -91,16 +88,16 @@ def recover_all_in_focus(
 ) -> AllInFocus:
     """Recover an all-in-focus picture and its depths from one shot.
 
-    `shears` (depths,): that surfaces may have, pixels per view step, ascending; two or more;
-    `weight`: of the prior, relative to the largest value of A'f; chosen by cross-validation if not
-    given; `recovery`: prior and data term of all pictures, and the weight of the refocused ones;
-    `progress`: called with the number of recoveries just done, of `count_recoveries`.
+    `shears` (depths,): that surfaces may have, pixels per view step, two or more; `weight`: of the
+    prior, by cross-validation if not given; `recovery`: prior and data term of all pictures, and the
+    weight of the refocused ones; `progress`: called with the number of recoveries just done, of
+    `count_recoveries`.
     """
     began = perf_counter()
     depths = np.asarray(shears, np.float64)
     if depths.ndim != 1 or depths.size < 2 or not np.all(np.diff(depths) > 0):
         raise InputError("depths are looked for among two or more ascending shears")
-    refocusing = ClipRecovery() if recovery is None else recovery
+    refocusing = recovery or ClipRecovery()
     # the weight found in the middle serves all depths
     camera = measurement.camera()
     middle = refocusing.recover_picture(
@@ -133,11 +130,9 @@ def recover_on_depth_map(
     weight: float | None = None,
     recovery: ClipRecovery | None = None,
 ) -> AllInFocus:
-    """Recover an all-in-focus picture where the depths are known.
-
-    `shears` (rows, columns): of the reference view's pixels, pixels per view step; infinite where
-    there is nothing; `weight`: of the prior, relative to the largest value of A'f; chosen by
-    cross-validation if not given; `recovery`: prior and data term.
+    """Recover an all-in-focus picture where the depths are known: shears of the reference view's pixels,
+    (rows, columns), pixels per view step, infinite where there is nothing. The weight is found by
+    cross-validation if not given.
     """
     began = perf_counter()
     if shears.shape != measurement.image_shape:
@@ -151,8 +146,8 @@ def recover_on_depth_map(
     levels, labels = np.unique(np.rint(filled / step), return_inverse=True)
     # pixels on the border of two surfaces hold some of the nearer one's light, and move with it
     nearer = scipy.ndimage.minimum_filter(labels.reshape(shears.shape), 3)
-    settings = ClipRecovery() if recovery is None else recovery
-    return _solve(measurement, nearer, levels * step, replace(settings, weight=weight), began)
+    settings = replace(recovery or ClipRecovery(), weight=weight)
+    return _solve(measurement, nearer, levels * step, settings, began)
 
 
 def _solve(

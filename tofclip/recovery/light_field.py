@@ -49,30 +49,19 @@ DENOISERS: dict[str, Callable[[], Denoiser]] = {
     "bm3d": BlockMatching,
     "nlm": NonlocalMeans,
 }
-PRESETS = {"fast": 2, "quality": 10}
-"""Calls of the denoiser."""
-
+PRESETS = {"fast": 2, "quality": 10}  # calls of the denoiser
 DATA_TERMS = ("squares", "huber", "poisson")
-
 MAX_ITERATIONS = 400
-LIGHT_FIELD_WEIGHT = (
-    1e-3  # of the weights tried on rendered planes the best at sampling ratios from 0.5 to 2
-)
+LIGHT_FIELD_WEIGHT = 1e-3  # the best of those tried on rendered planes at sampling ratios 0.5 to 2
 OBJECTIVE_TOLERANCE = 1e-4  # of the objective in an iteration: then the recovery has converged
-
 THRESHOLD_PASSES = 3  # at the errors, after which Huber's threshold stays within a few percent
-# robust deviations: 95 % of the efficiency of squares, and safe from what is still unknown
-INITIAL_THRESHOLD_DEVIATIONS = 1.345
-FINAL_THRESHOLD_DEVIATIONS = (
-    3.0  # robust deviations, once they are known: most of what is out of focus counts in full
-)
+# Robust deviations: 95 % of the efficiency of squares, and safe from what is still unknown; and once
+# they are known: most of what is out of focus counts in full.
+INITIAL_THRESHOLD_DEVIATIONS, FINAL_THRESHOLD_DEVIATIONS = 1.345, 3.0
+# How much the weight is raised with Huber's term. Its prediction error is a sum of many small errors on
+# the dark ground, which any weight predicts, and of edges cut off; on letters with 0 to 10 % bad
+# measurements the best weight is 1.5 to 2 times the one with the lowest error.
 HUBER_WEIGHT_FACTOR = 2.0
-"""How much the weight is raised with Huber's term.
-
-Its prediction error is a sum of many small errors on the dark ground, which any weight predicts,
-and of edges cut off; on letters with 0 to 10 % bad measurements the best weight is 1.5 to 2 times
-the one with the lowest error.
-"""
 
 
 @dataclass(frozen=True)
@@ -133,10 +122,8 @@ class ClipRecovery:
     def recover(
         self, measurement: ClipMeasurement, shear: float, progress: Progress = ignore_progress
     ) -> ClipResult:
-        """Recover the picture refocused at `shear`, pixels per view step.
-
-        `shear`: pixels per view step; `progress`: called with the number of recoveries just done,
-        of `work`. Returns picture (rows, columns), weight of the prior, and seconds of each step.
+        """Recover the picture refocused at `shear`, pixels per view step; `progress` is called with the
+        number of recoveries just done, of `work`.
         """
         camera = measurement.camera()
         return self.recover_picture(measurement, camera, camera.model(shear), progress)
@@ -149,12 +136,8 @@ class ClipRecovery:
         progress: Progress = ignore_progress,
         search: WeightSearch = THOROUGH_SEARCH,
     ) -> ClipResult:
-        """Recover the picture that a model of one's own explains the measurements by.
-
-        `camera`: that made them; `model`: picture (rows, columns) to measurements (measurements,),
-        such as ``camera.model(shear)``; `progress`: as for `recover`; `search`: for a weight, if
-        none is given. Returns picture (rows, columns), weight of the prior, and seconds of each
-        step.
+        """Recover the picture, (rows, columns), that a model of one's own explains the camera's
+        measurements by, such as ``camera.model(shear)``.
         """
         begin = perf_counter()
         problem = self._make_problem(measurement, camera, model)
@@ -176,12 +159,10 @@ class ClipRecovery:
     def _make_problem(
         self, measurement: ClipMeasurement, camera: LightFieldCamera, model: LinearOperator
     ) -> _InverseProblem:
-        weighting = camera.weighting()
+        weighting, near = camera.weighting(), camera.correlation_length
         if self.data_term != "poisson":
-            measurements = weighting(measurement.values)[:, np.newaxis]
-            return _InverseProblem(
-                weighting @ model, measurements, camera.correlation_length, LeastSquares
-            )
+            seen = weighting(measurement.values)[:, np.newaxis]
+            return _InverseProblem(weighting @ model, seen, near, LeastSquares)
         if not isinstance(weighting, Identity):
             raise InputError(
                 f"measurements of a {camera.name} camera all have about the same photon noise; take squares"
@@ -190,11 +171,9 @@ class ClipRecovery:
         # dark measurements count no more than a quarter of the mean: they would hold up the convergence
         # of all others
         deviation = np.sqrt(np.maximum(counts, counts.mean() / 4) + 1)
-        model = Diagonal(measurement.photons_per_unit / deviation) @ model
-        measurements = (counts / deviation)[:, np.newaxis]
-        return _InverseProblem(
-            model, measurements, camera.correlation_length, partial(Poisson, deviation=deviation)
-        )
+        weighted = Diagonal(measurement.photons_per_unit / deviation) @ model
+        seen = (counts / deviation)[:, np.newaxis]
+        return _InverseProblem(weighted, seen, near, partial(Poisson, deviation=deviation))
 
     def _choose_method(
         self, problem: _InverseProblem, progress: Progress, search: WeightSearch
@@ -232,37 +211,27 @@ class ClipRecovery:
 def recover_light_field(
     measurement: ClipMeasurement, weight: float = LIGHT_FIELD_WEIGHT
 ) -> LightField:
-    """Recover every view instead of one picture (Eq. 20), by total variation over pixels and views.
+    """Recover every view instead of one picture (Eq. 20), by total variation over pixels and views of a
+    complete grid.
 
     Far more unknowns than measurements: expect less than of the refocused picture, whose views
     agree. Views without measurements are filled in from their neighbours. Memory: about ten times
     the light field.
-
-    `measurement`: of views on a complete grid; `weight`: relative to the largest value of A'f.
-    Returns its views in the measurement's order.
     """
-    camera = measurement.camera()
-    grid = _view_grid_shape(measurement.views)
-    shape = (len(measurement.views), *measurement.image_shape)
-    model = (
-        camera.weighting() @ camera.light_field_model() @ ViewSelection(shape, camera.used_views)
-    )
-    method = LightFieldVariation(weight, MAX_ITERATIONS, OBJECTIVE_TOLERANCE, grid=grid)
-    pictures = method.recover(model, camera.weighting()(measurement.values)[:, np.newaxis]).frames[
-        0
-    ]
-    return LightField(pictures, measurement.views)
-
-
-def _view_grid_shape(views: NDArray[np.float64]) -> tuple[int, int]:
-    """Return how many views there are down and across."""
+    camera, views = measurement.camera(), measurement.views
     down, across = (np.unique(views[:, axis]) for axis in (0, 1))
     complete = np.stack(np.meshgrid(down, across, indexing="ij"), axis=-1).reshape(-1, 2)
     if complete.shape != views.shape or not np.array_equal(complete, views):
         raise InputError(
             "a light field is recovered from a complete grid of views, row by row; some are missing"
         )
-    return down.size, across.size
+    weighting = camera.weighting()
+    used = ViewSelection((len(views), *measurement.image_shape), camera.used_views)
+    model = weighting @ camera.light_field_model() @ used
+    grid = (down.size, across.size)
+    method = LightFieldVariation(weight, MAX_ITERATIONS, OBJECTIVE_TOLERANCE, grid=grid)
+    found = method.recover(model, weighting(measurement.values)[:, np.newaxis])
+    return LightField(found.frames[0], views)
 
 
 @dataclass(frozen=True)
@@ -276,8 +245,9 @@ class _InverseProblem:
 
 
 def _make_robust(method: ProximalMethod, problem: _InverseProblem) -> ProximalMethod:
-    """Return the method with Huber's term, its threshold from the errors that a narrow one leaves."""
-    # least squares first; then Huber's term, whose threshold follows the errors it leaves
+    """Return the method with Huber's term, its threshold from the errors that a narrow one leaves,
+    after least squares.
+    """
     looking = method
     for _ in range(THRESHOLD_PASSES):
         seen = looking.recover(problem.model, problem.measurements).frames[0]
