@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import importlib
 import struct
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,11 +26,12 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from tofclip.errors import FileFormatError, InputError, MissingDependencyError
+from tofclip.errors import FileFormatError, InputError
 from tofclip.files import (
     BoundedFile,
     atomic_path,
     guard,
+    import_file_reader,
     require_bounded_size,
     require_suffix,
     translate_read_errors,
@@ -282,17 +282,8 @@ def _list_npz(path: Path) -> Entries:
     return {label: archive.describe(label) for label in sorted(archive.names)}
 
 
-def _import_writer(name: str, formats: str, extra: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as fault:
-        raise MissingDependencyError(
-            f"{formats} need {name}: pip install 'tofclip[{extra}]'"
-        ) from fault
-
-
 def _write_las(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
-    laspy = _import_writer("laspy", "LAS and LAZ", "las")
+    laspy = import_file_reader("laspy", "tofclip[las]")
     values = {column.name: column.values for column in columns}
     reach = COORDINATE_STEP_M * 2**31
     if any(np.abs(values[axis]).max(initial=0) >= reach for axis in "xyz"):
@@ -346,7 +337,7 @@ def _list_las(path: Path) -> Entries:
 
 @contextlib.contextmanager
 def _open_las(path: Path) -> Iterator[Any]:
-    laspy = _import_writer("laspy", "LAS and LAZ", "las")
+    laspy = import_file_reader("laspy", "tofclip[las]")
     with (
         guard(path, "is not a LAS or LAZ file, or a damaged one"),
         BoundedFile(path) as file,
@@ -365,7 +356,7 @@ def _open_las(path: Path) -> Iterator[Any]:
 
 
 def _write_e57(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
-    pye57 = _import_writer("pye57", "E57 files", "exchange")
+    pye57 = import_file_reader("pye57", "tofclip[exchange]")
     path.unlink(missing_ok=True)  # the library makes its files itself
     file = pye57.E57(str(path), mode="w")
     try:
@@ -451,7 +442,7 @@ def _open_e57(path: Path) -> Iterator[tuple[Any, Any, list[tuple[Any, Any]]]]:
     """Open the scan's points and the extension's columns: each table with the label in the file, name
     and type of its columns.
     """
-    pye57 = _import_writer("pye57", "E57 files", "exchange")
+    pye57 = import_file_reader("pye57", "tofclip[exchange]")
     names = {label: name for name, label in E57_NAMES.items()}
     with (
         guard(path, "is not an E57 file, or a damaged one"),

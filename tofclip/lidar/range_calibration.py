@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -367,9 +367,8 @@ class RangeFit:
         return known
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """The target's returns of all shots, side by side."""
+class _Sample(NamedTuple):
+    """The target's returns of one shot or of all, side by side."""
 
     y: NDArray[np.int64]
     x: NDArray[np.int64]
@@ -379,7 +378,6 @@ class _Sample:
     sigma: FloatArray
     signal: FloatArray
     cosine: FloatArray
-    fraction: float
 
 
 def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None) -> RangeFit:
@@ -400,15 +398,11 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
             f"the targets lie {np.ptp(distances):.3g} m apart, and the record shows {length:.3g} m: "
             "one of them is out of the record"
         )
-    samples = [_select_target(shot, base, pulse) for shot in shots]
-    sample = _Sample(
-        shot=np.repeat(np.arange(len(samples)), [one.y.size for one in samples]),
-        fraction=min(one.fraction for one in samples),
-        **{
-            name: np.concatenate([getattr(one, name) for one in samples])
-            for name in ("y", "x", "pixel", "excess", "sigma", "signal", "cosine")
-        },
+    samples, shares = zip(
+        *(_select_target(number, shot, base, pulse) for number, shot in enumerate(shots)),
+        strict=True,
     )
+    sample = _Sample(*map(np.concatenate, zip(*samples, strict=True)))
     _require_agreement(shots, sample, pulse)
     span = np.percentile(np.log10(sample.signal), SPAN_PERCENTILES)
     walk_note = _explain_missing_walk(len(shots), span, walk)
@@ -458,18 +452,19 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
         float(np.sqrt(effects.variances.pixels)) if repeated else np.nan,
         sample.signal[effects.inliers],
         left - effects.fixed[0],
-        sample.fraction,
+        min(shares),
         walk_note,
         "" if repeated else once,
         "" if repeated else once,
     )
 
 
-def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
+def _select_target(
+    number: int, shot: TargetShot, camera: Camera, pulse: float
+) -> tuple[_Sample, float]:
     """Keep the strongest return of each pixel where it is the target's, with its excess over the
-    target's range, from the start of the time axis rather than any time zero.
-
-    `pulse`: its width, m.
+    target's range, from the start of the time axis rather than any time zero; and return the share of
+    pixels with a return in which it is. `pulse`: its width, m.
     """
     if shot.returns.camera.image_shape != camera.image_shape:
         raise CalibrationError(
@@ -514,17 +509,17 @@ def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
     # Whatever time zero the shot was recovered with is put back: it is what is to be found.
     zero = SPEED_OF_LIGHT / 2 * shot.returns.camera.time_zero
     y, x = found.y[target].astype(np.int64), found.x[target].astype(np.int64)
-    return _Sample(
+    sample = _Sample(
         y,
         x,
-        np.zeros(y.size, np.int64),
+        np.full(y.size, number),
         y * camera.image_shape[1] + x,
         excess[target] + zero,
         sigma[target],
         _count_signal(found)[target],
         cosine[target],
-        float(target.mean()),
     )
+    return sample, float(target.mean())
 
 
 def _count_signal(returns: Returns) -> FloatArray:
@@ -568,20 +563,22 @@ def _require_plate(
 
 def _find_cluster(excess: FloatArray, width: float, name: str) -> NDArray[np.bool_]:
     """Say which returns lie in the window that holds most of them, and refuse a rival to it."""
-    order = np.sort(excess)
-    # How many returns lie in a window that begins at each one; the fullest window is the target.
-    inside = np.searchsorted(order, order + width, side="right") - np.arange(order.size)
-    first = int(np.argmax(inside))
-    middle = float(np.median(order[first : first + inside[first]]))
+
+    def find_fullest(values: FloatArray) -> tuple[FloatArray, int]:
+        """What lies in the fullest of the windows that begin at each value."""
+        order = np.sort(values)
+        inside = np.searchsorted(order, order + width, side="right") - np.arange(order.size)
+        first = int(np.argmax(inside))
+        return order[first : first + inside[first]], int(inside[first])
+
+    middle = float(np.median(find_fullest(excess)[0]))
     target: NDArray[np.bool_] = np.abs(excess - middle) <= width
-    others = np.sort(excess[~target])
-    if others.size:
-        rivals = np.searchsorted(others, others + width, side="right") - np.arange(others.size)
-        if rivals.max() > MAX_RIVAL_FRACTION * target.sum():
-            further = float(others[int(np.argmax(rivals))]) - middle
+    if not target.all():
+        rival, number = find_fullest(excess[~target])
+        if number > MAX_RIVAL_FRACTION * target.sum():
             raise CalibrationError(
-                f"{name}: two surfaces as large as each other, {abs(further):.3g} m apart: which "
-                "is the target? Cut the picture to it (`region`)"
+                f"{name}: two surfaces as large as each other, {abs(rival[0] - middle):.3g} m apart: "
+                "which is the target? Cut the picture to it (`region`)"
             )
     return target
 

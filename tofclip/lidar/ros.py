@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from tofclip.errors import InputError, MissingDependencyError, StorageError
+from tofclip.errors import InputError, StorageError
+from tofclip.files import import_file_reader
 from tofclip.lidar.cloud import PointCloud
 from tofclip.lidar.export import make_rows
 
@@ -47,7 +48,10 @@ def write_bag(clouds: Iterable[StampedCloud], path: str | Path) -> int:
     single = target.suffix.lower() == MCAP_SUFFIX
     if not single and target.exists():
         raise StorageError(f"{target}: exists already; a bag is a new folder")
-    rosbag2, typestore = _import_rosbags()
+    import_file_reader("rosbags", "tofclip[exchange]")
+    from rosbags import rosbag2, typesys
+
+    typestore = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     plugin = rosbag2.StoragePlugin.MCAP if single else rosbag2.StoragePlugin.SQLITE3
     try:
         with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as scratch:
@@ -106,14 +110,3 @@ def _make_message(stamped: StampedCloud, types: Any) -> Any:
         data=rows.view(np.uint8).reshape(-1),
         is_dense=True,
     )
-
-
-def _import_rosbags() -> tuple[Any, Any]:
-    try:
-        from rosbags import rosbag2
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as fault:
-        raise MissingDependencyError(
-            "ROS 2 bags and MCAP need rosbags: pip install 'tofclip[exchange]'"
-        ) from fault
-    return rosbag2, get_typestore(Stores.ROS2_HUMBLE)
