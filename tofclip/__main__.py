@@ -17,8 +17,16 @@ def main() -> int:
     try:
         # Not above: while modules are loaded there, nothing would catch a Ctrl-C.
         import importlib
+        import importlib.util
+        from pathlib import Path
 
-        _put_own_packages_first()
+        # The folder of this package comes first if its neighbour would not be found otherwise.
+        root = Path(__file__).resolve().parents[1]
+        spec = importlib.util.find_spec(PROGRAM_PACKAGE)
+        own = root / PROGRAM_PACKAGE / "__init__.py"
+        if spec is None or spec.origin is None or Path(spec.origin).resolve() != own:
+            sys.path.insert(0, str(root))
+            importlib.invalidate_caches()
         status: int = importlib.import_module(f"{PROGRAM_PACKAGE}.cli").main()
     except ImportError as fault:  # typer and rich are needed before any verb
         from tofclip.files import describe_missing_package
@@ -32,19 +40,6 @@ def main() -> int:
         print("tofclip: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     return status
-
-
-def _put_own_packages_first() -> None:
-    """Search the folder of this package first if its neighbour would not be found otherwise."""
-    import importlib.util
-    from pathlib import Path
-
-    root = Path(__file__).resolve().parents[1]
-    found = importlib.util.find_spec(PROGRAM_PACKAGE)
-    own = root / PROGRAM_PACKAGE / "__init__.py"
-    if found is None or found.origin is None or Path(found.origin).resolve() != own:
-        sys.path.insert(0, str(root))
-        importlib.invalidate_caches()
 
 
 if __name__ == "__main__":

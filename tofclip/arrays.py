@@ -26,11 +26,9 @@ T = TypeVar("T")
 
 FloatArray = NDArray[np.float64]
 
-Array = Any
-"""An array of any library that follows the array API standard."""
+Array = Any  # of any library that follows the array API standard
 
-GRAPHICS_LIBRARIES = ("cupy", "torch")
-"""Those that can use a GPU, the preferred one first."""
+GRAPHICS_LIBRARIES = ("cupy", "torch")  # those that can use a GPU, the preferred one first
 
 CACHE_LINE_BYTES = 64
 
@@ -81,10 +79,7 @@ def _resolve_namespace(arrays: tuple[Array, ...]) -> Any:
 
 
 def clip_values(values: Array, lowest: float | None = None, highest: float | None = None) -> Array:
-    """Return an array's values with those below or above a limit replaced by it.
-
-    `lowest, highest`: no limit by default. Returns of the same shape and dtype.
-    """
+    """Return an array's values with those below or above a limit replaced by it."""
     if not is_numpy(values):
         return namespace(values).clip(values, min=lowest, max=highest)
     # the standard's function looks at dtypes and shapes for longer than a few numbers take
@@ -97,13 +92,9 @@ def to_numpy(array: Array) -> NDArray[Any]:
     """Return the values as a NumPy array, fetched from wherever they are; a NumPy array comes back
     as it is.
     """
-    if hasattr(
-        array, "detach"
-    ):  # PyTorch: what was computed from a tensor with a gradient carries that along
+    if hasattr(array, "detach"):  # PyTorch: a gradient is carried along
         array = array.detach().cpu()
-    elif hasattr(array, "get") and not is_numpy(
-        array
-    ):  # CuPy copies nothing from the device unless asked to
+    elif hasattr(array, "get") and not is_numpy(array):  # CuPy copies nothing unless asked to
         array = array.get()
     values: NDArray[Any] = np.asarray(array)
     return values
@@ -121,8 +112,6 @@ def as_type(array: Array, dtype: DTypeLike) -> Array:
     has that type.
 
     NumPy's come back contiguous, as compiled loops need them.
-
-    `array`: of any library; `dtype`: A NumPy type, or what names one. Returns of the same shape.
     """
     if is_numpy(array):
         return np.ascontiguousarray(array, dtype)
@@ -138,10 +127,7 @@ def native_device(array: Array) -> Any:
 
 
 def zeros(shape: tuple[int, ...], like: Array) -> Array:
-    """Return zeros of the type of `like`, where `like` is.
-
-    `like`: gives dtype, library and device.
-    """
+    """Return zeros of the type of `like`, where `like` is."""
     if is_numpy(like):
         return np.zeros(shape, like.dtype)
     return namespace(like).zeros(shape, dtype=like.dtype, device=native_device(like))
@@ -150,17 +136,12 @@ def zeros(shape: tuple[int, ...], like: Array) -> Array:
 def scalar_like(value: float, like: Array) -> Array:
     """Return a number of the type of `like`, where `like` is: for functions that not every library
     has for Python's.
-
-    `like`: gives dtype, library and device.
     """
     return like.dtype.type(value) if is_numpy(like) else zeros((), like) + value
 
 
 def require_numpy(what: str, *arrays: Array) -> None:
-    """Refuse arrays of other libraries.
-
-    `what`: what works on NumPy arrays only, as the message's subject.
-    """
+    """Refuse arrays of other libraries; `what` works on NumPy arrays only."""
     for array in arrays:
         if not is_numpy(array):
             raise InputError(
@@ -219,22 +200,15 @@ class ComputeDevice:
     def __str__(self) -> str:
         if self.library == "numpy":
             return "cpu"
-        return (
-            self.library
-            if self.device is None
-            else f"{self.library}:{getattr(self.device, 'id', self.device)}"
-        )
+        number = getattr(self.device, "id", self.device)
+        return self.library if self.device is None else f"{self.library}:{number}"
 
 
-CPU = ComputeDevice()
-"""NumPy's arrays, where the compiled loops work."""
+CPU = ComputeDevice()  # NumPy's arrays, where the compiled loops work
 
 
 class PerDevice(Generic[T]):
-    """What is set up once in each place where it is needed, such as the copy of an array.
-
-    `make`: sets it up in the `ComputeDevice` that it is given.
-    """
+    """What `make` sets up once on each device where it is needed, such as the copy of an array."""
 
     def __init__(self, make: Callable[[ComputeDevice], T]) -> None:
         self._make = make

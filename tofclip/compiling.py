@@ -21,20 +21,16 @@ from numba.core import event
 from numba.core.caching import FunctionCache
 from numba.extending import register_jitable
 
+# Says at level INFO which function is being compiled; what comes from disk is not reported.
 logger = logging.getLogger(__name__)
-"""Says at level INFO which function is being compiled; what comes from disk is not reported."""
-
+# What sums in vectors need; unlike all of ``fastmath`` it leaves infinities and NaN what they are.
 SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
-"""What sums in vectors need; unlike all of ``fastmath`` it leaves infinities and NaN what they are."""
-
+# For numbers without a sign: beside one with a sign the compiler would make both floats.
 ONE = np.uintp(1)
-"""For numbers without a sign: beside one with a sign the compiler would make both floats."""
+# What a full, forbidden or damaged cache raises.
+UNUSABLE = (OSError, EOFError, UnpicklingError)
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-
-UNUSABLE = (OSError, EOFError, UnpicklingError)
-"""What a full, forbidden or damaged cache raises."""
 
 
 class _DiskCache(FunctionCache):  # type: ignore[misc]
@@ -62,9 +58,8 @@ def _say_not_kept() -> None:
 
 
 def compile_and_keep(**options: Any) -> Callable[[Any], Any]:
-    """Make the decorator of loops that are kept on disk, where there is a place for them.
-
-    `**options`: of `numba.njit`, such as ``fastmath``.
+    """Make the decorator of loops that are kept on disk, where there is a place for them; options
+    are those of `numba.njit`.
     """
 
     def decorate(function: Any) -> Any:
@@ -84,8 +79,6 @@ def compile_loop(**options: Any) -> Callable[[Any], Any]:
 
     They make no array, so that nothing counts who holds one, and C does not call them: both would
     be compiled into each of them. They are kept as by `compile_and_keep`.
-
-    `**options`: of `numba.njit`, such as ``fastmath``.
     """
     usual = {"error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
     return compile_and_keep(**{**usual, **options})

@@ -1,8 +1,5 @@
-"""Packages of others by the names that they are imported and installed by, for messages about
-missing ones.
-
-Files of any format: written whole or not at all, known again by their content, and read for no
-more than they hold.
+"""Files of any format: written whole or not at all, known again by their content, and read for no
+more than they hold; and messages about packages that are missing.
 
 A damaged or malicious file of a few kilobytes may claim terabytes: every reader holds the sizes that
 a file states against the bytes that it has, before any memory is taken for them.
@@ -42,6 +39,7 @@ if TYPE_CHECKING:
 
 OWN_PACKAGES = ("tofclip", "nlos", "devices", "apps")
 
+# What to install for a module whose distribution has another name.
 DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
     {
         "array_api_compat": "array-api-compat",
@@ -57,13 +55,10 @@ DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
         "usb": "pyusb",
     }
 )
-"""What to install for a module whose distribution has another name."""
 
 
 def describe_missing_package(fault: ImportError) -> str | None:
     """Return which package is missing and what to install, None where a module of ours is missing.
-
-    `fault`: as it was raised by an import.
 
     Examples
     --------
@@ -80,10 +75,7 @@ def describe_missing_package(fault: ImportError) -> str | None:
 
 
 def import_file_reader(name: str, install: str) -> Any:
-    """Import a package that reads a kind of file.
-
-    `name`: of the module; `install`: what pip is asked for.
-    """
+    """Import a package that reads a kind of file; pip is asked to `install` it."""
     try:
         return importlib.import_module(name)
     except (ImportError, OSError) as fault:
@@ -110,34 +102,19 @@ def import_open3d() -> Any:
         ) from fault
 
 
+# Largest array that a file may make of much less: what deflate packs a thousandfold is zeros.
 MAX_UNPACKED_BYTES = 1 << 31
-"""Largest array that a file may make of much less, 2 GiB: what deflate packs a thousandfold is zeros."""
-
+# Arrays that take at least one byte of so many in their file may be larger: the file is large, too.
 USUAL_COMPRESSION = 8
-"""Arrays that take at least one byte of so many in their file may be larger: the file is large, too."""
-
-MEMORY_FRACTION = 0.5
-"""Of the computer's memory, the most that one array of a file may take."""
-
-ARRAY_LIMIT_VARIABLE = "TOFCLIP_MAX_ARRAY_GIB"
-"""Environment variable that states the largest array, GiB, in place of these limits."""
-
-MAX_COMPRESSION = 1032
-"""Deflate makes at most this number of bytes of one; other compressions are not believed to do better."""
-
-MAX_CHUNK_BYTES = 1 << 26
-"""A chunk of an HDF5 dataset is unpacked whole, however little of it is wanted."""
-
+MEMORY_FRACTION = 0.5  # of the computer's memory, the most that one array of a file may take
+ARRAY_LIMIT_VARIABLE = "TOFCLIP_MAX_ARRAY_GIB"  # states the largest array in place of these limits
+MAX_COMPRESSION = 1032  # of deflate; other compressions are not believed to do better
+MAX_CHUNK_BYTES = 1 << 26  # of an HDF5 dataset: unpacked whole, however little of it is wanted
+# Of larger files, size, time of change and so many first bytes stand for the content.
 MAX_HASHED_BYTES = 1 << 24
-"""Of larger files, size, time of change and the first bytes, this number of them, stand for the content."""
-
-MIN_FREE_BYTES = 4096
-"""A disk with less, a block of most file systems, is full."""
-
+MIN_FREE_BYTES = 4096  # a disk with less, a block of most file systems, is full
 DISK_IS_FULL = "the disk is full; free some space or choose another folder"
-
-MAX_MESSAGE_LENGTH = 200
-"""Of another library's message that is part of ours."""
+MAX_MESSAGE_LENGTH = 200  # of another library's message that is part of ours
 
 
 class BoundedFile(io.BufferedReader):
@@ -184,11 +161,8 @@ def _require_array_limit(path: str | Path, name: str, claimed: int, stored: int)
 def require_bounded_size(
     path: str | Path, name: str, claimed: int, stored: int, compressed: bool = False
 ) -> None:
-    """Refuse an array that claims more than its file can hold, or more than is read at all.
-
-    `path`: the file; `name`: of the array, for the message; `claimed`: bytes that its values would
-    take in memory; `stored`: bytes that it takes in the file; where the file itself says so, at
-    most the file's size is believed; `compressed`: whether these are compressed bytes.
+    """Refuse an array whose values would take `claimed` bytes of memory, more than its `stored` bytes
+    can hold (at most the file's size is believed), or more than is read at all.
     """
     _require_array_limit(path, name, claimed, stored)
     if claimed > min(stored, os.path.getsize(path)) * (MAX_COMPRESSION if compressed else 1):
@@ -225,8 +199,7 @@ def require_bounded_dataset(
 ) -> None:
     """Refuse a dataset whose values are not in its own file, or claim more than the file can hold.
 
-    `origin`: the file that it is in; `at_once`: how many of its values are read at once; by default
-    all.
+    `at_once`: how many of its values are read at once; by default all.
     """
     name, dtype = dataset.name.lstrip("/"), dataset.dtype
     if dataset.is_virtual or dataset.external:
@@ -312,11 +285,8 @@ def require_apart(outputs: Iterable[str | Path], inputs: Iterable[str | Path | N
     """Refuse outputs that are inputs too: they would be overwritten, or taken for results.
 
     They are compared as the file system knows them, so that a link or another spelling of a name
-    makes no difference. What does not exist yet is no input.
-
-    `outputs`: files that may be written, and folders for results; `inputs`: files, folders with the
-    files in them, patterns of `glob`, and addresses, of which only those that begin with
-    ``file://`` name a file.
+    makes no difference. What does not exist yet is no input. Inputs are files, folders with the files
+    in them, patterns of `glob`, and addresses, of which only those of ``file://`` name a file.
     """
     existing = {_identify_entry(Path(one)): Path(one) for one in outputs}
     existing.pop(None, None)
@@ -356,9 +326,7 @@ def _identify_entry(path: Path) -> tuple[int, int] | None:
 
 def remove_temporary_files(targets: Iterable[Path]) -> None:
     """Remove the temporary files of writers of `targets` that were killed before `atomic_path`
-    could.
-
-    Only when these targets are not written any more: a writer whose temporary file is gone fails.
+    could. A writer that is still at work would fail.
     """
     wanted: dict[Path, set[str]] = {}
     for target in targets:
@@ -441,15 +409,13 @@ def _is_full(folder: Path) -> bool:
 def _explain_os_error(fault: OSError) -> str:
     if fault.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return DISK_IS_FULL
-    if isinstance(fault, FileNotFoundError):
-        return "the folder does not exist; create it first"
-    if isinstance(fault, NotADirectoryError):
-        return "its folder is a file"
-    if isinstance(fault, IsADirectoryError):
-        return "it is a folder; name a file"
-    if isinstance(fault, PermissionError):
-        return "writing is not permitted there"
-    return format_error_line(fault)
+    reasons: dict[type[OSError], str] = {
+        FileNotFoundError: "the folder does not exist; create it first",
+        NotADirectoryError: "its folder is a file",
+        IsADirectoryError: "it is a folder; name a file",
+        PermissionError: "writing is not permitted there",
+    }
+    return reasons.get(type(fault)) or format_error_line(fault)
 
 
 def format_error_line(fault: BaseException) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import tomllib
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from tofclip.errors import require_path
-from tofclip.files import translate_read_errors
+from tofclip.files import guard, translate_read_errors
 from tofclip.io import read_streak
 from tofclip.io.archive import Archive
 from tofclip.io.light_fields import read_exr_parts
@@ -15,24 +16,21 @@ from tofclip.io.streaks import outline_streak_file
 from tofclip.lidar import PointCloud
 from tofclip.storage import HDF5_SIGNATURE, Field, Record, make_stand_in, read_outline
 
+# Where the object of each kind of record is made; `nlos` is named, not imported: it builds on this
+# package, as do recordings' readers.
 HOMES = {
     "camera": ("tofclip.camera", "Camera"),
     "capture": ("nlos", "Capture"),
+    "clip_measurement": ("tofclip.light_field", "ClipMeasurement"),
     "cloud": ("tofclip.lidar", "PointCloud"),
     "frames": ("tofclip.shots", "Frames"),
+    "light_field": ("tofclip.light_field", "LightField"),
+    "returns": ("tofclip.shots", "Returns"),
     "streak": ("tofclip.shots", "Streak"),
     "volume": ("nlos", "Volume"),
 }
-"""Where the object of each kind of record is made. `nlos` is named, not imported: it builds on this
-package, as do recordings' readers.
-"""
-
 CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57")
-
-EXR_SIGNATURE = b"\x76\x2f\x31\x01"
-NPZ_SIGNATURE = b"PK\x03\x04"
-UNITS_OF_NAMES = {"_m": "m", "_percent": "percent"}
-"""Of the arrays of a range image, by the ends of their names."""
+EXR_SIGNATURE, NPZ_SIGNATURE = b"\x76\x2f\x31\x01", b"PK\x03\x04"
 
 
 def load(path: str | Path) -> Any:
@@ -42,13 +40,14 @@ def load(path: str | Path) -> Any:
     ----------
     path : path-like
         HDF5, a point cloud in any format that `PointCloud.save` writes, a range image of
-        ``tofclip lidar photons``, a depth picture (OpenEXR), a recording, or what `read_streak` reads.
+        ``tofclip lidar photons``, a depth picture (OpenEXR), a recording, settings (TOML), or what
+        `read_streak` reads.
 
     Returns
     -------
-    Frames, PointCloud, Streak, Camera, nlos.Volume or nlos.Capture
-        For another kind of record, such as a recording's head, a range image or a depth picture, a
-        `tofclip.storage.Record`.
+    Frames, PointCloud, Streak, Camera, LightField, nlos.Volume or nlos.Capture
+        For another kind of record, such as a recording's head, a range image, a depth picture or
+        settings, a `tofclip.storage.Record`.
 
     Raises
     ------
@@ -62,9 +61,9 @@ def load(path: str | Path) -> Any:
     >>> import tofclip
     >>> frames = tofclip.load("frames.h5")  # doctest: +SKIP
     """
-    record, found = _open(path, values=True)
-    if found is not None:
-        return found
+    record, content = _open(path, values=True)
+    if content is not None:
+        return content
     if record.kind not in HOMES:
         return record
     module, name = HOMES[record.kind]
@@ -93,6 +92,10 @@ def _open(path: str | Path, values: bool) -> tuple[Record, Any]:
         return (Record.load if values else read_outline)(file), None
     if start.startswith(EXR_SIGNATURE):
         return _open_depth_picture(file), None
+    if file.suffix.lower() == ".toml":
+        with guard(file, "is not TOML"):
+            settings = tomllib.loads(file.read_text("utf-8"))
+        return Record("settings", provenance=settings, origin=str(file)), None
     is_cloud = file.suffix.lower() in CLOUD_SUFFIXES
     if start.startswith(NPZ_SIGNATURE):
         archive = Archive(file)
@@ -105,13 +108,13 @@ def _open(path: str | Path, values: bool) -> tuple[Record, Any]:
 
 
 def _open_range_image(archive: Archive, values: bool) -> Record:
-    """What `tofclip lidar photons` writes to .npz."""
+    """What `tofclip lidar photons` writes to .npz; the ends of the arrays' names are their units."""
     fields = {}
     for name in sorted(archive.names):
-        known = archive.describe(name)
-        units = next((unit for end, unit in UNITS_OF_NAMES.items() if name.endswith(end)), "")
-        content = archive.read(name) if values else make_stand_in(known.shape, known.dtype)
-        fields[name] = Field(content, units, ("y", "x", "return")[: len(known.shape)])
+        entry = archive.describe(name)
+        units = {"m": "m", "percent": "percent"}.get(name.rpartition("_")[2], "")
+        content = archive.read(name) if values else make_stand_in(entry.shape, entry.dtype)
+        fields[name] = Field(content, units, ("y", "x", "return")[: len(entry.shape)])
     return Record("range image", fields, origin=str(archive.path))
 
 

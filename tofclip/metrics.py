@@ -47,8 +47,6 @@ def nmse(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
 def nmse_energy(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
     """Squared error relative to the energy of the truth: ``sum (h - g)^2 / sum g^2``; arguments as
     in `nmse`.
-
-    `estimate, truth` (rows, columns); `border_px`: pixels left out on all sides.
     """
     h, g = _crop_borders(estimate, truth, border_px)
     energy = float(np.sum(g**2))
@@ -59,11 +57,7 @@ def nmse_energy(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> fl
 
 def correlation_coefficient(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
     """Pearson's correlation of two pictures, whatever their scales; 0 where the estimate is one
-    even tone.
-
-    Arguments as in `nmse`.
-
-    `estimate, truth` (rows, columns); `border_px`: pixels left out on all sides. Returns -1 to 1.
+    even tone. Arguments as in `nmse`.
     """
     h, g = _crop_borders(estimate, truth, border_px)
     h, g = h - h.mean(), g - g.mean()

@@ -34,10 +34,7 @@ def require_package(name: str) -> Any:
 
 
 def render_html(title: str, rows: Mapping[str, str], picture: NDArray[np.floating] | None) -> str:
-    """Return a table beside a picture, in HTML.
-
-    `rows`: names and values; `picture` (y, x): brightness; NaN is drawn black.
-    """
+    """Return a table of names and values beside a picture (y, x), whose NaN are drawn black."""
     cells = "".join(
         f"<tr><th style='text-align:left'>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>"
         for name, value in rows.items()
@@ -56,10 +53,8 @@ def plot_picture(
     unit: str = "counts",
     sides: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> Axes:
-    """Draw a picture with a scale of its brightness.
-
-    `picture` (y, x); `ax`: where to draw; by default the current figure's; `unit`: of the
-    brightness; `sides` (x, y): places of columns and rows, m; by default they are numbered.
+    """Draw a picture (y, x) with a scale of its brightness; `sides` (x, y) are places of columns and
+    rows, m, which are numbered by default.
     """
     pyplot = require_package("matplotlib.pyplot")
     ax = ax or pyplot.gca()
@@ -74,10 +69,7 @@ def plot_picture(
 def plot_points(
     xyz: NDArray[np.floating], distance: NDArray[np.floating], ax: Axes | None = None
 ) -> Axes:
-    """Draw points as the camera sees them, coloured by their range.
-
-    `xyz` (n, 3): m: x right, y down, z forward; `distance` (n,): m.
-    """
+    """Draw points (n, 3), m, as the camera sees them, coloured by their range."""
     pyplot = require_package("matplotlib.pyplot")
     ax = ax or pyplot.gca()
     step = max(1, len(xyz) // MAX_PLOTTED_POINTS)
@@ -94,9 +86,8 @@ def plot_points(
 def make_data_array(
     values: NDArray[Any], axes: Mapping[str, tuple[NDArray[Any], str]], name: str, unit: str
 ) -> Any:
-    """Return an `xarray.DataArray` whose coordinates carry their units.
-
-    `axes`: coordinates and unit of each axis, in order; `name, unit`: of the values.
+    """Return an `xarray.DataArray` whose coordinates carry their units; `axes` are coordinates and
+    unit of each axis, in order.
     """
     xarray = require_package("xarray")
     places = {axis: (axis, place, {"units": units}) for axis, (place, units) in axes.items()}
