@@ -29,10 +29,9 @@ from apps.help import (
     EXIT_INTERRUPTED,
     MAX_HELP_WIDTH,
     PROGRAM,
-    VerbTable,
-    make_lazy_group,
+    find_help,
+    make_verb_group,
 )
-from apps.verb_help import HELP_OPTION, show_verb_help
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import describe_missing_package
 from tofclip.version import __version__
@@ -108,7 +107,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   tofclip VERB --help explains a verb. Exit status: 0 done, 1 some failed,
   2 unusable input, 130 interrupted."""
 
-VERBS: VerbTable = {
+VERBS = {
     "demo": "Simulate a scene of letters and plates, recover it from one streak image, and compare with the truth.",
     "calibrate": "Find every view's slit centre and line angle, and draw the fits over the data.",
     "calibrate range": "Find time zero, range walk, offsets, response and reflectance from shots of a target.",
@@ -128,19 +127,20 @@ VERBS: VerbTable = {
     "warm-up": "Run everything that is compiled on first use once, on small data.",
     "info": "Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.",
 }
-"""Each verb's module in `apps.verbs` and its line in the list of commands."""
+"""The verbs, and groups of them, with their lines in the list of commands."""
 
-FILE_READERS = (
-    *("calibrate range", "recover", "cloud", "info", "view", "stream", "convert"),
-    *("lidar photons", "lidar scene", "lidar sequence", "lidar bag"),
-    *("clip simulate", "clip recover", "devices verify", "devices repair"),
-    *("nlos reconstruct", "nlos film", "nlos compare", "nlos info", "nlos stream"),
-)
-"""Verbs whose first argument has to be there, unless it is an address or a pattern."""
+HOMES = {
+    "calibrate range": "calibrate",
+    "cloud": "recover",
+    "convert": "files",
+    "info": "files",
+    "record": "devices",
+}
+"""Modules in `apps.verbs` that are not called like their verb."""
 
 app = typer.Typer(
-    name="tofclip",
-    cls=make_lazy_group("apps.verbs", VERBS, FILE_READERS),
+    name=PROGRAM,
+    cls=make_verb_group(VERBS, HOMES),
     pretty_exceptions_enable=False,
     context_settings={"max_content_width": MAX_HELP_WIDTH},
     epilog=EPILOG,
@@ -169,18 +169,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = DEBUG_FLAG in words
     _heed_end_signals()
     with _keep_to_one_line(debug):
-        status = _run([word for word in words if word != DEBUG_FLAG], debug)
+        status = int(_run([word for word in words if word != DEBUG_FLAG], debug) or 0)
     if status == EXIT_INTERRUPTED:
         print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
-    return int(status or 0)
+    return status
 
 
 def _run(words: Sequence[str], debug: bool) -> Any:
     """Run a verb and return its exit status."""
     try:
         _require_no_empty(words)
-        shown = words[-1:] == [HELP_OPTION] and show_verb_help(app, words)
-        status = 0 if shown else app(words, prog_name=PROGRAM, standalone_mode=False)
+        text = find_help(app, words)
+        if text is not None:
+            print(text)
+        status = 0 if text else app(words, prog_name=PROGRAM, standalone_mode=False)
         sys.stdout.flush()
     except Exception as fault:
         if debug:
@@ -294,10 +296,8 @@ def name_options(message: str) -> str:
     """
 
     def name_option(found: re.Match[str]) -> str:
-        option = OPTIONS_OF_ARGUMENTS.get(found["name"])
-        if option is None:
-            return found[0]
-        value = found["value"]
-        return option if value in (None, "True") else f"{option} {value}"
+        option = OPTIONS_OF_ARGUMENTS.get(found["name"], found[0])
+        is_named = option != found[0] and found["value"] not in (None, "True")
+        return f"{option} {found['value']}" if is_named else option
 
     return ARGUMENT_IN_MESSAGE.sub(name_option, message)

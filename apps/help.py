@@ -1,7 +1,7 @@
-"""The verbs as the command line shows them: imported when they are called, each with its help.
+"""The verbs as the command line shows them: each with its help, made from its docstring.
 
 The list of commands and the completion of a verb's name come from a table of names and one-line
-helps; everything else comes from the verb itself. Its docstring ends in a paragraph that begins
+helps; a verb's module is imported when it is called. Its docstring ends in a paragraph that begins
 with ``Example:``; several such paragraphs are several examples.
 """
 
@@ -10,25 +10,22 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from typing import Any, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
-from tofclip.errors import StorageError
-
 PROGRAM = "tofclip"
+HELP_OPTION = "--help"
+DEBUG_FLAG = "--debug"
 
 EXIT_INPUT_ERROR = 2
 EXIT_DEFECT = 1
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
-
-DEBUG_FLAG = "--debug"
 EPILOG = (
     f"Exit status: 0 done; {EXIT_INPUT_ERROR} unusable input, with one line on standard error that says what to do; "
     f"{EXIT_INTERRUPTED} interrupted; {EXIT_DEFECT} some of a sequence failed, or a defect of this program. "
@@ -37,102 +34,107 @@ EPILOG = (
 
 EXAMPLE_MARK = "Example:"
 AS_WRITTEN = "\b\n"  # before a paragraph whose lines typer must not join
-MAX_EXAMPLE_WIDTH = (
-    72  # of an example, so that it fits the narrowest usual terminal with its indentation
-)
-
+MAX_EXAMPLE_WIDTH = 72  # columns, which with the indentation fit the narrowest usual terminal
 MAX_HELP_WIDTH = 100  # columns, on a terminal that has them
-
-VerbTable = Mapping[str, str]
-"""The one-line help of each verb, by its name; its module has _ for -."""
 
 Command = TyperCommand | TyperGroup
 
 
-def make_lazy_group(
-    package: str, verbs: VerbTable, readers: Collection[str] = ()
-) -> type[TyperGroup]:
-    """Return the class of a group whose verbs are modules of a package.
+class VerbGroup(TyperGroup):
+    """The program's verbs, of which only the one that is called is imported.
 
-    `package`: where the modules are. A module holds a function named like the verb, or a group of
-    verbs called ``app``; `verbs`: in the order of the help. A verb of two words, such as
-    ``"calibrate range"``, stands beside one that is called by the first word alone; `readers`:
-    verbs, of one word or two, whose first argument is a file, a folder, a pattern or an address.
-    Returns for the ``cls`` of a ``typer.Typer``.
+    A verb of two words, such as ``calibrate range``, stands beside one called by the first alone.
     """
 
-    class LazyGroup(TyperGroup):
-        def __init__(self, **attributes: Any) -> None:
-            super().__init__(**attributes)
-            # what the list of commands shows until a verb is called
-            for name, line in verbs.items():
-                self.add_command(TyperCommand(name, help=line, short_help=line))
-            self.rich_markup_mode = None
+    verbs: Mapping[str, str]
+    homes: Mapping[str, str]
 
-        def get_params(self, ctx: Any) -> list[Any]:
-            """Return the options, those of completion too, which typer adds later."""
-            params = super().get_params(ctx)
-            _hide_types_of_flags(params)
-            return params
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        for name, line in self.verbs.items():
+            self.add_command(TyperCommand(name, help=line, short_help=line))
+        self.rich_markup_mode = None
 
-        def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-            """Refuse a source that is not there, before typer loads what it reads options with."""
-            if not ctx.resilient_parsing:
-                _require_source(args, readers)
-            return super().parse_args(ctx, args)
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the options, those of completion too, which typer adds later."""
+        return _hide_types_of_flags(super().get_params(ctx))
 
-        def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-            """Find the verb that is called; only this one is imported."""
-            pair = " ".join(args[:2])
-            if pair in verbs:  # before the verb that is called by the first word alone
-                args = [pair, *args[2:]]
-            name, listed, further = super().resolve_command(ctx, args)
-            return name, (name and self.load_verb(name)) or listed, further
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the verb that is called, and import it."""
+        if " ".join(args[:2]) in self.verbs:
+            args = [" ".join(args[:2]), *args[2:]]
+        name, listed, further = super().resolve_command(ctx, args)
+        return name, (name and self.load_verb(name)) or listed, further
 
-        def load_verb(self, name: str) -> Command:
-            """Import a verb and return its command."""
-            return load_command(f"{package}.{re.sub('[- ]', '_', name)}", name)
+    def load_verb(self, name: str) -> Command:
+        """Import a verb and return its command, which is a group if that is what its module has."""
+        own = re.sub("[- ]", "_", name)
+        home = import_module(f"apps.verbs.{self.homes.get(name, own)}")
+        is_group = not hasattr(home, own)
+        app: typer.Typer = home.app if is_group else typer.Typer()
+        if not is_group:
+            app.command(name)(getattr(home, own))
+        for verb in app.registered_commands:
+            _set_help(verb)
+        group = typer.main.get_group(app)
+        group.name = name
+        command = group if is_group else cast("TyperCommand", group.commands[name])
+        simplify_help(command)
+        return command
 
-        def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-            """Complete single words, as shells take them."""
-            found = super().shell_complete(ctx, incomplete)
-            return [item for item in found if " " not in item.value]
-
-    return LazyGroup
-
-
-def _require_source(words: Sequence[str], readers: Collection[str]) -> None:
-    """Refuse the source of a verb among `readers` that is plainly a file's name and not there."""
-    length = next((n for n in (2, 1) if " ".join(words[:n]) in readers), None)
-    if length is None:
-        return
-    words = words[length:]
-    source = words[0] if words and not {"--help", "-h"} & set(words) else "-"
-    if len(words) > 1 and not words[1].startswith("-"):
-        return  # one name too many, about which the verb itself complains
-    is_name = not source.startswith("-") and "://" not in source and not set("*?[") & set(source)
-    if is_name and not Path(source).exists():
-        raise StorageError(f"{source}: no such file")
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Complete single words, as shells take them."""
+        return [item for item in super().shell_complete(ctx, incomplete) if " " not in item.value]
 
 
-def load_command(module: str, name: str) -> Command:
-    """Import a verb's module and return its command, which is a group if the module has an ``app``.
+def make_verb_group(verbs: Mapping[str, str], homes: Mapping[str, str]) -> type[VerbGroup]:
+    """Return the class of the group of all verbs, for the ``cls`` of a ``typer.Typer``.
 
-    `module`: such as ``apps.verbs.recover``; `name`: of the verb. Returns with its help set from
-    its docstring.
+    `verbs`: their lines in the list of commands, in its order; `homes`: modules of `apps.verbs` that
+    are not called like their verb. A module has a function called like the verb, or a group ``app``.
     """
-    home = import_module(module)
-    is_group = hasattr(home, "app")
-    app: typer.Typer = home.app if is_group else typer.Typer()
-    if not is_group:
-        app.command(name)(getattr(home, module.rpartition(".")[2]))
-    set_help_texts(app)
-    group = typer.main.get_group(app)
-    group.name = name
-    # A verb on its own is taken out of the group that it was registered in.
-    command: Command = group if is_group else cast("TyperCommand", group.commands[name])
-    simplify_help(command)
-    return command
+    return type("Verbs", (VerbGroup,), {"verbs": verbs, "homes": homes})
+
+
+def make_group(meaning: str) -> typer.Typer:
+    """Return a group of verbs that alone shows its help."""
+    app = typer.Typer()
+
+    def show_help(context: typer.Context) -> None:
+        if context.invoked_subcommand is None:
+            print(context.get_help())
+
+    app.callback(invoke_without_command=True, help=meaning)(show_help)
+    return app
+
+
+def walk_verbs(group: VerbGroup) -> dict[str, TyperCommand]:
+    """Import every verb and return the commands by the words that call them, such as ``lidar scene``,
+    in the order of the help.
+    """
+    found: dict[str, TyperCommand] = {}
+    for name in group.verbs:
+        command = group.load_verb(name)
+        if isinstance(command, TyperGroup):
+            found |= {f"{name} {word}": verb for word, verb in command.commands.items()}  # type: ignore[misc]
+        else:
+            found[name] = command
+    return found
+
+
+def find_help(app: typer.Typer, words: Sequence[str]) -> str | None:
+    """Return the help that words ask for and nothing else, without what typer parses options with,
+    which takes longer to import than all the rest.
+    """
+    *names, last = words or ("",)
+    if last != HELP_OPTION or not names or any(name.startswith("-") for name in names):
+        return None
+    command: Any = typer.main.get_group(app)
+    context = typer.Context(command, info_name=PROGRAM, **command.context_settings)
+    while names and isinstance(command, TyperGroup):
+        name, command, names = command.resolve_command(context, names)
+        context = typer.Context(command, info_name=name, parent=context)
+    return str(command.get_help(context))
 
 
 def simplify_help(command: Command) -> None:
@@ -142,24 +144,28 @@ def simplify_help(command: Command) -> None:
     Importing what draws frames around the help takes longer than all the rest of showing it.
     """
     command.rich_markup_mode = None
-    # the settings of a verb stand under a heading of their own
     command.format_options = partial(_write_options, command)  # type: ignore[method-assign]
     usage = command.collect_usage_pieces
-    command.collect_usage_pieces = lambda ctx: _simplify_usage(usage(ctx))  # type: ignore[method-assign]
+    # typer writes ``{SHOT...}...``
+    command.collect_usage_pieces = lambda ctx: [  # type: ignore[method-assign]
+        re.sub(r"^\{(.*?)(\.\.\.)?\}", r"\1", piece) for piece in usage(ctx)
+    ]
     _hide_types_of_flags(command.get_params(typer.Context(command)))
     for further in getattr(command, "commands", {}).values():
         simplify_help(further)
 
 
 def _write_options(command: Command, ctx: Any, formatter: Any) -> None:
-    """Write arguments and options under their headings, and a group's verbs."""
+    """Write arguments, options and settings under their headings, and a group's verbs."""
     panels: dict[str, list[tuple[str, str]]] = {}
     for param in command.get_params(ctx):
         entry = param.get_help_record(ctx)
         if entry is not None:
             usual = "Arguments" if param.param_type_name == "argument" else "Options"
             heading = getattr(param, "rich_help_panel", None) or usual
-            panels.setdefault(heading, []).append((entry[0], _simplify_default(entry[1])))
+            # typer puts a default in words into brackets of its own
+            text = re.sub(r"\[default: \((.*)\)\]$", r"[default: \1]", entry[1])
+            panels.setdefault(heading, []).append((entry[0], text))
     for heading, entries in panels.items():
         with formatter.section(heading):
             formatter.write_dl(entries)
@@ -167,50 +173,20 @@ def _write_options(command: Command, ctx: Any, formatter: Any) -> None:
         command.format_commands(ctx, formatter)
 
 
-def _simplify_usage(pieces: Sequence[str]) -> list[str]:
-    """Take the braces off the names of arguments, of which typer writes ``{SHOT...}...``."""
-    return [re.sub(r"^\{(.*?)(\.\.\.)?\}", r"\1", piece) for piece in pieces]
-
-
-def _simplify_default(text: str) -> str:
-    """Take the brackets off a default in words, which typer puts around it within its own."""
-    return re.sub(r"\[default: \((.*)\)\]$", r"[default: \1]", text)
-
-
-def _hide_types_of_flags(params: Sequence[Any]) -> None:
+def _hide_types_of_flags(params: list[Any]) -> list[Any]:
     for param in params:
         if isinstance(param, TyperOption) and param.is_flag:
             param.metavar = ""
+    return params
 
 
-def walk_verbs(group: TyperGroup, words: tuple[str, ...] = ()) -> dict[str, TyperCommand]:
-    """Import every verb of a group and return the commands by the words that call them.
-
-    `group`: lazy or not; `words`: that call the group. Returns such as ``{"lidar scene":
-    command}``, in the order of the help.
-    """
-    found: dict[str, TyperCommand] = {}
-    for name, listed in group.commands.items():
-        load = getattr(group, "load_verb", None)
-        command = listed if load is None else load(name)
-        if isinstance(command, TyperGroup):
-            found |= walk_verbs(command, (*words, name))
-        elif isinstance(command, TyperCommand):
-            found[" ".join((*words, name))] = command
-    return found
-
-
-def set_help_texts(app: typer.Typer) -> None:
-    """Give every verb its help, made from its docstring; the exit statuses are its last paragraph."""
-    for verb in app.registered_commands:
-        prose, examples = split_docstring(verb.callback.__doc__ if verb.callback else None)
-        shown = [f"{AS_WRITTEN}{EXAMPLE_MARK}\n    {wrap_command(example)}" for example in examples]
-        verb.help = "\n\n".join(_keep_table(one) for one in prose)
-        verb.short_help = prose[0] if prose else None  # shown whole, not its first words
-        verb.epilog = "\n\n".join([*shown, EPILOG])
-    for group in app.registered_groups:
-        if group.typer_instance is not None:
-            set_help_texts(group.typer_instance)
+def _set_help(verb: Any) -> None:
+    """Make a verb's help from its docstring; the exit statuses are its last paragraph."""
+    prose, examples = split_docstring(verb.callback.__doc__)
+    verb.help = "\n\n".join(f"{AS_WRITTEN}{one}" if _is_table(one) else one for one in prose)
+    verb.short_help = prose[0] if prose else None  # shown whole, not its first words
+    shown = [f"{AS_WRITTEN}{EXAMPLE_MARK}\n    {wrap_command(example)}" for example in examples]
+    verb.epilog = "\n\n".join([*shown, EPILOG])
 
 
 def split_docstring(docstring: str | None) -> tuple[list[str], list[str]]:
@@ -221,7 +197,8 @@ def split_docstring(docstring: str | None) -> tuple[list[str], list[str]]:
     """
     paragraphs = [one for one in inspect.cleandoc(docstring or "").split("\n\n") if one.strip()]
     examples = [" ".join(one.split()[1:]) for one in paragraphs if one.startswith(EXAMPLE_MARK)]
-    return [_join_lines(one) for one in paragraphs if not one.startswith(EXAMPLE_MARK)], examples
+    prose = [one for one in paragraphs if not one.startswith(EXAMPLE_MARK)]
+    return [one if _is_table(one) else " ".join(one.split()) for one in prose], examples
 
 
 def wrap_command(command: str) -> str:
@@ -230,14 +207,6 @@ def wrap_command(command: str) -> str:
         command, MAX_EXAMPLE_WIDTH, break_long_words=False, break_on_hyphens=False
     )
     return " \\\n        ".join(lines)
-
-
-def _join_lines(paragraph: str) -> str:
-    return paragraph if _is_table(paragraph) else " ".join(paragraph.split())
-
-
-def _keep_table(paragraph: str) -> str:
-    return f"{AS_WRITTEN}{paragraph}" if _is_table(paragraph) else paragraph
 
 
 def _is_table(paragraph: str) -> bool:

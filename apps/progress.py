@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import sys
 import threading
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 Advance = Callable[[int], None]
+STEPS = 1000  # of a bar that is told fractions
 
 _screen_lock = threading.Lock()
 
@@ -22,7 +24,7 @@ def show_progress(title: str, total: int) -> Iterator[Advance]:
     thread as on a cluster's worker, there is none. After Ctrl-C the function raises in every thread
     that calls it, so that none goes on computing for nothing.
 
-    `total`: amount of work at which the bar is full. Yields takes the amount of work just done.
+    `total`: amount of work at which the bar is full.
     """
     with _watch_interrupt() as interrupted, _open_bar(title, total) as draw:
 
@@ -44,20 +46,32 @@ def show_activity(title: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def show_share(title: str, whole: float | None) -> Iterator[Callable[[float], None]]:
+    """Show a bar for what is told as so much of a whole, such as seconds that have passed; none
+    where the whole is not known.
+    """
+    if whole is None or not math.isfinite(whole):
+        yield lambda _: None
+        return
+    with show_progress(title, STEPS) as advance:
+        shown = 0
+
+        def watch(done: float) -> None:
+            nonlocal shown
+            # A bar takes whole steps forward; the difference of rounded sums never drifts.
+            step = round(STEPS * done / whole)
+            advance(step - shown)
+            shown = step
+
+        yield watch
+
+
+@contextlib.contextmanager
 def _open_bar(title: str, total: int | None) -> Iterator[Advance]:
     watched = sys.stderr.isatty() and threading.current_thread() is threading.main_thread()
     if not watched or not _screen_lock.acquire(blocking=False):
         yield lambda _: None
         return
-    try:
-        with _draw_bar(title, total) as draw:
-            yield draw
-    finally:
-        _screen_lock.release()
-
-
-@contextlib.contextmanager
-def _draw_bar(title: str, total: int | None) -> Iterator[Advance]:
     from rich import progress
     from rich.console import Console
 
@@ -71,15 +85,18 @@ def _draw_bar(title: str, total: int | None) -> Iterator[Advance]:
     )
     if total is None:
         columns = columns[:2] + columns[3:4]  # nothing is known of what is left
-    # Printed while the bar is there, a line goes above it; a pipe gets it as it is.
-    with progress.Progress(
-        *columns,
-        console=Console(stderr=True),
-        transient=True,
-        redirect_stdout=sys.stdout.isatty(),
-    ) as drawn:
-        task = drawn.add_task(title, total=total)
-        yield lambda amount: drawn.advance(task, amount)
+    try:
+        # Printed while the bar is there, a line goes above it; a pipe gets it as it is.
+        with progress.Progress(
+            *columns,
+            console=Console(stderr=True),
+            transient=True,
+            redirect_stdout=sys.stdout.isatty(),
+        ) as drawn:
+            task = drawn.add_task(title, total=total)
+            yield lambda amount: drawn.advance(task, amount)
+    finally:
+        _screen_lock.release()
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 from .backprojection import Backprojection as Backprojection
 from .backprojection import FilteredBackprojection as FilteredBackprojection
 from .capture import Capture as Capture
+from .completion import settings_for as settings_for
 from .confocal import FKMigration as FKMigration
 from .confocal import LightCone as LightCone
 from .method import Method as Method
@@ -12,7 +13,6 @@ from .phasor.plan import PlanarRSD as PlanarRSD
 from .phasor.propagate import propagate as propagate
 from .refinement.l1 import Refinement as Refinement
 from .settings import Settings as Settings
-from .settings import settings_for as settings_for
 from .video import TransientImaging as TransientImaging
 from .video import TransientVideo as TransientVideo
 from .volume import Grid as Grid

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-    from apps.nlos.truth import HiddenTruth
     from nlos import Volume
+    from nlos.known_scenes import HiddenTruth
 
 COLUMN_INCHES = 3.2
 TEXT_INCHES = 1.7

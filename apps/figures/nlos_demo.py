@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from apps.nlos.measure import MeasuredVolume
-    from apps.nlos.truth import HiddenTruth
-    from apps.verbs.nlos.demo import DemoRun
+    from apps.verbs.nlos import DemoRun
+    from apps.verbs.nlos_imaging import MeasuredVolume
     from nlos import Capture
+    from nlos.known_scenes import HiddenTruth
 
 OUTGOING_COLOUR, RETURN_COLOUR, DEVICE_COLOUR = "#d1495b", "#2e6f95", "#8d949b"
 WALL_COLOUR, INK_COLOUR = "#c9cdd2", "#20242c"

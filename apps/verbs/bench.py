@@ -3,41 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from apps.conventions import JsonOption, report, require_writable
+from apps.options import JSON, arg, opt
 from apps.progress import show_progress
+from apps.report import report, require_writable
 from tofclip.files import atomic_path
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 
 def bench(
-    name: Annotated[
-        str,
-        typer.Argument(
-            metavar="NAME",
-            help="recovery, clip, depth, streaming, rsd, propagation, confocal, backprojection, decode, or one of a "
-            "group, as recovery-l1. Studies, by name only: camera, quality, accuracy, device, corner, sequence, "
-            "driver, viewer.",
-        ),
-    ] = "all",
-    page: Annotated[
-        Path | None,
-        typer.Option(metavar="MD", help="A page of the figures to write.", show_default="none"),
-    ] = None,
-    peers: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="PYTHON",
-            help="A Python that has other programs to compare with: pip install y-tal pyfftw astra-toolbox lensless.",
-            show_default="none",
-        ),
-    ] = None,
-    as_json: JsonOption = False,
+    name: str = arg(
+        "NAME",
+        "recovery, clip, depth, streaming, rsd, propagation, confocal, backprojection, decode, or one of a group, as "
+        "recovery-l1. Studies, by name only: camera, quality, accuracy, device, corner, sequence, driver, viewer.",
+        "all",
+    ),
+    page: Path | None = opt("MD", "A page of the figures to write.", shown="none"),
+    peers: Path | None = opt(
+        "PYTHON",
+        "A Python that has other programs to compare with: pip install y-tal pyfftw astra-toolbox lensless.",
+        shown="none",
+    ),
+    as_json: bool = JSON,
 ) -> None:
     """Measure time and memory, each beside the least that the work needs.
 
@@ -61,13 +47,8 @@ def bench(
         with atomic_path(page) as temporary:
             temporary.write_text(render_page(figures, command), encoding="utf-8")
     if as_json:
-        report(figures, as_json=True)
-    else:
-        report(_format_summary(figures), as_json=False, written=[] if page is None else [page])
-
-
-def _format_summary(figures: Mapping[str, Any]) -> dict[str, str]:
-    """One line for each case, of its greatest size on all threads."""
+        report(figures, as_json)
+        return
     lines = {}
     for entry in figures["entries"]:
         # Sizes and threads rise, so that the last run is the largest.
@@ -76,4 +57,4 @@ def _format_summary(figures: Mapping[str, Any]) -> dict[str, str]:
             f"{run['seconds']['median']:.4g} s at {run['size']} {entry['size']}, {run['times_floor']:.2f} times "
             f"{entry['floor']}, {run['peak_mib']:.0f} MiB"
         )
-    return lines
+    report(lines, as_json, [] if page is None else [page])

@@ -1,67 +1,56 @@
-"""`tofclip calibrate`: four focus-mode pictures of a point source to a camera file."""
+"""`tofclip calibrate`: four focus-mode pictures of a point source to a camera file; `tofclip
+calibrate range`: shots of a target at known distances to a camera whose ranges are true.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import typer
-
-from apps.conventions import JsonOption, PreviewOption, choose_preview, report
-from apps.figures.calibration import make_calibration_figure
-from apps.figures.style import save_figure
-from apps.progress import show_activity
-from tofclip.camera.focus_pictures import calibrate_views as fit
-from tofclip.io import read_streak
-from tofclip.units import NANOSECOND, PICOSECOND
+from apps.options import JSON, PREVIEW, arg, opt
+from apps.progress import show_activity, show_progress
+from apps.report import choose_preview, report
+from apps.verbs.photons import AXES, FIELD_OF_VIEW, FOCAL_LENGTH, choose_camera, require_view
+from tofclip.errors import FileFormatError, InputError
+from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.camera.focus_pictures import FocusCalibration
+    from tofclip.camera import Camera
+    from tofclip.lidar import Pulse
+    from tofclip.lidar.range_calibration import RangeFit, TargetShot
+    from tofclip.shots import Frames
+
+PHOTON_SUFFIXES = (".npy", ".mat", ".ptu", ".sdt")
 
 
 def calibrate(
-    line: Annotated[
-        Path, typer.Option(metavar="TIF", help="Point source, slit open: a line for each lenslet.")
-    ],
-    line_background: Annotated[
-        Path, typer.Option(metavar="TIF", help="The same without the source.")
-    ],
-    dot: Annotated[
-        Path, typer.Option(metavar="TIF", help="Point source, slit closed: a dot for each lenslet.")
-    ],
-    dot_background: Annotated[
-        Path, typer.Option(metavar="TIF", help="The same without the source.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="H5", help="The camera file to write.")],
-    time_zero_ns: Annotated[
-        float | None,
-        typer.Option(
-            metavar="NS",
-            help="Reading of the time axis at which light of range 0 would arrive, in ns; e.g. -10.784. These pictures "
-            "do not show it; calibrate range finds it.",
-            show_default="not known: ranges are right up to one constant",
-        ),
-    ] = None,
-    focal_length_px: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PX",
-            help="Distance from lenslet to picture in pixels, which these pictures do not show. It gives the cloud its "
-            "width and height.",
-            show_default="265, that of similar instruments",
-        ),
-    ] = None,
-    pulse_ps: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PS",
-            help="Full width at half maximum of the response to a short pulse.",
-            show_default="60",
-        ),
-    ] = None,
-    preview: PreviewOption = None,
-    as_json: JsonOption = False,
+    line: Path = opt("TIF", "Point source, slit open: a line for each lenslet.", ...),
+    line_background: Path = opt("TIF", "The same without the source.", ...),
+    dot: Path = opt("TIF", "Point source, slit closed: a dot for each lenslet.", ...),
+    dot_background: Path = opt("TIF", "The same without the source.", ...),
+    out: Path = opt("H5", "The camera file to write.", ...),
+    time_zero: float | None = opt(
+        "NS",
+        "Reading of the time axis at which light of range 0 would arrive, in ns; e.g. -10.784. These pictures do not "
+        "show it; calibrate range finds it.",
+        name="--time-zero-ns",
+        shown="not known: ranges are right up to one constant",
+    ),
+    focal_length_px: float | None = opt(
+        "PX",
+        "Distance from lenslet to picture in pixels, which these pictures do not show. It gives the cloud its width "
+        "and height.",
+        shown="265, that of similar instruments",
+    ),
+    pulse_fwhm: float | None = opt(
+        "PS",
+        "Full width at half maximum of the response to a short pulse.",
+        name="--pulse-ps",
+        shown="60",
+    ),
+    preview: Path | None = PREVIEW,
+    as_json: bool = JSON,
 ) -> None:
     """Find every view's slit centre and line angle, and draw the fits over the data.
 
@@ -71,38 +60,255 @@ def calibrate(
     Example: tofclip calibrate --line line.tif --line-background line_background.tif --dot dot.tif
     --dot-background dot_background.tif --out camera.h5
     """
+    import numpy as np
+
+    from apps.figures.calibration import make_calibration_figure
+    from apps.figures.style import save_figure
+    from tofclip.camera.focus_pictures import calibrate_views
+    from tofclip.io import read_streak
+
     pictures = (line, line_background, dot, dot_background)
     # Both outputs are checked before any picture is read, and neither may replace an input.
     preview = choose_preview(out, preview, pictures)
     lines, no_lines, dots, no_dots = (read_streak(path).counts for path in pictures)
     with show_activity("calibrating"):
-        found = fit(lines, no_lines, dots, no_dots)
-    known = {
-        "time_zero": None if time_zero_ns is None else time_zero_ns * NANOSECOND,
-        "focal_length_px": focal_length_px,
-        "pulse_fwhm": None if pulse_ps is None else pulse_ps * PICOSECOND,
-    }
+        found = calibrate_views(lines, no_lines, dots, no_dots)
+    known = {"time_zero": time_zero, "focal_length_px": focal_length_px, "pulse_fwhm": pulse_fwhm}
     # Options that were not given leave the defaults of the camera alone.
-    camera = found.camera(**{name: value for name, value in known.items() if value is not None})
-    camera.save(out)
+    found.camera(**{name: value for name, value in known.items() if value is not None}).save(out)
     save_figure(make_calibration_figure(found), preview)
-    _report_calibration(found, as_json, [out, preview])
-
-
-def _report_calibration(found: FocusCalibration, as_json: bool, written: list[Path]) -> None:
-    figures: dict[str, Any] = {
-        "angles_deg": np.rad2deg(found.angles),
-        "centres_px": found.centres_px,
-        "centre_uncertainty_px": found.centre_uncertainty_px,
-    }
+    angles, sigmas = np.rad2deg(found.angles), np.rad2deg(found.angle_uncertainty)
     if as_json:
+        figures = {
+            "angles_deg": angles,
+            "centres_px": found.centres_px,
+            "centre_uncertainty_px": found.centre_uncertainty_px,
+        }
         report(figures, as_json)
         return
     print("view   centre (px)        angle (deg)")
-    angle_uncertainty = np.rad2deg(found.angle_uncertainty)
-    rows = zip(*figures.values(), angle_uncertainty, strict=True)
-    for view, (angle, centre, centre_error, angle_error) in enumerate(rows):
-        print(
-            f"{view:4d}   {centre:8.2f} +- {centre_error:4.2f}   {angle:7.2f} +- {angle_error:4.2f}"
+    rows = zip(found.centres_px, found.centre_uncertainty_px, angles, sigmas, strict=True)
+    for view, (centre, error, angle, sigma) in enumerate(rows):
+        print(f"{view:4d}   {centre:8.2f} +- {error:4.2f}   {angle:7.2f} +- {sigma:4.2f}")
+    report({}, as_json, [out, preview])
+
+
+def calibrate_range(
+    shots: list[str] = arg(
+        "SHOT...",
+        "Shots of the target: streak images, recovered frames, or photons as lidar photons takes them.",
+        read=True,
+    ),
+    target_m: list[float] = opt(
+        "M",
+        "Distance of the target along the optical axis; once for all shots, or again for each.",
+        ...,
+    ),
+    out: Path = opt("H5", "The camera file to write.", ...),
+    camera: Path | None = opt(
+        "H5", "That is calibrated.", shown="the one inside the first shot; of photons a pinhole"
+    ),
+    reflectance_percent: list[float] | None = opt(
+        "PERCENT",
+        "Of the target; once for all shots, or again for each, times its filter's transmission.",
+        shown="not known",
+    ),
+    walk: bool | None = opt(
+        None,
+        "Fit how ranges depend on intensity, or refuse; or leave it.",
+        name="--walk/--no-walk",
+        shown="where the shots can tell",
+    ),
+    region: tuple[int, int, int, int] | None = opt(
+        "Y0 Y1 X0 X1",
+        "Rows and columns where the target is, the last ones not included.",
+        shown="everywhere",
+    ),
+    method: str = opt(
+        "NAME",
+        "By which streak images are recovered: tv, l1 or linear; that of later shots.",
+        "tv",
+        choices=("tv", "l1", "linear"),
+    ),
+    bin_width: float | None = opt(
+        "PS", "Duration of a row or bin.", name="--bin-width-ps", shown="the file's"
+    ),
+    pulse_fwhm: float | None = opt(
+        "PS",
+        "Of photons: full width at half maximum of the pulse.",
+        name="--pulse-ps",
+        shown="learnt",
+    ),
+    axes: str | None = AXES,
+    focal_length_px: float | None = FOCAL_LENGTH,
+    field_of_view_deg: float = FIELD_OF_VIEW,
+    preview: Path | None = PREVIEW,
+    as_json: bool = JSON,
+) -> None:
+    """Find time zero, range walk, offsets, response and reflectance from shots of a target.
+
+    The target is flat, faces the camera and fills most of the picture. One shot gives time zero,
+    two give what each pixel measures too long and how bright it is, three of different brightness
+    (other distances, or grey filters) how ranges depend on intensity. All of it goes into the camera
+    file, with standard deviations, and is used wherever that camera is: recover, cloud, stream, view,
+    lidar sequence and lidar photons. A shot of anything but a plate is refused.
+
+    Example: tofclip calibrate range --target-m 1.5 plate.h5 --out camera.h5
+
+    Example: tofclip calibrate range --target-m 1 --target-m 2 --target-m 3 near.npy middle.npy far.npy
+    --bin-width-ps 80 --reflectance-percent 50 --out camera.h5
+    """
+    import math
+
+    from apps.figures.range_calibration import make_range_calibration_figure
+    from apps.figures.style import save_figure
+    from tofclip.camera import Camera
+    from tofclip.lidar import Pulse
+    from tofclip.lidar.range_calibration import fit_range_calibration
+
+    preview = choose_preview(out, preview, (*shots, camera))
+    require_view(focal_length_px, field_of_view_deg)
+    distances = _one_each(target_m, len(shots), "--target-m")
+    # NaN stands for a target of unknown reflectance; given, it is a mistake.
+    if any(map(math.isnan, reflectance_percent or [])):
+        raise InputError("--reflectance-percent must be a positive percentage, got nan")
+    percents = _one_each(reflectance_percent or [math.nan], len(shots), "--reflectance-percent")
+    reader = _ShotReader(
+        None if camera is None else Camera.load(camera),
+        method,
+        bin_width,
+        None if pulse_fwhm is None else Pulse.gaussian(pulse_fwhm),
+        axes,
+        (focal_length_px, field_of_view_deg),
+    )
+    seen = []
+    with show_progress("looking at the target", len(shots)) as advance:
+        for shot, distance, percent in zip(shots, distances, percents, strict=True):
+            one = replace(reader.read(shot, distance), reflectance_percent=percent)
+            seen.append(one if region is None else _cut(one, region))
+            advance(1)
+    found = fit_range_calibration(seen, walk=walk)
+    found.camera.save(out)
+    save_figure(make_range_calibration_figure(found), preview)
+    report(_list_figures(found, len(shots)), as_json, [out, preview])
+
+
+def _one_each(values: list[float], shots: int, option: str) -> list[float]:
+    """Give every shot its value."""
+    if len(values) not in (1, shots):
+        raise InputError(
+            f"{option}: give one for all {shots} shots or one for each, got {len(values)}"
         )
-    report({}, as_json, written)
+    return values * shots if len(values) == 1 else values
+
+
+def _cut(shot: TargetShot, region: tuple[int, int, int, int]) -> TargetShot:
+    """Leave the returns within some rows and columns."""
+    top, bottom, left, right = region
+    rows, columns = shot.returns.camera.image_shape
+    if not (0 <= top < bottom <= rows and 0 <= left < right <= columns):
+        raise InputError(f"--region: the picture has rows 0..{rows} and columns 0..{columns}")
+    y, x = shot.returns.y, shot.returns.x
+    return shot.cut((y >= top) & (y < bottom) & (x >= left) & (x < right))
+
+
+@dataclass(frozen=True)
+class _ShotReader:
+    """How shots of the target are read: frames, streak images, or counted photons."""
+
+    camera: Camera | None
+    method: str
+    bin_width: float | None  # s
+    pulse: Pulse | None
+    axes: str | None
+    view: tuple[float | None, float]  # focal length, px, and field of view, degrees, of a pinhole
+
+    def read(self, shot: str, distance: float) -> TargetShot:
+        """Find the returns of a shot of a target at a distance, m, as they were measured."""
+        from tofclip.lidar import depth
+        from tofclip.lidar.range_calibration import TargetShot
+
+        if not 0 < distance < float("inf"):
+            raise InputError(f"--target-m: a distance must be a positive length, got {distance}")
+        frames = self._load_frames(shot, distance)
+        if frames is None:
+            return self._read_photons(shot, distance)
+        if frames.returns is not None and frames.camera.range_calibration is not None:
+            raise InputError(
+                f"{shot}: its returns are corrected already: recover it with a camera without a "
+                "range calibration"
+            )
+        bare = frames.camera.replace(range_calibration=None)
+        returns = depth(frames, bare) if frames.returns is None else frames.returns
+        record = float(frames.times[0]), float(frames.times[-1])
+        return TargetShot(replace(returns, camera=bare), distance, record, shot)
+
+    def _load_frames(self, shot: str, distance: float) -> Frames | None:
+        """Load frames or recover them; None of counted photons."""
+        from devices.counted_photons import find_address
+        from tofclip.files import translate_read_errors
+        from tofclip.io import read_streak
+        from tofclip.recovery import make_method, open_shot, parse_focus, plan_recovery
+        from tofclip.shots import Frames
+        from tofclip.storage import HDF5_SIGNATURE, read_outline
+
+        if "://" in shot or Path(shot).suffix.lower() in PHOTON_SUFFIXES or find_address(shot):
+            return None
+        with translate_read_errors(shot), open(shot, "rb") as file:
+            ours = file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
+        try:
+            if ours and read_outline(shot).kind == Frames.RECORD_KIND:
+                return Frames.load(shot)
+            streak = read_streak(shot, self.bin_width)
+        except FileFormatError:
+            return None
+        known = self.camera or streak.camera
+        if known is None:
+            raise InputError(f"{streak.source} carries no camera: give one (`camera`)")
+        known = known.replace(range_calibration=None)
+        # Before anything that comes back, so that no return is lost to a time zero not yet known.
+        first, last = streak.times[[0, -1]]
+        opened = open_shot(streak, known, float(2 * first - last))
+        # The target's distance is known, and so is where the views see it.
+        focus = parse_focus(f"fixed:{float(known.shear_at(distance)):.9g}")
+        return plan_recovery(opened, make_method(self.method), focus, "cpu").run()
+
+    def _read_photons(self, shot: str, distance: float) -> TargetShot:
+        from apps.verbs.photons import read_any_photons
+        from tofclip.lidar.photons import estimate_pixels
+        from tofclip.lidar.range_calibration import TargetShot
+
+        image, pulse, first_time = read_any_photons(shot, self.bin_width, self.axes)
+        found = estimate_pixels(image, self.pulse or pulse)
+        seen_by = choose_camera(self.camera, image.image_shape, *self.view, found.pulse.fwhm)
+        # Ranges count from the first bin, as time zero will.
+        from_start = seen_by.replace(time_zero=0.0, range_calibration=None)
+        returns = found.calibrate(from_start, first_time).to_returns(from_start)
+        last_time = first_time + (image.bins - 1) * image.bin_width
+        return TargetShot(returns, distance, (first_time, last_time), shot)
+
+
+def _list_figures(found: RangeFit, shots: int) -> dict[str, Any]:
+    """List what was found; what was not is None, with the reason in a note."""
+    import numpy as np
+
+    known = found.calibration
+    has_walk = bool(known.walk.size)
+    has_offsets = bool(known.offsets.size)
+    figures: dict[str, Any] = {
+        "shots": shots,
+        "target_share": found.target_fraction,
+        "time_zero_ns": found.camera.time_zero / NANOSECOND,
+        "time_zero_sigma_ps": known.time_zero_sigma / PICOSECOND,
+        "shot_jitter_ps": found.jitter / PICOSECOND,
+        "intensity_counts": known.signal_range,
+        "walk_mm_per_decade": known.walk[0] / MILLIMETRE if has_walk else None,
+        "walk_sigma_mm": np.sqrt(known.walk_covariance[0, 0]) / MILLIMETRE if has_walk else None,
+        "offset_rms_mm": found.offset_spread / MILLIMETRE,
+        "offset_sigma_mm": np.median(known.offset_sigma) / MILLIMETRE if has_offsets else None,
+        "response_rms": np.std(known.response) if known.response.size else None,
+        "reflectance_percent_of_one_count_at_1_m": known.reflectance_scale,
+        "reflectance_relative_sigma": known.reflectance_scale_sigma,
+    }
+    notes = {"walk": found.walk_note, "offsets": found.offsets_note}
+    return figures | {f"{name}_note": note for name, note in notes.items() if note}

@@ -3,184 +3,105 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import typer
-
-from apps.conventions import (
-    RECORD_SUFFIXES,
-    JsonOption,
-    build_provenance,
-    make_completer,
-    report,
-    require_writable,
-)
+from apps.help import make_group
+from apps.options import JSON, arg, opt
 from apps.progress import show_progress
+from apps.report import RECORD_SUFFIXES, build_provenance, report, require_writable
 from tofclip.errors import InputError
-from tofclip.files import atomic_path
-from tofclip.io.light_fields import read_depth_map, read_light_field
-from tofclip.light_field.measurement import (
-    CameraSetup,
-    ClipMeasurement,
-    corrupt_measurement,
-    measure,
-)
-from tofclip.metrics import nmse, nmse_energy
-from tofclip.recovery.all_in_focus import (
-    AllInFocus,
-    count_recoveries,
-    make_shear_range,
-    recover_all_in_focus,
-    recover_on_depth_map,
-)
-from tofclip.recovery.light_field import ClipRecovery, ClipResult
-from tofclip.storage import Field, Record
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tofclip.light_field import LightField
+    from tofclip.light_field.measurement import ClipMeasurement
+    from tofclip.recovery.all_in_focus import AllInFocus
+    from tofclip.recovery.light_field import ClipRecovery
 
-
-# Views leave the picture there, so that the rim is not scored.
-SCORED_BORDER_PX = 12
+SCORED_BORDER_PX = 12  # views leave the picture there, so that the rim is not scored
+ENCODERS = (
+    *("line", "line-even", "single-pixel", "coded-line"),
+    *("coded-aperture", "cubic-phase", "diffuser"),
+)
 SURFACES = "surfaces"
+READABLE = "NPZ, HDF5, EXR with a part per view, or a folder."
 
-app = typer.Typer(help="Light fields from few nonlocal measurements.", no_args_is_help=True)
+app = make_group("Light fields from few nonlocal measurements.")
 
 
 @app.command()
 def simulate(
-    light_field: Annotated[
-        Path,
-        typer.Argument(
-            metavar="LIGHTFIELD", help="NPZ, HDF5, EXR with a part per view, or a folder."
-        ),
-    ],
-    encoder: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="line, line-even, single-pixel, coded-line, coded-aperture, cubic-phase or diffuser.",
-            autocompletion=make_completer(
-                "line",
-                "line-even",
-                "single-pixel",
-                "coded-line",
-                "coded-aperture",
-                "cubic-phase",
-                "diffuser",
-            ),
-        ),
-    ],
-    out: Annotated[Path, typer.Option(metavar="H5", help="The measurements to write.")],
-    sampling_ratio: Annotated[
-        float, typer.Option(metavar="SR", help="Measurements over pixels of one picture.")
-    ] = 0.5,
-    seed: Annotated[
-        int,
-        typer.Option(
-            metavar="N", min=0, help="For angles, codes, photons and corrupted measurements."
-        ),
-    ] = 0,
-    bad_fraction: Annotated[
-        float, typer.Option(metavar="SHARE", help="Measurements set to 0 or to the largest.")
-    ] = 0.0,
-    photons: Annotated[
-        float | None,
-        typer.Option(
-            metavar="N", help="Photons of the largest measurement.", show_default="no noise"
-        ),
-    ] = None,
-    as_json: JsonOption = False,
+    light_field: Path = arg("LIGHTFIELD", READABLE, read=True),
+    encoder: str = opt(
+        "NAME",
+        f"{', '.join(ENCODERS[:-1])} or {ENCODERS[-1]}.",
+        ...,
+        choices=ENCODERS,
+    ),
+    out: Path = opt("H5", "The measurements to write.", ...),
+    sampling_ratio: float = opt("SR", "Measurements over pixels of one picture.", 0.5),
+    seed: int = opt("N", "For angles, codes, photons and corrupted measurements.", 0, min=0),
+    bad_fraction: float = opt("SHARE", "Measurements set to 0 or to the largest.", 0.0),
+    photons: float | None = opt("N", "Photons of the largest measurement.", shown="no noise"),
+    as_json: bool = JSON,
 ) -> None:
     """Measure the true views of a light field with a camera of few measurements.
 
     Example: tofclip clip simulate light_field.npz --encoder line --sampling-ratio 0.5 --out
     measurements.h5
     """
+    from tofclip.io.light_fields import read_light_field
+    from tofclip.light_field.measurement import CameraSetup, corrupt_measurement, measure
+
     require_writable(out, *RECORD_SUFFIXES, inputs=(light_field,))
     known = read_light_field(light_field)
     setup = CameraSetup(encoder, sampling_ratio, seed)
     measurement = corrupt_measurement(measure(known, setup), photons, bad_fraction)
-    settings = {
-        "verb": "clip simulate",
-        **asdict(setup),
-        "bad_fraction": bad_fraction,
-        "photons": photons or 0.0,
-    }
-    replace(measurement, provenance=build_provenance(settings, light_field)).save(out)
-    figures = {
-        "readings": measurement.values.size,
-        "image_shape": measurement.image_shape,
-        **asdict(setup),
-    }
-    report(figures, as_json, [out])
+    noise = {"bad_fraction": bad_fraction, "photons": photons or 0.0}
+    past = build_provenance({"verb": "clip simulate", **asdict(setup), **noise}, light_field)
+    replace(measurement, provenance=past).save(out)
+    figures = {"readings": measurement.values.size, "image_shape": measurement.image_shape}
+    report({**figures, **asdict(setup)}, as_json, [out])
 
 
 @app.command()
 def recover(
-    measurement: Annotated[
-        Path, typer.Argument(metavar="H5", help="Measurements made by clip simulate.")
-    ],
-    shear: Annotated[
-        float, typer.Option(metavar="S", help="Depth to focus on, pixels per view step.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The picture: .h5, .png or .exr.")],
-    prior: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="tv, wavelet or l1; or a denoiser: collaborative, bm3d or nlm.",
-            autocompletion=make_completer("tv", "wavelet", "l1", "collaborative", "bm3d", "nlm"),
-        ),
-    ] = "tv",
-    preset: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="fast; quality: a denoiser finishes; surfaces: each pixel at its own depth.",
-            autocompletion=make_completer("fast", "quality", "surfaces"),
-        ),
-    ] = "fast",
-    weight: Annotated[
-        str,
-        typer.Option(metavar="auto|VALUE", help="Of the prior, relative; auto: cross-validation."),
-    ] = "auto",
-    data_term: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="squares; huber for corrupted measurements; poisson for few photons.",
-            autocompletion=make_completer("squares", "huber", "poisson"),
-        ),
-    ] = "squares",
-    truth: Annotated[
-        Path | None, typer.Option(metavar="LIGHTFIELD", help="Light field to score against.")
-    ] = None,
-    all_in_focus: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Picture sharp at all depths to write: .h5 (with its depths), .png or .exr.",
-        ),
-    ] = None,
-    depth_map: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Known shear of each pixel: .npy, or .h5 written by --all-in-focus.",
-            show_default="found from the measurements",
-        ),
-    ] = None,
-    shear_range: Annotated[
-        tuple[float, float],
-        typer.Option(metavar="S S", help="Nearest and farthest shear of surfaces to look for."),
-    ] = (-1.4, 1.4),
-    as_json: JsonOption = False,
+    measurement: Path = arg("H5", "Measurements made by clip simulate.", read=True),
+    shear: float = opt("S", "Depth to focus on, pixels per view step.", ...),
+    out: Path = opt("FILE", "The picture: .h5, .png or .exr.", ...),
+    prior: str = opt(
+        "NAME",
+        "tv, wavelet or l1; or a denoiser: collaborative, bm3d or nlm.",
+        "tv",
+        choices=("tv", "wavelet", "l1", "collaborative", "bm3d", "nlm"),
+    ),
+    preset: str = opt(
+        "NAME",
+        "fast; quality: a denoiser finishes; surfaces: each pixel at its own depth.",
+        "fast",
+        choices=("fast", "quality", SURFACES),
+    ),
+    weight: str = opt("auto|VALUE", "Of the prior, relative; auto: cross-validation.", "auto"),
+    data_term: str = opt(
+        "NAME",
+        "squares; huber for corrupted measurements; poisson for few photons.",
+        "squares",
+        choices=("squares", "huber", "poisson"),
+    ),
+    truth: Path | None = opt("LIGHTFIELD", "Light field to score against."),
+    all_in_focus: Path | None = opt(
+        "FILE", "Picture sharp at all depths to write: .h5 (with its depths), .png or .exr."
+    ),
+    depth_map: Path | None = opt(
+        "FILE",
+        "Known shear of each pixel: .npy, or .h5 written by --all-in-focus.",
+        shown="found from the measurements",
+    ),
+    shear_range: tuple[float, float] = opt(
+        "S S", "Nearest and farthest shear of surfaces to look for.", (-1.4, 1.4)
+    ),
+    as_json: bool = JSON,
 ) -> None:
     """Recover the picture refocused at one depth, and one that is sharp at all depths.
 
@@ -189,88 +110,65 @@ def recover(
 
     Example: tofclip clip recover measurements.h5 --shear -0.3 --preset quality --out picture.png
     """
-    # No output may replace a file that is read.
-    inputs = (measurement, truth, depth_map)
+    import numpy as np
+
+    from tofclip.io.light_fields import read_light_field
+    from tofclip.light_field.measurement import ClipMeasurement
+    from tofclip.metrics import nmse, nmse_energy
+    from tofclip.recovery.light_field import ClipRecovery
+
     outputs = [path for path in (out, all_in_focus) if path is not None]
-    # A wrong ending is refused before the recovery, not after it.
+    # A wrong ending is refused before the recovery, not after it; no output replaces an input.
     for path in outputs:
-        require_writable(path, ".h5", ".png", ".exr", inputs=inputs)
+        require_writable(path, ".h5", ".png", ".exr", inputs=(measurement, truth, depth_map))
     if out == all_in_focus:
         raise InputError("--out and --all-in-focus name the same file; take two")
     if depth_map is not None and preset != SURFACES and all_in_focus is None:
         raise InputError("--depth-map serves --preset surfaces and --all-in-focus only")
     # Surfaces are found with the settings of the fast preset, whichever refocuses.
-    surface_settings = ClipRecovery(prior, "fast", _parse_weight(weight), data_term)
-    settings = replace(surface_settings, preset="fast" if preset == SURFACES else preset)
+    quick = ClipRecovery(prior, "fast", _parse_weight(weight), data_term)
+    settings = replace(quick, preset="fast" if preset == SURFACES else preset)
     measurements = ClipMeasurement.load(measurement)
-    known_field = None if truth is None else read_light_field(truth)
-    find_surfaces = partial(
-        _find_surfaces, measurements, surface_settings, depth_map=depth_map, shears=shear_range
-    )
-    if preset == SURFACES:
-        found = _refocus_surfaces(measurements, shear, find_surfaces(weight=settings.weight))
+    known = None if truth is None else read_light_field(truth)
+    surfaces = None
+    if preset == SURFACES or all_in_focus is not None:
+        own_weight = settings.weight if preset == SURFACES else None
+        surfaces = _find_surfaces(measurements, quick, depth_map, shear_range, own_weight)
+    found: Any = surfaces
+    seconds = ["seconds"]
+    if surfaces is not None and preset == SURFACES:
+        picture = surfaces.render_views(measurements.views).refocus(shear)
     else:
-        surfaces = None if all_in_focus is None else find_surfaces(weight=None)
-        found = _refocus_measurements(measurements, shear, settings, surfaces)
-    past = {
-        "verb": "clip recover",
-        "shear": shear,
-        "prior": prior,
-        "preset": preset,
-        "data_term": data_term,
-    }
+        title = "recovering" if settings.weight is not None else "choosing the weight"
+        with show_progress(title, settings.work) as advance:
+            found = settings.recover(measurements, shear, advance)
+        picture = found.picture
+        seconds += ["seconds_setup", "seconds_weight"]
     figures: dict[str, Any] = {}
-    if known_field is not None:
-        figures |= _score_picture(found.picture, known_field.refocus(shear))
-    if found.surfaces is not None and all_in_focus is not None:
-        figures |= _write_all_in_focus(found.surfaces, known_field, all_in_focus, measurement, past)
-    figures |= found.figures
-    past |= {"weight": found.figures["weight"]}
-    _write_picture({"picture": found.picture}, out, measurement, past)
-    report(figures, as_json, outputs)
-
-
-class _Refocused(NamedTuple):
-    """A picture refocused at one depth, and the surfaces if they were looked for."""
-
-    picture: NDArray[Any]
-    figures: dict[str, Any]
-    surfaces: AllInFocus | None
-
-
-def _refocus_surfaces(
-    measurements: ClipMeasurement, shear: float, surfaces: AllInFocus
-) -> _Refocused:
-    """Render the picture at one depth from the one that explains all measurements."""
-    picture = surfaces.render_views(measurements.views).refocus(shear)
-    figures = _describe_recovery(surfaces) | {"seconds": surfaces.seconds}
-    return _Refocused(picture, figures, surfaces)
-
-
-def _refocus_measurements(
-    measurements: ClipMeasurement,
-    shear: float,
-    settings: ClipRecovery,
-    surfaces: AllInFocus | None,
-) -> _Refocused:
-    """Recover the picture at one depth from the measurements, taken to be sheared alike."""
-    title = "recovering" if settings.weight is not None else "choosing the weight"
-    with show_progress(title, settings.work) as advance:
-        found = settings.recover(measurements, shear, advance)
-    seconds = {
-        "seconds": found.seconds,
-        "seconds_setup": found.seconds_setup,
-        "seconds_weight": found.seconds_weight,
-    }
-    return _Refocused(found.picture, _describe_recovery(found) | seconds, surfaces)
-
-
-def _describe_recovery(found: AllInFocus | ClipResult) -> dict[str, Any]:
-    return {
+    if known is not None:
+        refocused = known.refocus(shear)
+        figures = {
+            "nmse": nmse(picture, refocused, SCORED_BORDER_PX),
+            "nmse_whole_frame": nmse(picture, refocused),
+            "nmse_energy": nmse_energy(picture, refocused, SCORED_BORDER_PX),
+        }
+    past = {"verb": "clip recover", "shear": shear, "prior": prior}
+    past |= {"preset": preset, "data_term": data_term}
+    if surfaces is not None and all_in_focus is not None:
+        arrays = {"picture": surfaces.picture, "shears": surfaces.shears}
+        _write_picture(arrays, all_in_focus, measurement, past | {"weight": surfaces.weight})
+        if known is not None and np.all(known.views == 0, axis=1).any():
+            truth_picture = known.pictures[np.all(known.views == 0, axis=1)][0]
+            score = nmse(surfaces.picture, truth_picture, SCORED_BORDER_PX)
+            figures["nmse_all_in_focus"] = score
+    figures |= {
         "weight": found.weight,
         "iterations": found.iterations,
         "stopped_because": found.stop_reason,
+        **{name: getattr(found, name) for name in seconds},
     }
+    _write_picture({"picture": picture}, out, measurement, past | {"weight": found.weight})
+    report(figures, as_json, outputs)
 
 
 def _find_surfaces(
@@ -281,38 +179,22 @@ def _find_surfaces(
     weight: float | None,
 ) -> AllInFocus:
     """Recover one picture with a depth for each pixel, known or found."""
+    from tofclip.io.light_fields import read_depth_map
+    from tofclip.recovery import all_in_focus
+
     if depth_map is not None:
         known = read_depth_map(depth_map)
         with show_progress("recovering at known depths", 1) as advance:
-            found = recover_on_depth_map(measurements, known, weight, settings)
+            found = all_in_focus.recover_on_depth_map(measurements, known, weight, settings)
             advance(1)
         return found
-    tried = make_shear_range(*shears, measurements.views)
-    with show_progress("looking for depths", count_recoveries(tried)) as advance:
-        return recover_all_in_focus(measurements, tried, weight, settings, advance)
-
-
-def _write_all_in_focus(
-    surfaces: AllInFocus,
-    truth: LightField | None,
-    out: Path,
-    measurement: Path,
-    past: dict[str, Any],
-) -> dict[str, float]:
-    """Write the picture that is sharp everywhere; return how far it is from the reference view."""
-    past = past | {"weight": surfaces.weight}
-    _write_picture({"picture": surfaces.picture, "shears": surfaces.shears}, out, measurement, past)
-    if truth is None:
-        return {}
-    references = truth.pictures[np.all(truth.views == 0, axis=1)]
-    if not len(references):
-        return {}
-    return {"nmse_all_in_focus": nmse(surfaces.picture, references[0], SCORED_BORDER_PX)}
+    tried = all_in_focus.make_shear_range(*shears, measurements.views)
+    with show_progress("looking for depths", all_in_focus.count_recoveries(tried)) as advance:
+        return all_in_focus.recover_all_in_focus(measurements, tried, weight, settings, advance)
 
 
 def _parse_weight(text: str) -> float | None:
-    """Return the weight that was asked for, None for `auto`."""
-    # No weight lets the recovery choose one by cross-validation.
+    """Return the weight that was asked for, None for `auto`: cross-validation chooses it."""
     if text == "auto":
         return None
     try:
@@ -321,33 +203,25 @@ def _parse_weight(text: str) -> float | None:
         raise InputError(f"--weight takes 'auto' or a number, not '{text}'") from None
 
 
-def _score_picture(picture: NDArray[Any], refocused: NDArray[Any]) -> dict[str, float]:
-    """Compare with the true views' shift-and-add."""
-    return {
-        "nmse": nmse(picture, refocused, SCORED_BORDER_PX),
-        "nmse_whole_frame": nmse(picture, refocused),
-        "nmse_energy": nmse_energy(picture, refocused, SCORED_BORDER_PX),
-    }
-
-
 def _write_picture(
     arrays: dict[str, NDArray[Any]], out: Path, measurement: Path, settings: dict[str, Any]
 ) -> None:
     """Write the picture; a PNG is scaled to the picture's own brightest pixel, the others keep the
     values, and HDF5 keeps its shears as well.
     """
-    picture = arrays["picture"]
-    if out.suffix.lower() == ".h5":
-        units = {"shears": "px"}
-        fields_kept = {
-            name: Field(values, units.get(name, ""), ("y", "x")) for name, values in arrays.items()
-        }
+    from tofclip.files import atomic_path
+    from tofclip.storage import Field, Record
+
+    picture, suffix = arrays["picture"], out.suffix.lower()
+    if suffix == ".h5":
+        units = {"picture": "", "shears": "px"}
+        fields = {name: Field(arrays[name], units[name], ("y", "x")) for name in arrays}
         past = build_provenance(settings, measurement)
-        Record("picture", fields_kept, {"shear": settings["shear"]}, provenance=past).save(out)
+        Record("picture", fields, {"shear": settings["shear"]}, provenance=past).save(out)
         return
     # Both libraries write to the name they get, which is not the final one yet.
     with atomic_path(out) as temporary:
-        if out.suffix.lower() == ".exr":
+        if suffix == ".exr":
             import OpenEXR
 
             header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}

@@ -3,42 +3,20 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from apps.conventions import JsonOption, build_provenance, make_folder, report
-from apps.figures.demo import make_demo_figure
-from apps.figures.style import save_figure
+from apps.options import JSON, SEED, opt
 from apps.progress import show_progress
-from tofclip.lidar import depth, point_cloud
-from tofclip.metrics import nmse
-from tofclip.recovery import open_shot, plan_recovery
-from tofclip.simulate import (
-    make_default_instrument,
-    make_default_scene,
-    make_nominal_camera,
-    render_true_frames,
-    score_returns,
-    simulate_shot,
-)
-
-if TYPE_CHECKING:
-    from tofclip.lidar import PointCloud, Returns
-    from tofclip.shots import Frames, Streak
-    from tofclip.simulate import SimulatedShot
+from apps.report import build_provenance, make_folder, report
 
 BORDER_PX = 12  # views leave the slit there, so the picture's rim is not scored
 
 
 def demo(
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for the results; made if missing.")
-    ] = Path("demo-output"),
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Of the photon noise.")] = 0,
-    as_json: JsonOption = False,
+    out: Path = opt("DIR", "Folder for the results; made if missing.", Path("demo-output")),
+    seed: int = SEED,
+    as_json: bool = JSON,
 ) -> None:
     """Simulate a scene of letters and plates, recover it from one streak image, and compare with
     the truth.
@@ -49,41 +27,22 @@ def demo(
 
     Example: tofclip demo --out demo-output
     """
+    from apps.figures.demo import make_demo_figure
+    from apps.figures.style import save_figure
+    from tofclip.lidar import depth, point_cloud
+    from tofclip.metrics import nmse
+    from tofclip.recovery import open_shot, plan_recovery
+    from tofclip.simulate import (
+        make_default_instrument,
+        make_default_scene,
+        make_nominal_camera,
+        render_true_frames,
+        score_returns,
+        simulate_shot,
+    )
+
     started = time.perf_counter()
     make_folder(out)
-    run = _run_demo(seed)
-    written = [out / name for name in ("streak.h5", "frames.h5", "cloud.ply", "preview.png")]
-    run.streak.save(written[0])
-    run.frames.save(written[1])
-    run.cloud.save(written[2])
-    save_figure(
-        make_demo_figure(
-            run.streak, run.frames, run.returns, run.cloud, run.shot.truth, run.compared
-        ),
-        written[3],
-    )
-    report(
-        {"seed": seed, **_collect_metrics(run), "seconds": time.perf_counter() - started},
-        as_json,
-        written,
-    )
-
-
-@dataclass(frozen=True)
-class DemoRun:
-    """Everything that a demonstration made, and the truth behind it."""
-
-    shot: SimulatedShot
-    truth: Frames
-    streak: Streak
-    frames: Frames
-    compared: Frames
-    returns: Returns
-    cloud: PointCloud
-
-
-def _run_demo(seed: int) -> DemoRun:
-    """The whole way, from a scene to a point cloud."""
     scene, instrument = make_default_scene(), make_default_instrument()
     shot = simulate_shot(scene, instrument, seed)
     streak = replace(shot.streak, camera=make_nominal_camera(shot.camera))
@@ -94,22 +53,26 @@ def _run_demo(seed: int) -> DemoRun:
     by_frames = plan_recovery(open_shot(streak, frames.camera))
     with show_progress("for comparison", by_frames.work) as advance:
         compared = by_frames.run(advance)
-    frames = replace(
-        frames,
-        provenance=build_provenance({"verb": "demo", "seed": seed}, earlier=frames.provenance),
-    )
+    past = build_provenance({"verb": "demo", "seed": seed}, earlier=frames.provenance)
+    frames = replace(frames, provenance=past)
     returns = depth(frames) if frames.returns is None else frames.returns
-    truth = render_true_frames(scene, instrument, shot.exposure)
-    return DemoRun(shot, truth, streak, frames, compared, returns, point_cloud(returns))
-
-
-def _collect_metrics(run: DemoRun) -> dict[str, Any]:
+    cloud = point_cloud(returns)
+    written = [out / name for name in ("streak.h5", "frames.h5", "cloud.ply", "preview.png")]
+    streak.save(written[0])
+    frames.save(written[1])
+    cloud.save(written[2])
+    figure = make_demo_figure(streak, frames, returns, cloud, shot.truth, compared)
+    save_figure(figure, written[3])
     # Light of all instants together: the picture a camera without time of flight would take.
-    picture, truth = run.frames.values.sum(axis=0), run.truth.values.sum(axis=0)
-    return {
-        **score_returns(run.returns, run.shot.truth),
+    picture = frames.values.sum(axis=0)
+    truth = render_true_frames(scene, instrument, shot.exposure).values.sum(axis=0)
+    figures = {
+        "seed": seed,
+        **score_returns(returns, shot.truth),
         "image_nmse": nmse(picture, truth),
         "image_nmse_inner": nmse(picture, truth, BORDER_PX),
-        "relative_residual": run.frames.figures["relative_residual"],
-        "points": len(run.cloud),
+        "relative_residual": frames.figures["relative_residual"],
+        "points": len(cloud),
+        "seconds": time.perf_counter() - started,
     }
+    report(figures, as_json, written)

@@ -1,49 +1,44 @@
-"""`tofclip devices`: find instruments, try them out, look after their recordings."""
+"""`tofclip devices` and `tofclip record`: find instruments, try them out, record them, look after
+their recordings.
+"""
 
 from __future__ import annotations
 
+import math
+import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-import devices
-from apps.conventions import RECORD_SUFFIXES, JsonOption, report, require_writable
-from apps.verbs.record import show_time_progress
-from devices import discover, registry
-from devices.recorder import measure_throughput
-from devices.recording.check import repair as repaired
-from devices.recording.check import verify as verified
+from apps.help import make_group
+from apps.options import JSON, arg, flag, opt
+from apps.progress import show_share
+from apps.report import RECORD_SUFFIXES, build_provenance, report, require_writable
+from tofclip.errors import InputError
 
 EXIT_DAMAGED = 2
+ADDRESS = arg("URI", "Such as timetag://SERIAL, file://run.h5 or 'sim+timetag://?seed=1'.")
+RECORDING = arg("H5", "Made by tofclip record.", read=True)
 
-app = typer.Typer(
-    help="Streak cameras, SPAD sensors, time taggers and their recordings.", no_args_is_help=True
-)
-
-AddressArgument = Annotated[
-    str,
-    typer.Argument(
-        metavar="URI", help="Such as timetag://SERIAL, file://run.h5 or 'sim+timetag://?seed=1'."
-    ),
-]
-RecordingArgument = Annotated[Path, typer.Argument(metavar="H5", help="Made by tofclip record.")]
+app = make_group("Streak cameras, SPAD sensors, time taggers and their recordings.")
 
 
 @app.command("list")
-def list_(as_json: JsonOption = False) -> None:
+def list_(as_json: bool = JSON) -> None:
     """Show the instruments that are connected, and the kinds of addresses there are.
 
     Example: tofclip devices list
     """
+    from devices import discover, registry
+
     found = [asdict(one) for one in discover()]
     # Files have no opener of their own: the name's ending chooses one.
     kinds = sorted({*registry.OPENERS, "file"})
     if as_json:
-        report(
-            {"devices": found, "kinds": kinds, "file_types": sorted(registry.FILE_OPENERS)}, as_json
-        )
+        file_types = sorted(registry.FILE_OPENERS)
+        report({"devices": found, "kinds": kinds, "file_types": file_types}, as_json)
         return
     for one in found:
         print(f"{one['uri']:<24}{one['instrument']}{': ' if one['note'] else ''}{one['note']}")
@@ -52,11 +47,13 @@ def list_(as_json: JsonOption = False) -> None:
 
 
 @app.command()
-def info(uri: AddressArgument, as_json: JsonOption = False) -> None:
+def info(uri: str = ADDRESS, as_json: bool = JSON) -> None:
     """Say what is known about an instrument or a recording.
 
     Example: tofclip devices info 'sim+linospad2://?seed=1'
     """
+    import devices
+
     with devices.open(uri) as source:
         figures: dict[str, Any] = {
             **source.info.as_dict(),
@@ -74,21 +71,24 @@ def info(uri: AddressArgument, as_json: JsonOption = False) -> None:
 
 @app.command("test")
 def try_(
-    uri: AddressArgument,
-    seconds: Annotated[float, typer.Option(metavar="S", help="How long to read.")] = 5.0,
-    as_json: JsonOption = False,
+    uri: str = ADDRESS,
+    seconds: float = opt("S", "How long to read.", 5.0),
+    as_json: bool = JSON,
 ) -> None:
     """Read and decode for a while, and say how fast and how well that went.
 
     Example: tofclip devices test 'sim+timetag://?seed=1' --seconds 1
     """
-    with show_time_progress("reading", seconds) as watch:
+    import devices
+    from devices.recorder import measure_throughput
+
+    with show_share("reading", seconds) as watch:
         trial = measure_throughput(devices.open(uri), seconds, watch)
     report(trial.figures, as_json)
 
 
 @app.command()
-def verify(file: RecordingArgument, as_json: JsonOption = False) -> None:
+def verify(file: Path = RECORDING, as_json: bool = JSON) -> None:
     """Read a recording from end to end and compare it with its checksums and accounts; exit status
     2 if it is damaged.
 
@@ -96,27 +96,62 @@ def verify(file: RecordingArgument, as_json: JsonOption = False) -> None:
 
     Example: tofclip devices verify run.h5
     """
-    found = verified(file)
+    from devices.recording import check
+
+    found = check.verify(file)
     report(found.as_dict(), as_json)
     # The findings are printed in either case; only the exit status differs.
     if not found.is_sound:
-        typer.echo(
-            f"tofclip: error: {file}: is damaged; tofclip devices repair makes a sound copy",
-            err=True,
-        )
+        hint = "is damaged; tofclip devices repair makes a sound copy"
+        print(f"tofclip: error: {file}: {hint}", file=sys.stderr)
         raise typer.Exit(EXIT_DAMAGED)
 
 
 @app.command()
 def repair(
-    file: RecordingArgument,
-    out: Annotated[Path, typer.Option(metavar="H5", help="The sound copy to write.")],
-    as_json: JsonOption = False,
+    file: Path = RECORDING,
+    out: Path = opt("H5", "The sound copy to write.", ...),
+    as_json: bool = JSON,
 ) -> None:
     """Copy all that is sound of a damaged or unfinished recording, and mark where something is
     missing.
 
     Example: tofclip devices repair run.h5 --out sound.h5
     """
+    from devices.recording import check
+
     require_writable(out, *RECORD_SUFFIXES, inputs=(file,))
-    report(repaired(file, out).as_dict(), as_json, [out])
+    report(check.repair(file, out).as_dict(), as_json, [out])
+
+
+def record(
+    uri: str = arg("URI", "Such as timetag://SERIAL, or 'sim+timetag://?seed=1'; see devices."),
+    out: Path = opt("H5", "The recording to write.", ...),
+    seconds: float | None = opt("S", "How long.", shown="until its end, or Ctrl-C"),
+    overwrite: bool = flag("--overwrite", "Replace a recording that exists."),
+    as_json: bool = JSON,
+) -> None:
+    """Record an instrument: its bytes as they come, with clock, accounts and calibration.
+
+    However this ends, by Ctrl-C, a signal or a crash, the file holds what came until then and opens
+    as file://H5. Its content is tofclip's own format, not HDF5, whatever its name ends in.
+
+    Example: tofclip record 'sim+timetag://?seed=1' --out run.h5 --seconds 1
+    """
+    import devices
+    from devices.recorder import record_source
+
+    if seconds is not None and not seconds > 0:
+        raise InputError(f"--seconds must be positive, got {seconds:g}")
+    require_writable(out, *RECORD_SUFFIXES, inputs=(uri,))
+    past = build_provenance({"verb": "record", "uri": uri, "seconds": seconds})
+    limit = math.inf if seconds is None else seconds
+    with show_share("recording", seconds) as watch:
+        done = record_source(devices.open(uri), out, limit, past, watch, overwrite)
+    figures = done.stats.as_dict()
+    rate = {
+        "bytes": done.bytes,
+        "bytes_per_second": done.bytes / done.seconds,
+        "records": figures.pop("acquired"),
+    }
+    report({"seconds": done.seconds, **rate, **figures}, as_json, [out])

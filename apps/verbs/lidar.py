@@ -1,94 +1,106 @@
 """`tofclip lidar`: how well ranges can be known, how views move with range, a scene's objects,
-clouds of many shots.
+clouds of many shots, and these as one recording for other programs.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import numpy as np
-import typer
-
-from apps.conventions import (
+from apps.help import make_group
+from apps.jobs import report_summary, run_with_progress
+from apps.options import BIN_WIDTH, CAMERA, CLUSTER, FOCUS, JSON, SUFFIX, TIME_ZERO, arg, flag, opt
+from apps.progress import show_progress
+from apps.report import (
     PICTURE_SUFFIXES,
     RECORD_SUFFIXES,
-    ClusterOption,
-    JsonOption,
-    TimeZeroOption,
     describe_ranges,
     report,
     require_writable,
 )
-from apps.figures.scene import make_scene_figure
-from apps.figures.style import save_figure
-from apps.progress import show_progress
-from apps.sequences import report_summary, run_with_progress
-from apps.verbs.bag import bag
-from apps.verbs.cloud import require_format
 from apps.verbs.photons import photons
+from apps.verbs.recover import CLOUD_SUFFIXES, require_format
 from tofclip.errors import InputError
-from tofclip.files import require_apart
-from tofclip.lidar import Detection, Pulse, depth, point_cloud
-from tofclip.lidar.photons import PhotonDetector, measure_accuracy
-from tofclip.lidar.processing import find_objects
-from tofclip.lidar.significance import SCENE_BRIGHTNESS_QUANTILE
-from tofclip.recovery import count_parallax_work, fit_parallax_to_shot, open_shot
-from tofclip.sequences import RangingSettings, list_shots
-from tofclip.shots import Frames
-from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.sequences.jobs import Report
+    from tofclip.lidar.ros import StampedCloud
 
-app = typer.Typer()
+app = make_group(
+    "How well a range can be known, and how the views' parallax grows with it; many shots in a row."
+)
 app.command()(photons)
-app.command()(bag)
 
 
-@app.callback(invoke_without_command=True)
-def _show_help(context: typer.Context) -> None:
-    """How well a range can be known, and how the views' parallax grows with it; many shots in a
-    row.
+@app.command()
+def bag(
+    clouds: Path = arg("CLOUDS", "A folder or quoted pattern of point clouds.", read=True),
+    out: Path = opt(
+        "BAG",
+        "Ends in .mcap for one MCAP file; any other name is a new folder, a ROS 2 bag.",
+        ...,
+    ),
+    rate_hz: float = opt("HZ", "Clouds a second, in the order of their names.", 10.0),
+    start_s: float = opt("S", "Stamp of the first cloud, since the epoch.", 0.0),
+    as_json: bool = JSON,
+) -> None:
+    """Write clouds with stamps as ROS 2 messages (sensor_msgs/PointCloud2 in an optical frame).
+
+    Needs no ROS, but rosbags: pip install 'tofclip[exchange]'.
+
+    Example: tofclip lidar bag clouds/ --out drive.mcap --rate-hz 25
     """
-    # The group alone shows its help; a verb below it runs by itself.
-    if context.invoked_subcommand is None:
-        print(context.get_help())
+    from tofclip.lidar import PointCloud
+    from tofclip.lidar.ros import MCAP_SUFFIX, NANOSECONDS_PER_SECOND, StampedCloud, write_bag
+    from tofclip.sequences import list_files
+    from tofclip.sequences.ranging import PLAN_NAME
+
+    if not (rate_hz > 0 and start_s >= 0):
+        raise InputError("the rate must be positive and the start not negative")
+    files = [
+        file
+        for file in list_files(clouds).values()
+        if file.suffix.lower() in CLOUD_SUFFIXES and file.name != PLAN_NAME
+    ]
+    if not files:
+        raise InputError(f"{clouds}: there is no cloud; names end in {', '.join(CLOUD_SUFFIXES)}")
+    if out.suffix.lower() == MCAP_SUFFIX:
+        require_writable(out, inputs=files)
+    points = 0
+
+    def read() -> Iterator[StampedCloud]:
+        nonlocal points
+        for number, file in enumerate(files):
+            cloud = PointCloud.load(file)
+            points += len(cloud)
+            yield StampedCloud(cloud, round((start_s + number / rate_hz) * NANOSECONDS_PER_SECOND))
+            advance(1)
+
+    with show_progress("writing", len(files)) as advance:
+        number = write_bag(read(), out)
+    figures = {"clouds": number, "points": points, "seconds": (number - 1) / rate_hz}
+    report(figures, as_json, [out])
 
 
 @app.command()
 def accuracy(
-    photons: Annotated[
-        float, typer.Option(metavar="N", help="Expected photons of a return.")
-    ] = 100.0,
-    background: Annotated[
-        float, typer.Option(metavar="N", help="Expected background photons in a bin.")
-    ] = 0.1,
-    pulse_ps: Annotated[
-        float, typer.Option(metavar="PS", help="Full width at half maximum of the pulse.")
-    ] = 60.0,
-    decay_ps: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PS",
-            help="Time constant of the pulse's tail.",
-            show_default="a Gaussian, no tail",
-        ),
-    ] = None,
-    bin_width_ps: Annotated[float, typer.Option(metavar="PS", help="Duration of a bin.")] = 20.0,
-    bins: Annotated[int, typer.Option(metavar="N", help="Bins of a histogram.")] = 256,
-    false_alarm_rate: Annotated[
-        float,
-        typer.Option(
-            metavar="SHARE", help="Histograms without a return in which one may be announced."
-        ),
-    ] = 0.01,
-    trials: Annotated[
-        int, typer.Option(metavar="N", help="Histograms with a return, and as many without.")
-    ] = 2000,
-    seed: Annotated[int, typer.Option(metavar="N", help="Of the photons' chance.")] = 0,
-    as_json: JsonOption = False,
+    photons: float = opt("N", "Expected photons of a return.", 100.0),
+    background: float = opt("N", "Expected background photons in a bin.", 0.1),
+    width: float = opt("PS", "Full width at half maximum of the pulse.", 60.0, name="--pulse-ps"),
+    decay: float | None = opt(
+        "PS",
+        "Time constant of the pulse's tail.",
+        name="--decay-ps",
+        shown="a Gaussian, no tail",
+    ),
+    bin_width: float = opt("PS", "Duration of a bin.", 20.0, name="--bin-width-ps"),
+    bins: int = opt("N", "Bins of a histogram.", 256),
+    false_alarm_rate: float = opt(
+        "SHARE", "Histograms without a return in which one may be announced.", 0.01
+    ),
+    trials: int = opt("N", "Histograms with a return, and as many without.", 2000),
+    seed: int = opt("N", "Of the photons' chance.", 0),
+    as_json: bool = JSON,
 ) -> None:
     """Locate returns in simulated photon histograms and compare the error with the Cramer-Rao
     bound.
@@ -96,13 +108,13 @@ def accuracy(
     Example: tofclip lidar accuracy --photons 100 --background 0.1 --pulse-ps 60 --bin-width-ps 20
     --trials 200
     """
-    width = pulse_ps * PICOSECOND
-    pulse = (
-        Pulse.gaussian(width)
-        if decay_ps is None
-        else Pulse.exponentially_modified(width, decay_ps * PICOSECOND)
-    )
-    detector = PhotonDetector(pulse, bin_width_ps * PICOSECOND, bins, false_alarm_rate)
+    from dataclasses import asdict
+
+    from tofclip.lidar import Pulse
+    from tofclip.lidar.photons import PhotonDetector, measure_accuracy
+
+    pulse = Pulse.gaussian(width) if decay is None else Pulse.exponentially_modified(width, decay)
+    detector = PhotonDetector(pulse, bin_width, bins, false_alarm_rate)
     with show_progress("simulating", max(trials, 1)) as advance:
         found = measure_accuracy(detector, photons, background, trials, seed, advance)
     report(asdict(found), as_json)
@@ -110,33 +122,25 @@ def accuracy(
 
 @app.command()
 def parallax(
-    streak: Annotated[
-        Path, typer.Argument(metavar="STREAK", help="A shot of a scene at several ranges.")
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(metavar="H5", help="The camera to write, for recover --focus depth-locked."),
-    ],
-    camera: Annotated[
-        Path | None,
-        typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside STREAK"),
-    ] = None,
-    time_zero_ns: TimeZeroOption = None,
-    gates: Annotated[int, typer.Option(metavar="N", help="Time gates, of equal brightness.")] = 8,
-    shears: Annotated[
-        tuple[float, float, int],
-        typer.Option(metavar="S0 S1 N", help="Shears tried, pixels per view step."),
-    ] = (-3.0, 3.0, 13),
-    as_json: JsonOption = False,
+    streak: Path = arg("STREAK", "A shot of a scene at several ranges.", read=True),
+    out: Path = opt("H5", "The camera to write, for recover --focus depth-locked.", ...),
+    camera: Path | None = CAMERA,
+    time_zero: float | None = TIME_ZERO,
+    gates: int = opt("N", "Time gates, of equal brightness.", 8),
+    shears: tuple[float, float, int] = opt(
+        "S0 S1 N", "Shears tried, pixels per view step.", (-3.0, 3.0, 13)
+    ),
+    as_json: bool = JSON,
 ) -> None:
     """Find lenslet pitch and focus distance from a shot: at which shear the views agree, gate by
     gate.
 
     Example: tofclip lidar parallax shot.tif --camera camera.h5 --out camera_locked.h5
     """
+    from tofclip.recovery import count_parallax_work, fit_parallax_to_shot, open_shot
+
     require_writable(out, *RECORD_SUFFIXES, inputs=(streak, camera))
-    zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
-    shot = open_shot(streak, camera, zero)
+    shot = open_shot(streak, camera, time_zero)
     with show_progress("focusing", count_parallax_work(shot, shears)) as advance:
         found = fit_parallax_to_shot(shot, gates, shears, advance)
     found.camera.save(out)
@@ -154,15 +158,11 @@ def parallax(
 
 @app.command()
 def scene(
-    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Recovered frames (HDF5).")],
-    out: Annotated[Path, typer.Option(metavar="PNG", help="The picture to write.")],
-    reach_mm: Annotated[
-        float, typer.Option(metavar="MM", help="Points this close belong together.")
-    ] = 40.0,
-    fewest_points: Annotated[
-        int, typer.Option(metavar="N", help="Smaller groups are not objects.")
-    ] = 40,
-    as_json: JsonOption = False,
+    frames: Path = arg("FRAMES", "Recovered frames (HDF5).", read=True),
+    out: Path = opt("PNG", "The picture to write.", ...),
+    reach: float = opt("MM", "Points this close belong together.", 40.0, name="--reach-mm"),
+    fewest_points: int = opt("N", "Smaller groups are not objects.", 40),
+    as_json: bool = JSON,
 ) -> None:
     """List a scene's objects with range, size and standard deviation; draw them from three sides.
 
@@ -171,16 +171,27 @@ def scene(
 
     Example: tofclip lidar scene frames.h5 --out scene.png
     """
+    import numpy as np
+
+    from apps.figures.scene import make_scene_figure
+    from apps.figures.style import save_figure
+    from tofclip.lidar import Detection, depth, point_cloud
+    from tofclip.lidar.processing import find_objects
+    from tofclip.lidar.significance import SCENE_BRIGHTNESS_QUANTILE
+    from tofclip.shots import Frames
+
     require_writable(out, *PICTURE_SUFFIXES, inputs=(frames,))
     recovered = Frames.load(frames)
     cloud = point_cloud(depth(recovered))
     if len(cloud):
         brightest = np.quantile(cloud.intensity, SCENE_BRIGHTNESS_QUANTILE)
         cloud = cloud[cloud.intensity >= Detection().min_scene_fraction * brightest]
-    objects = find_objects(cloud, reach_mm * MILLIMETRE, fewest_points)
+    objects = find_objects(cloud, reach, fewest_points)
     # Before the picture, which would show an empty scene.
     if not objects:
-        raise InputError(f"{frames}: no {fewest_points} points lie together within {reach_mm:g} mm")
+        raise InputError(
+            f"{frames}: no {fewest_points} points lie together within {1000 * reach:g} mm"
+        )
     save_figure(make_scene_figure(recovered, cloud, objects), out)
     named = ("range", "width", "height", "range_sigma", "scatter")
     rows = [
@@ -190,7 +201,7 @@ def scene(
     if as_json:
         # `confidence_m` is the deviation's earlier name: for one more version
         renamed = [row | {"confidence_m": row["range_sigma_m"]} for row in rows]
-        report({"points": len(cloud), "objects": renamed}, as_json=True)
+        report({"points": len(cloud), "objects": renamed}, as_json)
         return
     table = {f"object {number}": row for number, row in enumerate(rows, 1)}
     report(table, as_json, [out], describe_ranges(recovered))
@@ -198,43 +209,23 @@ def scene(
 
 @app.command()
 def sequence(
-    shots: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SHOTS",
-            help="A folder or quoted pattern of streak images, or an HDF5 stack of them.",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(metavar="FOLDER", help="Where the clouds go; those already there are kept."),
-    ],
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="H5", help="Made by calibrate.", show_default="the one inside the first shot"
-        ),
-    ] = None,
-    bin_width_ps: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PS", help="Duration of a row in ps; overrides the files' own time axis."
-        ),
-    ] = None,
-    time_zero_ns: TimeZeroOption = None,
-    average: Annotated[int, typer.Option(metavar="N", help="Shots averaged for each cloud.")] = 1,
-    focus: Annotated[
-        str, typer.Option(metavar="SHEAR", help="depth-locked or fixed:S.")
-    ] = "fixed:0",
-    suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds.")] = ".ply",
-    keep_jitter: Annotated[
-        bool,
-        typer.Option(
-            "--keep-jitter", help="Do not find how late each shot comes against the first."
-        ),
-    ] = False,
-    cluster: ClusterOption = None,
-    as_json: JsonOption = False,
+    shots: Path = arg(
+        "SHOTS",
+        "A folder or quoted pattern of streak images, or an HDF5 stack of them.",
+        read=True,
+    ),
+    out: Path = opt("FOLDER", "Where the clouds go; those already there are kept.", ...),
+    camera: Path | None = CAMERA,
+    bin_width: float | None = BIN_WIDTH,
+    time_zero: float | None = TIME_ZERO,
+    average: int = opt("N", "Shots averaged for each cloud.", 1),
+    focus: str = FOCUS,
+    suffix: str = SUFFIX,
+    keep_jitter: bool = flag(
+        "--keep-jitter", "Do not find how late each shot comes against the first."
+    ),
+    cluster: str | None = CLUSTER,
+    as_json: bool = JSON,
 ) -> None:
     """Make a cloud of each shot by the linear inverse, one shot in memory at a time.
 
@@ -243,30 +234,26 @@ def sequence(
 
     Example: tofclip lidar sequence shots/ --camera camera.h5 --out clouds/
     """
+    from tofclip.files import require_apart
+    from tofclip.sequences import RangingSettings, list_shots
+
     # Before the jobs claim the folder.
     require_format(suffix)
     require_apart([out], [shots, camera])
-    width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
-    zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
-    jobs = RangingSettings(camera, zero, focus, average, not keep_jitter).jobs(
-        list_shots(shots, width), out, suffix
+    settings = RangingSettings(camera, time_zero, focus, average, not keep_jitter)
+    jobs = settings.jobs(list_shots(shots, bin_width), out, suffix)
+    made: list[tuple[int, list[float]]] = []
+    # Without figures come clouds that were there already, whose points are not counted again.
+    summary = run_with_progress(
+        *("ranging", jobs, cluster),
+        lambda one: None if one.figures is None else made.append(one.figures),
     )
-    points: list[int] = []
-    late: list[float] = []
-
-    def watch(report: Report) -> None:
-        # None for clouds that were there already, whose points are not counted again.
-        if report.figures is not None:
-            points.append(report.figures[0])
-            late.extend(report.figures[1])
-
-    summary = run_with_progress("ranging", jobs, cluster, watch)
-    # Root mean square; 0 where nothing was done.
-    jitter = (sum(one**2 for one in late) / len(late)) ** 0.5 if late else 0.0
+    late = [bins for _, shifts in made for bins in shifts]
     figures = {
         "shots": len(late),
         "shots_per_second": len(late) / summary.seconds,
-        "points": sum(points),
-        "jitter_rms_bins": jitter,
+        "points": sum(points for points, _ in made),
+        # Root mean square; 0 where nothing was done.
+        "jitter_rms_bins": (sum(one**2 for one in late) / len(late)) ** 0.5 if late else 0.0,
     }
     report_summary(summary, len(jobs), as_json, out, figures)

@@ -4,34 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from apps.conventions import (
-    PICTURE_SUFFIXES,
-    JsonOption,
-    TimeZeroOption,
-    make_folder,
-    report,
-    require_writable,
-)
-from apps.figures.occlusion import make_occlusion_figure
-from apps.figures.occlusion_film import WALK_STEPS, save_flash_film, save_walk_film
-from apps.figures.style import save_figure
-from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
-from apps.occlusion.probe import DISTANCE_FACTORS, probe_target
-from apps.occlusion.scenes import make_occlusion_scene, make_walking_scene
+from apps.help import make_group
+from apps.options import JSON, NO_BROWSER, PORT, TIME_ZERO, flag, opt
 from apps.progress import show_activity, show_progress
+from apps.report import PICTURE_SUFFIXES, make_folder, report, require_writable
+from apps.verbs.view import PageDoor
 from tofclip.errors import InputError
-from tofclip.metrics import correlation_coefficient, nmse
-from tofclip.occlusion import InactiveRegion, SeparatedImages
-from tofclip.units import MILLIMETRE, NANOSECOND
-
-if TYPE_CHECKING:
-    from apps.occlusion.probe import ProbeResult
 
 SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board")
 """Those of `apps.occlusion.scenes`, named here so that help appears without loading them."""
@@ -39,31 +19,20 @@ SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board"
 SIDE_PX, LIVE_SIDE_PX = 128, 64
 """Rows and columns of the picture, unless given: a page shows a step every second."""
 
-app = typer.Typer()
-
-
-@app.callback(invoke_without_command=True)
-def _show_help(context: typer.Context) -> None:
-    """See through occluders: which places no view can see, and a demonstration of the others."""
-    if context.invoked_subcommand is None:
-        print(context.get_help())
+app = make_group(
+    "See through occluders: which places no view can see, and a demonstration of the others."
+)
 
 
 @app.command()
 def region(
-    baseline_mm: Annotated[
-        float, typer.Option(metavar="MM", help="Distance between the outermost views.")
-    ] = 15.0,
-    width_mm: Annotated[
-        float, typer.Option(metavar="MM", help="Width of the occluder's solid part.")
-    ] = 6.0,
-    distance_mm: Annotated[
-        float, typer.Option(metavar="MM", help="From the views to the occluder.")
-    ] = 50.0,
-    out: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Draw it.", show_default="no picture")
-    ] = None,
-    as_json: JsonOption = False,
+    baseline: float = opt(
+        "MM", "Distance between the outermost views.", 15.0, name="--baseline-mm"
+    ),
+    width: float = opt("MM", "Width of the occluder's solid part.", 6.0, name="--width-mm"),
+    distance: float = opt("MM", "From the views to the occluder.", 50.0, name="--distance-mm"),
+    out: Path | None = opt("PNG", "Draw it.", shown="no picture"),
+    as_json: bool = JSON,
 ) -> None:
     """Report how far behind a solid occluder nothing can be seen by any view.
 
@@ -73,100 +42,59 @@ def region(
     Example: tofclip occlusion region --baseline-mm 15 --width-mm 6 --distance-mm 50 --out
     region.png
     """
+    from apps.figures.occlusion_region import make_region_figure
+    from apps.figures.style import save_figure
+    from tofclip.occlusion import InactiveRegion
+
     if out is not None:
         require_writable(out, *PICTURE_SUFFIXES)
-    found = InactiveRegion(
-        *(length * MILLIMETRE for length in (baseline_mm, width_mm, distance_mm))
-    )
+    found = InactiveRegion(baseline, width, distance)
     if out is not None:
-        from apps.figures.occlusion_region import make_region_figure
-        from apps.figures.style import save_figure
-
         save_figure(make_region_figure(found), out)
-    promise = (
-        "seen beyond the inactive length"
+    figures = {
+        "inactive_length_m": found.length if found.is_bounded or as_json else "without end",
+        "promised": "seen beyond the inactive length"
         if found.is_bounded
-        else "nothing: the occluder is as wide as the baseline"
-    )
-    length = found.length if found.is_bounded or as_json else "without end"
-    figures = {"inactive_length_m": length, "promised": promise}
+        else "nothing: the occluder is as wide as the baseline",
+    }
     report(figures, as_json, [] if out is None else [out])
 
 
 @app.command()
 def demo(
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for the results; made if missing. Required without --live.",
-            show_default="nothing is written",
-        ),
-    ] = None,
-    scene: Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(SCENE_NAMES)}.")] = "tree",
-    illumination: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help="diodes, one beside each view; oblique; co-located, a single one."
-        ),
-    ] = "diodes",
-    encoder: Annotated[str, typer.Option(metavar="NAME", help="line or single-pixel.")] = "line",
-    sampling_ratio: Annotated[
-        float, typer.Option(metavar="SR", help="Measurements over pixels of one picture.")
-    ] = 0.5,
-    side_px: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Rows and columns of the picture.",
-            show_default="128; with --live 64",
-        ),
-    ] = None,
-    photons: Annotated[
-        float | None,
-        typer.Option(
-            metavar="N",
-            help="Of the largest measurement.",
-            show_default="2000; single-pixel 1000000",
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of line angles and photons.")] = 0,
-    moving: Annotated[
-        bool,
-        typer.Option("--moving", help="A second film: the target walks past; half a minute more."),
-    ] = False,
-    live: Annotated[
-        bool,
-        typer.Option(
-            "--live",
-            help="Open a page instead: a person walks behind the occluder, its width and the gate on sliders.",
-        ),
-    ] = False,
-    recording: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SOURCE",
-            help="With --live: your own shots, frames or instrument behind a gate, as for view.",
-            show_default="a simulated scene",
-        ),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="H5",
-            help="With --recording: made by calibrate.",
-            show_default="the one inside SOURCE",
-        ),
-    ] = None,
-    time_zero_ns: TimeZeroOption = None,
-    port: Annotated[
-        int | None,
-        typer.Option(min=1, max=65535, metavar="N", help="Of the page.", show_default="a free one"),
-    ] = None,
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Print the page's address; open nothing.")
-    ] = False,
-    as_json: JsonOption = False,
+    out: Path | None = opt(
+        "DIR",
+        "Folder for the results; made if missing. Required without --live.",
+        shown="nothing is written",
+    ),
+    scene: str = opt("NAME", f"{', '.join(SCENE_NAMES)}.", "tree"),
+    illumination: str = opt(
+        "NAME", "diodes, one beside each view; oblique; co-located, a single one.", "diodes"
+    ),
+    encoder: str = opt("NAME", "line or single-pixel.", "line"),
+    sampling_ratio: float = opt("SR", "Measurements over pixels of one picture.", 0.5),
+    side_px: int | None = opt("N", "Rows and columns of the picture.", shown="128; with --live 64"),
+    photons: float | None = opt(
+        "N", "Of the largest measurement.", shown="2000; single-pixel 1000000"
+    ),
+    seed: int = opt("N", "Of line angles and photons.", 0, min=0),
+    moving: bool = flag("--moving", "A second film: the target walks past; half a minute more."),
+    live: bool = flag(
+        "--live",
+        "Open a page instead: a person walks behind the occluder, its width and the gate on sliders.",
+    ),
+    recording: str | None = opt(
+        "SOURCE",
+        "With --live: your own shots, frames or instrument behind a gate, as for view.",
+        shown="a simulated scene",
+    ),
+    camera: Path | None = opt(
+        "H5", "With --recording: made by calibrate.", shown="the one inside SOURCE"
+    ),
+    time_zero: float | None = TIME_ZERO,
+    port: int | None = PORT,
+    no_browser: bool = NO_BROWSER,
+    as_json: bool = JSON,
 ) -> None:
     """Simulate a scene behind an occluder, see through it, and compare with other cameras and with
     the truth.
@@ -184,8 +112,19 @@ def demo(
 
     Example: tofclip occlusion demo --live --scene bush
     """
+    from apps.figures.occlusion import make_occlusion_figure
+    from apps.figures.occlusion_film import WALK_STEPS, save_flash_film, save_walk_film
+    from apps.figures.style import save_figure
+    from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
+    from apps.occlusion.probe import DISTANCE_FACTORS, probe_target
+    from apps.occlusion.scenes import make_occlusion_scene, make_walking_scene
+    from tofclip.metrics import correlation_coefficient, nmse
+
     started = time.perf_counter()
-    _require_sense(live, recording is not None or camera is not None, out is None)
+    if live and out is not None:
+        raise InputError("--live writes nothing; leave --out out")
+    if (recording is not None or camera is not None) and not live:
+        raise InputError("--recording and --camera are for --live")
     if encoder not in DEFAULT_PHOTONS:
         raise InputError(f"unknown encoder '{encoder}'; take one of {', '.join(DEFAULT_PHOTONS)}")
     # A single pixel sums a whole picture and so needs more photons.
@@ -193,15 +132,37 @@ def demo(
     side = side_px or (LIVE_SIDE_PX if live else SIDE_PX)
     rays = 1 if live else ExperimentSettings.samples
     settings = ExperimentSettings(side, encoder, sampling_ratio, illumination, usual, seed, rays)
-    if live or out is None:
-        zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
-        _show_live(scene, settings, (recording, camera, zero), (port, no_browser, as_json))
+    if live:
+        from apps.occlusion.live import GatedSource, WalkSource
+        from apps.viewer.server import LOOPBACK
+        from apps.viewer.session import Session
+        from apps.viewer.source_factory import ShotOptions, open_source
+
+        with show_activity("looking past"):
+            known = ShotOptions(camera, time_zero=time_zero)
+            source = (
+                WalkSource(make_walking_scene(scene), settings)
+                if recording is None
+                else GatedSource(open_source(recording, known))
+            )
+        with contextlib.closing(source) as opened:
+            PageDoor(LOOPBACK, port, no_browser, as_json).serve(Session(opened))
         return
+    if out is None:
+        raise InputError("give --out DIR, or --live for a page")
     experiment = Experiment(make_occlusion_scene(scene), settings)
     # Before anything is written: this refuses settings of which no camera can be built.
     measurement_count = experiment.rig.camera.measurements
     make_folder(out)
-    separated, probes = _run_experiment(experiment)
+    seen, probes = experiment.scene, []
+    # Small targets inside the inactive region and beyond; without a bound nothing is beyond.
+    factors = DISTANCE_FACTORS if seen.region.is_bounded else ()
+    with show_progress("looking past", 1 + len(factors)) as advance:
+        separated = experiment.separated
+        advance(1)
+        for factor in factors:
+            probes.append(probe_target(seen.occluder, seen.region, factor, seed))
+            advance(1)
     written = [out / "occlusion.png", out / "occlusion.gif"]
     save_figure(make_occlusion_figure(experiment, probes), written[0])
     save_flash_film(experiment, written[1])
@@ -209,95 +170,24 @@ def demo(
         written.append(out / "occlusion_moving.gif")
         with show_progress("walking", WALK_STEPS) as advance:
             save_walk_film(experiment, written[2], advance)
-    report(
-        {
-            **_collect_metrics(experiment, separated, probes),
-            "readings": measurement_count,
-            "seconds": time.perf_counter() - started,
-        },
-        as_json,
-        written,
-    )
-
-
-def _require_sense(live: bool, recorded: bool, writes_nothing: bool) -> None:
-    """Refuse options that contradict each other."""
-    if live != writes_nothing:
-        raise InputError(
-            "--live writes nothing; leave --out out"
-            if live
-            else "give --out DIR, or --live for a page"
-        )
-    if recorded and not live:
-        raise InputError("--recording and --camera are for --live")
-
-
-def _show_live(
-    scene: str,
-    settings: ExperimentSettings,
-    recorded: tuple[str | None, Path | None, float | None],
-    served: tuple[int | None, bool, bool],
-) -> None:
-    """Serve a page with the walk, or with a recording behind a gate, until Ctrl-C."""
-    from apps.occlusion.live import GatedSource, WalkSource
-    from apps.verbs.view import PageDoor
-    from apps.viewer.server import LOOPBACK
-    from apps.viewer.session import Session
-    from apps.viewer.source_factory import ShotOptions, open_source
-
-    recording, camera, time_zero = recorded
-    port, no_browser, as_json = served
-    with show_activity("looking past"):
-        source = (
-            WalkSource(make_walking_scene(scene), settings)
-            if recording is None
-            else GatedSource(open_source(recording, ShotOptions(camera, time_zero=time_zero)))
-        )
-    with contextlib.closing(source) as opened:
-        PageDoor(LOOPBACK, port, no_browser, as_json).serve(Session(opened))
-
-
-def _run_experiment(experiment: Experiment) -> tuple[SeparatedImages, list[ProbeResult]]:
-    """Cast the rays, recover, and try small targets inside the inactive region and beyond, if it
-    ends.
-    """
-    scene, probes = experiment.scene, []
-    # Without a bound there is no distance beyond the region to try.
-    factors = DISTANCE_FACTORS if scene.region.is_bounded else ()
-    with show_progress("looking past", 1 + len(factors)) as advance:
-        separated = experiment.separated
-        advance(1)
-        for factor in factors:
-            probes.append(
-                probe_target(scene.occluder, scene.region, factor, experiment.settings.seed)
-            )
-            advance(1)
-    return separated, probes
-
-
-def _collect_metrics(
-    experiment: Experiment, separated: SeparatedImages, probes: Sequence[ProbeResult]
-) -> dict[str, Any]:
-    """What is said about a run; correlations are with the target as seen with its occluder taken
-    away.
-    """
-    scene, truth = experiment.scene, experiment.truth
-    own = (
-        scene.distance,
-        correlation_coefficient(separated.target, truth),
-        experiment.expected_visible,
-    )
-    targets = [own, *((one.distance, one.correlation, one.expected_visible) for one in probes)]
+    # Correlations are with the target as seen with its occluder taken away.
+    truth = experiment.truth
+    correlation = correlation_coefficient(separated.target, truth)
+    targets = [(seen.distance, correlation, experiment.expected_visible)]
+    targets += [(one.distance, one.correlation, one.expected_visible) for one in probes]
     names = ("distance_m", "correlation", "expected_visible")
-    return {
-        "scene": scene.name,
-        "inactive_length_m": scene.region.length,
+    figures = {
+        "scene": seen.name,
+        "inactive_length_m": seen.region.length,
         "targets": [dict(zip(names, one, strict=True)) for one in sorted(targets)],
         "nmse": nmse(separated.target, truth),
-        "correlation": own[1],
+        "correlation": correlation,
         "correlation_without_model_of_occluder": correlation_coefficient(separated.plain, truth),
         "correlation_single_view": correlation_coefficient(
             experiment.single_view, experiment.single_view_truth
         ),
         "correlation_light_field_camera": correlation_coefficient(experiment.conventional, truth),
+        "readings": measurement_count,
+        "seconds": time.perf_counter() - started,
     }
+    report(figures, as_json, written)

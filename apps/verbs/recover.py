@@ -1,110 +1,79 @@
-"""`tofclip recover`: a streak image to one picture per instant."""
+"""`tofclip recover` and `tofclip cloud`: a streak image to one picture per instant, and these to a
+point cloud; one of them, or a sequence, here or on a cluster.
+"""
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from apps.conventions import (
-    ClusterOption,
-    DeviceOption,
-    JsonOption,
-    PreviewOption,
-    TimeZeroOption,
+from apps.jobs import report_summary, resolve_device, run_with_progress
+from apps.options import (
+    BIN_WIDTH,
+    CAMERA,
+    CLUSTER,
+    DEVICE,
+    JSON,
+    PREVIEW,
+    TIME_ZERO,
+    arg,
+    flag,
+    opt,
+)
+from apps.progress import show_progress
+from apps.report import (
+    build_provenance,
     choose_preview,
-    make_completer,
+    describe_ranges,
     report,
     require_writable,
 )
-from apps.figures.preview import make_preview_figure
-from apps.figures.style import save_figure
-from apps.progress import show_progress
-from apps.sequences import report_summary, resolve_device, run_with_progress
-from apps.verbs.cloud import CLOUD_SUFFIXES as CLOUD_SUFFIXES
 from tofclip.errors import InputError
 from tofclip.files import require_apart
-from tofclip.recovery import (
-    compute_view_delays_bins,
-    make_method,
-    open_shot,
-    parse_focus,
-    plan_recovery,
-)
-from tofclip.sequences import CloudSettings, RecoverySettings, expand_sweep, is_sequence, list_shots
-from tofclip.units import NANOSECOND, PICOSECOND
 
-if TYPE_CHECKING:
-    from tofclip.recovery import Shot
-    from tofclip.shots import Frames
+CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57", ".h5")
+DEPTH_SUFFIX = ".exr"
+METHODS = ("tv", "l1", "linear", "adjoint", "surfaces")
 
 
 def recover(
-    streak: Annotated[
-        str,
-        typer.Argument(
-            metavar="STREAK",
-            help="HPD-TA TIFF, ITEX, LIFT archive, our HDF5, or a source such as sim+linospad2://?seed=1. "
-            "A sequence: a folder, a quoted pattern, or an HDF5 stack.",
-        ),
-    ],
-    out: Annotated[
-        Path, typer.Option(metavar="H5", help="The frames to write; of a sequence: their folder.")
-    ],
-    camera: Annotated[
-        Path | None,
-        typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside STREAK"),
-    ] = None,
-    bin_width_ps: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PS", help="Duration of a row in ps; overrides the file's own time axis."
-        ),
-    ] = None,
-    time_zero_ns: TimeZeroOption = None,
-    method: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="tv, l1, linear, adjoint, or surfaces: range and brightness of each pixel from the whole shot.",
-            autocompletion=make_completer("tv", "l1", "linear", "adjoint", "surfaces"),
-        ),
-    ] = "tv",
-    iterations: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Maximum number of iterations of tv, l1 and surfaces.",
-            show_default="the method's",
-        ),
-    ] = None,
-    focus: Annotated[
-        str,
-        typer.Option(
-            metavar="SHEAR",
-            help="depth-locked: each frame at the shear of its range; fixed:S: all at S pixels per view step; "
-            "stack:S0:S1:N: each gate at the best of N.",
-        ),
-    ] = "fixed:0",
-    cloud: Annotated[
-        Path | None,
-        typer.Option(metavar="PLY", help="A point cloud to write as well.", show_default="none"),
-    ] = None,
-    preview: PreviewOption = None,
-    sweep: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=V,V",
-            help="Of a sequence: every combination of these values of method, iterations, weight or focus, each in a "
-            "folder of its own; may be given again.",
-            show_default="none",
-        ),
-    ] = None,
-    cluster: ClusterOption = None,
-    device: DeviceOption = "cpu",
-    as_json: JsonOption = False,
+    streak: str = arg(
+        "STREAK",
+        "HPD-TA TIFF, ITEX, LIFT archive, our HDF5, or a source such as sim+linospad2://?seed=1. "
+        "A sequence: a folder, a quoted pattern, or an HDF5 stack.",
+        read=True,
+    ),
+    out: Path = opt("H5", "The frames to write; of a sequence: their folder.", ...),
+    camera: Path | None = CAMERA,
+    bin_width: float | None = BIN_WIDTH,
+    time_zero: float | None = TIME_ZERO,
+    method: str = opt(
+        "NAME",
+        "tv, l1, linear, adjoint, or surfaces: range and brightness of each pixel from the whole shot.",
+        "tv",
+        choices=METHODS,
+    ),
+    iterations: int | None = opt(
+        "N", "Maximum number of iterations of tv, l1 and surfaces.", shown="the method's"
+    ),
+    focus: str = opt(
+        "SHEAR",
+        "depth-locked: each frame at the shear of its range; fixed:S: all at S pixels per view step; "
+        "stack:S0:S1:N: each gate at the best of N.",
+        "fixed:0",
+    ),
+    cloud: Path | None = opt("PLY", "A point cloud to write as well.", shown="none"),
+    preview: Path | None = PREVIEW,
+    sweep: list[str] | None = opt(
+        "NAME=V,V",
+        "Of a sequence: every combination of these values of method, iterations, weight or focus, each in a folder of "
+        "its own; may be given again.",
+        shown="none",
+    ),
+    cluster: str | None = CLUSTER,
+    device: str = DEVICE,
+    as_json: bool = JSON,
 ) -> None:
     """Recover every transient frame of a raw streak image, or of each one of a sequence.
 
@@ -120,113 +89,173 @@ def recover(
 
     Example: tofclip recover shot.tif --camera camera.h5 --out frames.h5 --time-zero-ns -10.784
     """
-    zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
-    width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
+    from apps.figures.preview import make_preview_figure
+    from apps.figures.style import save_figure
+    from tofclip.recovery import (
+        compute_view_delays_bins,
+        make_method,
+        open_shot,
+        parse_focus,
+        plan_recovery,
+    )
+    from tofclip.sequences import (
+        CloudSettings,
+        RecoverySettings,
+        expand_sweep,
+        is_sequence,
+        list_shots,
+    )
+
     if is_sequence(streak):
         # Options without effect are refused rather than ignored.
-        _check_sequence_options(cloud, preview)
-        recovery = RecoverySettings(method, iterations, None, focus, camera, zero, device)
+        if cloud is not None:
+            raise InputError("--cloud is for one shot; give the folder of frames to tofclip cloud")
+        if preview is not None:
+            raise InputError("--preview is for one shot")
+        settings = RecoverySettings(method, iterations, None, focus, camera, time_zero, device)
         used = resolve_device(device, cluster)
         require_apart([out], [streak, camera])
-        _recover_sequence(recovery, (streak, width), out, sweep or [], (cluster, used, as_json))
+        shots = list_shots(streak, bin_width)
+        tried = (text.partition("=") for text in sweep or [])
+        swept = expand_sweep(settings, {name: values.split(",") for name, _, values in tried})
+        jobs = [job for label, one in swept.items() for job in one.jobs(shots, out / label)]
+        summary = run_with_progress("recovering", jobs, cluster)
+        report_summary(summary, len(jobs), as_json, out, {"device": used})
         return
-    _check_single_options(streak, cluster, sweep)
+    if cluster is not None or sweep:
+        option = "--sweep" if cluster is None else "--cluster"
+        raise InputError(
+            f"{streak}: {option} is for a sequence: a folder, a quoted pattern or an HDF5 stack of shots"
+        )
     preview = choose_preview(out, preview, (streak, camera))
     if cloud is not None:
         require_writable(cloud, *CLOUD_SUFFIXES, inputs=(streak, camera))
     solver, chosen_focus = make_method(method, iterations=iterations), parse_focus(focus)
     started = time.perf_counter()
     # Outputs and settings have been checked by now: an instrument is not started for nothing.
-    shot = _open_source(streak, camera, zero, width)
+    if "://" in streak:
+        from devices.transients import read_transient
+
+        shot = open_shot(read_transient(streak, bin_width), camera, time_zero)
+    else:
+        shot = open_shot(streak, camera, time_zero, bin_width)
     plan = plan_recovery(shot, solver, chosen_focus, device)
     # An instrument's address is no file with a checksum.
-    inputs = tuple(Path(name) for name in (streak, camera) if name and not _is_address(name))
+    inputs = [Path(one) for one in (streak, camera) if one is not None and "://" not in str(one)]
     with show_progress("recovering", plan.work) as advance:
         frames = plan.add_provenance(plan.run(advance), *inputs)
     frames.save(out)
     seconds = time.perf_counter() - started
     save_figure(make_preview_figure(shot.streak, frames), preview)
-    written = [out, preview]
     if cloud is not None:
         points, _ = CloudSettings(device=device).make_cloud(frames, "the recovered frames")
         points.save(cloud)
-        written.append(cloud)
-    _report_frames(frames, seconds, as_json, written)
-
-
-def _check_sequence_options(cloud: Path | None, preview: Path | None) -> None:
-    if cloud is not None:
-        raise InputError("--cloud is for one shot; give the folder of frames to tofclip cloud")
-    if preview is not None:
-        raise InputError("--preview is for one shot")
-
-
-def _check_single_options(streak: str, cluster: str | None, sweep: list[str] | None) -> None:
-    if cluster is not None or sweep:
-        option = "--sweep" if cluster is None else "--cluster"
-        raise InputError(
-            f"{streak}: {option} is for a sequence: a folder, a quoted pattern or an HDF5 stack of shots"
-        )
-
-
-def _recover_sequence(
-    recovery: RecoverySettings,
-    shots: tuple[str, float | None],
-    out: Path,
-    sweep: list[str],
-    how: tuple[str | None, str, bool],
-) -> None:
-    cluster, device, as_json = how
-    found = list_shots(*shots)
-    swept = expand_sweep(recovery, dict(map(_parse_sweep, sweep)))
-    jobs = [job for label, variant in swept.items() for job in variant.jobs(found, out / label)]
-    report_summary(
-        run_with_progress("recovering", jobs, cluster), len(jobs), as_json, out, {"device": device}
-    )
-
-
-def _parse_sweep(text: str) -> tuple[str, list[str]]:
-    name, _, values = text.partition("=")
-    return name, values.split(",")
-
-
-def _is_address(name: str | Path) -> bool:
-    return "://" in str(name)
-
-
-def _open_source(
-    source: str, camera: Path | None, time_zero: float | None, bin_width: float | None
-) -> Shot:
-    """Open a file, or read an instrument until it ends."""
-    if not _is_address(source):
-        return open_shot(source, camera, time_zero, bin_width)
-    from devices.transients import read_transient
-
-    return open_shot(read_transient(source, bin_width), camera, time_zero)
-
-
-def _report_frames(frames: Frames, seconds: float, as_json: bool, written: list[Path]) -> None:
-    """Report a recovery that took `seconds` from reading the shot to writing the frames."""
     known = frames.figures
+    names = ("method", "iterations", "relative_residual", "seconds", "frames_per_second")
     # methods that know how far they are from the best there is say so, and shots that are not clean
     further = ("duality_gap", "defective_readings", "clipped_readings")
-    report(
-        {
-            "frames": frames.values.shape[0],
-            "image_shape": frames.camera.image_shape,
-            "method": known["method"],
-            "iterations": known["iterations"],
-            "relative_residual": known["relative_residual"],
-            "seconds": known["seconds"],
-            # of the iterations alone, as for the next shot of a sequence, and of the whole run
-            "frames_per_second": known["frames_per_second"],
-            "frames_per_second_overall": frames.values.shape[0] / seconds,
-            "view_gains": frames.camera.gains,
-            "time_shift_bins": compute_view_delays_bins(frames.camera),
-            "stopped_because": known["stopped_because"],
-            "device": known["device"],
-        }
-        | {name: known[name] for name in further if name in known},
-        as_json,
-        written,
-    )
+    figures = {
+        "frames": frames.values.shape[0],
+        "image_shape": frames.camera.image_shape,
+        **{name: known[name] for name in names},
+        "frames_per_second_overall": frames.values.shape[0] / seconds,
+        "view_gains": frames.camera.gains,
+        "time_shift_bins": compute_view_delays_bins(frames.camera),
+        "stopped_because": known["stopped_because"],
+        "device": known["device"],
+        **{name: known[name] for name in further if name in known},
+    }
+    report(figures, as_json, [out, preview, *([cloud] if cloud else [])])
+
+
+def cloud(
+    frames: Path = arg(
+        "FRAMES",
+        "Recovered frames (HDF5). A sequence: a folder or a quoted pattern of them.",
+        read=True,
+    ),
+    out: Path = opt(
+        "FILE",
+        "Ends in .ply, .pcd, .csv, .npz, .las, .laz, .e57, .h5, or .exr for a depth picture; of a sequence: a folder.",
+        ...,
+    ),
+    drop_outliers: bool = flag(
+        "--drop-outliers", "Leave out points further from their neighbours than these are."
+    ),
+    returns: str = opt("WHICH", "Of each pixel: first, strongest, last or all.", "all"),
+    organised: bool = flag(
+        "--organised",
+        "A point for every pixel, row by row, NaN where nothing came back (.pcd, .ply, .npz, .csv); of a "
+        "pixel's returns the strongest, unless --returns says which.",
+    ),
+    false_alarm: float | None = opt(
+        "P", "Drop points that are noise with a higher probability.", shown="0.5"
+    ),
+    voxel: float | None = opt(
+        "MM", "One point for each cube of this side.", name="--voxel-mm", shown="all points"
+    ),
+    suffix: str = opt(".EXT", "Format of the clouds of a sequence.", ".ply"),
+    cluster: str | None = CLUSTER,
+    device: str = DEVICE,
+    as_json: bool = JSON,
+) -> None:
+    """Find each pixel's returns and place them in space: x right, y down, z forward, in metres.
+
+    Columns of a point: intensity, range with its standard deviation (range_sigma), number within the
+    pixel, time of flight; where known the probability that it is noise (false_alarm) and the
+    surface's reflectance in percent (see calibrate range).
+
+    Of a sequence, clouds that are in the folder already are kept; frames of which none can be made
+    are listed at the end, and the exit status is 1.
+
+    Example: tofclip cloud frames.h5 --out scene.ply
+
+    Example: tofclip cloud frames.h5 --out scene.pcd --returns first --organised
+
+    Example: tofclip cloud 'frames/*.h5' --out clouds/ --cluster local
+    """
+    from tofclip.lidar.cloud import ORGANISED_SUFFIXES
+    from tofclip.sequences import CloudSettings, is_sequence, list_files
+    from tofclip.sequences.clouds import save_cloud
+    from tofclip.shots import Frames
+
+    if organised and returns == "all":
+        returns = "strongest"  # a pixel has one place in an organised cloud
+    settings = CloudSettings(drop_outliers, voxel, device, returns, organised, false_alarm)
+    used = resolve_device(device, cluster)
+    if is_sequence(frames):
+        require_format(suffix, DEPTH_SUFFIX)
+        require_apart([out], [frames])
+        jobs, counts = settings.jobs(list_files(frames), out, suffix), list[int]()
+        summary = run_with_progress(
+            "placing", jobs, cluster, lambda one: counts.append(one.figures or 0)
+        )
+        report_summary(summary, len(jobs), as_json, out, {"points": sum(counts), "device": used})
+        return
+    # An option without effect is refused rather than ignored.
+    if cluster is not None:
+        raise InputError(
+            f"{frames}: --cluster is for a sequence: a folder or a quoted pattern of frames"
+        )
+    suffixes = ORGANISED_SUFFIXES if organised else (*CLOUD_SUFFIXES, DEPTH_SUFFIX)
+    require_writable(out, *suffixes, inputs=(frames,))
+    recovered = Frames.load(frames)
+    # The cloud carries the history of its frames, and so that of the shot.
+    past = build_provenance({"verb": "cloud"}, frames, earlier=recovered.provenance)
+    points, kept = settings.make_cloud(replace(recovered, provenance=past), str(frames))
+    save_cloud(points, kept, out, organised)
+    rows, columns = kept.camera.image_shape
+    figures = {
+        "points": len(points),
+        "range_m": [points.range.min(), points.range.max()],
+        "returns_per_pixel_mean": len(points) / (rows * columns),
+        "device": used,
+    }
+    report(figures, as_json, [out], describe_ranges(recovered))
+
+
+def require_format(suffix: str, *further: str) -> None:
+    """Refuse an ending that names no format of clouds."""
+    known = (*CLOUD_SUFFIXES, *further)
+    if suffix not in known:
+        raise InputError(f"no cloud format is called '{suffix}'; use one of {', '.join(known)}")

@@ -4,100 +4,55 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import asdict
-from itertools import islice
 from pathlib import Path
-from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import typer
 
-from apps.conventions import JsonOption, TimeZeroOption, make_folder, report
-from apps.sequences import EXIT_SOME_FAILED
-from apps.verbs.cloud import require_format
-from devices.shot_stream import TrackedShots, read_transients
+from apps.jobs import EXIT_SOME_FAILED
+from apps.options import BIN_WIDTH, CAMERA, FOCUS, JSON, SUFFIX, TIME_ZERO, arg, flag, opt
+from apps.report import make_folder, report
+from apps.verbs.recover import require_format
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
-from tofclip.recovery import SharpestFocus, SurfaceRecovery, parse_focus
-from tofclip.sequences import list_shots
-from tofclip.sequences.following import SurfacePipeline
-from tofclip.sequences.ranger import CloudPipeline, RangingPipeline, build_cloud_path
-from tofclip.sequences.streaming import stream_clouds
-from tofclip.solvers import LinearInverse, ProximalMethod, Sparse, TotalVariation
-from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.sequences.inputs import Shot
+    from devices.shot_stream import TrackedShots
+    from tofclip.sequences.ranger import CloudPipeline
     from tofclip.sequences.streaming import StreamedCloud
     from tofclip.shots import Streak
 
-STREAM_METHODS: Mapping[str, Callable[[], LinearInverse | ProximalMethod]] = {
-    "linear": LinearInverse,
-    "l1": Sparse,
-    "tv": TotalVariation,
-}
-
-MAX_LATENCY_SAMPLES = 10_000  # shots over which medians are taken: a stream may run for days
+MAX_LATENCY_SAMPLES = 10_000  # over which medians are taken: a stream may run for days
 
 
 def stream(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="SOURCE",
-            help="An instrument's address such as 'sim+remoteex://?seed=1', a folder of shots or an HDF5 stack.",
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Where the clouds go.", show_default="nowhere"),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="H5", help="Made by calibrate.", show_default="the one inside the first shot"
-        ),
-    ] = None,
-    bin_width_ps: Annotated[
-        float | None,
-        typer.Option(
-            metavar="PS", help="Duration of a row in ps; overrides the shots' own time axis."
-        ),
-    ] = None,
-    time_zero_ns: TimeZeroOption = None,
-    focus: Annotated[
-        str, typer.Option(metavar="SHEAR", help="depth-locked or fixed:S.")
-    ] = "fixed:0",
-    method: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="linear, which is the fastest and draws rays around bright objects, or l1 or tv, "
-            "which leave them out: few iterations that begin at the last shot's pictures; or surfaces, "
-            "the truest and slowest, which follow those of the last shot.",
-        ),
-    ] = "linear",
-    shots: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Stop after this number of clouds.",
-            show_default="at the source's end",
-        ),
-    ] = None,
-    held: Annotated[int, typer.Option(metavar="N", help="Shots that may wait for their turn.")] = 1,
-    drop: Annotated[
-        bool,
-        typer.Option(
-            "--drop",
-            help="Drop the oldest waiting shot where they come too fast, as always for an instrument.",
-        ),
-    ] = False,
-    suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds.")] = ".ply",
-    as_json: JsonOption = False,
+    source: str = arg(
+        "SOURCE",
+        "An instrument's address such as 'sim+remoteex://?seed=1', a folder of shots or an HDF5 stack.",
+        read=True,
+    ),
+    out: Path | None = opt("FOLDER", "Where the clouds go.", shown="nowhere"),
+    camera: Path | None = CAMERA,
+    bin_width: float | None = BIN_WIDTH,
+    time_zero: float | None = TIME_ZERO,
+    focus: str = FOCUS,
+    method: str = opt(
+        "NAME",
+        "linear, which is the fastest and draws rays around bright objects, or l1 or tv, "
+        "which leave them out: few iterations that begin at the last shot's pictures; or surfaces, "
+        "the truest and slowest, which follow those of the last shot.",
+        "linear",
+    ),
+    shots: int | None = opt("N", "Stop after this number of clouds.", shown="at the source's end"),
+    held: int = opt("N", "Shots that may wait for their turn.", 1),
+    drop: bool = flag(
+        "--drop",
+        "Drop the oldest waiting shot where they come too fast, as always for an instrument.",
+    ),
+    suffix: str = SUFFIX,
+    as_json: bool = JSON,
 ) -> None:
     """Make a cloud of each shot while the next ones come; report method, rate and latencies.
 
@@ -110,14 +65,18 @@ def stream(
 
     Example: tofclip stream 'sim+remoteex://?seed=1' --shots 20 --out clouds/
     """
+    from dataclasses import asdict
+    from itertools import islice
+
+    from devices.shot_stream import TrackedShots
+    from tofclip.sequences.streaming import stream_clouds
+
     require_format(suffix)
     if shots is not None and shots < 1:
         raise InputError(f"--shots must be positive, got {shots}")
     if out is not None:
         require_apart([out, *out.glob(f"cloud_*{suffix}")], [source, camera])
-    coming = TrackedShots(
-        _read_shots(source, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
-    )
+    coming = TrackedShots(_read_shots(source, bin_width))
     # The first shot brings the camera and the time axis of all.
     first = coming.peek()
     if first is None:
@@ -125,13 +84,9 @@ def stream(
         if isinstance(fault, TofclipError):
             raise fault
         raise InputError(f"{source}: the source ended before it gave a shot")
-    pipeline = _make_pipeline(
-        first, camera, None if time_zero_ns is None else time_zero_ns * NANOSECOND, focus, method
-    )
+    pipeline = _make_pipeline(first, camera, time_zero, focus, method)
     if out is not None:  # only now: what cannot be streamed leaves no empty folder
         make_folder(out)
-    # Instruments do not wait: the newest shot counts. Files do, and lose nothing.
-    policy: Literal["drop_oldest", "block"] = "drop_oldest" if drop or coming.is_live else "block"
     failed = 0
 
     def note_failure(number: int, fault: TofclipError) -> None:
@@ -139,8 +94,16 @@ def stream(
         failed += 1
         print(f"tofclip: failed: shot {number}: {fault}", file=sys.stderr)
 
-    with closing(stream_clouds(coming, pipeline, held, policy, on_failure=note_failure)) as made:
-        figures = _consume_clouds(islice(made, shots), out, suffix, coming)
+    # Instruments do not wait: the newest shot counts. Files do, and lose nothing.
+    made = stream_clouds(
+        coming,
+        pipeline,
+        held,
+        "drop_oldest" if drop or coming.is_live else "block",
+        on_failure=note_failure,
+    )
+    with closing(made):
+        figures = _take_clouds(islice(made, shots), out, suffix, coming)
     # Counted last: only when the instrument has been stopped are its accounts final.
     accounts = coming.count_shots(figures["clouds"], failed)
     figures |= {"method": method, "dropped": accounts.dropped, **asdict(accounts)}
@@ -152,14 +115,18 @@ def stream(
 def _read_shots(
     source: str, bin_width: float | None
 ) -> Iterator[Streak] | Iterator[Streak | TofclipError]:
-    """Shots of an instrument, a folder or a stack."""
+    """Shots of an instrument, a folder or a stack; in the place of one that cannot be read its
+    error, which lets those behind it go on.
+    """
+    from devices.shot_stream import read_transients
+    from tofclip.sequences import list_shots
+
     if "://" in source:
         return read_transients(source, bin_width)
     return map(_read_or_fail, list_shots(source, bin_width).values())
 
 
-def _read_or_fail(shot: Shot) -> Streak | TofclipError:
-    """Return the error of a shot that cannot be read, which lets those behind it go on."""
+def _read_or_fail(shot: Callable[[], Streak]) -> Streak | TofclipError:
     try:
         return shot()
     except TofclipError as fault:
@@ -169,21 +136,31 @@ def _read_or_fail(shot: Shot) -> Streak | TofclipError:
 def _make_pipeline(
     first: Streak, camera: Path | None, time_zero: float | None, focus: str, method: str
 ) -> CloudPipeline:
+    from tofclip.recovery import SharpestFocus, SurfaceRecovery, parse_focus
+    from tofclip.sequences.following import SurfacePipeline
+    from tofclip.sequences.ranger import RangingPipeline
+    from tofclip.solvers import LinearInverse, Sparse, TotalVariation
+
     chosen = parse_focus(focus)
     if isinstance(chosen, SharpestFocus):
         raise InputError("a stream has one focus for all shots: depth-locked or fixed:S")
     if method == SurfaceRecovery.name:  # each surface is recovered at the shear of its range
         return SurfacePipeline.for_shot(first, camera, time_zero)
-    if method not in STREAM_METHODS:
-        names = ", ".join((*STREAM_METHODS, SurfaceRecovery.name))
+    methods: dict[str, Any] = {"linear": LinearInverse, "l1": Sparse, "tv": TotalVariation}
+    if method not in methods:
+        names = ", ".join((*methods, SurfaceRecovery.name))
         raise InputError(f"a stream's method is one of {names}, not '{method}'")
-    return RangingPipeline.for_shot(first, camera, chosen, time_zero, STREAM_METHODS[method]())
+    return RangingPipeline.for_shot(first, camera, chosen, time_zero, methods[method]())
 
 
-def _consume_clouds(
+def _take_clouds(
     made: Iterable[StreamedCloud], out: Path | None, suffix: str, shots: TrackedShots
 ) -> dict[str, Any]:
     """Take the clouds as they come; return what is reported of them at the end."""
+    from time import perf_counter
+
+    from tofclip.sequences.ranger import build_cloud_path
+
     stages: dict[str, deque[float]] = {}
     latency: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
     ages: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
@@ -205,19 +182,19 @@ def _consume_clouds(
     passed = perf_counter() - started
     return {
         "clouds": clouds,
-        **{f"latency_{name}_s": value for name, value in _compute_quantiles(ages).items()},
+        **{f"latency_{name}_s": value for name, value in compute_quantiles(ages).items()},
         "latency_from": origin,
         "points": points,
         "clouds_per_second": clouds / passed,
-        "latency_s": _compute_quantiles(latency),
-        "stages_s": {name: _compute_quantiles(seconds) for name, seconds in stages.items()},
+        "latency_s": compute_quantiles(latency),
+        "stages_s": {name: compute_quantiles(seconds) for name, seconds in stages.items()},
     }
 
 
-def _compute_quantiles(seconds: Iterable[float]) -> Mapping[str, float]:
-    values = np.fromiter(seconds, np.float64)
-    return (
-        dict(zip(("median", "p95"), np.quantile(values, (0.5, 0.95)).tolist(), strict=True))
-        if values.size
-        else {}
-    )
+def compute_quantiles(seconds: Iterable[float]) -> dict[str, float]:
+    """Return median and 95th percentile by their names; nothing of nothing."""
+    import numpy as np
+
+    values = list(seconds)
+    found = np.quantile(values, (0.5, 0.95)).tolist() if values else ()
+    return dict(zip(("median", "p95"), found, strict=False))

@@ -5,89 +5,53 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-import webbrowser
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING
 
-import typer
-
-from apps.conventions import JsonOption, TimeZeroOption, make_completer, report, require_writable
+from apps.options import JSON, NO_BROWSER, PORT, TIME_ZERO, arg, flag, opt
 from apps.progress import show_activity, show_progress
-from apps.viewer.desktop import open_window
-from apps.viewer.page import Page, WaitingPage
-from apps.viewer.render import choose_renderer
-from apps.viewer.scene_figure import choose_frames, save_film, save_picture
-from apps.viewer.server import is_local, parse_host
-from apps.viewer.session import Session
-from apps.viewer.source_factory import (
-    LOOK_METHODS,
-    SURFACES,
-    ShotOptions,
-    announce_nothing,
-    open_source,
-)
+from apps.report import report, require_writable
 from tofclip.errors import InputError
-from tofclip.units import NANOSECOND, PICOSECOND
+
+if TYPE_CHECKING:
+    from apps.viewer.page import WaitingPage
+    from apps.viewer.session import Session
+
+METHODS = ("tv", "l1", "linear", "adjoint", "surfaces")
 
 
 def view(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="SOURCE",
-            help="Frames, cloud, volume, raw shot, a folder or stack of clouds or shots, or an instrument's address.",
-        ),
-    ],
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="H5",
-            help="For raw shots; made by calibrate.",
-            show_default="the one inside SOURCE",
-        ),
-    ] = None,
-    bin_width_ps: Annotated[
-        float | None, typer.Option(metavar="PS", help="For raw shots: duration of a row in ps.")
-    ] = None,
-    time_zero_ns: TimeZeroOption = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            "--method",
-            metavar="NAME",
-            help="For raw shots: tv, l1, linear or adjoint, with few iterations; surfaces for one shot.",
-            show_default="l1 for one shot, linear for many",
-            autocompletion=make_completer(*LOOK_METHODS, SURFACES),
-        ),
-    ] = None,
-    port: Annotated[
-        int | None,
-        typer.Option(min=1, max=65535, metavar="N", help="Of the page.", show_default="a free one"),
-    ] = None,
-    host: Annotated[
-        str,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Where the page is served: an IP address of this computer; 0.0.0.0 for all of them.",
-        ),
-    ] = "127.0.0.1",
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Print the page's address; open nothing.")
-    ] = False,
-    desktop: Annotated[
-        bool, typer.Option("--desktop", help="Open a window instead of a page.")
-    ] = False,
-    png: Annotated[
-        Path | None,
-        typer.Option(metavar="PNG", help="Write a picture, without a screen.", show_default="none"),
-    ] = None,
-    mp4: Annotated[
-        Path | None,
-        typer.Option(metavar="MP4", help="Write a film, without a screen.", show_default="none"),
-    ] = None,
-    as_json: JsonOption = False,
+    source: str = arg(
+        "SOURCE",
+        "Frames, cloud, volume, raw shot, a folder or stack of clouds or shots, or an instrument's address.",
+        read=True,
+    ),
+    camera: Path | None = opt(
+        "H5", "For raw shots; made by calibrate.", shown="the one inside SOURCE"
+    ),
+    bin_width: float | None = opt(
+        "PS", "For raw shots: duration of a row in ps.", name="--bin-width-ps"
+    ),
+    time_zero: float | None = TIME_ZERO,
+    method: str | None = opt(
+        "NAME",
+        "For raw shots: tv, l1, linear or adjoint, with few iterations; surfaces for one shot.",
+        shown="l1 for one shot, linear for many",
+        choices=METHODS,
+    ),
+    port: int | None = PORT,
+    host: str = opt(
+        "ADDRESS",
+        "Where the page is served: an IP address of this computer; 0.0.0.0 for all of them.",
+        "127.0.0.1",
+    ),
+    no_browser: bool = NO_BROWSER,
+    desktop: bool = flag("--desktop", "Open a window instead of a page."),
+    png: Path | None = opt("PNG", "Write a picture, without a screen.", shown="none"),
+    mp4: Path | None = opt("MP4", "Write a film, without a screen.", shown="none"),
+    as_json: bool = JSON,
 ) -> None:
     """Look at a source: on a page of the browser, in a window, as a picture or as a film.
 
@@ -97,64 +61,46 @@ def view(
 
     Example: tofclip view frames.h5 --png scene.png
     """
-    _check_outputs(desktop, png, mp4, source, camera)
+    from apps.viewer.desktop import open_window
+    from apps.viewer.render import choose_renderer
+    from apps.viewer.scene_figure import choose_frames, save_film, save_picture
+    from apps.viewer.session import Session
+    from apps.viewer.source_factory import ShotOptions, announce_nothing, open_source
+
+    # Truth values add up: more than one was asked for.
+    if desktop + (png is not None) + (mp4 is not None) > 1:
+        raise InputError("choose one of --desktop, --png and --mp4")
+    for out, suffix in ((png, ".png"), (mp4, ".mp4")):
+        if out is not None:
+            require_writable(out, suffix, inputs=(source, camera))
     started = time.perf_counter()
-    known = ShotOptions(
-        camera,
-        None if bin_width_ps is None else bin_width_ps * PICOSECOND,
-        None if time_zero_ns is None else time_zero_ns * NANOSECOND,
-        method,
-    )
     is_page = not (desktop or png or mp4)
     door = PageDoor(host, port, no_browser, as_json)
     # Closing stops a live source and its threads, however the view ends.
     with contextlib.closing(door), contextlib.ExitStack() as opened:
         with show_activity(f"opening {source}"):
             announce = partial(door.open_waiting, source) if is_page else announce_nothing
+            known = ShotOptions(camera, bin_width, time_zero, method)
             found = opened.enter_context(contextlib.closing(open_source(source, known, announce)))
             session = Session(found)
-        if png is not None:
-            _draw_picture(session, png, started, as_json)
-        elif mp4 is not None:
-            _draw_film(session, mp4, started, as_json)
-        elif desktop:
-            _open_window(session)
-        else:
+        if is_page:
             door.serve(session)
-
-
-def _check_outputs(
-    desktop: bool, png: Path | None, mp4: Path | None, *inputs: str | Path | None
-) -> None:
-    # Truth values add up: more than one was asked for.
-    if desktop + (png is not None) + (mp4 is not None) > 1:
-        raise InputError("choose one of --desktop, --png and --mp4")
-    for out, suffix in ((png, ".png"), (mp4, ".mp4")):
-        if out is not None:
-            require_writable(out, suffix, inputs=inputs)
-
-
-def _draw_picture(session: Session, out: Path, started: float, as_json: bool) -> None:
-    shown, renderer = session.frame_at(0.0), choose_renderer()
-    save_picture(session.title, shown, renderer, out)
-    report(_collect_metrics(len(shown.cloud), renderer.name, started), as_json, [out])
-
-
-def _draw_film(session: Session, out: Path, started: float, as_json: bool) -> None:
-    renderer, pictures = choose_renderer(), len(choose_frames(session))
-    with show_progress("filming", pictures) as advance:
-        points = save_film(session, renderer, out, advance)
-    report(
-        _collect_metrics(points, renderer.name, started) | {"pictures": pictures}, as_json, [out]
-    )
-
-
-def _collect_metrics(points: int, backend: str, started: float) -> dict[str, Any]:
-    return {"points": points, "backend": backend, "seconds": time.perf_counter() - started}
-
-
-def _open_window(session: Session) -> None:
-    open_window(session)
+            return
+        if desktop:
+            open_window(session)
+            return
+        renderer, points, further = choose_renderer(), 0, {}
+        if png is not None:
+            shown = session.frame_at(0.0)
+            save_picture(session.title, shown, renderer, png)
+            points = len(shown.cloud)
+        elif mp4 is not None:
+            further = {"pictures": len(choose_frames(session))}
+            with show_progress("filming", further["pictures"]) as advance:
+                points = save_film(session, renderer, mp4, advance)
+        figures = {"points": points, "backend": renderer.name}
+        figures |= {"seconds": time.perf_counter() - started, **further}
+        report(figures, as_json, [path for path in (png, mp4) if path is not None])
 
 
 @dataclass
@@ -170,16 +116,19 @@ class PageDoor:
     _waiting: WaitingPage | None = None
 
     def open_waiting(self, source: str, words: str) -> None:
-        """Serve a page that says what is being done.
+        """Serve a page that says what is being done with a source, as the user named it."""
+        from apps.viewer.page import WaitingPage
+        from apps.viewer.server import parse_host
 
-        `source`: as the user named it; `words`: what is being done.
-        """
         title = source if "://" in source else Path(source).name
         self._waiting = WaitingPage(title, words, self.port, parse_host(self.host))
         self._show_address(self._waiting.address)
 
     def serve(self, session: Session) -> None:
         """Serve a session until Ctrl-C."""
+        from apps.viewer.page import Page
+        from apps.viewer.server import parse_host
+
         page = Page(session, self.port, parse_host(self.host), self._waiting)
         was_waiting, self._waiting = self._waiting is not None, None
         with contextlib.closing(page):
@@ -193,6 +142,10 @@ class PageDoor:
             self._waiting.close()
 
     def _show_address(self, address: str) -> None:
+        import webbrowser
+
+        from apps.viewer.server import is_local, parse_host
+
         report({"address": address}, self.as_json)
         sys.stdout.flush()  # a program that reads the address waits for it
         if not is_local(parse_host(self.host)):

@@ -7,23 +7,19 @@ import io
 import os
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-
-from apps.cli import main
-from apps.conventions import JsonOption, report
 from apps.help import EXIT_INTERRUPTED
+from apps.options import JSON
 from apps.progress import show_progress
-from tofclip.camera import Camera
+from apps.report import report
 from tofclip.errors import InputError
-from tofclip.shots import Streak
 from tofclip.units import PICOSECOND
 
 VIEW_ANGLES_DEG = (-43.0, -26.0, -13.0, 0.5, 23.0, 37.0, 48.0)
 VIEW_PITCH_PX, IMAGE_SHAPE = 40.0, (24, 24)
 ROWS, PULSE_ROWS, BIN_WIDTH_S = 64, 1.3, 20 * PICOSECOND
+HIDDEN_SCENE = "--letters T --facet-mm 100 --wall-width-m 0.8 --wall-points 12 --bin-width-ps 16"
 IMAGINGS = (
     ("planar", "single", ("rsd", "hybrid", "backprojection", "filtered-backprojection")),
     ("planar", "confocal", ("lct", "fk", "backprojection")),
@@ -31,19 +27,8 @@ IMAGINGS = (
 )
 """Walls, scans, and the methods to run on them."""
 
-HIDDEN_SCENE = (
-    "--letters",
-    "T",
-    "--facet-mm",
-    "100",
-    "--wall-width-m",
-    "0.8",
-    "--bin-width-ps",
-    "16",
-)
 
-
-def warm_up(as_json: JsonOption = False) -> None:
+def warm_up(as_json: bool = JSON) -> None:
     """Run everything that is compiled on first use once, on small data.
 
     Compiled code is kept beside the program, or in NUMBA_CACHE_DIR; later runs load it. After an
@@ -53,57 +38,49 @@ def warm_up(as_json: JsonOption = False) -> None:
     """
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        steps = list(_list_steps(Path(folder)))
+        steps = list_steps()
         _save_shots(Path(folder))
         with show_progress("compiling", len(steps)) as advance:
-            for words in steps:
-                _run_quietly(words)
+            for step in steps:
+                _run_quietly([word.replace("@", f"{folder}/") for word in step.split()])
                 advance(1)
     report({"steps": len(steps), "seconds": time.perf_counter() - started}, as_json)
 
 
-def _list_steps(folder: Path) -> Iterator[Sequence[str]]:
-    """Commands that between them call every compiled function."""
-    shots, frames = folder / "shots", folder / "frames.h5"
-    for method in ("tv", "l1", "linear", "adjoint", "surfaces"):
-        options = (
-            ("--method", method, "--iterations", "2")
-            if method in ("tv", "l1", "surfaces")
-            else ("--method", method)
-        )
-        yield ("recover", str(shots / "first.h5"), "--out", str(frames), *options)
-    yield ("cloud", str(frames), "--out", str(folder / "cloud.ply"))
-    yield ("lidar", "accuracy", "--trials", "10")
-    yield ("lidar", "sequence", str(shots), "--out", str(folder / "clouds"))
-    yield ("demo", "--out", str(folder / "demo"))
+def list_steps() -> list[str]:
+    """Commands that between them call every compiled function; ``@`` stands for a folder."""
+    steps = [
+        f"recover @shots/first.h5 --out @frames.h5 --method {method} --iterations 2"
+        for method in ("tv", "l1", "surfaces")
+    ]
+    steps += [
+        "recover @shots/first.h5 --out @frames.h5 --method linear",
+        "recover @shots/first.h5 --out @frames.h5 --method adjoint",
+        "cloud @frames.h5 --out @cloud.ply",
+        "lidar accuracy --trials 10",
+        "lidar sequence @shots --out @clouds",
+        "demo --out @demo",
+    ]
     for wall, scan, methods in IMAGINGS:
-        capture = str(folder / f"{wall}_{scan}.h5")
-        scene = ("--wall", wall, "--scan", scan, "--wall-points", "12", *HIDDEN_SCENE)
-        yield ("nlos", "simulate", *scene, "--out", capture)
-        for method in methods:
-            volume = str(folder / f"{method}.h5")
-            yield (
-                "nlos",
-                "reconstruct",
-                capture,
-                "--method",
-                method,
-                "--voxel-mm",
-                "50",
-                "--out",
-                volume,
-            )
+        capture = f"@{wall}_{scan}.h5"
+        steps.append(f"nlos simulate --wall {wall} --scan {scan} {HIDDEN_SCENE} --out {capture}")
+        steps += [
+            f"nlos reconstruct {capture} --method {method} --voxel-mm 50 --out @{method}.h5"
+            for method in methods
+        ]
+    return steps
 
 
 def _save_shots(folder: Path) -> None:
     """Write two small shots of a bright square, whose sweep and gains are not known."""
+    import numpy as np
+
+    from tofclip.camera import Camera
+    from tofclip.shots import Streak
+
     centres = VIEW_PITCH_PX * (0.5 + np.arange(len(VIEW_ANGLES_DEG), dtype=np.float64))
-    camera = Camera(
-        centres,
-        np.deg2rad(np.array(VIEW_ANGLES_DEG)),
-        IMAGE_SHAPE,
-        round(VIEW_PITCH_PX * centres.size),
-    )
+    angles = np.deg2rad(np.array(VIEW_ANGLES_DEG))
+    camera = Camera(centres, angles, IMAGE_SHAPE, round(VIEW_PITCH_PX * centres.size))
     frames = np.zeros((*IMAGE_SHAPE, ROWS), np.float32)
     pulse = np.exp(-(((np.arange(ROWS) - ROWS / 2) / PULSE_ROWS) ** 2) / 2)
     frames[8:16, 8:16] = 100 * pulse.astype(np.float32)
@@ -115,8 +92,10 @@ def _save_shots(folder: Path) -> None:
         streak.save(folder / "shots" / f"{name}.h5")
 
 
-def _run_quietly(words: Sequence[str]) -> None:
+def _run_quietly(words: list[str]) -> None:
     """Run a command without its output."""
+    from apps.cli import main
+
     messages = io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(messages):
         status = main(words)

@@ -286,7 +286,7 @@ def test_conversions(run: Run, files: Path, folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", [["frobnicate"], ["recover"], ["nlos", "frobnicate"], ["info", "a", "b"], ["--frob"]]
+    "words", [["frobnicate"], ["recover"], ["nlos", "frobnicate"], ["info", "/", "b"], ["--frob"]]
 )
 def test_usage(run: Run, words: list[str]) -> None:
     assert_refused(run(*words), "(see --help)")

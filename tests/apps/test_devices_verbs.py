@@ -176,7 +176,7 @@ def test_an_input_is_not_overwritten(run: Run, recording: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_leaves_a_whole_recording(tmp_path: Path, number: signal.Signals) -> None:
     path = tmp_path / "run.h5"
-    command = [sys.executable, "-m", "apps", "record", SIM, "--out", str(path)]
+    command = [sys.executable, "-m", "tofclip", "record", SIM, "--out", str(path)]
     # A shell that puts the tests into the background has them ignore Ctrl-C, and children inherit
     # that.
     heed = partial(signal.signal, number, signal.SIG_DFL)

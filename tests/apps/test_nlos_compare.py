@@ -9,8 +9,8 @@ import pytest
 from hidden_point import POINT, object_of
 from small_instrument import Run
 
-from apps.nlos.truth import HiddenTruth
 from nlos import Capture, Volume
+from nlos.known_scenes import HiddenTruth
 
 PNG = b"\x89PNG"
 
@@ -53,7 +53,7 @@ def test_its_settings_give_the_same_comparison(run: Run, confocal: Path, tmp_pat
 
 
 def test_memory_is_that_of_the_method() -> None:
-    from apps.nlos.measure import _reset_peak_memory, measure_imaging
+    from apps.verbs.nlos_imaging import _reset_peak_memory, measure_imaging
     from nlos import Grid
 
     if _reset_peak_memory() is None:
@@ -85,7 +85,7 @@ def test_memory_is_that_of_the_method() -> None:
 
 def test_the_demonstration(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As it is, with a coarser wall and fewer voxels."""
-    from apps.verbs.nlos import demo
+    from apps.verbs import nlos as demo
 
     for name, value in {
         "WALL_POINTS": 24,
@@ -123,8 +123,8 @@ def test_memory_is_foretold_within_a_factor(run: Run, confocal: Path, tmp_path: 
 
 
 def test_figures_of_merit_of_volumes_that_need_no_computing() -> None:
-    from apps.nlos.measure import compare_with_truth, measure_sharpness
     from nlos import Grid
+    from nlos.known_scenes import compare_with_truth, measure_sharpness
 
     grid = Grid(np.arange(4) * 0.03, np.arange(3) * 0.03, [1.0, 1.03])
     even, single = np.ones(grid.shape, np.float32), np.zeros(grid.shape, np.float32)

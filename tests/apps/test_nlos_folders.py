@@ -13,9 +13,8 @@ import pytest
 from hidden_point import object_of
 from small_instrument import Run
 
-from apps.nlos.files import ResultFiles, note_content
 from apps.settings import load_settings, save_settings
-from apps.verbs.nlos.reconstruct import ReconstructSettings
+from apps.verbs.nlos import ReconstructSettings, ResultFiles, note_content
 from nlos import Volume
 from tofclip.storage import HDF5_SIGNATURE
 
@@ -38,14 +37,14 @@ def words(folder: Path) -> list[object]:
 @pytest.fixture
 def _imaging_is_quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which captures are imaged is what matters here, not what comes out."""
-    from apps.verbs.nlos import reconstruct
+    from apps.verbs import nlos as verbs
 
-    def pretended(_: Path, results: ResultFiles, __: object) -> dict[str, Any]:
+    def pretended(_: Path, results: ResultFiles, *_others: object) -> dict[str, Any]:
         for path in results.paths:
             path.write_text("a result")
         return {}
 
-    monkeypatch.setattr(reconstruct, "_reconstruct_single", pretended)
+    monkeypatch.setattr(verbs, "reconstruct_single", pretended)
 
 
 def test_the_broken_one_is_listed_and_the_others_are_whole(run: Run, folder: Path) -> None:
@@ -118,16 +117,16 @@ def test_results_of_other_settings_are_not_mixed_in(run: Run, folder: Path) -> N
 def test_an_interruption_leaves_whole_results(
     run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from apps.verbs.nlos import reconstruct
+    from apps.verbs import nlos as verbs
 
-    original: Callable[..., dict[str, Any]] = reconstruct._reconstruct_single
+    original: Callable[..., dict[str, Any]] = verbs.reconstruct_single
 
     def interrupted(source: Path, *others: Any) -> dict[str, Any]:
         if source.name == "c.h5":
             raise KeyboardInterrupt
         return original(source, *others)
 
-    monkeypatch.setattr(reconstruct, "_reconstruct_single", interrupted)
+    monkeypatch.setattr(verbs, "reconstruct_single", interrupted)
     outcome = run("nlos", *words(folder))
     assert (outcome.status, outcome.out) == (130, "")
     assert {path.name for path in (folder.parent / "out").iterdir()} == {

@@ -9,9 +9,8 @@ import pytest
 from hidden_point import POINT, object_of
 from small_instrument import Run
 
-from apps.nlos.measure import compare_with_truth
-from apps.nlos.truth import HiddenTruth
 from nlos import Volume
+from nlos.known_scenes import HiddenTruth, compare_with_truth
 
 BOX = ["--x-m", -0.15, 0.25, "--y-m", -0.2, 0.2, "--near-m", 0.4, "--far-m", 0.7, "--everywhere"]
 

@@ -13,7 +13,7 @@ from hidden_point import object_of
 from small_instrument import Run
 
 import nlos.phasor.plan
-from apps.verbs.nlos.stream import _VolumeStream
+from apps.verbs.nlos_stream import VolumeStream
 from nlos import Capture, Volume
 from nlos import preparation as moveout
 from nlos.capture import TimeAxis
@@ -70,9 +70,9 @@ def test_pairs_are_joined_by_one_plan(
     for number in range(3):
         capture.save(tmp_path / "in" / f"{number}.h5")
     found, before = [], []
-    path_of, run_stream = moveout._path_of, _VolumeStream.run
+    path_of, run_stream = moveout._path_of, VolumeStream.run
     monkeypatch.setattr(moveout, "_path_of", lambda *a: found.append(1) or path_of(*a))
-    monkeypatch.setattr(_VolumeStream, "run", lambda s: before.append(len(found)) or run_stream(s))
+    monkeypatch.setattr(VolumeStream, "run", lambda s: before.append(len(found)) or run_stream(s))
     words = ["--out", tmp_path / "out", *WORDS[:-1], 700]  # paths are as if confocal
     assert object_of(run, "stream", tmp_path / "in", *words)["delivered"] == 3
     assert before == [len(found)] != [0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import shlex
 import signal
@@ -17,13 +16,14 @@ import pytest
 from hidden_point import POINT, SCENE, object_of
 from small_instrument import Run
 from test_program import LONGEST_WAIT_S, PROGRAM, ROOT, wait_for
+from verb_pages import collect_verbs
 
-from apps.help import split_docstring as told_by
-from apps.nlos.truth import HiddenTruth
-from apps.verbs.nlos import VERBS
+from apps.help import split_docstring
 from nlos import Capture, Volume
 from nlos.export import Mesh
 from nlos.illumination import AliasingWarning
+from nlos.known_scenes import HiddenTruth
+from nlos.method import Plan
 
 PNG = b"\x89PNG"
 
@@ -315,10 +315,12 @@ def test_progress_and_an_interruption(curved: Path, tmp_path: Path) -> None:
 
 def examples() -> dict[str, list[str]]:
     """Example commands in the help, by verb."""
-    return {
-        name: told_by(getattr(importlib.import_module(f"apps.verbs.nlos.{name}"), name).__doc__)[1]
-        for name in VERBS
+    verbs = {
+        name.partition(" ")[2]: verb
+        for name, verb in collect_verbs().items()
+        if name.startswith("nlos ")
     }
+    return {name: split_docstring(verb.callback.__doc__)[1] for name, verb in verbs.items()}
 
 
 def test_every_verb_explains_itself_with_an_example(run: Run) -> None:
@@ -388,3 +390,24 @@ def test_a_recording_under_its_default_settings_warns_of_nothing(shared_data: Pa
         warn_of_aliasing(capture, Band(VirtualPulse(wavelength), capture.axis))
     with pytest.warns(AliasingWarning):
         warn_of_aliasing(capture, Band(VirtualPulse(0.9 * wavelength), capture.axis))
+
+
+def test_each_plan_is_made_once_per_image(
+    run: Run, curved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, imaged = [], []
+    begin, image = Plan.__init__, Plan.image
+
+    def count_plan(plan: Plan, *arguments: object) -> None:
+        made.append(type(plan).__name__)
+        begin(plan, *arguments)  # type: ignore[arg-type]
+
+    def count_image(plan: Plan, *arguments: object) -> object:
+        imaged.append(type(plan).__name__)
+        return image(plan, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Plan, "__init__", count_plan)
+    monkeypatch.setattr(Plan, "image", count_image)
+    words = ["reconstruct", curved, "--method", "hybrid", "--out", tmp_path / "volume.h5"]
+    object_of(run, *words)
+    assert len(made) == len(imaged) == 2  # coarse voxels, then the bright part

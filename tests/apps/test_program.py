@@ -10,19 +10,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-import typer
 from small_instrument import Run
+from typer.core import TyperArgument
+from verb_pages import collect_verbs
 
-import apps
 import tofclip
 from apps import cli
-from apps.help import make_lazy_group
-from apps.verb_help import show_verb_help
 
-PROGRAM = [sys.executable, "-m", "apps"]
+PROGRAM = [sys.executable, "-m", "tofclip"]
 ROOT = Path(tofclip.__file__).parents[1]
 LONGEST_WAIT_S = 60.0  # compiling the kernels on a slow, cold machine
 
@@ -70,79 +67,24 @@ HEAVY = {
 }
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--help"], "Usage: tofclip"),
-        (["info", "absent.h5"], "absent.h5: no such file"),
-        (["nlos", "info", "absent.h5"], "absent.h5: no such file"),
-    ],
-)
-def test_help_and_refusals_need_nothing_heavy(words: list[str], said: str) -> None:
-    code = f"import sys; from apps.cli import main; main({words!r}); print(*sys.modules)"
+def list_loaded(statement: str) -> set[str]:
+    """Modules that a program loads."""
+    code = f"import sys; from apps.cli import main; {statement}; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    *shown, loaded = done.stdout.splitlines()
-    assert said in "\n".join([*shown, done.stderr])
-    assert HEAVY.isdisjoint(loaded.split())
+    return set(done.stdout.splitlines()[-1].split())
 
 
-SHOW_ALL_HELPS = """
-import contextlib, io, json, sys
-import typer
-from apps.cli import VERBS, app, main
-from apps.help import walk_verbs
-from apps.verb_help import import_placeholders
-
-def show(*words):
-    with contextlib.redirect_stdout(io.StringIO()) as shown:
-        assert main(words) == 0
-    return shown.getvalue()
-
-with import_placeholders():
-    verbs = list(walk_verbs(typer.main.get_group(app)))
-shown = {verb: show(*verb.split(), "--help") for verb in verbs}
-for_helps = list(sys.modules)
-group = typer.main.get_group(app)
-for verb in VERBS:
-    if verb != "nlos":
-        group.load_verb(verb)
-for_verbs = list(sys.modules)
-whole = {verb: show(*verb.split(), "--json", "--help") for verb in verbs}
-print(json.dumps([for_helps, for_verbs, shown, whole]))
-"""
-"""``--json`` before ``--help`` leads the way of all options, on which the verb is imported whole."""
+def test_helps_load_nothing_heavy() -> None:
+    helps = [["--help"], *([*verb.split(), "--help"] for verb in collect_verbs())]
+    assert HEAVY.isdisjoint(list_loaded(f"[main(words) for words in {helps}]"))
 
 
-def test_verbs_load_heavy_things_when_they_need_them_and_no_help_does() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SHOW_ALL_HELPS], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    for_helps, for_verbs, shown, whole = json.loads(done.stdout)
-    assert HEAVY.isdisjoint(for_helps)
-    late = {"numba", "matplotlib", "rich", "scipy.optimize", "pydantic", "viser", "pyvista"}
-    assert late.isdisjoint(for_verbs)
-    assert len(shown) > len(cli.VERBS)
-    assert shown == whole
-
-
-def test_a_help_with_a_number_of_its_verbs_work_imports_that(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "late_verbs").mkdir()
-    (tmp_path / "late_verbs" / "late.py").write_text(
-        "from numpy.absent import LANES\ndef late(): ...\nlate.__doc__ = f'Take {LANES} frames.'\n"
-    )
-    monkeypatch.setattr(apps, "__path__", [*apps.__path__, str(tmp_path)])
-    verbs = typer.Typer(cls=make_lazy_group("apps.late_verbs", {"late": ""}))
-    verbs.callback()(lambda: None)
-    assert not show_verb_help(verbs, ["late", "--json", "--help"])
-    with pytest.raises(ModuleNotFoundError, match=r"numpy\.absent"):  # the whole verb is imported
-        show_verb_help(verbs, ["late", "--help"])
-    monkeypatch.setitem(sys.modules, "numpy.absent", SimpleNamespace(LANES=16))
-    assert show_verb_help(verbs, ["late", "--help"])
-    assert "Take 16 frames." in capsys.readouterr().out
+def test_a_refusal_loads_no_more_than_the_options() -> None:
+    refused = [["info", "absent.h5"], ["nlos", "info", "absent.h5"]]
+    loaded = list_loaded(f"[main(words) for words in {refused}]")
+    assert loaded & HEAVY <= {"pydantic", "rich"}
 
 
 def test_libraries_say_nothing_before_the_one_line_about_an_error() -> None:
@@ -187,7 +129,7 @@ def test_a_defect_is_one_line_as_well(
     def fail(*_: object) -> None:
         raise ZeroDivisionError("a defect\nin two lines")
 
-    monkeypatch.setattr("apps.outline._read_outline", fail)
+    monkeypatch.setattr("tofclip.loading.outline", fail)
     outcome = run("info", files / "camera.h5")
     assert outcome.status == cli.EXIT_DEFECT
     assert outcome.err.startswith(
@@ -307,11 +249,23 @@ def wait_for(terminal: int, text: str) -> str:
     return seen
 
 
-@pytest.mark.parametrize("verb", cli.FILE_READERS)
-def test_a_missing_file_is_refused_before_its_verb_is_imported(
-    run: Run, monkeypatch: pytest.MonkeyPatch, verb: str
-) -> None:
-    monkeypatch.setattr("apps.help.load_command", lambda *_: pytest.fail("it was imported"))
+def is_read(param: TyperArgument) -> bool:
+    """Whether an argument names what is read: a file, a folder, a pattern or an address."""
+    return param.param_type_name == "argument" and param.callback is not None
+
+
+READERS = [verb for verb, command in collect_verbs().items() if any(map(is_read, command.params))]
+
+
+@pytest.mark.parametrize("verb", READERS)
+def test_a_missing_file_is_refused_before_anything_else(run: Run, verb: str) -> None:
     outcome = run(*verb.split(), "absent.h5")
     assert (outcome.status, outcome.out) == (2, "")
     assert outcome.err == "tofclip: error: absent.h5: no such file\n"
+
+
+def test_all_that_read_files_are_among_them() -> None:
+    assert {*("recover", "cloud", "view", "stream", "info", "convert", "calibrate range")} < set(
+        READERS
+    )
+    assert len(READERS) == 21

@@ -19,7 +19,7 @@ SMALL = CameraArray((40, 40), 4, focal_length_px=50.0, view_step=0.04, samples=1
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scenes of 40 x 40 pixels instead of 128 x 128."""
-    monkeypatch.setattr("apps.verbs.reproduce.Library", lambda data: Library(data, SMALL))
+    monkeypatch.setattr("apps.studies.cases.Library", lambda data: Library(data, SMALL))
 
 
 @pytest.mark.usefixtures("small")

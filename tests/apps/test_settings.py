@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apps.nlos.scene import WALLS, SceneSettings
-from apps.settings import load_settings, save_settings, setting_field, settings_to_dict
-from apps.verbs.nlos.compare import CompareSettings
-from apps.verbs.nlos.reconstruct import ReconstructSettings
+from apps.settings import load_settings, save_settings, setting, settings_to_dict
+from apps.verbs.nlos import CompareSettings, ReconstructSettings
+from nlos.known_scenes import WALLS, SceneSettings
 from tofclip.errors import FileFormatError, InputError, StorageError
 
 
@@ -20,21 +19,22 @@ from tofclip.errors import FileFormatError, InputError, StorageError
 class Sample:
     """One setting of every type."""
 
-    name: str | None = setting_field("TEXT", "A text.")
-    length_m: float | None = setting_field("M", "A length.")
-    count: int = setting_field("N", "A number.", 2)
-    whole: bool = setting_field(None, "A choice.", False)
-    ends_m: tuple[float, float] | None = setting_field("M M", "A pair.")
+    name: str | None = setting("TEXT", "A text.")
+    length: float | None = setting("M", "A length.", unit="m")
+    facet: float | None = setting("MM", "A short one.", unit="m", written="mm")
+    count: int = setting("N", "A number.", 2)
+    whole: bool = setting(None, "A choice.", False)
+    ends: tuple[float, float] | None = setting("M M", "A pair.", unit="m")
 
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 SAMPLES = st.builds(
     Sample,
     name=st.none() | st.text(st.characters(exclude_categories=["Cs"])),
-    length_m=st.none() | NUMBERS,
+    length=st.none() | NUMBERS,
     count=st.integers(-(2**63), 2**63 - 1),
     whole=st.booleans(),
-    ends_m=st.none() | st.tuples(NUMBERS, NUMBERS),
+    ends=st.none() | st.tuples(NUMBERS, NUMBERS),
 )
 
 
@@ -51,17 +51,24 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
     path = tmp_path / "settings.toml"
     path.write_text("length_m = 3\ncount = 5\nends_m = [1, 2.5]\n")
     found = load_settings(Sample, path, {"count": 7, "name": None, "whole": False})
-    assert found == Sample(length_m=3.0, count=7, ends_m=(1.0, 2.5))
-    assert isinstance(found.length_m, float)
+    assert found == Sample(length=3.0, count=7, ends=(1.0, 2.5))
+    assert isinstance(found.length, float)
     assert load_settings(Sample, None, {}) == Sample()
     assert settings_to_dict(Sample(count=3)) == {"count": 3, "whole": False}
+
+
+@given(st.decimals(1, 9999, places=4).map(float))
+def test_lengths_in_mm_are_metres_inside_and_come_back_as_they_were(facet_mm: float) -> None:
+    found = load_settings(Sample, None, {"facet_mm": facet_mm})
+    assert found.facet == facet_mm * 1e-3
+    assert settings_to_dict(found)["facet_mm"] == facet_mm
 
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
         ("lenght_m = 1", "did you mean 'length_m'"),
-        ("zzz = 1", "known are name, length_m, count, whole, ends_m"),
+        ("zzz = 1", "known are name, length_m, facet_mm, count, whole, ends_m"),
         ("length_m = 'one'", "length_m must be a finite number, got 'one'"),
         ("length_m = true", "length_m must be a finite number"),
         ("length_m = nan", "length_m must be a finite number"),
@@ -102,7 +109,11 @@ def test_every_setting_can_be_told_by_a_file(kind: type, tmp_path: Path) -> None
     """Values of each field's own type go out and come back."""
     examples = {"float": 0.5, "int": 3, "str": "a", "bool": True, "tuple[float, float]": (0.5, 1.5)}
     values = {
-        field.name: examples[str(field.type).removesuffix(" | None")] for field in fields(kind)
+        field.name: examples[
+            str(field.type).removesuffix(" | None").replace("Limits", "tuple[float, float]")
+        ]
+        for field in fields(kind)
+        if "help" in field.metadata and field.name not in ("gate_found", "reasons")
     }
     save_settings(kind(**values), tmp_path / "all.toml", "all of them")
     assert load_settings(kind, tmp_path / "all.toml", {}) == kind(**values)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from relay_walls import planar_wall
 
-from nlos import Capture, Grid, PlanarRSD, Volume, settings_for
+from nlos import Capture, Grid, PlanarRSD, Settings, Volume, settings_for
 from nlos.analysis import choose_wavelength, find_brightest_path, find_first_bounce
 from nlos.band import VirtualPulse
 from nlos.capture import TimeAxis
+from nlos.completion import complete_settings, is_brightest_on_wall
 from nlos.io import read_capture
 from nlos.preparation import fade_record_end, flip_capture, join_near_lasers, remove_first_bounce
-from nlos.settings import complete_settings, is_brightest_on_wall
 from nlos.simulate import PointScene, add_poisson_noise
 from tofclip.errors import InputError
 
@@ -124,20 +124,23 @@ def test_background_is_not_the_walls_own_light() -> None:
 
 
 def test_noise_makes_the_wave_longer() -> None:
-    quiet, random = complete_settings(clean()).wavelength, np.random.default_rng(1)
+    quiet, random = complete_settings(clean(), Settings()).wavelength, np.random.default_rng(1)
     many = clean().signal * (100 / clean().signal.max())
     noisy = replace(clean(), signal=random.poisson(many + 0.5).astype(np.float32))
-    found = complete_settings(noisy)
+    found = complete_settings(noisy, Settings())
     assert quiet is not None
     assert found.wavelength is not None
     fewer = replace(clean(), signal=random.poisson(many / 10 + 0.5).astype(np.float32))
-    longer = complete_settings(fewer).wavelength
+    longer = complete_settings(fewer, Settings()).wavelength
     assert longer is not None
     assert longer > found.wavelength
 
 
 def test_transforms_see_the_lattice_whatever_the_wavelength() -> None:
-    by_wave, by_lattice = complete_settings(clean()), complete_settings(clean(), method="fk")
+    by_wave, by_lattice = (
+        complete_settings(clean(), Settings()),
+        complete_settings(clean(), Settings(method="fk")),
+    )
     assert by_wave.voxel == pytest.approx((by_wave.wavelength or 0) / 8)
     bins = by_lattice.bins_together or 0
     assert bins * AXIS.spacing <= clean().spacing < (bins + 1) * AXIS.spacing
@@ -186,7 +189,7 @@ def test_the_box_before_a_wall_with_relief_begins_by_its_middle() -> None:
     wall[..., 2] = 0.3 * (wall[..., 0] > 0)
     hidden = [-0.15, -0.05, 0.5]
     capture = PointScene([hidden], [400.0]).simulate_capture(wall, wall, AXIS, 40e-12)
-    settings = complete_settings(with_glare(capture, 1000.0, 0.045))
+    settings = complete_settings(with_glare(capture, 1000.0, 0.045), Settings())
     assert settings.gate_found
     gate, near = settings.gate or 0.0, settings.near or 0.0
     # Two fifths of the gate from the middle of the relief.

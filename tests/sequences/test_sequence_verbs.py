@@ -271,7 +271,7 @@ def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path, af
         "local:1",
     )
     words = ("recover", shots, "--out", out, "--camera", recorded / "camera.h5", *slow)
-    command = [sys.executable, "-m", "apps", *map(str, words)]
+    command = [sys.executable, "-m", "tofclip", *map(str, words)]
     # A terminal sends Ctrl-C to a whole group of processes.
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=ROOT

@@ -24,7 +24,7 @@ from tofclip.errors import InputError, MissingDependencyError
 from tofclip.recovery import Shot
 
 ROOT = Path(tofclip.__file__).parents[1]
-PROGRAM = [sys.executable, "-m", "apps", "view"]
+PROGRAM = [sys.executable, "-m", "tofclip", "view"]
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from apps.conventions import report
 from apps.progress import show_progress
-from tofclip.arrays import parse_device
+from apps.report import report
 from tofclip.errors import MissingDependencyError
-from tofclip.sequences.jobs import run_jobs, select_unfinished
 
 if TYPE_CHECKING:
     from tofclip.sequences.jobs import Job, Report, Summary
@@ -30,11 +28,11 @@ def run_with_progress(
     cluster: str | None,
     watch: Callable[[Report], object] = lambda _: None,
 ) -> Summary:
-    """Run the jobs that are not done yet, with a bar that shows the time left.
-
-    `title`: of the bar; `cluster`: where; one after the other in this process by default; `watch`:
-    called with each report.
+    """Run the jobs that are not done yet, one after the other in this process unless a cluster is
+    named, with a bar that shows the time left; `watch` is called with each report.
     """
+    from tofclip.sequences.jobs import run_jobs, select_unfinished
+
     missing = select_unfinished(jobs)
     with show_progress(title, len(missing)) as advance:
 
@@ -46,10 +44,9 @@ def run_with_progress(
 
 
 def resolve_device(device: str, cluster: str | None) -> str:
-    """Return which device a name stands for here; workers on other machines look for it themselves.
+    """Return which device a name stands for here; workers on other machines look for it themselves."""
+    from tofclip.arrays import parse_device
 
-    `cluster`: address of the cluster's scheduler.
-    """
     try:
         found = str(parse_device(device))
     except MissingDependencyError:
@@ -64,14 +61,13 @@ def report_summary(
 ) -> None:
     """Print the figures of a sequence and its failures.
 
-    `total`: jobs of the sequence, those included that were done by an earlier run; `out`: where the
-    results are; `figures`: further ones.
+    `total`: its jobs, those included that were done by an earlier run; `figures`: further ones.
     """
-    attempted = summary.done + len(summary.failures)
+    failed = {one.name: one.problem for one in summary.failures}
     figures = {
         "results": summary.done,
-        "kept_from_before": total - attempted,
-        "failed": len(summary.failures),
+        "kept_from_before": total - summary.done - len(failed),
+        "failed": len(failed),
         "seconds": summary.seconds,
         "results_per_second": summary.done / summary.seconds,
         "processes": summary.processes,
@@ -79,13 +75,11 @@ def report_summary(
         **(figures or {}),
     }
     if as_json:
-        failures = [
-            {"name": failure.name, "problem": failure.problem} for failure in summary.failures
-        ]
-        report({**figures, "failures": failures}, as_json=True)
-    else:
-        report(figures, as_json=False, written=[out])
-        for failure in summary.failures:
-            print(f"failed: {failure.name}: {failure.problem}", file=sys.stderr)
-    if summary.failures:
+        listed = [{"name": name, "problem": problem} for name, problem in failed.items()]
+        figures |= {"failures": listed}
+    report(figures, as_json, [out])
+    if not as_json:
+        for name, problem in failed.items():
+            print(f"failed: {name}: {problem}", file=sys.stderr)
+    if failed:
         raise typer.Exit(EXIT_SOME_FAILED)

@@ -1,1 +1,0 @@
-"""Imaging around corners for the command line: settings, defaults, measures."""

@@ -1,0 +1,228 @@
+"""What every verb does before its work and after it: outputs are checked, figures printed."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tofclip.errors import StorageError
+from tofclip.files import require_apart, require_suffix
+
+if TYPE_CHECKING:
+    from tofclip.shots import Frames
+
+RECORD_SUFFIXES = (".h5", ".hdf5")
+PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
+MAX_LISTED_VALUES = 12  # of a list that are printed one by one
+MAX_TABLE_WIDTH = 100  # columns of a terminal for several things side by side
+UNITS = {"m", "mm", "s", "ns", "ps", "px"}
+
+
+def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | None] = ()) -> None:
+    """Refuse an output that cannot be written, or that would overwrite an input: finding out after
+    minutes of work would be too late. The writing itself is all or nothing in any case.
+
+    `*suffixes`: endings that the name may have; none given: any; `inputs`: what must survive, see
+    `tofclip.files.require_apart`.
+    """
+    _require_file_name(out)
+    if suffixes:
+        require_suffix(out, *suffixes)
+    if out.parent.exists() and not out.parent.is_dir():
+        raise StorageError(f"{out}: cannot be written: its folder is a file")
+    if not out.parent.is_dir():
+        raise StorageError(f"{out}: cannot be written: the folder does not exist; create it first")
+    if not os.access(out.parent, os.W_OK):
+        raise StorageError(f"{out}: cannot be written: writing is not permitted there")
+    require_apart([out], inputs)
+
+
+def _require_file_name(out: Path) -> None:
+    if not out.name or out.is_dir():
+        raise StorageError(f"{out}: cannot be written: it is a folder; name a file")
+
+
+def name_beside(out: Path, suffix: str) -> Path:
+    """Name what is written beside an output: as the output, with another ending."""
+    _require_file_name(out)
+    return out.with_suffix(suffix)
+
+
+def choose_preview(out: Path, preview: Path | None, inputs: Iterable[str | Path | None]) -> Path:
+    """Return where the picture of a result goes, by default beside the result, and refuse either
+    where it cannot be written.
+    """
+    preview, inputs = preview or name_beside(out, ".png"), list(inputs)
+    require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
+    require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
+    return preview
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for results, with its parents."""
+    if folder.exists() and not folder.is_dir():
+        raise StorageError(f"{folder}: cannot be made: it is a file; name a folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise StorageError(f"{folder}: cannot be made: {fault.strerror or fault}") from fault
+    if not os.access(folder, os.W_OK):
+        raise StorageError(f"{folder}: writing is not permitted there")
+
+
+def build_provenance(
+    settings: Mapping[str, Any], *inputs: Path, earlier: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Describe how a result came about, in plain values: options by name, checksums of the inputs,
+    and what is known about their own past.
+    """
+    from tofclip.storage import collect_provenance
+
+    plain = {
+        name: str(value) if isinstance(value, Path) else value for name, value in settings.items()
+    }
+    described = collect_provenance(plain, *inputs)
+    return described | {"earlier": dict(earlier)} if earlier else described
+
+
+def describe_ranges(frames: Frames) -> str:
+    """Return what has to be said about the ranges of frames; empty where they have a time zero."""
+    note = frames.time_zero_note
+    return f"ranges are right{note} (--time-zero-ns of recover)" if note else ""
+
+
+def report(
+    figures: Mapping[str, Any], as_json: bool, written: Sequence[Path] = (), note: str = ""
+) -> None:
+    """Print the figures of a run: numbers, strings, and lists or mappings of these by name.
+
+    `as_json`: one object on one line (NaN becomes null) instead of a table; `written`: files to name
+    in the table; `note`: what has to be known about its figures.
+    """
+    plain = to_json_value(figures)
+    if as_json:
+        print(json.dumps(plain, allow_nan=False))
+        return
+    width = max(map(len, plain), default=0)
+    compared = _find_compared(plain)
+    for name, value in plain.items():
+        entries = _list_alike_entries(value)
+        if name in compared[1:]:
+            continue  # in the table of the first
+        if name in compared:
+            print(_format_compared({column: plain[column] for column in compared}))
+        elif entries:
+            print(f"{_format_name(name)}\n{_format_rows(entries)}")
+        else:
+            line = f"{_format_name(name):<{width}}  {_format_value(value)}"
+            if isinstance(value, dict) and len(line) > MAX_TABLE_WIDTH:
+                cells = [[f"  {_format_name(one)}", _format_value(value[one])] for one in value]
+                line = f"{_format_name(name)}\n{_align_columns(cells)}"
+            print(line)
+    if note:
+        print(f"note: {note}")
+    for path in written:
+        print(f"wrote {path}")
+
+
+def to_json_value(value: Any) -> Any:
+    """Turn NumPy's numbers and arrays, paths and NaN into what JSON knows."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(name): to_json_value(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json_value(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def _find_compared(figures: Mapping[str, Any]) -> list[str]:
+    """Return the names of mappings that say the same of several things, such as methods."""
+    rows = {name: tuple(value) for name, value in figures.items() if isinstance(value, dict)}
+    kinds = list(rows.values())
+    shared = next((keys for keys in kinds if len(keys) > 1 and kinds.count(keys) > 1), ())
+    return [name for name, keys in rows.items() if shared and keys == shared]
+
+
+def _list_alike_entries(value: Any) -> dict[str, dict[str, Any]]:
+    """Return the entries of a list, by their numbers, or of a mapping that say the same of several
+    things, such as stages; none of anything else.
+    """
+    if isinstance(value, list):
+        value = {str(number): entry for number, entry in enumerate(value, start=1)}
+    if not isinstance(value, dict) or len(value) < 2:
+        return {}
+    kinds = {tuple(entry) if isinstance(entry, dict) else () for entry in value.values()}
+    return value if len(kinds) == 1 and kinds != {()} else {}
+
+
+def _format_compared(things: Mapping[str, Mapping[str, Any]]) -> str:
+    """Put things side by side where they fit, a column for each, and below each other where there
+    are too many.
+    """
+    cells = [["", *map(_format_name, things)]]
+    cells += [
+        [_format_name(figure), *(_format_value(thing[figure]) for thing in things.values())]
+        for figure in next(iter(things.values()))
+    ]
+    text = _align_columns(cells)
+    fits = max(map(len, text.splitlines())) <= MAX_TABLE_WIDTH
+    return text if fits else _format_rows(things)
+
+
+def _format_rows(things: Mapping[str, Mapping[str, Any]]) -> str:
+    """Put many things with few figures below each other: a line for each, indented."""
+    cells = [["  ", *map(_format_name, next(iter(things.values())))]]
+    cells += [
+        [f"  {_format_name(name)}", *map(_format_value, thing.values())]
+        for name, thing in things.items()
+    ]
+    return _align_columns(cells)
+
+
+def _align_columns(cells: Sequence[Sequence[str]]) -> str:
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    rows = ("  ".join(map(str.ljust, row, widths)) for row in cells)
+    return "\n".join(row.rstrip() for row in rows)
+
+
+def _format_name(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _format_entry(name: str, value: Any) -> str:
+    """Put one of several figures of a line into words, its unit behind it."""
+    *words, last = name.split("_")
+    if last not in UNITS:
+        return f"{_format_name(name)} {_format_value(value)}"
+    return " ".join([*words, _format_value(value), *([] if value is None else [last])])
+
+
+def summarise_list(values: Sequence[Any]) -> str:
+    """Return how many values there are, the first and the last, as a person reads a long list.
+
+    Examples
+    --------
+    >>> summarise_list([1.5, *range(58), 0.25])
+    '60 values, 1.5 ... 0.25'
+    """
+    return f"{len(values)} values, {_format_value(values[0])} ... {_format_value(values[-1])}"
+
+
+def _format_value(value: Any) -> str:
+    if isinstance(value, list):
+        long = len(value) > MAX_LISTED_VALUES
+        return summarise_list(value) if long else ", ".join(map(_format_value, value))
+    if isinstance(value, dict):
+        return ", ".join(_format_entry(name, entry) for name, entry in value.items())
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "unknown" if value is None else str(value)

@@ -1,0 +1,161 @@
+"""`tofclip info` and `tofclip convert`: what a file holds, and a streak image as HDF5 of ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from apps.options import JSON, arg, opt
+from apps.report import (
+    MAX_LISTED_VALUES,
+    RECORD_SUFFIXES,
+    report,
+    require_writable,
+    summarise_list,
+    to_json_value,
+)
+from tofclip.errors import FileFormatError
+
+if TYPE_CHECKING:
+    from tofclip.storage import Field, Record
+
+PHOTON_SUFFIXES = {".npy", ".mat", ".ptu", ".sdt"}  # counted photons or nothing of ours
+
+
+def convert(
+    streak: Path = arg("STREAK", "HPD-TA TIFF or LIFT archive.", read=True),
+    out: Path = opt("H5", "The file to write.", ...),
+    bin_width: float | None = opt(
+        "PS", "Duration of a row in ps, where the file does not say it.", name="--bin-width-ps"
+    ),
+    as_json: bool = JSON,
+) -> None:
+    """Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall
+    inside.
+
+    Example: tofclip convert wall.npz --out wall.h5
+    """
+    from tofclip.io import read_streak
+
+    require_writable(out, *RECORD_SUFFIXES, inputs=(streak,))
+    shot = read_streak(streak, bin_width)
+    shot.save(out)
+    figures = {
+        "rows": shot.counts.shape[0],
+        "columns": shot.counts.shape[1],
+        "has_time_axis": shot.row_times is not None,
+        "has_camera": shot.camera is not None,
+        "attachments": list(shot.attachments),
+    }
+    report(figures, as_json, [out])
+
+
+def info(
+    file: Path = arg("FILE", "Any file of ours, or a streak image of others.", read=True),
+    as_json: bool = JSON,
+) -> None:
+    """Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.
+
+    Values are not read, but for arrays of up to nine: a file larger than the memory is described as
+    quickly as a small one.
+
+    Example: tofclip info frames.h5
+    """
+    found = to_json_value({"file": file, **describe_file(file)})
+    if as_json:
+        report(found, as_json)
+    else:
+        print("\n".join(_format_tree(found)))
+
+
+def describe_file(file: Path) -> dict[str, Any]:
+    """Describe our own records, streak images, point clouds and counted photons by their headers:
+    their values may not fit into memory.
+    """
+    from devices.counted_photons import STAMPS_SUFFIX
+    from devices.linospad2 import LinoSpad2File
+    from tofclip.lidar.photons.files import describe_photons
+    from tofclip.loading import outline
+    from tofclip.storage import Record, is_own_file
+
+    if file.suffix.lower() == STAMPS_SUFFIX:
+        with LinoSpad2File(file) as source:
+            known = {"instrument": source.info.instrument, **source.info.details}
+            known["stamps"] = source.stats.acquired
+            return _describe_record(Record("photon stamps", attributes=known))
+    try:
+        return _describe_record(outline(file))
+    except FileFormatError as refusal:
+        if is_own_file(file):
+            raise  # a damaged record, not counted photons
+        try:
+            return describe_photons(file)
+        except FileFormatError:
+            if file.suffix.lower() in PHOTON_SUFFIXES:
+                raise  # it names the arrays that were found
+            # The first refusal names the formats that were expected.
+            raise refusal from None
+
+
+def _describe_record(record: Record) -> dict[str, Any]:
+    parts = {
+        "attributes": record.attributes,
+        "fields": {name: _describe_field(entry) for name, entry in record.fields.items()},
+        "children": {name: _describe_record(child) for name, child in record.children.items()},
+        "provenance": record.provenance,
+    }
+    return {"kind": record.kind, **{name: part for name, part in parts.items() if part}}
+
+
+def _describe_field(entry: Field) -> dict[str, Any]:
+    from tofclip.storage import is_stand_in
+
+    values = entry.values
+    known = {
+        "shape": values.shape,
+        "type": str(values.dtype),
+        "units": entry.units,
+        "axes": entry.axes,
+    }
+    is_number = values.dtype.kind in "uif" and not is_stand_in(values)
+    return known | {"values": values} if is_number else known
+
+
+def _format_tree(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
+    """Indent a tree; what has no branches of its own stays on one line."""
+    for name, value in found.items():
+        lead = f"{'  ' * depth}{name}:"
+        if isinstance(value, list) and value and isinstance(value[0], Mapping):
+            yield from _format_tree({name: dict(enumerate(value, start=1))}, depth)
+        elif isinstance(value, Mapping) and "shape" in value:
+            yield f"{lead} {_format_field(value)}"
+        elif isinstance(value, Mapping):
+            yield lead
+            yield from _format_tree(value, depth + 1)
+        elif isinstance(value, list) and len(value) > MAX_LISTED_VALUES:
+            yield f"{lead} {summarise_list(value)}"
+        else:
+            yield f"{lead} {_format_plain(value)}"
+
+
+def _format_plain(value: Any) -> str:
+    """Six digits tell a person enough; --json has all."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_format_plain, value))}]" if value else "none"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "not known" if value is None else str(value)
+
+
+def _format_field(known: Mapping[str, Any]) -> str:
+    shape = " x ".join(map(str, known["shape"])) or "single value"
+    axes = f" ({', '.join(known['axes'])})" if known["axes"] else ""
+    values = f", {_format_values(known['values'])}" if "values" in known else ""
+    return f"{shape}{axes} {known['type']}{values} {known['units']}".rstrip()
+
+
+def _format_values(values: Any) -> str:
+    if isinstance(values, list) and any(value is not None for value in values):
+        return f"[{', '.join(map(_format_values, values))}]"
+    return f"{values:.6g}" if isinstance(values, int | float) else "unknown"

@@ -1,0 +1,884 @@
+"""`tofclip nlos`: what a relay wall shows of the scene around the corner, captures of known scenes to
+compare with, and several methods side by side.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import typer
+
+from apps.help import make_group
+from apps.jobs import EXIT_SOME_FAILED, resolve_device, run_with_progress
+from apps.options import CLUSTER, DEVICE, JSON, SEED, SETTINGS, arg, opt
+from apps.progress import show_activity
+from apps.report import (
+    PICTURE_SUFFIXES,
+    RECORD_SUFFIXES,
+    build_provenance,
+    make_folder,
+    name_beside,
+    report,
+    require_writable,
+)
+from apps.settings import (
+    add_setting_flags,
+    load_settings,
+    save_settings,
+    setting,
+    settings_to_dict,
+)
+from apps.verbs.nlos_imaging import (
+    METHODS,
+    PORTABLE_METHODS,
+    ImagingSettings,
+    MeasuredVolume,
+    PreparedImaging,
+    add_provenance,
+    image_capture,
+    is_capture_folder,
+    list_captures,
+    measure_imaging,
+    parse_method_names,
+    prepare_imaging,
+    require_valid_settings,
+    show_settings,
+)
+from apps.verbs.nlos_stream import film, stream
+from nlos.known_scenes import SceneSettings
+from nlos.settings import Settings
+from tofclip.errors import InputError
+from tofclip.files import identify_file, require_apart
+from tofclip.units import MILLIMETRE, PICOSECOND
+
+if TYPE_CHECKING:
+    from nlos import Capture, Grid, Method, Volume
+    from nlos.known_scenes import HiddenTruth
+    from tofclip.sequences.jobs import Report
+
+CAPTURE = arg("CAPTURE", "Recovered frames of a relay wall, or a capture.", read=True)
+
+PHOTONS = "photons"
+REFINEMENTS = ("l1", "tv", PHOTONS)
+NAMED_REFINEMENTS = f"{', '.join(REFINEMENTS[:-1])} or {PHOTONS}"
+REFINED_METHOD = "hybrid"  # which is iterated by l1 and tv
+ITERATIONS = {"l1": 60, "tv": 60, PHOTONS: 12}
+PRIOR_WEIGHTS = {"l1": 2e-2, "tv": 2e-2, PHOTONS: 1.0}
+
+FOLDER_SETTINGS_NAME = ".settings.toml"
+CONTENT_MARK = "# the capture's content: "
+"""In the settings beside a volume: what the capture was that it was made of."""
+
+MAX_BLUR_FRACTION = 0.5
+"""A wavelength is usable while a point's image is narrower than this share of the wall."""
+
+BLUR_FACTOR = 1.2
+"""Width of a point's image in units of wavelength * distance / width of the wall; see
+`nlos.resolution`.
+"""
+
+WALL_SHAPE, WALL_POINTS = "cylinder", 64
+FACET_M = 0.03
+LETTERS = (("3", -0.27, 0.9, 0.5), ("D", 0.27, 1.15, 1.0))
+"""Of the demonstration: text, x and depth in m, and albedo: the nearer one is of grey paper, or it
+would outshine the other.
+"""
+
+LETTER_HEIGHT_M = 0.62
+BINS, BIN_WIDTH_S, JITTER_S = 480, 32e-12, 25e-12
+PEAK_COUNTS, BACKGROUND_COUNTS = 200.0, 0.5
+WAVELENGTH_M, VOXEL_M = 0.125, 0.012
+BOX_M = ((-0.8, 0.8), (-0.5, 0.5), (0.72, 1.32))
+
+app = make_group("Image the scene hidden around a corner.")
+
+
+@dataclass(frozen=True)
+class RefinementSettings(Settings):
+    """Whether and how an image is refined."""
+
+    refine: str | None = setting(
+        "NAME",
+        "Iterate the image: photons by the statistics of counts; l1 for few bright things, tv for even surfaces.",
+        shown="no",
+        choices=REFINEMENTS,
+    )
+    iterations: int | None = setting(
+        "N",
+        "With --refine: steps at most; of l1 and tv each costs some four images.",
+        shown=f"{ITERATIONS['l1']}; photons: {ITERATIONS[PHOTONS]}",
+    )
+    prior_weight: float | None = setting(
+        "SHARE",
+        "With --refine: weight of the prior, of that which leaves nothing; photons: of noise's standard deviation.",
+        shown=f"{PRIOR_WEIGHTS['l1']}; photons: {PRIOR_WEIGHTS[PHOTONS]:g}",
+    )
+
+
+@dataclass(frozen=True)
+class ReconstructSettings(RefinementSettings):
+    """How a capture is imaged and written."""
+
+    method: str | None = setting(
+        "NAME",
+        f"One of {', '.join(METHODS)}.",
+        shown="the quickest that suits the capture",
+        choices=METHODS,
+    )
+    point_fraction: float = setting(
+        "SHARE",
+        "Voxels with this share of the brightest become points of .ply, .pcd, .csv, and the surface.",
+        0.3,
+    )
+
+
+@dataclass(frozen=True)
+class ResultFiles:
+    """Names of what is written of one capture."""
+
+    volumes: Sequence[Path]  # the volume, in the format that each suffix names
+    picture: Path | None
+    settings: Path  # written last: where it stands, the others are whole
+    surface: Path | None = None  # the front surface with normals
+
+    @property
+    def paths(self) -> list[Path]:
+        """Every file, in the order of writing."""
+        others = [one for one in (self.picture, self.surface) if one is not None]
+        return [*self.volumes, *others, self.settings]
+
+    def require_writable(self, *inputs: Path | None) -> None:
+        """Refuse names that cannot be written, or that would overwrite an input."""
+        for volume in self.volumes:
+            require_writable(volume, *list_volume_suffixes(), inputs=inputs)
+        if self.picture is not None:
+            require_writable(self.picture, *PICTURE_SUFFIXES, inputs=inputs)
+        if self.surface is not None:
+            require_writable(self.surface, ".ply", inputs=inputs)
+            if self.surface.resolve() in [volume.resolve() for volume in self.volumes]:
+                raise InputError(f"{self.surface}: volume and surface need names of their own")
+        require_writable(self.settings, inputs=inputs)
+
+    def is_up_to_date(self, source: Path) -> bool:
+        """Whether all are there and came from the capture as it is now.
+
+        Results of versions that did not note the capture's content have to be younger than it.
+        """
+        if not all(path.is_file() for path in self.paths):
+            return False
+        text = self.settings.read_text("utf-8", errors="replace")
+        if CONTENT_MARK not in text:
+            return self.settings.stat().st_mtime >= source.stat().st_mtime
+        return note_content(source) in text.splitlines()
+
+
+def list_volume_suffixes() -> tuple[str, ...]:
+    """List the endings of files that a volume can be written to."""
+    from nlos.export import POINT_SUFFIXES, WRITERS
+
+    return (*RECORD_SUFFIXES, *WRITERS, *POINT_SUFFIXES)
+
+
+def note_content(source: Path) -> str:
+    """Return a comment for a TOML file by which a capture, or a folder of renderings, is known
+    again, whatever it is called and however old it is.
+    """
+    if not source.is_dir():
+        return CONTENT_MARK + identify_file(source)
+    files = sorted(path for path in source.rglob("*") if path.is_file())
+    marks = "\n".join(f"{path.relative_to(source)} {identify_file(path)}" for path in files)
+    return CONTENT_MARK + hashlib.sha256(marks.encode()).hexdigest()
+
+
+@app.command()
+@add_setting_flags(ReconstructSettings)
+def reconstruct(
+    source: Path = arg(
+        "CAPTURE", "Recovered frames of a relay wall, a capture, or a folder.", read=True
+    ),
+    out: Path = opt(
+        "FILE", "The volume to write, .h5, .vti, .npz, .exr or .ply; or a folder.", ...
+    ),
+    png: Path | None = opt("PNG", "Picture of the volume, three views.", shown="only in a folder"),
+    surface: Path | None = opt(
+        "PLY", "What is seen from the wall as a mesh: depth, normals, brightness."
+    ),
+    settings: Path | None = SETTINGS,
+    suffix: list[str] | None = opt(
+        ".EXT", "Format of the volumes in a folder; may be repeated.", shown=".h5"
+    ),
+    cluster: str | None = CLUSTER,
+    device: str = DEVICE,
+    as_json: bool = JSON,
+    **flags: Any,
+) -> None:
+    """Image the hidden scene from the transients on a relay wall.
+
+    rsd is quick and for planar, evenly scanned walls, hybrid nearly as quick and for any wall;
+    backprojection takes every wall, laser and grid, and is slow. These three see through a virtual
+    pulse and give the same picture. filtered-backprojection, lct (light-cone transform) and fk (f-k
+    migration) do without; the last two want a confocal scan of a planar wall.
+
+    The space in front of the wall is looked over with voxels of half a wavelength first, by the
+    quickest of the first three; then the part that is bright is imaged with the voxels asked for.
+    The settings that were given or found are written beside the volume (.toml); given back by
+    --settings they make the same volume, on another --device to some hundred-thousandths.
+
+    --refine photons looks for the albedo under which the photons that were counted are likeliest:
+    for captures of few photons, by time of flight, background included. --refine l1 or tv look for
+    the albedo that explains the wall's waves best, at the cost of some four images per iteration.
+
+    --surface takes what is foremost and bright on every line of sight from the wall (above
+    --point-fraction of the brightest) and its direction: from a confocal scan of a planar wall by
+    the directional light-cone transform, else from the gradients of the volume.
+
+    With --device rsd, hybrid and backprojection compute on a GPU; the
+    others cannot.
+
+    Of a folder every capture is imaged into the folder --out. Captures whose results are there
+    already are skipped. If some fail, the others are done all the same, and the exit status is 1.
+
+    Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png --surface mesh.ply
+    """
+    wanted = load_settings(ReconstructSettings, settings, flags)
+    _check_reconstruction(wanted)
+    # A device that does not exist is refused before any capture is read.
+    resolve_device(device, cluster)
+    if is_capture_folder(source):
+        if surface is not None:
+            raise InputError(f"{source}: --surface is for a single capture, and this is a folder")
+        _reconstruct_folder(
+            (source, settings), out, wanted, suffix or [".h5"], device, cluster, as_json
+        )
+        return
+    if cluster is not None:
+        raise InputError(f"{source}: --cluster is for a folder of captures")
+    results = ResultFiles([out], png, name_beside(out, ".toml"), surface)
+    results.require_writable(source, settings)
+    report(reconstruct_single(source, results, wanted, device), as_json, results.paths)
+
+
+def _check_reconstruction(wanted: ReconstructSettings) -> None:
+    """Refuse settings that no capture could make sense of, before any is read."""
+    if not 0 <= wanted.point_fraction <= 1:
+        raise InputError(f"point_fraction is a share between 0 and 1, got {wanted.point_fraction}")
+    names = PORTABLE_METHODS if wanted.method is None else parse_method_names(wanted.method)
+    if wanted.method is not None and len(names) > 1:
+        raise InputError(
+            f"one method is asked for, got '{wanted.method}'; nlos compare takes several"
+        )
+    _check_refinement(wanted)
+    require_valid_settings(wanted, names)
+
+
+def _check_refinement(wanted: ReconstructSettings) -> None:
+    """Refuse a refinement that makes no sense, and settings of one that is not asked for."""
+    if wanted.refine is None:
+        for name in ("iterations", "prior_weight"):
+            if getattr(wanted, name) is not None:
+                raise InputError(
+                    f"{name} is a setting of --refine; give --refine {NAMED_REFINEMENTS} as well"
+                )
+        return
+    if wanted.refine not in REFINEMENTS:
+        raise InputError(f"unknown prior '{wanted.refine}'; refine by {NAMED_REFINEMENTS}")
+    by_photons, method = wanted.refine == PHOTONS, wanted.method
+    if by_photons and method not in (None, *PORTABLE_METHODS):
+        raise InputError(
+            f"--refine photons begins with an image by {', '.join(PORTABLE_METHODS)}, not by "
+            f"{method}; leave --method out"
+        )
+    if not by_photons and method not in (None, REFINED_METHOD):
+        raise InputError(
+            f"--refine iterates the {REFINED_METHOD} method, not {method}; leave --method out"
+        )
+    if wanted.iterations is not None and wanted.iterations < 1:
+        raise InputError(f"iterations must be 1 or more, got {wanted.iterations}")
+    weight, most = wanted.prior_weight, 10.0 if by_photons else 1.0
+    if weight is not None and not 0 <= weight < most:
+        raise InputError(f"prior_weight is a share from 0 to less than {most:g}, got {weight}")
+
+
+def reconstruct_single(
+    source: Path, results: ResultFiles, wanted: ReconstructSettings, device: str
+) -> dict[str, Any]:
+    """Image one capture, write its results, and return the figures."""
+    from nlos.completion import is_brightest_on_wall
+    from nlos.io import read_capture
+    from nlos.normals import find_imaged_surface
+    from tofclip.arrays import ComputeDevice, parse_device
+
+    portable = wanted.method in (None, *PORTABLE_METHODS) and wanted.refine is None
+    # ``auto`` stays with the compiled loops where a method has nothing else.
+    used = ComputeDevice() if device == "auto" and not portable else parse_device(device)
+    # Before it is read: a capture that is replaced meanwhile is imaged again next time.
+    content = note_content(source)
+    capture = read_capture(source)
+    if wanted.refine not in (None, PHOTONS):
+        wanted = replace(wanted, method=REFINED_METHOD)
+    started = time.perf_counter()
+    prepared = prepare_imaging(capture, wanted, used)
+    found, volume = _image(prepared)
+    on_wall = is_brightest_on_wall(volume, capture, found.wavelength or 0.0)
+    if on_wall:
+        print(
+            f"tofclip: warning: {source}: the brightest voxel lies on the wall, whose own light the picture shows; "
+            "blank more of it by --gate-m, or begin farther away by --near-m",
+            file=sys.stderr,
+        )
+    # Files are written from the host's memory.
+    volume = volume.on(ComputeDevice())
+    seconds, imaging = time.perf_counter() - started, volume.provenance["imaging"]
+    shown = settings_to_dict(found)
+    past = {"verb": "nlos reconstruct", "device": str(used), **shown}
+    volume = add_provenance(volume, source, past)
+    for path in results.volumes:
+        if path.suffix.lower() in RECORD_SUFFIXES:
+            volume.save(path)
+        else:
+            volume.export(path, found.point_fraction)
+    if results.picture is not None:
+        volume.save_picture(results.picture)
+    further = {}
+    if results.surface is not None:
+        seen = find_imaged_surface(prepared.capture, volume, found.point_fraction)
+        seen.save(results.surface)
+        further = {"surface_points": len(seen.points), "surface_source": seen.source}
+    heading = "tofclip nlos reconstruct CAPTURE --settings THIS --out VOLUME"
+    save_settings(found, results.settings, f"{heading}\n{content}")
+    stop = ("iterations", "stopped_because") if found.refine else ()
+    return {
+        "method": found.method,
+        "device": str(used),
+        **({"refine": found.refine} if found.refine else {}),
+        **{name: imaging[name] for name in stop},
+        "gate_m": found.gate,
+        "gate_found": found.gate_found,
+        "wavelength_mm": shown["wavelength_mm"],
+        "wavelength_reason": found.reasons.get("wavelength", "given"),
+        "bins_together": found.bins_together,
+        "brightest_on_wall": on_wall,
+        "voxel_mm": shown["voxel_mm"],
+        "voxels": volume.grid.shape,
+        "wall_points": len(capture.points),
+        "seconds": seconds,
+        "voxels_per_second": volume.grid.size / seconds,
+        "peak_m": dict(zip("xyz", volume.find_brightest(), strict=True)),
+        **further,
+    }
+
+
+def _image(prepared: PreparedImaging[ReconstructSettings]) -> tuple[ReconstructSettings, Volume]:
+    """Make the image that settings ask for; return them as they are written beside it."""
+    settings, capture, grid = prepared.settings, prepared.capture, prepared.grid
+    found = show_settings(settings, [settings.method or ""])
+    if not found.refine:
+        plan = settings.make_method().plan(capture, grid)
+        return found, image_capture("imaging", plan, capture)
+    found = replace(
+        found,
+        iterations=found.iterations or ITERATIONS[found.refine],
+        prior_weight=PRIOR_WEIGHTS[found.refine]
+        if found.prior_weight is None
+        else found.prior_weight,
+    )
+    if found.refine == PHOTONS:
+        capture = settings.prepare_counts(prepared.recorded)
+    plan = _build_refinement(found, settings, grid).plan(capture, grid)
+    return found, image_capture("refining", plan, capture)
+
+
+def _build_refinement(found: ReconstructSettings, settings: Settings, grid: Grid) -> Method:
+    from nlos import Refinement
+    from nlos.preparation import MidpointImaging
+    from nlos.refinement.l1 import build_total_variation
+    from nlos.refinement.photons import PhotonRefinement
+    from tofclip.solvers import Sparse
+
+    weight, iterations = found.prior_weight or 0.0, found.iterations or 1
+    method: Any = settings.make_method()
+    if found.refine == PHOTONS:
+        return PhotonRefinement(
+            MidpointImaging(method),
+            iterations,
+            weight,
+            blank=settings.gate or 0.0,
+            ramp=settings.gate_ramp or 0.0,
+        )
+    if found.refine == "tv":
+        return Refinement(method, build_total_variation(grid, weight, iterations))
+    return Refinement(method, Sparse(weight, iterations))
+
+
+def _reconstruct_folder(
+    inputs: tuple[Path, Path | None],
+    out: Path,
+    wanted: ReconstructSettings,
+    suffixes: Sequence[str],
+    device: str,
+    cluster: str | None,
+    as_json: bool,
+) -> None:
+    """Image every capture of a folder whose results are not there yet."""
+    from tofclip.sequences.jobs import Job, run_jobs
+
+    for suffix in suffixes:
+        if suffix not in list_volume_suffixes():
+            known = ", ".join(list_volume_suffixes())
+            raise InputError(f"no format of volumes is called '{suffix}'; use one of {known}")
+    sources = list_captures(inputs[0])
+    results = {path: _name_results(out, path.stem, suffixes) for path in sources}
+    written = [path for one in results.values() for path in one.paths]
+    require_apart([out, *written], [*inputs, *sources])
+    make_folder(out)
+    # Results of other settings in the same folder would be taken for finished.
+    _check_folder_settings(out / FOLDER_SETTINGS_NAME, wanted)
+    jobs, skipped, imaged = [], [], list[dict[str, Any]]()
+    for path in sources:
+        made = _name_results(out.resolve(), path.stem, suffixes)
+        if made.is_up_to_date(path):
+            skipped.append(path.name)
+            continue
+        made.settings.unlink(missing_ok=True)  # it says that results are whole, and these are old
+        work = partial(_run_job, path.resolve(), made, wanted, device)
+        jobs.append(Job(path.name, made.settings, work, tuple(made.paths[:-1])))
+
+    def note(report: Report) -> None:
+        if report.figures is not None:  # None where the result was there already
+            imaged.append({"capture": report.name, **report.figures})
+
+    # Here every capture has a bar of its own; on a cluster there is one for all.
+    summary = (
+        run_jobs(jobs, None, note)
+        if cluster is None
+        else run_with_progress("imaging", jobs, cluster, note)
+    )
+    # Workers of a cluster finish in any order.
+    imaged.sort(key=lambda one: str(one["capture"]))
+    failed = {failure.name: failure.problem for failure in summary.failures}
+    for name, reason in failed.items():
+        print(f"tofclip: failed: {name}: {reason}", file=sys.stderr)
+    lists = {"imaged": imaged, "skipped": skipped, "failed": failed}
+    counts = {"imaged": summary.done, "skipped": len(skipped), "failed": len(failed)}
+    figures = {"captures": len(sources), **(lists if as_json else counts)}
+    report(figures, as_json, [out])
+    if failed:
+        raise typer.Exit(EXIT_SOME_FAILED)
+
+
+def _run_job(
+    source: Path, results: ResultFiles, wanted: ReconstructSettings, device: str
+) -> dict[str, Any]:
+    """Image one capture, here or on a worker, and report which one it is."""
+    if sys.stderr.isatty() and threading.current_thread() is threading.main_thread():
+        print(source.name, file=sys.stderr)
+    return reconstruct_single(source, results, wanted, device)
+
+
+def _name_results(folder: Path, stem: str, suffixes: Sequence[str]) -> ResultFiles:
+    volumes = [folder / f"{stem}{suffix}" for suffix in suffixes]
+    return ResultFiles(volumes, folder / f"{stem}.png", folder / f"{stem}.toml")
+
+
+def _check_folder_settings(file: Path, wanted: ReconstructSettings) -> None:
+    """Refuse to mix results of different settings in one folder."""
+    if not file.exists():
+        save_settings(wanted, file, "tofclip nlos reconstruct FOLDER --settings THIS --out RESULTS")
+        return
+    before = settings_to_dict(load_settings(ReconstructSettings, file, {}))
+    now = settings_to_dict(wanted)
+    for name in sorted(before.keys() | now.keys()):
+        if before.get(name) != now.get(name):
+            raise InputError(
+                f"{file.parent}: the results there were made with {name} = {before.get(name, 'not given')}, now it is "
+                f"{now.get(name, 'not given')}; choose another folder"
+            )
+
+
+app.command()(stream)
+app.command()(film)
+
+
+@dataclass(frozen=True)
+class CompareSettings(ImagingSettings):
+    """What is compared on one capture."""
+
+    methods: str | None = setting(
+        "A,B,...",
+        f"Of {', '.join(METHODS)}; the first is the reference.",
+        shown="all that suit the capture",
+        choices=METHODS,
+    )
+
+
+@app.command()
+@add_setting_flags(CompareSettings)
+def compare(
+    source: Path = CAPTURE,
+    out: Path = opt("PNG", "The picture to write.", ...),
+    volumes: Path | None = opt("DIR", "Folder for the volumes, one file per method."),
+    settings: Path | None = SETTINGS,
+    as_json: bool = JSON,
+    **flags: Any,
+) -> None:
+    """Image one capture by several methods, and show images, time, memory and figures of merit side
+    by side.
+
+    The correlation is that of the front views with the first method's. The sharpness says how far
+    the light of the front view is gathered, which is good only where it is gathered in the right
+    place: captures of nlos simulate carry the truth, and for them the share of energy near hidden
+    things and the contrast against the rest are reported.
+
+    The settings that were given or found are written beside the picture (.toml) and give the same
+    comparison.
+
+    Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
+    """
+    from apps.figures.nlos_compare import make_comparison_figure
+    from apps.figures.style import save_figure
+    from apps.studies.hidden_scene_adjoint import correlate_views
+    from nlos.io import read_capture
+    from nlos.known_scenes import HiddenTruth, compare_with_truth, measure_sharpness
+
+    wanted = load_settings(CompareSettings, settings, flags)
+    written = [out, name_beside(out, ".toml")]
+    require_writable(out, *PICTURE_SUFFIXES, inputs=(source, settings))
+    require_writable(written[1], inputs=(source, settings))
+    # Everything that can be refused is refused before the capture is read.
+    names = METHODS if wanted.methods is None else parse_method_names(wanted.methods)
+    require_valid_settings(wanted, names)
+    if volumes is not None:
+        require_apart([volumes, *(volumes / f"{name}.h5" for name in METHODS)], [source, settings])
+        make_folder(volumes)
+    capture, truth = read_capture(source), HiddenTruth.load(source)
+    # The voxels are those of the virtual pulse, for all methods alike.
+    prepared = prepare_imaging(capture, wanted)
+    chosen, left_out = _choose_methods(names, wanted.methods is not None, prepared)
+    runs: dict[str, MeasuredVolume] = {}
+    figures: dict[str, dict[str, Any]] = {}
+    for name in chosen:
+        method = prepared.settings.make_method(name)
+        runs[name] = run = measure_imaging(name, method, prepared.capture, prepared.grid)
+        figures[name] = {
+            **run.costs,
+            "correlation": correlate_views(run.volume, runs[chosen[0]].volume),
+            "sharpness": measure_sharpness(run.volume),
+            **({} if truth is None else compare_with_truth(run.volume, truth)),
+        }
+    images = {name: run.volume for name, run in runs.items()}
+    save_figure(make_comparison_figure(images, figures, truth), out)
+    found = replace(show_settings(prepared.settings, chosen), methods=",".join(chosen))
+    for name, volume in images.items() if volumes is not None else ():
+        path = cast("Path", volumes) / f"{name}.h5"
+        past = {"verb": "nlos compare", "method": name, **settings_to_dict(found)}
+        add_provenance(volume, source, past).save(path)
+        written.append(path)
+    save_settings(found, written[1], "tofclip nlos compare CAPTURE --settings THIS --out PICTURE")
+    shape = {"voxels": prepared.grid.shape}
+    if as_json:
+        report({**shape, "methods": figures, "left_out": left_out}, as_json)
+        return
+    lines = {name: _format_line(one) for name, one in figures.items()}
+    reasons = {name: f"no: {reason}" for name, reason in left_out.items()}
+    report({**shape, **lines, **reasons}, as_json, written)
+
+
+def _choose_methods(
+    names: Sequence[str], named: bool, prepared: PreparedImaging[CompareSettings]
+) -> tuple[list[str], dict[str, str]]:
+    """Choose methods that suit; of those that were not named by the user the others are left out,
+    with the reason.
+    """
+    left_out = {}
+    for name in names:
+        try:
+            # A plan checks the geometry without imaging, and so is cheap.
+            prepared.settings.make_method(name).plan(prepared.capture, prepared.grid)
+        except InputError as refused:
+            left_out[name] = str(refused)
+    # A method that was named must not vanish silently; of all methods, one has to remain.
+    if left_out and (named or len(left_out) == len(names)):
+        name, reason = next(iter(left_out.items()))
+        raise InputError(f"{name} does not suit this capture: {reason}")
+    return [name for name in names if name not in left_out], left_out
+
+
+def _format_line(figures: Mapping[str, Any]) -> str:
+    """Put a method's figures into columns that stand below those of other methods."""
+    memory = "" if figures["peak_mib"] is None else f"{figures['peak_mib']:7.0f} MiB"
+    line = f"{figures['seconds']:8.2f} s{memory}  correlation {figures['correlation']:6.3f}"
+    line += f"  sharpness {figures['sharpness']:5.2f}"
+    if "energy_near_truth" in figures:
+        line += f"  near truth {figures['energy_near_truth']:4.0%}  contrast {figures['contrast_to_truth']:5.1f}"
+    return line
+
+
+@app.command()
+@add_setting_flags(SceneSettings)
+def simulate(
+    out: Path = opt("H5", "The capture to write.", ...),
+    settings: Path | None = SETTINGS,
+    as_json: bool = JSON,
+    **flags: Any,
+) -> None:
+    """Simulate the capture of a known hidden scene before a relay wall.
+
+    Letters and meshes hide what is behind them; light that meets several surfaces is left out. The
+    capture carries the truth, for nlos compare. The settings are written beside it (.toml).
+
+    Example: tofclip nlos simulate --letters T --wall cylinder --wall-points 32 --out capture.h5
+    """
+    from nlos.known_scenes import simulate_scene
+
+    chosen = load_settings(SceneSettings, settings, flags)
+    inputs = [Path(path) for path in (settings, chosen.mesh) if path]
+    beside = name_beside(out, ".toml")
+    require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
+    require_writable(beside, inputs=inputs)
+    started = time.perf_counter()
+    capture, truth = simulate_scene(chosen)
+    known = {"verb": "nlos simulate", **settings_to_dict(chosen)}
+    past = build_provenance(known, *inputs, earlier=capture.provenance)
+    truth.attach_to_record(replace(capture, provenance=past)).save(out)
+    save_settings(chosen, beside, "tofclip nlos simulate --settings THIS --out CAPTURE")
+    figures = {
+        "wall_points": len(capture.points),
+        "bins": capture.axis.bins,
+        "path_m": [float(capture.axis.paths[0]), float(capture.axis.paths[-1])],
+        "hidden_facets": len(truth.positions),
+        "largest": float(capture.signal.max()),
+        "total": float(capture.signal.sum(dtype="float64")),
+        "seconds": time.perf_counter() - started,
+    }
+    report(figures, as_json, [out, beside])
+
+
+@app.command()
+@add_setting_flags(ImagingSettings)
+def info(
+    source: Path = CAPTURE,
+    settings: Path | None = SETTINGS,
+    as_json: bool = JSON,
+    **flags: Any,
+) -> None:
+    """Report a capture's geometry and sampling, usable wavelengths, resolution, and which methods
+    suit it.
+
+    Resolution is the width of a point's image that a perfect instrument would give in the middle of
+    the box. Memory is an estimate for filling the whole box with voxels.
+
+    Example: tofclip nlos info capture.h5
+    """
+    from nlos.band import VirtualPulse
+    from nlos.completion import find_settings
+    from nlos.io import read_capture
+    from nlos.known_scenes import HiddenTruth
+    from nlos.resolution import compute_diffraction_limit
+
+    recorded = read_capture(source)
+    found = find_settings(recorded, load_settings(ImagingSettings, settings, flags))
+    capture, grid = found.prepare(recorded), found.grid()
+    shown = settings_to_dict(found)
+    middle = [float(axis[[0, -1]].mean()) for axis in (grid.x, grid.y, grid.z)]
+    pulse = VirtualPulse(found.wavelength or 0.0, found.cycles)
+    paths = capture.axis.paths
+    figures = {
+        "wall": _describe_wall(capture),
+        "laser": _describe_laser(capture),
+        "record": {
+            "bins": capture.axis.bins,
+            "bin_width_ps": capture.bin_width / PICOSECOND,
+            "path_per_bin_m": capture.axis.spacing,
+            "first_path_m": float(paths[0]),
+            "last_path_m": float(paths[-1]),
+        },
+        "wavelength_mm": {
+            **_find_usable_wavelengths(capture, grid, found.cycles),
+            "chosen": shown["wavelength_mm"],
+        },
+        "gate": {"m": found.gate, "found": found.gate_found},
+        "bins_together": found.bins_together,
+        "method": found.method,
+        "reasons": dict(found.reasons),
+        "resolution_m": {**asdict(compute_diffraction_limit(capture, middle, pulse)), "at": middle},
+        "box_m": dict(zip("xyz", found.box, strict=True)),
+        "voxels": {"size_mm": shown["voxel_mm"], "shape": grid.shape},
+        "truth": HiddenTruth.load(source) is not None,
+    }
+    methods: dict[str, dict[str, Any]] = {}
+    for name in METHODS:
+        try:
+            plan = found.make_method(name).plan(capture, grid)
+        except InputError as refused:  # which is the reason to show
+            methods[name] = {"suits": False, "reason": str(refused)}
+        else:
+            methods[name] = {"suits": True, "memory_mib": plan.memory_bytes / 2**20}
+    if as_json:
+        report({**figures, "methods": methods}, as_json)
+        return
+    lines = {
+        name: f"yes, {one['memory_mib']:.0f} MiB" if one["suits"] else f"no: {one['reason']}"
+        for name, one in methods.items()
+    }
+    report({**figures, **lines}, as_json)
+
+
+def _describe_wall(capture: Capture) -> dict[str, Any]:
+    from nlos.analysis import find_sampling_step
+    from nlos.plane import PlanarWall
+
+    try:
+        # The class refuses any other wall, which is the test wanted here.
+        PlanarWall.of(capture.points)
+        shape = "planar lattice"
+    except InputError:
+        shape = "no planar lattice"
+    width, height, relief = capture.points.max(axis=0) - capture.points.min(axis=0)
+    return {
+        "points": len(capture.points),
+        "masked": int(capture.valid.size - len(capture.points)),
+        "shape": shape,
+        "width_m": width,
+        "height_m": height,
+        "relief_m": relief,
+        "step_m": find_sampling_step(capture),
+    }
+
+
+def _describe_laser(capture: Capture) -> str:
+    from nlos.illumination import group_by_illumination
+
+    parts = group_by_illumination(capture)
+    # Confocal captures have a laser spot for each wall point, and none for the group.
+    if parts[0].laser is None:
+        return "confocal"
+    if len(parts) > 1:
+        return f"{len(parts)} spots"
+    x, y, z = parts[0].laser
+    return f"one spot at ({x:.3g}, {y:.3g}, {z:.3g}) m"
+
+
+def _find_usable_wavelengths(capture: Capture, grid: Grid, cycles: float) -> dict[str, float]:
+    """Bounds of the carrier: what is sampled finely enough, and what still resolves something, mm."""
+    from nlos.analysis import find_shortest_wavelength
+
+    low, high = capture.points.min(axis=0), capture.points.max(axis=0)
+    width = float(max(high[0] - low[0], high[1] - low[1]))
+    distance = float(grid.z[[0, -1]].mean() - capture.points[:, 2].mean())
+    return {
+        "shortest": find_shortest_wavelength(capture, cycles) / MILLIMETRE,
+        "longest": MAX_BLUR_FRACTION * width**2 / (BLUR_FACTOR * distance) / MILLIMETRE,
+    }
+
+
+@dataclass(frozen=True)
+class DemoRun:
+    """Everything that a demonstration made."""
+
+    capture: Capture
+    truth: HiddenTruth
+    # by method; ``flat`` is the hybrid method for a wall without its depth
+    images: Mapping[str, MeasuredVolume]
+
+
+@app.command()
+def demo(
+    out: Path = opt("DIR", "Folder for the results; made if missing.", Path("nlos-demo-output")),
+    png: Path | None = opt("PNG", "The picture to write.", shown="nlos_demo.png in --out"),
+    seed: int = SEED,
+    as_json: bool = JSON,
+) -> None:
+    """Hide two characters before a curved wall, simulate what the wall shows, and image them by two
+    methods.
+
+    The hybrid method and back-projection give the same picture; the times are those of this run, on
+    this machine. As if the wall were flat, the same signal gives none. Writes capture.h5,
+    hybrid.h5, backprojection.h5 and the picture.
+
+    Example: tofclip nlos demo --out nlos-demo-output
+    """
+    from apps.figures.nlos_demo import make_demo_figure
+    from apps.figures.style import save_figure
+    from apps.studies.hidden_scene_adjoint import correlate_views
+    from nlos.known_scenes import compare_with_truth
+
+    started = time.perf_counter()
+    make_folder(out)
+    picture = out / "nlos_demo.png" if png is None else png
+    # Before the simulation and three images, which take a while.
+    require_writable(picture, *PICTURE_SUFFIXES)
+    run = run_demo(seed)
+    written = [out / f"{name}.h5" for name in ("capture", "hybrid", "backprojection")]
+    run.truth.attach_to_record(run.capture).save(written[0])
+    for path in written[1:]:
+        run.images[path.stem].volume.save(path)
+    save_figure(make_demo_figure(run), picture)
+    slow = run.images["backprojection"]
+    figures = {
+        "seed": seed,
+        "wall_points": len(run.capture.points),
+        "voxels": slow.volume.grid.shape,
+        **{
+            name: {
+                **image.costs,
+                "correlation": correlate_views(image.volume, slow.volume),
+                **compare_with_truth(image.volume, run.truth),
+            }
+            for name, image in run.images.items()
+        },
+        "times_faster": slow.seconds / run.images["hybrid"].seconds,
+        "seconds": time.perf_counter() - started,
+    }
+    report(figures, as_json, [*written, picture])
+
+
+def run_demo(seed: int) -> DemoRun:
+    """The whole way, from a scene to three images."""
+    from nlos import Backprojection, Grid, Hybrid
+
+    with show_activity("simulating"):
+        capture, truth = _simulate_letters(seed)
+    past = build_provenance({"verb": "nlos demo", "seed": seed}, earlier=capture.provenance)
+    capture = replace(capture, provenance=past)
+    grid, hybrid, slow = (
+        Grid.box(*BOX_M, VOXEL_M),
+        Hybrid(WAVELENGTH_M),
+        Backprojection(WAVELENGTH_M),
+    )
+    # The same signals with the curve ignored show what knowing the wall is worth.
+    wall, laser = capture.wall.copy(), capture.laser.copy()
+    wall[..., 2] = laser[..., 2] = 0.0
+    flat = replace(capture, wall=wall, laser=laser)
+    images = {
+        "hybrid": measure_imaging("hybrid", hybrid, capture, grid),
+        "backprojection": measure_imaging("backprojection", slow, capture, grid),
+        "flat": measure_imaging("as if flat", hybrid, flat, grid),
+    }
+    return DemoRun(capture, truth, images)
+
+
+def _simulate_letters(seed: int) -> tuple[Capture, HiddenTruth]:
+    import numpy as np
+
+    from nlos.capture import TimeAxis
+    from nlos.known_scenes import HiddenTruth, find_nearest_wall_point
+    from nlos.simulate import HiddenScene, Lambert, Surface, add_poisson_noise, build_relay_wall
+
+    surfaces = [
+        Surface.letters(text, (x, 0.0, z), LETTER_HEIGHT_M, FACET_M, Lambert(albedo))
+        for text, x, z, albedo in LETTERS
+    ]
+    wall = build_relay_wall(WALL_SHAPE, WALL_POINTS)
+    spot = find_nearest_wall_point(wall, (0.0, 0.0))
+    axis = TimeAxis(BINS, BIN_WIDTH_S)
+    expected = HiddenScene(surfaces).simulate_capture(wall, spot, axis, JITTER_S)
+    truth = HiddenTruth(np.concatenate([surface.positions for surface in surfaces]), FACET_M)
+    return add_poisson_noise(expected, PEAK_COUNTS, BACKGROUND_COUNTS, seed), truth

@@ -1,0 +1,292 @@
+"""Known hidden scenes: their settings, the capture that an instrument would make of them, the truth
+that travels in its file, and how well an image shows it.
+
+Importing this loads nothing heavy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tofclip.errors import FileFormatError, InputError
+from tofclip.units import SPEED_OF_LIGHT
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from nlos.capture import Capture, TimeAxis
+    from nlos.simulate import HiddenScene, PointScene
+    from nlos.volume import FloatArray, Grid, Volume
+    from tofclip.storage import Record
+
+SCANS = ("single", "confocal")
+WALLS = ("planar", "cylinder", "wavy", "relief", "plates")  # those of `nlos.simulate`
+MATERIALS = ("matte", "retroreflecting")
+# Room for the instrument's response behind the farthest path, in standard deviations.
+RESPONSE_SIGMAS = 6
+RECORD_KIND = "hidden_scene"
+# m; light so close to a hidden thing counts as its own, if voxels are not larger.
+TRUTH_RADIUS_M = 0.04
+
+
+def _setting(
+    unit: str, meaning: str, default: Any = None, shown: str | None = None, **more: Any
+) -> Any:
+    metadata = {"unit": unit, "help": meaning, "shown": shown, **more}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """What is hidden, and how it is captured: letters, points or a mesh before a wall that is
+    scanned, and an instrument with its noise. The metadata of each field are those of
+    `nlos.Settings`.
+    """
+
+    letters: str | None = _setting(
+        "", "Flat letters, as read from the wall.", shown="T, if nothing else is given"
+    )
+    points: str | None = _setting("", "Points that scatter evenly, in m.", shown="none")
+    mesh: str | None = _setting(
+        "", "Triangle mesh (.ply, .obj, .stl) in m, in the wall's frame.", shown="none"
+    )
+    depth: float = _setting("m", "Depth of the letters.", 1.0)
+    height: float = _setting("m", "Height of a capital letter.", 0.7)
+    material: str = _setting(
+        "", f"Of letters or mesh: {' or '.join(MATERIALS)}.", "matte", choices=MATERIALS
+    )
+    facet: float = _setting(
+        "m", "Size of the facets that letters or mesh are cut into.", 0.025, written="mm"
+    )
+    wall: str = _setting(
+        "",
+        "planar, cylinder, wavy, relief (hills) or plates (two, hanging apart).",
+        "cylinder",
+        choices=WALLS,
+    )
+    wall_points: int = _setting("1", "Rows of wall points, and columns.", 48)
+    wall_width: float = _setting("m", "Width and height of the wall.", 2.0)
+    scan: str = _setting("", "single (one laser spot) or confocal.", "single", choices=SCANS)
+    laser: tuple[float, float] = _setting(
+        "m", "Where the laser spot is, in m; the nearest wall point is taken.", (0.0, 0.0)
+    )
+    bin_width: float = _setting("s", "Duration of a time bin.", 32e-12, written="ps")
+    jitter: float = _setting(
+        "s", "Standard deviation of the instrument's response.", 30e-12, written="ps"
+    )
+    peak_counts: float | None = _setting(
+        "1", "Expected photons in the brightest bin.", shown="no noise"
+    )
+    background: float = _setting(
+        "1", "Expected background counts per bin, with --peak-counts.", 0.0
+    )
+    seed: int = _setting("1", "Of the photons' chance.", 0)
+
+
+def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:
+    """Simulate the capture that settings describe.
+
+    Parameters
+    ----------
+    settings : SceneSettings
+
+    Returns
+    -------
+    capture : Capture
+    truth : HiddenTruth
+        Where things are hidden.
+
+    Raises
+    ------
+    InputError
+        The settings contradict each other, or name what there is not.
+    """
+    from nlos.simulate import add_poisson_noise, build_relay_wall
+
+    if settings.scan not in SCANS:
+        raise InputError(f"no scan is called '{settings.scan}'; choose {' or '.join(SCANS)}")
+    if settings.background and settings.peak_counts is None:
+        raise InputError("a background goes with photon noise: give the peak counts as well")
+    scene, truth = _build_hidden_scene(settings)
+    wall = build_relay_wall(settings.wall, settings.wall_points, settings.wall_width)
+    laser = wall if settings.scan == "confocal" else find_nearest_wall_point(wall, settings.laser)
+    axis = _choose_time_axis(wall, laser, truth.positions, settings)
+    capture = scene.simulate_capture(wall, laser, axis, settings.jitter)
+    if settings.peak_counts is not None:
+        capture = add_poisson_noise(
+            capture, settings.peak_counts, settings.background, settings.seed
+        )
+    return capture, truth
+
+
+def _build_hidden_scene(settings: SceneSettings) -> tuple[HiddenScene | PointScene, HiddenTruth]:
+    """Build what is hidden, and say where it is."""
+    import numpy as np
+
+    from nlos.simulate import HiddenScene, Lambert, Material, PointScene, Retroreflector, Surface
+
+    given = [name for name in ("letters", "points", "mesh") if getattr(settings, name) is not None]
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)} cannot be hidden together; choose one of them")
+    if settings.points is not None:
+        points = PointScene(np.array(_parse_points(settings.points)))
+        return points, HiddenTruth(points.positions, 0.0)
+    materials: dict[str, Material] = {"matte": Lambert(), "retroreflecting": Retroreflector()}
+    if settings.material not in materials:
+        raise InputError(
+            f"no material is called '{settings.material}'; choose {' or '.join(MATERIALS)}"
+        )
+    material, facet = materials[settings.material], settings.facet
+    if not (math.isfinite(facet) and facet > 0):
+        raise InputError(f"facets need a positive size, got {1e3 * facet:g} mm")
+    if settings.mesh is not None:
+        surface = Surface.load(Path(settings.mesh), facet, material)
+    else:
+        letters = "T" if settings.letters is None else settings.letters
+        centre = (0.0, 0.0, settings.depth)
+        surface = Surface.letters(letters, centre, settings.height, facet, material)
+    return HiddenScene([surface]), HiddenTruth(surface.positions, facet)
+
+
+def _parse_points(text: str) -> list[list[float]]:
+    """Read points written as X,Y,Z with semicolons between them."""
+    try:
+        points = [
+            [float(number) for number in one.split(",")] for one in text.split(";") if one.strip()
+        ]
+    except ValueError:
+        points = []
+    if not points or any(len(point) != 3 or not all(map(math.isfinite, point)) for point in points):
+        raise InputError(
+            f"points are given as X,Y,Z in m with semicolons between them, got '{text}'"
+        )
+    return points
+
+
+def find_nearest_wall_point(wall: FloatArray, place: tuple[float, float]) -> FloatArray:
+    """Return the wall point (3,) whose x and y are nearest to a place, m.
+
+    `wall` (..., 3): metres; NaN where there is no wall.
+    """
+    import numpy as np
+
+    known = wall[np.isfinite(wall).all(axis=-1)]
+    spot: FloatArray = known[np.argmin(np.linalg.norm(known[:, :2] - place, axis=1))]
+    return spot
+
+
+def _choose_time_axis(
+    wall: FloatArray, laser: FloatArray, hidden: FloatArray, settings: SceneSettings
+) -> TimeAxis:
+    """Choose a time axis from path 0 on that holds the farthest path over anything hidden (n, 3), and
+    the response behind it. A sum of distances is largest at a corner of the box about what is hidden.
+    """
+    import numpy as np
+
+    from nlos.capture import TimeAxis
+
+    bin_width = settings.bin_width
+    if not (math.isfinite(bin_width) and bin_width > 0):
+        raise InputError(
+            f"the bin width must be a positive number of picoseconds, got {1e12 * bin_width:g}"
+        )
+    corners = itertools.product(*zip(hidden.min(axis=0), hidden.max(axis=0), strict=True))
+    paths = [
+        np.nanmax(np.linalg.norm(wall - corner, axis=-1) + np.linalg.norm(laser - corner, axis=-1))
+        for corner in corners
+    ]
+    latest = max(paths) + RESPONSE_SIGMAS * SPEED_OF_LIGHT * settings.jitter
+    return TimeAxis(int(np.ceil(latest / (SPEED_OF_LIGHT * bin_width))) + 1, bin_width)
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenTruth:
+    """Where hidden things scatter light; it travels inside the file of a simulated capture."""
+
+    positions: FloatArray  # (n, 3), points, or the centres of facets, m
+    spacing: float  # distance of neighbouring facets, m; 0 for points
+
+    def attach_to_record(self, capture: Capture) -> Record:
+        """Put the truth into the record of its capture."""
+        from tofclip.storage import Field, Record
+
+        own = {"positions": Field(self.positions, "m", ("point", "xyz"))}
+        truth = Record(RECORD_KIND, own, {"spacing_m": self.spacing})
+        return replace(capture.to_record(), children={RECORD_KIND: truth})
+
+    @classmethod
+    def load(cls, path: Path) -> HiddenTruth | None:
+        """Read the truth that a capture's file carries; None where there is none."""
+        import numpy as np
+
+        from tofclip.storage import HDF5_SIGNATURE, Record
+
+        if not path.is_file():
+            return None
+        with open(path, "rb") as file:
+            if file.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE:
+                return None
+        try:
+            found = Record.load(path).children.get(RECORD_KIND)
+        except FileFormatError:  # another laboratory's HDF5
+            return None
+        if found is None:
+            return None
+        return cls(found.array("positions", np.float64, 2, "m"), found.number("spacing_m"))
+
+    def mask_near(self, grid: Grid, reach: float) -> NDArray[np.bool_]:
+        """Voxels (z, y, x) whose centres lie within `reach` m of something hidden."""
+        import numpy as np
+        from scipy.spatial import cKDTree
+
+        if reach <= 0:
+            raise InputError(f"the reach about hidden things must be positive, got {reach} m")
+        z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
+        voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+        found, _ = cKDTree(self.positions).query(voxels, distance_upper_bound=reach)
+        return np.asarray(np.isfinite(found).reshape(grid.shape))
+
+
+def compare_with_truth(volume: Volume, truth: HiddenTruth) -> dict[str, float]:
+    """Fraction of the energy near hidden things (``energy_near_truth``), how much brighter voxels are
+    there than elsewhere (``contrast_to_truth``), and the distance that counts as near
+    (``truth_reach_m``).
+    """
+    import numpy as np
+
+    axes = (volume.grid.x, volume.grid.y, volume.grid.z)
+    # coarse voxels may have no centre within the radius
+    reach = max([TRUTH_RADIUS_M, *(float(axis[1] - axis[0]) for axis in axes if axis.size > 1)])
+    near, magnitude = truth.mask_near(volume.grid, reach), volume.magnitude.astype(np.float64)
+    energy = float(np.sum(magnitude**2))
+    around, elsewhere = (
+        float(magnitude[some].mean()) if some.any() else math.nan for some in (near, ~near)
+    )
+    return {
+        "energy_near_truth": float(np.sum(magnitude[near] ** 2)) / energy
+        if energy > 0
+        else math.nan,
+        "contrast_to_truth": around / elsewhere if elsewhere > 0 else math.nan,
+        "truth_reach_m": reach,
+    }
+
+
+def measure_sharpness(volume: Volume) -> float:
+    """How far the light of the front view is gathered: 1 where it is even, the number of pixels
+    where one has it all.
+
+    ``pixels * sum(I^2) / sum(I)^2``: the first sharpness of R. A. Muller and A. Buffington, J. Opt.
+    Soc. Am. 64, 1200 (1974), made free of scale. It compares images of one scene on one grid; it
+    does not separate right from wrong.
+    """
+    import numpy as np
+
+    front = volume.maximum_projection().brightness.astype(np.float64)
+    total = float(front.sum())
+    return front.size * float(np.sum(front**2)) / total**2 if total > 0 else math.nan
