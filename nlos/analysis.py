@@ -236,11 +236,7 @@ def require_plausible(capture: Capture) -> None:
 
 
 def require_usable_wavelength(capture: Capture, wavelength: float, cycles: float) -> None:
-    """Refuse a given wavelength that shows nothing.
-
-    `wavelength`: carrier of the virtual pulse, m of path; `cycles`: length of the pulse in
-    wavelengths.
-    """
+    """Refuse a given wavelength that shows nothing."""
     extent = float(np.ptp(capture.points, axis=0).max())
     record = float(np.ptp(capture.axis.paths))
     longest = min(limit for limit in (extent, record / cycles) if limit > 0)
@@ -312,7 +308,7 @@ def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
     The band's shortest wave is sampled twice along the wall (four times in a confocal scan, where
     the path grows on both legs) and twice along the record.
 
-    `cycles`: length of the pulse in wavelengths. Returns metres.
+    `cycles`: length of the pulse in wavelengths.
     """
     return _band_reach(cycles) * max(_sampling_limit(capture), 2 * capture.axis.spacing)
 

@@ -36,7 +36,7 @@ def backproject_on_device(
     Memory: the volume, 64 MiB of waveforms, and five chunks (`ArrayLibrary.chunk_bytes`) for the
     pairs of voxel and wall point that are looked up at a time.
 
-    `progress`: called with the number of look-ups just done. Returns (z, y, x).
+    Returns (z, y, x).
     """
     library = ArrayLibrary(capture.device)
     rows = _VoxelRows(grid, library, weighting)
@@ -101,7 +101,7 @@ class _VoxelRows:
     def look_up(self, some: slice, waveforms: _Waveforms) -> Array:
         """Return what some rows (rows, x) find in the waveforms.
 
-        `some`: of the rows. Returns (rows, x).
+        `some`: of the rows.
         """
         xp, wall = self.library.xp, waveforms.wall
         y, z = self.y[some, ...], self.z[some, ...]

@@ -99,8 +99,6 @@ def extract_points(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Positions (n, 3) in m, and magnitudes (n,), of the voxels with at least `fraction` (0..1) of
     the brightest.
-
-    Returns `xyz` (n, 3); `magnitude` (n,).
     """
     z, y, x = np.nonzero(volume.threshold(fraction).magnitude)
     xyz = np.stack([volume.grid.x[x], volume.grid.y[y], volume.grid.z[z]], axis=-1).astype(

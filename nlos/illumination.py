@@ -61,8 +61,6 @@ def choose_roles(capture: Capture) -> Capture:
 
     A wave has to be imaged for every laser spot, whatever the number of wall points: a scan by a
     laser in front of few detectors is quicker the other way round.
-
-    Returns the same one unless swapping helps.
     """
     if len(capture.lasers) == 1 or is_confocal(capture):
         return capture
@@ -112,9 +110,8 @@ def require_few_spots(capture: Capture, groups: Sequence[IlluminationGroup]) -> 
 
 
 def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> SphericalWaves:
-    """Return the waves between wall and voxels in one illumination group.
-
-    `continued`: whether they go on from a plane, or start at points; see `SphericalWaves`.
+    """Return the waves between wall and voxels in one illumination group; `continued` as of
+    `SphericalWaves`.
     """
     k = group.legs * band.wavenumbers
     step = float(k[1] - k[0]) if k.size > 1 else 1.0
@@ -122,10 +119,7 @@ def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> Spheri
 
 
 def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
-    """Return what shines on the scene in one illumination group.
-
-    `group`: its laser spot, m; `band`: wavenumbers and weights of the virtual pulse.
-    """
+    """Return what shines on the scene in one illumination group."""
     return LaserSource(group.laser, band.wavenumbers, band.strength)
 
 
@@ -146,7 +140,7 @@ def choose_band_for_paths(
     """Return the pulse's band over a period in which paths from `shortest` to `longest` (m) meet
     the record once.
 
-    `axis`: of the record; `shortest, longest`: metres.
+    `axis`: of the record.
     """
     tail = Band(pulse, axis).tail_bins * axis.spacing
     # no image of the record, a period earlier or later, may be reached by a path of the grid
@@ -156,10 +150,7 @@ def choose_band_for_paths(
 
 
 def find_leg_bounds(ends: FloatArray, grid: Grid) -> tuple[float, float]:
-    """Bounds of the distance between any of some points and any voxel.
-
-    `ends` (n, 3): metres. Returns shortest and longest, m.
-    """
+    """Shortest and longest distance between any of some points (n, 3) and any voxel, m."""
     axes = (grid.x, grid.y, grid.z)
     low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
     # distance from a point to the box: zero along axes within it
@@ -178,8 +169,6 @@ def describe_aliasing(capture: Capture, band: Band) -> str | None:
 
     They do if neighbouring wall points lie more than half the band's shortest wavelength apart. In
     a confocal scan the path grows on both legs from point to point, so that a quarter is the limit.
-
-    `band`: wavenumbers of the virtual pulse.
     """
     shortest = 2 * np.pi / float(band.wavenumbers[-1])
     finest = shortest / 4 if is_confocal(capture) else shortest / 2

@@ -63,7 +63,7 @@ def shift_signals(signal, delay_bins):
     """Read column p of `signal` (t, points) `delay_bins[p]` bins later, linearly interpolated, 0
     outside the record.
 
-    `signal` (t, points); `delay_bins` (points,): bins, fractions included. Returns (t, points).
+    `delay_bins` (points,): bins, fractions included.
     """
     bins, points = signal.shape
     result = np.zeros_like(signal)

@@ -235,7 +235,7 @@ class PhasorMethod(Method):
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear in the
         signal within the method's tolerance.
 
-        `progress`: called with the amount of work just done. Returns (z, y, x) complex64.
+        Returns (z, y, x) complex64.
         """
         return self.plan(capture, grid).field(capture, progress)
 

@@ -132,7 +132,7 @@ class VirtualPlane(Plane):
     root of the rim's distance only. Faded out as a raised cosine, whose second derivative jumps,
     they weaken with the third power of the fade's width.
 
-    `x, y` (n,): evenly spaced and increasing, m; at least 2 of each; `z`: m.
+    `x, y` (n,): evenly spaced and increasing, m; at least 2 of each.
     """
 
     fade: tuple[float, float] = (0.0, 0.0)  # width of the fade along y and x, m
@@ -283,18 +283,17 @@ class WallLattice:
     empty.
     """
 
-    x: FloatArray  # (n,), coordinates of the places, m
-    y: FloatArray  # (n,), coordinates of the places, m
-    row: NDArray[np.intp]  # (points,), place of every wall point
-    column: NDArray[np.intp]  # (points,), place of every wall point
+    # (n,), coordinates of the places, m
+    x: FloatArray
+    y: FloatArray
+    # (points,), place of every wall point
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
 
     @classmethod
     def of(cls, points: FloatArray, evenness: float = EVENNESS_TOLERANCE) -> WallLattice:
-        """Find the lattice that wall points (n, 3) stand above; they may be off it by a fraction of
-        its step.
-
-        `points` (n, 3): metres; `evenness`: how far off its place a point may be, in steps of the
-        lattice.
+        """Find the lattice that wall points (n, 3) stand above; `evenness`: how far off its place a
+        point may be, in steps of the lattice.
         """
         x, column = _fit_lattice_axis(points[:, 0], "x", evenness)
         y, row = _fit_lattice_axis(points[:, 1], "y", evenness)
@@ -352,12 +351,7 @@ class PlanarWall:
 
     @classmethod
     def of(cls, points: FloatArray, evenness: float = EVENNESS_TOLERANCE) -> PlanarWall:
-        """Find the lattice that wall points (n, 3) stand on; they may be off it by a fraction of
-        its step.
-
-        `points` (n, 3): metres; `evenness`: how far off its place a point may be, in steps of the
-        lattice.
-        """
+        """Find the lattice that wall points (n, 3) stand on; see `WallLattice.of`."""
         lattice = WallLattice.of(points, evenness)
         plane = Plane(lattice.x, lattice.y, float(points[:, 2].mean()))
         relief = float(np.ptp(points[:, 2]))

@@ -29,10 +29,7 @@ from tofclip.threads import split_blocks
 
 
 def crop_capture(capture: Capture, nearest: float, farthest: float) -> Capture:
-    """Keep the bins that hold paths from `nearest` to `farthest`.
-
-    `nearest, farthest`: lengths of path, m.
-    """
+    """Keep the bins that hold paths from `nearest` to `farthest`, m."""
     paths = capture.axis.paths
     kept = np.flatnonzero((paths >= nearest) & (paths <= farthest))
     if kept.size < 2:
@@ -49,8 +46,6 @@ def rebin_capture(capture: Capture, factor: int) -> Capture:
 
     Counts stay counts. Bins much finer than the wall's sampling carry noise and cost time: path per
     bin of about the distance of neighbouring wall points loses nothing.
-
-    Returns its bins are `factor` times wider.
     """
     bins = capture.axis.bins // factor if factor >= 1 else 0
     if bins < 2:
@@ -91,10 +86,7 @@ def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> C
 
 
 def flip_capture(capture: Capture, axis: str) -> Capture:
-    """Mirror a capture's coordinates, and with them the picture.
-
-    `axis`: its coordinates change sign.
-    """
+    """Mirror a capture's coordinates along an axis, and with them the picture."""
     if axis not in ("x", "y"):
         raise InputError(f"a capture is mirrored along x or y, not along '{axis}'")
     sign = np.ones(3)
@@ -103,11 +95,8 @@ def flip_capture(capture: Capture, axis: str) -> Capture:
 
 
 def fade_record_end(capture: Capture, length: float) -> Capture:
-    """Let signals fade out towards the end of the record, as a raised cosine.
-
-    Where light still comes when the record ends, its end would show as a plane.
-
-    `length`: m of path before the end.
+    """Let signals fade out over a length of path, m, before the end of the record, as a raised
+    cosine: where light still comes then, the end would show as a plane.
     """
     if not (np.isfinite(length) and length > 0):
         raise InputError(f"the record's end must fade over more than 0 m, got {length}")
@@ -130,7 +119,7 @@ MAX_PATH_ERROR_FRACTION = 0.1
 # Wall widths before the wall, where hidden things may be.
 SAMPLED_DEPTHS = (0.4, 0.7, 1.0)
 # Wall widths beside the wall's middle.
-SAMPLED_PLACES = (-0.4, 0.0, 0.4)
+SAMPLED_SIDES = (-0.4, 0.0, 0.4)
 # Pairs whose errors are looked at.
 MAX_SAMPLED_PAIRS = 500
 # Pairs whose signals are read together.
@@ -144,19 +133,14 @@ def join_near_lasers(capture: Capture) -> Capture:
 
     The path by way of a point at distance R then errs by at most ``d^2 / (4 R)``, d the distance of
     the two: 0.1 mm for 15 mm and half a metre. Where pairs are farther apart, signals are read at
-    the path that leads by way of the same points; see the module.
-
-    Returns the same one where pairs are so far apart that the path would err too much, or all are
-    confocal already.
+    the path that leads by way of the same points; see the module. Where the path would err too
+    much, or all are confocal already, the same capture comes back.
     """
     return MidpointJoin(capture).join(capture)
 
 
 class MidpointJoin:
-    """What `join_near_lasers` does, made ready for captures of one geometry.
-
-    `capture`: one of them.
-    """
+    """What `join_near_lasers` does, made ready for captures of one geometry."""
 
     def __init__(self, capture: Capture) -> None:
         self._geometry = PlannedGeometry(capture)
@@ -227,8 +211,8 @@ def _sample_space(points: FloatArray) -> FloatArray:
     middle, extent = (low + high) / 2, float((high - low).max())
     z, y, x = np.meshgrid(
         high[2] + extent * np.array(SAMPLED_DEPTHS),
-        middle[1] + extent * np.array(SAMPLED_PLACES),
-        middle[0] + extent * np.array(SAMPLED_PLACES),
+        middle[1] + extent * np.array(SAMPLED_SIDES),
+        middle[0] + extent * np.array(SAMPLED_SIDES),
         indexing="ij",
     )
     return np.stack([x, y, z], axis=-1).reshape(-1, 3)
@@ -256,11 +240,11 @@ def _find_path_error(capture: Capture) -> float:
     middle, squared, along = _find_offsets(capture, some)
     errors = []
     for place in _sample_space(capture.points):
-        outward, back, way = (
+        outward, back, middle_leg = (
             np.linalg.norm(place - spots, axis=1)
             for spots in (capture.lasers[some], capture.points[some], middle)
         )
-        errors.append(_path_of(2 * way, squared, along) - outward - back)
+        errors.append(_path_of(2 * middle_leg, squared, along) - outward - back)
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
@@ -272,10 +256,7 @@ def _path_of(confocal: FloatArray, squared: Any, along: Any) -> FloatArray:
 
 
 class _Moveout:
-    """Where between the bins every valid signal is read: at the path of its pair.
-
-    `capture`: for its geometry; NumPy's arrays.
-    """
+    """Where between the bins every valid signal is read: at the path of its pair."""
 
     def __init__(self, capture: Capture) -> None:
         self._axis, self._places = capture.axis, np.flatnonzero(capture.valid)
@@ -289,10 +270,7 @@ class _Moveout:
         )
 
     def read(self, signal: NDArray[Any]) -> NDArray[np.float32]:
-        """Return signals (t, ...) read at their pairs' paths, linear between bins; 0 outside.
-
-        `signal` (t, ...). Returns (t, ...).
-        """
+        """Return signals (t, ...) read at their pairs' paths, linear between bins; 0 outside."""
         read = np.zeros(signal.shape, np.float32)
         flat, recorded = (one.reshape(self._axis.bins, -1) for one in (read, signal))
         for number, some in enumerate(self._blocks):

@@ -26,9 +26,10 @@ MAX_WALL_POINTS = 4096
 class PeakWidths:
     """Full widths at half maximum of a point's magnitude, m."""
 
-    x: float  # naN where the magnitude does not fall to half on both sides
-    y: float  # naN where the magnitude does not fall to half on both sides
-    z: float  # naN where the magnitude does not fall to half on both sides
+    # NaN where the magnitude does not fall to half on both sides
+    x: float
+    y: float
+    z: float
 
 
 def compute_diffraction_limit(capture: Capture, point: Any, pulse: VirtualPulse) -> PeakWidths:
@@ -70,7 +71,7 @@ def measure_fwhm(axis: FloatArray, values: NDArray[Any], peak: int) -> float:
     """Full width at half of ``values[peak]``, by linear interpolation; NaN if one side does not
     fall so far.
 
-    `axis` (n,): metres, ascending; `values` (n,); `peak`: place of the maximum. Returns metres.
+    `axis` (n,): metres, ascending; `values` (n,); `peak`: place of the maximum.
     """
     level = HALF_MAXIMUM * float(values[peak])
     below = np.flatnonzero(values < level)

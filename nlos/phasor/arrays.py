@@ -133,8 +133,6 @@ def get_traces(capture: Capture, some: slice) -> Array:
 def arrange_on_lattice(values: Array, wall: WallLattice, library: ArrayLibrary) -> Array:
     """Put values (..., points) into their places on a lattice, (..., rows, columns); the others are
     0.
-
-    `values` (..., points). Returns (..., rows, columns).
     """
     xp = library.xp
     if not wall.is_complete:

@@ -63,10 +63,8 @@ def build_constant_illumination(frequencies: int) -> Illumination:
 def split_illumination(
     detuning: FloatArray, strength: FloatArray, half: float, tolerance: float
 ) -> Illumination:
-    """Split the illumination of distances from ``-half`` to ``half`` about a middle one.
-
-    `detuning` (frequencies,): ``k - k_0``, rad/m; `strength` (frequencies,): how much each
-    frequency counts; `half`: m; `tolerance`: root mean square error allowed, relative.
+    """Split the illumination of distances from ``-half`` to ``half``, m, about a middle one, to a
+    root mean square error; `detuning` (frequencies,): ``k - k_0``, rad/m.
     """
     # Even and odd functions are known by their values at the positive half of the nodes.
     angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES
@@ -212,33 +210,27 @@ class DiffractionPlan:
         )
 
     @cached_property
-    def lattice(self) -> tuple[int, int]:
-        """Voxels in a period along y and x: no image of a source may meet a voxel inside the
-        window.
+    def _lattice(self) -> tuple[tuple[int, float], tuple[int, float]]:
+        """Voxels in a period along y and along x, and the period, m: no image of a source may meet
+        a voxel inside the window.
         """
-        y, x = (
-            find_fast_length(side / axis_step(axis)) if axis.size > 1 else 1
-            for side, axis in zip(
-                find_min_periods(self._offsets, self.tolerance),
-                (self.grid.y, self.grid.x),
-                strict=True,
-            )
-        )
-        return y, x
+        sides = find_min_periods(self._offsets, self.tolerance)
+        found = []
+        for side, axis in zip(sides, (self.grid.y, self.grid.x), strict=True):
+            step = axis_step(axis) if axis.size > 1 else side
+            count = find_fast_length(side / step) if axis.size > 1 else 1
+            found.append((count, count * step))
+        return found[0], found[1]
 
-    @cached_property
+    @property
+    def lattice(self) -> tuple[int, int]:
+        """Voxels in a period along y and x."""
+        return self._lattice[0][0], self._lattice[1][0]
+
+    @property
     def _periods(self) -> tuple[float, float]:
         """Of the lattice along y and x, m."""
-        y, x = (
-            count * axis_step(axis) if axis.size > 1 else side
-            for count, axis, side in zip(
-                self.lattice,
-                (self.grid.y, self.grid.x),
-                find_min_periods(self._offsets, self.tolerance),
-                strict=True,
-            )
-        )
-        return y, x
+        return self._lattice[0][1], self._lattice[1][1]
 
     @cached_property
     def _window(self) -> Window:
@@ -324,11 +316,11 @@ class AxialSpectrum:
         centre: float,
         cosines: tuple[float, float],
     ) -> AxialSpectrum:
-        """Return the spectrum of a field of all directions forward.
+        """Return the spectrum of a field of all directions forward, of wavenumbers k and a carrier
+        k_0 (`centre`), rad/m.
 
-        `wavenumbers` (frequencies,): k, rad/m; `strength` (frequencies,): of each frequency;
-        `centre`: k_0, the carrier's wavenumber, rad/m; `cosines`: range of the cosine of the angle
-        between the laser's wave and z; both 0 without one.
+        `cosines`: range of the cosine of the angle between the laser's wave and z; both 0 without
+        one.
         """
         steps = (np.arange(ANGLES) + 0.5) / ANGLES
         low, high = cosines
@@ -342,10 +334,9 @@ class AxialSpectrum:
     def interpolate(
         self, wanted: FloatArray, known: FloatArray, noise: float
     ) -> tuple[NDArray[np.complex128], FloatArray]:
-        """Return the best linear interpolation between depths, and its error.
-
-        `wanted, known` (m,): depths, m; `noise`: relative error of the known ones, independent of
-        each other. Returns `weights` (m, n); `errors` (m,): root mean square, relative.
+        """Return the best linear interpolation between depths, weights (wanted, known), and its
+        root mean square errors (wanted,), relative; `noise`: that of the known ones, independent of
+        each other.
         """
         middle = float(known.mean())
         waves, at_known = (
@@ -377,10 +368,8 @@ class DepthInterpolation:
 
 
 def choose_depths(z: FloatArray, spectrum: AxialSpectrum, error: float) -> DepthInterpolation:
-    """Choose the fewest depths from which all others follow.
-
-    `z` (n,): wanted depths, ascending, m; `error`: root mean square error allowed at every depth,
-    relative.
+    """Choose the fewest depths from which all wanted ones, z (n,), m, follow with a root mean
+    square error allowed at every depth, relative.
     """
     everything = DepthInterpolation(np.arange(z.size), [])
     ratio = _find_spacing_ratio(z, spectrum, error)

@@ -224,8 +224,7 @@ def propagate_in_time(
     Supplementary Note 12 of X. Feng, Y. Ma, L. Gao, Nat. Commun. 13, 3333 (2022).
 
     `points` (n, 3): m; `traces` (n, t); `legs`: how often light runs between wall and plane: 2 in a
-    confocal scan; `progress`: called with the number of values just done. Returns (y, x,
-    frequencies).
+    confocal scan. Returns (y, x, frequencies).
     """
     targets = plane.points.reshape(-1, 3)
     scale = legs / band.axis.spacing

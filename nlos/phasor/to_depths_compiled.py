@@ -206,8 +206,7 @@ class _AxisTransform:
         """Sums of complex values (points, ...) with the first cosines and with the first sines,
         (count, ...).
 
-        `values` (points, ...); `count`: number of waves, from index 0 on. Returns cosine and sine
-        sums.
+        `count`: number of waves, from index 0 on. Returns cosine and sine sums.
         """
         half = self.cosines.shape[1]
         before, after = values[:half], values[::-1][:half]

@@ -41,17 +41,15 @@ VECTOR_LENGTH = 8
 class Window:
     """A circle about every source, outside of which its wave is cut off smoothly."""
 
-    inner_radius: float  # radii up to which waves are whole, and from which on they are gone, m
-    outer_radius: float  # radii up to which waves are whole, and from which on they are gone, m
+    # radii up to which waves are whole, and from which on they are gone, m
+    inner_radius: float
+    outer_radius: float
     steepness: float  # of the edge, an error function: it is cut off at this argument on both ends
 
     @classmethod
     def within(cls, offsets: Offsets, periods: Sides, tolerance: float) -> Window:
-        """Return the widest window that lets no image of a source in a periodic lattice meet a
-        target.
-
-        `periods`: along y and x, m; at least `find_min_periods`; `tolerance`: relative error
-        allowed.
+        """Return the widest window that lets no image of a source in a periodic lattice, of at
+        least `find_min_periods`, meet a target; `tolerance`: relative error allowed.
         """
         room = min(period - far for period, far in zip(periods, offsets.farthest, strict=True))
         inner = min(offsets.reach, room - MIN_EDGE_FRACTION * offsets.along)
@@ -98,10 +96,7 @@ class Offsets:
 
     @classmethod
     def between(cls, sources: Plane, y: FloatArray, x: FloatArray) -> Offsets:
-        """Return those of all sources on a plane from all targets.
-
-        `y, x` (n,): coordinates of the targets, ascending, m.
-        """
+        """Return those of all sources on a plane from all targets, whose coordinates ascend, m."""
         pairs = ((y, sources.y), (x, sources.x))
         along_y, along_x = (float(max(abs(a[-1] - b[0]), abs(a[0] - b[-1]))) for a, b in pairs)
         high, wide = (
@@ -111,10 +106,8 @@ class Offsets:
         return cls((along_y, along_x), reach, max(along_y, along_x), (high, wide))
 
     def limit(self, reach: float, rim: Sides) -> Offsets:
-        """Return the offsets where less reach is wanted, and where a rim carries little of the
-        field.
-
-        `reach`: m; `rim`: width of the rim along y and x, m.
+        """Return the offsets where less reach is wanted, m, and where a rim of some width along y
+        and x, m, carries little of the field.
         """
         y, x = (far - width for far, width in zip(self.farthest, rim, strict=True))
         reach = min(reach, float(np.hypot(y, x)))
@@ -123,10 +116,7 @@ class Offsets:
 
 
 def find_min_periods(offsets: Offsets, tolerance: float) -> Sides:
-    """Return the shortest periods along y and x in which a window has room, m.
-
-    `tolerance`: relative error allowed.
-    """
+    """Return the shortest periods along y and x in which a window has room, m."""
     inner = INNER_RADIUS_FRACTION - INNER_RADIUS_FRACTION_PER_DIGIT * np.log10(tolerance)
     edge = inner * offsets.reach + MIN_EDGE_FRACTION * offsets.along
     y, x = (
@@ -156,9 +146,10 @@ RADII_PER_PERIOD = 1.25
 class SphericalWaves:
     """The spherical waves that carry a field on."""
 
-    first: float  # evenly spaced wavenumbers, rad/m
-    step: float  # evenly spaced wavenumbers, rad/m
-    count: int  # evenly spaced wavenumbers, rad/m
+    # evenly spaced wavenumbers, rad/m
+    first: float
+    step: float
+    count: int
     # false for ``exp(1j * k * R) / R``, the wave of a point; True for the first Rayleigh-Sommerfeld
     # integral's ``z / (2 pi R^2) * (1 / R - 1j * k) * exp(1j * k * R)``, which continues a field
     # known on a plane
@@ -254,8 +245,8 @@ class TransferFunction:
         distance undoes a positive one, as far as waves travel at all. `leading_zeros` zeros stand
         before the lowest frequency.
 
-        `distance`: metres; `delay` (2,): path in m and the wavenumber k_0 in rad/m. Returns (nodes,
-        2, leading_zeros + frequencies).
+        `delay` (2,): path in m and the wavenumber k_0 in rad/m. Returns (nodes, 2, leading_zeros +
+        frequencies).
         """
         radii, _ = self._radii
         waves = np.zeros((radii.size, 2, leading_zeros + self.waves.count), np.float32)

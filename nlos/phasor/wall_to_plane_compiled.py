@@ -165,7 +165,7 @@ def sum_spherical_waves(
     frequency. Memory for the result and a copy of the phasors.
 
     `targets, sources` (m, 3): m; `phasors` (n, frequencies); `wavenumbers` (frequencies,): evenly
-    spaced, rad/m; `progress`: called with the number of values just done. Returns (m, frequencies).
+    spaced, rad/m. Returns (m, frequencies).
     """
     frequencies = wavenumbers.size
     padded = -(-frequencies // FREQUENCY_STEPS) * FREQUENCY_STEPS

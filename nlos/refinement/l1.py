@@ -1,8 +1,5 @@
-"""Spherical waves between two sets of points, the same in both directions.
-
-The wall's phasors as a linear function of the hidden volume, at the hybrid's speed.
-
-`nlos.Refinement`: the hybrid, iterated.
+"""`nlos.Refinement`: the hybrid, iterated, with the wall's phasors as a linear function of the
+hidden volume at the hybrid's speed.
 """
 
 from __future__ import annotations
@@ -48,17 +45,10 @@ def propagate_spherical_waves(
     With sources and targets exchanged it is its own transpose. In single precision good to 1e-5 and
     quick; in double precision plain.
 
-    `sources, targets` (n, 3): m; `values` (n, frequencies); `wavenumbers` (frequencies,): evenly
-    spaced, rad/m. Returns (m, frequencies): of the type of `values`.
+    `sources, targets` (n, 3): m; `values` (n, frequencies); `wavenumbers`: evenly spaced, rad/m.
     """
-    if values.dtype == np.complex128:
-        return _propagate_in_double_precision(sources, values, targets, wavenumbers)
-    return sum_spherical_waves(targets, sources, values, wavenumbers)
-
-
-def _propagate_in_double_precision(
-    sources: FloatArray, values: Array, targets: FloatArray, wavenumbers: FloatArray
-) -> Array:
+    if values.dtype == np.complex64:
+        return sum_spherical_waves(targets, sources, values, wavenumbers)
     field = np.empty((len(targets), wavenumbers.size), np.complex128)
     for some in split_blocks(len(targets), max(1, PAIRS_PER_BLOCK // len(sources))):
         distance = np.linalg.norm(targets[some, np.newaxis] - sources, axis=-1)
@@ -153,10 +143,6 @@ class WallModel:
         """The voxels of the hidden volume."""
         return self.plan.grid
 
-    @property
-    def _band(self) -> Band:
-        return self.plan.band
-
     @cached_property
     def laser_distance(self) -> FloatArray:
         """Mean distance of every voxel from the laser spots, m, shape (z, y, x); 1 for a confocal
@@ -176,13 +162,13 @@ class WallModel:
         """Return the phasors divided by ``sqrt(G_k)``, as the operator gives them, shape (n, 1),
         float32.
         """
-        strength = np.sqrt(self._band.weights)
+        strength = np.sqrt(self.plan.band.weights)
         parts = []
         traces = self.capture.traces()
         for group in (one.group for one in self.plan.groups):
             path_weight = (self.capture.axis.paths ** (group.legs + 1)).astype(np.float32)
             phasors = np.ascontiguousarray(
-                self._band.compute_phasors(traces[group.indices] * path_weight) / strength,
+                self.plan.band.compute_phasors(traces[group.indices] * path_weight) / strength,
                 np.complex64,
             )
             parts.append(phasors.view(np.float32).ravel())
@@ -190,7 +176,7 @@ class WallModel:
 
     def _build_group_operator(self, one: GroupPlan, dtype: DTypeLike) -> LinearOperator:
         points = self.capture.points[one.group.indices]
-        bare = HiddenToWall(points, one.plane_to_depths, one.group, self._band, dtype)
+        bare = HiddenToWall(points, one.plane_to_depths, one.group, self.plan.band, dtype)
         return bare @ Diagonal(self.laser_distance / self._compute_laser_distance(one.group), dtype)
 
     def _compute_laser_distance(self, group: IlluminationGroup) -> FloatArray:
@@ -228,7 +214,8 @@ class Refinement(Method):
     Minimises ``1/2 |A h - f|^2 + prior(h)`` over h >= 0 by FISTA, with f the wall's phasors and A
     the hybrid's own way from a volume to the wall; A'f is the real part of the hybrid's field. The
     albedo is real and not negative, so that the phase of f tells where within a wave a point lies:
-    voxels have to resolve the carrier in depth.
+    voxels have to resolve the carrier in depth, with `MIN_VOXELS_PER_WAVELENGTH`. Takes NumPy's
+    arrays of few laser spots only.
 
     Every step costs some four hybrid images. Memory: some 40 bytes per plane wave and frequency and
     thread, and twelve volumes.
@@ -246,44 +233,27 @@ class Refinement(Method):
     prior: Prior = field(default_factory=lambda: Sparse(weight=2e-2, iterations=60))
 
     def plan(self, capture: Capture, grid: Grid) -> RefinementPlan:
-        """Make the refinement ready for captures like `capture` on `grid`.
-
-        Parameters
-        ----------
-        capture : Capture
-            A NumPy array, of few laser spots.
-        grid : Grid
-            Evenly spaced along x and y; at least `MIN_VOXELS_PER_WAVELENGTH` voxels per wavelength
-            in depth.
-
-        Returns
-        -------
-        RefinementPlan
-
-        Raises
-        ------
-        InputError
-            The hybrid cannot image such a capture on the grid, the voxels are too coarse in depth,
-            or memory does not suffice.
-        """
         require_numpy_signal("iterative refinement", capture)
         hybrid = plan_waves(self.hybrid, choose_roles(capture), grid)
-        _require_fine_depths(grid, self.hybrid.wavelength)
-        _require_memory(grid)
+        coarsest = float(np.diff(grid.z).max()) if grid.z.size > 1 else 0.0
+        allowed = self.hybrid.wavelength / MIN_VOXELS_PER_WAVELENGTH
+        # Voxels drawn exactly at the limit must not be refused for a rounding error.
+        if coarsest > allowed * (1 + 1e-6):
+            raise InputError(
+                f"voxels {coarsest:.3g} m apart in depth are too coarse to refine with waves of "
+                f"{self.hybrid.wavelength:.3g} m: use at most {allowed:.3g} m"
+            )
+        needed = 4 * SOLVER_VOLUMES * grid.size
+        if needed > MEMORY_LIMIT_BYTES:
+            raise InputError(
+                f"{grid.size} voxels need {needed / 2**30:.1f} GiB to refine, more than the "
+                f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: use larger voxels or a smaller box"
+            )
         return RefinementPlan(capture, grid, self, hybrid)
 
 
 class RefinementPlan(Plan):
-    """An iterative refinement, ready for captures of one geometry.
-
-    Parameters
-    ----------
-    capture : Capture
-    grid : Grid
-    method : Refinement
-    hybrid : WavePlan
-        The plan of the image that is iterated.
-    """
+    """An iterative refinement of a hybrid's image, ready for captures of one geometry."""
 
     def __init__(self, capture: Capture, grid: Grid, method: Refinement, hybrid: WavePlan) -> None:
         super().__init__(capture, grid)
@@ -316,23 +286,3 @@ class RefinementPlan(Plan):
         # the solver's unknown is the albedo over the laser's distance
         albedo = (result.frames[0] * model.laser_distance).astype(np.float32)
         return Volume(albedo, self.grid, {**capture.provenance, "imaging": settings})
-
-
-def _require_fine_depths(grid: Grid, wavelength: float) -> None:
-    coarsest = float(np.diff(grid.z).max()) if grid.z.size > 1 else 0.0
-    allowed = wavelength / MIN_VOXELS_PER_WAVELENGTH
-    # Voxels drawn exactly at the limit must not be refused for a rounding error.
-    if coarsest > allowed * (1 + 1e-6):
-        raise InputError(
-            f"voxels {coarsest:.3g} m apart in depth are too coarse to refine with waves of "
-            f"{wavelength:.3g} m: use at most {allowed:.3g} m"
-        )
-
-
-def _require_memory(grid: Grid) -> None:
-    needed = 4 * SOLVER_VOLUMES * grid.size
-    if needed > MEMORY_LIMIT_BYTES:
-        raise InputError(
-            f"{grid.size} voxels need {needed / 2**30:.1f} GiB to refine, more than the {MEMORY_LIMIT_BYTES >> 30} GiB "
-            "allowed: use larger voxels or a smaller box"
-        )

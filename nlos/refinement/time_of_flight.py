@@ -38,8 +38,8 @@ class TimeOfFlight:
     obliquity: int = 0
 
     def compute_light(self, albedo: Array, voxels: Array, points: Array) -> Array:
-        """Return the light (m, bins) of some voxels (n,), flat indices into the grid, at some of the
-        capture's points (m,).
+        """Return the light (m, bins) of some voxels (n,), flat indices into the grid, at some of
+        the capture's points (m,).
         """
         light = np.empty((len(points), self._bins), np.float32)
         places, albedo = np.take(self._places, voxels, axis=1), np.asarray(albedo, np.float32)

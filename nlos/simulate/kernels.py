@@ -135,7 +135,7 @@ def add_facet_light(
 def distance_between(one, other):
     """Distance of two points.
 
-    `one, other` (3,): metres. Returns metres.
+    `one, other` (3,): metres.
     """
     return math.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)
 

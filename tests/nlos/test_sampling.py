@@ -71,8 +71,8 @@ def test_an_exhaustive_capture_pairs_every_laser_with_every_point() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"bin_width": 16.0}, "give seconds"),
-        ({"bin_width": 1e-16}, "give seconds"),
+        ({"bin_width": 16.0}, "check the unit of `bin_width`"),
+        ({"bin_width": 1e-16}, "check the unit of `bin_width`"),
         ({"wall": planar_wall() * 1e4}, "give its points in metres"),
         ({"laser": [0, 0, -1.0]}, "behind the hindmost wall point"),
         ({"laser": planar_wall() - [0, 0, 1.0]}, "behind the hindmost wall point"),
