@@ -9,8 +9,8 @@ import pytest
 from three_view_shot import CAMERA, make_streak
 
 from tofclip.camera import Camera
-from tofclip.errors import InputError, MissingTimeAxisError
-from tofclip.recovery import open_shot, plan_recovery
+from tofclip.errors import CalibrationError, InputError, MissingTimeAxisError
+from tofclip.recovery import DepthLockedFocus, FixedFocus, open_shot, plan_recovery
 from tofclip.recovery import shot as opening
 from tofclip.shots import Streak
 from tofclip.solvers import LinearInverse
@@ -84,3 +84,26 @@ def test_the_error_of_slit_centres_is_told_though_a_part_of_it_shows_in_no_shot(
         squares.append(shot.fit_camera().centre_error_px ** 2)
     # 10,000 degrees of freedom know a variance to 1.4 %
     assert np.mean(squares) == pytest.approx(0.5**2, rel=0.05)
+
+
+def test_a_plan_refuses_before_it_runs(streak):
+    shot = open_shot(streak)
+    with pytest.raises(InputError, match="unknown method"):
+        plan_recovery(shot, "magic")
+    with pytest.raises(InputError, match="focus"):
+        plan_recovery(shot, "tv", "sharp")
+    with pytest.raises(CalibrationError, match="lenslet pitch"):
+        plan_recovery(shot, "tv", DepthLockedFocus())
+    with pytest.raises(InputError, match="device"):
+        plan_recovery(shot, device="abacus")
+
+
+def test_a_plan_knows_its_work_and_its_memory(streak):
+    plan = plan_recovery(open_shot(streak), "linear", FixedFocus(0.5))
+    done: list[int] = []
+    frames = plan.run(done.append)
+    assert sum(done) == plan.work == 12
+    assert plan.memory_bytes == frames.values.nbytes + 90 * 12 * (4 + 1)
+    np.testing.assert_array_equal(frames.shears, np.full(12, 0.5))
+    again = plan.run()
+    np.testing.assert_array_equal(again.values, frames.values)
