@@ -67,10 +67,7 @@ class CountedPhotons:
 
 
 def find_address(file: str) -> str | None:
-    """Return the address of a file that holds an instrument's records, None of any other file.
-
-    `file`: A recording of this program, or a LinoSPAD2's (``.dat``).
-    """
+    """Return the address of a file that holds an instrument's records, None of any other file."""
     path = Path(file)
     is_stamps = path.suffix.lower() == STAMPS_SUFFIX
     return f"file://{file}" if is_stamps or read_head_if_recording(path) is not None else None

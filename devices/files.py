@@ -79,8 +79,6 @@ class RecordFile(Source):
 
     The calibration of photons and histograms has ``resolution_s``, the width of a bin, and
     ``channels``; of photons also ``laser_period_s``, of images ``rows`` and ``columns``.
-
-    `open_file`: makes the file's reader.
     """
 
     def __init__(self, path: str | Path, open_file: Callable[[Path], Reader]) -> None:

@@ -153,10 +153,7 @@ class FrameCodec:
         return len(data) // self.frame_bytes
 
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
-        """Decode whole frames; `state` is the last one's number.
-
-        `data`: whole frames; `after_loss`: not needed: every frame carries its number.
-        """
+        """Decode whole frames; `state` is the last one's number."""
         words = as_bytes(data)
         if words.size % self.frame_bytes:
             raise InputError(

@@ -159,8 +159,6 @@ class LinoSpad2Codec:
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
         """Decode whole cycles; `state` is how many came before. Cycles that were lost are not
         counted.
-
-        `data`: whole cycles; `after_loss`: not needed: cycles do not depend on each other.
         """
         from devices.linospad2_kernels import decode_stamps
 

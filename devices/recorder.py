@@ -153,10 +153,7 @@ class Throughput:
 def measure_throughput(
     source: Source, seconds: float, watch: Callable[[float], None] = lambda _: None
 ) -> Throughput:
-    """Read a source for some seconds or to its end, decode everything, and close it.
-
-    `watch`: called with the seconds that have passed, now and then.
-    """
+    """Read a source for some seconds or to its end, decode everything, and close it."""
     if not 0 < seconds < math.inf:
         raise InputError(f"a trial takes a positive, finite number of seconds, got {seconds:g}")
     read = 0

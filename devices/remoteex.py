@@ -204,8 +204,6 @@ class RemoteExClient:
 
     A command that found no answer in time may still be carried out, so it is never sent again:
     the next command first waits for the answer that is owed.
-
-    `timeout`: seconds to wait for an answer.
     """
 
     def __init__(self, host: str, port: int, data_port: int, timeout: float = 5.0) -> None:
@@ -455,8 +453,6 @@ class RemoteExFeed(FrameFeed):
 
     Pictures that fell out of the ring buffer before they were asked for are lost by the instrument.
     When the connection breaks, so are those that had been announced.
-
-    `connect`: returns a new connection.
     """
 
     def __init__(self, connect: ConnectFunction, options: StreakOptions) -> None:

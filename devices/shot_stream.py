@@ -79,9 +79,6 @@ def read_transients(address: str, bin_width: float | None = None) -> TransientSt
     One is made of each ``frames`` pictures of a camera or ``records`` photons, as the address says;
     the last one may have fewer. The source is opened with the first image, and closed with the
     stream. Memory: a batch of the source, and a streak image.
-
-    `address, bin_width`: as for `devices.read_transient`. Reading ends after ``seconds`` only where
-    the address gives them.
     """
     return TransientStream(address, bin_width)
 
@@ -92,8 +89,6 @@ class TransientStream(Iterator[Streak]):
     A live camera whose pictures are taken one by one is read newest first, unless the address
     chooses a ``policy``: what is shown or ranged late would be of no use. What is dropped for that
     is in `stats`.
-
-    `bin_width`: s.
     """
 
     def __init__(self, address: str, bin_width: float | None = None) -> None:

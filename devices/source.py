@@ -497,10 +497,7 @@ class Source(abc.ABC):
 
 
 class DecodedSource(Source):
-    """What live and recorded streams have in common, so that both decode alike.
-
-    `ledger`: where the pieces have been entered as unread.
-    """
+    """What live and recorded streams have in common, so that both decode alike."""
 
     def __init__(self, codec: Codec, ledger: Ledger) -> None:
         self.codec = codec

@@ -140,8 +140,6 @@ def find_error_text(data: bytes | bytearray) -> str | None:
     """Return what the server says instead of the rest of its pictures, None where it says nothing.
 
     To be asked when nothing more comes although pictures are due: pixels may spell anything.
-
-    `data`: what came for the present picture.
     """
     tail = bytes(data[-256:])
     if tail.endswith(ERROR_MARK):
@@ -188,8 +186,6 @@ class Spad512Feed(FrameFeed):
     Pictures are asked for a request at a time, and a request that finds no answer in time is not
     sent again. Behind a gate a picture's number modulo the gate's steps is its step: a scan that
     was cut is never finished, and the next one's numbers begin behind it.
-
-    `connect`: returns a new connection.
     """
 
     def __init__(self, connect: Callable[[], TcpLink], options: SpadOptions) -> None:

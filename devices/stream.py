@@ -70,8 +70,6 @@ class InstrumentClock:
         """Note when a stamped message arrived.
 
         A stamp that goes back means that the instrument's clock began anew.
-
-        `stamp`: s of the instrument's clock; `arrived_at`: s of `time.monotonic`.
         """
         if self._last_stamp is not None and stamp < self._last_stamp:
             self.reset()

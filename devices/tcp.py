@@ -1,4 +1,4 @@
-"""TCP: a connection to an instrument's server, with bounded waiting, bounded lengths and our
+"""TCP: a connection to an instrument's server, with bounded waiting (s), bounded lengths (bytes) and our
 exceptions.
 """
 
@@ -23,10 +23,7 @@ RECEIVE_BYTES = 1 << 18  # Most bytes taken from the system at once
 
 
 class TcpLink:
-    """A connection to a server. Not for two threads at once.
-
-    `timeout`: seconds to wait for the connection.
-    """
+    """A connection to a server. Not for two threads at once."""
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
         self.name = f"{host}:{port}"
@@ -45,19 +42,13 @@ class TcpLink:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, data: bytes, timeout: float) -> None:
-        """Send all of `data`.
-
-        `timeout`: seconds.
-        """
+        """Send all of `data`."""
         with self._translate_errors():
             self._socket.settimeout(timeout)
             self._socket.sendall(data)
 
     def read_available(self, limit: int, timeout: float) -> bytes:
-        """Return what came, at least 1 and at most `limit` bytes.
-
-        `limit`: bytes; `timeout`: seconds.
-        """
+        """Return what came, at least 1 and at most `limit` bytes."""
         if not self._buffer:
             self._fill_buffer(monotonic() + timeout, timeout)
         return self._take_bytes(min(limit, len(self._buffer)))
@@ -65,8 +56,6 @@ class TcpLink:
     def read_exactly(self, length: int, limit: int, timeout: float) -> bytes:
         """Return `length` bytes, a length that came from the wire and is bounded before anything is
         held for it.
-
-        `length, limit`: bytes; `timeout`: seconds for all of it.
         """
         if not 0 <= length <= limit:
             raise ProtocolError(
@@ -78,10 +67,7 @@ class TcpLink:
         return self._take_bytes(length)
 
     def read_until(self, end: bytes, limit: int, timeout: float) -> bytes:
-        """Return everything up to `end`, which is taken off.
-
-        `limit`: bytes; `timeout`: seconds for all of it.
-        """
+        """Return everything up to `end`, which is taken off."""
         deadline = monotonic() + timeout
         searched = 0
         while (found := self._buffer.find(end, searched)) < 0:

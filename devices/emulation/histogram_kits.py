@@ -104,10 +104,7 @@ EmulatedOptions = EmulatedTmf8828Options | EmulatedVl53l8Options
 
 
 class EmulatedKit:
-    """A kit that sends frames once it has been asked to, or at once where it needs no asking.
-
-    `format_lines`: from counts, the frame's number and its tick to lines.
-    """
+    """A kit that sends frames once it has been asked to, or at once where it needs no asking."""
 
     def __init__(self, options: EmulatedOptions, format_lines: LineFormatter) -> None:
         self._options, self._format = options, format_lines

@@ -64,10 +64,7 @@ class EmulatedLight:
 
     @classmethod
     def of(cls, light: LineLight, seed: int) -> EmulatedLight:
-        """Let a scene's light fall on the screen.
-
-        `seed`: of the photons.
-        """
+        """Let a scene's light fall on the screen."""
         return cls(light.photons, light.row_times, seed=seed)
 
 
@@ -141,10 +138,7 @@ def render_array_delays() -> NDArray[np.float64]:
 
 
 def draw_exposure(light: LineLight, seed: int) -> Streak:
-    """Draw one exposure, without any instrument in between.
-
-    `light`: expected photons.
-    """
+    """Draw one exposure, without any instrument in between."""
     counts = np.random.default_rng(seed).poisson(light.photons).astype(np.float32)
     return Streak(counts, light.row_times, camera=light.camera)
 

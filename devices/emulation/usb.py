@@ -30,11 +30,7 @@ def make_usb_error(number: int) -> usb.core.USBError:
 
 
 class VirtualDevice(abc.ABC):
-    """An instrument on the virtual USB.
-
-    `strings`: manufacturer, product and serial number; `endpoints`: addresses of its bulk
-    endpoints.
-    """
+    """An instrument on the virtual USB."""
 
     def __init__(
         self, identity: UsbIdentity, strings: tuple[str, str, str], endpoints: tuple[int, ...]
@@ -60,25 +56,17 @@ class VirtualDevice(abc.ABC):
         self.halted.discard(endpoint)
 
     def control(self, request: int, value: int) -> None:
-        """Do what a vendor request asks for; without an override it knows none, and stalls.
-
-        `request, value`: of the setup packet.
-        """
+        """Do what a vendor request asks for; without an override it knows none, and stalls."""
         raise make_usb_error(errno.EPIPE)
 
     @abc.abstractmethod
     def receive(self, endpoint: int, data: bytes) -> None:
-        """Take what the host sends.
-
-        `endpoint`: address.
-        """
+        """Take what the host sends."""
 
     @abc.abstractmethod
     def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
         """Write what the host asks for into `buffer` and return how many bytes; raise
         `make_usb_error` for faults.
-
-        `endpoint`: address; `buffer`: overwritten; `timeout`: seconds.
         """
 
 
@@ -105,10 +93,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: VirtualDevice, config: int) -> SimpleNamespace:
-        """Describe the one configuration of a device, as pyusb reads it.
-
-        `config`: 0. Returns fields of the USB 2.0 configuration descriptor.
-        """
+        """Describe the one configuration of a device, as pyusb reads it."""
         _require_descriptor(config == 0)
         return SimpleNamespace(
             # USB 2.0, table 9-10.
@@ -119,11 +104,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def get_interface_descriptor(
         self, dev: VirtualDevice, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """Describe the one interface of a device, as pyusb reads it.
-
-        `intf, alt, config`: numbers of interface, alternate setting and configuration. Returns
-        fields of the USB 2.0 interface descriptor.
-        """
+        """Describe the one interface of a device, as pyusb reads it."""
         _require_descriptor((intf, alt, config) == (INTERFACE_NUMBER, 0, 0))
         return SimpleNamespace(
             # USB 2.0, table 9-12.
@@ -135,11 +116,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def get_endpoint_descriptor(
         self, dev: VirtualDevice, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """Describe an endpoint of a device, as pyusb reads it.
-
-        `ep, intf, alt, config`: numbers of endpoint, interface, alternate setting and
-        configuration. Returns fields of the USB 2.0 endpoint descriptor.
-        """
+        """Describe an endpoint of a device, as pyusb reads it."""
         _require_descriptor(
             ep < len(dev.endpoints) and (intf, alt, config) == (INTERFACE_NUMBER, 0, 0)
         )
@@ -178,10 +155,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         _require_plugged(dev_handle)
 
     def clear_halt(self, dev_handle: VirtualDevice, ep: int) -> None:
-        """Let a stalled endpoint go on.
-
-        `ep`: address.
-        """
+        """Let a stalled endpoint go on."""
         _require_plugged(dev_handle)
         dev_handle.clear_halt(ep)
 
@@ -189,11 +163,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         self, dev_handle: VirtualDevice, bmRequestType: int, bRequest: int, wValue: int, wIndex: int, data: Any,
         timeout: int,
     ) -> int:  # fmt: skip
-        """Answer requests for string descriptors and those of the maker's own.
-
-        `bmRequestType, bRequest, wValue, wIndex`: the setup packet, USB 2.0, section 9.3; `data`:
-        overwritten with the answer; `timeout`: milliseconds. Returns bytes of the answer.
-        """
+        """Answer requests for string descriptors and those of the maker's own."""
         _require_plugged(dev_handle)
         if bmRequestType == VENDOR_REQUEST:
             dev_handle.control(bRequest, wValue)
@@ -216,11 +186,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def bulk_write(
         self, dev_handle: VirtualDevice, ep: int, intf: int, data: array.array[int], timeout: int
     ) -> int:
-        """Hand what the host sends to the device.
-
-        `ep, intf`: address of the endpoint, number of the interface; `timeout`: milliseconds.
-        Returns bytes.
-        """
+        """Hand what the host sends to the device."""
         self._require_ready(dev_handle, ep)
         dev_handle.receive(ep, data.tobytes())
         return len(data)
@@ -228,11 +194,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def bulk_read(
         self, dev_handle: VirtualDevice, ep: int, intf: int, buff: array.array[int], timeout: int
     ) -> int:
-        """Have the device fill the host's buffer.
-
-        `ep, intf`: address of the endpoint, number of the interface; `buff`: overwritten;
-        `timeout`: milliseconds. Returns bytes.
-        """
+        """Have the device fill the host's buffer."""
         self._require_ready(dev_handle, ep)
         return dev_handle.fill(ep, memoryview(buff), timeout / 1000)
 

@@ -69,8 +69,6 @@ def verify(path: Path) -> Findings:
 def repair(path: Path, out: Path) -> Findings:
     """Copy every sound block of a recording into a new one; gaps are marked where something had to
     be left out, and the copy of a damaged or truncated recording never claims to be complete.
-
-    `path`: also a recording of version 0.1.0; `out`: replaced if it exists. Returns of `path`.
     """
     with (
         Recording(path) as recording,

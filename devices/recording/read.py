@@ -164,9 +164,6 @@ class BlockReader:
 
     The first sound header decides which recording, and which version of the format, this is;
     blocks of any other are not looked at. Memory: one block.
-
-    `path`: for messages; `fetch`: takes position and length, returns these bytes, fewer at the end;
-    `length`: bytes there are.
     """
 
     def __init__(self, path: Path, fetch: Callable[[int, int], bytes], length: int) -> None:

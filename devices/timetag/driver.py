@@ -110,10 +110,7 @@ class TimeTagger:
         return self._transact(_READ, register, 0)
 
     def write(self, register: Register, value: int) -> None:
-        """Set a register.
-
-        `value`: 32 bits.
-        """
+        """Set a register."""
         self._transact(_WRITE, register, value)
 
     def reset(self) -> None:
@@ -464,10 +461,7 @@ class SendWindow:
         return 10.0 if is_full or self.size == RECORD_BYTES else LATENCY_S
 
     def choose(self, length: int, seconds: float) -> int:
-        """Return how many bytes should make a packet from now on.
-
-        `length`: bytes that the last transfer brought; `seconds`: how long it took. Returns bytes.
-        """
+        """Return how many bytes should make a packet from now on."""
         self._bytes += length
         self._transfers += 1
         self._seconds += seconds

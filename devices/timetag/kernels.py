@@ -70,10 +70,7 @@ def decode_timetags(data, epoch, previous, after_loss, ticks, channels, flags):
 
 @compiled
 def encode_timetags(ticks, channels, flags, data):
-    """Write records as 6-byte words, the highest byte first.
-
-    `ticks, channels, flags` (records,); `data` (6 * records,): overwritten.
-    """
+    """Write records as 6-byte words, the highest byte first."""
     for number in range(ticks.size):
         time = ticks[number] & TIME_MASK
         at = number * RECORD_BYTES
