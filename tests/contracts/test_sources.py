@@ -277,14 +277,20 @@ def test_seeking_is_exact_or_refused(opened: Open) -> None:
         first: list[Batch] = []
         read_on(source, first)
         whole = joined(first)
-        for target in (0, len(whole) // 3, len(whole) - 1):
+        for target in (len(whole) // 2, 0, 1, len(whole) // 3, len(whole) - 1):
             source.seek(target)
             again: list[Batch] = []
             read_on(source, again)
             assert again[0].first == target
             np.testing.assert_array_equal(joined(again), whole[target:])
-        with pytest.raises(InputError):
-            source.seek(len(whole) + 1)
+            # As if everything before had been read.
+            assert source.stats.is_balanced
+            assert (source.stats.delivered, source.stats.unread) == (len(whole), 0)
+        source.seek(len(whole))
+        assert source.read(LONG) is None
+        for absent in (-1, len(whole) + 1):
+            with pytest.raises(InputError, match="record"):
+                source.seek(absent)
 
 
 def test_the_same_again_is_the_same(opened: Open) -> None:

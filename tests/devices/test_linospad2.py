@@ -1,184 +1,31 @@
-"""LinoSPAD2's words, against words put together by hand, and its calibration."""
+"""LinoSPAD2's calibration, and its recordings and simulations as sources."""
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from numpy.typing import NDArray
 
+import devices
+from devices import linospad2 as recordings
+from devices.emulation.linospad2 import SimulatedBoard, draw_uneven_calibration
+from devices.emulation.scenes import LineLight, make_line_instrument, simulate_line_light
+from devices.histogram import BinAxis, StampHistogram
 from devices.linospad2 import (
     CODES_PER_PERIOD,
-    FIRMWARES,
-    MAX_TIMESTAMPS,
     BoardCalibration,
     LinoSpad2Codec,
     load_calibration,
     read_sidecar,
 )
-from devices.registry import build_codec
-from devices.source import Records, as_bytes
+from devices.source import Source
+from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
-from tofclip.threads import THREADS_VARIABLE
-
-unhurried = settings(deadline=None)  # the first call compiles
-
-codecs = st.builds(LinoSpad2Codec, st.sampled_from(FIRMWARES), st.integers(1, 6), st.booleans())
-
-
-@st.composite
-def streams(draw: st.DrawFn) -> tuple[LinoSpad2Codec, Records]:
-    """A codec and time stamps that its stream can hold."""
-    codec = draw(codecs)
-    seed = draw(st.integers(0, 2**32 - 1))
-    random = np.random.default_rng(seed)
-    records = np.zeros(draw(st.integers(0, 300)), codec.dtype)
-    records["cycle"] = random.integers(0, 5, len(records))
-    records["pixel"] = random.integers(0, 256, len(records))
-    records["code"] = random.integers(0, 1 << 28, len(records))
-    if codec.counter:
-        records["counter"] = random.integers(0, 1 << 63, 5, dtype=np.uint64)[records["cycle"]]
-    records = codec.sort_stamps(records)
-    queue = records["cycle"].astype(int) * 64 + codec.address_of[records["pixel"]] // 4
-    first = np.searchsorted(queue, queue)
-    return codec, records[np.arange(len(records)) - first < codec.timestamps]
-
-
-def words(codec: LinoSpad2Codec, cycles: int) -> NDArray[Any]:
-    return np.zeros((cycles, codec.cycle_words), "<u4")
-
-
-@unhurried
-@given(streams())
-def test_decoding_gives_back_what_was_encoded(stream: tuple[LinoSpad2Codec, Records]) -> None:
-    codec, records = stream
-    data = as_bytes(codec.encode(records))
-    found = codec.decode(data, codec.start)
-    assert found.malformed == 0
-    assert found.records.dtype == codec.dtype
-    np.testing.assert_array_equal(found.records, records)
-    assert codec.count_records(data) == len(records)
-    assert codec.count_complete_bytes(data) == len(data)
-
-
-@unhurried
-@given(streams(), st.data())
-def test_a_stream_may_be_cut_between_cycles(
-    stream: tuple[LinoSpad2Codec, Records], data: st.DataObject
-) -> None:
-    codec, records = stream
-    whole = as_bytes(codec.encode(records))
-    cut = codec.count_complete_bytes(whole[: data.draw(st.integers(0, len(whole)))])
-    first = codec.decode(whole[:cut], codec.start)
-    second = codec.decode(whole[cut:], first.state)
-    np.testing.assert_array_equal(np.concatenate([first.records, second.records]), records)
-
-
-@pytest.mark.parametrize(
-    ("firmware", "converter", "address", "pixel"),
-    [
-        ("2212b", 0, 3, 3),
-        ("2212b", 63, 1, 253),
-        ("2212b", 5, 0, 20),
-        ("2212s", 0, 3, 192),
-        ("2212s", 63, 1, 127),
-    ],
-)
-def test_words_written_by_hand(firmware: str, converter: int, address: int, pixel: int) -> None:
-    codec = LinoSpad2Codec(firmware, timestamps=3)
-    stream = words(codec, 2)
-    stream[1, converter * 3 + 2] = 1 << 31 | address << 28 | 1234567
-    stream[1, converter * 3 + 1] = 0x7FFFFFFF  # bit 31 says that there is none
-    found = codec.decode(as_bytes(stream.tobytes()), 10)
-    assert found.records.tolist() == [(11, 1234567, pixel)]
-    assert (found.malformed, found.state) == (0, 12)
-
-
-def test_the_absolute_counter_is_two_words_low_first() -> None:
-    codec = LinoSpad2Codec(timestamps=2, counter=True)
-    stream = words(codec, 1)
-    stream[0, :3] = [0x89ABCDEF, 0x01234567, 1 << 31 | 7]
-    found = codec.decode(as_bytes(stream.tobytes()), 0).records
-    assert found["counter"].tolist() == [0x0123456789ABCDEF]
-    assert (found["code"].tolist(), found["pixel"].tolist()) == ([7], [0])
-
-
-def test_stamps_of_the_converter_without_pixels_are_malformed() -> None:
-    codec = LinoSpad2Codec(timestamps=4)
-    stream = words(codec, 3)
-    stream[1, 0] = stream[2, 64 * 4 : 64 * 4 + 2] = 1 << 31 | 5
-    data = as_bytes(stream.tobytes())
-    found = codec.decode(data, 0)
-    assert (len(found.records), found.malformed, codec.count_records(data)) == (1, 2, 3)
-
-
-def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    codec = LinoSpad2Codec(timestamps=20)
-    stream = (
-        np.random.default_rng(1)
-        .integers(0, 1 << 32, (1500, codec.cycle_words), dtype=np.uint64)
-        .astype("<u4")
-    )
-    data = as_bytes(stream.tobytes())
-    monkeypatch.setenv(THREADS_VARIABLE, "1")
-    alone = codec.decode(data, 0)
-    monkeypatch.setenv(THREADS_VARIABLE, "3")
-    together = codec.decode(data, 0)
-    np.testing.assert_array_equal(together.records, alone.records)
-    assert together.malformed == alone.malformed == np.count_nonzero(stream[:, 64 * 20 :] >> 31)
-    assert len(alone.records) == np.count_nonzero(stream[:, : 64 * 20] >> 31)
-
-
-def test_the_codec_is_built_again_from_its_settings() -> None:
-    codec = LinoSpad2Codec("2212s", 20, True)
-    assert build_codec("linospad2", codec.settings) == codec
-
-
-@pytest.mark.parametrize(
-    ("arguments", "problem"),
-    [
-        (("2208",), "2212b or 2212s"),
-        (("2212b", 0), "1..16384"),
-        (("2212b", MAX_TIMESTAMPS + 1), "1..16384"),
-    ],
-)
-def test_impossible_settings_are_refused(arguments: tuple[Any, ...], problem: str) -> None:
-    with pytest.raises(InputError, match=problem):
-        LinoSpad2Codec(*arguments)
-
-
-def test_half_a_cycle_is_refused() -> None:
-    with pytest.raises(InputError, match="whole number"):
-        LinoSpad2Codec().decode(np.zeros(9, np.uint8), 0)
-
-
-@pytest.mark.parametrize(
-    ("rows", "problem"),
-    [
-        ([(0, 1, 256)], "pixel below 256"),
-        ([(0, 1 << 28, 0)], "code below"),
-        ([(1, 1, 0), (0, 1, 0)], "in order"),
-        ([(0, 1, 9), (0, 1, 0)], "in order"),
-        ([(0, 1, 0), (0, 2, 1), (0, 3, 2)], "more time stamps"),
-        ([(1 << 31, 1, 0)], "in pieces"),
-    ],
-)
-def test_stamps_that_no_stream_holds(rows: list[tuple[int, int, int]], problem: str) -> None:
-    codec = LinoSpad2Codec(timestamps=2)
-    with pytest.raises(InputError, match=problem):
-        codec.encode(np.array(rows, codec.dtype))
-
-
-def test_a_cycle_has_one_counter() -> None:
-    codec = LinoSpad2Codec(counter=True)
-    with pytest.raises(InputError, match="same counter"):
-        codec.encode(np.array([(5, 0, 1, 0), (6, 0, 1, 0)], codec.dtype))
-    with pytest.raises(InputError, match="one-dimensional array"):
-        LinoSpad2Codec().encode(np.array([(5, 0, 1, 0)], codec.dtype))
 
 
 @pytest.fixture
@@ -356,3 +203,157 @@ def test_companions_that_are_absent_or_too_large(recording: Path) -> None:
         file.truncate(1 << 30)
     with pytest.raises(FileFormatError, match="larger than any table"):
         load_calibration(recording.parent / "codes.csv", recording.parent / "offsets.npy")
+
+
+CODEC = LinoSpad2Codec("2212s", 24, True)
+SIDECAR = 'firmware = "2212s"\ntimestamps_per_cycle = 24\nabsolute_counter = true\n'
+
+
+@pytest.fixture(scope="module")
+def light() -> LineLight:
+    return simulate_line_light()
+
+
+@pytest.fixture
+def board(light: LineLight) -> SimulatedBoard:
+    return SimulatedBoard(light, draw_uneven_calibration(3), CODEC, 300, 3)
+
+
+@pytest.fixture
+def stamps(tmp_path: Path, board: SimulatedBoard, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Twenty cycles, read five at a time."""
+    monkeypatch.setattr(recordings, "PIECE_BYTES", 5 * CODEC.cycle_bytes)
+    path = tmp_path / "run.dat"
+    path.write_bytes(b"".join(board.encode_cycle(number) for number in range(20)))
+    path.with_suffix(".toml").write_text(SIDECAR)
+    return path
+
+
+def records_of(source: Source) -> NDArray[Any]:
+    return np.concatenate([batch.records for batch in source])
+
+
+@pytest.mark.parametrize("scheme", ["linospad2", "file"])
+def test_a_recording_gives_every_stamp(stamps: Path, board: SimulatedBoard, scheme: str) -> None:
+    expected = CODEC.decode(np.frombuffer(stamps.read_bytes(), np.uint8), 0).records
+    with devices.open(f"{scheme}://{stamps}") as source:
+        assert not source.is_live
+        assert source.is_seekable
+        np.testing.assert_array_equal(records_of(source), expected)
+        assert source.read() is None
+        assert "not public" in str(source.info.details["limits"])
+    assert source.stats.is_balanced
+    assert source.stats.delivered == len(expected)
+    assert source.read() is None
+
+
+def test_a_recording_that_was_cut_off(stamps: Path) -> None:
+    with devices.open(f"linospad2://{stamps}") as source:
+        whole = records_of(source)
+    stamps.write_bytes(stamps.read_bytes()[:-10])
+    with devices.open(f"linospad2://{stamps}") as source:
+        found = records_of(source)
+    np.testing.assert_array_equal(found, whole[whole["cycle"] < 19])
+    assert (source.stats.malformed, source.stats.is_balanced, source.stats.unread) == (1, True, 0)
+    stamps.write_bytes(b"short")
+    with pytest.raises(FileFormatError, match="one cycle takes"):
+        devices.open(f"linospad2://{stamps}")
+
+
+def test_recordings_that_cannot_be_opened(stamps: Path) -> None:
+    with pytest.raises(InputError, match="not public"):
+        devices.open("linospad2://")
+    with pytest.raises(InputError, match="'x' is unknown"):
+        devices.open(f"linospad2://{stamps}?x=1")
+    stamps.unlink()
+    with pytest.raises(StorageError, match="no such file"):
+        devices.open(f"linospad2://{stamps}")
+
+
+def test_a_recordings_calibration_has_laser_and_camera(stamps: Path) -> None:
+    make_line_instrument().camera.to_record().save(stamps.parent / "camera.h5")
+    stamps.with_suffix(".toml").write_text(
+        SIDECAR + 'laser_period_ps = 25000\ncamera = "camera.h5"\n'
+    )
+    with devices.open(f"linospad2://{stamps}") as source:
+        known = source.calibration
+    assert known is not None
+    assert known.attribute("laser_period_s") == pytest.approx(25e-9)
+    assert Camera.from_record(known.child("camera", "camera")).slit_width_px == 256
+
+
+def test_a_simulation_is_the_same_again() -> None:
+    found = []
+    for _ in range(2):
+        with devices.open(
+            "sim+linospad2://?seed=5&cycles=3&photons=2000&counter=1&firmware=2212s"
+        ) as source:
+            found.append(records_of(source))
+            assert source.stats.is_balanced
+    np.testing.assert_array_equal(found[0], found[1])
+    assert found[0]["cycle"].max() == 2
+    assert len(found[0]) == pytest.approx(6000, abs=5 * 80)  # Poisson
+    # 4 ms in ticks of 7.5 ns.
+    assert np.unique(found[0]["counter"]).tolist() == [0, 533333, 1066667]
+
+
+def test_the_light_comes_back_out_of_the_words(light: LineLight) -> None:
+    """Through uneven codes and pixels out of step, the histogram is the scene's own streak image,
+    up to its noise.
+    """
+    with devices.open("sim+linospad2://?seed=2&cycles=60") as source:
+        known = source.calibration
+        assert known is not None
+        axis = BinAxis(20e-12, len(light.row_times), 0.0, 25e-9)
+        histogram = StampHistogram(axis, BoardCalibration.from_record(known))
+        for batch in source:
+            histogram.add(batch.records)
+    counts = histogram.counts
+    expected = light.photons * (counts.sum() / light.photons.sum())
+    assert counts.sum() == pytest.approx(60 * 6000, rel=0.01)
+    # A photon's place is known to about a code, 18 ps: edges are softer than the light's own, sums
+    # over 3 rows are not.
+    rows = len(expected) // 3
+    coarse, wanted = (
+        values[: rows * 3].reshape(rows, 3, 256).sum(axis=1) for values in (counts, expected)
+    )
+    bright = wanted > 20
+    assert np.corrcoef(coarse[bright], wanted[bright])[0, 1] > 0.98
+    centre = (coarse * np.arange(rows)[:, None]).sum(axis=0) / coarse.sum(axis=0)
+    truth = (wanted * np.arange(rows)[:, None]).sum(axis=0) / wanted.sum(axis=0)
+    # Some 1400 photons in each pixel, spread over a few hundred rows by the background.
+    assert np.median(np.abs(centre - truth)) < 3
+
+
+def test_a_cycle_that_is_full_keeps_the_first_stamps(light: LineLight) -> None:
+    crowded = SimulatedBoard(
+        light, draw_uneven_calibration(0), LinoSpad2Codec(timestamps=4), 256, 1
+    )
+    data = np.frombuffer(crowded.encode_cycle(0), np.uint8)
+    assert 100 < LinoSpad2Codec(timestamps=4).count_records(data) < 256
+    nearly_dark = SimulatedBoard(light, draw_uneven_calibration(0), CODEC, 1e-9, 1)
+    assert nearly_dark.encode_cycle(0) == bytes(CODEC.cycle_bytes)
+
+
+def test_in_real_time_a_cycle_takes_its_time() -> None:
+    simulate_line_light()  # kept, so that opening takes no time
+    began = time.monotonic()
+    with devices.open("sim+linospad2://?cycles=30&photons=10&timestamps=4&pace=realtime") as source:
+        records_of(source)
+        assert time.monotonic() - began > 29 * 4e-3
+
+
+@pytest.mark.parametrize(
+    "query",
+    ["seed=-1", "cycles=-1", "photons=0", "photons=1e9", "firmware=1", "timestamps=0", "x=1"],
+)
+def test_simulations_that_cannot_be(query: str) -> None:
+    with pytest.raises(InputError):
+        devices.open(f"sim+linospad2://?{query}")
+
+
+def test_a_board_needs_its_own_number_of_pixels(light: LineLight) -> None:
+    with pytest.raises(ShapeError):
+        SimulatedBoard(
+            replace(light, photons=np.ones((5, 3))), draw_uneven_calibration(0), CODEC, 5, 0
+        )

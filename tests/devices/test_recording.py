@@ -29,7 +29,7 @@ from devices.recording.read import (
     ReplaySource,
 )
 from devices.recording.write import RecordingWriter, make_head
-from devices.source import Batch, DecodedSource, Gap, Info, Piece, Records, Source, Stats, as_bytes
+from devices.source import Batch, DecodedSource, Gap, Info, Piece, Records, Stats, as_bytes
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
 from tofclip.errors import (
     DeviceDisconnectedError,
@@ -278,15 +278,6 @@ def test_accounts_must_agree_with_the_records(tmp_path: Path, stats: Stats, soun
     assert (found.is_sound, found.records, found.damaged_blocks) == (sound, 600, 0)
 
 
-def test_a_recording_can_be_recorded(tmp_path: Path) -> None:
-    written(tmp_path / "run.h5")
-    record_source(devices.open(f"file://{tmp_path / 'run.h5'}"), tmp_path / "again.h5")
-    assert (
-        joined(replayed(tmp_path / "again.h5")).tobytes()
-        == joined(replayed(tmp_path / "run.h5")).tobytes()
-    )
-
-
 def test_an_instrument_that_fails_leaves_a_whole_recording(tmp_path: Path) -> None:
     with pytest.raises(DeviceDisconnectedError):
         record_source(
@@ -299,37 +290,6 @@ def test_an_instrument_that_fails_leaves_a_whole_recording(tmp_path: Path) -> No
     assert (found.complete, found.is_sound) == (True, True)
     assert "did not come back" in found.fault
     assert found.records == 9 * 1024 // 6
-
-
-def test_a_source_without_bytes_cannot_be_recorded(tmp_path: Path) -> None:
-    class Wordless(Source):
-        info, stats = Info("a file"), Stats()
-
-        def read(self, timeout: float = 0.0) -> Batch | None:
-            return None
-
-        def close(self) -> None:
-            pass
-
-    with pytest.raises(InputError, match="nothing to record"):
-        record_source(Wordless(), tmp_path / "run.h5")
-
-
-def test_seeking(tmp_path: Path) -> None:
-    records = np.concatenate(written(tmp_path / "run.h5"))
-    with ReplaySource(tmp_path / "run.h5") as source:
-        for target in (0, 49, 50, 51, 333, 120, 599, 0):
-            source.seek(target)
-            batch = source.read()
-            assert batch is not None
-            assert batch.first == target
-            np.testing.assert_array_equal(joined([batch, *source]), records[target:])
-            assert source.stats == Stats(600, 600)
-        source.seek(600)
-        assert source.read() is None
-        for wrong in (-1, 601):
-            with pytest.raises(InputError, match="record"):
-                source.seek(wrong)
 
 
 def test_a_paced_replay_waits_as_long_as_the_recorder_did(
