@@ -17,13 +17,13 @@ from tofclip.camera import Camera, Rectifier, SkewSweep, measure
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
 from tofclip.io.streaks import StreakStack, save_stack
 from tofclip.recovery import DepthLockedFocus
-from tofclip.sequences.ranger import (
+from tofclip.sequences.ranger import RangingPipeline
+from tofclip.sequences.ranging import (
     JitterEstimator,
-    RangingPipeline,
+    RangingSettings,
     compute_light_curve,
     make_average_cloud,
 )
-from tofclip.sequences.ranging import RangingSettings
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.bodies import Body
 from tofclip.simulate.patterns import make_checkerboard

@@ -67,24 +67,8 @@ class CloudSettings:
             raise InputError("an organised cloud keeps its pixels: leave the side of voxels out")
 
     def make_cloud(self, frames: Frames, origin: str) -> tuple[PointCloud, Returns]:
-        """Find each pixel's returns and place them in space.
-
-        Parameters
-        ----------
-        frames : Frames
-            Those that carry returns, as of surfaces, are not searched again.
-        origin : str
-            Whose frames they were, for the message.
-
-        Returns
-        -------
-        cloud : PointCloud
-        returns : Returns
-
-        Raises
-        ------
-        InputError
-            There is no return.
+        """Find each pixel's returns, where the frames carry none, and place them in space;
+        `InputError` where there is none, which names their `origin`.
         """
         from tofclip.lidar.processing import downsample_cloud, find_outliers
 
@@ -105,20 +89,8 @@ class CloudSettings:
         return (cloud if self.voxel is None else downsample_cloud(cloud, self.voxel)), returns
 
     def jobs(self, frames: Mapping[str, Path], folder: Path, suffix: str) -> list[Job]:
-        """Return one job for each file of frames, which writes its cloud into `folder`; see
-        `RecoverySettings.jobs`.
-
-        Parameters
-        ----------
-        frames : mapping of str to Path
-            Files by name.
-        folder : Path
-        suffix : str
-            Names the format of the clouds.
-
-        Returns
-        -------
-        list of Job
+        """Return one job for each file of frames, by name, which writes its cloud into `folder` in the
+        format of `suffix`; see `RecoverySettings.jobs`.
         """
         settings = {
             "verb": "cloud",
@@ -165,9 +137,8 @@ def write_cloud(clouds: CloudSettings, frames: Path, result: Path) -> int:
 
 
 def save_cloud(cloud: PointCloud, returns: Returns, path: Path, organised: bool = False) -> None:
-    """Write a cloud, or the depth picture of its returns where the name ends in .exr.
-
-    `organised`: write a point for every pixel.
+    """Write a cloud, a point for every pixel of an organised one, or the depth picture of its returns
+    where the name ends in .exr.
     """
     if path.suffix.lower() == DEPTH_IMAGE_SUFFIX:
         from tofclip.lidar import save_depth

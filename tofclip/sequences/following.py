@@ -1,9 +1,8 @@
-"""Shot after shot recovered with a prior, each beginning at what the last one showed.
+"""Shot after shot, each beginning at what the last one showed: pictures of a method with a prior, or
+surfaces.
 
 From one shot to the next little changes but the noise. Iterations that begin at the last shot's
 pictures need a few steps where those that begin in darkness need forty.
-
-Shot after shot by its surfaces, each beginning at those of the shot before.
 """
 
 from __future__ import annotations
@@ -24,18 +23,15 @@ from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfa
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import ProximalMethod
 
-WARM_ITERATIONS = 4
-"""Of each shot but the first, which has the method's own number."""
+WARM_ITERATIONS = 4  # of each shot but the first, which has the method's own number
 
 
 class WarmStartedRecovery:
     """Recovers the rows of a shot that hold light, beginning at the same rows of the shot before.
 
     Shots are taken one after the other, each with all cores: what comes out of a shot depends on
-    those before it, and only on them.
-
-    `method`: its iterations are the first shot's; `operator`: of all rows; `alive` (columns,):
-    false for slit columns that are never to be trusted; `iterations`: of each further shot.
+    those before it, and only on them. The method's iterations are the first shot's; slit columns
+    that are not `alive` are never trusted.
     """
 
     def __init__(
@@ -52,10 +48,8 @@ class WarmStartedRecovery:
         self._pictures = np.zeros((0, *operator.shape_in), np.float32)
 
     def recover(self, measurements: NDArray[np.float32], bins: TraceBins) -> PictureTraces:
-        """Recover some rows of a shot.
-
-        `measurements` (columns, bins): rectified, of these rows; `bins`: rows of which one stands
-        for several are dark, and stay so.
+        """Recover some rows of a shot from their rectified measurements (columns, bins); those of
+        which one stands for several are dark, and stay so.
         """
         lit = bins.bin_weights == 1
         rows = bins.numbers[lit]
@@ -86,8 +80,6 @@ class SurfacePipeline:
     they no longer explain the shot, as when something has come in, surfaces are found anew. Shots
     are taken in order.
 
-    `shot`: opened, its sweep known.
-
     Memory: as `SurfaceRecovery`; nothing is kept of the shots before but the last fit.
     """
 
@@ -109,11 +101,7 @@ class SurfacePipeline:
         time_zero: float | None = None,
         method: SurfaceRecovery | None = None,
     ) -> SurfacePipeline:
-        """Prepare for shots like this one; a sweep that is not known is found from it.
-
-        `shot`: with a time axis; `camera`: defaults to the one that the shot carries; `time_zero`:
-        reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
-        """
+        """Prepare for shots like this one; see `RangingPipeline.for_shot`."""
         return cls(open_shot(shot, camera, time_zero).fit_camera(), method)
 
     def rectify(self, shot: Streak) -> None:

@@ -139,10 +139,7 @@ def list_files(source: str | Path) -> dict[str, Path]:
 
 
 def make_result_paths(names: Mapping[str, object], folder: Path, suffix: str) -> dict[str, Path]:
-    """Return where the result of each input goes, absolute, and make the folders for them.
-
-    `names`: its keys count.
-    """
+    """Return where the result of each input goes, absolute, and make the folders for them."""
     paths = {name: folder.resolve() / f"{name}{suffix}" for name in names}
     for parent in {path.parent for path in paths.values()}:
         parent.mkdir(parents=True, exist_ok=True)

@@ -4,8 +4,6 @@ once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -27,9 +25,6 @@ from tofclip.solvers import LinearInverse, ProximalMethod
 from tofclip.solvers.direct import InverseTraces, order_by_patch
 
 FloatArray = NDArray[np.float64]
-Shot = Callable[[], Streak]
-
-MAX_JITTER_BINS = 32
 
 
 class CloudPipeline(Protocol):
@@ -56,8 +51,7 @@ class CloudPipeline(Protocol):
 class SummedShot(NamedTuple):
     """What a look at all rows of a shot brings."""
 
-    # (columns, instants and some), see `tofclip.lidar.signal_rows.SignalRowFinder.bins`
-    sums: NDArray[np.float32]
+    sums: NDArray[np.float32]  # (columns, instants and some), see `SignalRowFinder.bins`
     dark: float  # dark level, counts
 
 
@@ -73,9 +67,8 @@ class RangingPipeline:
     (`tofclip.solvers.direct`). Rows that hold no light are left out, but for a sample that tells
     background and noise (`tofclip.lidar.signal_rows`).
 
-    `camera`: with its sweep; one that has to be found from a shot is found from the first
-    (`fit_camera_to_shot`) beforehand; `row_times` (rows,): instant of each row, s; `method`: the
-    linear inverse by default; `focus`: one that needs no look at the shot: `FixedFocus` or
+    `camera`: with its sweep; `row_times` (rows,): instant of each row, s; `method`: the linear
+    inverse by default; `focus`: one that needs no look at the shot: `FixedFocus` or
     `DepthLockedFocus`.
 
     Memory: two (columns, columns) matrices for each shear, and for a shot as much again as its
@@ -136,10 +129,8 @@ class RangingPipeline:
         time_zero: float | None = None,
         method: LinearInverse | ProximalMethod | None = None,
     ) -> RangingPipeline:
-        """Prepare for shots like this one; a sweep that is not known is found from it.
-
-        `shot`: with a time axis; `camera`: defaults to the one that the shot carries; `time_zero`:
-        reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
+        """Prepare for shots like this one, which has a time axis; a sweep that is not known is found
+        from it. Camera and time zero, s, are by default those that the shot carries.
         """
         opened = open_shot(shot, camera, time_zero)
         focus.check_camera(opened.camera)
@@ -155,14 +146,12 @@ class RangingPipeline:
         return self.search(self.recover(measurements))
 
     def recover(self, measurements: NDArray[np.float32]) -> Traces:
-        """Do what a shot needs as a whole before its pixels are recovered, a few at a time, as they are asked for.
-
-        `measurements` (columns, rows): rectified.
+        """Do what a shot, (columns, rows), rectified, needs as a whole before its pixels are
+        recovered, a few at a time, as they are asked for.
         """
-        if measurements.shape != (self.camera.slit_width_px, self.times.size):
-            raise ShapeError(
-                "measurements", (self.camera.slit_width_px, self.times.size), measurements.shape
-            )
+        expected = self.camera.slit_width_px, self.times.size
+        if measurements.shape != expected:
+            raise ShapeError("measurements", expected, measurements.shape)
         bins = self._lit.bins(self._lit.sum_measurements(measurements))
         # by rows, which is how measurements lie in memory
         return self._recover_bins(np.take(measurements.T, bins.numbers, axis=0).T, bins)
@@ -178,10 +167,7 @@ class RangingPipeline:
         return SummedShot(*self._lit.sum_streak(shot.counts, self.rectifier))
 
     def recover_shot(self, shot: Streak, rectified: SummedShot) -> Traces:
-        """As `recover`, rectifying the rows with light and no others.
-
-        `rectified`: of the shot; overwritten.
-        """
+        """As `recover`, rectifying the rows with light and no others; `rectified` is overwritten."""
         bins = self._lit.bins(rectified.sums)
         measurements = self.rectifier.rectify_rows(shot.counts, rectified.dark, bins.numbers)
         return self._recover_bins(measurements, bins)
@@ -211,100 +197,11 @@ class _ShotTraces:
                 self._parts.append((place.inverse, held, weights))
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
-        """Write the traces of some pixels, recovered now; see `tofclip.lidar.pulse_tables.Traces`.
-
-        `piece`: of the pixels; `traces` (n, bins): overwritten.
-        """
+        """Write the traces (n, bins) of some pixels, recovered now."""
         for inverse, held, weights in self._parts:
             inverse.fill(weights, piece, traces, held)
-
-
-@dataclass
-class JitterEstimator:
-    """Finds by how many rows a shot is late, from its light over time."""
-
-    reference: FloatArray  # (rows,), light of the shot with which the others are compared
-    _spectrum: Any = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        # padded to twice the length: a circular correlation would compare the end with the
-        # beginning
-        self._spectrum = np.conj(
-            np.fft.rfft(_differentiate_root(self.reference), 2 * self.reference.size)
-        )
-
-    def late_bin(self, light: FloatArray) -> float:
-        """Rows by which `light` comes later than the reference, below a row; at most 32 either way."""
-        agreement = np.fft.irfft(
-            np.fft.rfft(_differentiate_root(light), 2 * light.size) * self._spectrum
-        )
-        reach = min(MAX_JITTER_BINS, light.size // 2 - 1)
-        near = np.concatenate([agreement[-reach:], agreement[: reach + 1]])
-        best = int(near.argmax())
-        # A maximum at the edge of the search has no neighbour for the parabola.
-        if best in (0, near.size - 1):
-            return float(best - reach)
-        # a parabola through the maximum and its neighbours gives the fraction of a bin
-        left, centre, right = near[best - 1 : best + 2]
-        return (
-            best
-            - reach
-            + float((right - left) / 2 / max(2 * centre - left - right, np.finfo(np.float64).tiny))
-        )
-
-
-def compute_light_curve(streak: Streak, camera: Camera) -> FloatArray:
-    """Sum of each raw row over the reference view's middle, where neighbouring views' skew does not
-    matter.
-
-    Returns (rows,): counts.
-    """
-    reference = int(np.argmin(np.abs(camera.view_positions)))
-    # the middle half of one view, which neighbours do not reach
-    half = camera.image_shape[1] // 4
-    middle = round(camera.centres_px[reference])
-    return np.asarray(
-        streak.counts[:, max(0, middle - half) : middle + half + 1].sum(axis=1, dtype=np.float64)
-    )
-
-
-def make_average_cloud(
-    shots: Sequence[Shot], pipeline: RangingPipeline, jitter: JitterEstimator | None
-) -> tuple[PointCloud, FloatArray]:
-    """Make one cloud of successive shots.
-
-    `shots`: at least one. Each reads its shot when it is called; one is in memory at a time;
-    `jitter`: none: the shots are taken as they come. Returns (shots,): rows by which each shot was
-    late, as far as that was asked for.
-    """
-    if not shots:
-        raise InputError("a cloud needs at least one shot")
-    late = np.zeros(len(shots))
-
-    def measurements(place: int) -> NDArray[np.float32]:
-        streak = shots[place]()
-        if jitter is not None:
-            late[place] = jitter.late_bin(compute_light_curve(streak, pipeline.camera))
-        return pipeline.rectifier.rectify(streak.counts, delay=float(late[place]))
-
-    total = measurements(0)
-    for place in range(1, len(shots)):
-        # rectified before they are averaged, because every shot has a delay of its own
-        total += measurements(place)
-    total /= len(shots)
-    return pipeline.cloud(total), late
 
 
 def build_cloud_path(folder: Path, number: int, suffix: str) -> Path:
     """Return where cloud `number` of a sequence is kept."""
     return folder / f"cloud_{number:06d}{suffix}"
-
-
-def _differentiate_root(light: FloatArray) -> FloatArray:
-    """Changes of the root of the light: near objects outshine far ones, and a constant says
-    nothing.
-    """
-    # Shot noise of a root of counts is the same at every level, so that no row dominates.
-    rise = np.diff(np.sqrt(np.maximum(light - np.median(light), 0)), prepend=0.0)
-    length: float = float(np.linalg.norm(rise)) or 1.0
-    return rise / length

@@ -1,13 +1,14 @@
-"""Streak images straight to point clouds, by the linear inverse, with all that is prepared once
-kept in a file.
+"""Sequences of streak images straight to point clouds, by the linear inverse, with all that is
+prepared once kept in a file; several shots may be averaged for each cloud.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,19 +16,18 @@ from numpy.typing import NDArray
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.files import compute_sha256, require_apart
+from tofclip.lidar import PointCloud
 from tofclip.recovery import SharpestFocus, open_shot, parse_focus
 from tofclip.sequences.inputs import Shot
 from tofclip.sequences.jobs import Job, lock_output_folder
-from tofclip.sequences.ranger import (
-    JitterEstimator,
-    RangingPipeline,
-    compute_light_curve,
-    make_average_cloud,
-)
+from tofclip.sequences.ranger import RangingPipeline
 from tofclip.shots import Streak
 from tofclip.storage import Storable, stored_array, stored_child, stored_value
 
+FloatArray = NDArray[np.float64]
+
 PLAN_NAME = "plan.h5"
+MAX_JITTER_BINS = 32
 
 
 @dataclass(frozen=True)
@@ -87,22 +87,10 @@ class RangingSettings:
             raise InputError("a sequence needs at least one shot to average")
 
     def jobs(self, shots: Mapping[str, Shot], folder: Path, suffix: str) -> list[Job]:
-        """Return one job for each cloud, which writes it into `folder`.
+        """Return one job for each cloud, which writes it into `folder` in the format of `suffix`.
 
-        The folder is made, and claimed for these settings
-        (`tofclip.sequences.jobs.lock_output_folder`). What is prepared for all shots is kept there;
-        a run that goes on uses it again.
-
-        Parameters
-        ----------
-        shots : mapping of str to Shot
-        folder : Path
-        suffix : str
-            Names the format of the clouds.
-
-        Returns
-        -------
-        list of Job
+        The folder is made, and locked for these settings (`lock_output_folder`). What is prepared
+        for all shots is kept there; a run that goes on uses it again.
         """
         plan, readers = folder.resolve() / PLAN_NAME, list(shots.values())
         names = list(shots)
@@ -158,17 +146,15 @@ def name_cloud(shots: Sequence[str]) -> str:
 def write_average_cloud(
     plan: Path, version: str, shots: tuple[Shot, ...], result: Path
 ) -> tuple[int, list[float]]:
-    """Write the cloud of some shots; return its points and how many rows each shot was late.
+    """Write the cloud of some shots; return its points and by how many rows each shot was late.
 
     The pipeline is made once in a process for each `version` (SHA-256) of the plan. Memory: one
     shot, and twice as much again for its measurements and what is recovered of them.
-
-    `version`: SHA-256 of the plan. Returns `delays`: rows by which each shot was late.
     """
     pipeline, jitter = _load_plan(plan, version)
     cloud, late = make_average_cloud(shots, pipeline, jitter)
     cloud.save(result)
-    return len(cloud), [float(one) for one in late]
+    return len(cloud), late.tolist()
 
 
 @lru_cache(maxsize=2)
@@ -176,3 +162,78 @@ def _load_plan(plan: Path, version: str) -> tuple[RangingPipeline, JitterEstimat
     shared = RangingPlan.load(plan)
     pipeline = RangingPipeline(shared.camera, shared.row_times, focus=parse_focus(shared.focus))
     return pipeline, JitterEstimator(shared.light) if shared.light.size else None
+
+
+@dataclass(frozen=True)
+class JitterEstimator:
+    """Finds by how many rows a shot is late, from its light over time."""
+
+    reference: FloatArray  # (rows,), light of the shot with which the others are compared
+
+    @cached_property
+    def _spectrum(self) -> Any:
+        # padded to twice the length: a circular correlation would compare the end with the
+        # beginning
+        return np.fft.rfft(_differentiate_root(self.reference), 2 * self.reference.size).conj()
+
+    def late_bin(self, light: FloatArray) -> float:
+        """Rows by which `light` comes later than the reference, below a row; at most 32 either way."""
+        spectrum = np.fft.rfft(_differentiate_root(light), 2 * light.size)
+        agreement = np.fft.irfft(spectrum * self._spectrum)
+        reach = min(MAX_JITTER_BINS, light.size // 2 - 1)
+        near = np.concatenate([agreement[-reach:], agreement[: reach + 1]])
+        best = int(near.argmax())
+        # A maximum at the edge of the search has no neighbour for the parabola.
+        if best in (0, near.size - 1):
+            return float(best - reach)
+        # a parabola through the maximum and its neighbours gives the fraction of a bin
+        left, centre, right = near[best - 1 : best + 2]
+        curvature = max(2 * centre - left - right, np.finfo(np.float64).tiny)
+        return best - reach + float((right - left) / 2 / curvature)
+
+
+def compute_light_curve(streak: Streak, camera: Camera) -> FloatArray:
+    """Sum of each raw row, counts, over the reference view's middle, where neighbouring views' skew
+    does not matter.
+    """
+    reference = int(np.argmin(np.abs(camera.view_positions)))
+    # the middle half of one view, which neighbours do not reach
+    half = camera.image_shape[1] // 4
+    middle = round(camera.centres_px[reference])
+    counts = streak.counts[:, max(0, middle - half) : middle + half + 1]
+    light: FloatArray = counts.sum(axis=1, dtype=np.float64)
+    return light
+
+
+def make_average_cloud(
+    shots: Sequence[Callable[[], Streak]], pipeline: RangingPipeline, jitter: JitterEstimator | None
+) -> tuple[PointCloud, FloatArray]:
+    """Make one cloud of successive shots, each read when it is called, and say by how many rows each
+    was late; without `jitter` they are taken as they come.
+    """
+    if not shots:
+        raise InputError("a cloud needs at least one shot")
+    late = np.zeros(len(shots))
+
+    def measurements(place: int) -> NDArray[np.float32]:
+        streak = shots[place]()
+        if jitter is not None:
+            late[place] = jitter.late_bin(compute_light_curve(streak, pipeline.camera))
+        return pipeline.rectifier.rectify(streak.counts, delay=float(late[place]))
+
+    total = measurements(0)
+    for place in range(1, len(shots)):
+        # rectified before they are averaged, because every shot has a delay of its own
+        total += measurements(place)
+    total /= len(shots)
+    return pipeline.cloud(total), late
+
+
+def _differentiate_root(light: FloatArray) -> FloatArray:
+    """Changes of the root of the light: near objects outshine far ones, and a constant says
+    nothing.
+    """
+    # Shot noise of a root of counts is the same at every level, so that no row dominates.
+    rise = np.diff(np.sqrt(np.maximum(light - np.median(light), 0)), prepend=0.0)
+    length: float = float(np.linalg.norm(rise)) or 1.0
+    return rise / length

@@ -80,22 +80,8 @@ class RecoverySettings:
     def jobs(self, shots: Mapping[str, Shot], folder: Path) -> list[Job]:
         """Return one job for each shot, which writes its frames into `folder`.
 
-        The folder is made, and claimed for these settings
-        (`tofclip.sequences.jobs.lock_output_folder`).
-
-        Parameters
-        ----------
-        shots : mapping of str to Shot
-        folder : Path
-
-        Returns
-        -------
-        list of Job
-
-        Raises
-        ------
-        InputError
-            A shot bears the name of a result, or the folder belongs to other settings.
+        The folder is made, and locked for these settings (`lock_output_folder`); `InputError` where
+        it belongs to others, or a shot bears the name of a result.
         """
         results = [folder / f"{name}{FRAMES_SUFFIX}" for name in shots]
         require_apart(results, {self.camera, *(shot.path for shot in shots.values())})
@@ -135,8 +121,6 @@ def recover_shot(recovery: RecoverySettings, shot: Shot, result: Path) -> None:
     """Read a shot, recover it, write its frames; operators are made once in a process.
 
     Memory: the shot, its measurements and mask, and the frames twice while they are written.
-
-    `shot`: called to read it.
     """
     plan = recovery.plan(shot())
     if plan.shot.camera.sweep is not None:  # otherwise it is fitted to the shot, another for each
@@ -148,8 +132,8 @@ def recover_shot(recovery: RecoverySettings, shot: Shot, result: Path) -> None:
     plan.add_provenance(plan.run()).save(result)
 
 
+# Settings that can be swept, and what their values are.
 PARAMETER_TYPES = {"method": str, "iterations": int, "weight": float, "focus": str}
-"""Settings that can be swept, and what their values are."""
 
 
 def expand_sweep(
