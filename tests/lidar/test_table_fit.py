@@ -128,8 +128,9 @@ def test_a_return_is_followed_when_it_moves_away_from_its_peak(peak, there):
     even = table.find_even_bins(TraceBins.all_bins(BINS))
     room = Room(
         **dict.fromkeys(("score", "responses", "free"), np.empty(0, np.float32)),
-        **dict.fromkeys(("peaks", "estimates", "profile"), np.empty((0, 2))),
+        **dict.fromkeys(("peaks", "estimates"), np.empty((0, 2))),
         **dict.fromkeys(("lone", "crowded"), np.zeros(1, np.int64)),
+        level=np.empty(0),
         places=np.empty((4, 0), np.int32),
         moments=np.array([[3.0, 1.0]]),
         candidates=candidates,

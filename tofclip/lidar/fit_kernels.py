@@ -237,23 +237,45 @@ def measure_returns_by_table(room, listed, least, pixels, times, table, found, c
             moved = shape - later * load_vector(table.slopes[phase], w)
             off = load_vector(rest, w) - high * moved
             misfits += choose(shape > zero, off * off, zero)
-        excess = sum_vector(misfits) - noise * noise * (known[6] - 2)
-        excess = excess if excess > 0 else 0.0
-        across_energy, total = known[2] - known[1] * known[1] / known[0], height * known[3]
-        unfitted = height * known[4] if height * known[4] > 1e-3 * total else 1e-3 * total
-        variance = noise * noise * across_energy + excess / unfitted * height * known[5]
+        misfit = sum_vector(misfits) - noise * noise * (known[6] - 2)
+        energy = known[2] - known[1] * known[1] / known[0]
         width = times[j + ONE] - times[j]
-        instant = times[j] + offset * width
-        place = number
-        while place > 0 and found[pixel, place - 1, 0] > instant:  # overtaken by a crowded one
-            for column in range(3):
-                found[pixel, place, column] = found[pixel, place - 1, column]
-            place -= 1
-        result = found[pixel, place]
-        result[0] = instant
-        result[1] = total
-        result[2] = math.sqrt(variance) / (across_energy * height) * width
+        deviation = estimate_deviation(height, noise, misfit, energy, known[3], known[4], known[5])
+        instant, total = times[j] + offset * width, height * known[3]
+        insert_return(found[pixel], number, instant, total, deviation * width)
         counts[pixel] = number + 1
+
+
+@inlined
+def estimate_deviation(height, noise, misfit, energy, total, unfitted, weighted):
+    """Standard deviation of a return's arrival, of which all are sums over its bins.
+
+    The variance of a bin is taken as ``noise^2 + dispersion * brightness`` (quasi-Poisson). The
+    dispersion is what makes the expected sum of squared residuals, ``sum_i variance_i (1 - h_i)``
+    with the fit's leverages h, equal to the one found, noise and `misfit`; the variances are then
+    carried through the least-squares fit. `energy`: of the slope across the pulse, the part that a
+    change of height cannot mimic; `total`: of the pulse; `unfitted`: of the pulse as far as the fit
+    leaves it; `weighted`: of the pulse times the square of the slope across it.
+    """
+    variance = noise * noise * energy
+    if misfit > 0:
+        least = 1e-3 * total
+        variance += misfit / (unfitted if unfitted > least else least) * weighted
+    return math.sqrt(variance) / (energy * height)
+
+
+@inlined
+def insert_return(found, number, instant, total, deviation):
+    """Enter a return of a pixel in the order of time behind `number` others."""
+    place = number
+    while place > 0 and found[place - 1, 0] > instant:
+        for column in range(3):
+            found[place, column] = found[place - 1, column]
+        place -= 1
+    own = found[place]
+    own[0] = instant
+    own[1] = total
+    own[2] = deviation
 
 
 @search_part
@@ -262,7 +284,7 @@ def fit_returns_exactly(traces, pixels, axis, least, listed, pulse, room, found,
     `measure_returns_by_table`, and the pulse's `curve` and `scale`.
     """
     curve, scale = pulse
-    times, candidates, level = axis.times, room.candidates, room.profile[:, 3]
+    times, candidates, level = axis.times, room.candidates, room.level
     start = 0
     while start < listed:
         place, end = int(candidates[start, TRACE]), start
@@ -282,15 +304,7 @@ def fit_returns_exactly(traces, pixels, axis, least, listed, pulse, room, found,
             even = level, 0.0
             refine_returns(trace, times, level, curve, scale, estimate, even, MAX_FIT_ROUNDS)
             counts[pixel] = measure_returns(
-                trace,
-                times,
-                noise,
-                curve,
-                scale,
-                estimate,
-                least * noise,
-                room.profile,
-                found[pixel],
+                trace, times, level, noise, curve, scale, estimate, least * noise, found[pixel]
             )
         start = end
 
@@ -443,12 +457,12 @@ def subtract_returns(rest, time, curve, scale, estimate, without):
 
 
 @loop_part
-def measure_returns(trace, times, noise, curve, scale, estimate, least, profile, found):
+def measure_returns(trace, times, background, noise, curve, scale, estimate, least, found):
     """Write instant, sum and standard deviation of every return that proves itself, nearest first;
     return their number.
 
     It has to lie on the time axis and to respond, height times root of the pulse's energy, by more than
-    `least`. The last column of `profile` is the background, the others are overwritten.
+    `least`.
     """
     number = 0
     for k in range(estimate.shape[0]):
@@ -458,64 +472,33 @@ def measure_returns(trace, times, noise, curve, scale, estimate, least, profile,
         crowded, _ = check_overlap(estimate, k, curve, scale)
         near = int(estimate[k, 2]), int(estimate[k, 3])
         first, last = find_pulse_window(times, near, arrival, scale)
-        pp = pd = dd = 0.0
+        misfit = total = pp = pd = dd = ppp = ppd = pdd = 0.0
         for i in range(np.uintp(first), np.uintp(last)):
             p, d = interpolate_pulse(times[i] - arrival, curve, scale)
-            rest = trace[i] - profile[i, 3]
+            rest = trace[i] - background[i]
             if crowded:
                 rest = subtract_returns(rest, times[i], curve, scale, estimate, k)
-            bin_profile = profile[i]
-            bin_profile[0] = p
-            bin_profile[1] = d
-            bin_profile[2] = rest - height * p
+            misfit += (rest - height * p) * (rest - height * p) - noise * noise
+            total += p
             pp += p * p
             pd += p * d
             dd += d * d
+            ppp += p * p * p
+            ppd += p * p * d
+            pdd += p * d * d
         # The normal equations have no solution where pulse and slope are alike, as in a window that
         # holds the pulse's edge only.
         if height * math.sqrt(pp) <= least or pp * dd <= pd * pd:
             continue
-        part = profile[first:last]
-        total, deviation = estimate_sum_and_deviation(part, height, noise, pp, pd, dd)
-        place = number
-        while place > 0 and found[place - 1, 0] > arrival:
-            for column in range(3):
-                found[place, column] = found[place - 1, column]
-            place -= 1
-        own = found[place]
-        own[0] = arrival
-        own[1] = total
-        own[2] = deviation
+        slant = pd / pp
+        energy = dd - pd * slant
+        weighted = pdd - 2 * slant * ppd + slant * slant * ppp
+        unfitted = total - ppp / pp - weighted / energy
+        misfit += 2 * noise * noise  # two of the bins' worth of noise went into the fit
+        deviation = estimate_deviation(height, noise, misfit, energy, total, unfitted, weighted)
+        insert_return(found, number, arrival, height * total, deviation)
         number += 1
     return number
-
-
-@inlined
-def estimate_sum_and_deviation(profile, height, noise, pp, pd, dd):
-    """Sum of a return over its bins, and the standard deviation of its arrival.
-
-    The variance of a bin is taken as ``noise^2 + dispersion * brightness`` (quasi-Poisson). The
-    dispersion is what makes the expected sum of squared residuals, ``sum_i variance_i (1 - h_i)``
-    with the fit's leverages h, equal to the one found; the variances are then carried through the
-    least-squares fit. Columns of `profile`: pulse, slope and residual in each bin that it reaches.
-    """
-    slant, per_pp = pd / pp, 1 / pp
-    across_energy = dd - pd * slant
-    per_across = 1 / across_energy
-    total = misfit = unfitted = weighted = 0.0
-    for i in range(profile.shape[0]):
-        p, d, residual = profile[i, 0], profile[i, 1], profile[i, 2]
-        across = d - p * slant  # the part of the slope that a change of height cannot mimic
-        total += height * p
-        misfit += residual * residual - noise * noise
-        unfitted += height * p * (1 - p * p * per_pp - across * across * per_across)
-        weighted += across * across * height * p
-    misfit += 2 * noise * noise  # two of the bins' worth of noise went into the fit
-    variance = noise * noise * across_energy
-    if misfit > 0:
-        least = 1e-3 * total
-        variance += misfit / (unfitted if unfitted > least else least) * weighted
-    return total, math.sqrt(variance) / (across_energy * height)
 
 
 @search_step

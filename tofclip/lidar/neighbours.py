@@ -127,12 +127,13 @@ def layer_returns(
     """
     rows, columns = (-(-size // STRIDE_PX) + 2 * MARGIN for size in image_shape)
     shape = (int(np.diff(starts).max()), STRIDE_PX**2, rows, columns + LENGTH - SIDE)
-    layers = np.full(shape, FAR, np.float32)
-    y, x = np.divmod(pixel.astype(np.int32), np.int32(image_shape[1]))
-    rank = np.arange(pixel.size) - starts.take(pixel)
+    y, x = np.arange(image_shape[0])[:, np.newaxis], np.arange(image_shape[1])
     part = y % STRIDE_PX * STRIDE_PX + x % STRIDE_PX
-    layers[rank, part, y // STRIDE_PX + MARGIN, x // STRIDE_PX + MARGIN] = nearness
-    return layers
+    place = (part * rows + y // STRIDE_PX + MARGIN) * shape[3] + x // STRIDE_PX + MARGIN
+    layers = np.full((shape[0], math.prod(shape[1:])), FAR, np.float32)
+    rank = np.arange(pixel.size) - starts.take(pixel)
+    layers[rank, place.ravel().take(pixel)] = nearness
+    return layers.reshape(shape)
 
 
 def allocate_window() -> NDArray[np.float32]:

@@ -100,7 +100,7 @@ class Room(NamedTuple):
     lone: NDArray[np.int64]  # (pixels * returns,), candidates whose bins no other one shares
     crowded: NDArray[np.int64]  # (pixels * returns,), the others that the table fits
     estimates: FloatArray  # (returns, 5), of the exact fit
-    profile: FloatArray  # (bins, 4), of the exact fit
+    level: FloatArray  # (bins,), background of the exact fit
 
 
 @search_part

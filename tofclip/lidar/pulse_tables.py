@@ -110,7 +110,7 @@ class PhaseTable(NamedTuple):
     tails: NDArray[np.float32]
     # (phases, 7), over the bins: of squared pulse, pulse times slope, and squared slope; of the
     # pulse; of the pulse as far as the fit leaves it, and of the pulse times the square of the
-    # slope across it (`tofclip.lidar.fit_kernels.estimate_sum_and_deviation`); number of bins
+    # slope across it (`tofclip.lidar.fit_kernels.estimate_deviation`); number of bins
     sums: FloatArray
     half: int  # bins on either side. 0: the axis is uneven, and the table empty
     bin_width: float  # s

@@ -146,7 +146,7 @@ class TraceSearch:
             lone=np.empty(listed, np.int64),
             crowded=np.empty(listed, np.int64),
             estimates=np.empty((most, 5)),
-            profile=np.empty((self._number, 4)),
+            level=np.empty(self._number),
         )
         handed = traces if whole else np.empty((pixels, self._number), np.float32)
         return Memory(handed, traces, room)
