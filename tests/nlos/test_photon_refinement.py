@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from point_score import find_near_voxels, score_brightest
 
 from nlos import Capture, Grid, Hybrid
 from nlos.capture import TimeAxis
@@ -17,7 +18,6 @@ from nlos.refinement.photons import (
     fit_brightness,
 )
 from nlos.refinement.time_of_flight import TimeOfFlight
-from nlos.score import find_near_voxels, score_brightest
 from nlos.simulate import HiddenScene, PointScene, Surface, add_poisson_noise, build_relay_wall
 from tofclip.errors import InputError
 

@@ -4,12 +4,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+from point_score import score_points
 
-from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD, Volume
+from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
-from nlos.score import score_points
 from nlos.simulate import PointScene, add_poisson_noise, build_relay_wall
-from tofclip.errors import InputError, ShapeError
 
 POINTS = np.array(
     [[0.0, 0.05, 0.7], [0.3, -0.25, 0.8], [-0.35, 0.2, 0.85], [0.2, 0.4, 0.95], [-0.3, -0.4, 1.05]]
@@ -53,26 +52,3 @@ def test_the_score_is_that_of_back_projection() -> None:
     )
     assert found.energy == pytest.approx(expected.energy, abs=3e-3)
     assert found.contrast == pytest.approx(expected.contrast, rel=5e-3)
-
-
-def test_a_volume_whose_shares_are_known() -> None:
-    grid = Grid([0.0, 0.03, 0.5], [0.0], [1.0])
-    score = score_points(Volume(np.array([[[2.0, 1.0, 1.0]]]), grid), [[0.0, 0.0, 1.0]])
-    assert score.energy == pytest.approx(5 / 6)
-    assert score.contrast == pytest.approx(1.5)
-    # A bright voxel in the wrong place scores badly, however bright.
-    assert score_points(Volume(np.array([[[1.0, 1.0, 9.0]]]), grid), [[0.0, 0.0, 1.0]]).contrast < 1
-
-
-def test_what_cannot_be_scored_is_refused() -> None:
-    grid = Grid([0.0, 0.03, 0.5], [0.0], [1.0])
-    volume = Volume(np.array([[[2.0, 1.0, 0.0]]]), grid)
-    for points, radius, reason in (
-        ([[3.0, 0.0, 1.0]], 0.04, "some voxels must lie within"),
-        ([[0.0, 0.0, 1.0]], 2.0, "some voxels must lie within"),
-        ([[0.0, 0.0, 1.0]], 0.04, "dark away from"),
-    ):
-        with pytest.raises(InputError, match=reason):
-            score_points(volume, points, radius)
-    with pytest.raises(ShapeError):
-        score_points(volume, [0.0, 0.0, 1.0])
