@@ -64,12 +64,6 @@ def test_a_single_pulse_is_located_far_below_a_bin(position, height, unevenness,
     assert returns.time[0] == pytest.approx(arrival, abs=2e-3 * BIN)
 
 
-def test_range_is_half_the_way_and_time_is_kept():
-    times = even_times(200)
-    returns = depth(frames_of(gaussian(times, np.array([START + 1e-9]), 10.0), times))
-    assert returns.range[0] == pytest.approx(299_792_458.0 * 11e-9 / 2, abs=1e-5)
-
-
 def test_background_neither_shifts_nor_brightens_a_return():
     times = even_times(200)
     arrivals = START + BIN * np.array([60.3, 90.7])
@@ -111,38 +105,70 @@ def test_two_returns_within_a_pulse_width_are_one():
     assert returns.time[0] == pytest.approx(arrivals.mean(), abs=0.1 * BIN)
 
 
-def test_a_faint_echo_505_rows_later_is_left_out_and_found_when_asked_for():
-    times = even_times(700)
-    trace = gaussian(times, START + BIN * np.array([100.0, 605.0]), np.array([1000.0, 20.0])).sum(
-        axis=1, keepdims=True
-    )
-    assert depth(frames_of(trace, times)).return_number.tolist() == [1]
-    both = depth(frames_of(trace, times), detection=EVERYTHING)
-    assert both.return_number.tolist() == [1, 2]
-    assert both.time[1] - both.time[0] == pytest.approx(505 * BIN, abs=0.01 * BIN)
+@pytest.mark.parametrize(
+    ("bins", "first", "returns", "counted", "all_found"),
+    [
+        # (pixel, bin, height)
+        pytest.param(
+            700, 0, [(0, 100.0, 1000.0), (0, 605.0, 20.0)], [0], [0, 1], id="an echo 505 rows later"
+        ),
+        pytest.param(
+            200,
+            0,
+            [(0, 80.0, 1000.0), (1, 80.5, 80.0), (2, 150.0, 80.0)],
+            [0, 2],
+            [0, 1, 2],
+            id="faint light beside something bright of the same instant",
+        ),
+        pytest.param(
+            200,
+            0,
+            [(0, 80.0, 1000.0), (1, 150.0, 20.0)],
+            [0],
+            [0, 1],
+            id="far weaker than the scene",
+        ),
+        pytest.param(100, 0, [(2, 50.0, 10.0), (4, 50.0, 0.0)], [0], [0], id="darkness"),
+        pytest.param(100, 0, [(2, 50.0, 0.0)], [], [], id="nothing but darkness"),
+        pytest.param(60, 0, [(0, -1.5, 100.0), (1, 61.0, 100.0)], [], [], id="cut off"),
+        pytest.param(
+            60, -530, [(0, 20.0, 100.0), (1, 40.0, 100.0)], [1], [1], id="before time zero"
+        ),
+    ],
+)
+def test_which_returns_count(bins, first, returns, counted, all_found):
+    times = START + BIN * (first + np.arange(bins))
+    values = np.zeros((bins, 5))
+    for pixel, place, height in returns:
+        values[:, pixel] += gaussian(times, np.array(times[0] + place * BIN), height)
+    for detection, expected in ((None, counted), (EVERYTHING, all_found)):
+        found = depth(frames_of(values, times), detection=detection)
+        assert found.x.tolist() == [returns[number][0] for number in expected]
+        arrivals = [times[0] + returns[number][1] * BIN for number in expected]
+        np.testing.assert_allclose(found.time, arrivals, atol=0.01 * BIN)
+        # range is half the way
+        np.testing.assert_allclose(found.range, 299_792_458.0 * found.time / 2)
 
 
-def test_faint_light_beside_a_bright_object_of_the_same_instant_is_left_out():
-    times = even_times(200)
-    arrivals = START + BIN * np.array([80.0, 80.5, 150.0])
-    values = gaussian(times, arrivals, np.array([1000.0, 80.0, 80.0]))
-    assert depth(frames_of(values, times)).x.tolist() == [0, 2]
-    assert depth(frames_of(values, times), detection=EVERYTHING).x.tolist() == [0, 1, 2]
-
-
-def test_what_is_far_weaker_than_the_scene_is_left_out():
-    times = even_times(200)
-    values = gaussian(times, START + BIN * np.array([80.0, 150.0]), np.array([1000.0, 20.0]))
-    assert depth(frames_of(values, times)).x.tolist() == [0]
-
-
-def test_pixels_without_signal_have_no_return():
-    times = even_times(100)
-    values = np.zeros((100, 5))
-    values[:, 2] = gaussian(times, np.array(START + 50 * BIN), 10.0)
-    returns = depth(frames_of(values, times))
-    assert returns.x.tolist() == [2]
-    assert len(depth(frames_of(np.zeros((100, 3)), times))) == 0
+def test_the_strongest_returns_are_kept_in_raster_order_nearest_first_and_make_pictures():
+    times = even_times(400)
+    values = np.zeros((400, 2, 3))
+    values[:, 0, 2] = gaussian(times, np.array(START + 40 * BIN), 100.0)
+    for place, height in ((50.0, 100.0), (120.0, 40.0), (200.0, 300.0), (300.0, 200.0)):
+        values[:, 1, 0] += gaussian(times, np.array(START + place * BIN), height)
+    frames = Frames(values.astype(np.float32), times, camera(2, 3))
+    returns = depth(frames, detection=replace(EVERYTHING, max_returns=3))
+    assert list(zip(returns.y, returns.x, returns.return_number, strict=True)) == [
+        (0, 2, 1),
+        *((1, 0, rank) for rank in (1, 2, 3)),
+    ]
+    expected = START + BIN * np.array([40.0, 50.0, 200.0, 300.0])
+    np.testing.assert_allclose(returns.time, expected, atol=0.01 * BIN)
+    picture = returns.image("time")
+    assert np.isnan(picture).sum() == 4
+    # the most intense of the three, with the fall-off with range undone
+    assert picture[1, 0] == pytest.approx(START + 200 * BIN, abs=0.01 * BIN)
+    assert picture[0, 2] == pytest.approx(START + 40 * BIN, abs=0.01 * BIN)
 
 
 def test_noise_alone_hardly_ever_makes_a_return():
@@ -190,51 +216,6 @@ def test_range_precision_is_near_the_photon_limit():
     errors = returns.image("range")[0] - range_of(arrivals)
     # even weights instead of Poisson ones cost a fifth for a Gaussian pulse
     assert bound < errors.std() < 1.3 * bound
-
-
-def test_a_pulse_cut_off_by_the_time_axis_is_no_return():
-    times = even_times(60)
-    arrivals = np.array([START - 1.5 * BIN, START + 61.0 * BIN])
-    assert len(depth(frames_of(gaussian(times, arrivals, 100.0), times))) == 0
-
-
-def test_light_from_before_time_zero_is_no_return():
-    times = BIN * (np.arange(60) - 30)
-    returns = depth(frames_of(gaussian(times, BIN * np.array([-10.0, 10.0]), 100.0), times))
-    assert returns.x.tolist() == [1]
-
-
-def test_only_the_strongest_returns_are_kept_nearest_first():
-    times = even_times(400)
-    arrivals = START + BIN * np.array([50.0, 120.0, 200.0, 300.0])
-    trace = gaussian(times, arrivals, np.array([100.0, 40.0, 300.0, 200.0])).sum(
-        axis=1, keepdims=True
-    )
-    returns = depth(frames_of(trace, times), detection=replace(EVERYTHING, max_returns=3))
-    np.testing.assert_allclose(returns.time, arrivals[[0, 2, 3]], atol=0.01 * BIN)
-    assert returns.return_number.tolist() == [1, 2, 3]
-
-
-def test_returns_come_in_raster_order_and_make_pictures():
-    times = even_times(150)
-    values = np.zeros((150, 2, 3))
-    values[:, 0, 2] = gaussian(times, np.array(START + 40 * BIN), 100.0)
-    values[:, 1, 0] = gaussian(times, np.array(START + 60 * BIN), 90.0)
-    values[:, 1, 0] += gaussian(times, np.array(START + 90 * BIN), 120.0)
-    returns = depth(Frames(values.astype(np.float32), times, camera(2, 3)))
-    assert list(
-        zip(returns.y.tolist(), returns.x.tolist(), returns.return_number.tolist(), strict=True)
-    ) == [
-        (0, 2, 1),
-        (1, 0, 1),
-        (1, 0, 2),
-    ]
-    picture = returns.image("time")
-    assert np.isnan(picture).sum() == 4
-    assert picture[1, 0] == pytest.approx(
-        START + 90 * BIN, abs=0.01 * BIN
-    )  # the more intense of the two
-    assert picture[0, 2] == pytest.approx(START + 40 * BIN, abs=0.01 * BIN)
 
 
 def test_another_pulse_shape_finds_its_own_arrivals():
