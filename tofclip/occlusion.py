@@ -82,19 +82,8 @@ class InactiveRegion:
         return self.distance * self.width / (self.baseline - self.width)
 
     def sees(self, place: ArrayLike, across: ArrayLike, behind: ArrayLike) -> NDArray[Any]:
-        """Return whether the line of sight passes the occluder.
-
-        Parameters
-        ----------
-        place : array
-            Of a view on the aperture, m from the axis.
-        across, behind : arrays
-            A point: m from the axis, and m behind the occluder. All three are broadcast.
-
-        Returns
-        -------
-        bool array
-            Of the broadcast shape.
+        """Return whether the line of sight passes the occluder, from a `place` on the aperture, m from the
+        axis, to a point: m from the axis, and m behind the occluder. All three are broadcast.
         """
         behind = np.asarray(behind, np.float64)
         passed = np.asarray(across) * self.distance + np.asarray(place) * behind
@@ -102,17 +91,7 @@ class InactiveRegion:
         return seen
 
     def contains(self, across: ArrayLike, behind: ArrayLike) -> NDArray[Any]:
-        """Return whether a point is hidden from the whole aperture.
-
-        Parameters
-        ----------
-        across, behind : array_like
-            As in `sees`, metres.
-
-        Returns
-        -------
-        bool array
-        """
+        """Return whether a point is hidden from the whole aperture; arguments as for `sees`."""
         # a convex occluder on the axis hides a point from the whole aperture if it hides it from
         # both ends
         left, right = (self.sees(end * self.baseline / 2, across, behind) for end in (-1, 1))

@@ -131,18 +131,7 @@ class RangeCalibration(Storable):
                 )
 
     def compute_walk(self, signal: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return what returns of some strength are measured too long, and its deviation.
-
-        Parameters
-        ----------
-        signal : (n,) array
-            Counts of the returns.
-
-        Returns
-        -------
-        walk, sigma : (n,) float64 array
-            Metres.
-        """
+        """Return what returns of so many counts, (n,), are measured too long, m, and its deviation."""
         strength = np.clip(np.asarray(signal, dtype=np.float64), *self.signal_range)
         decades = np.log10(strength / self.reference_signal)
         powers = decades[..., np.newaxis] ** np.arange(1, self.walk.size + 1)
@@ -152,19 +141,8 @@ class RangeCalibration(Storable):
     def compute_excess(
         self, signal: ArrayLike, y: NDArray[np.integer], x: NDArray[np.integer]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what returns are measured too long, by walk and pixel, and its deviation.
-
-        Parameters
-        ----------
-        signal : (n,) array
-            Counts of the returns.
-        y, x : (n,) int array
-            Row and column of their pixels.
-
-        Returns
-        -------
-        excess, sigma : (n,) float64 array
-            Metres. The deviation holds that of time zero too, which all returns share.
+        """Return what returns of so many counts at pixels (y, x), (n,) each, are measured too long, m, by
+        walk and pixel, and its deviation: with that of time zero, which all returns share.
         """
         excess, sigma = self.compute_walk(signal)
         sigma = np.hypot(sigma, SPEED_OF_LIGHT / 2 * self.time_zero_sigma)
@@ -176,19 +154,8 @@ class RangeCalibration(Storable):
     def compute_reflectance(
         self, intensity: ArrayLike, y: NDArray[np.integer], x: NDArray[np.integer]
     ) -> FloatArray:
-        """Return the reflectance of surfaces as if they faced the camera, percent.
-
-        Parameters
-        ----------
-        intensity : (n,) array
-            Counts, referred to a range of 1 m.
-        y, x : (n,) int array
-            Row and column of their pixels.
-
-        Returns
-        -------
-        (n,) float64 array
-            NaN where no target of known reflectance was seen.
+        """Return the reflectance of surfaces as if they faced the camera, percent, (n,): of counts referred
+        to a range of 1 m, at pixels (y, x). NaN where no target of known reflectance was seen.
         """
         gain = self.response[y, x] if self.response.size else 1.0
         reflectance: FloatArray = (

@@ -161,27 +161,14 @@ class Rectifier:
         dark: float | None = None,
         delay: float = 0.0,
     ) -> Measurement:
-        """Subtract the dark level and rectify the sweep (bilinear).
+        """Subtract the dark level and rectify the sweep (bilinear); see `tofclip.camera.measure`.
 
         Parameters
         ----------
-        counts : (rows, columns) array
-        saturated : (rows, columns) bool array, optional
-            A measurement is bad if any raw pixel that contributes to it is.
-        dark : float, optional
-            Counts; by default `estimate_dark_level` of the picture.
+        counts, saturated, dark
+            As there; a measurement is bad if any raw pixel that contributes to it is.
         delay : float
             Rows by which this shot's light comes later than the camera's calibration says.
-
-        Returns
-        -------
-        Measurement
-            Measurements (slit pixels, rows) float32 and their mask.
-
-        Raises
-        ------
-        CalibrationError, InputError
-            As for `measure`, or another number of rows.
         """
         self._require_shape(counts)
         bad = np.zeros(counts.shape, bool) if saturated is None else saturated
@@ -202,23 +189,15 @@ class Rectifier:
         dark: float | None = None,
         delay: float = 0.0,
     ) -> FloatImage:
-        """Return the measurements alone, for methods that cannot leave out single ones.
+        """Return the measurements alone, (columns, rows), for methods that cannot leave out single ones:
+        0 beyond the raw image and in dead columns.
+
+        All columns of a row lie side by side in memory, as in the raw picture.
 
         Parameters
         ----------
         counts, dark, delay
             As for `measure`.
-
-        Returns
-        -------
-        (columns, rows) float32 array
-            0 beyond the raw image and in dead columns. All columns of a row lie side by side in
-            memory, as in the raw picture.
-
-        Raises
-        ------
-        CalibrationError, InputError
-            As for `measure`, but for measurements that cannot be trusted.
         """
         level = estimate_dark_level(counts) if dark is None else dark
         measurements = self._sample(counts, level, delay)
@@ -231,21 +210,7 @@ class Rectifier:
     def rectify_rows(
         self, counts: FloatImage, dark: float, numbers: NDArray[np.int64]
     ) -> FloatImage:
-        """Return the measurements of some rows.
-
-        Parameters
-        ----------
-        counts : (rows, columns) array
-        dark : float
-            Counts.
-        numbers : (n,) int array
-            Of the rows.
-
-        Returns
-        -------
-        (columns, n) float32 array
-            As those of `rectify`.
-        """
+        """Return the measurements of the rows `numbers`, (columns, n), as `rectify` does."""
         return self._sample(counts, dark, 0.0, numbers).T
 
     def _sample(

@@ -21,7 +21,12 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sweep(Storable):
-    """Anything that says where a rectified pixel lies in the raw streak image."""
+    """Anything that says where a rectified pixel lies in the raw streak image, in float64 arrays."""
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            values = np.asarray(getattr(self, item.name), dtype=np.float64)
+            object.__setattr__(self, item.name, values)
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the raw (row, column) of rectified positions; arguments broadcast against each
@@ -64,8 +69,7 @@ class SkewSweep(Sweep):
     stretches: FloatArray = field(metadata=stored_array("", "view"))
 
     def __post_init__(self) -> None:
-        for name in ("centres_px", "offsets_bin", "stretches"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        super().__post_init__()
         if self.centres_px.size == 0 or self.centres_px.ndim != 1:
             raise ShapeError("sweep centres", "(views,)", self.centres_px.shape)
         if not self.centres_px.shape == self.offsets_bin.shape == self.stretches.shape:
@@ -104,12 +108,11 @@ class PolynomialSweep(Sweep):
     raw_scale: FloatArray = field(metadata=stored_array("px", "xy"))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for item in fields(self):
-            values = np.asarray(getattr(self, item.name), dtype=np.float64)
-            object.__setattr__(self, item.name, values)
             expected = (6,) if item.name.endswith("coefficients") else (2,)
-            if values.shape != expected:
-                raise ShapeError(f"polynomial sweep's {item.name}", expected, values.shape)
+            if (shape := getattr(self, item.name).shape) != expected:
+                raise ShapeError(f"polynomial sweep's {item.name}", expected, shape)
         if not (np.all(self.rectified_scale) and np.all(self.raw_scale)):
             raise CalibrationError("a polynomial sweep's scales must not be zero")
 
@@ -139,7 +142,7 @@ class ProjectiveSweep(Sweep):
     matrix: FloatArray = field(metadata=stored_array("px", dimensions=2))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "matrix", np.asarray(self.matrix, dtype=np.float64))
+        super().__post_init__()
         if self.matrix.shape != (3, 3):
             raise ShapeError("projective sweep matrix", (3, 3), self.matrix.shape)
 

@@ -237,20 +237,15 @@ class LineCamera(LightFieldCamera):
         return assign_randomly(angles, len(self.views), np.random.default_rng(self.seed))
 
     def _build_encoders(self) -> tuple[LinearOperator, ...]:
-        return tuple(self._make_projection(own, np.zeros(own.size)) for own in self.angles)
-
-    def _make_projection(
-        self, angles: NDArray[np.float64], offsets_px: NDArray[np.float64]
-    ) -> RadonProjection:
-        return RadonProjection(self.image_shape, self.detector_px, angles, offsets_px)
+        sizes = self.image_shape, self.detector_px
+        return tuple(RadonProjection(*sizes, own, np.zeros(own.size)) for own in self.angles)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d) as one sparse matrix: a sheared view is one whose detector is offset."""
         offsets = []
         for view, angles in zip(self.used_views, self.angles, strict=True):
-            down, right = (
-                shear * (a - b) for a, b in zip(self.views[view], reference, strict=True)
-            )
+            (v, u), (v_ref, u_ref) = self.views[view], reference
+            down, right = shear * (v - v_ref), shear * (u - u_ref)
             if not max(abs(down), abs(right)) < self.detector_px:
                 raise InputError(
                     f"shear {shear} moves view {self.views[view]} out of the field; take a smaller one"
@@ -258,7 +253,8 @@ class LineCamera(LightFieldCamera):
             # the shift's component along the line's direction (cos, sin); the other one moves along
             # the integral
             offsets.append(right * np.cos(angles) + down * np.sin(angles))
-        return self._make_projection(np.concatenate(self.angles), np.concatenate(offsets))
+        lines = np.concatenate(self.angles), np.concatenate(offsets)
+        return RadonProjection(self.image_shape, self.detector_px, *lines)
 
 
 class EvenAngleLineCamera(LineCamera):
@@ -302,11 +298,9 @@ class CodedLineCamera(LightFieldCamera):
         random = np.random.default_rng(self.seed)
         angles = MAX_LINE_ANGLE_RAD * (2 * np.arange(count) + 1 - count) / count
         used, dealt = assign_randomly(angles, len(self.views), random)
+        coded = self.image_shape, self.width_px
         self._spreads = [
-            np.stack(
-                [make_coded_line(self.image_shape, self.width_px, angle, random) for angle in own]
-            )
-            for own in dealt
+            np.stack([make_coded_line(*coded, angle, random) for angle in own]) for own in dealt
         ]
         return used
 

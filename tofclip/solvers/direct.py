@@ -143,19 +143,7 @@ class PreparedInverse:
         return PerDevice(partial(ComputeDevice.put, values=self.inverse_gram))
 
     def recover(self, measurements: Array, progress: Progress = ignore_progress) -> Result:
-        """Recover one picture per column of `measurements`, where they are.
-
-        Parameters
-        ----------
-        measurements : (measurements, frames) array
-        progress : callable
-            Called with the number of frames just done.
-
-        Returns
-        -------
-        Result
-            Frames (frames, rows, columns).
-        """
+        """Recover one picture per column of `measurements` (measurements, frames), where they are."""
         measurements = validate_measurements(self.operator, measurements, None)
         blocks = Blocks(self.operator, measurements)
         weights = self.weights(measurements) if is_numpy(measurements) else None
@@ -175,10 +163,7 @@ class PreparedInverse:
         """Return ``(A A' + mu I)^-1 f``, (measurements, frames and some): its adjoint is the pictures.
 
         Beyond the last frame rows are zero to a multiple of `LANES` frames and `ROW_GAP` more.
-
-        Parameters
-        ----------
-        measurements : (measurements, frames) array, finite
+        Measurements are (measurements, frames), finite.
         """
         number, frames = measurements.shape
         width = -(-frames // LANES) * LANES + ROW_GAP

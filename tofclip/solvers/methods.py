@@ -78,26 +78,16 @@ class StoppingRule:
         if self.further < 0:
             raise InputError(f"further iterations must not be negative, got {self.further}")
 
-    def follows_noise(self, objective: Sequence[Array]) -> bool:
-        """Say whether a block of little more than noise has come as near to it as it should.
-
-        Parameters
-        ----------
-        objective : sequence of scalars
-            Of the block before the first and after every iteration.
+    def _follows_noise(self, objective: Sequence[Array]) -> bool:
+        """Whether a block of little more than noise has come as near to it as it should, given its
+        objective before the first and after every iteration.
         """
         before, last = objective[-2], objective[-1]
         noisy = last > NOISE_FRACTION * objective[0]
         return bool(noisy & (before - last < self.noise_fall * last))
 
-    def continues(self, objective: Sequence[Array]) -> bool:
-        """Say whether a block goes on after its iterations.
-
-        Parameters
-        ----------
-        objective : sequence of scalars
-            Of the block before the first and after every iteration.
-        """
+    def _continues(self, objective: Sequence[Array]) -> bool:
+        """Whether a block goes on after its iterations."""
         done = len(objective) - 1
         if not (done >= GAP_INTERVAL and self.iterations <= done < self.iterations + self.further):
             return False
@@ -184,7 +174,7 @@ def iterate(
             little = objective[-2] - objective[-1] < stopping.tolerance * objective[-1]
             converged = bool(little & ~xp.any(solver.rejected))
         if stopping.noise_fall > 0:
-            converged |= stopping.follows_noise(objective)
+            converged |= stopping._follows_noise(objective)
         if stopping.gap > 0 and (converged or done == limit or done % GAP_INTERVAL == 0):
             gap = solver.duality_gap()
             if gap is not None:
@@ -195,7 +185,7 @@ def iterate(
             break
         progress(frames)
         if done == limit:
-            if stopping.continues(objective):
+            if stopping._continues(objective):
                 limit = min(done + GAP_INTERVAL, most)
             elif done < most:
                 progress(frames * (most - done))
@@ -237,38 +227,14 @@ class Result:
     def from_blocks(
         cls, frames: Array, histories: list[IterationHistory], setup_seconds: float = 0.0
     ) -> Result:
-        """Join the histories of all blocks.
-
-        Parameters
-        ----------
-        frames : (frames, rows, columns) array
-            Results of all blocks.
-        histories : list of IterationHistory
-            One for each block.
-        setup_seconds : float
-            Time before the first iteration.
-
-        Returns
-        -------
-        Result
-            Objectives are added up; a block that ended early counts with its last one.
-        """
+        """Join the histories of all blocks: a block that ended early keeps its last objective."""
         longest = max(history.iterations for history in histories)
-        total = np.zeros(longest + 1)
-        for history in histories:
-            # a block that ended early keeps its last objective
-            kept_on = np.full(longest - history.iterations, history.objective[-1])
-            total += np.concatenate([history.objective, kept_on])
+        padded = [np.pad(one.objective, (0, longest - one.iterations), "edge") for one in histories]
+        total = np.sum(padded, axis=0)
         converged = all(history.converged for history in histories)
-        gap = sum(history.gap for history in histories)
-        return cls(
-            frames,
-            longest,
-            total,
-            "converged" if converged else "iteration limit",
-            setup_seconds,
-            gap / total[-1] if total[-1] > 0 else gap,
-        )
+        why = "converged" if converged else "iteration limit"
+        gap = sum(history.gap for history in histories) / (total[-1] if total[-1] > 0 else 1)
+        return cls(frames, longest, total, why, setup_seconds, gap)
 
 
 class Method(Protocol):
