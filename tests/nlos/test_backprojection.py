@@ -7,7 +7,6 @@ import pytest
 from exact_phasor_field import compute_exact_phasor_field
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from refusals import find_refusal
 from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, lasers_for, planar_wall
 
 import nlos.backprojection
@@ -92,42 +91,11 @@ def test_the_exact_sum_is_its_own_definition() -> None:
     assert found == pytest.approx(expected, rel=1e-9)
 
 
-def test_it_is_linear_in_the_signal(capture: Capture) -> None:
-    random = np.random.default_rng(4)
-    first = replace(capture, signal=random.normal(size=capture.signal.shape))
-    second = replace(capture, signal=random.normal(size=capture.signal.shape))
-    both = replace(capture, signal=2 * first.signal - 3 * second.signal)
-    fields = [METHOD.phasor_field(some, GRID).values for some in (first, second, both)]
-    # Rounding of float32 sums over 357 wall points.
-    assert relative_error(fields[2], 2 * fields[0] - 3 * fields[1]) < 1e-5
-
-
 def test_signals_in_double_precision_give_the_same_picture(capture: Capture) -> None:
     double = replace(capture, signal=capture.signal.astype(np.float64))
     assert np.array_equal(
         METHOD.reconstruct(double, GRID).values, METHOD.reconstruct(capture, GRID).values
     )
-
-
-def test_masked_wall_points_do_not_matter(capture: Capture) -> None:
-    wall, signal = capture.wall.copy(), capture.signal.copy()
-    wall[3, 5] = wall[0, 0, 1] = np.nan
-    signal[:, 3, 5] = 1e6
-    masked = METHOD.phasor_field(replace(capture, wall=wall, signal=signal), GRID).values
-    kept = np.ones(wall.shape[:2], bool)
-    kept[3, 5] = kept[0, 0] = False
-    listed = replace(capture, wall=capture.wall[kept], signal=capture.signal[:, kept])
-    assert np.array_equal(masked, METHOD.phasor_field(listed, GRID).values)
-
-
-def test_the_order_and_shape_of_wall_points_do_not_matter(capture: Capture) -> None:
-    shuffled = np.random.default_rng(5).permutation(len(capture.points))
-    scattered = replace(
-        capture, wall=capture.points[shuffled], signal=capture.traces().T[:, shuffled]
-    )
-    # Sums of float32 in another order.
-    found = METHOD.phasor_field(scattered, GRID).values
-    assert relative_error(found, METHOD.phasor_field(capture, GRID).values) < 1e-5
 
 
 def test_the_volume_may_be_cut_into_pieces(capture: Capture) -> None:
@@ -159,64 +127,6 @@ def test_voxels_that_no_recorded_light_can_come_from_stay_dark(capture: Capture)
 def test_voxels_on_the_wall_stay_finite(capture: Capture) -> None:
     touching = Grid(planar_wall()[0, :, 0], planar_wall()[:, 0, 1], [0.0, 0.1])
     assert np.all(np.isfinite(METHOD.reconstruct(capture, touching).values))
-
-
-def test_progress_counts_all_lookups_and_may_interrupt(capture: Capture) -> None:
-    done: list[int] = []
-    METHOD.reconstruct(capture, GRID, done.append)
-    assert sum(done) == METHOD.plan(capture, GRID).cost == 17 * 21 * GRID.size
-
-    def interrupt(_: int) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        METHOD.reconstruct(capture, GRID, interrupt)
-
-
-def test_the_volume_remembers_how_it_was_made(capture: Capture) -> None:
-    made = METHOD.reconstruct(
-        replace(capture, provenance={"shot": 7}), Grid([0], [0], [0.5])
-    ).provenance
-    assert made == {
-        "shot": 7,
-        "imaging": {"method": "backprojection", "wavelength_m": 0.125, "cycles": 3},
-    }
-
-
-def test_support_is_true_or_says_why_not(capture: Capture) -> None:
-    assert find_refusal(METHOD, capture, GRID) == ""
-
-
-@pytest.mark.parametrize(
-    ("method", "grid", "reason"),
-    [
-        (
-            METHOD,
-            Grid.box((-0.2, 0.2), (-0.2, 0.2), (-0.8, -0.4), 0.1),
-            "behind the hindmost wall point",
-        ),
-        (
-            METHOD,
-            Grid.box((-0.2, 0.2), (-0.2, 0.2), (-0.1, 0.4), 0.1),
-            "behind the hindmost wall point",
-        ),
-        (METHOD, Grid.box((-1, 1), (-1, 1), (0.1, 2), 0.0015), "GiB allowed"),
-        (Backprojection(0.001), GRID, "empty band"),
-    ],
-)
-def test_what_cannot_be_imaged_is_refused(
-    method: Backprojection, grid: Grid, reason: str, capture: Capture
-) -> None:
-    assert reason in find_refusal(method, capture, grid)
-    with pytest.raises(InputError, match=reason):
-        method.reconstruct(capture, grid)
-
-
-def test_one_wall_point_is_refused() -> None:
-    lonely = Capture(np.ones(9), [0.0, 0.0, 0.0], [0.1, 0.0, 0.0], 16e-12)
-    assert "one wall point" in find_refusal(METHOD, lonely, GRID)
-    with pytest.raises(InputError, match="one wall point"):
-        compute_exact_phasor_field(lonely, GRID, METHOD.pulse)
 
 
 @pytest.mark.parametrize(("wavelength", "cycles"), [(0, 3), (0.1, -1), (np.nan, 3)])

@@ -182,17 +182,6 @@ def test_settings_are_checked(settings: dict[str, float]) -> None:
         LightCone(signal_to_noise=0)
 
 
-@named
-def test_progress_and_provenance(method: LightCone | FKMigration) -> None:
-    done: list[int] = []
-    volume = method.reconstruct(
-        replace(confocal([HIDDEN]), provenance={"shot": 7}), around(HIDDEN), done.append
-    )
-    assert sum(done) == volume.grid.size
-    assert volume.provenance["shot"] == 7
-    assert volume.provenance["imaging"]["falloff"] == 4
-
-
 def test_a_retroreflective_point_needs_the_smaller_power() -> None:
     point = (X[13], Y[11], 0.6)
     capture = confocal([point])

@@ -62,7 +62,6 @@ def shows_the_point(capture: Capture, point: Any = HIDDEN) -> None:
 
 
 # --- our own
-# ---------------------------------------------------------------------------------------------------------
 
 
 def test_our_own_captures_keep_their_history(tmp_path: Path) -> None:
@@ -92,7 +91,6 @@ def test_another_record_of_ours_is_no_capture(tmp_path: Path) -> None:
 
 
 # --- NumPy archives
-# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("laser", [SPOT, WALL], ids=["single", "confocal"])
@@ -127,7 +125,6 @@ def test_the_recorded_archives(shared_data: Path) -> None:
 
 
 # --- y-tal
-# -----------------------------------------------------------------------------------------------------------
 
 
 def write_tal(
@@ -173,7 +170,6 @@ def test_tal_with_shapes_that_disagree(tmp_path: Path) -> None:
 
 
 # --- Zaragoza
-# --------------------------------------------------------------------------------------------------------
 
 # In that data set the wall is upright in x and z, and the scene lies at smaller y.
 TO_ZARAGOZA = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
@@ -251,7 +247,6 @@ def test_turning_makes_a_direction_z_and_keeps_distances(
 
 
 # --- MATLAB
-# ----------------------------------------------------------------------------------------------------------
 
 
 def write_matlab(path: Path, version: str, **variables: Any) -> None:
@@ -498,7 +493,6 @@ def test_a_foreign_matlab_file(version: str, tmp_path: Path) -> None:
 
 
 # --- EXR
-# -------------------------------------------------------------------------------------------------------------
 
 GEOMETRY = """
 bin_width_ps = 16.0
@@ -576,7 +570,6 @@ def test_exr_folders_that_are_no_capture(tmp_path: Path) -> None:
 
 
 # --- damage
-# ----------------------------------------------------------------------------------------------------------
 
 
 def test_what_is_no_file_or_no_capture_says_so(tmp_path: Path) -> None:

@@ -79,8 +79,8 @@ def test_what_voxels_pay_does_not_depend_on_the_parts_of_the_wall() -> None:
 
 @pytest.mark.parametrize("sigma", [0.0, 2.0])
 def test_a_point_is_as_sharp_as_response_bin_and_wall_make_it(sigma: float) -> None:
-    """Two rings of wall points about a point's foot, each lit where it is seen: paths of
-    2 * hypot(radius, depth), whose light falls with the fourth power of the distance.
+    """Two rings of wall points about a point's foot, each lit where it is seen: paths of 2 *
+    hypot(radius, depth), whose light falls with the fourth power of the distance.
     """
     depth, radii = 0.5, np.array([0.1, 1.0])
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)

@@ -1,15 +1,18 @@
-"""What no method can image is refused by all of them, in one line that says what to do."""
+"""What all methods promise alike: masked points, the order of points, linearity, progress and
+history; and what none can image is refused by all of them, in one line that says what to do.
+"""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from refusals import find_refusal
-from relay_walls import AXIS, planar_wall
+from relay_walls import AXIS, HIDDEN, JITTER, planar_wall
 
 from nlos import (
     Backprojection,
@@ -24,6 +27,7 @@ from nlos import (
     TransientImaging,
 )
 from nlos.illumination import AliasingWarning
+from nlos.simulate import PointScene
 from tofclip.errors import InputError
 
 LONGEST_LINE = 260
@@ -73,6 +77,79 @@ def refusal(method: Any, capture: Capture, grid: Grid) -> str:
     assert "\n" not in reason
     assert len(reason) < LONGEST_LINE
     return str(reason)
+
+
+PULSE = {"wavelength_m": 0.125, "cycles": 3.0}
+SETTINGS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "backprojection": (Backprojection(0.125), PULSE),
+    "rsd": (PlanarRSD(0.125), {**PULSE, "tolerance": 1e-2}),
+    "hybrid": (
+        Hybrid(0.125, plane_z=0.1),
+        {**PULSE, "tolerance": 1e-2, "propagation": "spectral", "plane_z_m": 0.1},
+    ),
+    "filtered backprojection": (FilteredBackprojection(0.05), {"sigma_m": 0.05}),
+    "lightcone": (LightCone(), {"falloff": 4.0, "signal_to_noise": 0.8}),
+    "fk": (FKMigration(), {"falloff": 4.0}),
+}
+"""Methods and what their volumes say of how they were made, by the name that they say."""
+imagers = pytest.mark.parametrize("name", SETTINGS)
+coarse_walls = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
+
+
+def see_point(name: str) -> Capture:
+    """A hidden point before a planar wall."""
+    wall = planar_wall()
+    laser = wall if isinstance(SETTINGS[name][0], LightCone | FKMigration) else np.array(SPOT)
+    return PointScene([HIDDEN]).simulate_capture(wall, laser, AXIS, JITTER)
+
+
+@coarse_walls
+@imagers
+def test_masked_points_and_the_order_of_the_others_do_not_matter(name: str) -> None:
+    method, capture = SETTINGS[name][0], see_point(name)
+    wall, signal = capture.wall.copy(), capture.signal.copy()
+    wall[3, 5] = wall[0, 0, 1] = np.nan
+    signal[:, 3, 5] = 1e6
+    laser = wall if capture.laser.ndim > 1 else capture.laser
+    masked = replace(capture, wall=wall, signal=signal, laser=laser)
+    order = np.random.default_rng(5).permutation(len(masked.points))
+    points = masked.points[order]
+    laser = points if capture.laser.ndim > 1 else capture.laser
+    listed = replace(masked, wall=points, laser=laser, signal=masked.traces().T[:, order])
+    found, expected = (method.reconstruct(one, GRID).values for one in (listed, masked))
+    # Sums of float32 in another order.
+    assert np.linalg.norm(found - expected) < 1e-5 * np.linalg.norm(expected)
+
+
+@coarse_walls
+@pytest.mark.parametrize("name", ["backprojection", "rsd", "hybrid"])
+def test_fields_are_linear_in_the_signal(name: str) -> None:
+    method, capture, random = SETTINGS[name][0], see_point(name), np.random.default_rng(4)
+    first, second = (
+        replace(capture, signal=random.normal(size=capture.signal.shape)) for _ in range(2)
+    )
+    both = replace(capture, signal=2 * first.signal - 3 * second.signal)
+    # What a method leaves out follows from the first signals that it sees: one plan for all.
+    plan = method.plan(first, GRID)
+    fields = [plan.field(one).values for one in (first, second, both)]
+    difference = fields[2] - (2 * fields[0] - 3 * fields[1])
+    assert np.linalg.norm(difference) < 1e-5 * np.linalg.norm(fields[2])
+
+
+@coarse_walls
+@imagers
+def test_progress_counts_the_cost_and_may_interrupt_and_the_volume_remembers(name: str) -> None:
+    (method, settings), capture = SETTINGS[name], replace(see_point(name), provenance={"shot": 7})
+    done: list[int] = []
+    volume = method.reconstruct(capture, GRID, done.append)
+    assert sum(done) == method.plan(capture, GRID).cost
+    assert volume.provenance == {"shot": 7, "imaging": {"method": name, **settings}}
+
+    def interrupt(_: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        method.reconstruct(capture, GRID, interrupt)
 
 
 @every_method
