@@ -83,7 +83,7 @@ def add_recovery_error(
         return np.array(sigma)
     rows, columns = image_shape
     each = np.bincount(pixel, minlength=rows * columns)  # returns of each pixel
-    starts, most = np.append(0, np.cumsum(each)), int(each.max())
+    starts = np.append(0, np.cumsum(each))
     nearness = 1 / (distance * along_axis)
     metres = distance / nearness
     layers = layer_returns(nearness, pixel, starts, image_shape)
@@ -101,9 +101,8 @@ def add_recovery_error(
     own = np.zeros(image_shape, bool)
     own[::PLANE_STEP_PX, ::PLANE_STEP_PX] = True
     fit_planes(np.flatnonzero(own.ravel().take(pixel)))
-    # zeros, since numbers too small to be normal take a hundred times as long
-    cell = np.zeros((3, -(-(PLANE_STEP_PX**2) * most // LENGTH) * LENGTH), np.float32)
-    borrow_scatter(nearness, metres, starts, image_shape, gate, cell, scatter)
+    memory = np.empty((2, 16 * int(each.max())))
+    borrow_scatter(nearness, metres, starts, image_shape, gate, memory, scatter)
     fit_planes(np.flatnonzero(np.isnan(scatter)))
     known = scatter >= 0
     if np.count_nonzero(known) < MIN_KNOWN:
@@ -323,49 +322,24 @@ def borrow_scatter(nearness, metres, starts, image_shape, gate, memory, scatter)
     plane's reach whose row and column `PLANE_STEP_PX` divides; NaN where there is none or it has few
     neighbours. All returns of a cell of ``PLANE_STEP_PX**2`` pixels have the same ones around them.
 
-    `starts` (pixels + 1,): first return of each pixel; `memory` (3, whole vectors of a cell's returns):
-    nearness of a cell's returns, how far off the nearest is, and its scatter.
+    `starts` (pixels + 1,): first return of each pixel; `memory` (2, 16 * most returns of a pixel).
     """
     rows, columns = image_shape
-    step, zero = PLANE_STEP_PX, fill_vector(np.float32(0))
-    own, least, held = memory[0], memory[1], memory[2]
+    step, near, known = PLANE_STEP_PX, memory[0], memory[1]
     for top in range(0, rows, step):
         for left in range(0, columns, step):
-            right, below = min(left + step, columns), min(top + step, rows)
-            number = open_cell(nearness, starts, columns, (top, below, left, right), memory)
-            if number == 0:
-                continue
+            number = 0
             for y in range(max(top - step, 0), min(top + 3 * step, rows), step):
                 for x in range(max(left - step, 0), min(left + 3 * step, columns), step):
                     for k in range(starts[y * columns + x], starts[y * columns + x + 1]):
-                        there = fill_vector(np.float32(nearness[k]))
-                        known = fill_vector(np.float32(scatter[k]))
-                        for lane in range(np.uintp(0), np.uintp(number), STEP):
-                            off = load_vector(own, lane) - there
-                            off = choose(off > zero, off, zero - off)
-                            best = load_vector(least, lane)
-                            nearer = best > off
-                            store_vector(least, lane, choose(nearer, off, best))
-                            store_vector(held, lane, choose(nearer, known, load_vector(held, lane)))
-            number = starts[top * columns + left + 1] - starts[top * columns + left]
-            for y in range(top, below):
+                        near[number], known[number] = nearness[k], scatter[k]
+                        number += 1
+            for y in range(top, min(top + step, rows)):
                 first = y * columns + left + (1 if y == top else 0)
-                for k in range(starts[first], starts[y * columns + right]):
-                    near = least[number] * metres[k] < gate and held[number] >= 0
-                    scatter[k] = held[number] if near else np.nan
-                    number += 1
-
-
-@inlined
-def open_cell(nearness, starts, columns, cell, memory):
-    """Return how many returns a cell has, and list their nearness; `cell`: first row and the one after
-    the last, first column and the one after the last.
-    """
-    own, least, held = memory[0], memory[1], memory[2]
-    top, below, left, right = cell
-    number = 0
-    for y in range(top, below):
-        for k in range(starts[y * columns + left], starts[y * columns + right]):
-            own[number], least[number], held[number] = nearness[k], np.inf, np.nan
-            number += 1
-    return number
+                for k in range(starts[first], starts[y * columns + min(left + step, columns)]):
+                    least, best = np.inf, np.nan
+                    for place in range(number):
+                        off = math.fabs(nearness[k] - near[place])
+                        best = known[place] if off < least else best
+                        least = off if off < least else least
+                    scatter[k] = best if least * metres[k] < gate and best >= 0 else np.nan
