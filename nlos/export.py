@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,34 +108,29 @@ def extract_points(
 
 
 def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
-    """Do what `Volume.export_volume` describes.
-
-    `path`: its suffix names the format; `fraction`: which voxels become points: those with at least
-    this fraction of the brightest.
-    """
+    """Write a volume for other programs; see `Volume.export`."""
     suffix = Path(path).suffix.lower()
     if suffix in POINT_SUFFIXES:
-        _write_points(volume, path, fraction)
+        from tofclip.lidar.export import Column, write_table
+
+        xyz, brightness = extract_points(volume, fraction)
+        places = [
+            Column(name, "m", np.ascontiguousarray(xyz[:, i])) for i, name in enumerate("xyz")
+        ]
+        write_table(path, [*places, Column("brightness", "", brightness)])
         return
     require_suffix(path, *WRITERS, *POINT_SUFFIXES)
     with atomic_path(path) as temporary:
         WRITERS[suffix](volume, temporary)
 
 
-def _write_points(volume: Volume, path: str | Path, fraction: float) -> None:
-    from tofclip.lidar.export import Column, write_table
-
-    xyz, brightness = extract_points(volume, fraction)
-    columns = [Column(name, "m", np.ascontiguousarray(xyz[:, i])) for i, name in enumerate("xyz")]
-    write_table(path, [*columns, Column("brightness", "", brightness)])
-
-
 def _write_vti(volume: Volume, path: Path) -> None:
     """Write XML image data (VTK file formats, "XML formats, ImageData"), with the numbers appended
     in binary.
     """
-    origin = " ".join(f"{axis[0]:.9g}" for axis in (volume.grid.x, volume.grid.y, volume.grid.z))
-    spacing = " ".join(f"{_find_spacing(axis, name):.9g}" for axis, name in _list_axes(volume))
+    origin = " ".join(f"{getattr(volume.grid, name)[0]:.9g}" for name in "xyz")
+    steps = (_find_spacing(getattr(volume.grid, name), name) for name in "xyz")
+    spacing = " ".join(f"{step:.9g}" for step in steps)
     extent = " ".join(f"0 {n - 1}" for n in reversed(volume.grid.shape))
     head = (
         '<?xml version="1.0"?>\n'
@@ -153,13 +148,9 @@ def _write_vti(volume: Volume, path: Path) -> None:
 
 
 def _write_npz(volume: Volume, path: Path) -> None:
-    grid = volume.grid
+    axes: dict[str, Any] = {f"{name}_m": getattr(volume.grid, name) for name in "xyz"}
     with open(path, "wb") as file:
-        _save_npz(file, values=to_numpy(volume.values), x_m=grid.x, y_m=grid.y, z_m=grid.z)
-
-
-def _save_npz(file: BinaryIO, **arrays: NDArray[np.generic]) -> None:
-    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        np.savez_compressed(file, values=to_numpy(volume.values), **axes)
 
 
 def _write_exr(volume: Volume, path: Path) -> None:
@@ -173,10 +164,6 @@ def _write_exr(volume: Volume, path: Path) -> None:
     }
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, channels).write(str(path))
-
-
-def _list_axes(volume: Volume) -> list[tuple[FloatArray, str]]:
-    return [(volume.grid.x, "x"), (volume.grid.y, "y"), (volume.grid.z, "z")]
 
 
 def _find_spacing(axis: FloatArray, name: str) -> float:

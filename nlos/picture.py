@@ -1,6 +1,5 @@
-"""The picture of a volume: three views and a depth map, with axes in metres.
-
-The film of a transient video: its front view at every instant, with axes in metres.
+"""The picture of a volume, three views and a depth map, and the film of a transient video, its front
+view at every instant, both with axes in metres.
 """
 
 from __future__ import annotations
@@ -43,8 +42,6 @@ def save_picture(volume: Volume, path: str | Path) -> None:
     The front view looks along +z from the wall into the scene, x to the right and y down. Beside
     it, the side view shares y and has the wall at its left edge; below it, the top view shares x
     and has the wall at its upper edge.
-
-    `path`: ends in .png, .pdf or .svg.
     """
     target = Path(path)
     require_suffix(target, *PICTURE_SUFFIXES)
@@ -58,7 +55,9 @@ def _draw_figure(volume: Volume) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    width, height, depth = _compute_panel_sides(volume)
+    edges = [_find_edges(axis) for axis in (volume.grid.x, volume.grid.y, volume.grid.z)]
+    lengths = np.array([last - first for first, last in edges])
+    width, height, depth = np.clip(lengths / lengths[0], MIN_PANEL_RATIO, MAX_PANEL_RATIO)
     columns, rows = [width, depth, width], [height, depth]
     size = (WIDTH_INCHES, WIDTH_INCHES * sum(rows) / sum(columns) + 0.5)
     figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
@@ -79,13 +78,6 @@ def _draw_figure(volume: Volume) -> Figure:
     return figure
 
 
-def _compute_panel_sides(volume: Volume) -> NDArray[np.float64]:
-    """Width, height and depth of the panels, relative to the width."""
-    edges = [_find_edges(axis) for axis in (volume.grid.x, volume.grid.y, volume.grid.z)]
-    lengths = np.array([last - first for first, last in edges])
-    return np.asarray(np.clip(lengths / lengths[0], MIN_PANEL_RATIO, MAX_PANEL_RATIO))
-
-
 def _draw_views(volume: Volume, front: Axes, side: Axes, top: Axes) -> AxesImage:
     x, y, z = volume.grid.x, volume.grid.y, volume.grid.z
     magnitude = volume.magnitude
@@ -96,11 +88,6 @@ def _draw_views(volume: Volume, front: Axes, side: Axes, top: Axes) -> AxesImage
     _draw_picture(side, magnitude.max(axis=2).T, (z, y), ("z (m)", "y (m), down"))
     _draw_picture(top, magnitude.max(axis=1), (x, z), ("x (m)", "z (m)"))
     return _draw_picture(front, magnitude.max(axis=0), (x, y), ("x (m)", "y (m), down"))
-
-
-def _find_step(axis: NDArray[np.float64]) -> float:
-    """Distance of neighbouring voxels, m."""
-    return float(abs(axis[-1] - axis[0]) / max(axis.size - 1, 1))
 
 
 def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
@@ -114,8 +101,9 @@ def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
     drawn.set_cmap(DEPTH_COLOUR_MAP)
     nearest, furthest = drawn.get_clim()
     if nearest is not None and furthest is not None:
-        middle = (nearest + furthest) / 2
-        reach = max(furthest - nearest, MIN_DEPTH_SPAN_VOXELS * _find_step(volume.grid.z)) / 2
+        middle, z = (nearest + furthest) / 2, volume.grid.z
+        voxel = float(z[-1] - z[0]) / max(z.size - 1, 1)
+        reach = max(furthest - nearest, MIN_DEPTH_SPAN_VOXELS * voxel) / 2
         drawn.set_clim(middle - reach, middle + reach)
     return drawn
 
@@ -142,10 +130,8 @@ def _draw_picture(
 def compute_extent(
     right: NDArray[np.float64], down: NDArray[np.float64]
 ) -> tuple[float, float, float, float]:
-    """Left, right, lower and upper edge of a picture with axes to the right and downwards, m, as
-    matplotlib has it.
-
-    `right, down` (n,): centres of the pixels, m.
+    """Left, right, lower and upper edge of a picture of pixels centred on axes to the right and
+    downwards, m, as matplotlib has it.
     """
     return (*_find_edges(right), *_find_edges(down)[::-1])
 
@@ -157,7 +143,7 @@ def _find_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
 
 
 FIGURE_SIZE_INCHES = (5.6, 5.0)
-DOTS_PER_INCH_FILM = 80
+FILM_DOTS_PER_INCH = 80
 FRAME_DURATION_MS, LAST_FRAME_DURATION_MS = 80, 1000
 NANOSECOND = 1e-9
 
@@ -167,8 +153,6 @@ def save_film(video: TransientVideo, path: str | Path) -> None:
     one scale.
 
     Memory for all pictures of the film, 0.2 MB each.
-
-    `video`: with depth or without; `path`: ends in .gif.
     """
     from PIL import Image
 
@@ -191,7 +175,7 @@ def render_frames(video: TransientVideo) -> Iterator[NDArray[np.uint8]]:
     from matplotlib.figure import Figure
 
     front = video.values if video.values.ndim == 3 else video.values.max(axis=1)
-    figure = Figure(figsize=FIGURE_SIZE_INCHES, dpi=DOTS_PER_INCH_FILM, layout="constrained")
+    figure = Figure(figsize=FIGURE_SIZE_INCHES, dpi=FILM_DOTS_PER_INCH, layout="constrained")
     canvas, axes = FigureCanvasAgg(figure), figure.add_subplot()
     edges = compute_extent(video.grid.x, video.grid.y)
     drawn = axes.imshow(front[0], COLOUR_MAP, vmin=0, vmax=float(front.max()) or 1.0, extent=edges)

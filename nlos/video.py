@@ -1,6 +1,5 @@
-"""Hidden volumes of a moving scene, averaged over more captures the farther away they lie.
-
-`nlos.TransientImaging`: the hidden scene while the laser's flash passes through it.
+"""Hidden scenes in time: `nlos.TransientImaging` shows one while the laser's flash passes through it,
+and `DepthAverage` a moving one, averaged over more captures the farther away it lies.
 """
 
 from __future__ import annotations
@@ -68,10 +67,8 @@ class DepthAverage:
         return self._windows
 
     def add(self, field: Volume) -> Volume:
-        """Take the field of a new capture, and return the image of the average.
-
-        `field`: complex, as of `PhasorPlan.field`. Returns brightness, real and not negative,
-        float32. Of a stream's first captures it holds those that there are.
+        """Take the complex field of a new capture, and return the brightness, float32, of the
+        average; of a stream's first captures it holds those that there are.
         """
         self._latest.append(field.values)
         newest_first = list(self._latest)[::-1]

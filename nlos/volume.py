@@ -89,10 +89,8 @@ class Grid:
         sizes = np.broadcast_to(np.asarray(voxel, dtype=np.float64), (3,))
         if not np.all(np.isfinite(sizes) & (sizes > 0)):
             raise InputError(f"the voxel size must be a positive number of metres, got {voxel}")
-        sides = {"x": x, "y": y, "z": z}
-        return cls(
-            *(_fill_axis(name, sides[name], size) for name, size in zip("xyz", sizes, strict=True))
-        )
+        sides = zip("xyz", (x, y, z), sizes, strict=True)
+        return cls(*(_fill_axis(name, side, size) for name, side, size in sides))
 
     @classmethod
     def in_front_of(
@@ -182,10 +180,8 @@ class Grid:
 
     def find_nearest(self, point: Sequence[float]) -> tuple[int, int, int]:
         """Index (z, y, x) of the voxel nearest to a point (x, y, z) in m."""
-        x, y, z = (
-            int(np.argmin(np.abs(a - p)))
-            for a, p in zip((self.x, self.y, self.z), point, strict=True)
-        )
+        axes = zip((self.x, self.y, self.z), point, strict=True)
+        x, y, z = (int(np.argmin(np.abs(axis - place))) for axis, place in axes)
         return z, y, x
 
 
@@ -203,9 +199,8 @@ def _widen_range(axis: FloatArray, indices: NDArray[np.intp]) -> tuple[float, fl
     """Range of the axis that holds the indexed entries and, where there is one, the next on either
     side.
     """
-    return float(axis[max(indices.min() - 1, 0)]), float(
-        axis[min(indices.max() + 1, axis.size - 1)]
-    )
+    first, last = max(indices.min() - 1, 0), min(indices.max() + 1, axis.size - 1)
+    return float(axis[first]), float(axis[last])
 
 
 def _fill_axis(name: str, side: Sequence[float], voxel: float) -> FloatArray:
@@ -333,10 +328,8 @@ class Volume:
         if not 0 <= fraction <= 1:
             raise InputError(f"a threshold is a fraction between 0 and 1, got {fraction}")
         xp, magnitude = namespace(self.values), abs(self.values)
-        kept = xp.where(
-            magnitude >= fraction * xp.max(magnitude), self.values, xp.zeros_like(self.values)
-        )
-        return Volume(kept, self.grid, self.provenance)
+        bright = magnitude >= fraction * xp.max(magnitude)
+        return replace(self, values=xp.where(bright, self.values, xp.zeros_like(self.values)))
 
     def surface(self, fraction: float = 0.3) -> Mesh:
         """Draw the surface on which the magnitude is `fraction` (0..1) of the largest; save it with
@@ -424,21 +417,15 @@ class Volume:
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
         axes = {name: Field(getattr(self.grid, name), "m", (name,)) for name in AXES}
-        return Record(
-            "volume",
-            {"values": Field(to_numpy(self.values), "", AXES), **axes},
-            provenance=self.provenance,
-        )
+        fields = {"values": Field(to_numpy(self.values), "", AXES), **axes}
+        return Record("volume", fields, provenance=self.provenance)
 
     @classmethod
     def from_record(cls, record: Record) -> Volume:
         """Rebuild a volume from what was stored."""
-        stored = (
-            record.fields["values"].values.dtype
-            if "values" in record.fields
-            else np.dtype(np.float32)
-        )
-        values = record.array("values", stored if stored.kind in "fc" else np.float32, 3)
+        field = record.fields.get("values")
+        kept = field is not None and field.values.dtype.kind in "fc"
+        values = record.array("values", field.values.dtype if field and kept else np.float32, 3)
         x, y, z = (record.array(name, np.float64, 1, "m") for name in "xyz")
         return cls(values, Grid(x, y, z), record.provenance)
 
