@@ -145,22 +145,19 @@ def test_a_truncated_file_is_refused(record: Record, share: float, tmp_path: Pat
 
 
 def test_what_is_no_record_is_named(tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match="no such file"):
-        Record.load(tmp_path / "absent.h5")
-    with pytest.raises(StorageError, match="is a folder"):
-        Record.load(tmp_path)
-    empty = tmp_path / "empty.h5"
-    empty.touch()
-    with pytest.raises(FileFormatError, match="is empty"):
-        Record.load(empty)
-    text = tmp_path / "text.h5"
-    text.write_text("not HDF5")
-    with pytest.raises(FileFormatError, match="is not an HDF5 file"):
-        Record.load(text)
+    (tmp_path / "empty.h5").touch()
+    (tmp_path / "text.h5").write_text("not HDF5")
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["data"] = [1.0]
-    with pytest.raises(FileFormatError, match="not one of tofclip's"):
-        Record.load(tmp_path / "foreign.h5")
+    for name, fault, problem in (
+        ("absent.h5", StorageError, "no such file"),
+        ("", StorageError, "is a folder"),
+        ("empty.h5", FileFormatError, "is empty"),
+        ("text.h5", FileFormatError, "is not an HDF5 file"),
+        ("foreign.h5", FileFormatError, "not one of tofclip's"),
+    ):
+        with pytest.raises(fault, match=problem):
+            Record.load(tmp_path / name)
 
 
 def test_a_newer_format_is_refused(record: Record, tmp_path: Path) -> None:
@@ -283,23 +280,16 @@ def test_atomic_path_replaces_the_file_at_the_end_only(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["scene.ply"]
 
 
-@pytest.mark.skipif(os.name != "posix", reason="file modes")
-def test_a_written_file_has_the_usual_mode(tmp_path: Path) -> None:
-    (tmp_path / "usual").touch()
-    with atomic_path(tmp_path / "a") as temporary:
-        temporary.touch()
-    assert (tmp_path / "a").stat().st_mode == (tmp_path / "usual").stat().st_mode
-
-
 def test_unwritable_places_are_named(record: Record, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
-    with pytest.raises(StorageError, match="the folder does not exist"):
-        record.save(tmp_path / "absent" / "a.h5")
-    with pytest.raises(StorageError, match="its folder is a file"):
-        record.save(tmp_path / "file" / "a.h5")
-    with pytest.raises(StorageError, match="it is a folder"):
-        record.save(tmp_path / "folder")
+    for name, problem in (
+        ("absent/a.h5", "the folder does not exist"),
+        ("file/a.h5", "its folder is a file"),
+        ("folder", "it is a folder"),
+    ):
+        with pytest.raises(StorageError, match=problem):
+            record.save(tmp_path / name)
     assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
 
 
@@ -341,13 +331,8 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path) -> None:
     """
     target = tmp_path / "frames.h5"
     target.write_text("old")
-    child = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, str(target)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    command = [sys.executable, "-c", FULL_DISK, str(target)]
+    child = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (child.returncode, child.stderr) == (0, "")
     assert child.stdout.startswith(f"{target}: cannot be written: the disk is full")
     assert target.read_text() == "old"

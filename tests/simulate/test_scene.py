@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError
 from tofclip.simulate import Scene, make_plate
 from tofclip.simulate.bodies import Body
 from tofclip.simulate.patterns import cut_pattern, make_letter, make_plain_pattern, make_rings
@@ -66,9 +66,8 @@ def test_what_is_behind_the_camera_is_not_seen():
 
 def test_path_is_half_of_there_and_back_from_different_places():
     viewpoint = np.array([3.0, 0.0, 0.0])
-    hits = Scene((wall(4.0),)).trace(
-        viewpoint, np.array([[-0.75, 0.0, 1.0]])
-    )  # hits (0, 0, 4): 4 m from the lamp
+    # hits (0, 0, 4): 4 m from the lamp
+    hits = Scene((wall(4.0),)).trace(viewpoint, np.array([[-0.75, 0.0, 1.0]]))
     assert hits.path[0] == pytest.approx((4.0 + 5.0) / 2)
     assert hits.distance[0] == pytest.approx(4.0)
 
@@ -80,14 +79,11 @@ def test_a_slanted_surface_is_lit_by_the_cosine():
 
 def test_a_plate_casts_a_shadow_that_a_distant_lamp_moves_aside():
     card = make_plate((0, 0, 1.0), (0.1, 0.1), make_plain_pattern(0.9))
-    behind = np.array(
-        [[0.2, 0.0, 2.0], [0.0, 0.0, 2.0]]
-    )  # points on the wall, as directions from the origin
+    # points on the wall, as directions from the origin
+    behind = np.array([[0.2, 0.0, 2.0], [0.0, 0.0, 2.0]])
     beside = Scene((card, wall(2.0)), lamp=(-0.2, 0.0, 0.0)).trace(ORIGIN, behind)
     assert beside.body.tolist() == [1, 0]
-    assert (
-        beside.reflectance[0] == 0
-    )  # the line from the lamp to (0.2, 0, 2) passes the card's middle
+    assert beside.reflectance[0] == 0  # the way to (0.2, 0, 2) passes the card's middle
     colocated = Scene((card, wall(2.0))).trace(ORIGIN, behind)
     assert np.all(colocated.reflectance > 0)
 
@@ -97,47 +93,40 @@ def test_letters_have_their_shape():
         pattern = cut_pattern(make_letter(name), make_plain_pattern(0.8))
         return bool(np.isfinite(pattern[int(y * pattern.shape[0]), int(x * pattern.shape[1])]))
 
-    assert (at("U", 0.1, 0.1), at("U", 0.9, 0.1), at("U", 0.5, 0.1), at("U", 0.5, 0.95)) == (
-        True,
-        True,
-        False,
-        True,
-    )
-    assert (at("C", 0.1, 0.5), at("C", 0.9, 0.5), at("C", 0.5, 0.5), at("C", 0.5, 0.1)) == (
-        True,
-        False,
-        False,
-        True,
-    )
-    assert (at("L", 0.2, 0.1), at("L", 0.9, 0.9), at("L", 0.9, 0.1)) == (True, True, False)
-    assert (at("A", 0.5, 0.1), at("A", 0.5, 0.4), at("A", 0.5, 0.7), at("A", 0.5, 0.95)) == (
-        True,
-        False,
-        True,
-        False,
-    )
+    # where each letter is, and where it is not
+    for name, inside, outside in (
+        ("U", [(0.1, 0.1), (0.9, 0.1), (0.5, 0.95)], [(0.5, 0.1)]),
+        ("C", [(0.1, 0.5), (0.5, 0.1)], [(0.9, 0.5), (0.5, 0.5)]),
+        ("L", [(0.2, 0.1), (0.9, 0.9)], [(0.9, 0.1)]),
+        ("A", [(0.5, 0.1), (0.5, 0.7)], [(0.5, 0.4), (0.5, 0.95)]),
+    ):
+        assert all(at(name, *point) for point in inside)
+        assert not any(at(name, *point) for point in outside)
 
 
 def test_a_disc_of_rings_is_round():
     pattern = make_rings(3, 0.2, 0.8)
     assert np.mean(np.isfinite(pattern)) == pytest.approx(np.pi / 4, abs=0.02)
-    assert (np.nanmin(pattern), np.nanmax(pattern)) == (
-        pytest.approx(0.2, abs=0.01),
-        pytest.approx(0.8, abs=0.01),
-    )
+    limits = np.nanmin(pattern), np.nanmax(pattern)
+    np.testing.assert_allclose(limits, (0.2, 0.8), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("centre", "size", "pattern", "problem"),
+    [
+        ((0, 0, 1), (1, 1), np.zeros(3), "reflectance"),
+        ((0, 0, 1), (1, 1), np.full((2, 2), 1.5), r"within 0\.\.1"),
+        ((0, 0, 1), (1, 1), np.full((2, 2), np.nan), r"within 0\.\.1"),
+        ((0, 0, 1), (0, 1), make_plain_pattern(0.5), "positive size"),
+        ((0, 0, np.inf), (1, 1), make_plain_pattern(0.5), "finite position"),
+    ],
+)
+def test_unusable_plates_are_refused(centre, size, pattern, problem):
+    with pytest.raises(InputError, match=problem):
+        make_plate(centre, size, pattern)
 
 
 def test_unusable_scenes_are_refused():
-    with pytest.raises(ShapeError, match="reflectance"):
-        make_plate((0, 0, 1), (1, 1), np.zeros(3))
-    with pytest.raises(InputError, match=r"within 0\.\.1"):
-        make_plate((0, 0, 1), (1, 1), np.full((2, 2), 1.5))
-    with pytest.raises(InputError, match=r"within 0\.\.1"):
-        make_plate((0, 0, 1), (1, 1), np.full((2, 2), np.nan))
-    with pytest.raises(InputError, match="positive size"):
-        make_plate((0, 0, 1), (0, 1), make_plain_pattern(0.5))
-    with pytest.raises(InputError, match="finite position"):
-        make_plate((0, 0, np.inf), (1, 1), make_plain_pattern(0.5))
     with pytest.raises(InputError, match="at least one body"):
         Scene(())
     with pytest.raises(InputError, match="no outline is known for 'Q'"):
