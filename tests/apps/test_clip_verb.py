@@ -61,14 +61,6 @@ def test_letters_are_recovered(encoder, worst, shared_data, tmp_path, capsys):
     assert pixels.min() >= 0
 
 
-def test_another_file_than_a_measurement_is_refused(tmp_path, capsys):
-    (tmp_path / "m.h5").write_bytes(b"nothing")
-    out = str(tmp_path / "p.png")
-    assert main(["clip", "recover", str(tmp_path / "m.h5"), "--shear", "0", "--out", out]) == 2
-    assert "m.h5" in capsys.readouterr().err
-    assert not (tmp_path / "p.png").exists()
-
-
 def simulated(shared_data, folder) -> list[str]:
     """Write measurements of the letters; return the beginning of a command that recovers them."""
     scene, measurements = (

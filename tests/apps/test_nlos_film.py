@@ -79,38 +79,6 @@ def test_its_settings_give_the_same_film(run: Run, curved: Path, tmp_path: Path)
     np.testing.assert_array_equal(one.times, two.times)
 
 
-@pytest.mark.parametrize(
-    ("words", "out", "reason"),
-    [
-        (
-            ["--method", "backprojection"],
-            "film.gif",
-            "films are made by rsd or hybrid, not by backprojection",
-        ),
-        (["--method", "telepathy"], "film.gif", "unknown method 'telepathy'"),
-        (["--instants", 0], "film.gif", "at least one instant"),
-        (["--every-depth"], "film.gif", "write every depth to a .h5 file"),
-        (["--first-ns", 3, "--last-ns", 2], "film.gif", "must begin before it ends, got 3 to 2 ns"),
-        (["--sigma-mm", 3], "film.gif", "changes nothing"),
-        (["--method", "rsd"], "film.gif", "use the hybrid method"),
-        ([], "film.avi", "must end in .mp4 or .gif or .h5"),
-    ],
-)
-def test_what_cannot_be_filmed_is_refused(
-    run: Run, curved: Path, tmp_path: Path, words: list[object], out: str, reason: str
-) -> None:
-    refused = run("nlos", "film", curved, *words, "--voxel-mm", 80, "--out", tmp_path / out)
-    assert refused.status == 2
-    assert reason in refused.err.splitlines()[-1]
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_scan_of_many_spots_has_no_flash(run: Run, confocal: Path, tmp_path: Path) -> None:
-    refused = run("nlos", "film", confocal, "--voxel-mm", 80, "--out", tmp_path / "film.gif")
-    assert refused.status == 2
-    assert "need one laser spot" in refused.err
-
-
 def test_without_opencv_there_is_no_mp4(
     run: Run, curved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

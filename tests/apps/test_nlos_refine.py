@@ -82,18 +82,6 @@ def test_its_settings_give_the_same_volume(run: Run, curved: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["--refine", "l2"], "unknown prior 'l2'; refine by l1, tv or photons"),
-        (["--iterations", 5], "iterations is a setting of --refine"),
-        (["--prior-weight", 0.1], "prior_weight is a setting of --refine"),
-        (["--refine", "l1", "--iterations", 0], "iterations must be 1 or more"),
-        (["--refine", "tv", "--prior-weight", 1], "share from 0 to less than 1"),
-        (
-            ["--refine", "l1", "--method", "backprojection"],
-            "iterates the hybrid method, not backprojection",
-        ),
-        (["--refine", "photons", "--method", "lct"], "begins with an image by rsd"),
-        (["--refine", "photons"], "not multiples of one step"),
-        (["--refine", "l1", "--signal-to-noise", 1], "changes nothing for"),
         (["--refine", "l1", "--wavelength-mm", 100, "--voxel-mm", 50], "too coarse to refine"),
     ],
 )

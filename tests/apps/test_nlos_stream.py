@@ -159,22 +159,6 @@ def test_an_unreadable_first_capture_is_counted(run: Run, tmp_path: Path) -> Non
     assert '"acquired": 2, "delivered": 1, "dropped": 0, "failed": 1' in outcome.out
 
 
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        (["--captures", 0], "--captures must be positive"),
-        (["--follow-s", -1], "--follow-s must be 0 s or more"),
-        (["--method", "rsd,lct"], "one method images a stream"),
-    ],
-)
-def test_what_makes_no_sense_is_refused(
-    run: Run, tmp_path: Path, words: list[object], reason: str
-) -> None:
-    refused = run("nlos", "stream", tmp_path, "--out", tmp_path / "out", *words)
-    assert refused.status == 2
-    assert reason in refused.err.splitlines()[-1]
-
-
 def test_far_depths_are_averaged_over_captures(run: Run, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     for number in range(3):
@@ -190,6 +174,3 @@ def test_far_depths_are_averaged_over_captures(run: Run, tmp_path: Path) -> None
     assert averaged[0].max() < alone[0].max()
     row = volumes[1].grid.find_nearest((-0.2, 0.05, 0.9))
     assert averaged[row] > 1.2 * alone[row]
-    outcome = run("nlos", "stream", tmp_path, "--out", out, "--average", 2, "--method", "fk")
-    assert outcome.status == 2
-    assert "--average adds up waves" in outcome.err

@@ -53,15 +53,3 @@ def test_a_tilted_square_has_its_depth_and_normals(
     assert np.median(errors) < (0.015 if confocal else 0.03)
     cosines = normals @ [np.sin(TURN), 0, -np.cos(TURN)]
     assert np.median(np.degrees(np.arccos(np.clip(cosines, -1, 1)))) < 12
-
-
-def test_surfaces_that_cannot_be_written_are_refused_first(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "c.h5").write_bytes(b"")
-    words = ["nlos", "reconstruct", tmp_path / "c.h5", "--out", tmp_path / "v.ply"]
-    for name, reason in (("mesh.obj", ".ply"), ("v.ply", "names of their own")):
-        outcome = run(*words, "--surface", tmp_path / name)
-        assert outcome.status == 2
-        assert reason in outcome.err
-    folder = run("nlos", "reconstruct", tmp_path, "--out", tmp_path / "o", "--surface", "m.ply")
-    assert folder.status == 2
-    assert "single capture" in folder.err

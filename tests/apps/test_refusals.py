@@ -80,7 +80,9 @@ def spoilt(
     replace(streak, camera=other).save(folder / "moved.h5")
     dark = np.zeros((8, *IMAGE_SHAPE), np.float32)
     Frames(dark, np.arange(8) * 20e-12, camera).save(folder / "frames.h5")
-    np.save(folder / "cube.npy", np.random.default_rng(1).poisson(0.5, (6, 6, 32)))
+    cube = np.random.default_rng(1).poisson(0.5, (6, 6, 32))
+    cube[:, :, 9:13] += (10, 25, 25, 10)  # a pulse that can be learnt
+    np.save(folder / "cube.npy", cube)
     return folder
 
 
@@ -103,6 +105,7 @@ def test_a_mistake_is_answered_in_a_line(
     files: Path,
     spoilt: Path,
     curved: Path,
+    confocal: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     typed: str,
@@ -110,7 +113,7 @@ def test_a_mistake_is_answered_in_a_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     before = take_stock(files, spoilt, curved.parent)
-    typed = typed.format(files=files, spoilt=spoilt, wall=curved, long=300 * "x")
+    typed = typed.format(files=files, spoilt=spoilt, wall=curved, scan=confocal, long=300 * "x")
     assert_refused(run(*shlex.split(typed)), said)
     assert list(tmp_path.iterdir()) == []
     assert take_stock(files, spoilt, curved.parent) == before

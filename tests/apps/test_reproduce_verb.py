@@ -61,17 +61,6 @@ def test_a_damaged_or_other_result_is_made_again(tmp_path: Path) -> None:
     assert load_result(path, {"seeds": 1}) is not None
 
 
-def test_unknown_names_and_folders_are_refused(run: Run, tmp_path: Path) -> None:
-    unknown = run("reproduce", "table99", "--out", tmp_path / "made")
-    assert unknown.status == 2
-    assert "table2" in unknown.err
-    assert unknown.err.count("\n") == 1
-    absent = run("reproduce", "table1", "--out", tmp_path / "made", "--data", tmp_path / "absent")
-    assert absent.status == 2
-    assert "absent" in absent.err
-    assert not (tmp_path / "made").exists()
-
-
 def test_help_says_what_it_writes(run: Run) -> None:
     outcome = run("reproduce", "--help")
     assert "NAME.csv" in outcome.out
