@@ -4,7 +4,6 @@ waveforms.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,103 +34,46 @@ def backproject_on_device(
 
     Memory: the volume, 64 MiB of waveforms, and five chunks (`ArrayLibrary.chunk_bytes`) for the
     pairs of voxel and wall point that are looked up at a time.
-
-    Returns (z, y, x).
     """
     library = ArrayLibrary(capture.device)
-    rows = _VoxelRows(grid, library, weighting)
-    total = library.zeros((rows.count, grid.x.size))
-    analysis, pairs = (
-        BandTransform(band, capture.axis.bins, library),
-        library.chunk_bytes // BYTES_PER_PAIR,
+    xp = library.xp
+    z, y = (
+        library.put(axis.reshape(-1, 1, 1)) for axis in np.meshgrid(grid.z, grid.y, indexing="ij")
     )
-    size = min(TABLE_BYTES // (8 * band.sample_count), max(1, pairs // grid.x.size))
+    x, rows = library.put(grid.x[:, np.newaxis]), grid.z.size * grid.y.size
+    total = library.zeros((rows, grid.x.size))
+    transform = BandTransform(band, capture.axis.bins, library)
+    carriers, start, spacing = band.carriers
+    carriers, samples = library.put(carriers), band.sample_count
+    pairs = library.chunk_bytes // BYTES_PER_PAIR
+    size = min(TABLE_BYTES // (8 * samples), max(1, pairs // grid.x.size))
     for points in split_blocks(len(capture.points), max(1, size)):
-        waveforms = _Waveforms.of(capture, points, band, analysis)
+        # Waveforms of some wall points, one after the other in one flat array; the first and the
+        # last two samples of each are 0.
+        waveforms = xp.reshape(transform.of(get_traces(capture, points)) @ carriers, (-1,))
         count = points.stop - points.start
-        for some in split_blocks(rows.count, max(1, pairs // (grid.x.size * count))):
-            total[some, :] += rows.look_up(some, waveforms)
-            progress((some.stop - some.start) * grid.x.size * count)
-    return library.xp.reshape(total, grid.shape)
-
-
-@dataclass(frozen=True, eq=False)
-class _Waveforms:
-    """Waveforms of some wall points, one after the other in one flat array, and where these stand."""
-
-    values: Array  # (points * samples,), the first and the last two samples of a point are 0
-    sample_count: int
-    start: float  # path length of the first sample, and path between samples, m
-    spacing: float  # path length of the first sample, and path between samples, m
-    first: Array  # (points,), index of each point's first sample
-    wall: Array  # (3, points), m; one laser spot, or one for each point
-    lasers: Array  # (3, points), m; one laser spot, or one for each point
-
-    @classmethod
-    def of(cls, capture: Capture, points: slice, band: Band, analysis: BandTransform) -> _Waveforms:
-        """Return the waveforms of some wall points.
-
-        `points`: of its valid wall points; `analysis`: from signals to the band's phasors.
-        """
-        library, (carriers, start, spacing) = ArrayLibrary(capture.device), band.carriers
-        values = analysis.of(get_traces(capture, points)) @ library.put(carriers)
-        first = band.sample_count * np.arange(values.shape[0])
+        first, wall = library.put(samples * np.arange(count)), library.put(capture.points[points].T)
         lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[points]
-        return cls(
-            library.xp.reshape(values, (-1,)),
-            band.sample_count,
-            start,
-            spacing,
-            library.put(first),
-            library.put(capture.points[points].T),
-            library.put(lasers.T),
-        )
-
-
-class _VoxelRows:
-    """The rows of voxels along x of a grid, row after row."""
-
-    def __init__(self, grid: Grid, library: ArrayLibrary, weighting: Weighting) -> None:
-        self.library, self.weighting = library, weighting
-        z, y = np.meshgrid(grid.z, grid.y, indexing="ij")
-        self.count = y.size
-        self.x = library.put(grid.x[:, np.newaxis])
-        self.y, self.z = (library.put(axis.reshape(-1, 1, 1)) for axis in (y, z))
-
-    def look_up(self, some: slice, waveforms: _Waveforms) -> Array:
-        """Return what some rows (rows, x) find in the waveforms.
-
-        `some`: of the rows.
-        """
-        xp, wall = self.library.xp, waveforms.wall
-        y, z = self.y[some, ...], self.z[some, ...]
-        squared = (
-            xp.clip((y - wall[1, :]) ** 2 + (z - wall[2, :]) ** 2, MIN_DISTANCE_M**2, None)
-            + (self.x - wall[0, :]) ** 2
-        )
-        distance, laser = xp.sqrt(squared), waveforms.lasers
-        outward = xp.sqrt(
-            (self.x - laser[0, :]) ** 2 + (y - laser[1, :]) ** 2 + (z - laser[2, :]) ** 2
-        )
-        # Samples that the path is late by, in the order in which single precision loses least.
-        place = (outward - waveforms.start) * (1 / waveforms.spacing) + distance * (
-            1 / waveforms.spacing
-        )
-        place = xp.clip(place, 0.0, float(waveforms.sample_count - 2))
-        before = xp.astype(place, xp.int64)
-        weight = place - xp.astype(before, place.dtype)
-        index = xp.reshape(before + waveforms.first, (-1,))
-        here, there = (
-            xp.reshape(xp.take(waveforms.values, one), weight.shape) for one in (index, index + 1)
-        )
-        return xp.sum(
-            (here + weight * (there - here)) * self._compute_weights(distance, z - wall[2, :]),
-            axis=-1,
-        )
-
-    def _compute_weights(self, distance: Array, ahead: Array) -> Array:
-        falloff, obliquity = self.weighting.falloff, self.weighting.obliquity
-        weight = 1 / distance if falloff == 1 else distance**-falloff
-        if obliquity == 0:
-            return weight
-        return weight * (self.library.xp.clip(ahead, 0.0, None) / distance) ** obliquity
+        laser = library.put(lasers.T)
+        for some in split_blocks(rows, max(1, pairs // (grid.x.size * count))):
+            ahead, across = z[some, ...] - wall[2, :], y[some, ...] - wall[1, :]
+            squared = xp.clip(across**2 + ahead**2, MIN_DISTANCE_M**2, None)
+            distance = xp.sqrt(squared + (x - wall[0, :]) ** 2)
+            aside = (y[some, ...] - laser[1, :]) ** 2 + (z[some, ...] - laser[2, :]) ** 2
+            outward = xp.sqrt((x - laser[0, :]) ** 2 + aside)
+            # Samples that the path is late by, in the order in which single precision loses least.
+            position = (outward - start) * (1 / spacing) + distance * (1 / spacing)
+            position = xp.clip(position, 0.0, float(samples - 2))
+            before = xp.astype(position, xp.int64)
+            weight, index = position - xp.astype(before, position.dtype), before + first
+            here, there = (
+                xp.reshape(xp.take(waveforms, xp.reshape(one, (-1,))), weight.shape)
+                for one in (index, index + 1)
+            )
+            factor = 1 / distance if weighting.falloff == 1 else distance**-weighting.falloff
+            if weighting.obliquity != 0:
+                cosine = xp.clip(ahead, 0.0, None) / distance
+                factor = factor * cosine**weighting.obliquity
+            total[some, :] += xp.sum((here + weight * (there - here)) * factor, axis=-1)
+            progress((some.stop - some.start) * grid.x.size * count)
+    return xp.reshape(total, grid.shape)

@@ -308,7 +308,32 @@ class Capture:
             The frames carry no relay wall, the wall does not fit into the picture, or the frames
             are not evenly spaced in time.
         """
-        return _extract_wall_capture(frames)
+        require_type(frames, Frames, "a capture is made of Frames, see tofclip.recover")
+        record = frames.attachments.get(ATTACHMENT_NAME)
+        if record is None or record.kind != ATTACHMENT_NAME:
+            raise InputError(
+                "these frames carry no relay wall: recover them from a streak image converted with its wall's geometry"
+            )
+        wall = record.array("wall", np.float64, 3, "m")
+        camera, laser = (record.array(name, np.float64, 1, "m") for name in ("camera", "laser"))
+        bin_width, steps = frames.bin_width, np.diff(frames.times)
+        if np.max(np.abs(steps - bin_width)) > STEP_TOLERANCE * bin_width:
+            raise InputError(
+                f"the frames are {steps.min():.3e} to {steps.max():.3e} s apart; imaging around a corner needs evenly "
+                "spaced ones: recover with one `bin_width`"
+            )
+        row, column = (int(record.number(f"{name}_offset")) for name in ("row", "column"))
+        (rows, columns), (high, wide) = wall.shape[:2], frames.values.shape[1:]
+        if min(row, column) < 0 or row + rows > high or column + columns > wide:
+            raise InputError(
+                f"a wall of {rows} x {columns} points from pixel ({row}, {column}) on does not fit into frames of "
+                f"{high} x {wide} pixels"
+            )
+        seen = frames.values[:, row : row + rows, column : column + columns]
+        delay = record.number("receive_delay_bins")
+        start = SPEED_OF_LIGHT * (float(frames.times[0]) + delay * bin_width)
+        signal = unwarp_signal(seen, wall, camera, laser, bin_width)
+        return cls(signal, wall, laser, bin_width, start, frames.provenance)
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
@@ -386,29 +411,6 @@ ATTACHMENT_NAME = "relay_wall"
 STEP_TOLERANCE = 1e-3
 
 
-def _extract_wall_capture(frames: Frames) -> Capture:
-    require_type(frames, Frames, "a capture is made of Frames, see tofclip.recover")
-    record = frames.attachments.get(ATTACHMENT_NAME)
-    if record is None or record.kind != ATTACHMENT_NAME:
-        raise InputError(
-            "these frames carry no relay wall: recover them from a streak image converted with its wall's geometry"
-        )
-    wall = record.array("wall", np.float64, 3, "m")
-    camera = record.array("camera", np.float64, 1, "m")
-    laser = record.array("laser", np.float64, 1, "m")
-    bin_width = _require_even_bin_width(frames)
-    seen = _cut_wall_window(frames.values, record, wall.shape)
-    delay = record.number("receive_delay_bins")
-    return Capture(
-        signal=unwarp_signal(seen, wall, camera, laser, bin_width),
-        wall=wall,
-        laser=laser,
-        bin_width=bin_width,
-        start=SPEED_OF_LIGHT * (float(frames.times[0]) + delay * bin_width),
-        provenance=frames.provenance,
-    )
-
-
 def unwarp_signal(
     signal: Any, wall: Any, camera: Any, laser: Any, bin_width: float
 ) -> NDArray[np.float32]:
@@ -460,27 +462,3 @@ def _shift_earlier(signal: NDArray[np.float32], bins: FloatArray) -> NDArray[np.
     flat = np.ascontiguousarray(signal.reshape(signal.shape[0], -1))
     shifted: NDArray[np.float32] = shift_signals(flat, delay).reshape(signal.shape)
     return shifted
-
-
-def _require_even_bin_width(frames: Frames) -> float:
-    bin_width = frames.bin_width
-    steps = np.diff(frames.times)
-    if np.max(np.abs(steps - bin_width)) > STEP_TOLERANCE * bin_width:
-        raise InputError(
-            f"the frames are {steps.min():.3e} to {steps.max():.3e} s apart; imaging around a corner needs evenly "
-            "spaced ones: recover with one `bin_width`"
-        )
-    return bin_width
-
-
-def _cut_wall_window(
-    values: NDArray[np.float32], record: Record, wall_shape: tuple[int, ...]
-) -> NDArray[np.float32]:
-    row, column = int(record.number("row_offset")), int(record.number("column_offset"))
-    (rows, columns), (high, wide) = wall_shape[:2], values.shape[1:]
-    if min(row, column) < 0 or row + rows > high or column + columns > wide:
-        raise InputError(
-            f"a wall of {rows} x {columns} points from pixel ({row}, {column}) on does not fit into frames of "
-            f"{high} x {wide} pixels"
-        )
-    return values[:, row : row + rows, column : column + columns]

@@ -78,19 +78,11 @@ def measure_fwhm(axis: FloatArray, values: NDArray[Any], peak: int) -> float:
     left, right = below[below < peak], below[below > peak]
     if not left.size or not right.size:
         return float("nan")
-    ends = [
-        _interpolate_crossing(axis, values, int(outer), inward, level)
-        for outer, inward in ((left[-1], 1), (right[0], -1))
-    ]
+    ends = []
+    for outer, inner in ((left[-1], left[-1] + 1), (right[0], right[0] - 1)):
+        weight = (level - values[outer]) / (values[inner] - values[outer])
+        ends.append(float(axis[outer] + weight * (axis[inner] - axis[outer])))
     return abs(ends[1] - ends[0])
-
-
-def _interpolate_crossing(
-    axis: FloatArray, values: NDArray[Any], outer: int, inward: int, level: float
-) -> float:
-    inner = outer + inward
-    weight = (level - values[outer]) / (values[inner] - values[outer])
-    return float(axis[outer] + weight * (axis[inner] - axis[outer]))
 
 
 def _compute_ideal_width(
@@ -112,7 +104,8 @@ def _compute_ideal_width(
         moved = point.copy()
         moved[axis] += place
         detour = _compute_path_lengths(wall, lasers, moved) - start
-        field[i] = np.sum(weights * _evaluate_pulse(detour, pulse))
+        envelope = np.exp(-(detour**2) / (2 * pulse.sigma**2))
+        field[i] = np.sum(weights * envelope * np.exp(1j * pulse.wavenumber * detour))
     return measure_fwhm(places, np.abs(field), PROFILE_SAMPLES // 2)
 
 
@@ -121,7 +114,3 @@ def _compute_path_lengths(wall: FloatArray, lasers: FloatArray, point: FloatArra
         wall - point, axis=1
     )
     return lengths
-
-
-def _evaluate_pulse(detour: FloatArray, pulse: VirtualPulse) -> NDArray[np.complex128]:
-    return np.asarray(np.exp(-(detour**2) / (2 * pulse.sigma**2) + 1j * pulse.wavenumber * detour))

@@ -332,7 +332,12 @@ class TransientImaging:
         progress: Progress,
     ) -> None:
         """Hand the field of every depth to `use`, some instants at a time; depths run side by side."""
-        band = self._choose_band(capture, grid, instants)
+        # A band in which no voxel sees an echo of the record at any of the instants.
+        nearest, farthest = find_leg_bounds(capture.points, grid)
+        earliest, latest = SPEED_OF_LIGHT * instants.min(), SPEED_OF_LIGHT * instants.max()
+        band = choose_band_for_paths(
+            capture.axis, self.method.pulse, earliest + nearest, latest + farthest
+        )
         group = self._plan_group(capture, grid, band)
         warn_of_aliasing(capture, band)
         depths = DepthPropagator(group.plane_to_depths, ArrayLibrary())
@@ -351,14 +356,6 @@ class TransientImaging:
 
         with limit_blas_threads():
             run_blocks(process_block, grid.z.size, size=1)
-
-    def _choose_band(self, capture: Capture, grid: Grid, instants: FloatArray) -> Band:
-        """A band in which no voxel sees an echo of the record at any of the instants."""
-        nearest, farthest = find_leg_bounds(capture.points, grid)
-        earliest, latest = SPEED_OF_LIGHT * instants.min(), SPEED_OF_LIGHT * instants.max()
-        return choose_band_for_paths(
-            capture.axis, self.method.pulse, earliest + nearest, latest + farthest
-        )
 
     def _build_provenance(self, capture: Capture, **more: float) -> Mapping[str, Any]:
         settings = {
