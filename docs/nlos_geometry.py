@@ -1,6 +1,6 @@
 """The drawing of coordinates, light paths and time around a corner; `docs/nlos.md` shows it.
 
-``python -m apps.figures.nlos_geometry docs/pictures/nlos_geometry.png`` draws it.
+``python docs/nlos_geometry.py docs/pictures/nlos_geometry.png`` draws it.
 """
 
 from __future__ import annotations

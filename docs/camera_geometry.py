@@ -1,6 +1,6 @@
 """The drawing of a camera's conventions: slit, lines, time, and where a cloud's coordinates begin.
 
-``python -m apps.figures.camera_geometry docs/pictures/camera_geometry.png`` draws it; the guide to
+``python docs/camera_geometry.py docs/pictures/camera_geometry.png`` draws it; the guide to
 one's own camera shows it.
 """
 
