@@ -48,10 +48,9 @@ RANGE_MARGIN_M = 20e-3  # before the occluder and behind the target, m
 OBLIQUE_LAMP_M = (-55e-3, -25e-3, 0.0)
 ILLUMINATIONS = ("diodes", "oblique", "co-located")
 
+# of the brightest measurement: one of a single pixel gathers half the picture's light and learns
+# little of it
 DEFAULT_PHOTONS = {"line": 2e3, "single-pixel": 1e6}
-"""Of the brightest measurement: one of a single pixel gathers half the picture's light and
-learns little of it.
-"""
 
 
 @dataclass(frozen=True)
@@ -113,10 +112,8 @@ class Experiment:
     @cached_property
     def time_axis(self) -> TimeAxis:
         """Instants from before the occluder's return to after the target's."""
-        near, far = (
-            self.scene.region.distance - RANGE_MARGIN_M,
-            self.scene.distance + RANGE_MARGIN_M,
-        )
+        near = self.scene.region.distance - RANGE_MARGIN_M
+        far = self.scene.distance + RANGE_MARGIN_M
         lamp = float(np.linalg.norm(self.rig.lamps, axis=1).max())
         return TimeAxis.for_ranges(near, float(np.hypot(far, lamp)), BIN_WIDTH_S, PULSE_FWHM_S)
 
@@ -145,23 +142,20 @@ class Experiment:
         picture: Array = self._render_middle_view(self.scene.target, self.rig.array).sum(axis=-1)
         return picture
 
-    def _render_middle_view(self, bodies: tuple[Body, ...], array: CameraArray) -> Array:
-        return render_flash_view(
-            PulsedScene(bodies, self.rig.lamps), array, self.time_axis, MIDDLE_VIEW
-        )
+    def _render_middle_view(self, bodies: tuple[Body, ...], array: CameraArray) -> Any:
+        scene = PulsedScene(bodies, self.rig.lamps)
+        return render_flash_view(scene, array, self.time_axis, MIDDLE_VIEW)
 
     @cached_property
     def measurements(self) -> TimedMeasurements:
         """What the nonlocal views read, with photon noise."""
         clean = measure_views(self.pictures, self.rig, self.time_axis)
-        random = np.random.default_rng([self.settings.seed, 1])
-        return replace(
-            clean,
-            values=add_poisson_noise(clean.values, self._photons_per_unit(clean.values), random),
-        )
+        return replace(clean, values=self._add_noise(clean.values, 1))
 
-    def _photons_per_unit(self, light: Array) -> float:
-        return self.settings.photons / float(light.max())
+    def _add_noise(self, light: Array, stream: int) -> Array:
+        """Light with photon noise, from a stream of random numbers of its own."""
+        random = np.random.default_rng([self.settings.seed, stream])
+        return add_poisson_noise(light, self.settings.photons / float(light.max()), random)
 
     @cached_property
     def separated(self) -> SeparatedImages:
@@ -176,8 +170,7 @@ class Experiment:
         seen = self._render_middle_view(
             (*self.scene.target, *self.scene.occluder), self._single_array
         )
-        random = np.random.default_rng([self.settings.seed, 2])
-        noisy = add_poisson_noise(seen, self._photons_per_unit(seen), random)
+        noisy = self._add_noise(seen, 2)
         gates = [one.bins for one in self.measurements.find_returns()]
         picture: Array = noisy[..., gates[1]].sum(axis=-1) if len(gates) > 1 else 0 * noisy[..., 0]
         return picture
@@ -185,9 +178,8 @@ class Experiment:
     @cached_property
     def single_view_truth(self) -> Array:
         """What the single view would see of the target, were there no occluder."""
-        picture: Array = self._render_middle_view(self.scene.target, self._single_array).sum(
-            axis=-1
-        )
+        array = self._single_array
+        picture: Array = self._render_middle_view(self.scene.target, array).sum(axis=-1)
         return picture
 
     @property
@@ -202,8 +194,6 @@ class Experiment:
         """All pixels of all views, without time of flight, refocused on the target, (rows,
         columns).
         """
-        pictures = self.pictures.sum(axis=-1)
-        random = np.random.default_rng([self.settings.seed, 3])
-        noisy = add_poisson_noise(pictures, self._photons_per_unit(pictures), random)
+        noisy = self._add_noise(self.pictures.sum(axis=-1), 3)
         shear = float(self.rig.array.shear(self.scene.distance))
         return LightField(noisy, self.rig.array.views).refocus(shear)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from apps.occlusion.experiment import Experiment, ExperimentSettings
 from apps.occlusion.scenes import BASELINE_M, OCCLUDER_DISTANCE_M, OcclusionScene
-from apps.viewer.source import Capabilities, Gate, Setting, Source, View
+from apps.viewer.source import Capabilities, Gate, Inflow, Setting, Source, View
 from apps.viewer.sources import ShotSource, TransientSource, make_cloud
 from tofclip.errors import InputError
 from tofclip.files import format_error_line
@@ -29,20 +29,18 @@ from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT
 
 Picture = NDArray[np.float32]
 
-WALK_REACH_M, WALK_STEPS = 18e-3, 14
-"""How far the person walks to either side, m, and in how many steps."""
+WALK_REACH_M, WALK_STEPS = 18e-3, 14  # to either side
 
 MAX_KEPT_FRAMES = 32
+# pixels brighter than this fraction of a picture's brightest hundredth are points of the scene
 BRIGHT_FRACTION, WHITE_QUANTILE = 0.2, 0.99
-"""Pixels brighter than this fraction of a picture's brightest hundredth are points of the scene."""
 
 STOP_TIMEOUT_S = 20.0
 
 ONE_CAMERA, ONE_CAMERA_GATED = "one camera", "one camera behind the gate"
 CLIP_GATED, TRUTH = "ToF-CLIP behind the gate", "truth, no occluder"
 ALL_LIGHT = "all light"
-SHOWN_SIDE_PX, GAP_PX = 192, 6
-"""Of the pictures beside the scene, and between two of them."""
+SHOWN_SIDE_PX, GAP_PX = 192, 6  # of the pictures beside the scene, and between two of them
 
 
 @dataclass(frozen=True)
@@ -56,11 +54,8 @@ class WalkFrame:
 
 class WalkSource(Source):
     """A person walks to and fro behind an occluder. Each step is flashed, measured and recovered as
-    fast as the machine can, at the occluder's width and the gate that the sliders say.
-
-    `settings`: of the camera.
-
-    Memory: the last 32 steps.
+    fast as the machine can, at the occluder's width and the gate that the sliders say; the last 32
+    are kept.
     """
 
     def __init__(self, scene: OcclusionScene, settings: ExperimentSettings) -> None:
@@ -98,37 +93,19 @@ class WalkSource(Source):
         return self._count
 
     @property
-    def oldest(self) -> int:
-        return self._count - len(self._frames)
-
-    @property
-    def is_live(self) -> bool:
-        return self._thread.is_alive()
-
-    @property
-    def data_rate(self) -> float:
-        return 1 / self._seconds if self.is_live else 0.0
-
-    @property
-    def latency(self) -> float:
-        return self._seconds
-
-    @property
-    def failure_text(self) -> str:
-        return self._failure_text
+    def inflow(self) -> Inflow:
+        is_live = self._thread.is_alive()
+        rate = 1 / self._seconds if is_live else 0.0
+        oldest = self._count - len(self._frames)
+        return Inflow(oldest, is_live, rate, self._seconds, failure_text=self._failure_text)
 
     def describe_frame(self, number: int) -> str:
-        """Say what the formula of the inactive region promises."""
         return self._find_frame(number).description
 
     def view(self, number: int) -> View:
         return self._find_frame(number).view
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, Picture]:
-        """Return what one camera sees beside what CLIP sees; see `Source`.
-
-        `gate`: not used: the gate is one of the settings. Returns two beside each other in each.
-        """
         pictures = self._find_frame(number).pictures
         return {
             f"{left} | {right}": pair_pictures(pictures[left], pictures[right])
@@ -166,37 +143,27 @@ class WalkSource(Source):
 
 
 def look_behind(experiment: Experiment, opens: float) -> WalkFrame:
-    """Measure a scene and recover what stands before and behind a gate.
-
-    `opens`: distance from which on light passes the gate, m.
-    """
+    """Measure a scene and recover what stands before and behind a gate that opens at a distance, m."""
     measurements = experiment.measurements
     front, behind, distances = separate_at(measurements, opens)
     middle = experiment.pictures[len(experiment.pictures) // 2]
-    cut = int(
-        np.searchsorted(
-            measurements.time_axis.times,
-            float(measurements.rig.compute_flight_time(np.array([opens]))[0]),
-        )
-    )
+    opens_at = float(measurements.rig.compute_flight_time(np.array([opens]))[0])
+    cut = int(np.searchsorted(measurements.time_axis.times, opens_at))
     pictures = {
         ONE_CAMERA: middle.sum(axis=-1),
         ONE_CAMERA_GATED: middle[..., cut:].sum(axis=-1),
         CLIP_GATED: behind,
         TRUTH: experiment.truth,
     }
-    layers = [front, behind]
-    view = _place_pictures(measurements.rig.array, layers, distances)
+    view = _place_pictures(measurements.rig.array, [front, behind], distances)
     return WalkFrame(view, pictures, describe_region(experiment.scene))
 
 
 def separate_at(
     measurements: TimedMeasurements, opens: float
 ) -> tuple[Picture, Picture, tuple[float, float]]:
-    """Recover what sends light back before a gate opens, and after.
-
-    `opens`: distance from which on light passes the gate, m. Returns `front, behind` (rows,
-    columns): dark where no light came; `distances`: of both, m; `opens` for one that is dark.
+    """Recover what sends light back before a gate opens, and after: two pictures (rows, columns),
+    dark where no light came, and the distances of both, m; `opens` for one that is dark.
     """
     returns = measurements.split_returns(opens)
     found = separate_occluder(measurements, returns=returns)
@@ -209,10 +176,7 @@ def separate_at(
 
 
 def pair_pictures(left: Picture, right: Picture) -> Picture:
-    """Put two pictures of one shape beside each other, each at its own brightness.
-
-    `left, right` (rows, columns). Returns (n, m): enlarged, so that they can be looked at.
-    """
+    """Put two pictures of one shape beside each other, enlarged, each at its own brightness."""
     times = max(1, SHOWN_SIDE_PX // max(left.shape))
     parts = [
         np.maximum(one, 0) / max(float(np.quantile(one, 0.997)), 1e-12) for one in (left, right)
@@ -287,28 +251,9 @@ class GatedSource(Source):
         return 1 if isinstance(self._shots, TransientSource) else len(self._shots)
 
     @property
-    def oldest(self) -> int:
-        return min(self._shots.oldest, len(self) - 1)
-
-    @property
-    def is_live(self) -> bool:
-        return self._shots.is_live
-
-    @property
-    def data_rate(self) -> float:
-        return self._shots.data_rate
-
-    @property
-    def latency(self) -> float:
-        return self._shots.latency
-
-    @property
-    def lost(self) -> int:
-        return self._shots.lost
-
-    @property
-    def failure_text(self) -> str:
-        return self._shots.failure_text
+    def inflow(self) -> Inflow:
+        inflow = self._shots.inflow
+        return replace(inflow, oldest=min(inflow.oldest, len(self) - 1))
 
     def view(self, number: int) -> View:
         whole = self._shots.view(number)
@@ -317,10 +262,6 @@ class GatedSource(Source):
         return View(select_points(whole.cloud, behind), pixels)
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, Picture]:
-        """Return all light, as a camera without time of flight has it, and what passes the gate.
-
-        `gate`: not used: the gate is one of the settings. Returns both beside each other.
-        """
         frames = self._recover(number)
         distance: Any = SPEED_OF_LIGHT * frames.times / 2
         behind = frames.values[distance >= self._gate.value].sum(axis=0)

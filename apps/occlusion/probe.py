@@ -40,14 +40,9 @@ from tofclip.solvers import TotalVariation
 
 Array = NDArray[Any]
 
-DISTANCE_FACTORS = (0.8, 1.2, 2.0)
-"""Distances behind the occluder, in lengths of the inactive region."""
-
-TARGET_WIDTH_FRACTION = 0.15
-"""Of the occluder's; the umbra is 0.2 of it wide at 0.8 of its length."""
-
-MIN_CORRELATION = 0.8
-"""Correlation with the unoccluded truth from which on a target counts as recovered."""
+DISTANCE_FACTORS = (0.8, 1.2, 2.0)  # behind the occluder, in lengths of the inactive region
+TARGET_WIDTH_FRACTION = 0.15  # of the occluder's; the umbra is 0.2 of it wide at 0.8 of its length
+MIN_CORRELATION = 0.8  # with the unoccluded truth: from there on a target counts as recovered
 
 VIEW_COUNT = 7
 PICTURE_PX = 48
@@ -94,35 +89,27 @@ class ProbeResult:
 def probe_target(
     occluder: tuple[Body, ...], region: InactiveRegion, factor: float, seed: int = 0
 ) -> ProbeResult:
-    """Put a target behind an occluder and try to recover it.
-
-    `region`: of the occluder's solid part on the axis; it must have an end; `factor`: where the
-    target stands, in lengths of the region behind the occluder; `seed`: of the line angles and the
-    photons.
+    """Put a target behind an occluder, at `factor` lengths of its region, which must have an end,
+    and try to recover it; `seed`: of the line angles and the photons.
     """
     distance = region.distance + factor * region.length
     width = TARGET_WIDTH_FRACTION * region.width
-    rig = _make_rig(region, distance, width, seed)
-    target = Body(
-        Rectangle(width, width),
-        Lambertian(cut_pattern(make_letter("L"), make_plain_pattern(0.9))),
-        np.array([0.0, 0.0, distance]),
-    )
-    gate = _make_gate(rig, region.distance, distance)
+    focal_length_px = distance * TARGET_PX / width
+    rig = _make_rig(region, PICTURE_PX, focal_length_px, distance, 2, seed)
+    letter = Lambertian(cut_pattern(make_letter("L"), make_plain_pattern(0.9)))
+    target = Body(Rectangle(width, width), letter, np.array([0.0, 0.0, distance]))
+    # one bin about the target's return that opens halfway from the occluder's
+    near, far = rig.compute_flight_time(np.array([region.distance, distance]))
+    gate = TimeAxis(float(far), float(min(far - near, MAX_GATE_S)), 1, PULSE_FWHM_S)
     hidden, free = (
         render_flash(PulsedScene(bodies, rig.lamps), rig.array, gate)
         for bodies in ((target, *occluder), (target,))
     )
-    picture, views = _recover_target(
-        rig,
-        measure_views(hidden, rig, gate).values,
-        measure_views(free, rig, gate).values.max(),
-        seed,
-    )
+    light, unoccluded = (measure_views(one, rig, gate).values for one in (hidden, free))
+    picture, views = _recover_target(rig, light, unoccluded.max(), seed)
     truth = free[VIEW_COUNT // 2, :, :, 0]
-    return ProbeResult(
-        distance, factor, correlation_coefficient(picture, truth), views, picture, truth
-    )
+    correlation = correlation_coefficient(picture, truth)
+    return ProbeResult(distance, factor, correlation, views, picture, truth)
 
 
 def probe_with_fixed_camera(
@@ -136,23 +123,17 @@ def probe_with_fixed_camera(
     the board fills the picture; what is judged is a strip of it, as wide as the target of
     `probe_target`, whose pattern has nothing to do with that beside it.
 
-    `occluder`: upright, and so tall that no view sees its ends; `factor`: as of `probe_target`;
-    `seeds`: shots of one scene, with line angles and photons of their own. Returns one for each
+    The occluder is upright, and so tall that no view sees its ends. Returns one result for each
     seed, its pictures those of the strip; a correlation of 0 where no second return was found.
     """
     distance = region.distance + factor * region.length
     width = TARGET_WIDTH_FRACTION * region.width
     focal_length_px = FIXED_PICTURE_PX / FIXED_FIELD_OF_VIEW_RAD
-    array = CameraArray(
-        (FIXED_PICTURE_PX, FIXED_PICTURE_PX),
-        VIEW_COUNT,
-        focal_length_px,
-        region.baseline / (VIEW_COUNT - 1),
-        focus=FIXED_FOCUS_M,
-        samples=1,
-        view_rows=1,
-    )
-    lamps = np.stack([array.position((v, u)) for v, u in array.views])
+    rigs = [
+        _make_rig(region, FIXED_PICTURE_PX, focal_length_px, FIXED_FOCUS_M, 1, seed)
+        for seed in range(seeds)
+    ]
+    array, lamps = rigs[0].array, rigs[0].lamps
     sweep = TimeAxis.for_ranges(
         region.distance - RANGE_MARGIN_M,
         distance + RANGE_MARGIN_M,
@@ -165,17 +146,17 @@ def probe_with_fixed_camera(
     free = render_flash_view(PulsedScene((board,), lamps), array, sweep, (0.0, 0.0)).sum(axis=-1)
     half, axis = int(focal_length_px * width / distance / 2), FIXED_PICTURE_PX // 2
     strip = slice(axis - half, axis + half + 1)
-    truth, found = free[:, strip], []
-    for seed in range(seeds):
-        clean = measure_views(pictures, Rig(array, lamps, CameraSetup("line", 1.0, seed)), sweep)
+    truth, results = free[:, strip], []
+    for seed, rig in enumerate(rigs):
+        clean = measure_views(pictures, rig, sweep)
         per_unit = PEAK_PHOTONS / float(clean.values.max())
         dark = np.float32(FIXED_BACKGROUND_PHOTONS / per_unit)
         noise = np.random.default_rng([seed, 4])
         noisy = add_poisson_noise(clean.values + dark, per_unit, noise) - dark
         picture = separate_occluder(replace(clean, values=noisy)).target[:, strip]
         correlation = correlation_coefficient(picture, truth)
-        found.append(ProbeResult(distance, factor, correlation, VIEW_COUNT, picture, truth))
-    return found
+        results.append(ProbeResult(distance, factor, correlation, VIEW_COUNT, picture, truth))
+    return results
 
 
 def _make_board(cell_width: float, side: float, distance: float) -> Body:
@@ -189,24 +170,26 @@ def _make_board(cell_width: float, side: float, distance: float) -> Body:
     )
 
 
-def _make_rig(region: InactiveRegion, distance: float, width: float, seed: int) -> Rig:
-    """A row of views as long as the baseline, aimed at the target, a lamp beside each."""
-    step = region.baseline / (VIEW_COUNT - 1)
-    shape = (PICTURE_PX, PICTURE_PX)
+def _make_rig(
+    region: InactiveRegion,
+    side_px: int,
+    focal_length_px: float,
+    focus: float,
+    samples: int,
+    seed: int,
+) -> Rig:
+    """A row of views as long as the baseline, in focus at a distance, a lamp beside each."""
     array = CameraArray(
-        shape, VIEW_COUNT, distance * TARGET_PX / width, step, focus=distance, view_rows=1
+        (side_px, side_px),
+        VIEW_COUNT,
+        focal_length_px,
+        region.baseline / (VIEW_COUNT - 1),
+        focus=focus,
+        samples=samples,
+        view_rows=1,
     )
-    return Rig(
-        array,
-        np.stack([array.position((v, u)) for v, u in array.views]),
-        CameraSetup("line", 1.0, seed),
-    )
-
-
-def _make_gate(rig: Rig, occluder: float, target: float) -> TimeAxis:
-    """One bin about the target's return that opens halfway from the occluder's."""
-    near, far = rig.compute_flight_time(np.array([occluder, target]))
-    return TimeAxis(float(far), float(min(far - near, MAX_GATE_S)), 1, PULSE_FWHM_S)
+    lamps = np.stack([array.position((v, u)) for v, u in array.views])
+    return Rig(array, lamps, CameraSetup("line", 1.0, seed))
 
 
 def _recover_target(rig: Rig, light: Array, brightest: float, seed: int) -> tuple[Array, int]:

@@ -13,7 +13,7 @@ import numpy as np
 from apps.viewer.drawing import POINT_STYLE, FramePacer, Points, RateCounter
 from apps.viewer.furniture import draw_furniture
 from apps.viewer.page_text import Status, format_page_title, render_page_html, render_waiting_html
-from apps.viewer.panels import NO_SHADOWS, Controls, ExportPanel, SelectionPanel
+from apps.viewer.panels import NO_SHADOWS, Controls, SelectionPanel, add_export
 from apps.viewer.server import LOOPBACK, start_server, stop_server
 from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.side_pictures import render_pictures
@@ -101,9 +101,7 @@ class Page:
         self._selection_panel = SelectionPanel(
             self.server, session, self.post, self._pictures_panel
         )
-        self._export_panel = ExportPanel(
-            self.server, session, self.post, self._list_views, self.points.drawn_whole
-        )
+        add_export(self.server, session, self.post, self._list_views, self.points.drawn_whole)
         self.server.gui.add_html(render_page_html(session.source.title))
         self._pictures: dict[str, Any] = {}
         self._drawn: DisplayedFrame | None = None
@@ -257,11 +255,8 @@ class Page:
             shown.frame,
             len(source),
             shown.points,
-            source.data_rate,
             self._frames.per_second(now),
-            source.latency,
-            source.lost,
-            source.failure_text,
+            source.inflow,
             float("nan") if times is None else float(times[shown.frame]),
             source.frame_name,
             source.describe_frame(shown.frame),

@@ -5,11 +5,12 @@ escaped.
 from __future__ import annotations
 
 import html
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from apps.viewer.colouring import PALETTE_SIZE, Scale, choose_ticks, load_palette
+from apps.viewer.source import Inflow
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
 GRADIENT_STOPS, LABEL_MARGIN = 24, 0.04
@@ -46,12 +47,8 @@ class Status:
     frame: int
     frames: int
     points: int
-    data_rate: float  # frames per second that come in, and that are sent to the page
-    frame_rate: float  # frames per second that come in, and that are sent to the page
-    # from when a shot was taken until its cloud was there, s; NaN where none comes in
-    cloud_latency: float = float("nan")
-    lost: int = 0  # shots that were taken and are not shown, wherever they were lost
-    failure_text: str = ""
+    frame_rate: float  # frames per second that are sent to the page
+    inflow: Inflow = field(default_factory=Inflow)
     time: float = float("nan")  # time of flight of the frame, s; NaN where frames have none
     frame_name: str = "frame"  # what a frame is: frame, slice, shot or cloud
     depth_text: str = ""  # where a slice lies; empty where frames are not slices
@@ -85,26 +82,26 @@ class Status:
         part = f" ({drawn} drawn)" if drawn < self.points else ""
         lines.append(f"<span id='points'>{self.points}</span> points{part}")
         if self.frames > 1 or self.label == "LIVE":
-            coming = f"data {self.data_rate:.1f}/s, " if self.data_rate > 0 else ""
+            coming = f"data {self.inflow.data_rate:.1f}/s, " if self.inflow.data_rate > 0 else ""
             shown_words = (
                 f"shown {self.frame_rate:.1f}/s" if self.frame_rate > 0 else "standing still"
             )
             lines.append(f"<span id='rates'>{coming}{shown_words}</span>")
-        if self.label == "LIVE" or np.isfinite(self.cloud_latency):
+        if self.label == "LIVE" or np.isfinite(self.inflow.latency):
             delay = (
-                f"{1e3 * self.cloud_latency:.0f} ms"
-                if np.isfinite(self.cloud_latency)
+                f"{1e3 * self.inflow.latency:.0f} ms"
+                if np.isfinite(self.inflow.latency)
                 else "not known yet"
             )
-            lines.append(f"shot to cloud {delay}, {self.lost} dropped")
+            lines.append(f"shot to cloud {delay}, {self.inflow.lost} dropped")
         shown = "".join(f"<div style='{LINE_STYLE}'>{line}</div>" for line in lines)
         shown += "".join(
             f"<div class='note' style='color:#ffb020'>{html.escape(note)}</div>"
             for note in self.notes
         )
         trouble = (
-            f"<div style='color:#e5484d'>{html.escape(self.failure_text)}</div>"
-            if self.failure_text
+            f"<div style='color:#e5484d'>{html.escape(self.inflow.failure_text)}</div>"
+            if self.inflow.failure_text
             else ""
         )
         return f"<div style='{HTML_STYLE}'>{shown}{trouble}</div>"

@@ -182,7 +182,7 @@ def choose_frames(session: Session) -> list[int]:
     source = session.source
     count = len(source)
     pictures = min(MAX_FILM_FRAMES, count, max(1, round(count / source.rate * MAX_FRAME_RATE_HZ)))
-    return [int(frame) for frame in np.linspace(source.oldest, count - 1, pictures).round()]
+    return [int(frame) for frame in np.linspace(source.inflow.oldest, count - 1, pictures).round()]
 
 
 def save_film(

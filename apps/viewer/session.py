@@ -106,7 +106,7 @@ class Session:
         self.filters = Filters(intensity=(least, np.inf)) if least > 0 else Filters()
         self.gate, self.half_gate = GATE_UP_TO_FRAME, HALF_GATE_FRAMES
         self.shear: float | None = None
-        self.following = source.is_live
+        self.following = source.inflow.is_live
         self.picks: list[Pick] = []
         self.max_playing_points: int | None = None
         self._key: tuple[Any, ...] = ()
@@ -124,7 +124,7 @@ class Session:
     @property
     def label(self) -> str:
         """``"LIVE"`` while the newest frame of an instrument is shown, ``"REPLAY"`` otherwise."""
-        return "LIVE" if self.following and self.source.is_live else "REPLAY"
+        return "LIVE" if self.following and self.source.inflow.is_live else "REPLAY"
 
     @property
     def title(self) -> str:
@@ -142,7 +142,7 @@ class Session:
     def play(self) -> None:
         """Run through the frames; a live source from the oldest one that is still there."""
         self.following = False
-        self.clock.play(self.source.oldest, len(self.source))
+        self.clock.play(self.source.inflow.oldest, len(self.source))
 
     def pause(self) -> None:
         """Stand still."""
@@ -152,12 +152,12 @@ class Session:
     def jump(self, frame: int) -> None:
         """Go to a frame."""
         self.following = False
-        self.clock.jump(frame, self.source.oldest, len(self.source))
+        self.clock.jump(frame, self.source.inflow.oldest, len(self.source))
 
     def step(self, frames: int) -> None:
         """Pause, and move by a number of frames, back where it is negative."""
         self.following = False
-        self.clock.step(frames, self.source.oldest, len(self.source))
+        self.clock.step(frames, self.source.inflow.oldest, len(self.source))
 
     def follow(self) -> None:
         """Show the newest frame from now on."""
@@ -170,7 +170,7 @@ class Session:
         """
         if self.following:
             self.clock.position = float(max(0, len(self.source) - 1))
-        frame = self.clock.tick(now, self.source.oldest, len(self.source))
+        frame = self.clock.tick(now, self.source.inflow.oldest, len(self.source))
         display_modes = self.source.display_modes
         key = (
             frame,

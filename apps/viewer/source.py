@@ -87,6 +87,20 @@ class Capabilities:
     shears: tuple[float, float] | None = None
 
 
+@dataclass(frozen=True)
+class Inflow:
+    """What comes into a source while one looks; nothing by default."""
+
+    oldest: int = 0  # first frame that is still there
+    is_live: bool = False  # whether frames are added
+    data_rate: float = 0.0  # frames per second
+    # from when the instrument took a shot, by its own clock where it sends one, until it could be
+    # shown, s; NaN where nothing comes in
+    latency: float = float("nan")
+    lost: int = 0  # shots that were taken and are not shown, wherever they were lost
+    failure_text: str = ""  # what ended it early, in a line
+
+
 @dataclass
 class Source(abc.ABC):
     """A row of frames, numbered from 0."""
@@ -111,36 +125,9 @@ class Source(abc.ABC):
         """Return what is to be seen in frame `number`."""
 
     @property
-    def oldest(self) -> int:
-        """First frame that is still there."""
-        return 0
-
-    @property
-    def is_live(self) -> bool:
-        """Whether frames are added while one looks."""
-        return False
-
-    @property
-    def data_rate(self) -> float:
-        """Frames per second that come in; 0 where nothing does."""
-        return 0.0
-
-    @property
-    def latency(self) -> float:
-        """Time from when the instrument took a live shot, by its own clock where it sends one, until
-        it could be shown, s; NaN where nothing comes in.
-        """
-        return float("nan")
-
-    @property
-    def lost(self) -> int:
-        """Shots that were taken and are not shown, wherever they were lost."""
-        return 0
-
-    @property
-    def failure_text(self) -> str:
-        """What ended a live source early, in a line; empty while all is well."""
-        return ""
+    def inflow(self) -> Inflow:
+        """What comes in while one looks."""
+        return Inflow()
 
     @property
     def refocus_note(self) -> str:
@@ -149,20 +136,16 @@ class Source(abc.ABC):
 
     @property
     def whole_name(self) -> str:
-        """What is shown where it is not one frame but all of them, such as a maximum projection;
-        empty where it is one.
-        """
+        """What is shown where it is all frames, such as a maximum projection; empty where it is one."""
         return ""
 
     def describe_frame(self, number: int) -> str:
-        """Say in a few words what frame `number` is, beyond its time; empty where there is nothing to
-        say.
-        """
+        """Say in a few words what frame `number` is, beyond its time, if anything."""
         return ""
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
         """Return pictures of frame `number`, or of a transient's gate, by name: "streak",
-        "intensity", "depth" (m).
+        "intensity", "depth" (m, NaN where there is none).
         """
         return {}
 

@@ -39,19 +39,14 @@ if TYPE_CHECKING:
     from tofclip.shots import Streak
 
 
+# quick enough for shots that come one after the other, and to refocus by
 LOOK_METHODS = ("tv", "l1", "linear", "adjoint")
-"""Quick enough for shots that come one after the other, and to refocus by."""
-
-SURFACES = "surfaces"
-"""Takes some ten seconds, for which a single shot has the time."""
-
+SURFACES = "surfaces"  # takes some ten seconds, for which a single shot has the time
+# enough to read what is written on a surface; `tofclip recover` takes 40
 FIRST_LOOK_METHOD, FIRST_LOOK_ITERATIONS = "l1", 25
-"""Enough to read what is written on a surface; `tofclip recover` takes 40."""
-
+# Refinements of a camera whose sweep the shot itself has to tell; `tofclip recover` takes up to ten,
+# which is most of its time. Two leave 0.2 rows and 0.6 px of them on a recorded shot: no letter moves.
 FIRST_LOOK_ROUNDS = 2
-"""Refinements of a camera whose sweep the shot itself has to tell; `tofclip recover` takes up to ten,
-which is most of its time. Two leave 0.2 rows and 0.6 px of them on a recorded shot: no letter moves.
-"""
 
 FIRST_LOOK_NOTE = (
     f"quick look ({FIRST_LOOK_METHOD}, {FIRST_LOOK_ITERATIONS} iterations); "
@@ -74,8 +69,8 @@ class ShotOptions:
     method: str | None = None
 
 
+# called with what is about to be done, before it takes seconds
 Announce = Callable[[str], None]
-"""Called with what is about to be done, before it takes seconds."""
 
 
 def announce_nothing(_: str) -> None:
@@ -136,8 +131,11 @@ def _open_hdf5(path: Path, options: ShotOptions, announce: Announce) -> Source:
         return CloudSource(path.name, [path])
     if record.kind == "streak":
         return _open_shots(path.name, [partial(_read_shot, path, options)], options, announce)
+    verb = {"camera": "tofclip info", "capture": "tofclip nlos reconstruct"}.get(record.kind)
+    advice = f"; {verb} reads it" if verb else ""
     raise FileFormatError(
-        path, f"holds a {record.kind} record; frames, clouds, volumes and shots can be looked at"
+        path,
+        f"holds a {record.kind} record; frames, clouds, volumes and shots can be looked at{advice}",
     )
 
 

@@ -1,16 +1,5 @@
-"""Recovery while one looks, at any shear: by the linear inverse, each prepared once, or by a method of
-iterations.
-
-Point clouds in files, one or many in a row.
-
-The recovered frames of one shot: a cloud that grows while light travels.
-
-Raw streak images in a row, recovered as they are looked at.
-
-Hidden volumes: bright voxels, their surface, their brightest depth, or slice after slice; and those
-that come in while one looks.
-
-Shots that come in while one looks.
+"""What can be looked at: clouds in files; the recovered frames of one shot, refocused at any shear;
+raw shots, recovered as they are looked at, from files or while they come in; hidden volumes.
 """
 
 from __future__ import annotations
@@ -19,7 +8,7 @@ import abc
 import functools
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -40,12 +29,12 @@ from apps.viewer.source import (
     DisplayModes,
     FloatArray,
     Gate,
+    Inflow,
     Source,
     TriangleMesh,
     View,
     Waveform,
     list_camera_notes,
-    make_empty_cloud,
 )
 from devices.shot_stream import TrackedShots
 from nlos import Volume
@@ -64,31 +53,24 @@ from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Frames, Streak
-from tofclip.solvers import LinearInverse, Method, PreparedInverse
+from tofclip.solvers import LinearInverse, Method
 from tofclip.storage import Record
 from tofclip.units import SPEED_OF_LIGHT
 
 Readings = NDArray[np.float32]
 
-SHEAR_LIMITS = (-3.0, 3.0)
-"""Pixels per view step between which a picture can be refocused."""
-
+SHEAR_LIMITS = (-3.0, 3.0)  # pixels per view step between which a picture can be refocused
+# of the strongest return of its pixel; weaker ones before it are mostly rays, which would hide it
 MIN_PIXEL_SHARE = 0.3
-"""Of the strongest return of its pixel; weaker ones before it are mostly rays, which would hide it."""
-
-MIN_FRAMES = 3
-"""Without a neighbour on either side no return is located."""
+MIN_FRAMES = 3  # without a neighbour on either side no return is located
 
 
 class ShotRecovery:
     """Turns the measurements of one camera into frames, at any shear.
 
-    `times` (frames,): time of flight of each column of measurements, s; `method`: the linear
-    inverse by default.
-
-    Memory of the linear inverse: one operator and one matrix (columns, columns) for each of the last
-    16 shears, which every recovery of this process shares (`tofclip.sequences.cache`). Safe to share
-    by threads.
+    `times` (frames,): time of flight of each column of measurements, s. By default the linear
+    inverse: one operator and one matrix (columns, columns) for each of the last 16 shears, which
+    every recovery of this process shares. Safe to share by threads.
     """
 
     def __init__(self, camera: Camera, times: FloatArray, method: Method | None = None) -> None:
@@ -102,14 +84,13 @@ class ShotRecovery:
         return isinstance(self.method, LinearInverse)
 
     def frames(self, measurements: Readings, shear: float, gate: Gate) -> Frames:
-        """Recover the frames of a gate.
-
-        `measurements` (columns, frames): rectified, of the whole shot; `shear`: pixels per view
-        step.
-        """
+        """Recover the frames of a gate from the rectified measurements (columns, frames) of a shot."""
         part = np.ascontiguousarray(measurements[:, gate.frames])
         if self.is_linear:
-            found = self._prepare_inverse(shear).recover(part).frames
+            # Rounded, because sliders give numbers that differ by rounding only.
+            operator = self._cached_camera.operator(round(shear, 6))
+            inverse = prepare_inverse(LinearInverse(), operator, ~self.camera.dead_columns)
+            found = inverse.recover(part).frames
         elif part.max(initial=0.0) > 0:
             valid = np.broadcast_to(~self.camera.dead_columns[:, np.newaxis], part.shape)
             found = self.method.recover(self.camera.operator(shear), part, valid).frames
@@ -123,21 +104,13 @@ class ShotRecovery:
     ) -> View:
         """Recover the frames of a gate and locate their returns.
 
-        `measurements, shear, gate`: as for `frames`; `least_intensity`: weaker returns are left
-        out: a threshold relative to the gate would find noise in a dark one. Counts, referred to 1
-        m.
+        `least_intensity`, counts, referred to 1 m: weaker returns are left out: a threshold
+        relative to the gate would find noise in a dark one.
         """
-        found = make_view(depth(self.frames(measurements, shear, self._widen_gate(gate))))
-        return found if least_intensity <= 0 else select_brighter(found, least_intensity)
-
-    def _widen_gate(self, gate: Gate) -> Gate:
         first = max(0, min(gate.first, self.times.size - MIN_FRAMES))
-        return Gate(first, max(gate.stop, first + MIN_FRAMES))
-
-    def _prepare_inverse(self, shear: float) -> PreparedInverse:
-        # Rounded, because sliders give numbers that differ by rounding only.
-        operator = self._cached_camera.operator(round(shear, 6))
-        return prepare_inverse(LinearInverse(), operator, ~self.camera.dead_columns)
+        widened = Gate(first, max(gate.stop, first + MIN_FRAMES))
+        view = make_view(depth(self.frames(measurements, shear, widened)))
+        return view if least_intensity <= 0 else select_brighter(view, least_intensity)
 
 
 def list_recovery_notes(recovery: ShotRecovery) -> tuple[str, ...]:
@@ -147,10 +120,7 @@ def list_recovery_notes(recovery: ShotRecovery) -> tuple[str, ...]:
 
 
 def make_view(returns: Returns, cloud: PointCloud | None = None) -> View:
-    """Return the points of returns and which pixel saw them.
-
-    `cloud`: of these returns, where they have been placed in space already.
-    """
+    """Return the points of returns and which pixel saw them; `cloud`: of these, where it is known."""
     points = point_cloud(returns) if cloud is None else cloud
     return View(points, np.stack([returns.y, returns.x], axis=-1))
 
@@ -158,29 +128,21 @@ def make_view(returns: Returns, cloud: PointCloud | None = None) -> View:
 def find_min_intensity(whole: PointCloud) -> float:
     """Return the intensity below which a return of a shot does not count, as `Detection` has it for
     all of its frames.
-
-    `whole`: of all frames.
     """
-    light = whole.intensity
-    return (
-        float(np.quantile(light, SCENE_BRIGHTNESS_QUANTILE)) * Detection().min_scene_fraction
-        if light.size
-        else 0.0
-    )
+    if not whole.intensity.size:
+        return 0.0
+    scene = float(np.quantile(whole.intensity, SCENE_BRIGHTNESS_QUANTILE))
+    return scene * Detection().min_scene_fraction
 
 
 def select_brighter(view: View, intensity: float) -> View:
-    """Return the points with a minimum number of counts.
-
-    `intensity`: counts.
-    """
+    """Return the points with a minimum number of counts."""
     return _select(view, view.cloud.intensity >= intensity)
 
 
 def leave_out_rays(view: View) -> View:
-    """Return a view without dim points: of the whole scene, and beside a brighter one of their pixel.
-
-    `view`: of all frames, with pixels.
+    """Return a view without dim points: of the whole scene, and beside a brighter one of their
+    pixel.
     """
     found = select_brighter(view, find_min_intensity(view.cloud))
     if found.pixels is None or len(found.cloud) == 0:
@@ -201,17 +163,14 @@ MAX_CACHED_CLOUDS = 32
 
 
 class CloudSource(Source):
-    """Clouds in files, shown one after the other.
-
-    `paths`: in order.
-
-    Memory: the last 32 clouds looked at.
-    """
+    """Clouds in files, shown one after the other; the last 32 looked at stay in memory."""
 
     def __init__(self, title: str, paths: Sequence[Path]) -> None:
         super().__init__(title, CLOUD_RATE_HZ, frame_name="cloud")
         self._paths = list(paths)
-        self._cache: OrderedDict[int, View] = OrderedDict()
+        self._read = functools.lru_cache(MAX_CACHED_CLOUDS)(
+            lambda number: View(read_cloud(self._paths[number]))
+        )
         if not self._paths:
             raise InputError(f"{title}: there is no cloud to show")
         cloud = self.view(0).cloud
@@ -228,12 +187,7 @@ class CloudSource(Source):
         return self._paths[number].name if len(self._paths) > 1 else ""
 
     def view(self, number: int) -> View:
-        if number not in self._cache:
-            self._cache[number] = View(read_cloud(self._paths[number]))
-            if len(self._cache) > MAX_CACHED_CLOUDS:
-                # The entry that was read first.
-                self._cache.popitem(last=False)
-        return self._cache[number]
+        return self._read(number)
 
 
 def find_clouds(folder: Path) -> list[Path]:
@@ -281,9 +235,9 @@ def _place_pixels(picture: Record) -> PointCloud:
 
 
 def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) -> PointCloud:
-    """Make a cloud of positions; what is not known follows from them, or is 0.
+    """Make a cloud of positions (n, 3), m; columns that are not known follow from them, or are 0.
 
-    `xyz` (n, 3): m; `known`: columns by their names; ``"brightness"`` counts as intensity.
+    ``"brightness"`` counts as intensity.
     """
     known = known or {}
     distance = np.linalg.norm(xyz, axis=1)
@@ -301,8 +255,7 @@ def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) 
     return PointCloud(xyz=xyz, **columns)
 
 
-PLAY_TIME_S = 12.0
-"""A whole transient at natural speed."""
+PLAY_TIME_S = 12.0  # a whole transient at natural speed
 
 
 class TransientSource(Source):
@@ -312,10 +265,8 @@ class TransientSource(Source):
     the camera predicts them from the frames, which explain the measured ones but for the recovery's
     residual.
 
-    `measurements` (columns, frames): rectified measurements from which the frames were recovered;
-    `method`: of a refocus; the linear inverse by default.
-
-    Memory: the frames, and on the first refocus their measurements (columns, frames).
+    `measurements` (columns, frames): rectified, of the frames; `method`: of a refocus; the linear
+    inverse by default.
     """
 
     def __init__(
@@ -348,10 +299,6 @@ class TransientSource(Source):
         return self.frames
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
-        """Return streak image, intensity in a gate and depth; see `Source`.
-
-        `number`: not used: the gate says which frames are shown. Returns depth in m.
-        """
         distance = np.maximum(self.frames.times[gate.frames], 0) * SPEED_OF_LIGHT / 2
         # As the intensity of a point, referred to 1 m: far objects would be lost beside near ones.
         light = np.tensordot((distance**2).astype(np.float32), self.frames.values[gate.frames], 1)
@@ -363,27 +310,17 @@ class TransientSource(Source):
 
     @property
     def refocus_note(self) -> str:
-        """What is said while a refocus is shown."""
         return LINEAR_NOTE if self._recovery.is_linear else ""
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
-        """Return the signal of a pixel; see `Source`.
-
-        `number`: not used: the signal runs through all frames; `pixel`: row and column.
-        """
         row, column = pixel
         return Waveform(self.frames.times, self.frames.values[:, row, column])
 
     def refocus(self, number: int, shear: float, gate: Gate) -> View:
-        """Recover the frames of a gate at another shear; see `Source`.
+        least = find_min_intensity(self._full_view.cloud)
+        return self._recovery.view(self._measurements, shear, gate, least)
 
-        `number`: not used; `shear`: pixels per view step.
-        """
-        return self._recovery.view(
-            self._measurements, shear, gate, find_min_intensity(self._full_view.cloud)
-        )
-
-    @functools.cached_property
+    @cached_property
     def _full_view(self) -> View:
         # Surfaces were found with their points; frames are searched for theirs.
         if self.frames.returns is not None:
@@ -391,7 +328,7 @@ class TransientSource(Source):
         # Of these the dim ones, rays that few views leave around bright things, would hide the others.
         return leave_out_rays(make_view(depth(self.frames)))
 
-    @functools.cached_property
+    @cached_property
     def _measurements(self) -> Readings:
         """What the camera read or would read, (columns, frames); neighbouring frames of one shear
         share an operator.
@@ -410,10 +347,7 @@ class TransientSource(Source):
 
 
 def render_depth(view: View, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Return the range of each pixel's most intense return, m; NaN where nothing came back.
-
-    `shape`: rows and columns of the camera's picture. Returns (rows, columns).
-    """
+    """Return the range of each pixel's most intense return, m; NaN where nothing came back."""
     picture = np.full(shape, np.nan, np.float32)
     if view.pixels is not None:
         upwards = np.argsort(view.cloud.intensity, kind="stable")  # the last one written wins
@@ -429,8 +363,7 @@ MAX_CACHED_VIEWS = 16
 class ShotSource(Source):
     """Shots of one camera, wherever they come from; frame `n` is the cloud of shot `n`.
 
-    `camera`: with its sweep; `row_times` (rows,): instant of each row, s; `method`: the linear
-    inverse by default.
+    `row_times` (rows,): instant of each row, s; `method`: the linear inverse by default.
     """
 
     def __init__(
@@ -448,7 +381,9 @@ class ShotSource(Source):
             frame_name="shot",
             notes=list_recovery_notes(self.recovery),
         )
-        self._views: OrderedDict[int, View] = OrderedDict()
+        self._recover_view = functools.lru_cache(MAX_CACHED_VIEWS)(
+            lambda number: self.recovery.view(self.measurements(number), 0.0, self._full_gate)
+        )
 
     @cached_property
     def rectifier(self) -> Rectifier:
@@ -464,25 +399,18 @@ class ShotSource(Source):
         return self.rectifier.measure(streak.counts, streak.saturated).values
 
     def view(self, number: int) -> View:
-        if number not in self._views:
-            self._views[number] = self.recovery.view(
-                self.measurements(number), 0.0, self._full_gate
-            )
-            if len(self._views) > MAX_CACHED_VIEWS:
-                self._views.popitem(last=False)
-        return self._views[number]
+        return self._recover_view(number)
 
     def recover_frames(self, number: int) -> Frames:
         """Return all frames of shot `number`."""
         return self.recovery.frames(self.measurements(number), 0.0, self._full_gate)
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
-        """Return streak image, intensity and depth of shot `number`; see `Source`.
-
-        `gate`: not used: a shot is shown as a whole. Returns depth in m.
-        """
         measurements = self.measurements(number)
-        bright = self.recovery.frames(measurements, 0.0, self._find_bright_gate(measurements))
+        # the 64 frames about the brightest one: a picture of all would cost as much as the cloud
+        brightest = int(measurements.sum(axis=0).argmax())
+        about = Gate(max(0, brightest - 32), min(int(self.recovery.times.size), brightest + 32))
+        bright = self.recovery.frames(measurements, 0.0, about)
         return {
             "streak": measurements.T,
             "intensity": bright.values.sum(axis=0),
@@ -490,37 +418,19 @@ class ShotSource(Source):
         }
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
-        """Return the signal of a pixel over the whole shot; see `Source`.
-
-        `pixel`: row and column.
-        """
         frames = self.recover_frames(number)
         return Waveform(frames.times, frames.values[:, pixel[0], pixel[1]].copy())
 
     def refocus(self, number: int, shear: float, gate: Gate) -> View:
-        """Recover shot `number` at another shear; see `Source`.
-
-        `shear`: pixels per view step; `gate`: not used: the whole shot is recovered.
-        """
         return self.recovery.view(self.measurements(number), shear, self._full_gate)
 
     @property
     def _full_gate(self) -> Gate:
         return Gate(0, int(self.recovery.times.size))
 
-    def _find_bright_gate(self, measurements: Readings) -> Gate:
-        """The 64 frames about the brightest one: a picture of all would cost as much as the cloud."""
-        brightest = int(measurements.sum(axis=0).argmax())
-        return Gate(max(0, brightest - 32), min(int(self.recovery.times.size), brightest + 32))
-
 
 class StoredShotSource(ShotSource):
-    """Shots in files, read when they are looked at.
-
-    `shots`: each reads its shot; `camera`: with its sweep; `method`: the linear inverse by default.
-
-    Memory: the measurements of the last shot, and the last 16 clouds.
-    """
+    """Shots in files, each read when it is looked at; the measurements of the last one are kept."""
 
     def __init__(
         self,
@@ -552,21 +462,15 @@ PLAY_TIME_S_VOLUME = 8.0
 
 
 class VolumeSource(Source):
-    """A volume; frame `n` is slice `n` in z, which matters where slices are shown.
-
-    Memory: the magnitude of the volume.
-    """
+    """A volume; frame `n` is slice `n` in z, which matters where slices are shown."""
 
     def __init__(self, title: str, volume: Volume) -> None:
         super().__init__(
             title, max(1.0, volume.grid.z.size / PLAY_TIME_S_VOLUME), frame_name="slice"
         )
         can_have_surface = min(volume.grid.shape) > 1 and bool(volume.magnitude.any())
-        names = (
-            (PROJECTION_MODE, VOXEL_MODE, SURFACE_MODE, SLICE_MODE)
-            if can_have_surface
-            else (PROJECTION_MODE, VOXEL_MODE, SLICE_MODE)
-        )
+        surface = (SURFACE_MODE,) if can_have_surface else ()
+        names = (PROJECTION_MODE, VOXEL_MODE, *surface, SLICE_MODE)
         self.display_modes = DisplayModes(names, PROJECTION_MODE)
         self.volume = volume
         self._magnitude = volume.magnitude.astype(np.float32)
@@ -580,7 +484,6 @@ class VolumeSource(Source):
         return "" if self.display_modes.current == SLICE_MODE else self.display_modes.current
 
     def describe_frame(self, number: int) -> str:
-        """Say where a slice lies, or that slices do not matter in this mode."""
         if self.whole_name:
             return f"of all {len(self)} slices"
         return f"z {self.volume.grid.z[number]:.3f} m"
@@ -593,10 +496,6 @@ class VolumeSource(Source):
         return self._views[key]
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
-        """Return brightness and depth of the front view, or of slice `number`; see `Source`.
-
-        `number`: slice in z; `gate`: not used. Returns depth in m, NaN where it is too dark.
-        """
         projection = self.volume.maximum_projection()
         bright = projection.brightness >= self.display_modes.threshold * self._magnitude.max()
         return {
@@ -614,12 +513,9 @@ class VolumeSource(Source):
 
     def _make_view(self, number: int) -> View:
         if self.display_modes.current == SURFACE_MODE:
-            found = self.surface()
-            return View(
-                make_empty_cloud()
-                if found is None
-                else self._make_cloud(found.vertices, np.ones(len(found.vertices)))
-            )
+            mesh = self.surface()
+            vertices = np.empty((0, 3), np.float32) if mesh is None else mesh.vertices
+            return View(self._make_cloud(vertices, np.ones(len(vertices), np.float32)))
         if self.display_modes.current not in self.display_modes.names:
             raise InputError(
                 f"a volume is shown as {', '.join(self.display_modes.names)}, not as '{self.display_modes.current}'"
@@ -650,8 +546,7 @@ class VolumeSource(Source):
         return replace(cloud, range=cloud.xyz[:, 2])
 
 
-BRIGHT_FRACTION = 0.3
-"""Of the brightest voxel: brighter ones are shown."""
+BRIGHT_FRACTION = 0.3  # of the brightest voxel: brighter ones are shown
 
 
 class VolumeFeed(Protocol):
@@ -662,15 +557,11 @@ class VolumeFeed(Protocol):
     failed: int
     ended: threading.Event
 
-    latest: deque[Volume]
-    """The newest alone."""
+    latest: deque[Volume]  # the newest alone
 
 
 class VolumeStreamSource(Source):
-    """The newest volume of a stream; every volume is a frame, and only the last one is kept.
-
-    `feed`: with a volume.
-    """
+    """The newest volume of a stream that has one; every volume is a frame, the last one is kept."""
 
     def __init__(self, title: str, feed: VolumeFeed) -> None:
         super().__init__(title, 1.0, frame_name="volume")
@@ -680,20 +571,10 @@ class VolumeStreamSource(Source):
         return max(self._feed.delivered, 1)
 
     @property
-    def oldest(self) -> int:
-        return len(self) - 1
-
-    @property
-    def is_live(self) -> bool:
-        return not self._feed.ended.is_set()
-
-    @property
-    def latency(self) -> float:
-        return self._feed.latency
-
-    @property
-    def lost(self) -> int:
-        return self._feed.failed
+    def inflow(self) -> Inflow:
+        feed = self._feed
+        is_live = not feed.ended.is_set()
+        return Inflow(len(self) - 1, is_live, latency=feed.latency, lost=feed.failed)
 
     def view(self, number: int) -> View:
         xyz, brightness = self._feed.latest[-1].points(BRIGHT_FRACTION)
@@ -701,11 +582,8 @@ class VolumeStreamSource(Source):
 
 
 MAX_CACHED_SHOTS = 32
-STOP_TIMEOUT_S = 10.0
-"""s for the shot under way and for letting go of the instrument."""
-
-RATE_WINDOW_SHOTS = 8
-"""Arrivals over which the data rate is averaged."""
+STOP_TIMEOUT_S = 10.0  # for the shot under way and for letting go of the instrument
+RATE_WINDOW_SHOTS = 8  # arrivals over which the data rate is averaged
 
 
 class LiveShotSource(ShotSource):
@@ -717,11 +595,8 @@ class LiveShotSource(ShotSource):
     one sees is never late; `lost` counts the others wherever it happened, in the instrument, its
     driver or here.
 
-    `shots`: its end, or a fault of an instrument, ends the source; what came can still be looked
-    at; `camera`: with its sweep; `method`: the linear inverse by default: others take seconds for a
-    shot.
-
-    Memory: the measurements and clouds of 32 shots.
+    The end of `shots`, or a fault of an instrument, ends the source; what came can still be looked
+    at. `method`: the linear inverse by default: others take seconds for a shot.
     """
 
     def __init__(
@@ -755,31 +630,15 @@ class LiveShotSource(ShotSource):
         return self._count
 
     @property
-    def oldest(self) -> int:
-        return self._count - len(self._cache)
-
-    @property
-    def is_live(self) -> bool:
-        return not self._ended
-
-    @property
-    def data_rate(self) -> float:
+    def inflow(self) -> Inflow:
         with self._lock:
-            if len(self._arrivals) < 2 or self._ended:
-                return 0.0
-            return (len(self._arrivals) - 1) / max(self._arrivals[-1] - self._arrivals[0], 1e-9)
-
-    @property
-    def latency(self) -> float:
-        return self._latency
-
-    @property
-    def lost(self) -> int:
-        return self._lost
-
-    @property
-    def failure_text(self) -> str:
-        return self._failure_text
+            rate = 0.0
+            if len(self._arrivals) > 1 and not self._ended:
+                span = self._arrivals[-1] - self._arrivals[0]
+                rate = (len(self._arrivals) - 1) / max(span, 1e-9)
+            oldest = self._count - len(self._cache)
+            state = (self._latency, self._lost, self._failure_text)
+            return Inflow(oldest, not self._ended, rate, *state)
 
     def view(self, number: int) -> View:
         return self._find_entry(number)[1]
@@ -799,28 +658,19 @@ class LiveShotSource(ShotSource):
 
     def _run(self) -> None:
         try:
-            with (
-                ThreadPoolExecutor(1) as worker,
-                closing(
-                    stream_clouds(
-                        self._shots,
-                        self._pipeline,
-                        policy="drop_oldest",
-                        executor=worker,
-                        at_once=1,
-                    )
-                ) as clouds,
-            ):
-                for made in clouds:
-                    # Leaving the loop closes the generator, which stops its threads and the
-                    # instrument.
-                    if self._stopping.is_set():
-                        break
-                    stamp = self._shots.get_stamp(made.shot + 1)  # the first one is shown
-                    self._append_entry(made.measurements, make_view(made.returns, made.cloud))
-                    age = stamp.compute_age()
-                    self._latency = made.latency if age is None else age
-                    self._lost = self._shots.count_dropped(stamp, self._count)
+            with ThreadPoolExecutor(1) as worker:
+                how: Any = {"policy": "drop_oldest", "executor": worker, "at_once": 1}
+                stream = stream_clouds(self._shots, self._pipeline, **how)
+                # closing the generator stops its threads and the instrument
+                with closing(stream) as clouds:
+                    for made in clouds:
+                        if self._stopping.is_set():
+                            break
+                        stamp = self._shots.get_stamp(made.shot + 1)  # the first one is shown
+                        self._append_entry(made.measurements, make_view(made.returns, made.cloud))
+                        age = stamp.compute_age()
+                        self._latency = made.latency if age is None else age
+                        self._lost = self._shots.count_dropped(stamp, self._count)
         except Exception as fault:
             # Whatever ends it is shown on the page: an exception on this thread would be lost.
             self._failure_text = format_error_line(fault)

@@ -92,9 +92,9 @@ def test_a_person_walks_while_one_looks(monkeypatch: pytest.MonkeyPatch) -> None
         assert "nothing is promised" in source.describe_frame(len(source) - 1)
         assert not np.allclose(source.pictures(3, session.gate_at(3))[below], first)
         # Steps come one after the other, each after its wait.
-        assert 0.05 <= source.latency < time.monotonic() - began - 3 * 0.05
-    assert not source.is_live
-    assert source.failure_text == ""
+        assert 0.05 <= source.inflow.latency < time.monotonic() - began - 3 * 0.05
+    assert not source.inflow.is_live
+    assert source.inflow.failure_text == ""
 
 
 def test_a_recording_behind_a_gate(files: Path) -> None:
@@ -132,7 +132,7 @@ def test_the_verb_serves_either(
     assert run(*words, "--recording", files / "streak.h5").status == 0
     walk, recorded = served
     assert walk.source.title == "a person behind a bush, live"
-    assert not walk.source.is_live  # closed when the page is
+    assert not walk.source.inflow.is_live  # closed when the page is
     assert recorded.source.title.endswith("behind a gate")
     for wrong in (
         ("--live", "--out", tmp_path / "made"),

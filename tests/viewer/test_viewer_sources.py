@@ -378,12 +378,10 @@ def test_what_is_shown_is_called_what_it_is(transient: Source) -> None:
     assert of_frames.frame_at(0.0).caption == f"all {last + 1} frames"
     of_frames.jump(5)
     assert of_frames.frame_at(0.0).caption == "frames 0 to 5"
-    status = Status(
-        "REPLAY", 0, 21, 9, 0.0, 0.0, whole_name=VolumeSource("ball", volume()).whole_name
-    )
+    status = Status("REPLAY", 0, 21, 9, 0.0, whole_name=VolumeSource("ball", volume()).whole_name)
     assert "maximum projection" in status.html
     assert "of 21" not in status.html
-    assert "0 of 1" not in Status("REPLAY", 0, 1, 9, 0.0, 0.0, frame_name="cloud").html
+    assert "0 of 1" not in Status("REPLAY", 0, 1, 9, 0.0, frame_name="cloud").html
 
 
 def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
@@ -398,9 +396,9 @@ def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
     source = LiveShotSource("test", chain([streak(0)], shots()), camera())
     session = Session(source)
     deadline = time.monotonic() + 20
-    while source.is_live and time.monotonic() < deadline:
+    while source.inflow.is_live and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert (len(source), source.oldest, source.failure_text) == (3, 0, "nothing came")
+    assert (len(source), source.inflow.oldest, source.inflow.failure_text) == (3, 0, "nothing came")
     assert session.frame_at(0.0).frame == 2
     session.step(-1)
     assert (session.frame_at(0.0).frame, session.following) == (1, False)
@@ -437,29 +435,29 @@ def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPat
     released = time.monotonic()
     go_on.set()
     deadline = released + 20
-    while source.is_live and time.monotonic() < deadline:
+    while source.inflow.is_live and time.monotonic() < deadline:
         time.sleep(0.01)
     ended = time.monotonic()
     # One was being rectified, and one more could wait; on a busy computer that one replaces the
     # other, which is finished and not yet taken.
     assert len(source) in (2, 3)
-    assert len(source) + source.lost == 13
+    assert len(source) + source.inflow.lost == 13
     # Of the last one, which could not be made before `go_on` and was before the end, since it came.
-    assert released - taken <= source.latency <= ended - handed_over
+    assert released - taken <= source.inflow.latency <= ended - handed_over
     source.close()
 
 
 def test_an_instruments_address() -> None:
     source = open_source("sim+remoteex://?seed=1&scene=small&frame_rate=20")
-    assert source.is_live
+    assert source.inflow.is_live
     assert Session(source).label == "LIVE"
     deadline = time.monotonic() + 20
     while len(source) < 3 and time.monotonic() < deadline:
         time.sleep(0.02)
     assert len(source.view(2).cloud) > 100
-    assert source.data_rate > 0
+    assert source.inflow.data_rate > 0
     source.close()
-    assert not source.is_live
+    assert not source.inflow.is_live
 
 
 def test_what_cannot_be_looked_at(tmp_path: Path, folder: Path) -> None:
