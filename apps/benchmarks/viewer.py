@@ -25,8 +25,8 @@ from playwright.sync_api import sync_playwright
 from viser import _messages
 
 from apps.benchmarks.harness import Prepare, PreparedCase
-from apps.viewer.drawing import DetailChooser
 from apps.viewer.page import Page
+from apps.viewer.points import DetailChooser
 from apps.viewer.session import Session
 from apps.viewer.source import Source, View
 from apps.viewer.source_factory import open_source

@@ -31,20 +31,13 @@ if TYPE_CHECKING:
 
 COLUMN_INCHES = 3.2
 TEXT_INCHES = 1.7
+# bounds of a panel's height relative to its width, so that flat and deep boxes stay legible
 MIN_PANEL_ASPECT, MAX_PANEL_ASPECT = 0.25, 1.6
-"""Bounds of a panel's height relative to its width, so that flat and deep boxes stay legible."""
-
-OUTLINE_PIXELS = 400
-"""Along the longer side of a view, for the outline of what is hidden."""
-
-POINT_RADIUS_M = 0.03
-"""m; the circle about a hidden point."""
-
+OUTLINE_PIXELS = 400  # along the longer side of a view, for the outline of what is hidden
+POINT_RADIUS_M = 0.03  # m; the circle about a hidden point
+# by so much of a facet the stairs of slanting edges are smoothed, as a standard deviation
 CORNER_SMOOTHING = 0.5
-"""By so much of a facet the stairs of slanting edges are smoothed, as a standard deviation."""
-
-PlaneAxes = tuple[str, str]
-"""The axes to the right and downwards."""
+PlaneAxes = tuple[str, str]  # the axes to the right and downwards
 
 
 def make_comparison_figure(

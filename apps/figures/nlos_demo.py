@@ -29,17 +29,13 @@ if TYPE_CHECKING:
 
 OUTGOING_COLOUR, RETURN_COLOUR, DEVICE_COLOUR = "#d1495b", "#2e6f95", "#8d949b"
 WALL_COLOUR, INK_COLOUR = "#c9cdd2", "#20242c"
+# x and z, m; the screen stands between the device and everything hidden, and in no way of light
 DEVICE_POSITION_M, SCREEN_X_M, SCREEN_Z_M = (1.65, 0.75), 1.16, (0.68, 1.45)
-"""x and z, m; the screen stands between the device and everything hidden, and in no way of light."""
-
+# x of a wall point and x, z of a hidden point, between which a way of light is drawn, m
 WALL_POINT_X_M, HIDDEN_POINT_M = -0.8, (0.27, 1.15)
-"""x of a wall point and x, z of a hidden point, between which a way of light is drawn, m."""
-
-PANEL_ASPECT = 0.63
-"""Of the panels that hold no image, relative to their width: that of an image."""
-
+PANEL_ASPECT = 0.63  # of the panels that hold no image, relative to their width: that of an image
+# the record is shown from where a row holds this fraction of its brightest bin
 LIT_THRESHOLD = 0.02
-"""The record is shown from where a row holds this fraction of its brightest bin."""
 
 
 def make_demo_figure(run: DemoRun) -> Figure:

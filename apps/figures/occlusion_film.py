@@ -23,9 +23,8 @@ if TYPE_CHECKING:
 
 FRAME_MS, LAST_FRAME_MS = 120, 2500
 DARK_THRESHOLD = 0.02  # of a return's brightest instant: the film passes over fainter ones
+# of a target that walks: how many, how far to either side (m), and how long each is shown
 WALK_STEPS, WALK_REACH_M, WALK_STEP_MS = 14, 18e-3, 180
-"""Of a target that walks: how many, how far to either side (m), and how long each is shown."""
-
 PANEL_LAYOUT = {"left": 0.02, "right": 0.98, "bottom": 0.16, "top": 0.8}
 
 

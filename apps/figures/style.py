@@ -25,14 +25,13 @@ EMPTY_COLOUR = "#20242c"  # where a picture has no value
 LINE_COLOUR = "#3dd6c8"  # drawn over a brightness map
 SMALL_FONT_PT = 8
 DOTS_PER_INCH = 100
+# Colours of pictures with more bytes; 0: all, without transparency. 256 make a quarter of the
+# bytes, off by less than 16 of 255 anywhere; 64 are enough for the greys of many small pictures.
 FEWER_COLOURS = {150_000: 0, 290_000: 256, 600_000: 64}
-"""Colours of pictures with more bytes; 0: all, without transparency. 256 make a quarter of the bytes,
-off by less than 16 of 255 anywhere; 64 are enough for the greys of many small pictures.
-"""
 
 
+# what ticks and labels take at the left, right, bottom and top of a panel
 LABEL_ROOM_INCHES = (0.6, 0.12, 0.45, 0.3)
-"""What ticks and labels take at the left, right, bottom and top of a panel."""
 
 
 def make_figure(width: float, height: float) -> Figure:

@@ -23,10 +23,9 @@ Array = NDArray[Any]
 
 PATCHES_PER_BATCH = 64
 TRAINING_PATCHES = 2000
+# principal components that patches are learnt in: light fields have few, and learning is as much
+# faster
 MAX_COMPONENTS = 256
-"""Principal components that patches are learnt in: light fields have few, and learning is as much
-faster.
-"""
 SPARSITY_WEIGHT = 0.2  # of unit patches
 EPOCHS = 2
 POWER_ITERATIONS = 15

@@ -62,8 +62,8 @@ def view(
     Example: tofclip view frames.h5 --png scene.png
     """
     from apps.viewer.desktop import open_window
-    from apps.viewer.render import choose_renderer
-    from apps.viewer.scene_figure import choose_frames, save_film, save_picture
+    from apps.viewer.still import choose_renderer
+    from apps.viewer.still import choose_frames, save_film, save_picture
     from apps.viewer.session import Session
     from apps.viewer.source_factory import ShotOptions, announce_nothing, open_source
 

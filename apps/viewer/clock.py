@@ -11,8 +11,8 @@ MIN_SPEED, MAX_SPEED = 1 / 16, 16.0
 
 @dataclass
 class PlaybackClock:
-    """Counts frames while it runs; the caller gives the time, in seconds of any steady
-    clock.
+    """Counts frames while it runs; the caller gives the time, in seconds of any steady clock, the
+    `oldest` frame that still exists, and the `count` of frames, one after the last.
     """
 
     rate: float  # frames per second at speed 1
@@ -33,10 +33,7 @@ class PlaybackClock:
         return int(self.position)
 
     def play(self, oldest: int, count: int) -> None:
-        """Run; from the oldest frame on where the last one is reached.
-
-        `oldest`: first frame that still exists; `count`: number after the last frame.
-        """
+        """Run; from the oldest frame on where the last one is reached."""
         if self.frame >= count - 1:
             self.position = float(oldest)
         self.playing, self._last_tick_s = True, None
@@ -46,18 +43,12 @@ class PlaybackClock:
         self.playing = False
 
     def jump(self, frame: int, oldest: int, count: int) -> None:
-        """Go to a frame, or to the nearest that exists.
-
-        `oldest`: first frame that still exists; `count`: number after the last frame.
-        """
+        """Go to a frame, or to the nearest that exists."""
         self.position = float(min(max(frame, oldest), max(count - 1, oldest)))
         self._last_tick_s = None
 
     def step(self, frames: int, oldest: int, count: int) -> None:
-        """Pause, and move by a number of frames, back where it is negative.
-
-        `oldest`: first frame that still exists; `count`: number after the last frame.
-        """
+        """Pause, and move by a number of frames, back where it is negative."""
         self.pause()
         self.jump(self.frame + frames, oldest, count)
 
@@ -66,11 +57,7 @@ class PlaybackClock:
         self.speed = min(max(speed, MIN_SPEED), MAX_SPEED)
 
     def tick(self, now: float, oldest: int, count: int) -> int:
-        """Let time pass and return the frame that is due.
-
-        `now`: seconds of a steady clock; `oldest`: first frame that still exists; `count`: number
-        after the last frame.
-        """
+        """Let time pass and return the frame that is due."""
         # a clock of the machine may be set back
         passed = 0.0 if self._last_tick_s is None else max(0.0, now - self._last_tick_s)
         self._last_tick_s = now

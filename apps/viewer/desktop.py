@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from apps.viewer.render import BACKGROUND, add_to_plotter, has_working_graphics
-from apps.viewer.scene_figure import choose_point_size
 from apps.viewer.session import Session
+from apps.viewer.still import BACKGROUND, add_to_plotter, choose_point_size, has_working_graphics
 from apps.viewer.viewpoint import DOWN, place_viewpoint
 from tofclip.errors import MissingDependencyError
 

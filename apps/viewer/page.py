@@ -10,38 +10,36 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.viewer.drawing import POINT_STYLE, FramePacer, Points, RateCounter
-from apps.viewer.furniture import draw_furniture
-from apps.viewer.page_text import Status, format_page_title, render_page_html, render_waiting_html
-from apps.viewer.panels import NO_SHADOWS, Controls, SelectionPanel, add_export
+from apps.viewer.look import render_pictures
+from apps.viewer.panels import (
+    NO_SHADOWS,
+    Controls,
+    SelectionPanel,
+    Status,
+    add_export,
+    format_page_title,
+    render_page_html,
+    render_waiting_html,
+)
+from apps.viewer.points import POINT_STYLE, FramePacer, Points, RateCounter, draw_furniture
 from apps.viewer.server import LOOPBACK, start_server, stop_server
 from apps.viewer.session import DisplayedFrame, Session
-from apps.viewer.side_pictures import render_pictures
 from apps.viewer.viewpoint import Box, Viewpoint, make_presets, move_camera, place_viewpoint
 from tofclip.errors import TofclipError
 
 if TYPE_CHECKING:
     import viser
 
-TICK_S = 1 / 60
-"""s between two looks at the clock."""
-
+TICK_S = 1 / 60  # s between two looks at the clock
+# s; words, controls and flat pictures need not follow every frame: they cost the browser more than
+# the points do
 STATUS_PERIOD_S, PICTURES_PERIOD_S = 0.25, 0.5
-"""s; words, controls and flat pictures need not follow every frame: they cost the browser more than
-the points do.
-"""
-
+# width over height of the scene between two panels, on a usual screen: until a browser says its own
 SCENE_ASPECT = 0.9
-"""Width over height of the scene between two panels, on a usual screen: until a browser says its own."""
-
 PANEL_PX, PICTURES_PANEL_PX = 352, 240
 
-MANY_POINTS = 10**9
-"""More than any cloud has."""
-
-AMBIENT_INTENSITY = 2.0
-"""Light from everywhere, so that no side of a surface is black."""
-
+MANY_POINTS = 10**9  # more than any cloud has
+AMBIENT_INTENSITY = 2.0  # light from everywhere, so that no side of a surface is black
 SURFACE_COLOUR = (216, 210, 196)
 
 

@@ -12,9 +12,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apps.viewer.clock import PlaybackClock
-from apps.viewer.colouring import Colouring, Scale, colour_points, find_full_light, make_scale
-from apps.viewer.picking import Pick, find_point_on_ray, make_pick, measure_distance
-from apps.viewer.side_pictures import project_front
+from apps.viewer.look import (
+    Colouring,
+    Pick,
+    Scale,
+    colour_points,
+    find_full_light,
+    find_point_on_ray,
+    make_pick,
+    make_scale,
+    measure_distance,
+    project_front,
+)
 from apps.viewer.source import Gate, Source, TriangleMesh, View
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
@@ -60,15 +69,13 @@ GATE_UP_TO_FRAME, GATE_AROUND_FRAME, GATE_ALL_TIMES = (
     "around the frame",
     "all times",
 )
+# which points of a transient are shown: those of light that has come back by now, comes back now,
+# or ever does
 GATE_MODES = (GATE_UP_TO_FRAME, GATE_AROUND_FRAME, GATE_ALL_TIMES)
-"""Which points of a transient are shown: those of light that has come back by now, comes back now,
-or ever does.
-"""
-
 DIM_NOTE = "dim points are left out (filters, intensity)"
 
+# frames on either side of the current one, in the gate `GATE_AROUND_FRAME`, unless set
 HALF_GATE_FRAMES = 12
-"""Frames on either side of the current one, in the gate `GATE_AROUND_FRAME`, unless set."""
 
 
 @dataclass(frozen=True)

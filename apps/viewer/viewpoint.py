@@ -12,18 +12,14 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 
 FIELD_OF_VIEW_RAD = math.radians(35.0)
+# A cloud that fills more than this is looked at from further back than from where it was taken
 MAX_FIELD_OF_VIEW_RAD = math.radians(60.0)
-"""A cloud that fills more than this is looked at from further back than from where it was taken."""
-
+# how far the eye is moved off the camera's place, as seen from the scene's middle: objects do not
+# hide each other more than they did, and depth can be seen
 SIDEWAYS_TILT_RAD, UPWARD_TILT_RAD = math.radians(-1.0), math.radians(0.8)
-"""How far the eye is moved off the camera's place, as seen from the scene's middle: objects do not hide each other
-more than they did, and depth can be seen."""
-
+# room around most points, and around the tips of what sticks out; farther out than by the last
+# factor, points are strays, for which the others are not made small
 VIEW_MARGIN, TIP_MARGIN, MAX_TIP = 1.1, 1.02, 1.3
-"""Room around most points, and around the tips of what sticks out; farther out than by the last factor,
-points are strays, for which the others are not made small.
-"""
-
 DOWN = np.array([0.0, 1.0, 0.0])
 FloatArray = NDArray[np.float64]
 
@@ -75,13 +71,10 @@ class Viewpoint:
         )
 
 
-SCALE_BAR_FRACTION = 0.4
-"""The scale bar is at most as long as this fraction of the box's width."""
-
+SCALE_BAR_FRACTION = 0.4  # the scale bar is at most as long as this fraction of the box's width
+# fractions of the box's depth, from its front: little stands before the scale bar, which farther in
+# front would need much of the window, and neither hides the other's words from any side
 SCALE_BAR_DEPTH, Z_MARK_DEPTH = 0.3, 0.85
-"""Fractions of the box's depth, from its front: little stands before the scale bar, which farther in
-front would need much of the window, and neither hides the other's words from any side.
-"""
 
 
 @dataclass(frozen=True)
@@ -131,8 +124,7 @@ class Box:
         )
 
 
-MAX_NEIGHBOUR_POINTS = 20_000
-"""Points among which neighbours are looked for."""
+MAX_NEIGHBOUR_POINTS = 20_000  # points among which neighbours are looked for
 
 
 def measure_point_spacing(xyz: NDArray[np.float32]) -> float:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from viewer_scenes import plane
 
-from apps.viewer.colouring import (
+from apps.viewer.look import (
     PALETTE_SIZE,
     PALETTES,
     QUANTITIES,
@@ -17,12 +17,14 @@ from apps.viewer.colouring import (
     choose_ticks,
     colour_points,
     find_full_light,
+    find_point_on_ray,
     format_length,
     load_palette,
+    make_pick,
     make_scale,
+    measure_distance,
 )
 from apps.viewer.panels import mark_times
-from apps.viewer.picking import find_point_on_ray, make_pick, measure_distance
 from apps.viewer.session import Filters
 from apps.viewer.source import make_empty_cloud
 from apps.viewer.sources import make_cloud

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from viewer_scenes import PlaneSource
 
-from apps.viewer.drawing import MIN_DRAWN_POINTS, DetailChooser, FramePacer, RateCounter
+from apps.viewer.points import MIN_DRAWN_POINTS, DetailChooser, FramePacer, RateCounter
 from apps.viewer.session import Session
 
 

@@ -12,17 +12,20 @@ from matplotlib.image import imread
 from viewer_scenes import PlaneSource, plane, volume
 
 from apps.viewer import render
-from apps.viewer.render import (
-    BACKGROUND,
-    PyvistaRenderer,
-    RasterRenderer,
-    has_working_graphics,
-    rasterise_points,
-)
-from apps.viewer.scene_figure import PICTURE_SHAPE_PX, SceneFigure, save_film, save_picture
 from apps.viewer.session import Session
 from apps.viewer.source import make_empty_cloud
 from apps.viewer.sources import SURFACE_MODE, VolumeSource, make_cloud
+from apps.viewer.still import (
+    BACKGROUND,
+    PICTURE_SHAPE_PX,
+    PyvistaRenderer,
+    RasterRenderer,
+    SceneFigure,
+    has_working_graphics,
+    rasterise_points,
+    save_film,
+    save_picture,
+)
 from apps.viewer.viewpoint import MAX_FIELD_OF_VIEW_RAD, Viewpoint, place_viewpoint
 from tofclip.errors import InputError, MissingDependencyError
 

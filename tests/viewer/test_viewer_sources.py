@@ -27,9 +27,8 @@ from viewer_scenes import (
     volume,
 )
 
-from apps.viewer.page_text import Status
-from apps.viewer.render import RasterRenderer
-from apps.viewer.scene_figure import SceneFigure
+from apps.viewer.look import project_front, render_pictures
+from apps.viewer.panels import Status
 from apps.viewer.session import (
     DIM_NOTE,
     GATE_ALL_TIMES,
@@ -38,7 +37,6 @@ from apps.viewer.session import (
     Filters,
     Session,
 )
-from apps.viewer.side_pictures import project_front, render_pictures
 from apps.viewer.source import LINEAR_NOTE, NO_TIME_ZERO_NOTE, Gate, Source, View
 from apps.viewer.source_factory import FIRST_LOOK_NOTE, ShotOptions, open_source
 from apps.viewer.sources import (
@@ -51,6 +49,7 @@ from apps.viewer.sources import (
     make_cloud,
     render_depth,
 )
+from apps.viewer.still import RasterRenderer, SceneFigure
 from apps.viewer.viewpoint import Box, measure_point_spacing, place_viewpoint
 from tofclip.camera import registration
 from tofclip.errors import FileFormatError, InputError, StorageError

@@ -1,4 +1,6 @@
-"""The points on the page: how often and in how much detail they are drawn, so that browsers follow."""
+"""What is drawn on the page: the points, as often and in as much detail as browsers can follow; around
+them a box with the lengths of its sides, a scale bar, the axes, and the clip box with its handles.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.viewer.look import format_length
+from apps.viewer.viewpoint import Box
+
 if TYPE_CHECKING:
     import viser
+
 
 Post = Callable[[Callable[[], None]], None]
 POINT_STYLE: dict[str, Any] = {
@@ -23,31 +29,22 @@ POINT_STYLE: dict[str, Any] = {
     "precision": "float32",
 }
 
-RATE_WINDOW_S = 2.0
-"""s over which frames are counted."""
-
+RATE_WINDOW_S = 2.0  # s over which frames are counted
 MAX_FRAMES_PER_S = 30.0
-MAX_POINTS_PER_S = 2e6
-"""What a browser with a software renderer takes without falling behind."""
-
+MAX_POINTS_PER_S = 2e6  # what a browser with a software renderer takes without falling behind
+# smaller clouds are always drawn whole: this number six times a second by software on two cores
 MIN_DRAWN_POINTS = 16_000
-"""Smaller clouds are always drawn whole: this number six times a second by software on two cores."""
-
+# s that a browser may take to draw a large cloud while it moves, and while it stands still:
+# browsers draw what stands still once a second
 MOVING_FRAME_S, STILL_FRAME_S = 0.08, 0.5
-"""s that a browser may take to draw a large cloud while it moves, and while it stands still: browsers
-draw what stands still once a second.
-"""
-
+# A cloud is sent again where more points by this factor could be drawn, or have to be fewer by it
 WORTHWHILE_FACTOR = 1.5
-"""A cloud is sent again where more points by this factor could be drawn, or have to be fewer by it."""
-
+# browsers answer before they have drawn, and up to three frames are under way
 WARM_UP_FRAMES, TIMED_FRAMES = 3, 3
-"""Browsers answer before they have drawn, and up to three frames are under way."""
-
 ANSWER_TIMEOUT_S = 30.0
 
+# s after the last movement at which a large cloud is drawn for one who looks at it
 STILL_AFTER_S = 0.7
-"""s after the last movement at which a large cloud is drawn for one who looks at it."""
 
 
 @dataclass
@@ -279,3 +276,125 @@ class Points:
                 self._send()
                 # of more points the time is known more exactly
                 self._has_to_time = points < self._sent_still
+
+
+BOX_COLOUR, BOX_LINE_PX = (139, 147, 163), 1.0
+SCALE_BAR_COLOUR, SCALE_BAR_PX = (235, 238, 245), 4.0
+CLIP_COLOUR = (255, 176, 32)
+# length of the axes, and of the clip box's handles, of half the box's diagonal
+AXES_FRACTION = 0.12
+# quaternion, w x y z: half a turn after which the arrows at the high corner point into the box
+POINTING_INWARDS = (0.0, 0.5**0.5, -(0.5**0.5), 0.0)
+LABEL_SCALE = 0.9
+AXIS_COLOURS = ((229, 72, 77), (70, 167, 88), (62, 142, 208))
+
+
+def draw_furniture(scene: viser.SceneApi, box: Box) -> list[Any]:
+    """Draw box, scale bar and axes around a cloud.
+
+    `box`: of the cloud. Returns to be shown and hidden together.
+    """
+    drawn: list[Any] = [_add_lines(scene, "/box", box.corners[np.array(box.edges)], BOX_COLOUR)]
+    for name, length_m, place in zip("xyz", box.high - box.low, box.length_marks, strict=True):
+        words = f"{name} {format_length(float(length_m))}"
+        anchor = "top-right" if name == "z" else "top-left"  # z is written at the right
+        drawn.append(_add_label(scene, f"/box_{name}", words, place, anchor))
+    bar = box.scale_bar
+    if (length_m := float(bar[1, 0] - bar[0, 0])) > 0:
+        drawn.append(_add_lines(scene, "/scale", bar[np.newaxis], SCALE_BAR_COLOUR, SCALE_BAR_PX))
+        words = format_length(length_m)
+        drawn.append(_add_label(scene, "/scale_length", words, bar.mean(axis=0), "top-center"))
+    return drawn + _draw_axes(scene, box)
+
+
+def _draw_axes(scene: viser.SceneApi, box: Box) -> list[Any]:
+    """Name x, y and z at the far lower left corner, which is nearly always in the picture; small."""
+    origin = np.array([box.low[0], box.high[1], box.high[2]])
+    ends = origin + _measure_reach(box) * AXES_FRACTION * np.eye(3)
+    drawn = []
+    for axis, (name, colour) in enumerate(zip("xyz", AXIS_COLOURS, strict=True)):
+        ray = np.stack([origin, ends[axis]])[np.newaxis]
+        drawn.append(_add_lines(scene, f"/axes_{name}", ray, colour, 2.0))
+        drawn.append(_add_label(scene, f"/axes_{name}_name", name, ends[axis], "center-center"))
+    return drawn
+
+
+class ClipBox:
+    """A box in the scene whose two opposite corners can be dragged; points outside are not shown.
+
+    `changed`: called with the box after a corner was dragged.
+    """
+
+    def __init__(self, scene: viser.SceneApi, changed: Callable[[Box], None]) -> None:
+        self._scene, self._changed = scene, changed
+        self._handles: list[Any] = []
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether there are handles to drag."""
+        return bool(self._handles)
+
+    def show(self, box: Box) -> None:
+        """Draw the box with its handles."""
+        self._draw_edges(box)
+        corners = {"low": box.low, "high": box.high}
+        turns = {"low": (1.0, 0.0, 0.0, 0.0), "high": POINTING_INWARDS}
+        if self._handles:
+            for handle, corner in zip(self._handles, corners.values(), strict=True):
+                handle.position = corner
+            return
+        for name, corner in corners.items():
+            handle = self._scene.add_transform_controls(
+                f"/clip/{name}",
+                scale=2 * AXES_FRACTION * _measure_reach(box),
+                disable_rotations=True,
+                disable_sliders=True,
+                depth_test=False,
+                position=corner,
+                wxyz=turns[name],
+            )
+            handle.on_update(lambda _: self._report())
+            self._handles.append(handle)
+
+    def hide(self) -> None:
+        """Take the box and its handles away."""
+        for handle in self._handles:
+            handle.remove()
+        self._handles = []
+        if self._scene.get_handle_by_name("/clip/box") is not None:
+            self._scene.remove_by_name("/clip/box")
+
+    def _report(self) -> None:
+        corners = np.stack([np.asarray(handle.position, float) for handle in self._handles])
+        # a corner may be dragged past the other
+        box = Box(corners.min(axis=0), corners.max(axis=0))
+        self._draw_edges(box)
+        self._changed(box)
+
+    def _draw_edges(self, box: Box) -> None:
+        _add_lines(self._scene, "/clip/box", box.corners[np.array(box.edges)], CLIP_COLOUR)
+
+
+def _measure_reach(box: Box) -> float:
+    return max(float(np.linalg.norm(box.high - box.low)) / 2, 0.01)
+
+
+def _add_lines(
+    scene: viser.SceneApi,
+    name: str,
+    ends: NDArray[Any],
+    colour: tuple[int, int, int],
+    width_px: float = BOX_LINE_PX,
+) -> Any:
+    points = ends.astype(np.float32)
+    return scene.add_line_segments(
+        name, points, colour, thickness=width_px, thickness_units="screen"
+    )
+
+
+def _add_label(
+    scene: viser.SceneApi, name: str, text: str, position: NDArray[Any], anchor: Any = "top-left"
+) -> Any:
+    return scene.add_label(
+        name, text, position=position, anchor=anchor, font_screen_scale=LABEL_SCALE
+    )

@@ -1,7 +1,11 @@
-"""The scene as a picture or a film with its colours' scale, made without a screen."""
+"""The scene as a picture or a film with its colours' scale, made without a screen: by the graphics
+library where it works, by NumPy everywhere.
+"""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,19 +13,150 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.figures.style import make_figure, save_figure
 from apps.mp4 import open_film
-from apps.viewer.colouring import PALETTE_SIZE, choose_ticks, format_length, load_palette
-from apps.viewer.render import Renderer
+from apps.viewer.look import PALETTE_SIZE, choose_ticks, format_length, load_palette
 from apps.viewer.session import Session
-from apps.viewer.viewpoint import Box, Viewpoint, measure_point_spacing, place_viewpoint
+from apps.viewer.viewpoint import DOWN, Box, Viewpoint, measure_point_spacing, place_viewpoint
 from tofclip.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from apps.viewer.colouring import Scale
-    from apps.viewer.render import Renderer
+    from apps.viewer.look import Scale
     from apps.viewer.session import DisplayedFrame
+
+
+BACKGROUND = (24, 27, 33)
+
+
+def rasterise_points(
+    xyz: NDArray[np.float32],
+    colours: NDArray[np.uint8],
+    viewpoint: Viewpoint,
+    shape: tuple[int, int],
+    size_px: int,
+) -> NDArray[np.uint8]:
+    """Draw points (n, 3) as squares, near ones over far ones, into a picture (rows, columns, 3)."""
+    picture = np.empty((*shape, 3), np.uint8)
+    picture[:] = BACKGROUND
+    row, column, depth = viewpoint.project(xyz, shape)
+    with np.errstate(invalid="ignore"):
+        seen = (np.abs(row - shape[0] / 2) < shape[0]) & (np.abs(column - shape[1] / 2) < shape[1])
+    order = np.flatnonzero(seen)
+    order = order[
+        np.argsort(-depth[order], kind="stable")
+    ]  # of writes to one pixel the last one stays
+    corner = np.stack([row[order], column[order]]) - (size_px - 1) / 2
+    # All pixels of one point before those of the next, or far points would show at the edges of
+    # near ones.
+    offsets = np.indices((size_px, size_px)).reshape(2, 1, -1)
+    rows, columns = (np.rint(corner).astype(np.intp)[..., np.newaxis] + offsets).reshape(2, -1)
+    inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
+    picture[rows[inside], columns[inside]] = colours[order].repeat(size_px**2, axis=0)[inside]
+    return picture
+
+
+Image = NDArray[np.uint8]
+PROBE_TIMEOUT_S = 60.0  # seconds; loading the library takes three on a slow machine
+PROBE_SCRIPT = """
+import pyvista
+plotter = pyvista.Plotter(off_screen=True, window_size=(64, 64))
+plotter.add_mesh(pyvista.Sphere())
+raise SystemExit(0 if plotter.screenshot(return_img=True).std() > 0 else 1)
+"""
+
+
+class PyvistaRenderer:
+    """Draws off screen with VTK, every picture in the same window."""
+
+    name = "pyvista"
+
+    def __init__(self) -> None:
+        self._plotter: Any = None
+
+    def draw(
+        self, shown: DisplayedFrame, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int
+    ) -> Image:
+        """Return a picture of `shape` rows and columns, (rows, columns, 3); points are `point_px`
+        wide.
+        """
+        import pyvista
+
+        if self._plotter is None:
+            _silence_missing_screen()
+            self._plotter = pyvista.Plotter(off_screen=True)
+            self._plotter.set_background([value / 255 for value in BACKGROUND])
+        plotter, camera = self._plotter, self._plotter.camera
+        plotter.window_size = (shape[1], shape[0])
+        add_to_plotter(plotter, shown, point_px)
+        camera.position, camera.focal_point = viewpoint.eye.tolist(), viewpoint.target.tolist()
+        camera.up, camera.view_angle = (-DOWN).tolist(), float(np.rad2deg(viewpoint.field_of_view))
+        plotter.renderer.reset_camera_clipping_range()
+        return np.ascontiguousarray(plotter.screenshot(return_img=True)[..., :3])
+
+
+def _silence_missing_screen() -> None:
+    """Keep VTK from warning that there is no X server: it goes on without one, which is wanted."""
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+
+
+class RasterRenderer:
+    """Draws with NumPy; the frame around comes from matplotlib, as always."""
+
+    name = "matplotlib"
+
+    def draw(
+        self, shown: DisplayedFrame, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int
+    ) -> Image:
+        """Return a picture, as `PyvistaRenderer.draw` does; surfaces appear as their points."""
+        return rasterise_points(shown.cloud.xyz, shown.colours, viewpoint, shape, point_px)
+
+
+Renderer = PyvistaRenderer | RasterRenderer
+
+
+def add_to_plotter(plotter: Any, shown: DisplayedFrame, point_px: int) -> None:
+    """Put points, or the surface, into a pyvista plotter, instead of what was shown before."""
+    import pyvista
+
+    plotter.remove_actor("shown", render=False)
+    if shown.surface is not None:
+        faces = np.column_stack([np.full(len(shown.surface.faces), 3), shown.surface.faces]).ravel()
+        plotter.add_mesh(
+            pyvista.PolyData(shown.surface.vertices, faces),
+            color="#d8d2c4",
+            name="shown",
+            specular=0.3,
+        )
+    elif len(shown.cloud):
+        points = pyvista.PolyData(shown.cloud.xyz)
+        points["colour"] = shown.colours
+        look = {"rgb": True, "point_size": point_px, "lighting": False, "name": "shown"}
+        plotter.add_mesh(points, scalars="colour", **look)
+
+
+def choose_renderer() -> Renderer:
+    """Return the graphics library's where it works."""
+    return PyvistaRenderer() if has_working_graphics() else RasterRenderer()
+
+
+def has_working_graphics(probe: str = PROBE_SCRIPT) -> bool:
+    """Whether VTK can draw here. Where it cannot it ends its process, so another one tries."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", probe],
+            capture_output=True,
+            timeout=PROBE_TIMEOUT_S,
+            check=False,
+            stdin=subprocess.DEVNULL,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return done.returncode == 0
+
 
 PICTURE_SHAPE_PX = (640, 960)
 DOTS_PER_INCH = 100
@@ -31,8 +166,6 @@ SCALE_LABEL_PX = 4
 
 MAX_POINT_PX = 16
 FEW_POINTS, MANY_POINTS = 20_000, 200_000
-
-Image = NDArray[np.uint8]
 
 
 class SceneFigure:
@@ -117,19 +250,12 @@ class SceneFigure:
 
 
 def save_picture(title: str, shown: DisplayedFrame, renderer: Renderer, out: Path) -> None:
-    """Write a picture of what is shown, whole or not at all.
-
-    `out`: its suffix names the format.
-    """
-    from apps.figures.style import save_figure
-
+    """Write a picture of what is shown, whole or not at all, in the format of its suffix."""
     save_figure(SceneFigure(title, shown, renderer).draw(shown), out)
 
 
 def _make_axes() -> tuple[Figure, Any, Any]:
     """An empty figure, its axes, and the image in them."""
-    from apps.figures.style import make_figure
-
     figure = make_figure(
         PICTURE_SHAPE_PX[1] / DOTS_PER_INCH + 1.2, PICTURE_SHAPE_PX[0] / DOTS_PER_INCH + 0.4
     )
@@ -173,8 +299,7 @@ def choose_point_size(points: int) -> int:
 
 
 MAX_FRAME_RATE_HZ = 15.0
-MAX_FILM_FRAMES = 1500
-"""A minute; live sources never end."""
+MAX_FILM_FRAMES = 1500  # A minute; live sources never end
 
 
 def choose_frames(session: Session) -> list[int]:
