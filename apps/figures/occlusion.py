@@ -1,21 +1,26 @@
-"""The demonstration of seeing through an occluder, in one picture."""
+"""Seeing through an occluder: the inactive region behind it, to scale; the demonstration in one picture;
+films of a flash as it travels and of a target that walks past behind.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from apps.figures.occlusion_region import OCCLUDER_COLOUR, TEXT_BOX, draw_region
 from apps.figures.style import (
     EMPTY_COLOUR,
     LINE_COLOUR,
     SMALL_FONT_PT,
+    add_colour_bar,
     draw_image,
     label_axes,
     make_figure,
 )
+from tofclip.files import atomic_path
 from tofclip.metrics import correlation_coefficient
 from tofclip.units import MILLIMETRE, PICOSECOND
 
@@ -26,6 +31,91 @@ if TYPE_CHECKING:
 
     from apps.occlusion.experiment import Experiment
     from apps.occlusion.probe import ProbeResult
+    from tofclip.occlusion import InactiveRegion
+
+
+VIEW_COUNT = 7
+DRAWN_LENGTH_FACTOR = 2.2  # of the region, behind the occluder
+ENDLESS_DEPTH_FACTOR = 3.0  # drawn behind an occluder whose region has no end
+GRID_SHAPE = (240, 480)
+OCCLUDER_COLOUR = "#e8b04a"
+TEXT_BOX = {"facecolor": EMPTY_COLOUR, "edgecolor": "none", "pad": 1.5}
+
+
+def make_region_figure(region: InactiveRegion) -> Figure:
+    """Draw views, occluder and the region from above, in millimetres."""
+    figure = make_figure(9.6, 4.2)
+    draw_region(figure.subplots(), region)
+    return figure
+
+
+def draw_region(axes: Axes, region: InactiveRegion, least_reach: float = 0.0) -> None:
+    """Draw the region from above with seven views; z to the right, x upwards.
+
+    `least_reach`: draw at least so far behind the occluder, m.
+    """
+    places = np.linspace(-0.5, 0.5, VIEW_COUNT) * region.baseline
+    usual = (
+        DRAWN_LENGTH_FACTOR * region.length
+        if region.is_bounded
+        else ENDLESS_DEPTH_FACTOR * region.distance
+    )
+    reach = max(usual, least_reach)
+    half = 0.62 * max(region.baseline, region.width)
+    x = np.linspace(-half, half, GRID_SHAPE[0])[:, np.newaxis, np.newaxis]
+    behind = np.linspace(0, reach, GRID_SHAPE[1])[:, np.newaxis]
+    share = region.sees(places, x, behind).mean(axis=-1)
+    edges = np.array([region.distance, region.distance + reach, -half, half]) / MILLIMETRE
+    left, right, low, high = edges.tolist()
+    mapped = draw_image(
+        axes, share[::-1], (left, right, low, high), cmap="bone", vmin=0, vmax=1, aspect="auto"
+    )
+    add_colour_bar(axes, mapped, "share of the views that see the place")
+    _draw_lines(axes, region, reach)
+    axes.plot(
+        np.zeros(len(places)), places / MILLIMETRE, "s", color=LINE_COLOUR, ms=7, clip_on=False
+    )
+    axes.plot(
+        [left, left], np.array([-0.5, 0.5]) * region.width / MILLIMETRE, color=OCCLUDER_COLOUR, lw=6
+    )
+    axes.set_xlim(-0.03 * right, right)
+    axes.set_facecolor(EMPTY_COLOUR)
+    label_axes(
+        axes, _format_title(region), "z, away from the views (mm)", "x, along the baseline (mm)"
+    )
+
+
+def _draw_lines(axes: Axes, region: InactiveRegion, reach: float) -> None:
+    """Lines of sight from both ends past the occluder's nearer edge, and the region's length."""
+    far = region.distance + reach
+    for side in (-1, 1):
+        slope = side * (region.width - region.baseline) / 2 / region.distance
+        z = np.array([0, far])
+        x = side * region.baseline / 2 + slope * z
+        axes.plot(z / MILLIMETRE, x / MILLIMETRE, color=LINE_COLOUR, lw=1, ls="--")
+    if region.is_bounded:
+        start, stop = region.distance / MILLIMETRE, (region.distance + region.length) / MILLIMETRE
+        axes.annotate(
+            "", (stop, 0), (start, 0), arrowprops={"arrowstyle": "<->", "color": OCCLUDER_COLOUR}
+        )
+        said = f"l = {region.length / MILLIMETRE:.1f} mm, hidden"
+        axes.annotate(
+            said,
+            (start, 0),
+            (8, 7),
+            textcoords="offset points",
+            color=OCCLUDER_COLOUR,
+            bbox=TEXT_BOX,
+        )
+
+
+def _format_title(region: InactiveRegion) -> str:
+    sizes = f"L = {region.baseline / MILLIMETRE:g} mm, D = {region.width / MILLIMETRE:.3g} mm, "
+    sizes += f"d = {region.distance / MILLIMETRE:g} mm"
+    if not region.is_bounded:
+        return f"{sizes}: D \N{GREATER-THAN OR EQUAL TO} L, nothing behind the occluder is promised to be seen"
+    return f"{sizes}: l = d D / (L \N{MINUS SIGN} D) = {region.length / MILLIMETRE:.1f} mm"
+
 
 SEEN_COLOUR, UNSEEN_COLOUR = "#57c84d", "#ff5a5f"
 DRAWN_DEPTH_FACTOR = 1.15  # of the target's distance behind the occluder is drawn
@@ -150,3 +240,152 @@ def draw_history(axes: Axes, experiment: Experiment) -> None:
         "time after the flash (ps)",
         "relative to the brightest instant",
     )
+
+
+FRAME_MS, LAST_FRAME_MS = 120, 2500
+DARK_THRESHOLD = 0.02  # of a return's brightest instant: the film passes over fainter ones
+# of a target that walks: how many, how far to either side (m), and how long each is shown
+WALK_STEPS, WALK_REACH_M, WALK_STEP_MS = 14, 18e-3, 180
+PANEL_LAYOUT = {"left": 0.02, "right": 0.98, "bottom": 0.16, "top": 0.8}
+
+
+class FlashFrame(NamedTuple):
+    """An instant of the flash."""
+
+    time: float  # ps after the flash
+    title: str
+    # of the middle view and of the recovery, from 0 to 1
+    pictures: tuple[NDArray[Any], NDArray[Any]]
+
+
+def save_flash_film(experiment: Experiment, path: Path) -> None:
+    """Write a GIF: light reaches the occluder, then what stands behind it.
+
+    Each return is shown at its own brightness; the recovered pictures light up as the measurements
+    of their gates do.
+
+    `path`: of the GIF.
+    """
+    figure, frames = _make_canvas(8, 3.2), _make_flash_frames(experiment)
+    left, right, time = figure.subplots(1, 3, gridspec_kw=PANEL_LAYOUT)
+    images = _lay_out_pictures((left, right), ("what one view sees", "ToF-CLIP"), experiment)
+    draw_history(time, experiment)
+    time.set_title("sum of all measurements", fontsize=SMALL_FONT_PT + 2)
+    time.set_ylabel("")
+    time.tick_params(axis="y", labelleft=False)
+    cursor = time.axvline(experiment.time_axis.start / PICOSECOND, color=UNSEEN_COLOUR, lw=2)
+
+    def drawn() -> Iterator[Any]:
+        for frame in frames:
+            cursor.set_xdata([frame.time, frame.time])
+            yield _render_image(figure, images, frame.pictures, frame.title)
+
+    _write_gif(path, list(drawn()), [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS])
+
+
+def save_walk_film(experiment: Experiment, path: Path, advance: Callable[[int], None]) -> None:
+    """Write a GIF: the target walks past behind the occluder, each step flashed, measured and
+    recovered again.
+
+    Calls ``advance(1)`` after each of `WALK_STEPS`.
+
+    `path`: of the GIF.
+    """
+    figure = _make_canvas(9.4, 2.9)
+    names = ("one view, all its light", "one view, the second return", "ToF-CLIP", "truth")
+    images = _lay_out_pictures(
+        figure.subplots(1, 4, gridspec_kw={**PANEL_LAYOUT, "bottom": 0.02}), names, experiment
+    )
+    brightest, drawn = float(experiment.truth.max()), []
+    for number, across in enumerate(np.linspace(-WALK_REACH_M, WALK_REACH_M, WALK_STEPS)):
+        settings = replace(experiment.settings, seed=experiment.settings.seed + number)
+        there = type(experiment)(experiment.scene.move_target(float(across)), settings)
+        everything = there.pictures[len(there.pictures) // 2].sum(axis=-1)
+        seen = everything * (brightest / everything.max())
+        pictures = seen, there.single_view, there.separated.target, there.truth
+        title = f"target {across / MILLIMETRE:+.0f} mm from the axis, {there.scene.behind / MILLIMETRE:.0f} mm behind"
+        drawn.append(_render_image(figure, images, [one / brightest for one in pictures], title))
+        advance(1)
+    # there and back again, without showing the ends twice
+    _write_gif(path, [*drawn, *drawn[-2:0:-1]], [WALK_STEP_MS] * (2 * WALK_STEPS - 2))
+
+
+def _make_canvas(width: float, height: float) -> Figure:
+    """Make a figure whose drawing can be read back, in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure = make_figure(width, height)
+    figure.set_layout_engine("none")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _lay_out_pictures(
+    panels: Sequence[Axes], names: Sequence[str], experiment: Experiment
+) -> list[Any]:
+    """Lay out pictures of a film and return what changes in them."""
+    side = experiment.settings.side_px
+    images = []
+    for axes, name in zip(panels, names, strict=True):
+        images.append(draw_image(axes, 0 * experiment.truth, (0, side, side, 0), vmin=0, vmax=1))
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(name, fontsize=SMALL_FONT_PT + 2)
+    return images
+
+
+def _render_image(
+    figure: Figure, images: Sequence[Any], pictures: Sequence[NDArray[Any]], title: str
+) -> Any:
+    """Put pictures from 0 to 1 into their places and return the figure as an image."""
+    from PIL import Image
+
+    for image, picture in zip(images, pictures, strict=True):
+        image.set_data(picture)
+    figure.suptitle(title, fontsize=SMALL_FONT_PT + 4)
+    canvas: Any = figure.canvas
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+
+
+def _write_gif(path: Path, images: list[Any], durations_ms: list[int]) -> None:
+    with atomic_path(path) as temporary:
+        images[0].save(
+            temporary, save_all=True, append_images=images[1:], duration=durations_ms, loop=0
+        )
+
+
+def _make_flash_frames(experiment: Experiment) -> list[FlashFrame]:
+    """Every instant that is not dark; at last the whole of the second return."""
+    separated, returns = experiment.separated, experiment.measurements.find_returns()
+    parts = [separated.occluder, separated.target][: len(returns)]
+    history, middle = (
+        experiment.measurements.history,
+        experiment.pictures[len(experiment.pictures) // 2],
+    )
+    times, frames = experiment.time_axis.times / PICOSECOND, []
+    for found, recovered in zip(returns, parts, strict=True):
+        lit = history / history[found.bins].max()
+        scales = [
+            max(float(top), 1e-12)
+            for top in (middle[..., found.bins].max(), np.quantile(recovered, 0.999))
+        ]
+        for instant in np.arange(found.bins.start, found.bins.stop)[
+            lit[found.bins] > DARK_THRESHOLD
+        ]:
+            pictures = middle[..., instant] / scales[0], lit[instant] * recovered / scales[1]
+            frames.append(
+                FlashFrame(
+                    float(times[instant]), f"{times[instant]:.0f} ps after the flash", pictures
+                )
+            )
+    brightest = experiment.truth.max()
+    behind, last = separated.plain, "nothing comes from behind the occluder"
+    if separated.sees_target:
+        behind, last = (
+            middle[..., returns[1].bins].sum(axis=-1),
+            "all of the second return together",
+        )
+    return [
+        *frames,
+        FlashFrame(frames[-1].time, last, (behind / brightest, separated.target / brightest)),
+    ]

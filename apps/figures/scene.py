@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apps.figures.style import (
-    BRIGHTNESS_COLOURMAP,
     DEPTH_COLOURMAP,
-    EMPTY_COLOUR,
     SMALL_FONT_PT,
-    draw_image,
+    draw_camera_picture,
     label_axes,
     make_figure,
+    scatter_points,
+    tone_map,
 )
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from tofclip.lidar.processing import DetectedObject
     from tofclip.shots import Frames
 
-WHITE_PERCENTILE = 99.5  # percent: a glint does not darken the rest
 MIN_BRIGHTNESS = 0.4  # of the colours: dim points stay visible
 MAX_RANGE_PANELS = 4
 HALF_GATE_BINS = 4
@@ -50,29 +49,20 @@ def make_scene_figure(
         panel.remove()
     distance = np.maximum(frames.times, 0) * SPEED_OF_LIGHT / 2
     brightness = frames.values * (distance**2).astype(np.float32)[:, np.newaxis, np.newaxis]
-    draw_image(axes[0, 0], _tone_map(brightness.sum(axis=0)))
-    label_axes(axes[0, 0], "summed over time, times range squared", "x (px)", "y (px), down")
+    summed = tone_map(brightness.sum(axis=0))
+    draw_camera_picture(axes[0, 0], summed, "summed over time, times range squared")
     _draw_cloud(figure, cloud)
     _draw_top_view(axes[0, 3], cloud, objects)
-    shown = sorted(
-        sorted(objects, key=lambda one: -one.points.size)[:MAX_RANGE_PANELS],
-        key=lambda one: one.range,
-    )
+    largest = sorted(objects, key=lambda one: -one.points.size)[:MAX_RANGE_PANELS]
+    shown = sorted(largest, key=lambda one: one.range)
     for panel in axes[1, len(shown) :]:
         panel.set_axis_off()
     for panel, one in zip(axes[1], shown, strict=False):
         row = int(np.abs(distance - one.range).argmin())
         gate = slice(max(0, row - HALF_GATE_BINS), row + HALF_GATE_BINS + 1)
-        draw_image(panel, _tone_map(brightness[gate].sum(axis=0)))
-        label_axes(
-            panel, f"{one.range:.2f} m, shear {frames.shears[row]:.2f} px", "x (px)", "y (px), down"
-        )
+        title = f"{one.range:.2f} m, shear {frames.shears[row]:.2f} px"
+        draw_camera_picture(panel, tone_map(brightness[gate].sum(axis=0)), title)
     return figure
-
-
-def _tone_map(picture: Any) -> Any:
-    top = np.percentile(picture, WHITE_PERCENTILE) or 1.0
-    return np.clip(picture / top, 0, 1)
 
 
 def _draw_cloud(figure: Figure, cloud: PointCloud) -> None:
@@ -80,27 +70,16 @@ def _draw_cloud(figure: Figure, cloud: PointCloud) -> None:
     space: Any = figure.add_subplot(2, 4, (2, 3), projection="3d")
     x, y, z = cloud.xyz.T
     space.scatter(x, z, -y, c=cloud.range, cmap=DEPTH_COLOURMAP, s=1.5, linewidths=0)
-    space.set_xlabel("x (m)", fontsize=SMALL_FONT_PT)
-    space.set_ylabel("z (m)", fontsize=SMALL_FONT_PT)
-    space.set_zlabel("up (m)", fontsize=SMALL_FONT_PT)
+    for axis, name in ((space.xaxis, "x (m)"), (space.yaxis, "z (m)"), (space.zaxis, "up (m)")):
+        axis.set_label_text(name, fontsize=SMALL_FONT_PT)
     space.view_init(elev=22, azim=-70)
     space.tick_params(labelsize=SMALL_FONT_PT)
     space.set_title("point cloud", fontsize=SMALL_FONT_PT + 2)
 
 
 def _draw_top_view(axes: Any, cloud: PointCloud, objects: Sequence[DetectedObject]) -> None:
-    axes.set_facecolor(EMPTY_COLOUR)
-    light = MIN_BRIGHTNESS + (1 - MIN_BRIGHTNESS) * _tone_map(cloud.intensity)
-    axes.scatter(
-        cloud.xyz[:, 0],
-        cloud.xyz[:, 2],
-        c=light,
-        cmap=BRIGHTNESS_COLOURMAP,
-        vmin=0,
-        vmax=1,
-        s=1.5,
-        linewidths=0,
-    )
+    light = MIN_BRIGHTNESS + (1 - MIN_BRIGHTNESS) * tone_map(cloud.intensity)
+    scatter_points(axes, cloud.xyz[:, 0], cloud.xyz[:, 2], light)
     for number, one in enumerate(objects, 1):
         axes.annotate(
             str(number), (one.centre[0], one.centre[2]), color="white", fontsize=SMALL_FONT_PT

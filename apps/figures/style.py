@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.files import atomic_path
+from tofclip.units import NANOSECOND
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,6 +25,8 @@ DEPTH_COLOURMAP = "viridis"
 EMPTY_COLOUR = "#20242c"  # where a picture has no value
 LINE_COLOUR = "#3dd6c8"  # drawn over a brightness map
 SMALL_FONT_PT = 8
+WHITE_PERCENTILE = 99.5  # percent: a glint does not darken the rest
+SHOWN_PERCENTILES = (1.0, 99.0)  # percent of the pixels that span the colours
 DOTS_PER_INCH = 100
 # Colours of pictures with more bytes; 0: all, without transparency. 256 make a quarter of the
 # bytes, off by less than 16 of 255 anywhere; 64 are enough for the greys of many small pictures.
@@ -35,11 +38,7 @@ LABEL_ROOM_INCHES = (0.6, 0.12, 0.45, 0.3)
 
 
 def make_figure(width: float, height: float) -> Figure:
-    """Make an empty figure, in inches. It draws with Agg: no display is needed and pyplot is left
-    alone.
-
-    `width, height`: inches.
-    """
+    """Make an empty figure, in inches; it draws with Agg, without a display or pyplot."""
     from matplotlib.figure import Figure  # a third of a second that only a verb's pictures need
 
     return Figure(figsize=(width, height), dpi=DOTS_PER_INCH, layout="constrained")
@@ -82,10 +81,7 @@ def add_panels(
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure in the format that the name's ending says, whole or not at all.
-
-    `path`: its suffix names the format.
-    """
+    """Write a figure in the format that the name's ending says, whole or not at all."""
     engine, panels = figure.get_layout_engine(), figure.get_axes()
     if engine is not None and panels:
         # Saving would draw all twice, the first time only to find the places of the axes.
@@ -99,10 +95,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def store_picture(picture: Path, place: Path) -> None:
-    """Store a picture; a large PNG in `FEWER_COLOURS`.
-
-    `picture`: as it was drawn; `place`: where it goes; may be the same.
-    """
+    """Store a picture at a place, which may be its own; a large PNG in `FEWER_COLOURS`."""
     from PIL import Image
 
     drawn = picture.read_bytes()
@@ -128,8 +121,7 @@ def draw_image(
 ) -> AxesImage:
     """Draw a picture without smoothing over its pixels.
 
-    `picture` (rows, columns); `extent` (left, right, bottom, top): outer edges in the axes' units;
-    pixel numbers where absent; `**look`: further settings of ``imshow``.
+    `extent` (left, right, bottom, top): outer edges in the axes' units; pixel numbers where absent.
     """
     axes.set_facecolor(EMPTY_COLOUR)
     return axes.imshow(
@@ -138,10 +130,7 @@ def draw_image(
 
 
 def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
-    """Set the title of a picture and the labels of its axes.
-
-    `title, x, y`: with units.
-    """
+    """Set the title of a picture and the labels of its axes, with units."""
     # A place of its own, or matplotlib looks for free space above the ticks at every drawing.
     axes.set_title(title, fontsize=SMALL_FONT_PT + 2, y=1.0)
     axes.set_xlabel(x, fontsize=SMALL_FONT_PT)
@@ -150,10 +139,7 @@ def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
 
 
 def add_colour_bar(axes: Axes, mapped: Any, meaning: str) -> None:
-    """Put a labelled colour scale beside a picture.
-
-    `mapped`: what the picture was drawn with; `meaning`: label, with its unit.
-    """
+    """Put a colour scale beside a picture, labelled with its meaning and unit."""
     bar = axes.figure.colorbar(mapped, ax=axes, shrink=0.9)
     bar.set_label(meaning, fontsize=SMALL_FONT_PT)
     bar.ax.tick_params(labelsize=SMALL_FONT_PT)
@@ -165,3 +151,52 @@ def outer_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
     """
     half = (axis[-1] - axis[0]) / (2 * (axis.size - 1)) if axis.size > 1 else 0.5
     return float(axis[0] - half), float(axis[-1] + half)
+
+
+def draw_camera_picture(
+    axes: Axes, picture: NDArray[Any], title: str, meaning: str = "", **look: Any
+) -> None:
+    """Draw what a camera sees, with a colour scale beside it where its meaning is named."""
+    drawn = draw_image(axes, picture, **look)
+    label_axes(axes, title, "x (px)", "y (px), down")
+    if meaning:
+        add_colour_bar(axes, drawn, meaning)
+
+
+def draw_spread_picture(axes: Axes, picture: NDArray[Any], title: str, **look: Any) -> None:
+    """Draw a pixel's own numbers; all but the outermost of them span the colours."""
+    finite = picture[np.isfinite(picture)]
+    if finite.size and "vmin" not in look:
+        low, high = np.percentile(finite, SHOWN_PERCENTILES)
+        look |= {"vmin": low, "vmax": high}
+    axes.figure.colorbar(draw_image(axes, picture, **look), ax=axes)
+    label_axes(axes, title, "x (px)", "y (px), down")
+
+
+def draw_streak(
+    axes: Axes, picture: NDArray[Any], times: NDArray[np.float64], title: str, **look: Any
+) -> AxesImage:
+    """Draw a streak image over the slit's columns and its time axis."""
+    first, last = outer_edges(times / NANOSECOND)
+    extent = (-0.5, picture.shape[1] - 0.5, last, first)
+    drawn = draw_image(axes, picture, extent, aspect="auto", **look)
+    label_axes(axes, title, "slit column (px)", "time axis (ns)")
+    return drawn
+
+
+def scatter_points(
+    axes: Axes, right: NDArray[Any], up: NDArray[Any], light: NDArray[Any], size: float = 1.5
+) -> None:
+    """Draw a cloud from one side, as bright as its points are, 0 to 1."""
+    axes.set_facecolor(EMPTY_COLOUR)
+    look: Any = {"cmap": BRIGHTNESS_COLOURMAP, "vmin": 0, "vmax": 1, "linewidths": 0}
+    axes.scatter(right, up, c=light, s=size, **look)
+
+
+def tone_map(
+    picture: NDArray[Any], brightest: float = WHITE_PERCENTILE, gamma: float = 1.0
+) -> NDArray[Any]:
+    """Scale brightness to 0..1 for the eye, with the percentile `brightest` at 1."""
+    top = (np.percentile(picture, brightest) or picture.max() or 1.0) if picture.size else 1.0
+    toned: NDArray[Any] = np.clip(picture / top, 0, 1) ** gamma
+    return toned

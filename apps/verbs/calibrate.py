@@ -160,7 +160,7 @@ def calibrate_range(
     """
     import math
 
-    from apps.figures.range_calibration import make_range_calibration_figure
+    from apps.figures.calibration import make_range_calibration_figure
     from apps.figures.style import save_figure
     from tofclip.camera import Camera
     from tofclip.lidar import Pulse

@@ -27,7 +27,7 @@ def demo(
 
     Example: tofclip demo --out demo-output
     """
-    from apps.figures.demo import make_demo_figure
+    from apps.figures.shot import make_demo_figure
     from apps.figures.style import save_figure
     from tofclip.lidar import depth, point_cloud
     from tofclip.metrics import nmse

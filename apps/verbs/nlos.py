@@ -542,7 +542,7 @@ def compare(
 
     Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
     """
-    from apps.figures.nlos_compare import make_comparison_figure
+    from apps.figures.nlos import make_comparison_figure
     from apps.figures.style import save_figure
     from apps.studies.hidden_scene_adjoint import correlate_views
     from nlos.io import read_capture
@@ -805,7 +805,7 @@ def demo(
 
     Example: tofclip nlos demo --out nlos-demo-output
     """
-    from apps.figures.nlos_demo import make_demo_figure
+    from apps.figures.nlos import make_demo_figure
     from apps.figures.style import save_figure
     from apps.studies.hidden_scene_adjoint import correlate_views
     from nlos.known_scenes import compare_with_truth

@@ -42,7 +42,7 @@ def region(
     Example: tofclip occlusion region --baseline-mm 15 --width-mm 6 --distance-mm 50 --out
     region.png
     """
-    from apps.figures.occlusion_region import make_region_figure
+    from apps.figures.occlusion import make_region_figure
     from apps.figures.style import save_figure
     from tofclip.occlusion import InactiveRegion
 
@@ -113,7 +113,7 @@ def demo(
     Example: tofclip occlusion demo --live --scene bush
     """
     from apps.figures.occlusion import make_occlusion_figure
-    from apps.figures.occlusion_film import WALK_STEPS, save_flash_film, save_walk_film
+    from apps.figures.occlusion import WALK_STEPS, save_flash_film, save_walk_film
     from apps.figures.style import save_figure
     from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
     from apps.occlusion.probe import DISTANCE_FACTORS, probe_target

@@ -115,7 +115,7 @@ def photons(
     """
     import numpy as np
 
-    from apps.figures.photons import make_range_figure
+    from apps.figures.shot import make_range_figure
     from apps.figures.style import save_figure
     from tofclip.camera import Camera
     from tofclip.lidar import Pulse, point_cloud, save_depth

@@ -13,7 +13,7 @@ import pytest
 from small_instrument import Run
 
 from apps.cli import main
-from apps.figures import occlusion_film
+from apps.figures import occlusion as occlusion_figures
 from apps.occlusion.scenes import SCENES, make_occlusion_scene
 from apps.verbs.occlusion import SCENE_NAMES
 
@@ -60,7 +60,7 @@ def demonstrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[s
         "--moving",
     ]
     with contextlib.redirect_stdout(io.StringIO()) as out, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(occlusion_film, "WALK_STEPS", 3)
+        patch.setattr(occlusion_figures, "WALK_STEPS", 3)
         assert main([*words, "--out", str(folder), "--json"]) == 0
     return folder, json.loads(out.getvalue())
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apps.figures.preview import MAX_MOMENTS, choose_moments, make_preview_figure
+from apps.figures.shot import MAX_MOMENTS, choose_moments, make_preview_figure
 from apps.figures.style import make_figure, save_figure
 from apps.progress import show_activity, show_progress
 from apps.report import build_provenance, make_folder, report, require_writable, to_json_value

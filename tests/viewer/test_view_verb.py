@@ -15,7 +15,7 @@ from viewer_scenes import frames, plane, streak
 
 import tofclip
 from apps.cli import main
-from apps.viewer import render
+from apps.viewer import still
 from apps.viewer.desktop import DesktopWindow, open_window
 from apps.viewer.page import Page
 from apps.viewer.session import Session
@@ -37,7 +37,7 @@ def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_picture_and_its_figures(
     cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(render, "has_working_graphics", lambda: False)
+    monkeypatch.setattr(still, "has_working_graphics", lambda: False)
     assert main(["view", str(cloud), "--png", str(tmp_path / "cloud.png"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["points"], found["backend"]) == (500, "matplotlib")
@@ -123,7 +123,7 @@ def raise_input_error() -> None:
 
 
 def test_the_window_follows_its_keys() -> None:
-    if not render.has_working_graphics():
+    if not still.has_working_graphics():
         pytest.skip("no working graphics library here")
     import pyvista
 

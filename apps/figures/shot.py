@@ -1,5 +1,5 @@
-"""A shot and its recovered frames at a glance: streak image, brightness, distance, and the
-strongest frames.
+"""A shot and its recovered frames at a glance; the demonstration in one picture: what was measured, what
+came out of it, and how far that is from the truth; the range image that counted photons show.
 """
 
 from __future__ import annotations
@@ -15,20 +15,30 @@ from numpy.typing import NDArray
 from apps.figures.style import (
     DEPTH_COLOURMAP,
     SMALL_FONT_PT,
+    WHITE_PERCENTILE,
     add_colour_bar,
     add_panels,
+    draw_camera_picture,
     draw_image,
+    draw_spread_picture,
+    draw_streak,
     label_axes,
     make_figure,
-    outer_edges,
+    scatter_points,
+    tone_map,
 )
-from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
+from tofclip.camera import estimate_dark_level
+from tofclip.units import MILLIMETRE, NANOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from tofclip.lidar import PointCloud, Returns
+    from tofclip.lidar.photons import SurfaceImage
     from tofclip.shots import Frames, Streak
+    from tofclip.simulate import GroundTruth
+
 
 PANEL_COLUMNS = 4
 MAX_MOMENTS = 3 * PANEL_COLUMNS
@@ -40,7 +50,6 @@ MIN_PEAK_DISTANCE_BINS = 12
 MIN_PEAK_PROMINENCE = 0.01  # of the highest
 CROP_THRESHOLD = 0.35  # of a frame's brightest pixel: what is dimmer is mostly artefacts
 CROP_MARGIN_PX = 8
-WHITE_PERCENTILE = 99.5  # percent: a glint does not darken the rest
 LIT_THRESHOLD = 0.2  # pixels that are lighter decide about the scale of distances
 BRIGHT_AREA_PERCENTILE = 95.0  # percent: colours need light to be distinguishable
 GAMMA = 0.6  # far objects stay visible beside near ones
@@ -68,9 +77,13 @@ def make_preview_figure(streak: Streak, frames: Frames) -> Figure:
     (overview,) = add_panels(figure, 1, 3, (0, OVERVIEW_INCHES), widths=OVERVIEW_WIDTHS)
     left, middle, right = overview
     brightness = frames.values * _compute_compensation(frames)[:, np.newaxis, np.newaxis]
-    _draw_streak(left, streak)
-    draw_image(middle, _tone_map(brightness.sum(axis=0)))
-    label_axes(middle, "summed brightness" + _format_compensation(frames), "x (px)", "y (px), down")
+    counts = np.maximum(streak.counts - estimate_dark_level(streak.counts), 0)
+    draw_streak(left, tone_map(counts, gamma=GAMMA), streak.times, "streak image as measured")
+    squared = (
+        " \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}" if _has_known_range(frames) else ""
+    )
+    summed = tone_map(brightness.sum(axis=0), gamma=GAMMA)
+    draw_camera_picture(middle, summed, f"summed brightness{squared}")
     _draw_distance(right, brightness, frames)
     strip = (OVERVIEW_INCHES + STRIP_TITLE_INCHES, height)
     figure.text(
@@ -147,46 +160,21 @@ def _compute_compensation(frames: Frames) -> NDArray[np.float32]:
     return np.ones(frames.times.size, np.float32)
 
 
-def _format_compensation(frames: Frames) -> str:
-    return " \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}" if _has_known_range(frames) else ""
-
-
-def _tone_map(picture: NDArray[Any], brightest: float = WHITE_PERCENTILE) -> NDArray[Any]:
-    """Scale a picture to 0..1 for the eye, with the percentile `brightest` at 1."""
-    top = np.percentile(picture, brightest) or picture.max() or 1.0
-    toned: NDArray[Any] = np.clip(picture / top, 0, 1) ** GAMMA
-    return toned
-
-
-def _draw_streak(axes: Axes, streak: Streak) -> None:
-    from tofclip.camera import estimate_dark_level
-
-    first, last = outer_edges(streak.times / NANOSECOND)
-    extent = (-0.5, streak.counts.shape[1] - 0.5, last, first)
-    draw_image(
-        axes,
-        _tone_map(np.maximum(streak.counts - estimate_dark_level(streak.counts), 0)),
-        extent,
-        aspect="auto",
-    )
-    label_axes(axes, "streak image as measured", "slit column (px)", "time axis (ns)")
-
-
 def _draw_distance(axes: Axes, brightness: NDArray[Any], frames: Frames) -> None:
     """Colour says when each pixel was brightest, lightness how bright it was."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    light = _tone_map(brightness.max(axis=0), BRIGHT_AREA_PERCENTILE)
+    light = tone_map(brightness.max(axis=0), BRIGHT_AREA_PERCENTILE, GAMMA)
     scale, meaning = (frames.times / NANOSECOND, "time (ns)")
     if _has_known_range(frames):
         scale, meaning = _compute_ranges(frames), "range (m)"
     distance = scale[brightness.argmax(axis=0)]
     lit = distance[light > LIT_THRESHOLD] if np.any(light > LIT_THRESHOLD) else distance
     mapped = ScalarMappable(Normalize(*np.percentile(lit, (1, 99))), colormaps[DEPTH_COLOURMAP])
-    draw_image(axes, mapped.to_rgba(distance)[..., :3] * light[..., np.newaxis])
-    label_axes(axes, "when each pixel was brightest", "x (px)", "y (px), down")
+    picture = mapped.to_rgba(distance)[..., :3] * light[..., np.newaxis]
+    draw_camera_picture(axes, picture, "when each pixel was brightest")
     add_colour_bar(axes, mapped, meaning)
 
 
@@ -202,11 +190,9 @@ def _draw_moments(
         where = f"{frames.times[moment.frame] / NANOSECOND:.2f} ns"
         if _has_known_range(frames):
             where = f"{_compute_ranges(frames)[moment.frame]:.2f} m"
-        which = (
-            f"frame {moment.frame}"
-            if moment.first == moment.last
-            else f"frames {moment.first} to {moment.last}"
-        )
+        which = f"frames {moment.first} to {moment.last}"
+        if moment.first == moment.last:
+            which = f"frame {moment.frame}"
         label_axes(axes, f"{where}  ({which})", "", "")
     for axes in panels.ravel()[len(moments) :]:
         axes.set_axis_off()
@@ -227,3 +213,81 @@ def _crop_to_bright(pictures: list[NDArray[Any]]) -> tuple[slice, slice]:
             slice(max(0, first - CROP_MARGIN_PX), min(lit.size, last + CROP_MARGIN_PX + 1))
         )
     return sides[0], sides[1]
+
+
+HISTOGRAM_BINS = 61
+
+
+def make_demo_figure(
+    streak: Streak,
+    frames: Frames,
+    returns: Returns,
+    cloud: PointCloud,
+    truth: GroundTruth,
+    compared: Frames,
+) -> Figure:
+    """Draw streak image, brightness and range as seen by the camera; top and side view in metres;
+    range errors. `compared`: of the same shot, each frame recovered alone.
+    """
+    figure = make_figure(15.5, 7.6)
+    panels = figure.subplots(2, 4)
+    top = np.percentile(streak.counts, WHITE_PERCENTILE)
+    title = "streak image: one shot, seven views"
+    drawn = draw_streak(panels[0, 0], streak.counts, streak.times, title, vmin=0, vmax=top)
+    add_colour_bar(panels[0, 0], drawn, "photons")
+    _draw_brightness(panels[0, 1], frames, "surfaces")
+    _draw_brightness(panels[0, 2], compared, "tv")
+    distance = returns.image("range")
+    title = "range of the strongest return"
+    draw_camera_picture(panels[0, 3], distance, title, "range (m)", cmap=DEPTH_COLOURMAP)
+    meaning = "of the light that falls on it"
+    draw_camera_picture(panels[1, 3], truth.reflectance, "true reflectance", meaning, vmin=0)
+    light = tone_map(cloud.intensity, gamma=0.5)  # some light is left for the dim points
+    scatter_points(panels[1, 0], cloud.xyz[:, 0], cloud.xyz[:, 2], light, 1.2)
+    label_axes(panels[1, 0], "top view of the cloud", "x (m)", "z, away from the camera (m)")
+    scatter_points(panels[1, 1], cloud.xyz[:, 2], cloud.xyz[:, 1], light, 1.2)
+    # y points down in a cloud, as in a picture.
+    panels[1, 1].invert_yaxis()
+    label_axes(panels[1, 1], "side view of the cloud", "z, away from the camera (m)", "y, down (m)")
+    _draw_errors(panels[1, 2], returns, truth)
+    return figure
+
+
+def _draw_brightness(axes: Axes, frames: Frames, name: str) -> None:
+    ranges = np.maximum(frames.times, 0) * SPEED_OF_LIGHT / 2
+    picture = np.tensordot((ranges**2).astype(np.float32), frames.values, axes=1)
+    title = f"{name}: brightness \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}"
+    top = np.percentile(picture, WHITE_PERCENTILE)
+    draw_camera_picture(axes, picture, title, "photons at 1 m", vmin=0, vmax=top)
+
+
+def _draw_errors(axes: Axes, returns: Returns, truth: GroundTruth) -> None:
+    error = (returns.image("range") - truth.range)[truth.target] / MILLIMETRE
+    error = error[np.isfinite(error)]
+    bin_mm = SPEED_OF_LIGHT * truth.bin_width / 2 / MILLIMETRE
+    edges = np.linspace(-2 * bin_mm, 2 * bin_mm, HISTOGRAM_BINS).tolist()
+    axes.hist(np.clip(error, edges[0], edges[-1]), edges, color="#4c72b0")
+    for edge in (-bin_mm, bin_mm):
+        axes.axvline(edge, color="black", linewidth=0.8, linestyle=":")
+    median = float(np.median(np.abs(error)))
+    label_axes(
+        axes,
+        f"range error: median {median:.2f} mm, one bin = {bin_mm:.2f} mm",
+        "range error (mm), larger ones at the ends",
+        "target pixels",
+    )
+
+
+def make_range_figure(found: SurfaceImage) -> Figure:
+    """Draw a range image with what it is worth."""
+    figure = make_figure(12, 9)
+    axes = figure.subplots(2, 2)
+    panels: tuple[tuple[Any, str, dict[str, Any]], ...] = (
+        (found.range, "range (m)", {"cmap": DEPTH_COLOURMAP}),
+        (found.range_sigma * 1e3, "one standard deviation (mm)", {}),
+        (found.intensity, "photons", {}),
+        (found.outlier_probability, "probability of an outlier", {"vmin": 0, "vmax": 1}),
+    )
+    for panel, (picture, title, look) in zip(axes.flat, panels, strict=True):
+        draw_spread_picture(panel, picture, title, **look)
+    return figure
