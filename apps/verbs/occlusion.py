@@ -112,8 +112,12 @@ def demo(
 
     Example: tofclip occlusion demo --live --scene bush
     """
-    from apps.figures.occlusion import make_occlusion_figure
-    from apps.figures.occlusion import WALK_STEPS, save_flash_film, save_walk_film
+    from apps.figures.occlusion import (
+        WALK_STEPS,
+        make_occlusion_figure,
+        save_flash_film,
+        save_walk_film,
+    )
     from apps.figures.style import save_figure
     from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
     from apps.occlusion.probe import DISTANCE_FACTORS, probe_target

@@ -62,10 +62,9 @@ def view(
     Example: tofclip view frames.h5 --png scene.png
     """
     from apps.viewer.desktop import open_window
-    from apps.viewer.still import choose_renderer
-    from apps.viewer.still import choose_frames, save_film, save_picture
     from apps.viewer.session import Session
     from apps.viewer.source_factory import ShotOptions, announce_nothing, open_source
+    from apps.viewer.still import choose_frames, choose_renderer, save_film, save_picture
 
     # Truth values add up: more than one was asked for.
     if desktop + (png is not None) + (mp4 is not None) > 1:

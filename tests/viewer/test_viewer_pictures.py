@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from matplotlib.image import imread
 from viewer_scenes import PlaneSource, plane, volume
 
-from apps.viewer import still
+from apps.viewer import still as stills
 from apps.viewer.session import Session
 from apps.viewer.source import make_empty_cloud
 from apps.viewer.sources import SURFACE_MODE, VolumeSource, make_cloud
@@ -103,8 +103,8 @@ def test_a_graphics_library_that_ends_its_process_is_found_out(probe: str, works
 def test_without_graphics_the_picture_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(still, "has_working_graphics", lambda: False)
-    renderer = still.choose_renderer()
+    monkeypatch.setattr(stills, "has_working_graphics", lambda: False)
+    renderer = stills.choose_renderer()
     assert renderer.name == "matplotlib"
     shown = Session(PlaneSource()).frame_at(0.0)
     still = SceneFigure("planes", shown, renderer)
