@@ -308,9 +308,8 @@ def test_two_returns_are_both_found_and_do_not_pull_each_other():
     for column, arrival, photons in ((0, near, 400), (1, far, 150)):
         error = found.range[:, column] - metres(arrival)
         bound = compute_range_bound(detector.pulse, BIN, photons, 0.1)
-        assert (
-            np.sqrt(np.mean(error**2)) < 1.2 * bound
-        )  # 300 trials: 4 percent; beside each other they know slightly less
+        # 300 trials: 4 percent; beside each other they know slightly less
+        assert np.sqrt(np.mean(error**2)) < 1.2 * bound
         assert abs(error.mean()) < 4 * bound / np.sqrt(300)
 
 
@@ -403,9 +402,8 @@ def test_neighbours_help_starved_pixels_and_borders_stay_sharp(detector):
     smooth = locate_with_smoothness(detector, counts.reshape(32, 32, -1))
     error = np.abs(smooth.range.reshape(32, 32) - metres(arrival))
     bin_m = metres(BIN)
-    assert (
-        np.mean(np.abs(alone - metres(arrival)) < 2 * bin_m) < 0.6
-    )  # most pixels alone know too little
+    # most pixels alone know too little
+    assert np.mean(np.abs(alone - metres(arrival)) < 2 * bin_m) < 0.6
     assert np.mean(error < 2 * bin_m) > 0.98
     assert np.median(error) < 0.6 * bin_m
     # Gaussian errors have their median at 0.67; here 0.74 over 12 seeds, with a deviation of 0.034

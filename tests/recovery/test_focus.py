@@ -124,12 +124,10 @@ def test_pieces_cover_all_frames_within_the_tolerance(shot):
         assert pieces[-1].frames.stop == times.size
         assert all(a.frames.stop == b.frames.start for a, b in pairwise(pieces))
         used = np.repeat([p.shear for p in pieces], [p.size for p in pieces])
-        wrong = (
-            np.abs(used - made.shear_at(SPEED_OF_LIGHT * times / 2)) * 3
-        )  # three steps to the outermost view
-        assert (
-            wrong.max() < 2 * tolerance
-        )  # a piece spans twice the tolerance; its mean may lie off its middle
+        # three steps to the outermost view
+        wrong = np.abs(used - made.shear_at(SPEED_OF_LIGHT * times / 2)) * 3
+        # a piece spans twice the tolerance; its mean may lie off its middle
+        assert wrong.max() < 2 * tolerance
         assert np.median(wrong) < tolerance
     assert np.all(np.diff([piece.brightness for piece in pieces]) < 0)
 

@@ -135,7 +135,7 @@ def fit_surfaces(
     # 4. Amplitudes.
     solver = AmplitudeSolver(model, pictures[masks], weight)
     solver.run(START_ITERATIONS, progress, count)
-    _require_explained(solver, frames, streak)
+    require_explained(solver, frames, streak)
     model.find_behind(solver.amplitude)
 
     # 5. Ranges, after splines that are not needed: these take longer to be right, and late views give
@@ -202,7 +202,7 @@ def measure_slopes(distance: Image) -> tuple[FloatArray, FloatArray]:
     return np.where(share > 0.5, np.hypot(across, down), 0.0), scatter
 
 
-def _require_explained(solver: AmplitudeSolver, frames: Frames, streak: Streak) -> None:
+def require_explained(solver: AmplitudeSolver, frames: Frames, streak: Streak) -> None:
     """Refuse a shot that surfaces explain neither well nor as well as its frames do."""
     unexplained = solver.model.unexplained(solver.amplitude)
     if unexplained <= MAX_UNEXPLAINED:
