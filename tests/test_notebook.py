@@ -174,7 +174,10 @@ def test_wrong_types_and_names_are_refused_by_our_own_errors(
         lambda: tofclip.Frames([1.0], times, camera): "not a list",
         lambda: tofclip.Frames(values, times, "camera.h5"): "not a str",  # type: ignore[arg-type]
         lambda: tofclip.Frames("a", "b", "c"): "belong to a Camera",  # type: ignore[arg-type]
-        **{lambda limits=limits: frames.sel(range=limits): "limits" for limits in ("near", 2, (1, 2, 3))},
+        **{
+            lambda limits=limits: frames.sel(range=limits): "limits"
+            for limits in ("near", 2, (1, 2, 3))
+        },
         lambda: cloud["near"]: "slice, a mask or numbers",
         lambda: cloud[3]: r"one point is cloud\[3:4\]",
         lambda: frames[60:70]: "no frame is selected of 50",

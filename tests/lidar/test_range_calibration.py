@@ -33,6 +33,20 @@ def walk_at(signal):
     return WALK_M * np.log10(signal / REFERENCE)
 
 
+def list_returns(y, x, measured, signal, sigma, camera: Camera) -> Returns:
+    """One return in each of these pixels."""
+    return Returns(
+        y=y.astype(np.int32),
+        x=x.astype(np.int32),
+        range=measured,
+        intensity=(signal * measured**2).astype(np.float32),
+        confidence=sigma.astype(np.float32),
+        return_number=np.ones(y.size, np.uint8),
+        time=2 * measured / SPEED_OF_LIGHT,
+        camera=camera,
+    )
+
+
 class World:
     """An instrument whose faults are known, in front of a target."""
 
@@ -58,16 +72,7 @@ class World:
             + self.random.normal(0, self.jitter_m)
             + self.random.normal(0, sigma)
         )
-        returns = Returns(
-            y=y.astype(np.int32),
-            x=x.astype(np.int32),
-            range=measured,
-            intensity=(signal * measured**2).astype(np.float32),
-            confidence=sigma.astype(np.float32),
-            return_number=np.ones(y.size, np.uint8),
-            time=2 * measured / SPEED_OF_LIGHT,
-            camera=CAMERA,
-        )
+        returns = list_returns(y, x, measured, signal, sigma, CAMERA)
         return TargetShot(returns, distance, RECORD, f"a plate at {distance:g} m", percent)
 
     def see_all(self) -> list[TargetShot]:
@@ -267,17 +272,7 @@ def see_depths(depth_m: np.ndarray, photons: float, random: np.random.Generator)
     signal = random.poisson(photons * (2 / true) ** 2).clip(1).astype(float)
     sigma = NOISE_M / np.sqrt(signal)
     measured = true + LATE_S * SPEED_OF_LIGHT / 2 + random.normal(0, sigma)
-    returns = Returns(
-        y=y.astype(np.int32),
-        x=x.astype(np.int32),
-        range=measured,
-        intensity=(signal * measured**2).astype(np.float32),
-        confidence=sigma.astype(np.float32),
-        return_number=np.ones(y.size, np.uint8),
-        time=2 * measured / SPEED_OF_LIGHT,
-        camera=ROOM_CAMERA,
-    )
-    return TargetShot(returns, 2.0, RECORD)
+    return TargetShot(list_returns(y, x, measured, signal, sigma, ROOM_CAMERA), 2.0, RECORD)
 
 
 @pytest.mark.parametrize("kind", ["room", "slanted", "bush", "relief", "walls", "empty"])
