@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from devices.linospad2 import CLOCK_PERIOD_S, PIXELS, BoardCalibration
 from devices.source import Records
-from devices.timetag.codec import DELTA
+from devices.timetag_codec import DELTA
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.shots import Streak
@@ -263,12 +263,12 @@ class TagHistogram(Accumulator):
         self._known = -1
 
     def add(self, records: Records, after_gap: bool = False) -> None:
-        """Add time tags, an array of `devices.timetag.codec.RECORD_DTYPE`; `after_gap`: some are
+        """Add time tags, an array of `devices.timetag_codec.RECORD_DTYPE`; `after_gap`: some are
         missing before them.
 
         Parameters
         ----------
-        records : (n,) array of `devices.timetag.codec.RECORD_DTYPE`
+        records : (n,) array of `devices.timetag_codec.RECORD_DTYPE`
         after_gap : bool
         """
         from devices.histogram_kernels import add_tags, find_last_sync

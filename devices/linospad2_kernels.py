@@ -1,9 +1,5 @@
-"""Layout of the words of LinoSPAD2's stream; see `devices.linospad2` for what the bits mean.
-
-Apart from the compiled loops that read them, so that their names do not load a compiler.
-
-Compiled loops over the words of LinoSPAD2's stream; see `devices.linospad2` for what the
-bits mean.
+"""Compiled loops over the words of LinoSPAD2's stream, and their layout; see `devices.linospad2` for
+what the bits mean.
 """
 
 from __future__ import annotations

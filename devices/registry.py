@@ -27,7 +27,7 @@ OPENERS: dict[str, str] = {
     "sim+linospad2": "devices.emulation.linospad2:open_simulated",
     "sim+remoteex": "devices.emulation.remoteex:open_emulated",
     "sim+spad512": "devices.emulation.spad512:open_emulated",
-    "timetag": "devices.timetag.driver:open_timetag",
+    "timetag": "devices.timetag:open_timetag",
     "sim+tmf8828": "devices.emulation.histogram_kits:open_tmf8828",
     "sim+vl53l8": "devices.emulation.histogram_kits:open_vl53l8",
     "tmf8828": "devices.histogram_kits:open_tmf8828",
@@ -50,14 +50,14 @@ FILE_OPENERS: dict[str, str] = {
 # Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail,
 # without hardware.
 FINDERS: tuple[str, ...] = (
-    "devices.timetag.driver:find_timetaggers",
+    "devices.timetag:find_timetaggers",
     "devices.aravis:find_cameras",
 )
 # Name of a codec -> its class; a recording names the codec that its bytes need
 CODECS: dict[str, str] = {
     "frames": "devices.frames:FrameCodec",
     "linospad2": "devices.linospad2:LinoSpad2Codec",
-    "timetag": "devices.timetag.codec:TimeTagCodec",
+    "timetag": "devices.timetag_codec:TimeTagCodec",
 }
 
 

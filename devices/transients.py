@@ -11,14 +11,25 @@ Besides what a source itself takes, its address may say how to gather (`Accumula
 * ``records``: photons of a shot, where a source is read shot after shot; 100 000 by default;
 * ``sync``, ``pixels``: channel of the laser's pulses and channels of the line's pixels of a time
   tagger, ``0`` and ``1,2,3`` by default.
+
+Read shot after shot, a source gives streak images as they come, with what became of every other
+one::
+
+    Source -> TransientStream (one image of several pictures or photons) -> TrackedShots
+           -> stages that make clouds -> consumer, which asks TrackedShots for the age of each and
+                                         for the accounts of all
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterator
+from collections import deque
+from collections.abc import Collection, Generator, Iterator
 from dataclasses import dataclass, replace
+from math import inf
+from operator import itemgetter
 from pathlib import Path
+from sys import maxsize
 from time import monotonic
 from urllib.parse import quote, urlencode
 
@@ -30,9 +41,10 @@ from devices.files import compute_photon_times
 from devices.histogram import BinAxis, StampHistogram, TagHistogram, TimeHistogram
 from devices.linospad2 import BoardCalibration
 from devices.registry import open as open_source
-from devices.source import READ_TIMEOUT_S, Batch, Source
+from devices.source import READ_TIMEOUT_S, Batch, Source, Stats
+from devices.stream import InstrumentClock, StreamSource
 from tofclip.camera import Camera
-from tofclip.errors import DeviceTimeoutError, InputError
+from tofclip.errors import DeviceTimeoutError, InputError, TofclipError
 from tofclip.shots import Streak
 from tofclip.storage import Record, collect_provenance
 
@@ -223,3 +235,246 @@ def strip_options(uri: Uri, names: Collection[str] = Accumulation.names()) -> st
     values = {k: v for k, v in uri.values.items() if k not in names or k in own}
     place = quote(uri.location, safe="/:@[]~ ")
     return f"{uri.scheme}://{place}" + (f"?{urlencode(values)}" if values else "")
+
+
+MAX_STAMPS = 10_000  # Shots on their way whose stamps are kept
+
+
+@dataclass(frozen=True)
+class ShotStamp:
+    """As which shot, and when, a streak image was taken."""
+
+    # its number at the instrument, from 0: those that were lost on the way have been counted
+    number: int
+    # when the instrument took the last of it by its own clock, s of `time.monotonic`; 0 where it
+    # does not say
+    taken_at: float = 0.0
+    # when the last of it came, s of `time.monotonic`; 0 where it comes from a file
+    received_at: float = 0.0
+
+    def compute_age(self) -> float | None:
+        """Return the seconds since it was taken, or since it came where the instrument does not say
+        when it was taken; None for a file.
+        """
+        began = self.taken_at or self.received_at
+        return monotonic() - began if began else None
+
+
+@dataclass(frozen=True)
+class ShotAccounts:
+    """What became of every shot."""
+
+    acquired: int  # shots that the instrument took, or that were read from a file
+    delivered: int
+    dropped_device: int  # lost by the instrument or on the wire, or damaged when they came
+    # came and were dropped for newer ones, by the driver's buffer or between the stages, or waited
+    # still when the stream was ended
+    dropped_host: int
+    failed: int = 0  # could not be read, or no cloud could be made of them
+
+    @property
+    def dropped(self) -> int:
+        """All that were taken and lost or left out, without those that failed."""
+        return self.dropped_device + self.dropped_host
+
+
+def read_transients(address: str, bin_width: float | None = None) -> TransientStream:
+    """Read a source until it ends, and yield one streak image after the other.
+
+    One is made of each ``frames`` pictures of a camera or ``records`` photons, as the address says;
+    the last one may have fewer. The source is opened with the first image, and closed with the
+    stream. Memory: a batch of the source, and a streak image.
+    """
+    return TransientStream(address, bin_width)
+
+
+class TransientStream(Iterator[Streak]):
+    """Streak images as they come, and where every other one went; see `read_transients`.
+
+    A live camera whose pictures are taken one by one is read newest first, unless the address
+    chooses a ``policy``: what is shown or ranged late would be of no use. What is dropped for that
+    is in `stats`.
+    """
+
+    def __init__(self, address: str, bin_width: float | None = None) -> None:
+        self._uri = Uri.parse(address)
+        self._gathering = Accumulation.of(self._uri, bin_width)
+        self._source: Source | None = None
+        self._shots = self._read()
+        self._records_per_shot = 1
+        self._clock = InstrumentClock()
+        self._taken_at = self._received_at = 0.0
+        self.stamp: ShotStamp | None = None
+        """Of the last image; None before the first."""
+        self.is_numbered = False
+        """Whether the instrument itself numbers its shots, as cameras do."""
+
+    @property
+    def is_live(self) -> bool:
+        """Whether an instrument, real or emulated, is being read."""
+        return self._source is not None and self._source.is_live
+
+    @property
+    def stats(self) -> Stats:
+        """Where every record went; see `Source.stats`."""
+        return Stats() if self._source is None else self._source.stats
+
+    @property
+    def shots_acquired(self) -> int:
+        """Images for which the instrument has registered enough."""
+        return -(-self.stats.acquired // self._records_per_shot)
+
+    @property
+    def shots_lost(self) -> int:
+        """Of these, images for which the instrument or the wire lost or damaged the data."""
+        return (self.stats.lost_device + self.stats.malformed) // self._records_per_shot
+
+    def __next__(self) -> Streak:
+        return next(self._shots)
+
+    def close(self) -> None:
+        """Close the source."""
+        self._shots.close()
+
+    def _read(self) -> Generator[Streak]:
+        gathering = self._gathering
+        with open_source(strip_options(self._uri)) as source:
+            self._source = source
+            known = source.calibration
+            camera = read_camera(known)
+            tick = None if known is None else known.attributes.get("tick_s")
+            self._records_per_shot = gathering.records
+            if isinstance(source, StreamSource) and source.codec.name == "frames":
+                self._records_per_shot = gathering.frames
+                self.is_numbered = True
+                if gathering.frames == 1 and "policy" not in self._uri.values:
+                    source.keep_newest()
+            seconds = gathering.seconds if "seconds" in self._uri.values else inf
+            batches = self._note_times(read_batches(source, seconds), tick)
+            for number, parts in itertools.groupby(_split_shots(batches, gathering), itemgetter(0)):
+                streak = accumulate_streak((part for _, part in parts), known, gathering)
+                self.stamp = ShotStamp(number, self._taken_at, self._received_at)
+                yield replace(streak, camera=camera, source=f"{self._uri.text} shot {number}")
+
+    def _note_times(self, batches: Iterator[Batch], tick: object) -> Iterator[Batch]:
+        """Note when each batch was taken and came; photons carry the instrument's clock in their
+        time tags, of which `tick` is the unit in s.
+        """
+        for batch in batches:
+            self._taken_at, self._received_at = batch.taken_at, batch.received_at
+            names = batch.records.dtype.names or ()
+            if isinstance(tick, float) and "time_ticks" in names and len(batch):
+                stamp = float(batch.records["time_ticks"][-1]) * tick
+                self._clock.observe(stamp, batch.received_at)
+                self._taken_at = self._clock.to_host(stamp) if batch.received_at else 0.0
+            yield batch
+
+
+class TrackedShots(Iterator[Streak | TofclipError]):
+    """Shots on their way into stages, each with its stamp, so that the consumer behind the stages
+    can say how old a shot is and where the others went.
+
+    `shots`: A `TransientStream`, or shots from files: in the place of one that cannot be read its
+    error.
+    """
+
+    def __init__(self, shots: Iterator[Streak] | Iterator[Streak | TofclipError]) -> None:
+        self._shots = shots
+        self._stream = shots if isinstance(shots, TransientStream) else None
+        self._stamps: dict[int, ShotStamp] = {}
+        self._count = self._first_number = 0
+        self._peeked: deque[Streak | TofclipError] = deque()
+
+    @property
+    def is_live(self) -> bool:
+        """Whether an instrument is read, so that what comes too late is dropped."""
+        return self._stream is not None and self._stream.is_live
+
+    def peek(self) -> Streak | None:
+        """Return the next shot that can be read; it and those before it are still to come. None at
+        the end.
+        """
+        while not self._peeked or isinstance(self._peeked[-1], TofclipError):
+            try:
+                self._peeked.append(self._take())
+            except StopIteration:
+                return None
+        return self._peeked[-1]
+
+    def __next__(self) -> Streak | TofclipError:
+        return self._peeked.popleft() if self._peeked else self._take()
+
+    def _take(self) -> Streak | TofclipError:
+        shot = next(self._shots)
+        stamp = None if self._stream is None else self._stream.stamp
+        stamp = stamp or ShotStamp(self._count)
+        self._stamps[self._count] = stamp
+        if self._count == 0:
+            self._first_number = stamp.number
+        self._stamps.pop(self._count - MAX_STAMPS, None)
+        self._count += 1
+        return shot
+
+    def get_stamp(self, place: int) -> ShotStamp:
+        """Return the stamp of the shot that came as number `place` out of this iterator, from 0.
+        Asked once for each shot, and not for one before.
+        """
+        for earlier in [known for known in list(self._stamps) if known < place]:
+            del self._stamps[earlier]  # they were dropped
+        return self._stamps.pop(place, ShotStamp(place))
+
+    def count_dropped(self, stamp: ShotStamp, delivered: int) -> int:
+        """Return how many shots up to a delivered one were lost, wherever that was. Those behind
+        it are not known yet.
+
+        `stamp`: the newest delivered one's; `delivered`: shots delivered so far, this one included.
+        """
+        missing = stamp.number - self._first_number + 1 - delivered
+        if self._stream is not None and not self._stream.is_numbered:
+            missing += self._stream.shots_lost
+        return missing
+
+    def count_shots(self, delivered: int, failed: int = 0) -> ShotAccounts:
+        """Return what became of every shot, given how many were delivered and how many failed;
+        final once the stream has been closed.
+        """
+        acquired, lost = self._count, 0
+        if self._stream is not None and self._stream.is_live:
+            # The instrument knows of shots that never reached this program.
+            acquired = max(self._stream.shots_acquired, self._count)
+            lost = self._stream.shots_lost
+        dropped = acquired - lost - delivered - failed
+        return ShotAccounts(acquired, delivered, lost, dropped, failed)
+
+    def close(self) -> None:
+        """Close the source; not while another thread waits for a shot."""
+        close = getattr(self._shots, "close", None)
+        if close is not None:
+            close()
+
+
+def _split_shots(batches: Iterator[Batch], gathering: Accumulation) -> Iterator[tuple[int, Batch]]:
+    """Cut batches where shots end, and say to which shot each part belongs.
+
+    Pictures carry the instrument's number, in which those that were lost have been counted; where
+    it begins anew, it is counted on from the last one. Photons are counted here.
+    """
+    done = number = base = 0
+    last = -1
+    for batch in batches:
+        names = batch.records.dtype.names or ()
+        size = {"counts": gathering.frames, "histogram": maxsize}.get(names[-1], gathering.records)
+        own = batch.records["number"] if "number" in names else None
+        if own is not None and len(own):
+            base += last + 1 if own[0] <= last else 0
+            last = int(own[-1])
+        start = 0
+        while start < len(batch):
+            end = min(len(batch), start + size - done % size)
+            if done % size == 0:
+                number = (done if own is None else base + int(own[start])) // size
+            after_gap, first = batch.after_gap and start == 0, batch.first + start
+            part = batch.records[start:end]
+            yield number, replace(batch, records=part, first=first, after_gap=after_gap)
+            done += end - start
+            start = end

@@ -21,7 +21,7 @@ from devices.histogram import BinAxis, StampHistogram, TagHistogram
 from devices.linospad2 import STAMP_DTYPE, LinoSpad2Codec
 from devices.recorder import record_source
 from devices.source import Records, Source, as_bytes
-from devices.timetag.codec import RECORD_BYTES, RECORD_DTYPE, TimeTagCodec
+from devices.timetag_codec import RECORD_BYTES, RECORD_DTYPE, TimeTagCodec
 
 MEGA = 10**6
 FILL_FRACTION = 0.5  # of LinoSPAD2's words hold a time stamp

@@ -19,7 +19,7 @@ from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
 
 if TYPE_CHECKING:
-    from devices.shot_stream import TrackedShots
+    from devices.transients import TrackedShots
     from tofclip.sequences.ranger import CloudPipeline
     from tofclip.sequences.streaming import StreamedCloud
     from tofclip.shots import Streak
@@ -68,7 +68,7 @@ def stream(
     from dataclasses import asdict
     from itertools import islice
 
-    from devices.shot_stream import TrackedShots
+    from devices.transients import TrackedShots
     from tofclip.sequences.streaming import stream_clouds
 
     require_format(suffix)
@@ -118,7 +118,7 @@ def _read_shots(
     """Shots of an instrument, a folder or a stack; in the place of one that cannot be read its
     error, which lets those behind it go on.
     """
-    from devices.shot_stream import read_transients
+    from devices.transients import read_transients
     from tofclip.sequences import list_shots
 
     if "://" in source:

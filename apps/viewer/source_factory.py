@@ -22,8 +22,7 @@ from apps.viewer.sources import (
     find_clouds,
 )
 from devices.recording.read import read_head_if_recording
-from devices.shot_stream import TrackedShots, read_transients
-from devices.transients import read_transient
+from devices.transients import TrackedShots, read_transient, read_transients
 from tofclip.camera import Camera, measure
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import translate_read_errors

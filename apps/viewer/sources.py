@@ -36,7 +36,7 @@ from apps.viewer.source import (
     Waveform,
     list_camera_notes,
 )
-from devices.shot_stream import TrackedShots
+from devices.transients import TrackedShots
 from nlos import Volume
 from tofclip.camera import Camera, Rectifier
 from tofclip.errors import FileFormatError, InputError, TofclipError

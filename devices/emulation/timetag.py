@@ -33,8 +33,7 @@ from devices.emulation.scenes import LineLight, simulate_line_light
 from devices.emulation.usb import PACKET_BYTES, VirtualDevice, VirtualUsb, make_usb_error
 from devices.source import ByteView, Records
 from devices.stream import StreamSource
-from devices.timetag.codec import COUNTER_RANGE, LOST, RECORD_BYTES, RECORD_DTYPE, WRAP
-from devices.timetag.driver import (
+from devices.timetag import (
     COMMAND_ENDPOINT,
     DATA_ENDPOINT,
     INSTRUMENT,
@@ -45,6 +44,7 @@ from devices.timetag.driver import (
     TimeTagOptions,
     open_on_backend,
 )
+from devices.timetag_codec import COUNTER_RANGE, LOST, RECORD_BYTES, RECORD_DTYPE, WRAP
 from tofclip.errors import InputError
 
 MAX_TICK = (1 << 62) - 1  # A tick that never comes
@@ -87,7 +87,7 @@ class PoissonStream:
 
     def next_words(self, limit: int, last: int) -> ByteView:
         """Return the next words; see `TagStream`."""
-        from devices.timetag.kernels import fill_poisson_words
+        from devices.timetag_kernels import fill_poisson_words
 
         words = np.empty(limit * RECORD_BYTES, np.uint8)
         written = fill_poisson_words(
@@ -155,7 +155,7 @@ class PulsedSceneStream:
 
     def _fill_block(self) -> None:
         """Make the records of the next pulses; the same number of a block gives the same records."""
-        from devices.timetag.kernels import encode_timetags
+        from devices.timetag_kernels import encode_timetags
 
         records = self._draw_records(np.random.default_rng([self._seed, self._block]))
         first = self._block * BLOCK_TICKS

@@ -15,8 +15,7 @@ import pytest
 from apps.cli import main
 from devices.emulation.remoteex import EmulatedStreakCamera
 from devices.emulation.scenes import EmulatedLight, draw_exposure, simulate_line_light
-from devices.shot_stream import read_transients
-from devices.transients import read_transient
+from devices.transients import read_transient, read_transients
 from tofclip.camera import Camera, SkewSweep
 from tofclip.io.streaks import save_stack
 from tofclip.lidar import PointCloud

@@ -21,7 +21,7 @@ from devices.linospad2 import LinoSpad2Codec
 from devices.recorder import record_source
 from devices.recording.check import verify
 from devices.source import Batch, DecodedSource, Records, Source, as_bytes
-from devices.timetag.driver import SendWindow
+from devices.timetag import SendWindow
 from tofclip.errors import DeviceTimeoutError, InputError
 
 RECORDS = 4000

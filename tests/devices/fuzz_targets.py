@@ -28,7 +28,7 @@ from devices.remoteex import (
 from devices.source import Codec, Gap, as_bytes
 from devices.spad512 import ExposureRequest, Spad512Feed, SpadOptions
 from devices.tcp import TcpLink
-from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec, mark_wraps
+from devices.timetag_codec import RECORD_DTYPE, TimeTagCodec, mark_wraps
 from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError
 from tofclip.io import hamamatsu as hpdta
 

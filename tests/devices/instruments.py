@@ -14,7 +14,7 @@ from devices.emulation.timetag import (
     PoissonStream,
 )
 from devices.source import Batch, Records, Source, as_bytes
-from devices.timetag.codec import TimeTagCodec
+from devices.timetag_codec import TimeTagCodec
 from tofclip.errors import DeviceTimeoutError
 
 TAGS = TimeTagCodec()

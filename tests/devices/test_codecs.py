@@ -14,7 +14,7 @@ from devices.linospad2 import FIRMWARES, MAX_TIMESTAMPS, LinoSpad2Codec
 from devices.registry import CODECS, build_codec
 from devices.source import Codec, Records, as_bytes
 from devices.spad512 import ExposureRequest
-from devices.timetag.codec import (
+from devices.timetag_codec import (
     COUNTER_RANGE,
     DELTA,
     LOST,

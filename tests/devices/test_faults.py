@@ -35,7 +35,7 @@ from devices.emulation.timetag import GroundTruth
 from devices.frames import FrameCodec
 from devices.source import Batch, Info, Ledger, OverflowPolicy, Source, Stats
 from devices.stream import StreamOptions, StreamSource, Transfer
-from devices.timetag.driver import SendWindow
+from devices.timetag import SendWindow
 from tofclip.errors import (
     BufferOverflowError,
     DeviceDisconnectedError,

@@ -18,7 +18,7 @@ from devices.linospad2 import (
     STAMP_WITH_COUNTER_DTYPE,
     BoardCalibration,
 )
-from devices.timetag.codec import DELTA, RECORD_DTYPE
+from devices.timetag_codec import DELTA, RECORD_DTYPE
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.threads import THREADS_VARIABLE

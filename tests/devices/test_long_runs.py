@@ -18,7 +18,7 @@ from devices.linospad2 import LinoSpad2Codec
 from devices.recorder import measure_throughput
 from devices.source import Info, Ledger, as_bytes
 from devices.stream import StreamOptions, StreamSource, Transfer
-from devices.timetag.codec import RECORD_BYTES
+from devices.timetag_codec import RECORD_BYTES
 from tofclip.storage import Record
 
 pytestmark = pytest.mark.nightly

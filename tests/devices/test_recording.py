@@ -30,7 +30,7 @@ from devices.recording.read import (
 )
 from devices.recording.write import RecordingWriter, make_head
 from devices.source import Batch, DecodedSource, Gap, Info, Piece, Records, Stats, as_bytes
-from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
+from devices.timetag_codec import RECORD_DTYPE, TimeTagCodec
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceTimeoutError,
@@ -573,7 +573,7 @@ def test_a_reader_thread_never_dies_silently(monkeypatch: pytest.MonkeyPatch) ->
 
     for method in ("pull", "close"):
         with monkeypatch.context() as patch:
-            patch.setattr(f"devices.timetag.driver.TimeTaggerFeed.{method}", fail)
+            patch.setattr(f"devices.timetag.TimeTaggerFeed.{method}", fail)
             source = devices.open(SIM)
             source.stop()
             with pytest.raises(BrokenError):

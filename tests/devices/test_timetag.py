@@ -16,6 +16,7 @@ import pytest
 from instruments import KIND, TAGS, finish, joined, make_tagger, read_until_dark, true_records
 
 import devices
+from devices import timetag as driver
 from devices.emulation.harness import Fault
 from devices.emulation.timetag import (
     BOARD_MEMORY_BYTES,
@@ -28,9 +29,7 @@ from devices.emulation.timetag import (
 )
 from devices.emulation.usb import VirtualUsb, make_usb_error
 from devices.source import as_bytes
-from devices.timetag import driver
-from devices.timetag.codec import COUNTER_RANGE, WRAP
-from devices.timetag.driver import (
+from devices.timetag import (
     COMMAND_ENDPOINT,
     DATA_ENDPOINT,
     REPLY_ENDPOINT,
@@ -41,6 +40,7 @@ from devices.timetag.driver import (
     TimeTaggerFeed,
     TimeTagOptions,
 )
+from devices.timetag_codec import COUNTER_RANGE, WRAP
 from devices.usb import UsbLink
 from tofclip.errors import (
     BufferOverflowError,

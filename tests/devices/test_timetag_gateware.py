@@ -22,8 +22,8 @@ from devices.emulation.timetag import (
 )
 from devices.emulation.usb import VirtualUsb
 from devices.source import as_bytes
-from devices.timetag.codec import TimeTagCodec
-from devices.timetag.driver import USB_IDENTITY, Capture, Register, TimeTagger
+from devices.timetag import USB_IDENTITY, Capture, Register, TimeTagger
+from devices.timetag_codec import TimeTagCodec
 from devices.usb import UsbLink
 
 BENCH = Path(__file__).with_name("timetag_bench.v")

@@ -18,7 +18,7 @@ from devices.emulation.timetag import (
     PulsedSceneStream,
 )
 from devices.source import Records, as_bytes
-from devices.timetag.codec import COUNTER_RANGE, WRAP, TimeTagCodec
+from devices.timetag_codec import COUNTER_RANGE, WRAP, TimeTagCodec
 from devices.transients import read_transient
 from tofclip.errors import InputError
 

@@ -13,10 +13,9 @@ from devices.emulation.linospad2 import SimulatedBoard, draw_uneven_calibration
 from devices.emulation.scenes import simulate_line_light
 from devices.histogram import BinAxis, StampHistogram
 from devices.linospad2 import BoardCalibration, LinoSpad2Codec, load_calibration
-from devices.shot_stream import read_transients
 from devices.source import Batch, Info, Records, Source, Stats
-from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
-from devices.transients import read_transient
+from devices.timetag_codec import RECORD_DTYPE, TimeTagCodec
+from devices.transients import read_transient, read_transients
 from tofclip.errors import InputError, MissingTimeAxisError
 from tofclip.lidar import depth
 from tofclip.recovery import recover

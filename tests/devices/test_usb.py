@@ -11,10 +11,10 @@ import pytest
 import usb.backend.libusb1
 import usb.core
 
+from devices import timetag as timetag
 from devices.address import Uri
 from devices.emulation.usb import VirtualDevice, VirtualUsb, make_usb_error
-from devices.timetag import driver as timetag
-from devices.timetag.driver import BARE_CHIP_IDENTITY, find_timetaggers, open_timetag
+from devices.timetag import BARE_CHIP_IDENTITY, find_timetaggers, open_timetag
 from devices.usb import UsbIdentity, UsbLink, system_backend, translate_errors
 from tofclip.errors import (
     DeviceBusyError,

@@ -13,7 +13,7 @@ from devices.histogram_kits import Tmf8828Options, Vl53l8Options
 from devices.registry import FILE_OPENERS, OPENERS
 from devices.remoteex import RemoteExOptions
 from devices.spad512 import SpadOptions
-from devices.timetag.driver import TimeTagOptions
+from devices.timetag import TimeTagOptions
 
 DOCS = Path(tofclip.__file__).parents[1] / "docs"
 PAGES = {

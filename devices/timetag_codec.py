@@ -1,8 +1,4 @@
-"""Layout of the words of the time tagger's stream; see `devices.timetag.codec` for what the bits mean.
-
-Apart from the compiled loops that read them, so that their names do not load a compiler.
-
-The record stream of the FX2 time tagger (S. V. Polyakov, B. Gamari; gateware and format are
+"""The record stream of the FX2 time tagger (S. V. Polyakov, B. Gamari; gateware and format are
 public).
 
 A record is 6 bytes, the highest first::
@@ -17,6 +13,8 @@ A record is 6 bytes, the highest first::
 
 The counter wraps every 2**36 ticks (about nine minutes at 128 MHz), and the instrument sends a
 record each time it is at zero, whether or not a channel saw anything, so that none is missed.
+
+The compiled loops that read them are apart, so that their names do not load a compiler.
 """
 
 from __future__ import annotations
@@ -98,7 +96,7 @@ class TimeTagCodec:
         `data`: whole records; `after_loss`: records are missing right before these, so that the
         counter may have wrapped unseen.
         """
-        from devices.timetag.kernels import decode_timetags
+        from devices.timetag_kernels import decode_timetags
 
         words = as_bytes(data)
         if words.size % RECORD_BYTES:
@@ -112,7 +110,7 @@ class TimeTagCodec:
 
     def encode(self, records: Records) -> bytes:
         """Return the bytes that the instrument would have sent."""
-        from devices.timetag.kernels import encode_timetags
+        from devices.timetag_kernels import encode_timetags
 
         _require_valid(records)
         data = np.empty(len(records) * RECORD_BYTES, np.uint8)

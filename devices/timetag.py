@@ -19,7 +19,7 @@ from devices.address import Uri, option
 from devices.registry import DiscoveredInstrument
 from devices.source import Gap, Info, Ledger
 from devices.stream import LiveOptions, StreamSource, Transfer
-from devices.timetag.codec import RECORD_BYTES, TimeTagCodec
+from devices.timetag_codec import RECORD_BYTES, TimeTagCodec
 from devices.usb import UsbIdentity, UsbLink, find_devices, read_serial, system_backend
 from tofclip.errors import (
     DeviceDisconnectedError,

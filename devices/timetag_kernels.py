@@ -1,5 +1,5 @@
 """Compiled loops over the words of the time tagger's stream, and those that make them for its
-emulation; see `devices.timetag.codec` for what the bits mean.
+emulation; see `devices.timetag_codec` for what the bits mean.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from devices.timetag.codec import (
+from devices.timetag_codec import (
     DELTA,
     HALF_RANGE,
     LOST,
@@ -128,7 +128,7 @@ def fill_poisson_words(state, now, scale, weights, last, words):
         state[0], now[0] = after, tick
         at = written * RECORD_BYTES
         time = tick & TIME_MASK
-        # Six bytes, the highest first; see devices.timetag.codec.
+        # Six bytes, the highest first; see devices.timetag_codec.
         words[at] = kind << 5
         words[at + 1] = (lines << 4) | (time >> 32)
         words[at + 2] = (time >> 24) & 0xFF
