@@ -40,25 +40,11 @@ class InactiveRegion:
     Everything happens in the plane of the axis and the aperture's width. A point is seen from
     somewhere on the aperture exactly if it is seen from one of its ends; hence views that stand at
     both ends and anywhere between see as far as a lens that fills the aperture would.
-
-    Parameters
-    ----------
-    baseline : float
-        L, distance between the outermost views, m.
-    width : float
-        D, width of the occluder's solid part along the baseline, m.
-    distance : float
-        d, from the views to the occluder, m.
-
-    Raises
-    ------
-    InputError
-        A length is not positive and finite.
     """
 
-    baseline: float
-    width: float
-    distance: float
+    baseline: float  # L, between the outermost views, m
+    width: float  # D, of the occluder's solid part along the baseline, m
+    distance: float  # d, from the views to the occluder, m
 
     def __post_init__(self) -> None:
         for name in ("baseline", "width", "distance"):

@@ -60,21 +60,9 @@ __all__ = [
 class LightFieldCamera(ABC):
     """An encoder A_k for each view, and the two models that follow from them.
 
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns of every view's picture.
-    views : sequence of (float, float)
-        (v, u) of every view.
-    sampling_ratio : float
-        Measurements over pixels of one picture.
-    seed : int
-        Of everything random.
-
-    Attributes
-    ----------
-    used_views : tuple of int
-        Views that get measurements, in the order of the measurements.
+    `image_shape` is that of every view's picture, `views` (v, u) of each, `sampling_ratio` measurements
+    over pixels of one picture, `seed` that of everything random. `used_views` get measurements, in the
+    order of the measurements.
     """
 
     name: ClassVar[str]
@@ -105,18 +93,8 @@ class LightFieldCamera(ABC):
 
     @abstractmethod
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d), from (rows, columns) pictures to (measurements,) vectors (Eq. 21).
-
-        Parameters
-        ----------
-        shear : float
-            That the picture is refocused at, pixels per view step.
-        reference : (float, float)
-            View (v, u) from which the picture is seen, in view steps.
-
-        Returns
-        -------
-        LinearOperator
+        """Return F(d), from the (rows, columns) picture that is refocused at `shear` and seen from the
+        view `reference`, (v, u), to (measurements,) vectors (Eq. 21).
         """
 
     def weighting(self) -> LinearOperator:
