@@ -65,7 +65,7 @@ BIN_WIDTH_NAMES = {
 
 
 @dataclass(frozen=True)
-class PhotonFile:
+class _PhotonFile:
     """What a file says it holds."""
 
     arrays: Mapping[
@@ -76,7 +76,7 @@ class PhotonFile:
     image_shape: tuple[int, int] | None = None  # of the picture of events where the format says it
 
 
-PhotonReader = Callable[[Path], PhotonFile]
+_PhotonReader = Callable[[Path], _PhotonFile]
 
 
 def read_photons(
@@ -92,7 +92,7 @@ def read_photons(
     source = Path(path)
     if axes is not None and sorted(axes) != ["t", "x", "y"]:
         raise InputError(f"axes are an order of y, x and t such as yxt, got '{axes}'")
-    opened = open_photons(source)
+    opened = _open_photons(source)
     width = opened.bin_width if bin_width is None else bin_width
     if width is None:
         raise InputError(f"{source}: does not say how long a bin lasts; give `bin_width`")
@@ -102,7 +102,7 @@ def read_photons(
 
 def describe_photons(path: str | Path) -> dict[str, Any]:
     """Return what a file of photons holds, without reading its values."""
-    opened = open_photons(Path(path))
+    opened = _open_photons(Path(path))
     axes = opened.axes
     try:
         layout = _find_layout(opened, Path(path))
@@ -122,7 +122,7 @@ def describe_photons(path: str | Path) -> dict[str, Any]:
     return found
 
 
-def open_photons(path: Path) -> PhotonFile:
+def _open_photons(path: Path) -> _PhotonFile:
     """List the arrays of a file by the reader that its first bytes or its name ask for."""
     with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(520)
@@ -147,7 +147,7 @@ def _is_cell(entry: ArchiveEntry) -> bool:
 
 
 def _find_layout(
-    opened: PhotonFile, path: Path, axes: str | None = None
+    opened: _PhotonFile, path: Path, axes: str | None = None
 ) -> tuple[str, list[ArchiveEntry]]:
     """Choose the arrays that hold the photons."""
     arrays = opened.arrays
@@ -172,7 +172,9 @@ def _find_layout(
     raise FileFormatError(path, f"holds {problem} ({held}); {remedy}")
 
 
-def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | None) -> PhotonImage:
+def _read_layout(
+    opened: _PhotonFile, path: Path, bin_width: float, axes: str | None
+) -> PhotonImage:
     layout, arrays = _find_layout(opened, path, axes)
     if layout == "cube":
         cube = arrays[0].load()
@@ -253,7 +255,7 @@ def _compare_concentration(cube: NDArray[Any], time: int) -> float:
     return float(unevenness[0] / max(unevenness[1:]))
 
 
-def _open_npy(path: Path) -> PhotonFile:
+def _open_npy(path: Path) -> _PhotonFile:
     with BoundedFile(path) as file:
         shape, dtype = read_npy_header(file)
         held = path.stat().st_size - file.tell()
@@ -262,10 +264,10 @@ def _open_npy(path: Path) -> PhotonFile:
     def load() -> NDArray[Any]:
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
-    return PhotonFile({"array": ArchiveEntry(shape, dtype, load)})
+    return _PhotonFile({"array": ArchiveEntry(shape, dtype, load)})
 
 
-def _open_npz(path: Path) -> PhotonFile:
+def _open_npz(path: Path) -> _PhotonFile:
     entries = list_npz_entries(path)
     scalars = {
         name: one.load()
@@ -273,7 +275,7 @@ def _open_npz(path: Path) -> PhotonFile:
         if not one.shape and one.dtype.kind in "uif"
     }
     arrays = {name: one for name, one in entries.items() if one.shape}
-    return PhotonFile(arrays, _find_bin_width(scalars))
+    return _PhotonFile(arrays, _find_bin_width(scalars))
 
 
 def _find_bin_width(scalars: Mapping[str, Any]) -> float | None:
@@ -285,7 +287,7 @@ def _find_bin_width(scalars: Mapping[str, Any]) -> float | None:
     return None
 
 
-def _open_mat(path: Path) -> PhotonFile:
+def _open_mat(path: Path) -> _PhotonFile:
     """Version 5; version 7.3 is HDF5."""
     arrays, scalars = {}, {}
     for name, entry in list_mat_entries(path).items():
@@ -293,10 +295,10 @@ def _open_mat(path: Path) -> PhotonFile:
             scalars[name] = entry.load()
         else:
             arrays[name] = entry
-    return PhotonFile(arrays, _find_bin_width(scalars))
+    return _PhotonFile(arrays, _find_bin_width(scalars))
 
 
-def _open_hdf5(path: Path) -> PhotonFile:
+def _open_hdf5(path: Path) -> _PhotonFile:
     import h5py
 
     arrays, scalars = {}, {}
@@ -316,7 +318,7 @@ def _open_hdf5(path: Path) -> PhotonFile:
                 shape = dataset.shape[::-1] if matlab else dataset.shape
                 load = partial(_load_dataset, path, name, matlab)
                 arrays[name] = ArchiveEntry(shape, dataset.dtype, load)
-    return PhotonFile(arrays, _find_bin_width(scalars))
+    return _PhotonFile(arrays, _find_bin_width(scalars))
 
 
 def _iterate_datasets(group: Any, visited: set[int], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -350,7 +352,7 @@ def _load_dataset(path: Path, name: str, matlab: bool) -> NDArray[Any]:
     return values.T if matlab else values
 
 
-def _open_tiff(path: Path) -> PhotonFile:
+def _open_tiff(path: Path) -> _PhotonFile:
     import tifffile
 
     with BoundedFile(path) as file, tifffile.TiffFile(file) as tiff:
@@ -369,10 +371,10 @@ def _open_tiff(path: Path) -> PhotonFile:
         with BoundedFile(path) as reopened, tifffile.TiffFile(reopened) as again:
             return np.asarray(again.series[0].asarray())
 
-    return PhotonFile({"pages": ArchiveEntry(shape, dtype, load)}, axes="tyx")
+    return _PhotonFile({"pages": ArchiveEntry(shape, dtype, load)}, axes="tyx")
 
 
-def _open_ptu(path: Path) -> PhotonFile:
+def _open_ptu(path: Path) -> _PhotonFile:
     """PicoQuant's images: markers make lines and frames; frames and channels are summed."""
     ptufile = import_file_reader("ptufile", TCSPC)
     with BoundedFile(path) as opened, ptufile.PtuFile(opened) as file:
@@ -402,10 +404,10 @@ def _open_ptu(path: Path) -> PhotonFile:
         summed: NDArray[Any] = np.asarray(cube).sum(axis=(0, 3), dtype=np.uint32)
         return summed
 
-    return PhotonFile({"image": ArchiveEntry(shape, np.dtype(np.uint32), load)}, width, "yxt")
+    return _PhotonFile({"image": ArchiveEntry(shape, np.dtype(np.uint32), load)}, width, "yxt")
 
 
-def _open_scan(path: Path) -> PhotonFile:
+def _open_scan(path: Path) -> _PhotonFile:
     """PicoQuant's images in T2 mode: markers make lines and frames; frames are put together."""
     events = PtuEvents(path)
     rows, columns = get_scan_shape(events)
@@ -414,10 +416,10 @@ def _open_scan(path: Path) -> PhotonFile:
     scan = read_scan(events)  # only then it is known which events are photons in a line
     found = {"x": scan.x, "y": scan.y, "time": scan.time}
     arrays = {name: ArchiveEntry.of(values) for name, values in found.items()}
-    return PhotonFile(arrays, events.tick, "", (rows, columns))
+    return _PhotonFile(arrays, events.tick, "", (rows, columns))
 
 
-def _open_sdt(path: Path) -> PhotonFile:
+def _open_sdt(path: Path) -> _PhotonFile:
     """Becker & Hickl's images; those of several channels are summed."""
     blocks, width = read_sdt_blocks(path)
     # Before the last three axes some have those of routed detectors.
@@ -435,10 +437,10 @@ def _open_sdt(path: Path) -> PhotonFile:
     def load() -> NDArray[Any]:
         return np.asarray(np.sum(np.stack(images), axis=0, dtype=dtype))
 
-    return PhotonFile({"image": ArchiveEntry(shape, dtype, load)}, width, "yxt")
+    return _PhotonFile({"image": ArchiveEntry(shape, dtype, load)}, width, "yxt")
 
 
-READERS_BY_SIGNATURE: dict[bytes, PhotonReader] = {
+READERS_BY_SIGNATURE: dict[bytes, _PhotonReader] = {
     b"\x93NUMPY": _open_npy,
     b"PK\x03\x04": _open_npz,
     b"MATLAB 5": _open_mat,
@@ -448,4 +450,4 @@ READERS_BY_SIGNATURE: dict[bytes, PhotonReader] = {
     b"II+\0": _open_tiff,
     b"PQTTTR": _open_ptu,
 }
-READERS_BY_SUFFIX: dict[str, PhotonReader] = {".mat": _open_mat, ".sdt": _open_sdt}
+READERS_BY_SUFFIX: dict[str, _PhotonReader] = {".mat": _open_mat, ".sdt": _open_sdt}
