@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-    from apps.verbs.nlos import DemoRun
     from apps.verbs.nlos_imaging import MeasuredVolume
+    from apps.verbs.nlos_scenes import DemoRun
     from nlos import Capture, Volume
     from nlos.known_scenes import HiddenTruth
 

@@ -85,7 +85,7 @@ def test_memory_is_that_of_the_method() -> None:
 
 def test_the_demonstration(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As it is, with a coarser wall and fewer voxels."""
-    from apps.verbs import nlos as demo
+    from apps.verbs import nlos_scenes as demo
 
     for name, value in {
         "WALL_POINTS": 24,

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apps.settings import load_settings, save_settings, setting, settings_to_dict
-from apps.verbs.nlos import CompareSettings, ReconstructSettings
+from apps.verbs.nlos import ReconstructSettings
+from apps.verbs.nlos_scenes import CompareSettings
 from nlos.known_scenes import WALLS, SceneSettings
 from tofclip.errors import FileFormatError, InputError, StorageError
 
