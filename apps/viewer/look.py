@@ -150,10 +150,7 @@ def choose_ticks(scale: Scale, count: int = 6) -> tuple[list[tuple[float, str]],
 
 
 def choose_round_values(low: float, high: float, count: int) -> NDArray[np.float64]:
-    """Return at most about `count` round values, evenly apart, between two limits.
-
-    `low, high`: rising, or equal. Returns (n,).
-    """
+    """Return at most about `count` round values, evenly apart, between two limits."""
     if not high > low:
         return np.array([low])
     step = 10.0 ** np.floor(np.log10((high - low) / count))
@@ -177,11 +174,7 @@ def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
 
 
 def colour_points(cloud: PointCloud, scale: Scale, brightest: float = 0.0) -> NDArray[np.uint8]:
-    """Return each point's red, green and blue, (n, 3).
-
-    `brightest`: intensity that is drawn in full light, less of it darker; 0 for no shading. Returns
-    (n, 3).
-    """
+    """Return each point's red, green and blue, (n, 3)."""
     colours = scale.colours(QUANTITIES[scale.quantity].extract(cloud))
     # Intensity is in the colour already.
     if brightest <= 0 or scale.quantity == "intensity":
@@ -279,18 +272,8 @@ def find_point_on_ray(
     return int(np.argmin(miss))
 
 
-def make_pick(
-    cloud: PointCloud,
-    number: int,
-    pixel: tuple[int, int] | None = None,
-    waveform: Waveform | None = None,
-    return_times: tuple[float, ...] = (),
-) -> Pick:
-    """Return what is known about point `number` of a cloud.
-
-    `number`: of the point; `pixel`: row and column that the point comes from; `waveform`: of that
-    pixel; `return_times`: time of flight of that pixel's returns, s.
-    """
+def make_pick(cloud: PointCloud, number: int) -> Pick:
+    """Return what is known about point `number` of a cloud."""
     x, y, z = (float(value) for value in cloud.xyz[number])
     return Pick(
         (x, y, z),
@@ -299,17 +282,11 @@ def make_pick(
         float(cloud.intensity[number]),
         int(cloud.return_number[number]),
         float(cloud.time[number]),
-        pixel,
-        waveform,
-        return_times,
     )
 
 
 def measure_distance(first: Pick, second: Pick) -> float:
-    """Distance of two points, m.
-
-    Returns metres.
-    """
+    """Distance of two points, m."""
     return float(np.linalg.norm(np.subtract(first.position, second.position)))
 
 
@@ -377,10 +354,7 @@ def _close_seams(depth: Picture, light: Picture) -> None:
 
 
 def colour_brightness(picture: Picture, palette: str) -> Image:
-    """Colour a picture by its brightness, negative values as dark.
-
-    `picture` (rows, columns). Returns (rows, columns, 3).
-    """
+    """Colour a picture by its brightness, negative values as dark."""
     light = np.maximum(np.nan_to_num(picture), 0)
     top = float(np.percentile(light, PICTURE_WHITE_PERCENTILE)) or float(light.max()) or 1.0
     toned = np.clip(light / np.float32(top), 0, 1) ** np.float32(PICTURE_GAMMA)

@@ -161,10 +161,7 @@ def _find_label_shift(place: float) -> int:
 
 
 def render_page_html(title: str) -> str:
-    """Return what is said at the foot of the controls, and what names the browser's tab.
-
-    `title`: of the source.
-    """
+    """Return what is said at the foot of the controls, and what names the browser's tab."""
     name = html.escape(format_page_title(title), quote=True)
     # a picture's event is the one script that runs in a text put into a page
     tab = f'<img hidden src="{BLANK_PIXEL}" data-name="{name}" onload="document.title=this.dataset.name">'
@@ -175,10 +172,7 @@ def render_page_html(title: str) -> str:
 
 
 def render_waiting_html(words: str) -> str:
-    """Return what is said while there is nothing to look at yet.
-
-    `words`: what is being done.
-    """
+    """Return what is said while there is nothing to look at yet."""
     return f"<div id='waiting' style='{HTML_STYLE}'>{html.escape(words)} ...</div>"
 
 

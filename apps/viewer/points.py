@@ -71,10 +71,7 @@ class FramePacer:
     _next: float = 0.0
 
     def record_sent(self, now: float, points: int) -> None:
-        """Note that a frame was sent.
-
-        `now`: time in s; `points`: of the frame.
-        """
+        """Note that a frame was sent."""
         self._next = now + max(1 / MAX_FRAMES_PER_S, points / MAX_POINTS_PER_S)
 
     def can_send(self, now: float) -> bool:
@@ -91,10 +88,7 @@ class DetailChooser:
     _points_per_s: dict[int, float] = field(default_factory=dict)
 
     def record(self, browser: int, points: int, seconds: float) -> None:
-        """Note how long a browser took for a frame.
-
-        `browser`: its number; `points`: that were drawn.
-        """
+        """Note how long a browser took for a frame."""
         self._points_per_s[browser] = points / max(seconds, 1e-3)
 
     def knows(self, browser: int) -> bool:
@@ -117,10 +111,7 @@ class DetailChooser:
         return min(points, max(drawable, MIN_DRAWN_POINTS))
 
     def is_worthwhile(self, drawn: int, points: int) -> bool:
-        """Whether clearly more points of a cloud than are drawn now could be, or have to be fewer.
-
-        `drawn, points`: now, and of the whole cloud.
-        """
+        """Whether clearly more points of a cloud than are drawn now could be, or have to be fewer."""
         wanted = self.count(points, moving=False)
         return wanted != drawn and not (
             drawn / WORTHWHILE_FACTOR < wanted < drawn * WORTHWHILE_FACTOR and wanted < points
@@ -172,10 +163,7 @@ class Points:
         return self._order is None or (known and not self._has_to_time and not self._timing)
 
     def draw(self, xyz: NDArray[np.float32], colours: NDArray[np.uint8], size_m: float) -> None:
-        """Draw points.
-
-        `xyz` (n, 3): m; `colours` (n, 3); `size_m`: side of a point, where all are drawn.
-        """
+        """Draw points."""
         self._xyz, self._size_m = xyz, size_m
         self._colours = colours if len(xyz) else (0, 0, 0)
         # drawn by lot: every n-th point of rows of pixels would make stripes
@@ -197,10 +185,7 @@ class Points:
         self._moved_at, self._has_to_time = time.monotonic(), True
 
     def update(self, now: float) -> None:
-        """Draw what suits movement or rest, and measure browsers of which nothing is known.
-
-        `now`: seconds of the monotonic clock.
-        """
+        """Draw what suits movement or rest, and measure browsers of which nothing is known."""
         if self._order is None or self._is_held:
             return
         moving = now - self._moved_at < STILL_AFTER_S
@@ -290,10 +275,7 @@ AXIS_COLOURS = ((229, 72, 77), (70, 167, 88), (62, 142, 208))
 
 
 def draw_furniture(scene: viser.SceneApi, box: Box) -> list[Any]:
-    """Draw box, scale bar and axes around a cloud.
-
-    `box`: of the cloud. Returns to be shown and hidden together.
-    """
+    """Draw box, scale bar and axes around a cloud."""
     drawn: list[Any] = [_add_lines(scene, "/box", box.corners[np.array(box.edges)], BOX_COLOUR)]
     for name, length_m, place in zip("xyz", box.high - box.low, box.length_marks, strict=True):
         words = f"{name} {format_length(float(length_m))}"
@@ -320,10 +302,7 @@ def _draw_axes(scene: viser.SceneApi, box: Box) -> list[Any]:
 
 
 class ClipBox:
-    """A box in the scene whose two opposite corners can be dragged; points outside are not shown.
-
-    `changed`: called with the box after a corner was dragged.
-    """
+    """A box in the scene whose two opposite corners can be dragged; points outside are not shown."""
 
     def __init__(self, scene: viser.SceneApi, changed: Callable[[Box], None]) -> None:
         self._scene, self._changed = scene, changed

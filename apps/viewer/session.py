@@ -41,8 +41,8 @@ class Filters:
     intensity: Limits = NO_LIMITS  # counts, referred to 1 m
     time: Limits = NO_LIMITS  # time of flight, s
     x: Limits = NO_LIMITS  # sides of the box, m
-    y: Limits = NO_LIMITS  # sides of the box, m
-    z: Limits = NO_LIMITS  # sides of the box, m
+    y: Limits = NO_LIMITS
+    z: Limits = NO_LIMITS
 
     def __post_init__(self) -> None:
         for name, (low, high) in vars(self).items():
@@ -64,11 +64,8 @@ class Filters:
         return kept
 
 
-GATE_UP_TO_FRAME, GATE_AROUND_FRAME, GATE_ALL_TIMES = (
-    "up to the frame",
-    "around the frame",
-    "all times",
-)
+GATE_UP_TO_FRAME, GATE_AROUND_FRAME = "up to the frame", "around the frame"
+GATE_ALL_TIMES = "all times"
 # which points of a transient are shown: those of light that has come back by now, comes back now,
 # or ever does
 GATE_MODES = (GATE_UP_TO_FRAME, GATE_AROUND_FRAME, GATE_ALL_TIMES)
@@ -178,7 +175,7 @@ class Session:
         if self.following:
             self.clock.position = float(max(0, len(self.source) - 1))
         frame = self.clock.tick(now, self.source.inflow.oldest, len(self.source))
-        display_modes = self.source.display_modes
+        modes = self.source.display_modes
         key = (
             frame,
             self.colouring,
@@ -186,8 +183,8 @@ class Session:
             self.gate,
             self.half_gate,
             self.shear,
-            display_modes.current,
-            display_modes.threshold,
+            modes.current,
+            modes.threshold,
             *(setting.value for setting in self.source.settings),
             self._find_point_limit(),
         )
@@ -198,8 +195,6 @@ class Session:
     def pick(self, origin: ArrayLike, direction: ArrayLike) -> Pick | None:
         """Choose the point that a ray hits, m; the last two choices are kept, and a miss forgets
         them.
-
-        `origin` (3,): of the ray, m; `direction` (3,).
         """
         if self._displayed is None:
             return None
@@ -214,21 +209,15 @@ class Session:
         shown = self._displayed
         if shown is None or not 0 <= number < len(shown.cloud):
             raise InputError(f"there is no point {number}")
-        pixel = (
-            None
-            if shown.pixels is None
-            else (int(shown.pixels[number, 0]), int(shown.pixels[number, 1]))
-        )
-        if pixel is None or shown.pixels is None:
-            pick = make_pick(shown.cloud, number)
-        else:
-            beside = np.all(shown.pixels == pixel, axis=1)
-            pick = make_pick(
-                shown.cloud,
-                number,
-                pixel,
-                self.source.waveform(shown.frame, pixel),
-                tuple(shown.cloud.time[beside].astype(float).tolist()),
+        pick = make_pick(shown.cloud, number)
+        if shown.pixels is not None:
+            row, column = shown.pixels[number].tolist()
+            beside = np.all(shown.pixels == (row, column), axis=1)
+            pick = replace(
+                pick,
+                pixel=(row, column),
+                waveform=self.source.waveform(shown.frame, (row, column)),
+                return_times=tuple(shown.cloud.time[beside].astype(float).tolist()),
             )
         self.picks = [*self.picks, pick][-2:]
         return pick
@@ -297,12 +286,9 @@ class Session:
         # Only a gate around the frame changes with it; else all instants are recovered once and
         # filtered.
         gate = self.gate_at(frame) if self.gate == GATE_AROUND_FRAME else Gate(0, len(self.source))
-        return self._refocus_view(frame, self.shear, gate)
-
-    def _refocus_view(self, frame: int, shear: float, gate: Gate) -> View:
-        key = (0 if self.source.capabilities.times is not None else frame, shear, gate)
+        key = (0 if self.source.capabilities.times is not None else frame, self.shear, gate)
         if self._refocus_cache is None or self._refocus_cache[0] != key:
-            self._refocus_cache = key, self.source.refocus(frame, shear, gate)
+            self._refocus_cache = key, self.source.refocus(frame, self.shear, gate)
         return self._refocus_cache[1]
 
     def _gate_filters(self, frame: int) -> Filters:

@@ -57,9 +57,6 @@ class Viewpoint:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return row, column and depth (m) of points in a picture of `shape` pixels; NaN behind the
         eye.
-
-        `xyz` (n, 3): metres; `shape`: rows and columns. Returns `row, column, depth` (n,): pixels,
-        pixels and metres.
         """
         right, down, depth = self.axes @ (np.asarray(xyz, dtype=np.float64) - self.eye).T
         depth = np.where(depth > 0, depth, np.nan)

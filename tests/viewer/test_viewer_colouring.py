@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -147,7 +149,7 @@ def test_what_is_known_about_a_pick() -> None:
     cloud = make_cloud(
         np.array([[0.3, 0.4, 1.2], [0.0, 0, 0]]), {"range_sigma": np.array([0.002, 0.0])}
     )
-    first, second = make_pick(cloud, 0, (3, 4)), make_pick(cloud, 1)
+    first, second = replace(make_pick(cloud, 0), pixel=(3, 4)), make_pick(cloud, 1)
     assert measure_distance(first, second) == pytest.approx(1.3)
     assert first.description.splitlines()[:2] == [
         "x 0.3000, y 0.4000, z 1.2000 m",
