@@ -103,7 +103,28 @@ class RingMachine(RuleBasedStateMachine):
 
 
 TestRing = RingMachine.TestCase
-TestRing.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)
+TestRing.settings = settings(max_examples=200, stateful_step_count=30, deadline=None)
+
+
+@pytest.mark.parametrize(
+    ("capacity", "gaps", "left"),
+    [
+        (10, [Gap.RESTART, Gap.NONE], [Gap.RESTART]),
+        (20, [Gap.NONE, Gap.RESTART, Gap.NONE], [Gap.RESTART, Gap.NONE]),
+        (20, [Gap.NONE, Gap.NONE, Gap.NONE], [Gap.LOSS, Gap.NONE]),
+    ],
+)
+def test_a_restart_stays_one_whatever_is_dropped(
+    capacity: int, gaps: list[Gap], left: list[Gap]
+) -> None:
+    ring = RingBuffer(capacity, "drop_oldest", Ledger())
+    for gap in gaps:
+        ring.put(Piece(bytes(10), 1, gap))
+    ring.end()
+    found = []
+    while (piece := ring.get(SOON)) is not None:
+        found.append(piece.gap)
+    assert found == left
 
 
 def test_one_piece_always_fits() -> None:
