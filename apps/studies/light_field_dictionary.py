@@ -8,8 +8,9 @@ a patch of the exposure is enough to find which atoms they are made of.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -49,10 +50,7 @@ def learn_dictionary(
     light_fields: Sequence[LightField], patch_px: int = 8, atoms: int = 256, seed: int = 0
 ) -> LightFieldDictionary:
     """Learn atoms from patches of light fields with the same views (scikit-learn's online
-    dictionary learning).
-
-    `patch_px`: rows and columns of a patch; it has all views; `seed`: of the patches that are
-    looked at and of the learning.
+    dictionary learning); a patch has `patch_px` rows and columns, and all views.
     """
     try:
         from sklearn.decomposition import PCA, MiniBatchDictionaryLearning
@@ -102,20 +100,14 @@ def recover_with_dictionary(
 
     Memory beyond the result is that of 64 patches' coded dictionaries, 4 MB with the default sizes.
     """
-    if (
-        codes.ndim != 3
-        or exposure.shape != codes.shape[1:]
-        or dictionary.atoms.shape[1] != len(codes)
-    ):
-        expected = (dictionary.atoms.shape[1], *exposure.shape)
+    expected = (dictionary.atoms.shape[1], *exposure.shape)
+    if codes.shape != expected:
         raise ShapeError("mask codes for this dictionary and exposure", expected, codes.shape)
     size = dictionary.patch_px
     if min(exposure.shape) < size:
         raise ShapeError("the exposure", f"at least ({size}, {size}) px, a patch", exposure.shape)
     total, count = np.zeros(codes.shape, np.float32), np.zeros(exposure.shape, np.float32)
-    corners = list(
-        _iterate_corners((exposure.shape[0], exposure.shape[1]), size, max(size // 2, 1))
-    )
+    corners = _list_corners(exposure.shape, size, max(size // 2, 1))
     for some in split_blocks(len(corners), PATCHES_PER_BATCH):
         windows = [(slice(y, y + size), slice(x, x + size)) for y, x in corners[some]]
         measurements = np.stack([exposure[window].ravel() for window in windows]).astype(np.float32)
@@ -185,7 +177,7 @@ def _draw_training_patches(
             raise ShapeError(
                 "every light field to learn from", expected, light_field.pictures.shape
             )
-        corners = list(_iterate_corners((rows, columns), patch_px, 1))
+        corners = _list_corners((rows, columns), patch_px, 1)
         chosen = random.permutation(len(corners))[: 4 * TRAINING_PATCHES // len(light_fields)]
         found += [
             light_field.pictures[:, y : y + patch_px, x : x + patch_px]
@@ -200,15 +192,13 @@ def _draw_training_patches(
         )
     patches = np.stack([found[number] for number in kept])
     patches -= patches.mean(axis=(1, 2, 3), keepdims=True)
-    unit: Array = (
-        patches / spread[kept, np.newaxis, np.newaxis, np.newaxis] / np.sqrt(patches[0].size)
-    )
+    norms = spread[kept, np.newaxis, np.newaxis, np.newaxis] * np.sqrt(patches[0].size)
+    unit: Array = patches / norms
     return unit
 
 
-def _iterate_corners(shape: tuple[int, int], size: int, stride: int) -> Iterator[tuple[int, int]]:
+def _list_corners(shape: tuple[int, ...], size: int, stride: int) -> list[tuple[int, ...]]:
     """Upper left corners of patches that cover everything, the last ones flush with the border."""
-    rows, columns = (
-        sorted({*range(0, length - size + 1, stride), length - size}) for length in shape
+    return list(
+        product(*(sorted({*range(0, side - size + 1, stride), side - size}) for side in shape))
     )
-    return ((row, column) for row in rows for column in columns)
