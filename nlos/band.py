@@ -218,7 +218,7 @@ class Band:
 
         Within a block of bins a narrow band's waves are made up of few shapes (bins, n), whatever
         their phases; the second matrix (blocks * n, 2 * frequencies) has what `compute_phasors` are
-        made of, real and imaginary parts in turns.
+        made of, real and imaginary parts interleaved.
         """
         phases = np.outer(self.axis.spacing * np.arange(BLOCK_BINS), self.wavenumbers)
         waves = np.exp(-1j * phases)
@@ -228,8 +228,8 @@ class Band:
         )
         shapes = shapes[:, strengths > precision * strengths[0]]
         starts = self.axis.start + self.axis.spacing * np.arange(0, bins, BLOCK_BINS)
-        turns = self.weights * np.exp(-1j * np.outer(starts, self.wavenumbers))
-        coefficients = turns[:, np.newaxis] * (shapes.T @ waves)
+        carriers = self.weights * np.exp(-1j * np.outer(starts, self.wavenumbers))
+        coefficients = carriers[:, np.newaxis] * (shapes.T @ waves)
         return shapes, coefficients.reshape(-1, self.wavenumbers.size).view(np.float64)
 
     def waveforms(self, phasors: NDArray[Any]) -> Waveforms:

@@ -27,16 +27,16 @@ COSINE_COEFFICIENTS = (
     7.8001313,
     -1.4531124,
 )
-# Polynomials in the square of an angle in turns, fitted to cos(2 pi t) and sin(2 pi t) / t up to
-# half a turn.
+# Polynomials in the square of an angle in cycles, fitted to cos(2 pi t) and sin(2 pi t) / t up to
+# half a cycle.
 SINE_COEFFICIENTS = (6.2831855, -41.341702, 81.605133, -76.703018, 42.025928, -14.899847, 3.2381375)
 
 
 @inlined
-def cosine_of_turns(turns):
-    """Cosine of an angle of -0.5 to 0.5 turns, to 1e-6."""
+def cosine_of_cycles(cycles):
+    """Cosine of an angle of -0.5 to 0.5 cycles, to 1e-6."""
     # Horner's rule in two halves, which the processor works on side by side
-    u = turns * turns
+    u = cycles * cycles
     high = np.float32(COSINE_COEFFICIENTS[4]) + u * (
         np.float32(COSINE_COEFFICIENTS[5])
         + u * (np.float32(COSINE_COEFFICIENTS[6]) + u * np.float32(COSINE_COEFFICIENTS[7]))
@@ -46,14 +46,14 @@ def cosine_of_turns(turns):
 
 
 @inlined
-def sine_of_turns(turns):
-    """Sine of an angle of -0.5 to 0.5 turns, to 1e-6."""
-    u = turns * turns
+def sine_of_cycles(cycles):
+    """Sine of an angle of -0.5 to 0.5 cycles, to 1e-6."""
+    u = cycles * cycles
     high = np.float32(SINE_COEFFICIENTS[4]) + u * (
         np.float32(SINE_COEFFICIENTS[5]) + u * np.float32(SINE_COEFFICIENTS[6])
     )
     low = np.float32(SINE_COEFFICIENTS[2]) + u * (np.float32(SINE_COEFFICIENTS[3]) + u * high)
-    return turns * (
+    return cycles * (
         np.float32(SINE_COEFFICIENTS[0]) + u * (np.float32(SINE_COEFFICIENTS[1]) + u * low)
     )
 
@@ -88,7 +88,7 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers,
     Meant for a brick of voxels so small that their paths to a wall point span a short piece of its
     waveform, which then stays in the first cache level while the voxels' sums stay in the second.
 
-    `waveforms` (points, 2 * samples): real and imaginary parts in turns; the first and the last two
+    `waveforms` (points, 2 * samples): real and imaginary parts interleaved; the first and the last two
     samples are 0; `start, spacing`: path length of the first sample and path between samples, m;
     `wall` (points, 3); `lasers` (1, 3): one laser spot for all wall points or one for each; `x, y,
     z`: axes of the brick; `powers` (2,): further weights: powers of the last leg's length and of
@@ -225,18 +225,18 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
     waves = np.empty((2, x.size), np.float32)
     # A plane of one voxel has a span of 0: any sample is right there.
     per_metre = (table.shape[1] - 1) / max(span[1] - span[0], 1e-12)
-    turns_per_metre = wavenumber / (2 * math.pi)
+    cycles_per_metre = wavenumber / (2 * math.pi)
     for iy in range(y.size):
         across = (y[iy] - laser[1]) ** 2 + (depth - laser[2]) ** 2
         for ix in range(x.size):
-            # The wave turns many times across the plane and is computed; what multiplies it, f_m,
+            # The wave oscillates many times across the plane and is computed; what multiplies it, f_m,
             # is smooth enough for linear interpolation.
             distance = math.sqrt((x[ix] - laser[0]) ** 2 + across)
             place = max((distance - span[0]) * per_metre, 0.0)
             # So that the last sample has a neighbour behind it; the weight is then 1.
             sample = min(int(place), table.shape[1] - 2)
             before[ix], weight[ix] = sample, place - sample
-            waves[0, ix], waves[1, ix] = _compute_wave(distance * turns_per_metre)
+            waves[0, ix], waves[1, ix] = _compute_wave(distance * cycles_per_metre)
         sums[:] = 0
         for m in range(terms.shape[0]):
             _add_term(terms[m, iy], table[m], before, weight, m >= odd, sums)
@@ -253,23 +253,23 @@ def add_with_carrier(values, x, y, z, laser, wavenumber, field):
     to.
     """
     waves = np.empty((2, x.size), np.float32)
-    turns_per_metre = wavenumber / (2 * math.pi)
+    cycles_per_metre = wavenumber / (2 * math.pi)
     for iz in range(z.size):
         for iy in range(y.size):
             across = (y[iy] - laser[1]) ** 2 + (z[iz] - laser[2]) ** 2
             # in a loop of its own, since what is complex keeps it from being done in vectors
             for ix in range(x.size):
                 distance = math.sqrt((x[ix] - laser[0]) ** 2 + across)
-                waves[0, ix], waves[1, ix] = _compute_wave(distance * turns_per_metre)
+                waves[0, ix], waves[1, ix] = _compute_wave(distance * cycles_per_metre)
             for ix in range(x.size):
                 field[iz, iy, ix] += values[iz, iy, ix] * complex(waves[0, ix], waves[1, ix])
 
 
 @compiled
-def _compute_wave(turns):
-    """Real and imaginary part of the carrier wave after some turns."""
-    turns -= math.floor(turns + 0.5)
-    return cosine_of_turns(np.float32(turns)), sine_of_turns(np.float32(turns))
+def _compute_wave(cycles):
+    """Real and imaginary part of the carrier wave after some cycles."""
+    cycles -= math.floor(cycles + 0.5)
+    return cosine_of_cycles(np.float32(cycles)), sine_of_cycles(np.float32(cycles))
 
 
 @compiled

@@ -65,9 +65,9 @@ class ArrayLibrary:
         """Make complex zeros."""
         return self.xp.zeros(shape, dtype=self._complex, device=self.device.device)
 
-    def exp_turns(self, turns: Array) -> Array:
-        """Return ``exp(2j * pi * turns)``, accurate however large the turns are."""
-        angle = 2 * np.pi * (turns - self.xp.round(turns))
+    def exp_cycles(self, cycles: Array) -> Array:
+        """Return ``exp(2j * pi * cycles)``, accurate however large the cycles are."""
+        angle = 2 * np.pi * (cycles - self.xp.round(cycles))
         return self.xp.exp(1j * self.xp.astype(angle, self._complex))
 
     def make_complex(self, real: Array, imaginary: Array) -> Array:
@@ -79,11 +79,11 @@ class ArrayLibrary:
         return xp.astype(real, xp.complex64) + 1j * xp.astype(imaginary, xp.complex64)
 
 
-def remove_whole_turns(turns: Any) -> NDArray[np.float64]:
-    """Leave out whole turns while there are digits for it: what is left goes well into single
+def remove_whole_cycles(cycles: Any) -> NDArray[np.float64]:
+    """Leave out whole cycles while there are digits for it: what is left goes well into single
     precision.
     """
-    values = np.asarray(turns, np.float64)
+    values = np.asarray(cycles, np.float64)
     return np.asarray(values - np.round(values))
 
 

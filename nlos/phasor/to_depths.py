@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.method import Progress, ignore_progress
-from nlos.phasor.arrays import ArrayLibrary, remove_whole_turns
+from nlos.phasor.arrays import ArrayLibrary, remove_whole_cycles
 from nlos.phasor.depth_steps import DepthInterpolation, DiffractionPlan, Illumination
 from nlos.phasor.to_depths_compiled import LaserSource
 from nlos.phasor.to_depths_kernels import TAPS
@@ -252,16 +252,16 @@ class PortableDiffraction:
         """
         xp, planes, parts = self.library.xp, self._block_slices, {}
 
-        def process_blocks(turns: slice) -> None:
+        def process_blocks(own: slice) -> None:
             total: Any = 0
-            for some in planes[turns]:
+            for some in planes[own]:
                 block = self._get_block(some)
                 lit = volume[some, ...] * xp.conj(self._carrier(block.axial))
                 terms = self.waves.to_images_adjoint(lit[:, None, ...] * self._functions(block))
                 waves = terms @ xp.conj(xp.permute_dims(block.coefficients, (0, 2, 1)))
                 waves *= xp.conj(self.waves.transfer(block.transfer))
                 total = total + xp.sum(waves, axis=0)
-            parts[turns.start] = total
+            parts[own.start] = total
 
         run_blocks(process_blocks, len(planes), -(-len(planes) // thread_count()))
         # In a fixed order, so that the same input gives the same sum.
@@ -307,7 +307,7 @@ class PortableDiffraction:
         if self.source.laser is None:
             return self.library.xp.ones_like(axial.distance)
         wavenumber = self.source.centre_wavenumber / (2 * np.pi)
-        return self.library.exp_turns(axial.cycles + self._extra_distance(axial) * wavenumber)
+        return self.library.exp_cycles(axial.cycles + self._extra_distance(axial) * wavenumber)
 
     @cached_property
     def _computed_depths(self) -> DepthInterpolation:
@@ -365,7 +365,7 @@ class PortableDiffraction:
         ahead = self._measure_ahead(depths)[:, np.newaxis, np.newaxis]
         # whole cycles are taken off in double precision, before single precision would lose the
         # fraction
-        cycles = remove_whole_turns(self.source.centre_wavenumber / (2 * np.pi) * ahead)
+        cycles = remove_whole_cycles(self.source.centre_wavenumber / (2 * np.pi) * ahead)
         return _Axial(self.library.put(ahead), self.library.put(cycles))
 
     @cached_property

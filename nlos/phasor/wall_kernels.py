@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from nlos.kernels import cosine_of_turns, sine_of_turns
+from nlos.kernels import cosine_of_cycles, sine_of_cycles
 from nlos.phasor.to_depths_kernels import TAPS
 from tofclip.compiling import SUMS_IN_ANY_ORDER, compile_and_keep
 
@@ -32,9 +32,9 @@ def add_spherical_waves(sources, phasors, targets, first, step, sums):
     e_w - e_(w-1)``, two products instead of four. All that the inner loop writes lies in two flat
     arrays, so that it becomes vector code.
 
-    `sources` (n, 3): m; `phasors` (n, 2 * frequencies): real and imaginary parts in turns; the
+    `sources` (n, 3): m; `phasors` (n, 2 * frequencies): real and imaginary parts interleaved; the
     number of frequencies is a multiple of `FREQUENCY_STEPS`; `targets` (3 * LANES,): all x, all y,
-    all z, m; `first, step`: lowest wavenumber and distance of neighbouring ones, in turns per m;
+    all z, m; `first, step`: lowest wavenumber and distance of neighbouring ones, in cycles per m;
     `sums` (frequencies * 2 * LANES,): added to: per frequency all real, then all imaginary parts.
     """
     wave = np.empty(5 * TARGET_LANES, np.float32)
@@ -55,12 +55,12 @@ def _start_waves(x, y, z, targets, first, step, wave):
         )
         distance = math.sqrt(max(across, np.float32(MIN_DISTANCE_M * MIN_DISTANCE_M)))
         weight = np.float32(1) / distance
-        turns = distance * first
-        turns -= math.floor(turns + np.float32(0.5))
-        real, imaginary = cosine_of_turns(turns) * weight, sine_of_turns(turns) * weight
-        turns = distance * step
-        turns -= math.floor(turns + np.float32(0.5))
-        along, aside = cosine_of_turns(turns), sine_of_turns(turns)
+        cycles = distance * first
+        cycles -= math.floor(cycles + np.float32(0.5))
+        real, imaginary = cosine_of_cycles(cycles) * weight, sine_of_cycles(cycles) * weight
+        cycles = distance * step
+        cycles -= math.floor(cycles + np.float32(0.5))
+        along, aside = cosine_of_cycles(cycles), sine_of_cycles(cycles)
         wave[j], wave[TARGET_LANES + j] = real, imaginary
         wave[2 * TARGET_LANES + j] = real * along + imaginary * aside
         wave[3 * TARGET_LANES + j] = imaginary * along - real * aside
@@ -138,7 +138,7 @@ def add_low_rank_terms(
     The factors depend on the lateral wavenumber alone and are interpolated once for a column and
     its mirror image.
 
-    `spectra` (m, columns, 2 * rows): real and imaginary parts in turns; columns and rows in the
+    `spectra` (m, columns, 2 * rows): real and imaginary parts interleaved; columns and rows in the
     order of Fourier transforms; `node_factors` (nodes, n): factors at the nodes: the real parts of
     all m terms, then the imaginary parts, then anything; `node` (columns, rows): first node about
     every wave whose indices are not negative; `weight` (columns, rows, taps): weights of the nodes

@@ -180,7 +180,7 @@ class _DirectPropagator:
         across = xp.sum((self._targets[:, some, None] - self._sources[:, None, :]) ** 2, axis=0)
         distance = xp.sqrt(xp.clip(across, MIN_DISTANCE_M**2, None))[:, :, None]
         coarse, fine = (
-            self.library.exp_turns(distance * turns) for turns in (self._coarse, self._fine)
+            self.library.exp_cycles(distance * cycles) for cycles in (self._coarse, self._fine)
         )
         waves = (coarse / distance)[:, :, :, None] * fine[:, :, None, :]
         return xp.sum(waves * phasors, axis=1)

@@ -180,13 +180,18 @@ def sum_spherical_waves(
     emitters = (sources - middle).astype(np.float32)
     field = np.empty((groups, TARGET_LANES, frequencies), np.complex64)
     step = wavenumbers[1] - wavenumbers[0] if frequencies > 1 else 0.0
-    turns, turns_on = np.float32(wavenumbers[0] / (2 * np.pi)), np.float32(step / (2 * np.pi))
+    cycles, cycle_step = np.float32(wavenumbers[0] / (2 * np.pi)), np.float32(step / (2 * np.pi))
 
     def process_block(some: slice) -> None:
         for group in range(some.start, some.stop):
             sums = np.zeros(padded * 2 * TARGET_LANES, np.float32)
             add_spherical_waves(
-                emitters, parts, np.ascontiguousarray(lanes[group].T).ravel(), turns, turns_on, sums
+                emitters,
+                parts,
+                np.ascontiguousarray(lanes[group].T).ravel(),
+                cycles,
+                cycle_step,
+                sums,
             )
             real, imaginary = np.moveaxis(sums.reshape(padded, 2, TARGET_LANES)[:frequencies], 1, 0)
             field[group].real, field[group].imag = real.T, imaginary.T

@@ -63,7 +63,7 @@ class HiddenToWall(LinearOperator):
 
     ``P_k(r_p) = sqrt(G_k) * sum_r h(r) * exp(-1j * k * (|r_L - r| + |r - r_p|)) / |r - r_p|``: the
     phasors of the conventions in `nlos`, weighted so that the adjoint of the phasors divided by
-    ``sqrt(G_k)`` is the real part of the hybrid's field. Result: real and imaginary parts in turns,
+    ``sqrt(G_k)`` is the real part of the hybrid's field. Result: real and imaginary parts interleaved,
     point by point, each at all frequencies.
 
     Memory beyond volume and phasors: some 40 bytes per plane wave and frequency and thread.
@@ -232,7 +232,7 @@ class Refinement(Method):
     hybrid: Hybrid
     prior: Prior = field(default_factory=lambda: Sparse(weight=2e-2, iterations=60))
 
-    def plan(self, capture: Capture, grid: Grid) -> RefinementPlan:
+    def plan(self, capture: Capture, grid: Grid) -> Plan:
         require_numpy_signal("iterative refinement", capture)
         hybrid = plan_waves(self.hybrid, choose_roles(capture), grid)
         coarsest = float(np.diff(grid.z).max()) if grid.z.size > 1 else 0.0
