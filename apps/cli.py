@@ -161,10 +161,7 @@ def _show_overview(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program and return its exit status.
-
-    `arguments`: defaults to the command line's.
-    """
+    """Run the program and return its exit status. `arguments`: defaults to the command line's."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = DEBUG_FLAG in words
     _heed_end_signals()

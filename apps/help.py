@@ -41,9 +41,8 @@ Command = TyperCommand | TyperGroup
 
 
 class VerbGroup(TyperGroup):
-    """The program's verbs, of which only the one that is called is imported.
-
-    A verb of two words, such as ``calibrate range``, stands beside one called by the first alone.
+    """The program's verbs, of which only the one that is called is imported. A verb of two words,
+    such as ``calibrate range``, stands beside one called by the first alone.
     """
 
     verbs: Mapping[str, str]
@@ -88,10 +87,9 @@ class VerbGroup(TyperGroup):
 
 
 def make_verb_group(verbs: Mapping[str, str], homes: Mapping[str, str]) -> type[VerbGroup]:
-    """Return the class of the group of all verbs, for the ``cls`` of a ``typer.Typer``.
-
-    `verbs`: their lines in the list of commands, in its order; `homes`: modules of `apps.verbs` that
-    are not called like their verb. A module has a function called like the verb, or a group ``app``.
+    """Return the class of the group of all verbs, for the ``cls`` of a ``typer.Typer``. `verbs`:
+    their lines in the list of commands, in its order; `homes`: modules of `apps.verbs` that are not
+    called like their verb. A module has a function called like the verb, or a group ``app``.
     """
     return type("Verbs", (VerbGroup,), {"verbs": verbs, "homes": homes})
 
@@ -138,10 +136,9 @@ def find_help(app: typer.Typer, words: Sequence[str]) -> str | None:
 
 
 def simplify_help(command: Command) -> None:
-    """Let a command, and those of a group, show their help as plain text, and an option that takes no
-    value as one, such as ``--json``, where typer writes ``--json <bool>``.
-
-    Importing what draws frames around the help takes longer than all the rest of showing it.
+    """Let a command, and those of a group, show their help as plain text, and an option that takes
+    no value as one, such as ``--json``, where typer writes ``--json <bool>``. Importing what draws
+    frames around the help takes longer than all the rest of showing it.
     """
     command.rich_markup_mode = None
     command.format_options = partial(_write_options, command)  # type: ignore[method-assign]
@@ -190,10 +187,8 @@ def _set_help(verb: Any) -> None:
 
 
 def split_docstring(docstring: str | None) -> tuple[list[str], list[str]]:
-    """Split a docstring into its paragraphs of prose and its example commands.
-
-    Lines of a paragraph are joined, since a terminal is narrower than the source; one with indented
-    lines stays.
+    """Split a docstring into its paragraphs of prose and its example commands. Lines of a paragraph
+    are joined, since a terminal is narrower than the source; one with indented lines stays.
     """
     paragraphs = [one for one in inspect.cleandoc(docstring or "").split("\n\n") if one.strip()]
     examples = [" ".join(one.split()[1:]) for one in paragraphs if one.startswith(EXAMPLE_MARK)]

@@ -59,9 +59,8 @@ def resolve_device(device: str, cluster: str | None) -> str:
 def report_summary(
     summary: Summary, total: int, as_json: bool, out: Path, figures: Mapping[str, Any] | None = None
 ) -> None:
-    """Print the figures of a sequence and its failures.
-
-    `total`: its jobs, those included that were done by an earlier run; `figures`: further ones.
+    """Print the figures of a sequence and its failures. `total`: its jobs, those included that were
+    done by an earlier run; `figures`: further ones.
     """
     failed = {one.name: one.problem for one in summary.failures}
     figures = {

@@ -32,10 +32,7 @@ BOX_HEADER, LONG_LENGTH = Struct(">I4s"), Struct(">Q")
 
 
 class FilmWriter:
-    """A film that is being written.
-
-    `rate`: pictures per second.
-    """
+    """A film that is being written. `rate`: pictures per second."""
 
     def __init__(self, path: Path, rate: float) -> None:
         self.path, self._rate, self._cv2 = path, rate, import_opencv()
@@ -62,9 +59,8 @@ class FilmWriter:
 
 @contextmanager
 def open_film(out: Path, rate: float) -> Iterator[FilmWriter]:
-    """Yield a film to add pictures to; the file appears whole or not at all.
-
-    `rate`: pictures per second.
+    """Yield a film to add pictures to; the file appears whole or not at all. `rate`: pictures per
+    second.
     """
     with atomic_path(out) as temporary:
         film = FilmWriter(temporary, rate)

@@ -36,10 +36,9 @@ def opt(
     choices: Iterable[str] = (),
     **further: Any,
 ) -> Any:
-    """Declare an option, needed where the default is ``...``.
-
-    `name`: where it is not that of the parameter; if it ends in a unit, the verb gets SI units;
-    `shown`: the default in words; `choices`: what shells offer; `further`: of `typer.Option`.
+    """Declare an option, needed where the default is ``...``. `name`: where it is not that of the
+    parameter; if it ends in a unit, the verb gets SI units; `shown`: the default in words;
+    `choices`: what shells offer; `further`: of `typer.Option`.
     """
     unit = UNITS.get((name or "").rpartition("-")[2])
     if unit is not None:

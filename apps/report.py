@@ -25,7 +25,6 @@ UNITS = {"m", "mm", "s", "ns", "ps", "px"}
 def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | None] = ()) -> None:
     """Refuse an output that cannot be written, or that would overwrite an input: finding out after
     minutes of work would be too late. The writing itself is all or nothing in any case.
-
     `*suffixes`: endings that the name may have; none given: any; `inputs`: what must survive, see
     `tofclip.files.require_apart`.
     """
@@ -99,9 +98,8 @@ def report(
     figures: Mapping[str, Any], as_json: bool, written: Sequence[Path] = (), note: str = ""
 ) -> None:
     """Print the figures of a run: numbers, strings, and lists or mappings of these by name.
-
-    `as_json`: one object on one line (NaN becomes null) instead of a table; `written`: files to name
-    in the table; `note`: what has to be known about its figures.
+    `as_json`: one object on one line (NaN becomes null) instead of a table; `written`: files to
+    name in the table; `note`: what has to be known about its figures.
     """
     plain = to_json_value(figures)
     if as_json:

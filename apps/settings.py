@@ -58,7 +58,6 @@ def setting(
     written: str | None = None,
 ) -> Any:
     """Declare a verb's own setting; its default None is found by the verb, or may be absent.
-
     `shown`: the default in words; `unit`: that of SI; `written`: on the command line.
     """
     known = {"metavar": metavar, "help": meaning, "shown": shown, "choices": choices, "unit": unit}

@@ -75,10 +75,9 @@ class Reader(Protocol):
 
 
 class RecordFile(Source):
-    """A file's records. Memory: one piece of it, decoded.
-
-    The calibration of photons and histograms has ``resolution_s``, the width of a bin, and
-    ``channels``; of photons also ``laser_period_s``, of images ``rows`` and ``columns``.
+    """A file's records. Memory: one piece of it, decoded. The calibration of photons and histograms
+    has ``resolution_s``, the width of a bin, and ``channels``; of photons also ``laser_period_s``,
+    of images ``rows`` and ``columns``.
     """
 
     def __init__(self, path: str | Path, open_file: Callable[[Path], Reader]) -> None:
@@ -157,7 +156,6 @@ class WholeRecords:
 class PtuPhotons:
     """Photons of a PTU file; see `Reader`. Opening reads the file once, to know its channels and
     where each piece begins. Markers are passed over; pictures are read by `tofclip.lidar.photons`.
-
     `sync`: channel of the laser's pulses in T2 mode; by default the electronics' own input for
     them.
     """
@@ -188,10 +186,9 @@ class PtuPhotons:
 
 class SwabianPhotons:
     """Photons of Swabian Instruments' files; see `Reader`. Their library reads forwards only, so
-    that stepping back begins anew.
-
-    `sync`: channel of the laser's pulses, as the instrument numbers it: negative for falling edges.
-    All others become channels from 0, in the order of their numbers.
+    that stepping back begins anew. `sync`: channel of the laser's pulses, as the instrument numbers
+    it: negative for falling edges. All others become channels from 0, in the order of their
+    numbers.
     """
 
     def __init__(self, path: Path, sync: int) -> None:

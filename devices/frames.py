@@ -85,10 +85,8 @@ _PIXEL_DTYPES = {1: "u1", 8: "u1", 16: "<u2", 32: "<u4"}
 @dataclass(frozen=True)
 class FrameCodec:
     """A picture's number (8 bytes, little-endian) and its pixels as the camera sent them, to
-    records and back.
-
-    A frame is malformed if its number is not above that of the one before. Decoding allocates what
-    the pixels take, 8 bits for each of those that came as single bits.
+    records and back. A frame is malformed if its number is not above that of the one before.
+    Decoding allocates what the pixels take, 8 bits for each of those that came as single bits.
     """
 
     rows: int

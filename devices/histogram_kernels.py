@@ -56,13 +56,11 @@ def _add_photon(row, position, width, density, period, per_period):
 
 @compiled
 def add_stamps(stamps, clock_bins, codes, period, steps):
-    """Add LinoSPAD2's time stamps.
-
-    `stamps` (n, columns): the last two columns are code and pixel; `clock_bins`: period of the
-    board's clock; `codes` (pixels, codes, 2): where a code begins within the first period of the
-    clock, offset and start of the axis included; its length; `period`: time between two laser
-    pulses, 0 for none; `steps` (pixels, bins + 2). Returns stamps left out because there is no such
-    pixel.
+    """Add LinoSPAD2's time stamps. `stamps` (n, columns): the last two columns are code and pixel;
+    `clock_bins`: period of the board's clock; `codes` (pixels, codes, 2): where a code begins
+    within the first period of the clock, offset and start of the axis included; its length;
+    `period`: time between two laser pulses, 0 for none; `steps` (pixels, bins + 2). Returns stamps
+    left out because there is no such pixel.
     """
     number = np.uint32(codes.shape[1])
     last = stamps.shape[1] - 1
@@ -85,11 +83,10 @@ def add_stamps(stamps, clock_bins, codes, period, steps):
 
 @compiled
 def add_times(pixels, times, scale, shift, width, period, steps):
-    """Add photons of which pixel and time are known; ``position = times * scale + shift``.
-
-    `pixels` (photons,); `times` (photons,); `scale, shift`: bins per unit of time, and bins;
-    `width`: bins over which a photon is spread; `period`: bins of the laser's period; `steps`
-    (pixels, bins + 2): added to, in place; the density's differences.
+    """Add photons of which pixel and time are known; ``position = times * scale + shift``. `pixels`
+    (photons,); `times` (photons,); `scale, shift`: bins per unit of time, and bins; `width`: bins
+    over which a photon is spread; `period`: bins of the laser's period; `steps` (pixels, bins + 2):
+    added to, in place; the density's differences.
     """
     density, per_period = 1.0 / width, 1.0 / period
     for photon in range(times.size):
@@ -115,13 +112,12 @@ def find_last_sync(ticks, channels, flags, ignored, sync, before, known):
 
 @compiled
 def add_tags(ticks, channels, flags, ignored, sync, known, pixel_of, scale, shift, period, steps):
-    """Add time tags, each by how long it came after the last sync pulse.
-
-    `ticks, channels, flags` (n,): one bit of `channels` for each channel that saw an edge;
-    `ignored`: flags of records that report no edges; `sync`: the sync's bit; `known`: ticks at the
-    last sync before the first record, -1 where there was none: photons before the first one are
-    left out; `pixel_of` (channels,): negative: not a pixel; `scale, shift`: ``position = ticks
-    since sync * scale + shift``; a tick is `scale` bins long; `steps` (pixels, bins + 2).
+    """Add time tags, each by how long it came after the last sync pulse. `ticks, channels, flags`
+    (n,): one bit of `channels` for each channel that saw an edge; `ignored`: flags of records that
+    report no edges; `sync`: the sync's bit; `known`: ticks at the last sync before the first
+    record, -1 where there was none: photons before the first one are left out; `pixel_of`
+    (channels,): negative: not a pixel; `scale, shift`: ``position = ticks since sync * scale +
+    shift``; a tick is `scale` bins long; `steps` (pixels, bins + 2).
     """
     density, per_period = 1.0 / scale, 1.0 / period
     for record in range(ticks.size):

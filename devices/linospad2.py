@@ -79,10 +79,9 @@ _ENCODE_ERRORS = {
 
 @dataclass(frozen=True)
 class LinoSpad2Codec:
-    """Bytes of LinoSPAD2 to time stamps and back.
-
-    A valid word of the converter that serves no pixels is malformed. Decoding allocates at most 5
-    bytes for each byte of the stream: rows for the valid words only.
+    """Bytes of LinoSPAD2 to time stamps and back. A valid word of the converter that serves no
+    pixels is malformed. Decoding allocates at most 5 bytes for each byte of the stream: rows for
+    the valid words only.
     """
 
     # ``"2212b"`` (blocks: pixel = 4 * converter + address) or ``"2212s"`` (skipping: converter + 64
@@ -303,10 +302,8 @@ class BoardCalibration(Storable):
         return begins
 
     def times(self, records: Records) -> NDArray[np.float64]:
-        """Return when each photon came, s since its cycle began: the end of its code.
-
-        ``time = (code - code % 140) * 2500 ps / 140 + code_ends[pixel, code % 140] +
-        offsets[pixel]``
+        """Return when each photon came, s since its cycle began: the end of its code. ``time =
+        (code - code % 140) * 2500 ps / 140 + code_ends[pixel, code % 140] + offsets[pixel]``
         """
         periods, code = np.divmod(records["code"], CODES_PER_PERIOD)
         found: NDArray[np.float64] = periods * CLOCK_PERIOD_S
@@ -318,11 +315,9 @@ class BoardCalibration(Storable):
 def load_calibration(
     code_table: str | Path, offset_table: str | Path, hot_pixels: str | Path | None = None
 ) -> BoardCalibration:
-    """Read tables as the board's makers and daplis write them.
-
-    `code_table`: CSV, ps: a line of code numbers, then for each pixel its number and 140 ends of
-    codes; `offset_table`: NPY with 256 numbers, ps; `hot_pixels`: text with one pixel number in
-    each line.
+    """Read tables as the board's makers and daplis write them. `code_table`: CSV, ps: a line of
+    code numbers, then for each pixel its number and 140 ends of codes; `offset_table`: NPY with 256
+    numbers, ps; `hot_pixels`: text with one pixel number in each line.
     """
     picosecond = 1e-12
     with _guard_table(code_table):

@@ -22,11 +22,9 @@ compiled = compile_and_keep(error_model="numpy")
 
 @compiled
 def count_stamps(cycles, header, kept_of_cycle):
-    """Count the valid words of each cycle.
-
-    `cycles` (cycles, words); `header`: words before the first converter's; `kept_of_cycle`
-    (cycles,): gets the number of valid words of the converters that have pixels. Returns valid
-    words of the converter that has none.
+    """Count the valid words of each cycle. `cycles` (cycles, words); `header`: words before the
+    first converter's; `kept_of_cycle` (cycles,): gets the number of valid words of the converters
+    that have pixels. Returns valid words of the converter that has none.
     """
     words = cycles.shape[1]
     # the last converter serves no pixels
@@ -79,11 +77,10 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
 
 @compiled
 def encode_stamps(records, header, address_of, cycles):
-    """Put records into the words of empty cycles.
-
-    `records` (rows, header + 3): as `decode_stamps` writes them, in order of cycle and converter;
-    `address_of` (pixels,): converter * 4 + address; `cycles` (cycles, words): zeros; gets the
-    words. Returns `ENCODED_OK`, or what keeps the records from being encoded.
+    """Put records into the words of empty cycles. `records` (rows, header + 3): as `decode_stamps`
+    writes them, in order of cycle and converter; `address_of` (pixels,): converter * 4 + address;
+    `cycles` (cycles, words): zeros; gets the words. Returns `ENCODED_OK`, or what keeps the records
+    from being encoded.
     """
     depth = (cycles.shape[1] - header) // CONVERTERS
     previous, slot = np.int64(-1), 0

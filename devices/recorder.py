@@ -103,10 +103,8 @@ def _read_all(
 @contextlib.contextmanager
 def _defer_end_signals() -> Iterator[threading.Event]:
     """Yield an event that the first signal to end sets, so that no piece is cut in two; the second
-    raises `KeyboardInterrupt`.
-
-    Does nothing outside the main thread, which is the only one that gets signals, and leaves
-    signals alone that the program was started to ignore.
+    raises `KeyboardInterrupt`. Does nothing outside the main thread, which is the only one that
+    gets signals, and leaves signals alone that the program was started to ignore.
     """
     interrupted = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -200,10 +200,9 @@ class CameraFrame:
 
 
 class RemoteExClient:
-    """A connection to HPD-TA or HiPic. Not for two threads at once.
-
-    A command that found no answer in time may still be carried out, so it is never sent again:
-    the next command first waits for the answer that is owed.
+    """A connection to HPD-TA or HiPic. Not for two threads at once. A command that found no answer
+    in time may still be carried out, so it is never sent again: the next command first waits for
+    the answer that is owed.
     """
 
     def __init__(self, host: str, port: int, data_port: int, timeout: float = 5.0) -> None:
@@ -255,7 +254,6 @@ class RemoteExClient:
 
     def send_and_wait(self, *commands: tuple[str, ...]) -> None:
         """Send commands at once, whatever is still owed, and wait until each has been answered.
-
         Closing without waiting could make the network drop the commands.
         """
         last_words = [self.send_command(*words) for words in commands]
@@ -361,10 +359,9 @@ class RemoteExClient:
             self._messages.append(answer)
 
     def _receive(self, timeout: float) -> Answer:
-        """Return the next answer or message.
-
-        Answers of several lines, and errors whose text holds carriage returns, fall apart at these;
-        what is not the beginning of an answer is passed over.
+        """Return the next answer or message. Answers of several lines, and errors whose text holds
+        carriage returns, fall apart at these; what is not the beginning of an answer is passed
+        over.
         """
         deadline = monotonic() + timeout
         while True:
@@ -449,10 +446,9 @@ class _Announcement(NamedTuple):
 
 
 class RemoteExFeed(FrameFeed):
-    """Live pictures in the order of their numbers; see `devices.stream.Feed`.
-
-    Pictures that fell out of the ring buffer before they were asked for are lost by the instrument.
-    When the connection breaks, so are those that had been announced.
+    """Live pictures in the order of their numbers; see `devices.stream.Feed`. Pictures that fell
+    out of the ring buffer before they were asked for are lost by the instrument. When the
+    connection breaks, so are those that had been announced.
     """
 
     def __init__(self, connect: ConnectFunction, options: StreakOptions) -> None:
@@ -507,7 +503,6 @@ class RemoteExFeed(FrameFeed):
 
     def stop(self) -> None:
         """Turn the gain down first, whatever the state of the connection, and stop the acquisition.
-
         Live mode that another program had started goes on, with the gain that it had.
         """
         self._stopped = True
@@ -710,7 +705,6 @@ class RemoteExFeed(FrameFeed):
 def open_remoteex(uri: Uri) -> StreamSource:
     """Open
     ``remoteex://HOST:1001?data_port=1002&buffers=16&mcp_gain=N&timeout_s=5&reconnect_s=5&buffer_mib=64``.
-
     ``time_range=20 ns`` (or ``3`` for a synchroscan unit) sets the sweep before the start;
     ``time_ranges_ps=165,500,1000`` says how long a synchroscan unit's ranges last, for one that
     gives no scaling table.

@@ -175,9 +175,8 @@ class Ledger:
         self._add(acquired=records, unread=records)
 
     def deliver(self, delivered: int, malformed: int) -> None:
-        """Move records that waited to those that were read.
-
-        `delivered`: records that were sound; `malformed`: records that were not.
+        """Move records that waited to those that were read. `delivered`: records that were sound;
+        `malformed`: records that were not.
         """
         self._add(unread=-delivered - malformed, delivered=delivered, malformed=malformed)
 
@@ -236,9 +235,7 @@ class Piece:
 
 class RingBuffer:
     """A queue of pieces that never holds more than `capacity` bytes (but always at least one
-    piece).
-
-    `capacity`: bytes; `policy`: what happens when it is full: the writer waits (and the
+    piece). `capacity`: bytes; `policy`: what happens when it is full: the writer waits (and the
     instrument's own memory fills up), the oldest piece goes, or measurement ends with
     `BufferOverflowError` after what is in the queue; `ledger`: where arrivals and drops are
     entered.

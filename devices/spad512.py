@@ -138,7 +138,6 @@ class ExposureRequest:
 
 def find_error_text(data: bytes | bytearray) -> str | None:
     """Return what the server says instead of the rest of its pictures, None where it says nothing.
-
     To be asked when nothing more comes although pictures are due: pixels may spell anything.
     """
     tail = bytes(data[-256:])
@@ -341,7 +340,6 @@ class Spad512Feed(FrameFeed):
 def open_spad512(uri: Uri) -> StreamSource:
     """Open
     ``spad512://HOST:9999?bits=8&exposure_us=1000&images=1&width=512&pile_up=0&timeout_s=5&reconnect_s=5``.
-
     ``mode=gated&gate_steps=72&gate_step_ps=252&gate_width_ns=5&gate_offset_ps=5000`` moves a gate
     from picture to picture; ``images`` are whole scans then.
     """

@@ -67,9 +67,8 @@ class InstrumentClock:
         self._least = self._least_before = float("inf")
 
     def observe(self, stamp: float, arrived_at: float) -> None:
-        """Note when a stamped message arrived.
-
-        A stamp that goes back means that the instrument's clock began anew.
+        """Note when a stamped message arrived. A stamp that goes back means that the instrument's
+        clock began anew.
         """
         if self._last_stamp is not None and stamp < self._last_stamp:
             self.reset()
@@ -156,9 +155,8 @@ class LiveOptions(StreamOptions):
 
 
 class StreamSource(DecodedSource):
-    """A live source. Opening starts the instrument.
-
-    Memory: the buffer's capacity, plus one transfer and one decoded piece.
+    """A live source. Opening starts the instrument. Memory: the buffer's capacity, plus one
+    transfer and one decoded piece.
     """
 
     def __init__(self, feed: Feed, options: StreamOptions | None = None) -> None:
@@ -218,7 +216,6 @@ class StreamSource(DecodedSource):
 
     def _run_reader(self) -> None:
         """Move bytes from the instrument into the ring until the end; the thread's whole life.
-
         Whatever goes wrong here, `read` raises it: a thread that ended without a word would look
         like an instrument in the dark.
         """

@@ -144,10 +144,8 @@ class TimeTagger:
         self, channels: int, delta: int, capture: Capture = Capture.COUNT | Capture.REGISTER
     ) -> None:
         """Start the counter, then the registration, so that the first zero of the counter is not
-        taken for a wrap.
-
-        `channels, delta`: one bit for each channel whose edges are recorded as strobes, or whose
-        levels; `capture`: what to switch on in the end.
+        taken for a wrap. `channels, delta`: one bit for each channel whose edges are recorded as
+        strobes, or whose levels; `capture`: what to switch on in the end.
         """
         self.write(Register.STROBE, channels)
         self.write(Register.DELTA, delta)
@@ -156,16 +154,13 @@ class TimeTagger:
 
     def set_send_window(self, size: int) -> bool:
         """Set how many bytes make a packet, and let the chip send what it holds now, however
-        little.
-
-        `size`: at most 512. Packets of 512 bytes do not end a transfer, smaller ones do. Returns
-        false where the firmware has no such request.
+        little. `size`: at most 512. Packets of 512 bytes do not end a transfer, smaller ones do.
+        Returns false where the firmware has no such request.
         """
         return self._request(_SET_SEND_WINDOW, size)
 
     def flush(self) -> bool:
         """Let the chip get rid of an unfinished packet: send it or, by other firmware, forget it.
-
         Returns false where the firmware has no such request.
         """
         return self._request(_FLUSH, 0)

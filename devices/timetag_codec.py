@@ -91,10 +91,8 @@ class TimeTagCodec:
         return len(data) // RECORD_BYTES
 
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
-        """Decode whole records; `state` is a `CounterState`.
-
-        `data`: whole records; `after_loss`: records are missing right before these, so that the
-        counter may have wrapped unseen.
+        """Decode whole records; `state` is a `CounterState`. `data`: whole records; `after_loss`:
+        records are missing right before these, so that the counter may have wrapped unseen.
         """
         from devices.timetag_kernels import decode_timetags
 
@@ -119,11 +117,10 @@ class TimeTagCodec:
 
 
 def mark_wraps(records: Records) -> Records:
-    """Add the records that the instrument sends each time its counter wraps.
-
-    `records` (n,): times must not go back. Returns (m,): with one record of flag WRAP at every
-    multiple of `COUNTER_RANGE` ticks up to the last time. A record that is already at such a time
-    gets the flag instead.
+    """Add the records that the instrument sends each time its counter wraps. `records` (n,): times
+    must not go back. Returns (m,): with one record of flag WRAP at every multiple of
+    `COUNTER_RANGE` ticks up to the last time. A record that is already at such a time gets the flag
+    instead.
     """
     ticks = records["time_ticks"]
     if len(ticks) == 0:

@@ -28,7 +28,6 @@ _DOUBLE_STEP = 2.0**-53
 @compiled
 def decode_timetags(data, epoch, previous, after_loss, ticks, channels, flags):
     """Decode the 6-byte words in `data` (bytes) into three arrays; see `TimeTagCodec.decode`.
-
     `data` (bytes,); `epoch, previous`: state of the counter; `ticks` (words,): overwritten;
     `channels, flags` (words,): overwritten. Returns `kept`: records written; all other words are
     malformed; `epoch, previous`: how often the counter has wrapped, and its last value.
@@ -97,7 +96,6 @@ def _next_random(state):
 @compiled
 def fill_poisson_words(state, now, scale, weights, last, words):
     """Write the words of photons that arrive at random on four channels, one at most per tick.
-
     `state` (1,): of the random numbers; changed in place; `now` (1,): tick of the last record;
     changed in place; `scale`: of the exponential distribution of which the whole part is the number
     of ticks between two photons; `weights` (4,): of all photons, the fraction of each channel,

@@ -372,10 +372,8 @@ class TransientStream(Iterator[Streak]):
 
 class TrackedShots(Iterator[Streak | TofclipError]):
     """Shots on their way into stages, each with its stamp, so that the consumer behind the stages
-    can say how old a shot is and where the others went.
-
-    `shots`: A `TransientStream`, or shots from files: in the place of one that cannot be read its
-    error.
+    can say how old a shot is and where the others went. `shots`: A `TransientStream`, or shots from
+    files: in the place of one that cannot be read its error.
     """
 
     def __init__(self, shots: Iterator[Streak] | Iterator[Streak | TofclipError]) -> None:
@@ -424,10 +422,9 @@ class TrackedShots(Iterator[Streak | TofclipError]):
         return self._stamps.pop(place, ShotStamp(place))
 
     def count_dropped(self, stamp: ShotStamp, delivered: int) -> int:
-        """Return how many shots up to a delivered one were lost, wherever that was. Those behind
-        it are not known yet.
-
-        `stamp`: the newest delivered one's; `delivered`: shots delivered so far, this one included.
+        """Return how many shots up to a delivered one were lost, wherever that was. Those behind it
+        are not known yet. `stamp`: the newest delivered one's; `delivered`: shots delivered so far,
+        this one included.
         """
         missing = stamp.number - self._first_number + 1 - delivered
         if self._stream is not None and not self._stream.is_numbered:
@@ -454,10 +451,9 @@ class TrackedShots(Iterator[Streak | TofclipError]):
 
 
 def _split_shots(batches: Iterator[Batch], gathering: Accumulation) -> Iterator[tuple[int, Batch]]:
-    """Cut batches where shots end, and say to which shot each part belongs.
-
-    Pictures carry the instrument's number, in which those that were lost have been counted; where
-    it begins anew, it is counted on from the last one. Photons are counted here.
+    """Cut batches where shots end, and say to which shot each part belongs. Pictures carry the
+    instrument's number, in which those that were lost have been counted; where it begins anew, it
+    is counted on from the last one. Photons are counted here.
     """
     done = number = base = 0
     last = -1

@@ -106,10 +106,9 @@ def find_first_bounce(capture: Capture) -> FirstBounce | None:
 
 @dataclass(frozen=True, eq=False)
 class SignalSpectrum:
-    """How much of each wave a capture's signals hold, and how much of it is noise.
-
-    Photons' noise is white: what the highest frequencies hold, all frequencies hold. Other noise is
-    known where the record begins before light can have come.
+    """How much of each wave a capture's signals hold, and how much of it is noise. Photons' noise
+    is white: what the highest frequencies hold, all frequencies hold. Other noise is known where
+    the record begins before light can have come.
     """
 
     power: FloatArray  # (frequencies,), mean over the wall points
@@ -122,9 +121,8 @@ class SignalSpectrum:
 
     @classmethod
     def of(cls, capture: Capture, margin: float) -> SignalSpectrum:
-        """Analyse a capture without the wall's own light.
-
-        `margin`: m of path before light may come that a wave reaches ahead.
+        """Analyse a capture without the wall's own light. `margin`: m of path before light may come
+        that a wave reaches ahead.
         """
         traces, direct = _select_traces(capture)
         # Waves would see an edge where the record ends while light still comes.
@@ -141,9 +139,8 @@ class SignalSpectrum:
 
     @property
     def is_noisy(self) -> bool:
-        """Whether white noise is seen in the spectrum, as in all that was recorded.
-
-        It is flat at the highest frequencies, where the tail of a pulse falls.
+        """Whether white noise is seen in the spectrum, as in all that was recorded. It is flat at
+        the highest frequencies, where the tail of a pulse falls.
         """
         count = max(1, int(NOISE_BAND_FRACTION * self.power.size) // 2)
         below = float(np.mean(self.power[-2 * count : -count]))
@@ -160,7 +157,6 @@ class SignalSpectrum:
 
     def fraction_shorter(self, pulse: VirtualPulse, wavelength: float) -> float:
         """Fraction of a pulse's signal, noise taken off, in waves shorter than `wavelength` m.
-
         `wavelength`: metres. Returns 0 to 1.
         """
         signal = pulse.spectrum(self.wavenumbers) ** 2 * np.maximum(self.power - self.floor, 0)

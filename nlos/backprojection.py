@@ -165,9 +165,8 @@ def backproject_signals(
     progress: Progress,
 ) -> NDArray[np.complex64]:
     """Smear every wall point's filtered signal over the voxels (z, y, x) that it may come from, and
-    add all up.
-
-    `apply_filter`: from signals (points, t) to what is back-projected, of so many samples.
+    add all up. `apply_filter`: from signals (points, t) to what is back-projected, of so many
+    samples.
     """
     total = np.zeros(grid.shape, np.complex64)
     # the loop divides by the distance already

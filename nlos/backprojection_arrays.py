@@ -30,10 +30,9 @@ BYTES_PER_PAIR = 16
 def backproject_on_device(
     capture: Capture, grid: Grid, band: Band, weighting: Weighting, progress: Progress
 ) -> Array:
-    """Return the complex sum of `nlos.Backprojection` where the capture's signal lives.
-
-    Memory: the volume, 64 MiB of waveforms, and five chunks (`ArrayLibrary.chunk_bytes`) for the
-    pairs of voxel and wall point that are looked up at a time.
+    """Return the complex sum of `nlos.Backprojection` where the capture's signal lives. Memory: the
+    volume, 64 MiB of waveforms, and five chunks (`ArrayLibrary.chunk_bytes`) for the pairs of voxel
+    and wall point that are looked up at a time.
     """
     library = ArrayLibrary(capture.device)
     xp = library.xp

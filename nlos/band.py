@@ -263,10 +263,8 @@ class Band:
     @cached_property
     def carriers(self) -> tuple[NDArray[np.complex128], float, float]:
         """``exp(1j * k * L)``, shape (frequencies, samples); path length of sample 0 and path
-        between samples, m.
-
-        They are 0 at the first and the last two samples: a path outside is clamped there, and reads
-        silence.
+        between samples, m. They are 0 at the first and the last two samples: a path outside is
+        clamped there, and reads silence.
         """
         carriers: NDArray[np.complex128] = np.exp(
             1j * np.outer(self.wavenumbers, self._sample_paths)

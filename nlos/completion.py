@@ -155,7 +155,6 @@ def find_bright_box(settings: Wanted, scouted: Volume) -> Wanted:
 
 def is_brightest_on_wall(volume: Volume, capture: Capture, wavelength: float) -> bool:
     """Whether the brightest voxel lies on the wall, so that the picture shows the wall's own light.
-
     `wavelength`: nearer to a wall point than half of it, m, is on the wall.
     """
     away = np.linalg.norm(capture.points - np.array(volume.find_brightest()), axis=1)

@@ -55,10 +55,8 @@ class CompressedCapture:
     @classmethod
     def of(cls, capture: Capture, operator: LinearOperator) -> CompressedCapture:
         """Read a capture (t, rows, columns) through an operator, as a CLIP camera does; masked wall
-        points are dark.
-
-        `capture`: signal (t, rows, columns); `operator`: (rows, columns) pictures to
-        (measurements,) vectors.
+        points are dark. `capture`: signal (t, rows, columns); `operator`: (rows, columns) pictures
+        to (measurements,) vectors.
         """
         if capture.signal.shape[1:] != operator.shape_in:
             raise ShapeError("signal", ("t", *operator.shape_in), capture.signal.shape)
@@ -69,10 +67,8 @@ class CompressedCapture:
         return cls(measurements, operator, *place, capture.provenance)
 
     def recover_transients(self, method: Recovery | None = None) -> Capture:
-        """Recover the wall's transients.
-
-        `method`: of `tofclip.solvers`; defaults to the adjoint. `LinearInverse` costs as much and
-        is sharper.
+        """Recover the wall's transients. `method`: of `tofclip.solvers`; defaults to the adjoint.
+        `LinearInverse` costs as much and is sharper.
         """
         method = method or Backprojection()
         frames = method.recover(self.operator, self.measurements).frames
@@ -111,10 +107,7 @@ class AdjointImaging:
         )
 
     def reconstruct(self, capture: CompressedCapture, grid: Grid) -> Volume:
-        """Image the hidden scene.
-
-        Returns weak voxels are zero.
-        """
+        """Image the hidden scene. Returns weak voxels are zero."""
         plan = self.plan(capture, grid)
         volume = plan.image(capture.recover_transients(self.recovery))
         return volume.threshold(self.threshold)

@@ -282,10 +282,8 @@ def apply_wiener_filter(
 
 def build_rebinning_matrix(source_edges: FloatArray, target_edges: FloatArray) -> csr_array:
     """Matrix (targets, sources) of the means over target intervals of a function given by its means
-    over source ones.
-
-    The edges (n + 1,) increase; intervals of length 0 are allowed. Targets beyond the sources count
-    as 0 there.
+    over source ones. The edges (n + 1,) increase; intervals of length 0 are allowed. Targets beyond
+    the sources count as 0 there.
     """
     from scipy.sparse import csr_array
 
@@ -306,11 +304,9 @@ def transform_squared_distances(
     scan: ConfocalScan, squares: float, falloff: float
 ) -> tuple[NDArray[np.complex64], tuple[int, int, int]]:
     """Return the spectrum of the signals over the square v = d^2 of the distance, in which every
-    depth has the same kernel.
-
-    `squares`: distance of samples of v, m^2; `falloff`: power of the distance by which light is
-    weaker; it is made up for. Returns the half spectrum (y, x, v), padded, so that no convolution
-    wraps around, and the samples along y, x and v with the padding.
+    depth has the same kernel. `squares`: distance of samples of v, m^2; `falloff`: power of the
+    distance by which light is weaker; it is made up for. Returns the half spectrum (y, x, v),
+    padded, so that no convolution wraps around, and the samples along y, x and v with the padding.
     """
     from scipy.fft import fft2, rfft
 
@@ -329,10 +325,8 @@ def _transform_paraboloid(
     scan: ConfocalScan, squares: float, shape: tuple[int, int, int]
 ) -> NDArray[np.complex64]:
     """Spectrum of the kernel ``v = x^2 + y^2`` of unit energy, for frequencies that are not
-    negative.
-
-    Along v every column of it is an impulse between two samples, whose spectrum is known; along x
-    and y it is even, so that cosine transforms of a quadrant suffice.
+    negative. Along v every column of it is an impulse between two samples, whose spectrum is known;
+    along x and y it is even, so that cosine transforms of a quadrant suffice.
     """
     from scipy.fft import dctn
 
@@ -359,9 +353,8 @@ def _transform_paraboloid(
 def tabulate_powers(
     turn: NDArray[np.complex128], power: NDArray[np.intp], period: int, first: int = 0
 ) -> NDArray[np.complex64]:
-    """``turn[w] ** power`` from a table of one whole turn.
-
-    `turn` (w,): ``exp(-2j * pi * (first + w) / period)``. Returns (..., w).
+    """``turn[w] ** power`` from a table of one whole turn. `turn` (w,): ``exp(-2j * pi * (first +
+    w) / period)``. Returns (..., w).
     """
     # powers of a root of unity repeat: a table is quicker than exponentials, and as exact
     table = np.exp(-2j * np.pi * np.arange(period) / period).astype(np.complex64)

@@ -74,9 +74,7 @@ def write_ply(
 
 def extract_surface(volume: Volume, fraction: float) -> Mesh:
     """Draw the surface on which the magnitude is `fraction` (0..1) of the largest, by marching
-    cubes.
-
-    Returns vertices in m, float32, and faces, int32.
+    cubes. Returns vertices in m, float32, and faces, int32.
     """
     import pyvista
 

@@ -57,9 +57,8 @@ def swap_roles(capture: Capture) -> Capture:
 
 
 def choose_roles(capture: Capture) -> Capture:
-    """Return the capture with fewer laser spots than wall points: itself, or its roles swapped.
-
-    A wave has to be imaged for every laser spot, whatever the number of wall points: a scan by a
+    """Return the capture with fewer laser spots than wall points: itself, or its roles swapped. A
+    wave has to be imaged for every laser spot, whatever the number of wall points: a scan by a
     laser in front of few detectors is quicker the other way round.
     """
     if len(capture.lasers) == 1 or is_confocal(capture):
@@ -125,10 +124,8 @@ def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
 
 def choose_unaliased_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Band:
     """Return the pulse's band over a period so long that every voxel sees the record once, or
-    silence.
-
-    Evenly spaced frequencies repeat a signal with their period; where the paths of the grid go
-    beyond the record, the record is continued with silence.
+    silence. Evenly spaced frequencies repeat a signal with their period; where the paths of the
+    grid go beyond the record, the record is continued with silence.
     """
     outward, back = find_leg_bounds(capture.lasers, grid), find_leg_bounds(capture.points, grid)
     return choose_band_for_paths(capture.axis, pulse, outward[0] + back[0], outward[1] + back[1])
@@ -138,9 +135,7 @@ def choose_band_for_paths(
     axis: TimeAxis, pulse: VirtualPulse, shortest: float, longest: float
 ) -> Band:
     """Return the pulse's band over a period in which paths from `shortest` to `longest` (m) meet
-    the record once.
-
-    `axis`: of the record.
+    the record once. `axis`: of the record.
     """
     tail = Band(pulse, axis).tail_bins * axis.spacing
     # no image of the record, a period earlier or later, may be reached by a path of the grid
@@ -165,10 +160,9 @@ class AliasingWarning(UserWarning):
 
 
 def describe_aliasing(capture: Capture, band: Band) -> str | None:
-    """Say why false images may appear; None where none will.
-
-    They do if neighbouring wall points lie more than half the band's shortest wavelength apart. In
-    a confocal scan the path grows on both legs from point to point, so that a quarter is the limit.
+    """Say why false images may appear; None where none will. They do if neighbouring wall points
+    lie more than half the band's shortest wavelength apart. In a confocal scan the path grows on
+    both legs from point to point, so that a quarter is the limit.
     """
     shortest = 2 * np.pi / float(band.wavenumbers[-1])
     finest = shortest / 4 if is_confocal(capture) else shortest / 2

@@ -61,9 +61,7 @@ def sine_of_cycles(cycles):
 @compiled
 def shift_signals(signal, delay_bins):
     """Read column p of `signal` (t, points) `delay_bins[p]` bins later, linearly interpolated, 0
-    outside the record.
-
-    `delay_bins` (points,): bins, fractions included.
+    outside the record. `delay_bins` (points,): bins, fractions included.
     """
     bins, points = signal.shape
     result = np.zeros_like(signal)
@@ -210,12 +208,11 @@ def _add_samples(waveform, sample, before, after, sums):
 @compiled
 def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, span, carrier, field):
     """Add ``sum_m terms[m] * f_m(R) * exp(1j * wavenumber * R)``, R the distance from the laser
-    spot, to a plane.
-
-    `terms` (m, y, x): may be larger than the plane along y and x; `odd`: terms from this one on are
-    multiplied by 1j; `x, y` (n,); `laser` (3,); `wavenumber`: rad/m; carrier of the illumination;
-    `table` (m, samples): the functions f_m, evenly spaced over the distances from ``span[0]`` to
-    ``span[1]``; `span` (2,); `carrier` (x,): multiplies every column; `field` (y, x): added to.
+    spot, to a plane. `terms` (m, y, x): may be larger than the plane along y and x; `odd`: terms
+    from this one on are multiplied by 1j; `x, y` (n,); `laser` (3,); `wavenumber`: rad/m; carrier
+    of the illumination; `table` (m, samples): the functions f_m, evenly spaced over the distances
+    from ``span[0]`` to ``span[1]``; `span` (2,); `carrier` (x,): multiplies every column; `field`
+    (y, x): added to.
     """
     before, weight, sums = (
         np.empty(x.size, np.uint32),
@@ -247,10 +244,9 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
 
 @compiled
 def add_with_carrier(values, x, y, z, laser, wavenumber, field):
-    """Add ``values * exp(1j * wavenumber * R)``, R the distance from the laser spot, to some planes.
-
-    `values` (z, y, x); `x, y, z` (n,); `laser` (3,); `wavenumber`: rad/m; `field` (z, y, x): added
-    to.
+    """Add ``values * exp(1j * wavenumber * R)``, R the distance from the laser spot, to some
+    planes. `values` (z, y, x); `x, y, z` (n,); `laser` (3,); `wavenumber`: rad/m; `field` (z, y,
+    x): added to.
     """
     waves = np.empty((2, x.size), np.float32)
     cycles_per_metre = wavenumber / (2 * math.pi)

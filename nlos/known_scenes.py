@@ -170,9 +170,8 @@ def _parse_points(text: str) -> list[list[float]]:
 
 
 def find_nearest_wall_point(wall: FloatArray, place: tuple[float, float]) -> FloatArray:
-    """Return the wall point (3,) whose x and y are nearest to a place, m.
-
-    `wall` (..., 3): metres; NaN where there is no wall.
+    """Return the wall point (3,) whose x and y are nearest to a place, m. `wall` (..., 3): metres;
+    NaN where there is no wall.
     """
     import numpy as np
 

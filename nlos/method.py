@@ -35,10 +35,8 @@ def ignore_progress(_: int) -> None:
 
 class SubProgress:
     """Progress of one step of several, reported as a portion of all work; may be called from
-    several threads.
-
-    `progress`: of the whole; `work`: what the step counts up to; `portion`: what that is of the
-    whole.
+    several threads. `progress`: of the whole; `work`: what the step counts up to; `portion`: what
+    that is of the whole.
     """
 
     def __init__(self, progress: Progress, work: int, portion: int) -> None:
@@ -233,9 +231,7 @@ class PhasorMethod(Method):
         self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
     ) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear in the
-        signal within the method's tolerance.
-
-        Returns (z, y, x) complex64.
+        signal within the method's tolerance. Returns (z, y, x) complex64.
         """
         return self.plan(capture, grid).field(capture, progress)
 

@@ -81,10 +81,8 @@ class FrontSurface:
 
 def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
     """Find the front surface of a volume of at least 3 voxels along every axis; its normals are the
-    directions in which brightness changes most.
-
-    `fraction`: a line of sight shows a surface where its brightest voxel has this fraction of the
-    brightest of all.
+    directions in which brightness changes most. `fraction`: a line of sight shows a surface where
+    its brightest voxel has this fraction of the brightest of all.
     """
     from scipy.ndimage import gaussian_filter
 

@@ -150,9 +150,7 @@ NANOSECOND = 1e-9
 
 def save_film(video: TransientVideo, path: str | Path) -> None:
     """Write a GIF that looks along +z from the wall, x to the right and y down; all instants share
-    one scale.
-
-    Memory for all pictures of the film, 0.2 MB each.
+    one scale. Memory for all pictures of the film, 0.2 MB each.
     """
     from PIL import Image
 

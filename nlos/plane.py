@@ -227,10 +227,9 @@ MAX_RIM_FRACTION, RIM_FRACTION, RIM_FRACTION_PER_DIGIT = 0.7, 1.5, 0.5
 
 @dataclass(frozen=True)
 class StraightPaths:
-    """How far across straight paths from wall points to voxels lead, before and behind a virtual plane.
-
-    What the plane carries to a voxel comes from about their crossings: elsewhere the phases of both
-    legs turn, and their sum cancels.
+    """How far across straight paths from wall points to voxels lead, before and behind a virtual
+    plane. What the plane carries to a voxel comes from about their crossings: elsewhere the phases
+    of both legs turn, and their sum cancels.
     """
 
     wall_to_plane: float  # along the plane, at most, m; with room about the crossings
@@ -243,11 +242,9 @@ class StraightPaths:
     def find(
         cls, points: NDArray[np.float64], plane: VirtualPlane, grid: Grid, tolerance: float
     ) -> StraightPaths | None:
-        """Find the straight paths between wall points and voxels through a plane.
-
-        `points` (n, 3): of the wall, m; `plane`: in front of them; `tolerance`: relative error
-        allowed. Returns none where voxels lie before the plane: no straight path to these crosses
-        it.
+        """Find the straight paths between wall points and voxels through a plane. `points` (n, 3):
+        of the wall, m; `plane`: in front of them; `tolerance`: relative error allowed. Returns none
+        where voxels lie before the plane: no straight path to these crosses it.
         """
         first, last = float(grid.z[0]), float(grid.z[-1])
         if first <= plane.z:

@@ -42,10 +42,9 @@ def crop_capture(capture: Capture, nearest: float, farthest: float) -> Capture:
 
 
 def rebin_capture(capture: Capture, factor: int) -> Capture:
-    """Add up every `factor` neighbouring bins; bins left over at the end are dropped.
-
-    Counts stay counts. Bins much finer than the wall's sampling carry noise and cost time: path per
-    bin of about the distance of neighbouring wall points loses nothing.
+    """Add up every `factor` neighbouring bins; bins left over at the end are dropped. Counts stay
+    counts. Bins much finer than the wall's sampling carry noise and cost time: path per bin of
+    about the distance of neighbouring wall points loses nothing.
     """
     bins = capture.axis.bins // factor if factor >= 1 else 0
     if bins < 2:

@@ -51,11 +51,9 @@ def compute_diffraction_limit(capture: Capture, point: Any, pulse: VirtualPulse)
 
 
 def measure_point_spread(volume: Volume, point: Any | None = None) -> PeakWidths:
-    """Widths of a volume's peak, along the lines x, y and z through it.
-
-    `volume`: A quarter of the width per voxel, or finer; `point` (3,): the voxel nearest to it is
-    taken for the peak; defaults to the brightest. Returns full widths at half maximum along x, y
-    and z, m.
+    """Widths of a volume's peak, along the lines x, y and z through it. `volume`: A quarter of the
+    width per voxel, or finer; `point` (3,): the voxel nearest to it is taken for the peak; defaults
+    to the brightest. Returns full widths at half maximum along x, y and z, m.
     """
     z, y, x = volume.grid.find_nearest(volume.find_brightest() if point is None else point)
     magnitude = volume.magnitude
@@ -69,9 +67,7 @@ def measure_point_spread(volume: Volume, point: Any | None = None) -> PeakWidths
 
 def measure_fwhm(axis: FloatArray, values: NDArray[Any], peak: int) -> float:
     """Full width at half of ``values[peak]``, by linear interpolation; NaN if one side does not
-    fall so far.
-
-    `axis` (n,): metres, ascending; `values` (n,); `peak`: place of the maximum.
+    fall so far. `axis` (n,): metres, ascending; `values` (n,); `peak`: place of the maximum.
     """
     level = HALF_MAXIMUM * float(values[peak])
     below = np.flatnonzero(values < level)

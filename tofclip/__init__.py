@@ -7,10 +7,9 @@ x)`` with y pointing down; shear s in pixels per view step, negative for near ob
 
 
 def __getattr__(name):
-    """Find a public name; `__init__.pyi` beside this file lists them and their homes.
-
-    What finds them is loaded with the first one: the program `tofclip` needs none, and cannot catch
-    a Ctrl-C before this package is there.
+    """Find a public name; `__init__.pyi` beside this file lists them and their homes. What finds
+    them is loaded with the first one: the program `tofclip` needs none, and cannot catch a Ctrl-C
+    before this package is there.
     """
     import lazy_loader as lazy
 

@@ -43,10 +43,8 @@ def is_numpy(array: Array) -> bool:
 
 
 def empty_aligned(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return an array whose first element begins a cache line: NumPy's begin anywhere, and then every
-    vector of 512 bits lies in two lines.
-
-    Returns contiguous; its elements are not set.
+    """Return an array whose first element begins a cache line: NumPy's begin anywhere, and then
+    every vector of 512 bits lies in two lines. Returns contiguous; its elements are not set.
     """
     kind = np.dtype(dtype)
     size = math.prod(shape) * kind.itemsize
@@ -109,9 +107,7 @@ def is_complex(array: Array) -> bool:
 
 def as_type(array: Array, dtype: DTypeLike) -> Array:
     """Return `array` in a NumPy type, in the library and on the device where it is; as it is if it
-    has that type.
-
-    NumPy's come back contiguous, as compiled loops need them.
+    has that type. NumPy's come back contiguous, as compiled loops need them.
     """
     if is_numpy(array):
         return np.ascontiguousarray(array, dtype)
@@ -224,11 +220,10 @@ class PerDevice(Generic[T]):
 
 
 def parse_device(name: str) -> ComputeDevice:
-    """Return the place that a user asks for.
-
-    `name`: ``cpu`` for NumPy and the compiled loops; ``cuda`` or ``cuda:1`` for a GPU, through CuPy
-    or else PyTorch; ``auto`` for a GPU where there is one, and ``cpu`` where there is none; or a
-    library with its own name of a device, such as ``torch:cpu`` or ``torch:xpu``.
+    """Return the place that a user asks for. `name`: ``cpu`` for NumPy and the compiled loops;
+    ``cuda`` or ``cuda:1`` for a GPU, through CuPy or else PyTorch; ``auto`` for a GPU where there
+    is one, and ``cpu`` where there is none; or a library with its own name of a device, such as
+    ``torch:cpu`` or ``torch:xpu``.
     """
     if name == "cpu":
         return ComputeDevice()

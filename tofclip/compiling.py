@@ -75,10 +75,9 @@ def compile_and_keep(**options: Any) -> Callable[[Any], Any]:
 
 
 def compile_loop(**options: Any) -> Callable[[Any], Any]:
-    """Make the decorator of loops that Python calls and that write into arrays they are given.
-
-    They make no array, so that nothing counts who holds one, and C does not call them: both would
-    be compiled into each of them. They are kept as by `compile_and_keep`.
+    """Make the decorator of loops that Python calls and that write into arrays they are given. They
+    make no array, so that nothing counts who holds one, and C does not call them: both would be
+    compiled into each of them. They are kept as by `compile_and_keep`.
     """
     usual = {"error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
     return compile_and_keep(**{**usual, **options})

@@ -62,9 +62,8 @@ class MissingTimeAxisError(InputError):
 
 
 class FileFormatError(TofclipError, ValueError):
-    """A file is damaged, incomplete or of another format than expected.
-
-    `path`: the offending file; `problem`: what was found and what was expected, as one clause.
+    """A file is damaged, incomplete or of another format than expected. `path`: the offending file;
+    `problem`: what was found and what was expected, as one clause.
     """
 
     def __init__(self, path: str | Path, problem: str) -> None:

@@ -118,10 +118,9 @@ MAX_MESSAGE_LENGTH = 200  # of another library's message that is part of ours
 
 
 class BoundedFile(io.BufferedReader):
-    """A file, open for reading, that is never asked for more than it has.
-
-    Python takes the memory for all bytes that are asked for before it reads them, and decoders ask
-    for as many as a damaged header says.
+    """A file, open for reading, that is never asked for more than it has. Python takes the memory
+    for all bytes that are asked for before it reads them, and decoders ask for as many as a damaged
+    header says.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -176,10 +175,9 @@ def iterate_members(
     group: h5py.Group, visited: set[int]
 ) -> Iterator[tuple[str, h5py.Dataset | h5py.Group | None]]:
     """Yield names and members of an HDF5 group; None for a link to elsewhere, and for an object
-    whose address is among those `visited`.
-
-    A file of a few kilobytes may hold a group that holds itself many times over: whoever walks
-    through groups in groups hands on one set of visited addresses.
+    whose address is among those `visited`. A file of a few kilobytes may hold a group that holds
+    itself many times over: whoever walks through groups in groups hands on one set of visited
+    addresses.
     """
     import h5py
 
@@ -198,7 +196,6 @@ def require_bounded_dataset(
     dataset: h5py.Dataset, origin: str | Path, at_once: int | None = None
 ) -> None:
     """Refuse a dataset whose values are not in its own file, or claim more than the file can hold.
-
     `at_once`: how many of its values are read at once; by default all.
     """
     name, dtype = dataset.name.lstrip("/"), dataset.dtype
@@ -380,10 +377,9 @@ def _is_endless(path: str | Path) -> bool:
 
 
 def _create_temporary_file(target: Path) -> Path:
-    """Create an empty file beside `target`, with the permissions that any new file has.
-
-    `tempfile` would make it private, and asking for the process's umask means changing it, which
-    other threads that create files meanwhile would see.
+    """Create an empty file beside `target`, with the permissions that any new file has. `tempfile`
+    would make it private, and asking for the process's umask means changing it, which other threads
+    that create files meanwhile would see.
     """
     while True:
         path = target.with_name(f".{target.name}.{secrets.token_hex(4)}{target.suffix}")

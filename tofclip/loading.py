@@ -77,9 +77,8 @@ def outline(path: str | Path) -> Record:
 
 def _open(path: str | Path, values: bool) -> tuple[Record, Any]:
     """Return a file's record; and where `values` of other formats are asked for, what they make,
-    the record being empty then.
-
-    The first line that fits says what a file is: by its content, because suffixes get lost.
+    the record being empty then. The first line that fits says what a file is: by its content,
+    because suffixes get lost.
     """
     require_path(path)
     file = Path(path)

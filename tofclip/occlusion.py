@@ -154,9 +154,7 @@ class TimedMeasurements:
 
     def find_returns(self) -> tuple[Return, ...]:
         """Find the two strongest returns, the nearer first; a gate ends at the darkest instant
-        between them.
-
-        A return counts if it is above its own noise, even far below the other one.
+        between them. A return counts if it is above its own noise, even far below the other one.
         """
         peaks, prominences = self._find_peaks()
         if not peaks.size:

@@ -345,10 +345,9 @@ _KEY = "tofclip.stored"
 
 
 class Storable:
-    """A dataclass that can be turned into a `Record` and back.
-
-    Every field is declared with one of the functions below, such as `stored_array` or
-    `stored_value`; fields without a declaration are not stored.
+    """A dataclass that can be turned into a `Record` and back. Every field is declared with one of
+    the functions below, such as `stored_array` or `stored_value`; fields without a declaration are
+    not stored.
     """
 
     RECORD_KIND: ClassVar[str]
@@ -385,7 +384,6 @@ def stored_array(
     skip_empty: bool = False,
 ) -> Metadata:
     """Declare an array with its unit and the names of its axes (`dimensions` where they have none).
-
     `name` in the file is by default the dataclass field's; boolean arrays are stored as 0 and 1.
     Where it is `optional`, None is a value, and files without it get the field's default;
     `skip_empty` leaves an array without elements out of the file.
@@ -398,9 +396,8 @@ def stored_array(
 def stored_value(
     *names: str, dtype: Callable[[Scalar], Any] = float, optional: bool = False
 ) -> Metadata:
-    """Declare a number or a text, stored as an attribute; several names declare a tuple of them.
-
-    By convention names end in the unit (``time_zero_s``). Files without an `optional` one get the
+    """Declare a number or a text, stored as an attribute; several names declare a tuple of them. By
+    convention names end in the unit (``time_zero_s``). Files without an `optional` one get the
     field's default.
     """
     return _declare("value", names=names, dtype=dtype, optional=optional)
@@ -412,9 +409,8 @@ def stored_part(part: type) -> Metadata:
 
 
 def stored_child(read: Callable[[Record], Any], kind: str = "", optional: bool = False) -> Metadata:
-    """Declare a `Storable` object that has a record of its own within this one.
-
-    `read` makes it from its record; without a `kind` it looks at that itself.
+    """Declare a `Storable` object that has a record of its own within this one. `read` makes it
+    from its record; without a `kind` it looks at that itself.
     """
     return _declare("child", read=read, record_kind=kind, optional=optional)
 

@@ -187,10 +187,9 @@ def _set_blas_threads(library: LibController, number: int) -> None:
 
 @lru_cache(maxsize=1)
 def _find_blas_libraries(imported: tuple[bool, ...]) -> list[LibController]:
-    """Return the linear-algebra libraries that are loaded.
-
-    To look for them takes almost a millisecond, a tenth of all time where surfaces are fitted: it is
-    done again where one of `BLAS_PACKAGES` has been imported since.
+    """Return the linear-algebra libraries that are loaded. To look for them takes almost a
+    millisecond, a tenth of all time where surfaces are fitted: it is done again where one of
+    `BLAS_PACKAGES` has been imported since.
     """
     import scipy.linalg  # noqa: F401 - brings one of its own beside NumPy's
     from threadpoolctl import ThreadpoolController

@@ -32,10 +32,7 @@ ANY_ORDER = ("contract", "reassoc", "nsz")
 
 
 class Vector(types.Type):  # type: ignore[misc]
-    """Type of sixteen float32, int32 or bool.
-
-    `dtype`: of one of them.
-    """
+    """Type of sixteen float32, int32 or bool. `dtype`: of one of them."""
 
     def __init__(self, dtype: Any) -> None:
         self.dtype = dtype

@@ -141,7 +141,6 @@ LIBRARIES = ("numpy", "scipy", "numba", "pyfftw", "h5py", "scikit-image")
 
 def describe_machine() -> dict[str, Any]:
     """Return processor, cores, memory, devices and versions; no name of a machine or person.
-
     ``load``: how many other processes wanted a core, on average over the last minute; what the
     system does not report is None.
     """
@@ -196,12 +195,11 @@ BYTES_PER_MIB = 1 << 20
 
 
 def measure_case(case: Case, size: int) -> dict[str, Any]:
-    """Return the figures of a case at one size.
-
-    Returns ``seconds`` (median, least and greatest of the repeats after one that warms up),
-    ``per_second``, ``peak_mib`` of the process with its libraries and inputs, ``own_mib`` of that
-    only while the action ran, ``floor_seconds``, ``times_floor``, ``peers``: seconds, or why there
-    are none, and ``figures``, where the case has more to say.
+    """Return the figures of a case at one size. Returns ``seconds`` (median, least and greatest of
+    the repeats after one that warms up), ``per_second``, ``peak_mib`` of the process with its
+    libraries and inputs, ``own_mib`` of that only while the action ran, ``floor_seconds``,
+    ``times_floor``, ``peers``: seconds, or why there are none, and ``figures``, where the case has
+    more to say.
     """
     ready = case.prepare(size)
     before = measure_peak_memory_bytes()
@@ -344,10 +342,9 @@ CASE_TIMEOUT_S = 120
 def run_cases(
     cases: Sequence[Case], peers: str | None, advance: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Measure cases one after the other; `advance` is called with 1 after each process.
-
-    `peers`: Python in which other programs are installed. Returns ``machine`` and ``entries``, one
-    for each case.
+    """Measure cases one after the other; `advance` is called with 1 after each process. `peers`:
+    Python in which other programs are installed. Returns ``machine`` and ``entries``, one for each
+    case.
     """
     machine = describe_machine()  # before anything is measured: its load is that of others
     remaining_s = [float(TOTAL_TIMEOUT_S)]

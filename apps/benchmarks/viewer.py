@@ -74,9 +74,8 @@ class WholeDetail(DetailChooser):
 
 
 def make_echo_request(server: Any, answered: Callable[[], None]) -> Callable[[], None]:
-    """Return a function that asks the page to call back once all that was sent so far is drawn.
-
-    It reaches into viser's inner messages, which only a measurement may do.
+    """Return a function that asks the page to call back once all that was sent so far is drawn. It
+    reaches into viser's inner messages, which only a measurement may do.
     """
     names = (f"tofclip-drawn-{number % 4}" for number in itertools.count())
 

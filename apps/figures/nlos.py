@@ -49,11 +49,9 @@ def make_comparison_figure(
     truth: HiddenTruth | None,
 ) -> Figure:
     """Draw the brightest voxel along z (upper row) and along y (lower row), a column for each
-    method.
-
-    `volumes`: by method, on one grid; each is drawn relative to its own brightest voxel; `figures`:
-    what is written below each column: ``seconds``, ``peak_mib``, ``correlation`` and so on;
-    `truth`: outlined where it is known.
+    method. `volumes`: by method, on one grid; each is drawn relative to its own brightest voxel;
+    `figures`: what is written below each column: ``seconds``, ``peak_mib``, ``correlation`` and so
+    on; `truth`: outlined where it is known.
     """
     grid = next(iter(volumes.values())).grid
     across = float(np.subtract(*outer_edges(grid.x)[::-1]))
@@ -84,10 +82,9 @@ def make_comparison_figure(
 
 
 def draw_view(axes: Axes, volume: Volume, plane: PlaneAxes, truth: HiddenTruth | None) -> AxesImage:
-    """Draw the brightest voxel along the third axis, and the outline of what is hidden.
-
-    `plane`: names of the axes to the right and downwards. Returns brightness relative to the view's
-    largest, 0 to 1.
+    """Draw the brightest voxel along the third axis, and the outline of what is hidden. `plane`:
+    names of the axes to the right and downwards. Returns brightness relative to the view's largest,
+    0 to 1.
     """
     along = "zyx".index(next(name for name in "zyx" if name not in plane))
     picture = volume.magnitude.max(axis=along)
@@ -102,9 +99,8 @@ def draw_view(axes: Axes, volume: Volume, plane: PlaneAxes, truth: HiddenTruth |
 
 
 def draw_outline(axes: Axes, truth: HiddenTruth, plane: PlaneAxes) -> None:
-    """Draw the border of everything hidden, seen along the third axis.
-
-    `truth`: positions, m; `plane`: names of the axes to the right and downwards.
+    """Draw the border of everything hidden, seen along the third axis. `truth`: positions, m;
+    `plane`: names of the axes to the right and downwards.
     """
     places = truth.positions[:, ["xyz".index(name) for name in plane]]
     radius = truth.spacing / 2 if truth.spacing else POINT_RADIUS_M

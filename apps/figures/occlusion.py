@@ -50,9 +50,8 @@ def make_region_figure(region: InactiveRegion) -> Figure:
 
 
 def draw_region(axes: Axes, region: InactiveRegion, least_reach: float = 0.0) -> None:
-    """Draw the region from above with seven views; z to the right, x upwards.
-
-    `least_reach`: draw at least so far behind the occluder, m.
+    """Draw the region from above with seven views; z to the right, x upwards. `least_reach`: draw
+    at least so far behind the occluder, m.
     """
     places = np.linspace(-0.5, 0.5, VIEW_COUNT) * region.baseline
     usual = (
@@ -127,9 +126,7 @@ MIN_RELATIVE_LIGHT, CAPTION_LEVEL = (
 
 def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult]) -> Figure:
     """Draw the geometry, the returns in time, and what three cameras make of the target, beside the
-    truth.
-
-    `probes`: small targets on the axis, drawn with a tick or a cross.
+    truth. `probes`: small targets on the axis, drawn with a tick or a cross.
     """
     figure = make_figure(13, 7)
     figure.suptitle(_format_headline(experiment), fontsize=SMALL_FONT_PT + 5)

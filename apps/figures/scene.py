@@ -36,10 +36,8 @@ HALF_GATE_BINS = 4
 def make_scene_figure(
     frames: Frames, cloud: PointCloud, objects: Sequence[DetectedObject]
 ) -> Figure:
-    """Draw a scene in the manner of the paper's Supplementary Figure 21.
-
-    `cloud`: of these frames; `objects`: numbered in the top view; the four with most points are
-    shown at their ranges.
+    """Draw a scene in the manner of the paper's Supplementary Figure 21. `cloud`: of these frames;
+    `objects`: numbered in the top view; the four with most points are shown at their ranges.
     """
     figure = make_figure(13, 7.5)
     if frames.time_zero_note:

@@ -65,10 +65,8 @@ class Moment:
 
 
 def make_preview_figure(streak: Streak, frames: Frames) -> Figure:
-    """Draw a recovery.
-
-    Where times are ranges, brightness is multiplied by range squared, so that near and far
-    surfaces of one kind look alike.
+    """Draw a recovery. Where times are ranges, brightness is multiplied by range squared, so that
+    near and far surfaces of one kind look alike.
     """
     moments = choose_moments(frames)
     lines = math.ceil(len(moments) / PANEL_COLUMNS)

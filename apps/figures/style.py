@@ -119,9 +119,8 @@ def draw_image(
     extent: tuple[float, float, float, float] | None = None,
     **look: Any,
 ) -> AxesImage:
-    """Draw a picture without smoothing over its pixels.
-
-    `extent` (left, right, bottom, top): outer edges in the axes' units; pixel numbers where absent.
+    """Draw a picture without smoothing over its pixels. `extent` (left, right, bottom, top): outer
+    edges in the axes' units; pixel numbers where absent.
     """
     axes.set_facecolor(EMPTY_COLOUR)
     return axes.imshow(

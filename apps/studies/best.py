@@ -55,7 +55,6 @@ def solve_best(
     advance: Advance,
 ) -> dict[str, BestFigure]:
     """Solve the rows that are not known yet, measurements on all cores; figures by `Case.key`.
-
     `known`: of an earlier run; `keep`: called with all figures so far after each measurement, so
     that a run that is stopped can go on.
     """

@@ -120,10 +120,9 @@ def study(name: str, *aliases: str, **others: Any) -> Callable[[Work], Work]:
 
 
 class Library:
-    """Light fields by name, each rendered or read once.
-
-    `data`: folder of recorded data, whose ``lightfields`` holds NPZ light fields; `array`: cameras
-    of the rendered ones; the paper's 8 x 8 views of 128 x 128 pixels unless given.
+    """Light fields by name, each rendered or read once. `data`: folder of recorded data, whose
+    ``lightfields`` holds NPZ light fields; `array`: cameras of the rendered ones; the paper's 8 x 8
+    views of 128 x 128 pixels unless given.
     """
 
     def __init__(self, data: Path | None = None, array: CameraArray | None = None) -> None:
@@ -131,11 +130,10 @@ class Library:
         self._cache: dict[str, LightField] = {}
 
     def light_field(self, name: str) -> LightField:
-        """Return the light field of a scene.
-
-        `name`: of `tofclip.simulate.light_fields.SCENES`, ``NAME:EDIT`` with an edit of the flip
-        test, ``NAME:4x4`` for its middle sixteen views, ``NAME:flat`` for its reference view as a
-        poster at s = 0, or ``data:NAME`` for a recorded one.
+        """Return the light field of a scene. `name`: of `tofclip.simulate.light_fields.SCENES`,
+        ``NAME:EDIT`` with an edit of the flip test, ``NAME:4x4`` for its middle sixteen views,
+        ``NAME:flat`` for its reference view as a poster at s = 0, or ``data:NAME`` for a recorded
+        one.
         """
         if name not in self._cache:
             self._cache[name] = self._make_light_field(name)
@@ -243,7 +241,6 @@ def solve_cases(
     cases: Sequence[Case], library: Library, seeds: int, advance: Advance
 ) -> list[SolvedCase]:
     """Solve every case for every seed, cases on all cores; advances once for each case and seed.
-
     The prior's weight is chosen by cross-validation with the first seed, and kept for the others.
     """
     # Made once, before the threads start: many cases share a truth, and the library keeps a plain
@@ -283,7 +280,6 @@ def lay_out_lines(
     title: Callable[[Case], str],
 ) -> list[list[Panel]]:
     """Lay out a line for each run of cases of one group: the truth, then what was recovered.
-
     `head`: of the truth, filled in from the labels of a line's first case.
     """
     lines = []

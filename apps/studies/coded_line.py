@@ -31,11 +31,10 @@ HELD_OUT_RUN = 4  # neighbouring measurements left out together by the cross-val
 def make_coded_line_sensors(
     image_shape: tuple[int, int], lines: int, width_px: int, steepest: float, seed: int
 ) -> list[SliceConvolution]:
-    """Build 1D sensors behind coded lines, each with a code of its own.
-
-    `lines`: m; `width_px`: n_p; `steepest`: angles run evenly from minus this to this, rad; 0 keeps
-    all lines upright. Returns one for each line, long enough for lines of 45 degrees from all of
-    the picture, whatever `steepest` is.
+    """Build 1D sensors behind coded lines, each with a code of its own. `lines`: m; `width_px`:
+    n_p; `steepest`: angles run evenly from minus this to this, rad; 0 keeps all lines upright.
+    Returns one for each line, long enough for lines of 45 degrees from all of the picture, whatever
+    `steepest` is.
     """
     random = np.random.default_rng(seed)
     spreads = [
@@ -66,13 +65,12 @@ def recover_from_lines(
     weight: float | None = None,
 ) -> tuple[NDArray[Any], float]:
     """Measure each view of a light field by a coded line of its own, and recover the picture that
-    is in focus at one depth (supplement Eq. 21).
-
-    `light_field`: as many views as there are sensors. Each view's own picture is measured, so that
-    surfaces out of focus enter the measurements as they would in an instrument; `shear`: depth of
-    the picture, pixels per view step; `sensors`: one 1D sensor for each view; `weight`: of total
-    variation, relative to the largest value of A'f. By default it is chosen by cross-validation: no
-    true picture is looked at. Returns `picture` (rows, columns); `weight`: the one that was used.
+    is in focus at one depth (supplement Eq. 21). `light_field`: as many views as there are sensors.
+    Each view's own picture is measured, so that surfaces out of focus enter the measurements as
+    they would in an instrument; `shear`: depth of the picture, pixels per view step; `sensors`: one
+    1D sensor for each view; `weight`: of total variation, relative to the largest value of A'f. By
+    default it is chosen by cross-validation: no true picture is looked at. Returns `picture` (rows,
+    columns); `weight`: the one that was used.
     """
     measured = [
         one(picture).ravel() for one, picture in zip(sensors, light_field.pictures, strict=True)

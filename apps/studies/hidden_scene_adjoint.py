@@ -97,10 +97,8 @@ def build_tomography(points: int, sampling_ratio: float) -> RadonProjection:
 
 def find_expected_peak(capture: Capture, largest_count: float, seed: int) -> float:
     """Expected counts in the brightest bin for which chance makes `largest_count` the largest count
-    of all.
-
-    With millions of measurements the largest count lies far above the largest expected one: 6 where
-    that is about 1. Found by bisection; `capture`: expected signal, of any scale.
+    of all. With millions of measurements the largest count lies far above the largest expected one:
+    6 where that is about 1. Found by bisection; `capture`: expected signal, of any scale.
     """
     relative = capture.signal / capture.signal.max()
     relative = relative[relative > PEAK_FRACTION]
@@ -120,7 +118,6 @@ def correlate_views(one: Volume, other: Volume) -> float:
 
 def run_study(capture: Capture, grid: Grid, solver: Method, seed: int = 0) -> list[StudyRow]:
     """Image a noiseless capture, of as many rows as columns, at every exposure and sampling ratio.
-
     The photons of the reference and of the compressed measurements are independent.
     """
     # Without noise: what more light could reach at best.

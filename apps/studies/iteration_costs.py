@@ -56,10 +56,9 @@ def measure_iteration_costs(
     repeats: int = 5,
 ) -> list[IterationCost]:
     """Time one iteration of every method of Table 1: FISTA with total variation for all of them
-    alike, in memory of about ten light fields in float32.
-
-    `shear`, `sampling_ratio`: of CLIP; `exposures`: r, of Ashok's and Babacan's methods;
-    `repeats`: iterations timed, after a first one that is not.
+    alike, in memory of about ten light fields in float32. `shear`, `sampling_ratio`: of CLIP;
+    `exposures`: r, of Ashok's and Babacan's methods; `repeats`: iterations timed, after a first one
+    that is not.
     """
     views = [(v, u) for v, u in light_field.views.tolist()]
     shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])

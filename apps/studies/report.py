@@ -100,10 +100,9 @@ def load_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
 
 
 def add_best(result: Result, figures: Mapping[str, BestFigure], seconds: float | None) -> Result:
-    """Return a study's result with what the settings of choice reach in its rows.
-
-    `figures`: by the rows' labels; rows that are missing are marked as not tried; `seconds`: of
-    processor time, that they took; None: not known.
+    """Return a study's result with what the settings of choice reach in its rows. `figures`: by the
+    rows' labels; rows that are missing are marked as not tried; `seconds`: of processor time, that
+    they took; None: not known.
     """
 
     def identify(row: Mapping[str, Any]) -> list[str]:
@@ -172,9 +171,8 @@ def write_page(results: Sequence[Result], folder: Path) -> Path:
 
 
 def render_section(result: Result, beside: str = "") -> str:
-    """Return a study's heading, command, table and picture in Markdown.
-
-    `beside`: folder of the picture; ends in a slash, or is empty.
+    """Return a study's heading, command, table and picture in Markdown. `beside`: folder of the
+    picture; ends in a slash, or is empty.
     """
     names = ", ".join([result["name"], *result["also"]])
     has_best = "best_seconds" in result

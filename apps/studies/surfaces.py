@@ -68,10 +68,9 @@ class Scored(NamedTuple):
 
 
 def make_small_instrument(photons: float, rays_per_pixel_side: int = 4) -> Instrument:
-    """Return an instrument like the demonstration's with pictures of half its side.
-
-    `photons`: expected signal of the brightest streak pixel; `rays_per_pixel_side`: rays of the
-    simulation; they have to be closer than the finest pattern.
+    """Return an instrument like the demonstration's with pictures of half its side. `photons`:
+    expected signal of the brightest streak pixel; `rays_per_pixel_side`: rays of the simulation;
+    they have to be closer than the finest pattern.
     """
     centres = np.arange(60.0, 600.0, 86.0)
     camera = Camera(
@@ -166,9 +165,8 @@ SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def make_scene_instrument(name: str, photons: float) -> Instrument:
-    """Return the instrument before which a scene of `SCENES` stands.
-
-    `photons`: expected signal of the brightest streak pixel.
+    """Return the instrument before which a scene of `SCENES` stands. `photons`: expected signal of
+    the brightest streak pixel.
     """
     if name == "gauze":
         return make_small_instrument(photons, GAUZE_RAYS_PER_PIXEL_SIDE)
@@ -176,10 +174,8 @@ def make_scene_instrument(name: str, photons: float) -> Instrument:
 
 
 def score_methods(scene: Scene, instrument: Instrument, seed: int, fit: bool) -> dict[str, Scored]:
-    """Recover one shot by every method, with the same camera.
-
-    `seed`: of the photon noise; `fit`: whether sweep, gains and centres are found from the shot;
-    else the true ones are known.
+    """Recover one shot by every method, with the same camera. `seed`: of the photon noise; `fit`:
+    whether sweep, gains and centres are found from the shot; else the true ones are known.
     """
     shot = simulate_shot(scene, instrument, seed)
     streak = shot.streak

@@ -129,7 +129,6 @@ def format_length(length: float) -> str:
 
 def choose_ticks(scale: Scale, count: int = 6) -> tuple[list[tuple[float, str]], str]:
     """Return round values of a scale and its title, in a unit in which the numbers are short.
-
     `count`: about how many there should be. Returns where each one lies, 0 for the first colour to
     1 for the last, and its number; then the quantity with its unit.
     """
@@ -302,10 +301,8 @@ Image = NDArray[np.uint8]
 
 
 def render_pictures(pictures: Mapping[str, Picture], scale: Scale) -> dict[str, Image]:
-    """Turn pictures into images of a handy size.
-
-    `pictures`: ``"depth"`` is in m, NaN where there is nothing; all others are brightness; `scale`:
-    the scene's colours.
+    """Turn pictures into images of a handy size. `pictures`: ``"depth"`` is in m, NaN where there
+    is nothing; all others are brightness; `scale`: the scene's colours.
     """
     return {
         name: resize_image(
@@ -362,10 +359,9 @@ def colour_brightness(picture: Picture, palette: str) -> Image:
 
 
 def colour_depth(picture: Picture, scale: Scale) -> Image:
-    """Colour a picture of distances; NaN becomes a dark grey.
-
-    `picture` (rows, columns): metres; `scale`: taken where it is one of ranges; else the colours
-    run from the 1st to the 99th percentile. Returns (rows, columns, 3).
+    """Colour a picture of distances; NaN becomes a dark grey. `picture` (rows, columns): metres;
+    `scale`: taken where it is one of ranges; else the colours run from the 1st to the 99th
+    percentile. Returns (rows, columns, 3).
     """
     image = np.empty((*picture.shape, 3), np.uint8)
     image[:] = EMPTY_COLOUR

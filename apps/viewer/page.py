@@ -68,10 +68,8 @@ class WaitingPage:
 
 class Page:
     """Serves a session. One thread, in `run`, owns the session; whatever the browsers ask for waits
-    in a queue.
-
-    `host`: an IP address of this computer; `waiting`: served already, where this page is to be;
-    instead of port and host.
+    in a queue. `host`: an IP address of this computer; `waiting`: served already, where this page
+    is to be; instead of port and host.
     """
 
     def __init__(

@@ -220,10 +220,9 @@ def bind_user_input(handle: Any, post: Post, act: Callable[[Any], None]) -> None
 
 
 class Controls:
-    """Playback, time gate, refocus, ways of showing, colours and filters.
-
-    `first`: its extent is that of the filters until they are narrowed; `resize`: called when points
-    are to have another size.
+    """Playback, time gate, refocus, ways of showing, colours and filters. `first`: its extent is
+    that of the filters until they are narrowed; `resize`: called when points are to have another
+    size.
     """
 
     def __init__(
@@ -413,9 +412,8 @@ class Controls:
 
 
 def mark_times(times: NDArray[np.float64]) -> tuple[tuple[int, str], ...]:
-    """Return the frames at round times of flight, with their times in ns, for a time line.
-
-    `times` (frames,): s; rising.
+    """Return the frames at round times of flight, with their times in ns, for a time line. `times`
+    (frames,): s; rising.
     """
     in_ns = times / NANOSECOND
     places = choose_round_values(in_ns[0], in_ns[-1], MAX_TIME_MARKS)
@@ -543,11 +541,10 @@ def add_export(
     list_views: Callable[[float], Mapping[str, Viewpoint]],
     drawn_whole: Callable[[], AbstractContextManager[None]],
 ) -> None:
-    """Add screenshot, export, bookmarks and keys.
-
-    `list_views`: takes a window's width over its height, returns where one can look from, by name;
-    the first is where one looks from at first; `drawn_whole`: returns what a screenshot is taken
-    within, so that all points of a large cloud are on it.
+    """Add screenshot, export, bookmarks and keys. `list_views`: takes a window's width over its
+    height, returns where one can look from, by name; the first is where one looks from at first;
+    `drawn_whole`: returns what a screenshot is taken within, so that all points of a large cloud
+    are on it.
     """
     gui = server.gui
     bookmarked: dict[str, Viewpoint] = {}

@@ -100,10 +100,8 @@ class DetailChooser:
         self._points_per_s.pop(browser, None)
 
     def count(self, points: int, moving: bool) -> int:
-        """Return how many points of a cloud are drawn.
-
-        `points`: of the cloud; `moving`: whether the view or the cloud moves, so that the next
-        frame has to come soon.
+        """Return how many points of a cloud are drawn. `points`: of the cloud; `moving`: whether
+        the view or the cloud moves, so that the next frame has to come soon.
         """
         known = self._points_per_s.values()
         longest = MOVING_FRAME_S if moving else STILL_FRAME_S
@@ -119,9 +117,8 @@ class DetailChooser:
 
 
 def time_frame(client: viser.ClientHandle) -> float:
-    """Return how long a browser takes to draw what it shows, s.
-
-    `client`: asked for something that it does not have: it answers once in each frame.
+    """Return how long a browser takes to draw what it shows, s. `client`: asked for something that
+    it does not have: it answers once in each frame.
     """
     for _ in range(WARM_UP_FRAMES):
         client.local_storage.get_item("tofclip-drawn", ANSWER_TIMEOUT_S)
@@ -132,9 +129,8 @@ def time_frame(client: viser.ClientHandle) -> float:
 
 
 class Points:
-    """The points in the scene. Of a large cloud a part is drawn, larger, so that surfaces stay closed:
-    fewer while it moves, as many as the slowest browser can draw while it stands still.
-
+    """The points in the scene. Of a large cloud a part is drawn, larger, so that surfaces stay
+    closed: fewer while it moves, as many as the slowest browser can draw while it stands still.
     `post`: takes what is to be done by the thread that owns the page.
     """
 

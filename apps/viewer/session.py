@@ -96,10 +96,8 @@ class DisplayedFrame:
 
 
 class Session:
-    """A source being looked at.
-
-    Not to be used by two threads at once. Public attributes may be set at any time; `frame_at` then
-    draws accordingly.
+    """A source being looked at. Not to be used by two threads at once. Public attributes may be set
+    at any time; `frame_at` then draws accordingly.
     """
 
     def __init__(self, source: Source) -> None:

@@ -79,12 +79,11 @@ def announce_nothing(_: str) -> None:
 def open_source(
     name: str, options: ShotOptions | None = None, announce: Announce = announce_nothing
 ) -> Source:
-    """Open a file, a folder of files, or the address of an instrument.
-
-    `name`: frames, cloud, volume, shot or stack of shots (HDF5); a cloud of another format; a raw
-    streak image; a range image or depth picture; a folder of clouds or of streak images; or an
-    address such as ``sim+linospad2://?seed=1``; `announce`: called with what is done where it takes
-    seconds, as soon as the inputs are known to be good.
+    """Open a file, a folder of files, or the address of an instrument. `name`: frames, cloud,
+    volume, shot or stack of shots (HDF5); a cloud of another format; a raw streak image; a range
+    image or depth picture; a folder of clouds or of streak images; or an address such as
+    ``sim+linospad2://?seed=1``; `announce`: called with what is done where it takes seconds, as
+    soon as the inputs are known to be good.
     """
     options = options or ShotOptions()
     if "://" in name:

@@ -66,11 +66,10 @@ MIN_FRAMES = 3  # without a neighbour on either side no return is located
 
 
 class ShotRecovery:
-    """Turns the measurements of one camera into frames, at any shear.
-
-    `times` (frames,): time of flight of each column of measurements, s. By default the linear
-    inverse: one operator and one matrix (columns, columns) for each of the last 16 shears, which
-    every recovery of this process shares. Safe to share by threads.
+    """Turns the measurements of one camera into frames, at any shear. `times` (frames,): time of
+    flight of each column of measurements, s. By default the linear inverse: one operator and one
+    matrix (columns, columns) for each of the last 16 shears, which every recovery of this process
+    shares. Safe to share by threads.
     """
 
     def __init__(self, camera: Camera, times: FloatArray, method: Method | None = None) -> None:
@@ -102,10 +101,9 @@ class ShotRecovery:
     def view(
         self, measurements: Readings, shear: float, gate: Gate, least_intensity: float = 0.0
     ) -> View:
-        """Recover the frames of a gate and locate their returns.
-
-        `least_intensity`, counts, referred to 1 m: weaker returns are left out: a threshold
-        relative to the gate would find noise in a dark one.
+        """Recover the frames of a gate and locate their returns. `least_intensity`, counts,
+        referred to 1 m: weaker returns are left out: a threshold relative to the gate would find
+        noise in a dark one.
         """
         first = max(0, min(gate.first, self.times.size - MIN_FRAMES))
         widened = Gate(first, max(gate.stop, first + MIN_FRAMES))
@@ -236,7 +234,6 @@ def _place_pixels(picture: Record) -> PointCloud:
 
 def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) -> PointCloud:
     """Make a cloud of positions (n, 3), m; columns that are not known follow from them, or are 0.
-
     ``"brightness"`` counts as intensity.
     """
     known = known or {}
@@ -361,9 +358,8 @@ MAX_CACHED_VIEWS = 16
 
 
 class ShotSource(Source):
-    """Shots of one camera, wherever they come from; frame `n` is the cloud of shot `n`.
-
-    `row_times` (rows,): instant of each row, s; `method`: the linear inverse by default.
+    """Shots of one camera, wherever they come from; frame `n` is the cloud of shot `n`. `row_times`
+    (rows,): instant of each row, s; `method`: the linear inverse by default.
     """
 
     def __init__(

@@ -169,9 +169,8 @@ FEW_POINTS, MANY_POINTS = 20_000, 200_000
 
 
 class SceneFigure:
-    """A figure around a rendered scene: box, colours, words. Pictures of a film share one.
-
-    `first`: says from where one looks.
+    """A figure around a rendered scene: box, colours, words. Pictures of a film share one. `first`:
+    says from where one looks.
     """
 
     def __init__(self, title: str, first: DisplayedFrame, renderer: Renderer) -> None:
@@ -313,10 +312,8 @@ def choose_frames(session: Session) -> list[int]:
 def save_film(
     session: Session, renderer: Renderer, out: Path, advance: Callable[[int], None]
 ) -> int:
-    """Write a film, whole or not at all.
-
-    `out`: ends in ``.mp4``; `advance`: called with 1 after every picture. Returns the largest
-    number of points in a picture.
+    """Write a film, whole or not at all. `out`: ends in ``.mp4``; `advance`: called with 1 after
+    every picture. Returns the largest number of points in a picture.
     """
     whole = session.frame_at(0.0)  # a transient begins at its end: with all of its points
     still, most, frames = (

@@ -143,11 +143,9 @@ def round_length_down(length: float) -> float:
 
 
 def make_presets(xyz: NDArray[np.float32], aspect: float = 1.5) -> dict[str, Viewpoint]:
-    """Return places to look at a cloud from, by name.
-
-    `xyz` (n, 3): m; not empty; `aspect`: width of the picture over its height. Returns ``"start"``
-    is `place_viewpoint`'s; ``"front"``, ``"top"`` and ``"side"`` see the whole cloud; ``"camera"``
-    is where it was taken from.
+    """Return places to look at a cloud from, by name. `xyz` (n, 3): m; not empty; `aspect`: width
+    of the picture over its height. Returns ``"start"`` is `place_viewpoint`'s; ``"front"``,
+    ``"top"`` and ``"side"`` see the whole cloud; ``"camera"`` is where it was taken from.
     """
     box = Box.around(xyz)
     middle = (box.low + box.high) / 2
@@ -171,7 +169,6 @@ def make_presets(xyz: NDArray[np.float32], aspect: float = 1.5) -> dict[str, Vie
 
 def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
     """Return a viewpoint close to the camera's own, the origin, from which a cloud is seen whole.
-
     `xyz` (n, 3): m; `aspect`: width of the picture over its height.
     """
     if len(xyz) == 0:

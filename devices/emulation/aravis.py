@@ -29,7 +29,6 @@ FillPattern = ctypes.CFUNCTYPE(
 
 class EmulatedCamera:
     """Aravis' own emulated camera: of `light`, or of moving stripes where there is none.
-
     `lost_per_thousand`: packets of a thousand that are lost on the wire.
     """
 
@@ -59,10 +58,8 @@ class EmulatedCamera:
 
 
 class ShownLight:
-    """Lets an emulated camera send pictures of some light.
-
-    The binding drops Python's function after the call that sets it, so that the library itself is
-    asked.
+    """Lets an emulated camera send pictures of some light. The binding drops Python's function
+    after the call that sets it, so that the library itself is asked.
     """
 
     def __init__(self, camera_process: Any, light: EmulatedLight) -> None:
@@ -115,11 +112,9 @@ class EmulationOptions(CameraOptions):
 
 def open_emulated(uri: Uri) -> StreamSource:
     """Open ``sim+aravis://?frame_rate=100&scene=stripes&lost_per_thousand=0``: Aravis' own emulated
-    camera.
-
-    ``scene``: ``stripes`` that move, or ``demo`` and ``small`` (a slit of 256 pixels), of which it
-    sends streak pictures in Mono16; ``seed``: of their photons; ``lost_per_thousand``: packets lost
-    on the wire.
+    camera. ``scene``: ``stripes`` that move, or ``demo`` and ``small`` (a slit of 256 pixels), of
+    which it sends streak pictures in Mono16; ``seed``: of their photons; ``lost_per_thousand``:
+    packets lost on the wire.
     """
     options = EmulationOptions.from_uri(uri)
     library, serial, lost = load_aravis(), uri.location or "EMULATED", options.lost_per_thousand

@@ -171,9 +171,8 @@ class Instrument(Protocol):
 
 class EmulatedFeed:
     """A driver's feed whose instrument is software, which is switched off with it; see
-    `devices.stream.Feed`.
-
-    `describe`: from the calibration that the driver knows to that of the scene.
+    `devices.stream.Feed`. `describe`: from the calibration that the driver knows to that of the
+    scene.
     """
 
     def __init__(

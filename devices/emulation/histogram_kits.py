@@ -39,7 +39,6 @@ PULSE_BINS = 1.5  # Standard deviation of the emulated pulse
 
 def format_tmf8828(counts: NDArray[Any], number: int, tick: int) -> list[bytes]:
     """Return the lines that a TMF8828's program sends for a frame; the inverse of `Tmf8828Parser`.
-
     `counts` (128, zones); `number`: of the frame; `tick`: 0.2 us. Returns with their ends.
     """
     captures, halves = (TMF_CAPTURES, 2) if counts.shape[1] == 64 else (1, 1)

@@ -72,9 +72,8 @@ class SimulatedBoard:
         return (self.calibration.code_ends + self._table_offsets[:, np.newaxis]).ravel()
 
     def encode_cycle(self, number: int) -> bytes:
-        """Return the words of one cycle; the same number gives the same words.
-
-        Photons that find their converter's memory full are not stamped.
+        """Return the words of one cycle; the same number gives the same words. Photons that find
+        their converter's memory full are not stamped.
         """
         random = np.random.default_rng([self.seed, number])
         pixel, time = self._draw_photons(random)
@@ -140,10 +139,8 @@ def draw_uneven_calibration(seed: int) -> BoardCalibration:
 
 
 class SimulatedFeed:
-    """A board's cycles, one after the other; see `devices.stream.Feed`.
-
-    `cycles`: until the stream ends; `cycle_time`: seconds that a cycle takes at least; 0: as fast
-    as they are read.
+    """A board's cycles, one after the other; see `devices.stream.Feed`. `cycles`: until the stream
+    ends; `cycle_time`: seconds that a cycle takes at least; 0: as fast as they are read.
     """
 
     def __init__(self, board: SimulatedBoard, cycles: int, cycle_time: float) -> None:

@@ -65,13 +65,12 @@ class _RefusedError(Exception):
 
 
 class EmulatedStreakCamera:
-    """The server. Pictures are numbered from 0 for each client.
-
-    `frame_rate`: pictures per second; `frames`: pictures until it is dark; `faults`: by number of
-    the request for a picture, from 0: ``timeout`` answers `amount` tenths of a second late,
-    ``short`` pauses so long in the middle of a picture, ``unplug`` hangs up, ``corrupt`` answers
-    nonsense, ``lost`` lets `amount` pictures fall out of the ring buffer, ``overflow`` announces
-    more than any picture takes. What a client finds besides is the class's: subclasses differ.
+    """The server. Pictures are numbered from 0 for each client. `frame_rate`: pictures per second;
+    `frames`: pictures until it is dark; `faults`: by number of the request for a picture, from 0:
+    ``timeout`` answers `amount` tenths of a second late, ``short`` pauses so long in the middle of
+    a picture, ``unplug`` hangs up, ``corrupt`` answers nonsense, ``lost`` lets `amount` pictures
+    fall out of the ring buffer, ``overflow`` announces more than any picture takes. What a client
+    finds besides is the class's: subclasses differ.
     """
 
     is_application_up = True  # HPD-TA runs; otherwise all but the start of it is refused

@@ -57,15 +57,13 @@ CONFIRMED_COMMANDS = (b"V,", b"D,", b"AE,", b"S,", b"CALIB,", b"Ga,")
 
 
 class EmulatedSpadArray:
-    """The server.
-
-    `photons` (512, 512): expected photons of each pixel in one second; `delays` (512, 512): when
-    each pixel's light comes back after the laser's pulse, s; NaN where none does. Pictures behind a
-    gate need it; `pictures`: until it is dark: then a request finds no answer; `faults`: by number
-    of the request, from 0: ``timeout`` answers `amount` tenths of a second late, ``short`` pauses
-    so long in the middle of a picture, ``unplug`` hangs up there, ``corrupt`` ends with other
-    letters, ``stall`` says that it failed: with the mark at the end, with amount 2 with the mark in
-    front, with amount 3 in the middle of a picture.
+    """The server. `photons` (512, 512): expected photons of each pixel in one second; `delays`
+    (512, 512): when each pixel's light comes back after the laser's pulse, s; NaN where none does.
+    Pictures behind a gate need it; `pictures`: until it is dark: then a request finds no answer;
+    `faults`: by number of the request, from 0: ``timeout`` answers `amount` tenths of a second
+    late, ``short`` pauses so long in the middle of a picture, ``unplug`` hangs up there,
+    ``corrupt`` ends with other letters, ``stall`` says that it failed: with the mark at the end,
+    with amount 2 with the mark in front, with amount 3 in the middle of a picture.
     """
 
     is_framed = True  # it ends its texts with `DONE_MARK`

@@ -60,11 +60,9 @@ class TagStream(Protocol):
 
 
 class PoissonStream:
-    """Photons at random, at a constant rate.
-
-    `rate`: photons per second on all channels together; `clock_hz`: ticks per second. There is one
-    record at most per tick; `weights`: how the photons are shared among the channels; any positive
-    scale.
+    """Photons at random, at a constant rate. `rate`: photons per second on all channels together;
+    `clock_hz`: ticks per second. There is one record at most per tick; `weights`: how the photons
+    are shared among the channels; any positive scale.
     """
 
     def __init__(
@@ -454,7 +452,6 @@ class EmulatedTimeTagger(VirtualDevice):
 
     def _register_until_now(self, in_flight: int = 0) -> None:
         """Register what fell on the instrument up to now, where that depends on the time.
-
         `in_flight`: bytes that a transfer under way takes besides what the instrument holds.
         """
         if not self._is_paced or Capture.REGISTER not in self._capture:
@@ -645,10 +642,9 @@ SCENE_RATE_HZ = 1_000_000.0
 
 
 def open_timetag(uri: Uri) -> StreamSource:
-    """Open ``sim+timetag://?seed=1``: an emulated time tagger behind the real driver.
-
-    The board's own memory, with which it loses what a loaded computer does not fetch within 3 ms,
-    is ``memory_mib=0.01172``.
+    """Open ``sim+timetag://?seed=1``: an emulated time tagger behind the real driver. The board's
+    own memory, with which it loses what a loaded computer does not fetch within 3 ms, is
+    ``memory_mib=0.01172``.
     """
     options = EmulationOptions.from_uri(uri)
     make_light = choose_light(options)

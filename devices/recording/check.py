@@ -58,9 +58,7 @@ class Findings:
 
 def verify(path: Path) -> Findings:
     """Read a recording from end to end, decode it, and compare it with its checksums and its
-    accounts.
-
-    Memory: one block and its records.
+    accounts. Memory: one block and its records.
     """
     with Recording(path) as recording:
         return _inspect(recording, lambda piece: None)

@@ -160,10 +160,9 @@ class Block:
 
 
 class BlockReader:
-    """Blocks in anything that holds bytes; damage between them is stepped over and reported.
-
-    The first sound header decides which recording, and which version of the format, this is;
-    blocks of any other are not looked at. Memory: one block.
+    """Blocks in anything that holds bytes; damage between them is stepped over and reported. The
+    first sound header decides which recording, and which version of the format, this is; blocks of
+    any other are not looked at. Memory: one block.
     """
 
     def __init__(self, path: Path, fetch: Callable[[int, int], bytes], length: int) -> None:

@@ -100,10 +100,9 @@ class RecordingWriter:
             )
 
     def finish(self, stats: Stats, fault: str = "", is_complete: bool = True) -> None:
-        """Append the accounts.
-
-        `fault`: what ended the recording if it was not meant to end; `is_complete`: false where
-        something of it is known to be missing: a copy of a damaged recording.
+        """Append the accounts. `fault`: what ended the recording if it was not meant to end;
+        `is_complete`: false where something of it is known to be missing: a copy of a damaged
+        recording.
         """
         with contextlib.suppress(StorageError):  # a full disk may still have room for the accounts
             self._append(BlockKind.HEAD, self._head)
@@ -179,10 +178,8 @@ def _refuse_existing(path: Path) -> InputError:
 
 
 def _create_file(path: Path, overwrite: bool, stack: contextlib.ExitStack) -> tuple[int, Path]:
-    """Create and lock a file beside `path`, which gets its name when the head is in it.
-
-    The lock on a file that exists already is held as long, so that of two recorders one is
-    refused.
+    """Create and lock a file beside `path`, which gets its name when the head is in it. The lock on
+    a file that exists already is held as long, so that of two recorders one is refused.
     """
     with _explain_refusal(path):
         old = _lock_existing(path)

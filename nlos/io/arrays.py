@@ -26,9 +26,8 @@ class NamedArrays(Archive):
         return self.array(name, *[None] * self._count_axes(name))
 
     def read_time_last(self, name: str) -> NDArray[Any]:
-        """Return entry `name`, signals of three axes with time last.
-
-        Two equal axes after a longer one are rows and columns after time, which is refused.
+        """Return entry `name`, signals of three axes with time last. Two equal axes after a longer
+        one are rows and columns after time, which is refused.
         """
         signal = self.array(name, None, None, None)
         if signal.shape[1] == signal.shape[2] < signal.shape[0]:
@@ -63,9 +62,7 @@ def read_hdf5(path: str | Path) -> NamedArrays:
 
 def read_matlab(path: str | Path) -> NamedArrays:
     """List all numeric variables of a .mat file of version 5 to 7.3, without axes of length 1;
-    structs become dotted names.
-
-    Axes are in MATLAB's order, whatever the version.
+    structs become dotted names. Axes are in MATLAB's order, whatever the version.
     """
     with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(MATLAB_HEADER_BYTES + len(HDF5_SIGNATURE))

@@ -122,7 +122,6 @@ OPERATIONS: Mapping[type[ast.operator], Callable[[float, float], float]] = {
 
 def read_curvelet_data(fields: NamedArrays) -> Capture:
     """Read ``sub_Sig`` with the pairs' points, and the script that scales them, beside the file.
-
     Without the script points are metres: (depth, to the left, up) where the first does not vary,
     else (x, y, z).
     """
@@ -475,12 +474,10 @@ CONFOCAL_AXES, EXHAUSTIVE_AXES = 5, 7
 
 def read_zaragoza(fields: NamedArrays) -> Capture:
     """Read a rendering; colours and bounces are added up, and the ways to and from the devices
-    taken off.
-
-    ``data`` is (colour, t, bounce, camera grid, laser grid) where positions are (3, ...), and the
-    reverse where they are (..., 3); a confocal file has no laser grid. ``deltaT`` and ``t0`` are in
-    m of path. The wall's normals, and the hidden volume where it is given, tell which way the scene
-    lies; coordinates are turned so that it lies at larger z.
+    taken off. ``data`` is (colour, t, bounce, camera grid, laser grid) where positions are (3,
+    ...), and the reverse where they are (..., 3); a confocal file has no laser grid. ``deltaT`` and
+    ``t0`` are in m of path. The wall's normals, and the hidden volume where it is given, tell which
+    way the scene lies; coordinates are turned so that it lies at larger z.
     """
     first = fields.read_numbers("cameraGridPositions").shape[0] == 3
     signal = _add_up_bounces(fields, first)

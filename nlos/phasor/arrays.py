@@ -71,10 +71,7 @@ class ArrayLibrary:
         return self.xp.exp(1j * self.xp.astype(angle, self._complex))
 
     def make_complex(self, real: Array, imaginary: Array) -> Array:
-        """Make complex numbers of real and imaginary parts.
-
-        `real, imaginary`: of one shape.
-        """
+        """Make complex numbers of real and imaginary parts. `real, imaginary`: of one shape."""
         xp = self.xp
         return xp.astype(real, xp.complex64) + 1j * xp.astype(imaginary, xp.complex64)
 
@@ -89,9 +86,7 @@ def remove_whole_cycles(cycles: Any) -> NDArray[np.float64]:
 
 class BandTransform:
     """The Fourier transform of signals at a band's frequencies, as a matrix that is kept where the
-    signals live.
-
-    `bins`: of the signals; a band may have been made for a longer record.
+    signals live. `bins`: of the signals; a band may have been made for a longer record.
     """
 
     def __init__(self, band: Band, bins: int, library: ArrayLibrary) -> None:
@@ -111,9 +106,8 @@ class BandTransform:
 
 
 def get_group_traces(capture: Capture, group: IlluminationGroup) -> Array:
-    """Return the signals of one illumination group.
-
-    Returns (points, t): in the capture's own library.
+    """Return the signals of one illumination group. Returns (points, t): in the capture's own
+    library.
     """
     return ArrayLibrary.of(capture.signal).xp.permute_dims(
         _select_signals(capture, group.indices), (1, 0)
@@ -121,9 +115,8 @@ def get_group_traces(capture: Capture, group: IlluminationGroup) -> Array:
 
 
 def get_traces(capture: Capture, some: slice) -> Array:
-    """Return the signals (points, t) of some valid wall points.
-
-    `some`: of the valid wall points. Returns (points, t): in the capture's own library.
+    """Return the signals (points, t) of some valid wall points. `some`: of the valid wall points.
+    Returns (points, t): in the capture's own library.
     """
     xp = ArrayLibrary.of(capture.signal).xp
     indices = np.arange(len(capture.points))[some]

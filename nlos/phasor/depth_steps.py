@@ -42,7 +42,6 @@ TABLE_SAMPLES = 512
 @dataclass(frozen=True, eq=False)
 class Illumination:
     """``exp(1j * (k - k_0) * (R - middle)) ~ sum_m b_m(k) * f_m(R)``, the odd functions f times 1j.
-
     The even and the odd part in R are each split by their own eigenvectors, which keeps everything
     real and takes some two thirds of the terms of a Chebyshev expansion.
     """
@@ -317,10 +316,8 @@ class AxialSpectrum:
         cosines: tuple[float, float],
     ) -> AxialSpectrum:
         """Return the spectrum of a field of all directions forward, of wavenumbers k and a carrier
-        k_0 (`centre`), rad/m.
-
-        `cosines`: range of the cosine of the angle between the laser's wave and z; both 0 without
-        one.
+        k_0 (`centre`), rad/m. `cosines`: range of the cosine of the angle between the laser's wave
+        and z; both 0 without one.
         """
         steps = (np.arange(ANGLES) + 0.5) / ANGLES
         low, high = cosines

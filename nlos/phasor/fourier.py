@@ -57,10 +57,8 @@ class FourierPlan(Protocol):
 
 
 class ScipyPlan:
-    """The same by scipy.fft, for one or both of the directions that FFTW has.
-
-    `source, target`: buffers of one shape; `inverse`: ``exp(+1j ...)`` instead of ``exp(-1j ...)``;
-    unscaled as well.
+    """The same by scipy.fft, for one or both of the directions that FFTW has. `source, target`:
+    buffers of one shape; `inverse`: ``exp(+1j ...)`` instead of ``exp(-1j ...)``; unscaled as well.
     """
 
     def __init__(
@@ -89,10 +87,8 @@ def allocate_zeros(shape: tuple[int, ...]) -> ComplexArray:
 def plan_transform(
     source: ComplexArray, target: ComplexArray, axis: int, inverse: bool = False
 ) -> FourierPlan:
-    """Plan a transform along one axis on one thread.
-
-    `source, target`: buffers of one shape; `inverse`: ``exp(+1j ...)`` instead of ``exp(-1j ...)``;
-    neither is scaled.
+    """Plan a transform along one axis on one thread. `source, target`: buffers of one shape;
+    `inverse`: ``exp(+1j ...)`` instead of ``exp(-1j ...)``; neither is scaled.
     """
     if pyfftw is None:
         return ScipyPlan(source, target, axis, inverse)

@@ -158,10 +158,8 @@ class WavePlan(PhasorPlan):
         diffraction.add(on_plane, total, SubProgress(progress, self.grid.size, work))
 
     def _hold_diffraction(self, number: int) -> Diffraction:
-        """Return what carries a group's field to the voxels.
-
-        Tables and threads' memory are those of one plane at a time, which its groups share: a scan
-        may have hundreds of planes.
+        """Return what carries a group's field to the voxels. Tables and threads' memory are those
+        of one plane at a time, which its groups share: a scan may have hundreds of planes.
         """
         group = self.groups[number]
         plane, made = self._held

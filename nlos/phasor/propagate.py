@@ -79,9 +79,8 @@ class CompiledBackend:
 
 
 class PortableBackend:
-    """Matrix products on the arrays of any library, where these live.
-
-    `capture`: for the device and the number of bins of its signal.
+    """Matrix products on the arrays of any library, where these live. `capture`: for the device and
+    the number of bins of its signal.
     """
 
     def __init__(self, band: Band, capture: Capture) -> None:

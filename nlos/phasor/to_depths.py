@@ -33,10 +33,8 @@ SOLVER_BLOCK_BYTES = 2 << 20
 
 
 class DepthPropagator:
-    """Plane waves between a plane and the depths of a grid.
-
-    Memory: some 20 bytes per plane wave and frequency in single precision, as much again for every
-    spectrum.
+    """Plane waves between a plane and the depths of a grid. Memory: some 20 bytes per plane wave
+    and frequency in single precision, as much again for every spectrum.
     """
 
     def __init__(self, plan: DiffractionPlan, library: ArrayLibrary) -> None:

@@ -185,10 +185,9 @@ class _AxisTransform:
 
     @classmethod
     def of(cls, axis: FloatArray, origin: float, step: float, reach: int) -> _AxisTransform:
-        """Return the transform of an axis for the plane waves of index 0 to `reach`.
-
-        `axis` (points,): evenly spaced, m; `origin`: where all waves have phase 0, m; `step`:
-        lateral wavenumber of index 1, rad/m; `reach`: largest index.
+        """Return the transform of an axis for the plane waves of index 0 to `reach`. `axis`
+        (points,): evenly spaced, m; `origin`: where all waves have phase 0, m; `step`: lateral
+        wavenumber of index 1, rad/m; `reach`: largest index.
         """
         numbers = step * np.arange(reach + 1)
         half = (axis.size + 1) // 2
@@ -204,9 +203,7 @@ class _AxisTransform:
 
     def project(self, values: NDArray[np.complex64], count: int) -> list[NDArray[np.complex64]]:
         """Sums of complex values (points, ...) with the first cosines and with the first sines,
-        (count, ...).
-
-        `count`: number of waves, from index 0 on. Returns cosine and sine sums.
+        (count, ...). `count`: number of waves, from index 0 on. Returns cosine and sine sums.
         """
         half = self.cosines.shape[1]
         before, after = values[:half], values[::-1][:half]
@@ -237,10 +234,9 @@ def choose_inverse(
     waves: WaveIndices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int
 ) -> InverseProduct | InverseTransform:
     """Choose the quicker way: few voxels of a long period by matrix products, many by Fourier
-    transforms; a period that is not a whole number of voxels leaves matrix products only.
-
-    `waves` (rows, columns): indices along y and x; `lattice`: voxels in a period along y and x;
-    `wanted`: voxels wanted along y and x, from the origin on; `terms`: maximum number of spectra.
+    transforms; a period that is not a whole number of voxels leaves matrix products only. `waves`
+    (rows, columns): indices along y and x; `lattice`: voxels in a period along y and x; `wanted`:
+    voxels wanted along y and x, from the origin on; `terms`: maximum number of spectra.
     """
     rows, columns = (2 * int(np.max(index)) + 1 for index in waves)
     high, wide = (int(length) for length in lattice)

@@ -68,10 +68,8 @@ def sample_waves(radius, distance, first, step, delay, continued, leading_zeros,
 @compiled
 def find_interpolation_weights(place, node, share):
     """Find the first of the `TAPS` nodes about every place, and their Lagrange weights (places,
-    taps).
-
-    `place` (places,): in steps of the nodes; `node` (places,): overwritten with the first node of
-    each place; `share` (places, TAPS): overwritten with the weights.
+    taps). `place` (places,): in steps of the nodes; `node` (places,): overwritten with the first
+    node of each place; `share` (places, TAPS): overwritten with the weights.
     """
     for b in range(place.size):
         node[b] = int(place[b]) - TAPS // 2 + 1
@@ -277,14 +275,13 @@ def _store_two_waves(terms, to, sums):
 @compiled
 def assemble_groups(parts, row, column, along_y, along_x, share, counts, first, spectrum):
     """Put together the plane waves of some frequencies, as many as count there, and put them into
-    their groups.
-
-    `parts` (4, columns, k, rows): sums with cosine and with sine along x, first with cosine and
-    then with sine along y; `row, column` (groups, LANES): indices of the waves, not negative;
-    `along_y, along_x` (n,): what waves of every index are multiplied by, those of negative ones by
-    its conjugate; `share` (groups, MIRROR_IMAGES, LANES): what they are multiplied by besides;
-    `counts` (k,): lanes of all groups that count at each frequency; `first`: where the frequencies
-    begin in `spectrum`; `spectrum` (groups, frequencies, 2, MIRROR_IMAGES, LANES): written to.
+    their groups. `parts` (4, columns, k, rows): sums with cosine and with sine along x, first with
+    cosine and then with sine along y; `row, column` (groups, LANES): indices of the waves, not
+    negative; `along_y, along_x` (n,): what waves of every index are multiplied by, those of
+    negative ones by its conjugate; `share` (groups, MIRROR_IMAGES, LANES): what they are multiplied
+    by besides; `counts` (k,): lanes of all groups that count at each frequency; `first`: where the
+    frequencies begin in `spectrum`; `spectrum` (groups, frequencies, 2, MIRROR_IMAGES, LANES):
+    written to.
     """
     for k in range(counts.size):
         for lane in range(counts[k]):
@@ -319,9 +316,7 @@ def multiply_by_minus_i(number):
 @compiled
 def transpose(source, target):
     """Copy ``target[i, j] = source[j, i]``, in squares that stay in cache; quickest for complex64
-    seen as float64.
-
-    `source` (columns, rows); `target` (rows, columns): overwritten.
+    seen as float64. `source` (columns, rows); `target` (rows, columns): overwritten.
     """
     rows, columns = target.shape
     for top in range(0, rows, TILE_SIDE):
@@ -343,11 +338,9 @@ def transpose(source, target):
 
 @compiled
 def scatter_terms(terms, cell, folded, spectra):
-    """Put the waves of some terms into their cells.
-
-    `terms` (m, groups, 2, MIRROR_IMAGES, LANES): real and imaginary parts; `cell` (groups,
-    MIRROR_IMAGES, LANES); `folded`: waves may meet in one cell, and then add up; `spectra` (m,
-    cells).
+    """Put the waves of some terms into their cells. `terms` (m, groups, 2, MIRROR_IMAGES, LANES):
+    real and imaginary parts; `cell` (groups, MIRROR_IMAGES, LANES); `folded`: waves may meet in one
+    cell, and then add up; `spectra` (m, cells).
     """
     flat, cells, half = terms.reshape(-1), cell.reshape(-1), np.uint64(GROUP_FLOATS // 2)
     for m in range(terms.shape[0]):

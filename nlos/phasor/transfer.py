@@ -202,10 +202,8 @@ class TransferFunction:
     @cached_property
     def _radii(self) -> tuple[FloatArray, FloatArray]:
         """Radii, m, and the weights of an integral over the plane; exponentially accurate for
-        smooth waves.
-
-        A trapezoidal rule in t with ``rho = h * log(1 + exp(t))``: evenly spaced but for a few ever
-        smaller radii.
+        smooth waves. A trapezoidal rule in t with ``rho = h * log(1 + exp(t))``: evenly spaced but
+        for a few ever smaller radii.
         """
         fastest = self.waves.max_wavenumber + self.max_lateral_wavenumber
         # the fastest phase along the radius is that of wave and Bessel function together

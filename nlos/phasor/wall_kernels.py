@@ -95,11 +95,9 @@ def _add_frequencies(phasors, w, wave, sums):
 @compiled
 def shift_and_sum(signals, sources, targets, scale, latest, sums):
     """Add every source's signal, moved earlier by its way to a target and divided by it, to the
-    target's.
-
-    `signals` (n, bins); `sources, targets` (n, 3): m; `scale`: bins per m of distance; `latest`:
-    distance in bins that bin 0 of the results is early by; at least the largest; `sums` (m, bins):
-    added to; long enough for the earliest and the latest arrival.
+    target's. `signals` (n, bins); `sources, targets` (n, 3): m; `scale`: bins per m of distance;
+    `latest`: distance in bins that bin 0 of the results is early by; at least the largest; `sums`
+    (m, bins): added to; long enough for the earliest and the latest arrival.
     """
     bins = signals.shape[1]
     for v in range(targets.shape[0]):

@@ -142,10 +142,9 @@ def plan_transforms(
     scattered: bool = False,
 ) -> WallToPlanePlan | None:
     """Plan the way from wall points to a plane by Fourier transforms; None where direct sums are
-    faster, or needed.
-
-    `strength` (frequencies,): relative amplitude of each frequency, decides what may be neglected;
-    `tolerance`: relative error allowed; `scattered`: whether points may stand above no lattice.
+    faster, or needed. `strength` (frequencies,): relative amplitude of each frequency, decides what
+    may be neglected; `tolerance`: relative error allowed; `scattered`: whether points may stand
+    above no lattice.
     """
     points, plane, paths = geometry.points, geometry.plane, geometry.paths
     wall = geometry.lattice

@@ -56,11 +56,10 @@ def _place_light(wall, laser, cell, start, per_metre, obliquity, voxels, bins, l
 
 @compiled
 def add_expected_light(walls, lasers, cell, start, per_metre, obliquity, voxels, albedo, changes):
-    """Add the light that voxels send to wall points, as changes from bin to bin.
-
-    `walls` (points, 3); `lasers` (1, 3); `cell, start, per_metre, obliquity`: as of `_place_light`;
-    `voxels` (3, n): m; `albedo` (n,); `changes` (points, bins + 2): added to; its running sum is
-    the light in every bin.
+    """Add the light that voxels send to wall points, as changes from bin to bin. `walls` (points,
+    3); `lasers` (1, 3); `cell, start, per_metre, obliquity`: as of `_place_light`; `voxels` (3, n):
+    m; `albedo` (n,); `changes` (points, bins + 2): added to; its running sum is the light in every
+    bin.
     """
     bins = changes.shape[1] - 2
     begins = np.empty(VOXELS_PER_RUN, np.float32)
@@ -90,12 +89,10 @@ def add_backprojected_light(
     walls, lasers, cell, start, per_metre, obliquity, voxels, sums, squared, total
 ):
     """Add to every voxel what the bins hold that its light arrives in: the adjoint of
-    `add_expected_light`.
-
-    `walls` (points, 3); `lasers` (1, 3); `cell, start, per_metre, obliquity`: as of `_place_light`;
-    `voxels` (3, n): m; `sums` (points, bins + 2): of every bin and all later ones; 0 behind the
-    record; `squared`: whether every bin counts by the square of the light that a voxel sends it;
-    `total` (n,): added to.
+    `add_expected_light`. `walls` (points, 3); `lasers` (1, 3); `cell, start, per_metre, obliquity`:
+    as of `_place_light`; `voxels` (3, n): m; `sums` (points, bins + 2): of every bin and all later
+    ones; 0 behind the record; `squared`: whether every bin counts by the square of the light that a
+    voxel sends it; `total` (n,): added to.
     """
     bins = sums.shape[1] - 2
     begins = np.empty(VOXELS_PER_RUN, np.float32)

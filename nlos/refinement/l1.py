@@ -197,7 +197,6 @@ def build_total_variation(
     grid: Grid, weight: float = 2e-2, iterations: int = 60
 ) -> LightFieldVariation:
     """Return the prior of even surfaces with sharp borders: total variation along x, y and z alike.
-
     `grid`: what will be imaged on; evenly spaced; `weight, iterations`: as of
     `tofclip.solvers.TotalVariation`.
     """

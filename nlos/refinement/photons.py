@@ -95,10 +95,8 @@ class CountedPhotons:
 
 def improve_background(background: Array, mean: float, ratios: Array, seen: Array) -> Array:
     """One step of expectation maximisation of some wall points' background (n,), photons per bin,
-    drawn to the mean of all wall points.
-
-    `ratios` (n, bins): what was counted over what is expected; `seen` (n,): bins that are taken
-    into account.
+    drawn to the mean of all wall points. `ratios` (n, bins): what was counted over what is
+    expected; `seen` (n,): bins that are taken into account.
     """
     drawn = background * ratios.sum(axis=1) + BACKGROUND_PHOTONS
     return np.asarray(np.maximum(drawn / (seen + BACKGROUND_PHOTONS / mean), MIN_BACKGROUND))
@@ -158,11 +156,10 @@ FINE_SUBSETS = (4, 4, 4, 2, 2)
 
 
 class PhotonFit:
-    """Albedo of some voxels, and background, fitted to photons.
-
-    `voxels` (n,): flat indices into the model's grid; `albedo` (n,): to begin with, on any scale;
-    nowhere 0; `prior_weight`: see `PhotonRefinement`. `albedo` (n,); `background` (points,):
-    photons per bin; `likelihood`: logarithm of the likelihood before the last pass.
+    """Albedo of some voxels, and background, fitted to photons. `voxels` (n,): flat indices into
+    the model's grid; `albedo` (n,): to begin with, on any scale; nowhere 0; `prior_weight`: see
+    `PhotonRefinement`. `albedo` (n,); `background` (points,): photons per bin; `likelihood`:
+    logarithm of the likelihood before the last pass.
     """
 
     def __init__(
@@ -509,9 +506,8 @@ class PhotonPlan(Plan):
 
 def judge(fit: PhotonFit, linear_light: Array, held: Array) -> LikelihoodGain:
     """Compare a fit with light as bright as in the linear image, and with background alone, by
-    photons that neither has seen; return the gain over the better of the two.
-
-    `linear_light` (points, bins): on any scale; `held` (points, bins): `HELD_OUT_FRACTION` of all.
+    photons that neither has seen; return the gain over the better of the two. `linear_light`
+    (points, bins): on any scale; `held` (points, bins): `HELD_OUT_FRACTION` of all.
     """
     ratio, photons = HELD_OUT_FRACTION / (1 - HELD_OUT_FRACTION), fit.photons
     expected = ratio * fit.expect()

@@ -56,7 +56,6 @@ class TimeOfFlight:
         self, values: Array, voxels: Array, points: Array, squared: bool = False
     ) -> Array:
         """Return what some voxels (n,) see of values (m, bins): the adjoint of `compute_light`.
-
         `squared`: weight by the square of the light instead: with the inverse of the expected
         counts this is what they tell of a voxel, Fisher's information.
         """

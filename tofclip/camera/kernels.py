@@ -25,12 +25,10 @@ fast_loop = compile_loop(fastmath=True)
 
 @inlined
 def sample_row(counts, dark, position, runs, reading):
-    """Sample every column of a row linearly between two raw rows, and take off the dark level; 0 beyond
-    the raw image.
-
-    `position` (columns,) says where each rectified pixel lies, pixels; `runs` (n, 3) the first column,
-    the one after the last, and the upper of the two raw rows between which all of them lie: from the
-    number of raw rows on, they lie beyond the image.
+    """Sample every column of a row linearly between two raw rows, and take off the dark level; 0
+    beyond the raw image. `position` (columns,) says where each rectified pixel lies, pixels; `runs`
+    (n, 3) the first column, the one after the last, and the upper of the two raw rows between which
+    all of them lie: from the number of raw rows on, they lie beyond the image.
     """
     rows, columns = np.uintp(counts.shape[0]), np.uintp(counts.shape[1])
     below, level = np.uintp(min(1, counts.shape[0] - 1)), fill_vector(dark)

@@ -86,10 +86,8 @@ class MeasurementNoise:
         return np.asarray(variance, dtype=np.float32)
 
     def find_dazzling(self, light: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Find light that is too bright for what else there is at the same instant.
-
-        Where a bright object is alone, there is nothing that it could dazzle. Counts, (columns,
-        frames).
+        """Find light that is too bright for what else there is at the same instant. Where a bright
+        object is alone, there is nothing that it could dazzle. Counts, (columns, frames).
         """
         dazzling = light > self.dazzle
         for frame in np.flatnonzero(dazzling.any(axis=0)):

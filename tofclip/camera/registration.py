@@ -342,10 +342,9 @@ class _Evidence:
     def solve_corrections(
         self, camera: Camera, view: int, drift: float, slope: Array
     ) -> FloatArray:
-        """Offset (rows), stretch, relative gain and centre (px) that best explain one view's misfit.
-
-        `slope` (columns, frames) is that of the measurements in time, a row. A centre that has drifted
-        far from its calibration is held back by a prior of `CENTRE_PRIOR_PX`.
+        """Offset (rows), stretch, relative gain and centre (px) that best explain one view's
+        misfit. `slope` (columns, frames) is that of the measurements in time, a row. A centre that
+        has drifted far from its calibration is held back by a prior of `CENTRE_PRIOR_PX`.
         """
         one = slice(view, view + 1)
         alone = camera.replace(

@@ -86,10 +86,8 @@ def read_row_times(
     metadata: Mapping[str, str], path: str | Path, rows: int
 ) -> NDArray[np.float64] | None:
     """Return the instant of each row, s, counted from the start of the sweep; None in focus mode,
-    where nothing is swept, and without a unit of time.
-
-    The table covers the whole sweep; a picture of a part of the sensor (``areSource`` = left, top,
-    width, height) begins at its row ``top``.
+    where nothing is swept, and without a unit of time. The table covers the whole sweep; a picture
+    of a part of the sensor (``areSource`` = left, top, width, height) begins at its row ``top``.
     """
     unit = TIME_UNITS.get(metadata.get("Scaling/ScalingYUnit", ""))
     if unit is None or metadata.get("Scaling/ScalingYScalingFile") == "Focus mode":
@@ -117,7 +115,6 @@ def read_row_times(
 
 def find_table(metadata: Mapping[str, str], axis: str) -> tuple[int, int] | None:
     """Return where in its file the scaling table of an axis (X or Y) lies: first byte, entries.
-
     None where the axis has no table: it is linear, or has no unit at all.
     """
     place = _TABLE.fullmatch(metadata.get(f"Scaling/Scaling{axis}ScalingFile", ""))

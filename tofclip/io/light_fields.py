@@ -219,11 +219,9 @@ def _decode(path: Path) -> NDArray[Any]:
 
 
 def read_light_field(path: str | Path) -> LightField:
-    """Read a light field; the name's ending says how.
-
-    `path`: ``.npz``: `lf` (v, u, y, x), `scale`, a factor for it, and the view numbers `v` and `u`.
-    ``.h5``, ``.hdf5``: written by `write_light_field`. ``.exr``: one part for each view, named
-    ``v=0,u=-1``.
+    """Read a light field; the name's ending says how. `path`: ``.npz``: `lf` (v, u, y, x), `scale`,
+    a factor for it, and the view numbers `v` and `u`. ``.h5``, ``.hdf5``: written by
+    `write_light_field`. ``.exr``: one part for each view, named ``v=0,u=-1``.
     """
     source = Path(path)
     if source.is_dir():

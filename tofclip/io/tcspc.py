@@ -89,10 +89,8 @@ class Events:
 
 
 class PtuEvents:
-    """A PTU file as pieces of a million events. Memory: one piece, decoded.
-
-    `sync`: channel of the laser's pulses in T2 mode; by default the electronics' own input for
-    them.
+    """A PTU file as pieces of a million events. Memory: one piece, decoded. `sync`: channel of the
+    laser's pulses in T2 mode; by default the electronics' own input for them.
     """
 
     def __init__(self, path: str | Path, sync: int | None = None) -> None:
@@ -198,9 +196,8 @@ def get_scan_shape(events: PtuEvents) -> tuple[int, int]:
 
 def read_scan(events: PtuEvents) -> ScannedPhotons:
     """Put the photons of a file in T2 mode into the pixels of a scanner's picture, by the markers
-    that it sets where lines begin and end and frames change; those between lines are left out.
-
-    The file is read twice. Memory: a piece of it, and 12 bytes for each photon.
+    that it sets where lines begin and end and frames change; those between lines are left out. The
+    file is read twice. Memory: a piece of it, and 12 bytes for each photon.
     """
     rows, columns = get_scan_shape(events)
     lines = _find_lines(events, rows, columns)

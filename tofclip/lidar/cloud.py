@@ -336,10 +336,9 @@ def _list_columns(path: str | Path) -> dict[str, ArchiveEntry]:
 
 
 def save_organised(returns: Returns, path: str | Path) -> int:
-    """Write a place for every pixel, whole or not at all; return how many have a point.
-
-    There is at most one return for each pixel (`Returns.select`). WIDTH and HEIGHT of PCD are the
-    picture's, and NPZ holds pictures, (rows, columns).
+    """Write a place for every pixel, whole or not at all; return how many have a point. There is at
+    most one return for each pixel (`Returns.select`). WIDTH and HEIGHT of PCD are the picture's,
+    and NPZ holds pictures, (rows, columns).
     """
     suffix = Path(path).suffix.lower()
     if suffix not in ORGANISED_SUFFIXES:

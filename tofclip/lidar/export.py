@@ -82,10 +82,8 @@ Entries = dict[str, ArchiveEntry]
 
 
 def write_table(path: str | Path, columns: Columns, shape: tuple[int, int] | None = None) -> None:
-    """Write columns to the format that the suffix of `path` names, whole or not at all.
-
-    `shape`: rows and columns of a picture whose pixels the values are, in raster order; PCD and NPZ
-    say so.
+    """Write columns to the format that the suffix of `path` names, whole or not at all. `shape`:
+    rows and columns of a picture whose pixels the values are, in raster order; PCD and NPZ say so.
     """
     require_suffix(path, *FORMATS)
     writer = FORMATS[Path(path).suffix.lower()][0]

@@ -58,10 +58,9 @@ def find_phase(offset):
 
 @search_step
 def search_traces(traces, pixels, axis, limits, table, pulse, room, found, counts):
-    """Find the returns of some traces, (n, bins): all steps, one after the other.
-
-    `pixels` (n,): to which they belong; `found` (all pixels, most returns, 3) gets instants, s, sums over
-    the bins and standard deviations, s, nearest first, and `counts` (all pixels,) how many.
+    """Find the returns of some traces, (n, bins): all steps, one after the other. `pixels` (n,): to
+    which they belong; `found` (all pixels, most returns, 3) gets instants, s, sums over the bins
+    and standard deviations, s, nearest first, and `counts` (all pixels,) how many.
     """
     listed, lone, crowded = find_candidates(traces, pixels, axis, limits, table.half, room, counts)
     fit_lone_returns(traces, table, axis.even, room, lone)
@@ -108,10 +107,9 @@ def fit_lone_returns(traces, table, even, room, moving):
 
 @search_part
 def fit_crowded_returns(traces, table, even, room, number):
-    """Fit returns that overlap, the first `number` of `room.crowded`, as `fit_lone_returns` does, by
-    steps on one at a time. In the end `rests` is what the others leave.
-
-    A return that moved no more and that no moving one reaches is left alone.
+    """Fit returns that overlap, the first `number` of `room.crowded`, as `fit_lone_returns` does,
+    by steps on one at a time. In the end `rests` is what the others leave. A return that moved no
+    more and that no moving one reaches is left alone.
     """
     candidates, crowded, half = room.candidates, room.crowded, table.half
     start = 0
@@ -210,9 +208,8 @@ def subtract_others(rest, w, candidates, group, k, table):
 @search_part
 def measure_returns_by_table(room, listed, least, pixels, times, table, found, counts):
     """Write what is `found` of the returns that respond by `least` deviations: (all pixels, most
-    returns, 3) instant, s, sum over the bins, standard deviation, s; nearest first.
-
-    `pixels` (traces,): of the traces; `counts` (all pixels,) goes up by one for each return, and is
+    returns, 3) instant, s, sum over the bins, standard deviation, s; nearest first. `pixels`
+    (traces,): of the traces; `counts` (all pixels,) goes up by one for each return, and is
     `NEEDS_EXACT_FIT` where one of the pixel does.
     """
     zero, candidates = fill_vector(np.float32(0)), room.candidates
@@ -459,10 +456,8 @@ def subtract_returns(rest, time, curve, scale, estimate, without):
 @loop_part
 def measure_returns(trace, times, background, noise, curve, scale, estimate, least, found):
     """Write instant, sum and standard deviation of every return that proves itself, nearest first;
-    return their number.
-
-    It has to lie on the time axis and to respond, height times root of the pulse's energy, by more than
-    `least`.
+    return their number. It has to lie on the time axis and to respond, height times root of the
+    pulse's energy, by more than `least`.
     """
     number = 0
     for k in range(estimate.shape[0]):

@@ -72,12 +72,11 @@ def add_recovery_error(
     image_shape: tuple[int, int],
     gate: float,
 ) -> FloatArray:
-    """Return one standard deviation of ranges, m, with the recovery's own errors.
-
-    `sigma` (n,): deviation that the noise in each pixel's trace explains, m; `distance` (n,): range, m;
-    `along_axis` (n,): depth along the optical axis for a range of 1; `pixel` (n,): number of the pixel,
-    not decreasing. A neighbour that is further away than `gate`, m, is on another surface. Returns with
-    few neighbours get what is usual for the others.
+    """Return one standard deviation of ranges, m, with the recovery's own errors. `sigma` (n,):
+    deviation that the noise in each pixel's trace explains, m; `distance` (n,): range, m;
+    `along_axis` (n,): depth along the optical axis for a range of 1; `pixel` (n,): number of the
+    pixel, not decreasing. A neighbour that is further away than `gate`, m, is on another surface.
+    Returns with few neighbours get what is usual for the others.
     """
     if pixel.size == 0:
         return np.array(sigma)
@@ -147,10 +146,9 @@ def allocate_window() -> NDArray[np.float32]:
 @compile_loop(fastmath=True)
 def scatter_about_planes(nearness, metres, pixel, columns, layers, gate, chosen, memory, scatter):
     """Robust deviation of the returns around each from a plane through them, m; -1 if they are few.
-
-    `nearness` (n,): inverse depth along the optical axis, 1/m; `metres` (n,): change of a return's range
-    for a change of its nearness, m^2; `pixel` (n,); `layers`: see `layer_returns`; `gate`: m; `chosen`
-    (k,): returns for which `scatter` (n,) is overwritten; `memory`: of `allocate_window`.
+    `nearness` (n,): inverse depth along the optical axis, 1/m; `metres` (n,): change of a return's
+    range for a change of its nearness, m^2; `pixel` (n,); `layers`: see `layer_returns`; `gate`: m;
+    `chosen` (k,): returns for which `scatter` (n,) is overwritten; `memory`: of `allocate_window`.
     """
     for own in chosen:
         y, x = pixel[own] // columns, pixel[own] % columns

@@ -106,11 +106,10 @@ class Room(NamedTuple):
 @search_part
 def find_candidates(traces, pixels, axis, limits, half, room, counts):
     """List the peaks of some traces that the matched filter confirms, and cut out the bins around.
-
     `traces` (n, bins) have memory for another one after the last; `pixels` (n,): their pixels;
-    `half`: of the table of the pulse, which says how far to cut out. `counts` (all pixels,) become 0,
-    or `NEEDS_EXACT_FIT` where a candidate's bins are not all there. Returns how many candidates there
-    are, and how many of them stand alone and do not.
+    `half`: of the table of the pulse, which says how far to cut out. `counts` (all pixels,) become
+    0, or `NEEDS_EXACT_FIT` where a candidate's bins are not all there. Returns how many candidates
+    there are, and how many of them stand alone and do not.
     """
     listed = lone = crowded = 0
     candidates = room.candidates
@@ -198,9 +197,8 @@ def apply_filter(trace, axis, score):
 @search_part
 def list_maxima(score, of_interest, words, level, places):
     """List bin and height of the local maxima of interest, in the order of time; return how many.
-
-    Of a level top the last bin counts. Rows of `places` get bins, keys (`make_key`) with zeros behind
-    the last one, zeros, and what is only needed meanwhile. `level`: score of the background.
+    Of a level top the last bin counts. Rows of `places` get bins, keys (`make_key`) with zeros
+    behind the last one, zeros, and what is only needed meanwhile. `level`: score of the background.
     """
     zero, background, filled, listed = fill_vector(np.float32(0)), fill_vector(level), 0, 0
     for word in range(np.uintp(0), np.uintp(words.size)):
@@ -310,10 +308,9 @@ def take_strongest_peaks(trace, axis, limits, about, listed, room):
 
 @inlined
 def take_highest(bins, keys, listed, low, high):
-    """Height (0 where none is left) and place of the highest maximum, without those from bin `low` to
-    before `high`, whose keys become zero.
-
-    Every peak waits for the one before it, so that what counts is how soon it is found.
+    """Height (0 where none is left) and place of the highest maximum, without those from bin `low`
+    to before `high`, whose keys become zero. Every peak waits for the one before it, so that what
+    counts is how soon it is found.
     """
     highest, entry, zero = np.int32(0), np.uintp(0), fill_vector(np.int32(0))
     first, after = fill_vector(low), fill_vector(high)
@@ -363,9 +360,8 @@ def claim_bins(trace, centre, free, first, after):
 @inlined
 def confirm_peaks(trace, axis, limits, known, peaks, candidates, listed):
     """List the peaks of a trace that the matched filter confirms, placed below a bin, from `listed`
-    on; return how many candidates there are now.
-
-    `known`: background and noise, and place of the trace among those searched together.
+    on; return how many candidates there are now. `known`: background and noise, and place of the
+    trace among those searched together.
     """
     times, sums, matched, starts = axis.times, axis.sums, axis.matched, axis.starts
     background, noise, place = known
@@ -448,11 +444,10 @@ def cut_out(trace, background, start, held, rest):
 
 @compile_loop()
 def pool_significance(pixel, at, distance, own, starts, image_shape, limits, pooled):
-    """Add to each candidate's significance those of its neighbours at the same range.
-
-    `pixel` (n,) does not decrease; `at, distance` (n,): range at which neighbours are looked for, and
-    their own, m; `starts` (pixels + 1,): first candidate of each pixel; `limits`: radius in pixels,
-    and gate in m for each of them.
+    """Add to each candidate's significance those of its neighbours at the same range. `pixel` (n,)
+    does not decrease; `at, distance` (n,): range at which neighbours are looked for, and their own,
+    m; `starts` (pixels + 1,): first candidate of each pixel; `limits`: radius in pixels, and gate
+    in m for each of them.
     """
     rows, columns = image_shape
     radius, gate = limits

@@ -49,9 +49,8 @@ def select_points(cloud: PointCloud, chosen: NDArray[Any]) -> PointCloud:
 
 def transform_cloud(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
     """Return a cloud in another frame, such as that of a mount or of a map; ranges stay those from
-    the camera.
-
-    `pose` (4, 4): extrinsics: rotation and translation (m) from the camera's frame to the other.
+    the camera. `pose` (4, 4): extrinsics: rotation and translation (m) from the camera's frame to
+    the other.
     """
     matrix = np.asarray(pose, dtype=np.float64)
     if matrix.shape != (4, 4):
@@ -63,9 +62,8 @@ def transform_cloud(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
 
 
 def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
-    """Return one point for each occupied cube of side `voxel`, m: means of its points.
-
-    Deviations of independent points shrink with their number; the return number is the least.
+    """Return one point for each occupied cube of side `voxel`, m: means of its points. Deviations
+    of independent points shrink with their number; the return number is the least.
     """
     if not (np.isfinite(voxel) and voxel > 0):
         raise InputError(f"the side of a voxel must be a positive length, got {voxel}")
@@ -163,9 +161,8 @@ def align_clouds(
     source: PointCloud, target: PointCloud, reach: float, start: ArrayLike | None = None
 ) -> Alignment:
     """Lay a cloud over another one, such as the next of a sequence (point-to-plane iterated closest
-    points).
-
-    `reach`: largest distance of points that may belong together, m; `start` (4, 4): first guess.
+    points). `reach`: largest distance of points that may belong together, m; `start` (4, 4): first
+    guess.
     """
     if min(len(source), len(target)) < 3 or not reach > 0:
         raise InputError(
@@ -202,9 +199,7 @@ class DetectedObject:
 
 def find_objects(cloud: PointCloud, reach: float, min_points: int = 40) -> list[DetectedObject]:
     """Group points that lie within `reach`, m, of each other, directly or through others; the
-    nearest object first.
-
-    `min_points`: smaller groups are left out.
+    nearest object first. `min_points`: smaller groups are left out.
     """
     if not (np.isfinite(reach) and reach > 0) or min_points < 1:
         raise InputError("objects need a positive reach, and at least one point")

@@ -73,13 +73,11 @@ class FrameTraces(PictureTraces):
 def list_windows(
     times: FloatArray, scale: tuple[float, float, float, float], distance: float
 ) -> NDArray[np.int64]:
-    """List the bins that a return at each bin reaches, and those too near for another return: (bins,
-    4) first bin reached and the one after the last; first bin nearer than `distance`, s, and the one
-    after the last.
-
-    `scale`: of the pulse, `tofclip.lidar.Pulse.kernel_table`. Bins are often just `distance` apart;
-    what then is nearer is for the rounding of their difference to say, and not for that of a sum with
-    the distance.
+    """List the bins that a return at each bin reaches, and those too near for another return:
+    (bins, 4) first bin reached and the one after the last; first bin nearer than `distance`, s, and
+    the one after the last. `scale`: of the pulse, `tofclip.lidar.Pulse.kernel_table`. Bins are
+    often just `distance` apart; what then is nearer is for the rounding of their difference to say,
+    and not for that of a sum with the distance.
     """
     first = np.searchsorted(times, times - distance)
     last = np.searchsorted(times, times + distance, side="right")
@@ -96,10 +94,9 @@ MAX_UNEVENNESS = 1e-3  # of a bin, over the length of a pulse: moves no return b
 
 
 class PhaseTable(NamedTuple):
-    """A pulse in the bins around the one in which it has its peak, at each phase.
-
-    A streak camera's rows last equally long, so that the pulse and its slope in the bins around a
-    return depend on one number, by what part of a bin it arrives after the middle of its bin.
+    """A pulse in the bins around the one in which it has its peak, at each phase. A streak camera's
+    rows last equally long, so that the pulse and its slope in the bins around a return depend on
+    one number, by what part of a bin it arrives after the middle of its bin.
     """
 
     # (phases, width), pulse, and its change from bin to bin; zero where the pulse does not matter and
@@ -203,10 +200,9 @@ class PulseFilters:
 
 
 def _build_filter(pulse: Pulse, times: FloatArray) -> NDArray[np.float32]:
-    """Unit-energy filter for a return at each bin, (width, bins); the time axis may be uneven.
-
-    What a measured pulse has below zero is noise and left out. Where the axis cuts off most of the
-    pulse the energy stays below one: little would be known of such a return.
+    """Unit-energy filter for a return at each bin, (width, bins); the time axis may be uneven. What
+    a measured pulse has below zero is noise and left out. Where the axis cuts off most of the pulse
+    the energy stays below one: little would be known of such a return.
     """
     before, after = pulse.support
     # what lies between two bins is reached by neither: without it rows of zeros would be applied

@@ -185,9 +185,8 @@ def measure_correlation(standardised: FloatArray, data: Measurements) -> float:
 def _estimate_variances(
     data: Measurements, sizes: tuple[int, int], present: tuple[bool, bool], rounds: int
 ) -> Variances:
-    """Estimate what varies, from the scatter of the means over shots and over pixels.
-
-    `sizes`: numbers of shots and of pixels; `present`: whether these have effects of their own.
+    """Estimate what varies, from the scatter of the means over shots and over pixels. `sizes`:
+    numbers of shots and of pixels; `present`: whether these have effects of their own.
     """
     if data.value.size <= data.design.shape[1]:
         # Nothing is left over that would tell the noise: the measurements' own deviations hold.
@@ -264,9 +263,8 @@ def _solve(data: Measurements, variances: Variances, sizes: tuple[int, int]) -> 
 
 
 def correct_returns(returns: Returns) -> Returns:
-    """Undo range walk and the pixels' offsets where the camera knows them, where returns are listed.
-
-    Ranges, times and intensities are corrected; deviations get the calibration's.
+    """Undo range walk and the pixels' offsets where the camera knows them, where returns are
+    listed. Ranges, times and intensities are corrected; deviations get the calibration's.
     """
     known = returns.camera.range_calibration
     if known is None:
@@ -294,10 +292,9 @@ def correct_ranges(
     sigma: FloatArray,
     pixel: tuple[NDArray[np.integer], NDArray[np.integer]],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Undo range walk and the pixels' offsets; return ranges, counts referred to 1 m, and deviations.
-
-    `distance, sigma` (n,): ranges as they were measured and one standard deviation, m; `signal` (n,):
-    counts of the returns; `pixel`: rows and columns.
+    """Undo range walk and the pixels' offsets; return ranges, counts referred to 1 m, and
+    deviations. `distance, sigma` (n,): ranges as they were measured and one standard deviation, m;
+    `signal` (n,): counts of the returns; `pixel`: rows and columns.
     """
     excess, further = known.compute_excess(signal, *pixel)
     corrected = distance - excess

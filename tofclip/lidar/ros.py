@@ -39,10 +39,9 @@ class StampedCloud:
 
 
 def write_bag(clouds: Iterable[StampedCloud], path: str | Path) -> int:
-    """Write clouds as a ROS 2 recording, whole or not at all; return how many.
-
-    `clouds` come in the order of their stamps. A `path` that ends in ``.mcap`` becomes one MCAP file,
-    any other a folder, a bag in SQLite, which must not exist yet.
+    """Write clouds as a ROS 2 recording, whole or not at all; return how many. `clouds` come in the
+    order of their stamps. A `path` that ends in ``.mcap`` becomes one MCAP file, any other a
+    folder, a bag in SQLite, which must not exist yet.
     """
     target = Path(path)
     single = target.suffix.lower() == MCAP_SUFFIX

@@ -59,12 +59,10 @@ MIN_PULSE_BINS = 2.0  # anything shorter falls between the samples
 
 
 class ReturnSearch:
-    """What stays the same from shot to shot in the search for returns.
-
-    `times` (time,): time of flight of each frame, s, increasing; `pulse`: shape of a single return,
-    by default a Gaussian as wide as ``camera.pulse_fwhm``. Two returns of similar strength are
-    separated from 1.3 widths on; `shears` (time,): shear at which each frame is recovered, pixels
-    per view step; 0 by default.
+    """What stays the same from shot to shot in the search for returns. `times` (time,): time of
+    flight of each frame, s, increasing; `pulse`: shape of a single return, by default a Gaussian as
+    wide as ``camera.pulse_fwhm``. Two returns of similar strength are separated from 1.3 widths on;
+    `shears` (time,): shear at which each frame is recovered, pixels per view step; 0 by default.
     """
 
     def __init__(
@@ -91,10 +89,9 @@ class ReturnSearch:
         provenance: Mapping[str, Any] | None = None,
         judge: SignificanceJudge | None = None,
     ) -> Returns:
-        """Find the returns in the traces of all pixels.
-
-        `judge` decides which candidates count; by default the fractions of `Detection`. Takes 256
-        KiB of traces a thread, and 100 bytes a pixel.
+        """Find the returns in the traces of all pixels. `judge` decides which candidates count; by
+        default the fractions of `Detection`. Takes 256 KiB of traces a thread, and 100 bytes a
+        pixel.
         """
         # the compiler takes as long to import as all else
         from tofclip.lidar.neighbours import add_recovery_error
@@ -162,11 +159,9 @@ class ReturnSearch:
     def _find_candidates(
         self, traces: Traces, judged: bool
     ) -> tuple[NDArray[np.int64], FloatArray]:
-        """Pixel number of every candidate, and (3, n) instants, counts and deviations, in raster and
-        time order.
-
-        Unless all candidates are `judged`, those that are too weak beside what a sample of the
-        pixels shows are not fitted.
+        """Pixel number of every candidate, and (3, n) instants, counts and deviations, in raster
+        and time order. Unless all candidates are `judged`, those that are too weak beside what a
+        sample of the pixels shows are not fitted.
         """
         # the compiler takes as long to import as all else
         from tofclip.lidar.trace_search import TraceSearch
@@ -191,9 +186,8 @@ class ReturnSearch:
         self, pixel: NDArray[np.int64], values: FloatArray, at: FloatArray, traces: Traces
     ) -> NDArray[np.float32]:
         """Response of the matched filter, (bins,), below which no candidate can become a return.
-
-        `pixel, values`: what was found in some of the pixels. Those of all pixels are brighter or as
-        bright, so that nothing is lost.
+        `pixel, values`: what was found in some of the pixels. Those of all pixels are brighter or
+        as bright, so that nothing is lost.
         """
         if pixel.size == 0:
             return np.zeros(at.size, np.float32)

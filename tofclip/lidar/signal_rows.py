@@ -47,11 +47,9 @@ FloatImage = NDArray[np.float32]
 
 
 class BrightFrameFinder:
-    """Says in which frames the matched filter of any pixel reaches a limit.
-
-    `tiles`: the operator's transpose, a row for each pixel; its entries are not negative;
-    `measurements`: columns of it; `group_pixels`: successive rows that are ruled out together:
-    neighbours in a row of the picture.
+    """Says in which frames the matched filter of any pixel reaches a limit. `tiles`: the operator's
+    transpose, a row for each pixel; its entries are not negative; `measurements`: columns of it;
+    `group_pixels`: successive rows that are ruled out together: neighbours in a row of the picture.
     """
 
     def __init__(self, tiles: Tiles, measurements: int, group_pixels: int) -> None:
@@ -92,11 +90,10 @@ class BrightFrameFinder:
         self._groups = starts, windows, (highest * (1 + ROUNDING_MARGIN)).astype(np.float32)
 
     def find(self, readings: FloatImage, span: slice, limit: float) -> Mask:
-        """Say in which frames of a span a pixel stands out: in which the response ``a'f / |a|`` reaches
-        the limit, a being its column of the operator.
-
-        `readings` (measurements, frames) are in units of their noise. Whole blocks of `LANES` frames
-        from the first of the span on lie within them.
+        """Say in which frames of a span a pixel stands out: in which the response ``a'f / |a|``
+        reaches the limit, a being its column of the operator. `readings` (measurements, frames) are
+        in units of their noise. Whole blocks of `LANES` frames from the first of the span on lie
+        within them.
         """
         # the compiler takes as long to import as all else
         from tofclip.lidar.signal_row_kernels import find_bright_frames
@@ -124,10 +121,8 @@ class BrightFrameFinder:
 def _list_pairs(
     row: NDArray[np.int64], tiles: Tiles
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """List each row's entries two by two, as far as they are neighbours: row, first column, sum of both,
-    and what the second one has of it.
-
-    `row`: of each entry.
+    """List each row's entries two by two, as far as they are neighbours: row, first column, sum of
+    both, and what the second one has of it. `row`: of each entry.
     """
     order = np.lexsort((tiles.columns, row))
     row, column, value = row[order], tiles.columns[order].astype(np.int64), tiles.values[order]
@@ -234,7 +229,6 @@ class SignalRowFinder:
 
     def bins(self, sums: FloatImage) -> TraceBins:
         """Return the rows worth recovering, and a sample of the dark ones that stands for the rest.
-
         All rows, if a quarter of the shot is not nearly as dark as the darkest twentieth, or if not
         much would be left out. `sums` of `sum_measurements` or `sum_streak` are overwritten.
         """

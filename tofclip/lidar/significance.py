@@ -225,9 +225,8 @@ class SignificanceJudge:
     def judge(
         self, pixel: NDArray[np.int64], time: FloatArray, signal: FloatArray
     ) -> tuple[NDArray[np.bool_], FloatArray]:
-        """Say which candidates are returns, and how probable it is that each is noise.
-
-        `pixel` (n,) does not decrease; `signal` (n,): counts, summed over the bins.
+        """Say which candidates are returns, and how probable it is that each is noise. `pixel` (n,)
+        does not decrease; `signal` (n,): counts, summed over the bins.
         """
         length = SPEED_OF_LIGHT / 2 * self.pulse.fwhm
         own = weigh_candidates(self.frames, self.noise, self.pulse, pixel, time, signal)
@@ -352,10 +351,8 @@ def find_usual_at_range(distance: FloatArray, pooled: FloatArray, length: float)
 
 
 def estimate_false_alarms(pool: CandidatePool, pooled: FloatArray) -> FloatArray:
-    """Return the probability that each candidate is noise, by decoys at displaced ranges.
-
-    `pooled`: of `POOL_RADIUS_PX`. 0 where all candidates lie so close together that no decoy can be
-    had.
+    """Return the probability that each candidate is noise, by decoys at displaced ranges. `pooled`:
+    of `POOL_RADIUS_PX`. 0 where all candidates lie so close together that no decoy can be had.
     """
     span = float(np.ptp(pool.distance)) if pooled.size else 0.0
     if span < MIN_RANGE_GATES * pool.gate:

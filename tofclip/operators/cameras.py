@@ -58,11 +58,10 @@ __all__ = [
 
 
 class LightFieldCamera(ABC):
-    """An encoder A_k for each view, and the two models that follow from them.
-
-    `image_shape` is that of every view's picture, `views` (v, u) of each, `sampling_ratio` measurements
-    over pixels of one picture, `seed` that of everything random. `used_views` get measurements, in the
-    order of the measurements.
+    """An encoder A_k for each view, and the two models that follow from them. `image_shape` is that
+    of every view's picture, `views` (v, u) of each, `sampling_ratio` measurements over pixels of
+    one picture, `seed` that of everything random. `used_views` get measurements, in the order of
+    the measurements.
     """
 
     name: ClassVar[str]
@@ -195,7 +194,6 @@ def _group_by_view(directions: NDArray[np.float64], owners: NDArray[np.intp]) ->
 
 class LineCamera(LightFieldCamera):
     """CLIP-1D: line projections, their angles assigned to the views at random (supplement Note 6).
-
     ``sampling_ratio * rows * columns / detector`` angles, evenly in [0, pi). A detector has as many
     pixels as the picture's longer side.
     """
@@ -236,11 +234,9 @@ class LineCamera(LightFieldCamera):
 
 
 class EvenAngleLineCamera(LineCamera):
-    """CLIP-1D with angles assigned so that neighbouring ones look from places spread evenly over the
-    aperture.
-
-    What is out of focus is then blurred rather than torn into streaks, and which seed was drawn
-    hardly matters (`apps.studies.pictures` shows how much better it is than dealing at
+    """CLIP-1D with angles assigned so that neighbouring ones look from places spread evenly over
+    the aperture. What is out of focus is then blurred rather than torn into streaks, and which seed
+    was drawn hardly matters (`apps.studies.pictures` shows how much better it is than dealing at
     random).
     """
 
@@ -259,10 +255,8 @@ MAX_LINE_ANGLE_RAD = np.pi / 4
 
 
 class CodedLineCamera(LightFieldCamera):
-    """Coded lines one pixel wide, their angles evenly from -45 to 45 degrees, assigned to the views at
-    random.
-
-    Each line has a code and a 1D sensor of its own, as long as the picture is wide.
+    """Coded lines one pixel wide, their angles evenly from -45 to 45 degrees, assigned to the views
+    at random. Each line has a code and a 1D sensor of its own, as long as the picture is wide.
     """
 
     name: ClassVar[str] = "coded-line"
@@ -300,9 +294,8 @@ MASK_SHEAR_PX = 1.0
 
 
 class CompressiveCamera(LightFieldCamera):
-    """Masks that weigh the views' pixels before they add up on a dense area sensor.
-
-    The sampling ratio is the number of exposures, a whole number.
+    """Masks that weigh the views' pixels before they add up on a dense area sensor. The sampling
+    ratio is the number of exposures, a whole number.
     """
 
     def _assign_measurements(self) -> tuple[int, ...]:
@@ -345,10 +338,8 @@ class ApertureMaskCamera(CompressiveCamera):
 
 class AshokCamera(ApertureMaskCamera):
     """Masks of open and closed cells from a Hadamard matrix (A. Ashok, M. A. Neifeld, Proc. SPIE
-    7690, 76900Q (2010)).
-
-    The first exposure is an ordinary photograph, all cells open; the others are drawn from the
-    matrix.
+    7690, 76900Q (2010)). The first exposure is an ordinary photograph, all cells open; the others
+    are drawn from the matrix.
     """
 
     name: ClassVar[str] = "ashok"
@@ -386,10 +377,9 @@ class BabacanCamera(ApertureMaskCamera):
 
 
 class MarwahCamera(CompressiveCamera):
-    """One exposure through a random mask just in front of the sensor.
-
-    Each view sees the mask moved by `MASK_SHEAR_PX` pixels against its neighbour (Eq. 18; K. Marwah
-    et al., ACM Trans. Graph. 32, 46 (2013)).
+    """One exposure through a random mask just in front of the sensor. Each view sees the mask moved
+    by `MASK_SHEAR_PX` pixels against its neighbour (Eq. 18; K. Marwah et al., ACM Trans. Graph. 32,
+    46 (2013)).
     """
 
     name: ClassVar[str] = "marwah"
@@ -453,9 +443,8 @@ class SinglePixelCamera(LightFieldCamera):
 
 class PointSpreadCamera(LightFieldCamera):
     """Every view goes through its own part of the aperture; their light adds up on one sparse
-    sensor (Eq. 4, 5).
-
-    The sensor's pixels are spread evenly over the picture, as many as the sampling ratio asks for.
+    sensor (Eq. 4, 5). The sensor's pixels are spread evenly over the picture, as many as the
+    sampling ratio asks for.
     """
 
     @abstractmethod
@@ -530,9 +519,7 @@ class DiffuserCamera(PointSpreadCamera):
 
 class MeasuredCamera:
     """A camera known by its PSFs only, measured with a point source at several depths (supplement
-    Note 4).
-
-    `sensor`: from the light on the sensor's plane to the measurements, any of
+    Note 4). `sensor`: from the light on the sensor's plane to the measurements, any of
     `tofclip.operators.codes`; its plane may be smaller than the picture.
     """
 

@@ -105,7 +105,6 @@ def validate_point_spread(
     point_spread: ArrayLike, image_shape: tuple[int, int]
 ) -> NDArray[np.float64]:
     """Return a point-spread function as float64 once it is known to fit pictures of `image_shape`.
-
     `point_spread` (rows, columns); `image_shape`: rows and columns of the picture. Returns (rows,
     columns).
     """
@@ -229,12 +228,11 @@ class SliceConvolution(LinearOperator):
 def make_coded_line(
     shape: tuple[int, int], width_px: int, angle: float, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Make a line PSF times a random 0/1 code (supplement Note 4).
-
-    `shape`: rows and columns of the PSF; the line runs through all rows; `width_px`: n_p, cells of
-    the code in each row; `angle`: of the line from the vertical, rad; each row's cells are moved by
-    ``row * tan(angle)`` columns, and shared between two columns where that is not a whole number;
-    `random`: of the code. Returns (rows, columns): its sum is 1.
+    """Make a line PSF times a random 0/1 code (supplement Note 4). `shape`: rows and columns of the
+    PSF; the line runs through all rows; `width_px`: n_p, cells of the code in each row; `angle`: of
+    the line from the vertical, rad; each row's cells are moved by ``row * tan(angle)`` columns, and
+    shared between two columns where that is not a whole number; `random`: of the code. Returns
+    (rows, columns): its sum is 1.
     """
     rows, columns = shape
     if not 1 <= width_px <= columns:

@@ -85,9 +85,8 @@ def _make_rows_product(lanes: int, unroll: int) -> Any:
 
     @intrinsic
     def add_row_product(typing, result, start, stride, block, columns, values, first, last, onto):
-        """``result[start : start + lanes] = present + sum_q values[q] * block[columns[q], :lanes]`` for
-        q in [first, last), `result` flat and `stride` the distance of two rows of the block.
-
+        """``result[start : start + lanes] = present + sum_q values[q] * block[columns[q], :lanes]``
+        for q in [first, last), `result` flat and `stride` the distance of two rows of the block.
         `present` is 0, or what stands there already where the boolean `onto` says so.
         """
         given = result, start, stride, block, columns, values, first, last, onto
@@ -95,11 +94,9 @@ def _make_rows_product(lanes: int, unroll: int) -> Any:
 
     @compile_as_part()
     def multiply(tile_starts, columns, values, block, first, result, place):
-        """``result[:, place + j] = (M @ block)[:, first + j]`` for all lanes j and a sparse matrix M in
-        column tiles; see `tofclip.operators.sparse.Tiles`.
-
-        Rows of the block that begin at whole cache lines are read 1.6 times as fast; see
-        `tofclip.arrays.empty_aligned`.
+        """``result[:, place + j] = (M @ block)[:, first + j]`` for all lanes j and a sparse matrix
+        M in column tiles; see `tofclip.operators.sparse.Tiles`. Rows of the block that begin at
+        whole cache lines are read 1.6 times as fast; see `tofclip.arrays.empty_aligned`.
         """
         lanes, stride = block[:, first:], block.shape[1]
         for tile in range(tile_starts.shape[0]):
@@ -150,11 +147,10 @@ def _deposit_light(line, position, light, light_step):
 @fast_loop
 def project_onto_lines(picture, starts, rightward, downward, lines):
     """Project a (rows, columns) picture onto lines; adds to `lines`, (lines, bins, 2), which
-    `_deposit_light` explains.
-
-    `starts`, `rightward` and `downward`, (lines,) int64, are the position of the first pixel and
-    the steps from pixel to pixel in units of 2^-32 bins; every position and the next bin must lie
-    on the line. Two lines at a time keep the processor busy while a sum is on its way to memory.
+    `_deposit_light` explains. `starts`, `rightward` and `downward`, (lines,) int64, are the
+    position of the first pixel and the steps from pixel to pixel in units of 2^-32 bins; every
+    position and the next bin must lie on the line. Two lines at a time keep the processor busy
+    while a sum is on its way to memory.
     """
     # Light times 2^-32: the fraction stays a whole number until it is multiplied once.
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
@@ -219,10 +215,9 @@ def count_line_nonzeros(starts, rightward, downward, before, shape, counts):
 
 @fast_loop
 def fill_line_nonzeros(starts, rightward, downward, before, shape, places, columns, values):
-    """Write the nonzeros that `count_line_nonzeros` counted.
-
-    `places`, (lines, detector pixels), says where each row of the matrix begins in `columns` and
-    `values`, and says afterwards where it ends.
+    """Write the nonzeros that `count_line_nonzeros` counted. `places`, (lines, detector pixels),
+    says where each row of the matrix begins in `columns` and `values`, and says afterwards where it
+    ends.
     """
     whole, step = values.dtype.type(1), values.dtype.type(1 / (1 << FRACTION_BITS))
     for number in range(starts.size):

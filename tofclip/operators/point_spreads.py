@@ -39,7 +39,6 @@ it deflects it down and to the right. Pupil coordinates v, (rays, 1), down and u
 @dataclass(frozen=True)
 class CodedAperture:
     """An amplitude mask: ``g(x, s)`` is the code f, mirrored and scaled by s (supplement Eq. 6).
-
     ``g(x, s) = f(-x / s)`` up to the factor that keeps the light the same at every depth; at s = 0
     it is a point.
     """
@@ -61,10 +60,8 @@ class CodedAperture:
 @dataclass(frozen=True)
 class CubicPhasePlate:
     """A cubic phase plate (E. R. Dowski, W. T. Cathey, Appl. Opt. 34, 1859 (1995)): its PSF hardly
-    changes with depth.
-
-    The phase ``u^3 + v^3`` deflects by its gradient, so rays land at ``strength * (v^2, u^2)``, the
-    middle taken off.
+    changes with depth. The phase ``u^3 + v^3`` deflects by its gradient, so rays land at ``strength
+    * (v^2, u^2)``, the middle taken off.
     """
 
     strength_px: float  # extent of the PSF on either axis
@@ -125,12 +122,10 @@ def trace_view_point_spreads(
     rays: int = RAYS_PER_SIDE,
 ) -> NDArray[np.float64]:
     """Trace each view's PSF ``r(x, -u_k)``: the light that passes its patch of the aperture from a
-    point at infinity.
-
-    `views`: (v, u) of every view; a view's patch is one view step wide, and the patches fill the
-    aperture; `shape`: rows and columns of the PSFs; rays that land beyond are lost; `rays`: along
-    each side of a patch. Returns (views, rows, columns): all PSFs together have the sum 1 for an
-    element that lets all light pass onto `shape`.
+    point at infinity. `views`: (v, u) of every view; a view's patch is one view step wide, and the
+    patches fill the aperture; `shape`: rows and columns of the PSFs; rays that land beyond are
+    lost; `rays`: along each side of a patch. Returns (views, rows, columns): all PSFs together have
+    the sum 1 for an element that lets all light pass onto `shape`.
     """
     grid = np.asarray(views, dtype=np.float64)
     middle = (grid.max(axis=0) + grid.min(axis=0)) / 2
@@ -154,10 +149,8 @@ def shear_point_spreads(
     spreads: NDArray[Any], views: Sequence[View], shear: float, reference: View = (0.0, 0.0)
 ) -> NDArray[np.float64]:
     """Move each view's PSF by ``s (u - u_ref)``: convolving with it is shearing the picture and
-    convolving then.
-
-    `spreads` (views, rows, columns); `shear`: s, pixels per view step. Returns (views, rows,
-    columns): their sum over the views is the camera's ``g(x, s)`` (supplement Eq. 4).
+    convolving then. `spreads` (views, rows, columns); `shear`: s, pixels per view step. Returns
+    (views, rows, columns): their sum over the views is the camera's ``g(x, s)`` (supplement Eq. 4).
     """
     shape = (spreads.shape[1], spreads.shape[2])
     pairs = zip(spreads, views, strict=True)
@@ -168,11 +161,9 @@ def shear_point_spreads(
 
 class MeasuredPointSpreads:
     """PSFs measured once with a point source at several depths (supplement Note 4), and those in
-    between.
-
-    `stack` (depths, rows, columns): background taken off. Each PSF is brought to the sum 1: a point
-    source looks brighter when it is near; `shears` (depths,): s of each depth, in pixels per view
-    step; any order.
+    between. `stack` (depths, rows, columns): background taken off. Each PSF is brought to the sum
+    1: a point source looks brighter when it is near; `shears` (depths,): s of each depth, in pixels
+    per view step; any order.
     """
 
     def __init__(self, stack: ArrayLike, shears: ArrayLike) -> None:

@@ -54,10 +54,9 @@ class Tiles(NamedTuple):
 
 
 def make_product(matrix: scipy.sparse.csr_array, device: ComputeDevice) -> Product:
-    """Bring a CSR matrix to where the arrays to come are.
-
-    NumPy's are multiplied by compiled loops. PyTorch and CuPy have such products, by the maker of the
-    device (cuSPARSE, MKL); any other library gathers a row's entries and sums them.
+    """Bring a CSR matrix to where the arrays to come are. NumPy's are multiplied by compiled loops.
+    PyTorch and CuPy have such products, by the maker of the device (cuSPARSE, MKL); any other
+    library gathers a row's entries and sums them.
     """
     if device.has_compiled_loops:
         return partial(_multiply_tiles, Tiles.from_csr(matrix))

@@ -86,11 +86,10 @@ def recover_all_in_focus(
     recovery: ClipRecovery | None = None,
     progress: Progress = ignore_progress,
 ) -> AllInFocus:
-    """Recover an all-in-focus picture and its depths from one shot.
-
-    `shears` (depths,): that surfaces may have, pixels per view step, two or more; `weight`: of the
-    prior, by cross-validation if not given; `recovery`: prior and data term of all pictures, and the
-    weight of the refocused ones; `progress`: called with the number of recoveries just done, of
+    """Recover an all-in-focus picture and its depths from one shot. `shears` (depths,): that
+    surfaces may have, pixels per view step, two or more; `weight`: of the prior, by
+    cross-validation if not given; `recovery`: prior and data term of all pictures, and the weight
+    of the refocused ones; `progress`: called with the number of recoveries just done, of
     `count_recoveries`.
     """
     began = perf_counter()

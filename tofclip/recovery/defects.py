@@ -111,10 +111,9 @@ def find_defects(streak: Streak, pulse_rows: float) -> Defects:
 
 
 def find_clipping_level(counts: FloatImage) -> float:
-    """Find the value at which a streak image is cut off; infinite where nothing is.
-
-    What is cut off is at least as bright as it shows, which says more than nothing: it is not
-    masked, but fitted from below (`tofclip.solvers.ClippedSquares`).
+    """Find the value at which a streak image is cut off; infinite where nothing is. What is cut off
+    is at least as bright as it shows, which says more than nothing: it is not masked, but fitted
+    from below (`tofclip.solvers.ClippedSquares`).
     """
     highest = float(np.max(counts))
     number = np.count_nonzero(counts == highest)
@@ -177,9 +176,8 @@ def find_dead_columns(counts: FloatImage, noise: float) -> Mask:
 
 
 def mask_defects(streak: Streak, pulse_fwhm: float) -> Streak:
-    """Return a streak image whose defects are masked as ``saturated``, and mended for methods that know
-    no mask; ``metadata`` says how many there are. The same where nothing is wrong with it.
-
+    """Return a streak image whose defects are masked as ``saturated``, and mended for methods that
+    know no mask; ``metadata`` says how many there are. The same where nothing is wrong with it.
     `pulse_fwhm`: full width at half maximum of the instrument's response, s.
     """
     rows = streak.counts.shape[0]
@@ -221,10 +219,9 @@ def clip_from_below(streak: Streak, clipping: float) -> DataTermMaker:
 
 
 def describe_noise(streak: Streak, measurement: Measurement) -> MeasurementNoise:
-    """Say how the measurements fluctuate, by which returns are judged later.
-
-    For frames with a prior, which fit the measurements as well as these allow: what a linear
-    inverse spreads over the picture has another cause. Their misfit is known after the recovery.
+    """Say how the measurements fluctuate, by which returns are judged later. For frames with a
+    prior, which fit the measurements as well as these allow: what a linear inverse spreads over the
+    picture has another cause. Their misfit is known after the recovery.
     """
     _, floor, gain = estimate_noise(streak.counts)
     least = max(float(floor), MIN_NOISE_COUNT)
@@ -235,7 +232,6 @@ def list_noise_figures(
     noise: MeasurementNoise, measurement: Measurement, used: Mask, residual: float
 ) -> dict[str, Scalar]:
     """List what the frames have to know of their measurements: noise, and what the model misses.
-
     `used` (measurements, frames): those that were fitted; `residual`: norm of what is left of them
     over theirs.
     """

@@ -36,9 +36,8 @@ _inverse_lock = Lock()
 
 
 class _CachedCamera(Camera):
-    """A camera that is equal to others of its content, with which it shares operators.
-
-    Memory: for each of the operators 16 bytes for each of ``views * rows * columns * 2`` entries.
+    """A camera that is equal to others of its content, with which it shares operators. Memory: for
+    each of the operators 16 bytes for each of ``views * rows * columns * 2`` entries.
     """
 
     @cached_property
@@ -83,9 +82,8 @@ def prepare_inverse(
     method: LinearInverse, operator: LinearOperator, alive: NDArray[np.bool_]
 ) -> PreparedInverse:
     """Return what `LinearInverse.prepare` does, the same object for the same arguments; the 16
-    inverses used last are kept.
-
-    `operator`: of a camera that `get_cached_camera` returned; another one is not found again.
+    inverses used last are kept. `operator`: of a camera that `get_cached_camera` returned; another
+    one is not found again.
     """
     with _inverse_lock:  # threads that ask at the same time wait for a single preparation
         return _prepare(method, operator, alive.tobytes())
@@ -114,10 +112,9 @@ class CachedInverse(Method):
         valid: Array | None = None,
         progress: Progress = ignore_progress,
     ) -> Result:
-        """Recover one picture per column of `measurements`; see `LinearInverse.recover`.
-
-        A slit column that is dead in every frame drops out of the Gram matrix; one masked in some
-        frames stays.
+        """Recover one picture per column of `measurements`; see `LinearInverse.recover`. A slit
+        column that is dead in every frame drops out of the Gram matrix; one masked in some frames
+        stays.
         """
         alive = np.ones(operator.shape_out, bool)
         if valid is not None:

@@ -127,9 +127,7 @@ def _explain_empty_cloud(frames: Frames) -> str:
 
 def write_cloud(clouds: CloudSettings, frames: Path, result: Path) -> int:
     """Read frames, write their cloud, or their depth picture where that is asked for; return the
-    number of points.
-
-    Memory: the frames, and about as much again while returns are looked for.
+    number of points. Memory: the frames, and about as much again while returns are looked for.
     """
     cloud, returns = clouds.make_cloud(Frames.load(frames), str(frames))
     save_cloud(cloud, returns, result, clouds.organised)

@@ -139,12 +139,10 @@ WAIT_SECONDS = 30.0
 
 @contextlib.contextmanager
 def connect_workers(where: str) -> Iterator[Client]:
-    """Yield a client of the workers that `where` names.
-
-    `where`: ``local``: one worker for each core of this machine; ``local:N``: N workers, which
-    share the cores; ``tcp://HOST:PORT`` or ``tls://HOST:PORT``: a scheduler (``dask scheduler``),
-    whose workers (``dask worker``) have this version of this program and see the files under the
-    same names.
+    """Yield a client of the workers that `where` names. `where`: ``local``: one worker for each
+    core of this machine; ``local:N``: N workers, which share the cores; ``tcp://HOST:PORT`` or
+    ``tls://HOST:PORT``: a scheduler (``dask scheduler``), whose workers (``dask worker``) have this
+    version of this program and see the files under the same names.
     """
     number = count_local_workers(where)
     try:
@@ -327,10 +325,8 @@ def select_unfinished(jobs: Iterable[Job]) -> list[Job]:
 
 
 def run_job(job: Job) -> Report:
-    """Do a job unless its result is there; whatever goes wrong is reported, so that the
-    others go on.
-
-    The libraries of linear algebra get one thread: with more, they round differently, and jobs
+    """Do a job unless its result is there; whatever goes wrong is reported, so that the others go
+    on. The libraries of linear algebra get one thread: with more, they round differently, and jobs
     would give other results on a cluster than here.
     """
     problem, figures = "", None

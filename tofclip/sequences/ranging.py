@@ -146,10 +146,9 @@ def name_cloud(shots: Sequence[str]) -> str:
 def write_average_cloud(
     plan: Path, version: str, shots: tuple[Shot, ...], result: Path
 ) -> tuple[int, list[float]]:
-    """Write the cloud of some shots; return its points and by how many rows each shot was late.
-
-    The pipeline is made once in a process for each `version` (SHA-256) of the plan. Memory: one
-    shot, and twice as much again for its measurements and what is recovered of them.
+    """Write the cloud of some shots; return its points and by how many rows each shot was late. The
+    pipeline is made once in a process for each `version` (SHA-256) of the plan. Memory: one shot,
+    and twice as much again for its measurements and what is recovered of them.
     """
     pipeline, jitter = _load_plan(plan, version)
     cloud, late = make_average_cloud(shots, pipeline, jitter)

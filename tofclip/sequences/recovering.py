@@ -118,9 +118,8 @@ def normalise_device(device: str) -> str | None:
 
 
 def recover_shot(recovery: RecoverySettings, shot: Shot, result: Path) -> None:
-    """Read a shot, recover it, write its frames; operators are made once in a process.
-
-    Memory: the shot, its measurements and mask, and the frames twice while they are written.
+    """Read a shot, recover it, write its frames; operators are made once in a process. Memory: the
+    shot, its measurements and mask, and the frames twice while they are written.
     """
     plan = recovery.plan(shot())
     if plan.shot.camera.sweep is not None:  # otherwise it is fitted to the shot, another for each

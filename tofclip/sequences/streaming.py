@@ -134,10 +134,9 @@ def _raise_or_work(work: Callable[[Any], Any], value: Any) -> Any:
 
 
 class _Stream:
-    """What reader and consumer share: things that wait and things that the executor has.
-
-    Nothing waits while the executor has room: in its own queue a thing could no longer be dropped,
-    and would grow old.
+    """What reader and consumer share: things that wait and things that the executor has. Nothing
+    waits while the executor has room: in its own queue a thing could no longer be dropped, and
+    would grow old.
     """
 
     def __init__(

@@ -312,11 +312,9 @@ class TimeAxis:
 def render_flash(
     scene: PulsedScene, array: CameraArray, time_axis: TimeAxis
 ) -> NDArray[np.float32]:
-    """Return what every view sees at every instant, (views, rows, columns, bins).
-
-    A surface of reflectance 1 that faces all lamps from the distance of the array's focus has
-    brightness 1, summed over time. Memory beyond the result is about 1 kB for each ray of a view
-    and thread.
+    """Return what every view sees at every instant, (views, rows, columns, bins). A surface of
+    reflectance 1 that faces all lamps from the distance of the array's focus has brightness 1,
+    summed over time. Memory beyond the result is about 1 kB for each ray of a view and thread.
     """
     views = array.views
     pictures = np.empty((len(views), *array.image_shape, time_axis.bins), np.float32)

@@ -95,10 +95,8 @@ def accumulate_cells(cell: NDArray[np.intp], amount: Array, shape: tuple[int, ..
 
 def spread_pulse(position: Array, sigma: Array) -> tuple[NDArray[np.intp], Array]:
     """Integrate Gaussian pulses at `position` (n,), in bins, over the bins around them; bin i
-    reaches from i - 1/2 to i + 1/2.
-
-    Returns the first bin of each pulse, and (n, reach) fractions of its energy in that bin and those
-    after it.
+    reaches from i - 1/2 to i + 1/2. Returns the first bin of each pulse, and (n, reach) fractions
+    of its energy in that bin and those after it.
     """
     if position.size == 0:
         return np.zeros(0, dtype=np.intp), np.zeros((0, 1))

@@ -105,7 +105,6 @@ def make_scene(name: str, array: CameraArray) -> Scene:
 
 def edit_scene(scene: Scene, edit: str) -> Scene:
     """Change what stands before the backdrop, in 3D (generalised flip test, supplement Note 6).
-
     `edit`: ``original``, ``shift``, ``flip`` or ``rotate``.
     """
     if edit not in EDITS:

@@ -93,12 +93,10 @@ def choose_weight(
 
 def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
     """Assign runs of consecutive measurements to folds at random; True where a measurement is left
-    out.
-
-    `count`: number of measurements; `run`: consecutive measurements that stay together; shortened
-    where there would be fewer runs than `FOLD_COUNT`; `seed`: of the assignment. Returns (count,
-    folds): one column for each fold that is tried: `FOLD_COUNT`, or 1 from `SINGLE_FOLD_RUNS` runs
-    on.
+    out. `count`: number of measurements; `run`: consecutive measurements that stay together;
+    shortened where there would be fewer runs than `FOLD_COUNT`; `seed`: of the assignment. Returns
+    (count, folds): one column for each fold that is tried: `FOLD_COUNT`, or 1 from
+    `SINGLE_FOLD_RUNS` runs on.
     """
     # Too few runs for the folds: shorter ones, although neighbours then know more of each other.
     if -(-count // run) < FOLD_COUNT:

@@ -12,10 +12,8 @@ fast_njit = compile_and_keep(fastmath=SUMS_IN_ANY_ORDER, error_model="numpy")
 @fast_njit
 def _patch_distances(pilot, row, column, patch, reach, distances, corners):
     """Squared distances of the patches around one; `corners` gets where they begin. Returns how
-    many there are.
-
-    The patch itself comes first, so that it is in its own group however many others are just like
-    it.
+    many there are. The patch itself comes first, so that it is in its own group however many others
+    are just like it.
     """
     distances[0] = -1
     corners[0, 0], corners[0, 1] = row, column
@@ -160,10 +158,9 @@ def _scatter_patches(group, mean, corners, patch, weight, total, weights):
 @fast_njit
 def filter_patch_groups(noisy, pilot, deviation, settings):
     """Filter groups of similar patches and average where they overlap, steadier groups counting
-    more.
-
-    `settings` are the side of a patch and the stride in pixels, the reach of the search in pixels, and
-    the patches in a group. Groups and the filter's gain are found in the pilot. Pictures are float32.
+    more. `settings` are the side of a patch and the stride in pixels, the reach of the search in
+    pixels, and the patches in a group. Groups and the filter's gain are found in the pilot.
+    Pictures are float32.
     """
     patch, stride, reach, wanted = settings
     rows, columns = noisy.shape

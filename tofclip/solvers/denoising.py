@@ -32,9 +32,8 @@ alike in a pilot, a cleaner estimate of the same picture.
 
 @dataclass(frozen=True)
 class NonlocalMeans:
-    """Means over patches that look alike (scikit-image).
-
-    A. Buades, B. Coll, J.-M. Morel, CVPR 2005, 60.
+    """Means over patches that look alike (scikit-image). A. Buades, B. Coll, J.-M. Morel, CVPR
+    2005, 60.
     """
 
     patch_px: int = 5  # side of a patch
@@ -58,9 +57,8 @@ class NonlocalMeans:
 
 @dataclass(frozen=True)
 class BlockMatching:
-    """Block matching and 3D filtering by its authors' package `bm3d`.
-
-    K. Dabov, A. Foi, V. Katkovnik, K. Egiazarian, IEEE Trans. Image Process. 16, 2080 (2007).
+    """Block matching and 3D filtering by its authors' package `bm3d`. K. Dabov, A. Foi, V.
+    Katkovnik, K. Egiazarian, IEEE Trans. Image Process. 16, 2080 (2007).
     """
 
     def __call__(self, noisy: Picture, pilot: Picture, deviation: float) -> Picture:

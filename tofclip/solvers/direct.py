@@ -233,10 +233,9 @@ def order_by_patch(image_shape: tuple[int, int]) -> NDArray[np.int64]:
 
 
 class InverseTraces:
-    """A prepared inverse of a sparse matrix in float32, whose sparse part is applied to `pixels` (n,),
-    numbers in raster order, in an order of their own; see `order_by_patch`.
-
-    `tiles` is the operator's transpose, a row for each pixel, without measurements that are not used.
+    """A prepared inverse of a sparse matrix in float32, whose sparse part is applied to `pixels`
+    (n,), numbers in raster order, in an order of their own; see `order_by_patch`. `tiles` is the
+    operator's transpose, a row for each pixel, without measurements that are not used.
     """
 
     def __init__(self, inverse: PreparedInverse, pixels: NDArray[np.int64]) -> None:

@@ -121,10 +121,8 @@ def copy_lanes_to_frames(block, start, frames):
 @compile_loop(fastmath=FASTMATH, _nrt=True)
 def compute_traces(tile_starts, columns, values, rows, weights, traces, span):
     """``traces[:, span[0] : span[1]] = M[rows[0] : rows[1]] @ weights`` for a sparse matrix M in
-    column tiles, see `tofclip.operators.sparse.Tiles`.
-
-    `weights` (M's columns, time): rows are a multiple of `LANES` long at least; `traces`
-    (rows[1] - rows[0], at least span[1]).
+    column tiles, see `tofclip.operators.sparse.Tiles`. `weights` (M's columns, time): rows are a
+    multiple of `LANES` long at least; `traces` (rows[1] - rows[0], at least span[1]).
     """
     starts, time, done = tile_starts[:, rows[0] : rows[1] + 1], span[1] - span[0], 0
     while done + WIDE_LANES <= time:
@@ -239,9 +237,8 @@ def _add_variation(lanes, here, below, total):
 @fast_loop
 def compute_light_field_primal(lanes, noisy, dual, weight, angular, room, result):
     """``result = max(noisy + weight * div(dual), 0)``; arrays are (v, u, rows, row), `dual` four of
-    them along rows, columns, v and u. `room` is two rows, the second one of zeros.
-
-    The last difference along every axis crosses the border and is always zero.
+    them along rows, columns, v and u. `room` is two rows, the second one of zeros. The last
+    difference along every axis crosses the border and is always zero.
     """
     down, across, rows, _ = noisy.shape
     between, dark = room[0], room[1]

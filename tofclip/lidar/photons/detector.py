@@ -132,9 +132,8 @@ class Arrivals:
 
 @dataclass(frozen=True)
 class LogMatchedFilter:
-    """Log-likelihood ratios of photons around a return of the weakest strength, for each background.
-
-    Of hashable fields only, so that thresholds of the same filter are simulated once.
+    """Log-likelihood ratios of photons around a return of the weakest strength, for each
+    background. Of hashable fields only, so that thresholds of the same filter are simulated once.
     """
 
     share: tuple[float, ...]  # of a return's photons, in the bins from `first` on
@@ -400,9 +399,8 @@ class PhotonDetector:
         live: FloatArray | None = None,
         cycles: float = NO_PILE_UP,
     ) -> Arrivals:
-        """Move returns from the bins where they were found to the likelihood's maximum.
-
-        `live` (n, bins): fraction of the cycles in which the detector was ready; all by default.
+        """Move returns from the bins where they were found to the likelihood's maximum. `live` (n,
+        bins): fraction of the cycles in which the detector was ready; all by default.
         """
         from tofclip.lidar.photons.kernels import fit_histograms
 

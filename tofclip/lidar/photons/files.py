@@ -82,9 +82,7 @@ _PhotonReader = Callable[[Path], _PhotonFile]
 def read_photons(
     path: str | Path, bin_width: float | None = None, axes: str | None = None
 ) -> PhotonImage:
-    """Read the photons that every pixel of a picture counted.
-
-    `bin_width`: duration of a bin, or
+    """Read the photons that every pixel of a picture counted. `bin_width`: duration of a bin, or
     unit of the photon times, s; overrides the file's own; `axes`: order of a cube's axes, such as
     ``"yxt"`` or ``"txy"``; by default that is time along which light is most concentrated and which
     is longest; `PhotonImage.axes` says how surely.
@@ -213,9 +211,8 @@ def _read_layout(
 
 
 def recognise_axes(cube: NDArray[Any], path: Path) -> tuple[str, float]:
-    """Say which axis of a cube is time: light is concentrated along it, and it is long.
-
-    Returns ``tyx``, ``ytx`` or ``yxt``, and by what factor it is ahead of the next axis.
+    """Say which axis of a cube is time: light is concentrated along it, and it is long. Returns
+    ``tyx``, ``ytx`` or ``yxt``, and by what factor it is ahead of the next axis.
     """
     step = math.ceil((cube.size / MAX_LOOKED_AT) ** (1 / 3))
     light, score = np.empty(3), np.empty(3)

@@ -41,10 +41,8 @@ def weigh_evidence(
     surface: FloatArray,
     signal_pool: int = SIGNAL_POOL_PX,
 ) -> FloatArray:
-    """Log-likelihood ratio of each pixel's held-back photons, (pixels,): this surface, in bins, against
-    any instant.
-
-    Pixels in a square of `signal_pool` share one fraction of signal photons.
+    """Log-likelihood ratio of each pixel's held-back photons, (pixels,): this surface, in bins,
+    against any instant. Pixels in a square of `signal_pool` share one fraction of signal photons.
     """
     from tofclip.lidar.photons import kernels
 
@@ -72,7 +70,6 @@ def learn_scene(
     train: PhotonImage, test: PhotonImage, scene: Scene, surface: FloatArray, required: bool
 ) -> BinnedResponse | None:
     """Learn the response from the photons held back, around the surface that the others found.
-
     Returns None if the response known so far explains the photons as well and none is required.
     """
     fitted = fit_surface(train, scene, surface, RESPONSE_REACH_PX)[..., 0]

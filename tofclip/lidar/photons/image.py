@@ -239,10 +239,9 @@ NEIGHBOUR_BINS = 2  # by which the same surface may lie earlier or later in the 
 
 
 def find_hot_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
-    """Say which pixels, (rows, columns), have one bin far beyond what the others count.
-
-    Pairs of photons grow with the square of their number: one such pixel would say more about the
-    pulse than all others together. They are found before anything is learnt.
+    """Say which pixels, (rows, columns), have one bin far beyond what the others count. Pairs of
+    photons grow with the square of their number: one such pixel would say more about the pulse than
+    all others together. They are found before anything is learnt.
     """
     rows, columns = photons.image_shape
     hot, table = np.zeros((rows, columns), np.bool_), photons.table

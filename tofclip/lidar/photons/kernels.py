@@ -35,10 +35,9 @@ SLOPE_RIDGE_FRACTION = 1e-3  # of it, for level planes: finite slopes where one 
 
 @per_histogram
 def find_best_score(counts, weights, shade, first):
-    """Largest log-matched filter response over all bins, and its bin.
-
-    ``score[j] = sum_w weights[shade[j + first + w], w] * counts[j + first + w]``; photons are few,
-    so each one adds to the bins it concerns. A photon where the background is bright says less.
+    """Largest log-matched filter response over all bins, and its bin. ``score[j] = sum_w
+    weights[shade[j + first + w], w] * counts[j + first + w]``; photons are few, so each one adds to
+    the bins it concerns. A photon where the background is bright says less.
     """
     score = np.zeros(counts.size)
     for i in range(counts.size):
@@ -73,10 +72,9 @@ def spread_filter(weights, shade):
 
 @per_histogram
 def compute_best_score(counts, table, first, score):
-    """What `find_best_score` says of histograms in which most bins hold photons, to the bit.
-
-    Taking all bins at a time, one weight after the other, needs neither a question about each bin
-    nor a search for what it reaches.
+    """What `find_best_score` says of histograms in which most bins hold photons, to the bit. Taking
+    all bins at a time, one weight after the other, needs neither a question about each bin nor a
+    search for what it reaches.
     """
     score[:] = 0
     for w in range(table.shape[0]):
@@ -118,12 +116,11 @@ def extract_strongest_returns(
     rest, free, dither, level, table, background, first, scale, times, peaks, numbers
 ):
     """Find the strongest return of each histogram and take its bins out, for the next one to be
-    sought in the rest.
-
-    `rest` (n, bins): photons that belong to no return yet; `free` (n,): background of their bins,
-    relative to that of a usual bin; `dither` (n,): decides ties; `level` (n,): row of the table of
-    thresholds and weights, negative where nothing is sought; `background`: relative brightness of
-    each bin, and its shade; `peaks` (n, most returns) and `numbers` (n,) are added to.
+    sought in the rest. `rest` (n, bins): photons that belong to no return yet; `free` (n,):
+    background of their bins, relative to that of a usual bin; `dither` (n,): decides ties; `level`
+    (n,): row of the table of thresholds and weights, negative where nothing is sought;
+    `background`: relative brightness of each bin, and its shade; `peaks` (n, most returns) and
+    `numbers` (n,) are added to.
     """
     (thresholds, weights), (relative, shade) = table, background
     for row in range(rest.shape[0]):
@@ -143,11 +140,10 @@ def extract_strongest_returns(
 def fit_histograms(
     histograms, arrived, live, cycles, peaks, numbers, relative, curve, scale, times, found
 ):
-    """Refine the returns of each histogram to the likelihood's maximum.
-
-    `histograms, arrived` (n, bins): photons counted, and with pile-up corrected; `live` (n, bins):
-    fraction of the cycles in which the detector was ready; `relative` (bins,): background over that
-    of a usual bin; `found` (n, most returns, 3): arrival, photons and deviation of each return.
+    """Refine the returns of each histogram to the likelihood's maximum. `histograms, arrived` (n,
+    bins): photons counted, and with pile-up corrected; `live` (n, bins): fraction of the cycles in
+    which the detector was ready; `relative` (bins,): background over that of a usual bin; `found`
+    (n, most returns, 3): arrival, photons and deviation of each return.
     """
     estimate = np.empty((peaks.shape[1], 5))
     for row in range(histograms.shape[0]):
@@ -225,9 +221,8 @@ def summarise_return(around, estimate, k, variance, found):
 @compiled
 def score_labels(offsets, coarse_bin, count, place, weights, first, score):
     """Log-likelihood ratio of a surface at each label against none, `score` (pixels, labels).
-
-    `place` (coarse bins,): label of each, or -1; `weights` (width,): log-likelihood ratio of a photon
-    ``first + w`` coarse bins after the surface.
+    `place` (coarse bins,): label of each, or -1; `weights` (width,): log-likelihood ratio of a
+    photon ``first + w`` coarse bins after the surface.
     """
     for pixel in range(score.shape[0]):
         own = score[pixel]
@@ -256,11 +251,10 @@ def find_highest(values):
 
 @vectorised
 def extend_path(score, before, highest, slope_cost, jump_cost, path, total):
-    """One step of semi-global matching; return the path's highest score.
-
-    ``path[t] = score[t] + max(before[t], before[t -+ 1] - slope_cost, highest - jump_cost) -
-    highest``; Hirschmueller, IEEE Trans. Pattern Anal. 30, 328 (2008), Eq. 13, with likelihoods
-    where he has costs. `path` is overwritten and added to `total`.
+    """One step of semi-global matching; return the path's highest score. ``path[t] = score[t] +
+    max(before[t], before[t -+ 1] - slope_cost, highest - jump_cost) - highest``; Hirschmueller,
+    IEEE Trans. Pattern Anal. 30, 328 (2008), Eq. 13, with likelihoods where he has costs. `path` is
+    overwritten and added to `total`.
     """
     last = score.size - 1
     floor = highest - jump_cost
@@ -313,7 +307,6 @@ def add_path_scores(score, slope_cost, jump_cost, total):
 @compiled
 def find_best_labels(score, total, extra_paths, apart, label, margin):
     """Best label of each pixel, and by how much it beats every label further than `apart` away.
-
     `score, total` (pixels, labels); the paths counted a pixel's own score `extra_paths` too often.
     """
     for pixel in range(score.shape[0]):
@@ -334,11 +327,9 @@ def find_best_labels(score, total, extra_paths, apart, label, margin):
 @compiled
 def measure_events(offsets, bin_time, count, surface, table, start, step, brightness, sums):
     """What the photons of each pixel say about moving its surface, `sums` (pixels, 3): slope of the
-    log-likelihood, its Fisher information, photons of the signal.
-
-    `table` (n, 2): of the response, sampled from `start` by `step`: minus the slope of its logarithm,
-    and its density over that of the background for one photon of signal, of which `brightness`
-    (pixels,) are expected.
+    log-likelihood, its Fisher information, photons of the signal. `table` (n, 2): of the response,
+    sampled from `start` by `step`: minus the slope of its logarithm, and its density over that of
+    the background for one photon of signal, of which `brightness` (pixels,) are expected.
     """
     for pixel in range(surface.size):
         slope = information = photons = 0.0
@@ -445,7 +436,6 @@ def sum_pair_lags(offsets, bin_time, count, lags):
 @compiled
 def sum_evidence(offsets, bin_time, count, surface, density, start, step, signal, evidence):
     """Log-likelihood ratio of the photons of each pixel: its surface against light at any instant.
-
     `density` (n,): of the response over that of light spread over the whole axis, sampled from
     `start` by `step`; `signal` (pixels,): share of the pixel's photons that are signal.
     """

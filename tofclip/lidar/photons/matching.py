@@ -113,9 +113,8 @@ def match_labels(
     score: NDArray[np.float32], image_shape: tuple[int, int], slope_cost: float, jump_cost: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Find the labels of the most likely piecewise smooth surface, (rows, columns), and by how much
-    each beats the next best that is not beside it.
-
-    The costs are of a change by one label, and by more.
+    each beats the next best that is not beside it. The costs are of a change by one label, and by
+    more.
     """
     from tofclip.lidar.photons import kernels
 
@@ -143,9 +142,8 @@ def fit_surface(
     reach: int,
     rounds: int = PLANE_ROUNDS,
 ) -> FloatArray:
-    """Move a surface, (rows, columns) in bins, to the likelihood's maximum, plane by plane.
-
-    Pixels up to `reach` away share a plane. Returns (rows, columns, 3): instant, deviation and mean
+    """Move a surface, (rows, columns) in bins, to the likelihood's maximum, plane by plane. Pixels
+    up to `reach` away share a plane. Returns (rows, columns, 3): instant, deviation and mean
     photons, as of `kernels.fit_planes`.
     """
     from tofclip.lidar.photons import kernels

@@ -211,9 +211,8 @@ def learn_response(
     residual_bins: NDArray[np.float64], count: NDArray[np.float32], width: float, bin_width: float
 ) -> tuple[Pulse, float]:
     """Estimate the response from the times of photons after their surface, which others found.
-
-    Times and rough full width are in bins, the bin width in s. Returns the response, whose arrival is
-    its highest point, and by how many bins later this is than the arrival was before.
+    Times and rough full width are in bins, the bin width in s. Returns the response, whose arrival
+    is its highest point, and by how many bins later this is than the arrival was before.
     """
     step = width / SAMPLES_PER_WIDTH
     first, last = (round(edge * SAMPLES_PER_WIDTH) for edge in EXTENT_WIDTHS)
@@ -336,7 +335,6 @@ def find_clumps(counts: FloatArray) -> NDArray[np.bool_]:
 
 def find_lower_mean(counts: FloatArray) -> float:
     """Return the mean of the lower part of a mixture: background, and background with a return.
-
     Numbers of a return's photons are taken as geometrically distributed, so that returns of any
     strength find room; fraction and mean of either part are those of the largest likelihood.
     """

@@ -203,7 +203,6 @@ def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> Phot
 
 def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> FloatArray:
     """Return a further surface, NaN where the background alone would explain its photons.
-
     `photons`: those that no nearer surface explains; `layer`: as of `SurfacePlan.locate`.
     """
     reach = 0.5 * scene.response.width + 1

@@ -90,10 +90,9 @@ def fit_surfaces(
     iterations: int,
     progress: Progress = ignore_progress,
 ) -> SurfaceFit:
-    """Find and fit the surfaces of a shot.
-
-    `frames`: A fast recovery of the same shot, with the camera to use; `weight, iterations`: see
-    `SurfaceRecovery`; `progress`: called with the number of frame iterations just done.
+    """Find and fit the surfaces of a shot. `frames`: A fast recovery of the same shot, with the
+    camera to use; `weight, iterations`: see `SurfaceRecovery`; `progress`: called with the number
+    of frame iterations just done.
     """
     camera, count = frames.camera, frames.times.size
     # 1. Frames by a fast method, whose returns are a picture of ranges. The model explains what was
@@ -224,11 +223,9 @@ def require_explained(solver: AmplitudeSolver, frames: Frames, streak: Streak) -
 
 
 def straighten_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
-    """Replace splines by quadratics that explain the shot at least as well, after a step each; return
-    the same solver where all are needed.
-
-    Splines follow the returns of frames, also where these are displaced, as behind gauze; the shot
-    itself says whether the surface is bent.
+    """Replace splines by quadratics that explain the shot at least as well, after a step each;
+    return the same solver where all are needed. Splines follow the returns of frames, also where
+    these are displaced, as behind gauze; the shot itself says whether the surface is bent.
     """
     bent = [surface for surface, basis in enumerate(solver.model.bases) if not basis.is_quadratic]
     if not bent:
@@ -358,10 +355,9 @@ def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
 
 def pool_information(information: Image, picture: Image) -> Image:
     """Return the information about each pixel's amplitude, (rows, columns), one over its variance,
-    with that of pixels tied to it.
-
-    These are the nearest ones, and those further off that the prior has made as bright: where little
-    is known of each pixel it leaves large even pieces, whose amplitude all their pixels determine.
+    with that of pixels tied to it. These are the nearest ones, and those further off that the prior
+    has made as bright: where little is known of each pixel it leaves large even pieces, whose
+    amplitude all their pixels determine.
     """
 
     def add_up(values: Image, side: int) -> Image:

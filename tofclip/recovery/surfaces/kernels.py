@@ -40,9 +40,8 @@ def split_between_rows(row: NDArray[np.float64]) -> tuple[NDArray[np.int32], Ima
 
 @fast_loop
 def split_over_slit(position, tangent, subrows, first, shares):
-    """Share of a picture pixel that falls on each slit pixel, (points, reach), from `first` on.
-
-    A pixel is a square of side 1: its width and the slit pixel's make a triangle, and its height
+    """Share of a picture pixel that falls on each slit pixel, (points, reach), from `first` on. A
+    pixel is a square of side 1: its width and the slit pixel's make a triangle, and its height
     spreads it by the tangent of the line's angle, for which `subrows` lines stand.
     """
     reach = shares.shape[1]
@@ -65,9 +64,8 @@ def split_over_slit(position, tangent, subrows, first, shares):
 
 @fast_loop
 def add_light(amplitude, row, row_shares, column, slit_shares, image):
-    """Add the light of surface points to the image of a view; all of it must fall inside.
-
-    `row, column` (points,): first of those that a point reaches; shares: (points, 3) and (points, 4).
+    """Add the light of surface points to the image of a view; all of it must fall inside. `row,
+    column` (points,): first of those that a point reaches; shares: (points, 3) and (points, 4).
     """
     for point in range(amplitude.size):
         # most points of a volume are dark

@@ -138,9 +138,8 @@ def find_rows(times: FloatArray, time: FloatArray) -> FloatArray:
 
 
 class Footprint(NamedTuple):
-    """The rows and columns of a view on which points have light, and in which fractions.
-
-    Rows count from the streak image's first, columns from `first_column`.
+    """The rows and columns of a view on which points have light, and in which fractions. Rows count
+    from the streak image's first, columns from `first_column`.
     """
 
     row: NDArray[np.int32]  # (points,), first of those that a point reaches
@@ -211,10 +210,9 @@ class SurfaceModel:
         return np.asarray(ray_length / np.maximum(inverse, MIN_INVERSE_DEPTH))
 
     def _spread_view(self, view: int) -> Footprint:
-        """Return which rows and columns of a view the light of points reaches.
-
-        Nothing of what misses the streak image is kept: a surface may run off without end, and one
-        that comes close is spread over all of the slit's plane.
+        """Return which rows and columns of a view the light of points reaches. Nothing of what
+        misses the streak image is kept: a surface may run off without end, and one that comes close
+        is spread over all of the slit's plane.
         """
         from tofclip.recovery.surfaces import kernels
 
@@ -355,10 +353,9 @@ class SurfaceModel:
         part: slice = slice(None),
         rows: tuple[int, int] | None = None,
     ) -> Image:
-        """Return what a view of gain 1 receives from some points, (rows, its columns).
-
-        `amplitude`: of the points in `part`; `kernel` (taps,): of the pulse; `rows`: first and the one
-        after the last; all by default.
+        """Return what a view of gain 1 receives from some points, (rows, its columns). `amplitude`:
+        of the points in `part`; `kernel` (taps,): of the pulse; `rows`: first and the one after the
+        last; all by default.
         """
         from tofclip.recovery.surfaces.kernels import add_light, smooth_rows
 

@@ -130,9 +130,8 @@ class Patch:
 def find_patches(
     pixels: Pixels, distance: FloatArray, ray_length: FloatArray, bin_m: float
 ) -> list[Patch]:
-    """Find the smooth surfaces in a picture's returns, (n,) each, the largest first.
-
-    A pixel may have several returns.
+    """Find the smooth surfaces in a picture's returns, (n,) each, the largest first. A pixel may
+    have several returns.
     """
     patches = [
         _fit_quadratic(pixels[own], distance[own], ray_length)
@@ -267,10 +266,8 @@ def find_dimmer_patches(
     patches: list[Patch], returns: Returns, ray_length: FloatArray, bin_m: float
 ) -> list[Patch]:
     """Find surfaces that are nowhere the brightest of their pixels, as gauze before a bright wall,
-    beside the patches of the strongest returns.
-
-    Recoveries make weak returns of their own, here and there; those of a surface lie side by side and
-    hold a part of the light.
+    beside the patches of the strongest returns. Recoveries make weak returns of their own, here and
+    there; those of a surface lie side by side and hold a part of the light.
     """
     pixel = returns.y.astype(np.intp) * ray_length.shape[1] + returns.x
     free = np.ones(pixel.size, bool)

@@ -66,7 +66,6 @@ class ShotPulse:
 
 def measure_pulse(frames: Frames, pixels: NDArray[np.intp], distance: FloatArray) -> ShotPulse:
     """Measure the pulse of a shot in its frames; the camera's where it is as short as that.
-
     `pixels` (n,): raster numbers of pixels that lie on surfaces; `distance` (n,): range of the
     strongest return of each, m.
     """

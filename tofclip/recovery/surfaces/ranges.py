@@ -52,10 +52,9 @@ class Derivatives(NamedTuple):
 
 
 def iterate_derivatives(model: SurfaceModel, amplitude: Image) -> Iterator[Derivatives]:
-    """Yield the image's derivatives by the unknowns of the state, each view's and surface's.
-
-    The reference view keeps its delay and stretch: time zero is its own. Derivatives by gains
-    and widths are by their logarithms.
+    """Yield the image's derivatives by the unknowns of the state, each view's and surface's. The
+    reference view keeps its delay and stretch: time zero is its own. Derivatives by gains and
+    widths are by their logarithms.
     """
     views = range(model.camera.views)
     others = [view for view in views if view != model.reference]
@@ -154,10 +153,9 @@ class NormalEquations(NamedTuple):
 
 
 def _take_root(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return F with ``F F' = C``, and its inverse.
-
-    Products in float32 may leave a covariance with a variance of zero or below along directions that
-    a shot says nothing about, where no Cholesky factor is. There it is taken for very small.
+    """Return F with ``F F' = C``, and its inverse. Products in float32 may leave a covariance with
+    a variance of zero or below along directions that a shot says nothing about, where no Cholesky
+    factor is. There it is taken for very small.
     """
     unit = np.sqrt(np.maximum(np.abs(np.diag(covariance)), np.finfo(np.float64).tiny))
     variances, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
@@ -169,9 +167,8 @@ def multiply_derivatives(
     groups: list[Derivatives], weights: Image, rest: Image, error: Image
 ) -> NormalEquations:
     """Return the products of all derivatives with each other, with the misfit that a step is to
-    explain and with the one of the clusters' scores.
-
-    Cluster by cluster: what is on one stays in cache, and most derivatives are on few.
+    explain and with the one of the clusters' scores. Cluster by cluster: what is on one stays in
+    cache, and most derivatives are on few.
     """
     ends = np.cumsum([0] + [len(group.names) for group in groups])
     normal, slope = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
@@ -232,10 +229,9 @@ def refine_state(
     model: SurfaceModel, amplitude: Image, earlier: Refinement | None = None
 ) -> Refinement:
     """Take a Gauss-Newton step on ranges, gains, pulse widths and, from the second step on, delays
-    and stretches, if it lowers the misfit that amplitudes cannot explain.
-
-    The model is moved in place; the mean gain stays, and so does the mean brightness behind a
-    surface. What the step before this one (`earlier`) knew saves work.
+    and stretches, if it lowers the misfit that amplitudes cannot explain. The model is moved in
+    place; the mean gain stays, and so does the mean brightness behind a surface. What the step
+    before this one (`earlier`) knew saves work.
     """
     error = model.image - model.render(amplitude)
     scale = scale_amplitude(model, amplitude > 0)
@@ -310,9 +306,8 @@ def _explain_rest(
 def _leave_out_even_shading(
     model: SurfaceModel, groups: list[Derivatives], rest: Image
 ) -> list[Derivatives]:
-    """Leave out the shading of surfaces whose hidden points all views see alike, as behind a rim.
-
-    A surface that has been found to be shaded before stays so.
+    """Leave out the shading of surfaces whose hidden points all views see alike, as behind a rim. A
+    surface that has been found to be shaded before stays so.
     """
     # what each view would make of them alone; views hardly share measurements
     information, shading = np.zeros(model.state.shading.shape), model.state.shading.copy()
