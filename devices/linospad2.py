@@ -303,7 +303,7 @@ class BoardCalibration(Storable):
 
     def times(self, records: Records) -> NDArray[np.float64]:
         """Return when each photon came, s since its cycle began: the end of its code. ``time =
-        (code - code % 140) * 2500 ps / 140 + code_ends[pixel, code % 140] + offsets[pixel]``
+        (code - code % 140) * 2500 ps / 140 + code_ends[pixel, code % 140] + offsets[pixel]``.
         """
         periods, code = np.divmod(records["code"], CODES_PER_PERIOD)
         found: NDArray[np.float64] = periods * CLOCK_PERIOD_S
