@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from hidden_point import object_of
 from small_instrument import Run
 
-from apps.verbs.nlos import reconstruct
 from nlos import Volume
 
 torch = pytest.importorskip("torch")
@@ -79,11 +77,11 @@ def test_a_device_that_is_not_there_is_refused_at_once(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_name_travels_with_a_folders_jobs(curved: Path, tmp_path: Path) -> None:
-    order = reconstruct._ImagingRequest(reconstruct.ReconstructSettings(voxel_mm=80.0), "torch:cpu")
-    jobs, _ = reconstruct._plan_jobs([curved], tmp_path, order, [".h5"])
-    (job,) = pickle.loads(pickle.dumps(jobs))  # as a worker gets it
-    assert job.work()["device"] == "torch:cpu"
-    assert (
-        Volume.load(tmp_path / f"{curved.stem}.h5").provenance["settings"]["device"] == "torch:cpu"
+def test_the_name_travels_with_a_folders_jobs(run: Run, curved: Path, tmp_path: Path) -> None:
+    object_of(
+        run,
+        *("reconstruct", curved.parent, "--out", tmp_path / "volumes"),
+        *("--voxel-mm", 80, "--device", "torch:cpu"),
     )
+    volume = Volume.load(tmp_path / "volumes" / f"{curved.stem}.h5")
+    assert volume.provenance["settings"]["device"] == "torch:cpu"

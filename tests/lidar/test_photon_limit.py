@@ -473,4 +473,5 @@ def test_a_bump_is_taken_off_a_background_that_rises():
     slope = 1000.0 + 10 * bins
     bump = 3000 * np.exp2(-((2 * (bins - 200) / 12) ** 2))
     left = remove_bumps(slope + bump, slope + bump, 12.0)
-    np.testing.assert_allclose(left, slope, rtol=0.015)
+    # The bump's own tails lie in the flanks, a hundredth of its height at their inner ends.
+    np.testing.assert_allclose(left, slope, rtol=0.005)

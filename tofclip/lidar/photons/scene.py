@@ -389,7 +389,8 @@ def remove_bumps(level: FloatArray, counts: FloatArray, width: float) -> FloatAr
                 continue
             before = counts[middle - flank : middle - core].mean()
             after = counts[middle + core + 1 : middle + flank + 1].mean()
-            line = before + (after - before) * (offsets + flank) / (2 * flank)
+            # The means are those of the flanks' middles, core + flank + 1 bins apart.
+            line = (before + after) / 2 + (after - before) * offsets / (core + flank + 1)
             excess = counts[middle - core : middle + core + 1] - line
             # Least squares for the height of a known shape; its noise is that of the line beneath
             # it.
