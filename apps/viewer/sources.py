@@ -252,7 +252,7 @@ def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) 
     return PointCloud(xyz=xyz, **columns)
 
 
-PLAY_TIME_S = 12.0  # a whole transient at natural speed
+TRANSIENT_PLAY_TIME_S = 12.0  # a whole transient at natural speed
 
 
 class TransientSource(Source):
@@ -275,7 +275,7 @@ class TransientSource(Source):
     ) -> None:
         shears = SHEAR_LIMITS if frames.camera.views > 1 else None
         capabilities = Capabilities(frames.times, shears)
-        super().__init__(title, frames.times.size / PLAY_TIME_S, capabilities)
+        super().__init__(title, frames.times.size / TRANSIENT_PLAY_TIME_S, capabilities)
         self.frames = frames
         self._recovery = ShotRecovery(frames.camera, frames.times, method)
         self.notes = list_camera_notes(frames.camera)
@@ -454,7 +454,7 @@ VOXEL_MODE, SURFACE_MODE, PROJECTION_MODE, SLICE_MODE = (
     "maximum projection",
     "slices",
 )
-PLAY_TIME_S_VOLUME = 8.0
+VOLUME_PLAY_TIME_S = 8.0
 
 
 class VolumeSource(Source):
@@ -462,7 +462,7 @@ class VolumeSource(Source):
 
     def __init__(self, title: str, volume: Volume) -> None:
         super().__init__(
-            title, max(1.0, volume.grid.z.size / PLAY_TIME_S_VOLUME), frame_name="slice"
+            title, max(1.0, volume.grid.z.size / VOLUME_PLAY_TIME_S), frame_name="slice"
         )
         can_have_surface = min(volume.grid.shape) > 1 and bool(volume.magnitude.any())
         surface = (SURFACE_MODE,) if can_have_surface else ()

@@ -22,7 +22,6 @@ Image = NDArray[np.float32]
 fast_loop = compile_loop(fastmath=True)
 
 SPLINE_SAMPLES = 3
-SPLINE_VARIANCE = 0.25  # rows^2, of the samples' spread
 
 
 def split_between_rows(row: NDArray[np.float64]) -> tuple[NDArray[np.int32], Image]:
