@@ -1,22 +1,38 @@
+"""Cameras by hand: where points fall, sweeps, parallax, and their files."""
+
 from __future__ import annotations
+
+from functools import partial
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from tofclip.camera import Camera, ProjectiveSweep, SkewSweep
-from tofclip.errors import CalibrationError, FileFormatError
+from tofclip.camera import (
+    Camera,
+    Measurement,
+    PolynomialSweep,
+    ProjectiveSweep,
+    SkewSweep,
+    Sweep,
+)
+from tofclip.camera.parallax import (
+    find_sharpest_shears,
+    fit_parallax_to_centres,
+    fit_parallax_to_shears,
+    measure_sharpness,
+)
+from tofclip.camera.sweep import sweep_from_record
+from tofclip.errors import CalibrationError, FileFormatError, InputError
+from tofclip.storage import Record
 
 CENTRES = [20.5, 50.0, 80.25]
 
 
 def camera(**changes: object) -> Camera:
-    settings = {
-        "centres_px": CENTRES,
-        "angles": [-0.5, 0.0, 0.5],
-        "image_shape": (21, 25),
-        "slit_width_px": 101,
-    }
-    return Camera(**{**settings, **changes})
+    made = {"centres_px": CENTRES, "angles": [-0.5, 0.0, 0.5], "image_shape": (21, 25)}
+    return Camera(**{**made, "slit_width_px": 101, **changes})
 
 
 def test_defaults():
@@ -26,6 +42,8 @@ def test_defaults():
     np.testing.assert_array_equal(made.view_positions, [-1, 0, 1])
     assert made.optical_axis_px == (10, 12)
     assert not made.dead_columns.any()
+    with pytest.raises(ValueError, match="read-only"):
+        made.gains[0] = 2
 
 
 UNEVEN = Camera(
@@ -45,24 +63,38 @@ def test_a_point_falls_where_the_convention_says(view: int, shear: float):
     bright as the view's gain.
     """
     rows, columns = UNEVEN.image_shape
-    operator = UNEVEN.operator(shear, np.float64)
-    middle = UNEVEN.centres_px[view]
+    operator, middle = UNEVEN.operator(shear, np.float64), UNEVEN.centres_px[view]
     own = np.abs(np.arange(UNEVEN.slit_width_px) - middle) < 29  # views lie 58 px apart at least
     for row, column in ((0, 0), (0, 18), (7, 9), (4, 13), (14, 0), (14, 18)):
         picture = np.zeros(UNEVEN.image_shape)
         picture[row, column] = 1
         light = np.where(own, operator(picture), 0)
         down, right = row - rows // 2, column - columns // 2
-        expected = (
-            middle
-            + right
-            - down * np.tan(UNEVEN.angles[view])
-            + shear * UNEVEN.view_positions[view]
-        )
+        slant = down * np.tan(UNEVEN.angles[view])
+        expected = middle + right - slant + shear * UNEVEN.view_positions[view]
         found = np.average(np.arange(light.size), weights=light)
         where = f"view {view} at shear {shear}: the point {right} right and {down} down of the axis"
         assert found == pytest.approx(expected, abs=1e-9), where
         assert light.sum() == pytest.approx(UNEVEN.gains[view]), where
+
+
+@pytest.mark.parametrize("rows", [40, 41])
+def test_no_shot_settles_the_sign_of_all_angles(rows: int) -> None:
+    """With every sign turned round, the picture upside down explains any shot as well, however
+    unequal the angles are and whatever the shear: nothing can be warned of.
+    """
+    angles = np.deg2rad([-55.0, -30, -18, 3, 22, 35, 60])
+    made = Camera(np.linspace(80.0, 320.0, 7), angles, (rows, 50), 400)
+    turned = made.replace(angles=-angles)
+    picture = np.zeros((rows, 50))
+    picture[5:-5, 5:-5] = np.random.default_rng(0).random((rows - 10, 40))
+    # About the optical axis, which is the row rows // 2.
+    upside_down = np.roll(picture[::-1], 1 - rows % 2, axis=0)
+    for shear in (0.0, 1.5):
+        other = turned.operator(shear, np.float64)
+        seen = made.operator(shear, np.float64)(picture)
+        np.testing.assert_allclose(other(upside_down), seen, atol=1e-9 * seen.max())
+        assert np.abs(other(picture) - seen).max() > 0.1 * seen.max()
 
 
 @pytest.mark.parametrize(
@@ -81,6 +113,9 @@ def test_a_point_falls_where_the_convention_says(view: int, shear: float):
         ({"focal_length_px": -1.0}, "focal"),
         ({"time_zero": np.nan}, "time zero"),
         ({"centres_px": [], "angles": []}, "at least one view"),
+        ({"lenslet_pitch": -1e-3}, "pitch"),
+        ({"lenslet_pitch": np.nan}, "pitch"),
+        ({"focus_distance": 0.0}, "pitch"),
     ],
 )
 def test_contradictions_are_refused(changes, message):
@@ -88,63 +123,217 @@ def test_contradictions_are_refused(changes, message):
         camera(**changes)
 
 
-def test_a_camera_is_not_changed_by_accident():
-    with pytest.raises(ValueError, match="read-only"):
-        camera().gains[0] = 2
+SKEW = SkewSweep(np.array([100.0, 300.0]), np.array([-4.0, 2.0]), np.array([0.01, -0.02]))
+POLYNOMIAL = PolynomialSweep(
+    column_coefficients=np.array([0.5, 1.0, 0.0, 0.25, -0.1, 0.2]),
+    row_coefficients=np.array([-0.5, 0.1, 1.0, 0.0, 0.3, 0.0]),
+    rectified_origin=np.array([10.0, 20.0]),
+    rectified_scale=np.array([2.0, 4.0]),
+    raw_origin=np.array([100.0, 200.0]),
+    raw_scale=np.array([3.0, 5.0]),
+)
+PROJECTIVE = ProjectiveSweep(np.array([[1.0, 0.5, 3.0], [0.0, 2.0, -1.0], [0.001, 0.0, 1.0]]))
+LEANING = ProjectiveSweep(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.01, 1.0]]))
+FOUR = SkewSweep(np.array([0.0, 10, 20, 40]), np.array([0.0, 5, -3, 1]), np.zeros(4))
+every_sweep = pytest.mark.parametrize("sweep", [SKEW, POLYNOMIAL, PROJECTIVE])
 
 
 @pytest.mark.parametrize(
-    "sweep",
-    [None, SkewSweep(CENTRES, [1.0, 0.0, -2.0], [0.01, 0.0, 0.002]), ProjectiveSweep(np.eye(3))],
+    ("sweep", "rectified", "raw"),
+    [
+        (SKEW, (50, 100), (-4 + 1.01 * 50, 100)),
+        (SKEW, (50, 300), (2 + 0.98 * 50, 300)),
+        (SKEW, (50, 200), (-1 + 0.995 * 50, 200)),  # half way: the means
+        # a quarter beyond the outer centre: the line goes on
+        (SKEW, (50, 350), (3.5 + (1 - 0.0275) * 50, 350)),
+        (SKEW, (50, 50), (-5.5 + (1 + 0.0175) * 50, 50)),
+        (SkewSweep([7.0], [3.0], [0.5]), (10, 900), (18, 900)),
+        *(
+            (FOUR, (0, column), (row, column))
+            for column, row in ((-2, -1), (5, 2.5), (10, 5), (15, 1), (20, -3), (30, -1), (50, 3))
+        ),
+        # x = (14 - 10) / 2 = 2 and y = (12 - 20) / 4 = -2:
+        # u = 0.5 + 2 + 0 + 0.25 * -4 - 0.1 * 4 + 0.2 * 4 = 1.9, v = -0.5 + 0.2 - 2 + 0.3 * 4 = -1.1
+        (POLYNOMIAL, (12, 14), (-1.1 * 5 + 200, 1.9 * 3 + 100)),
+        # Weight 0.001 * 100 + 1 = 1.1; column (100 + 0.5 * 10 + 3) / 1.1, row (2 * 10 - 1) / 1.1.
+        (PROJECTIVE, (10, 100), (19 / 1.1, 108 / 1.1)),
+        (LEANING, (50, 30), (50 / 1.5, 30 / 1.5)),
+    ],
 )
-def test_saved_and_loaded_again(tmp_path, sweep):
-    made = camera(
-        gains=[0.9, 1.0, 1.1],
-        sweep=sweep,
-        time_zero=-1.5e-9,
-        pulse_fwhm=7e-11,
-        focal_length_px=400.5,
-        dead_columns=np.arange(101) == 17,
-        centre_uncertainty_px=[0.1, 0.2, 0.3],
-        angle_uncertainty=[0.01, 0.02, 0.03],
-    )
+def test_sweeps_by_hand(sweep: Sweep, rectified: tuple[float, float], raw: tuple[float, float]):
+    found = sweep.raw_position(*np.array(rectified, float))
+    assert tuple(map(float, found)) == pytest.approx(raw, abs=1e-12)
+
+
+@given(st.floats(0, 1000), st.floats(-100, 500))
+def test_no_skew_moves_nothing(row: float, column: float) -> None:
+    still = SkewSweep([100.0, 200.0, 300.0], np.zeros(3), np.zeros(3))
+    assert still.raw_position(np.array(row), np.array(column)) == (row, column)
+
+
+@every_sweep
+def test_rows_and_columns_of_a_sweep_broadcast(sweep: Sweep) -> None:
+    rows, columns = np.arange(5.0), np.linspace(0, 400, 7)
+    grid = sweep.raw_position(rows[:, np.newaxis], columns[np.newaxis, :])
+    for i, row in enumerate(rows):
+        for j, column in enumerate(columns):
+            one = sweep.raw_position(np.array(row), np.array(column))
+            np.testing.assert_allclose([grid[0][i, j], grid[1][i, j]], one, rtol=1e-14)
+
+
+@pytest.mark.parametrize("sweep", [None, SKEW, POLYNOMIAL, PROJECTIVE])
+def test_a_camera_and_its_sweep_survive_their_file(tmp_path, sweep):
+    arrays = {
+        "gains": [0.9, 1.0, 1.1],
+        "dead_columns": np.arange(101) == 17,
+        "centre_uncertainty_px": [0.1, 0.2, 0.3],
+        "angle_uncertainty": [0.01, 0.02, 0.03],
+    }
+    numbers = {"time_zero": -1.5e-9, "pulse_fwhm": 7e-11, "focal_length_px": 400.5}
+    made = camera(sweep=sweep, **arrays, **numbers)
     made.save(tmp_path / "camera.h5")
     back = Camera.load(tmp_path / "camera.h5")
-    for name in (
-        "centres_px",
-        "angles",
-        "gains",
-        "view_positions",
-        "dead_columns",
-        "centre_uncertainty_px",
-    ):
+    for name in ("centres_px", "angles", "view_positions", *arrays):
         np.testing.assert_array_equal(getattr(back, name), getattr(made, name))
-    for name in ("image_shape", "slit_width_px", "time_zero", "pulse_fwhm", "focal_length_px"):
+    for name in ("image_shape", "slit_width_px", *numbers):
         assert getattr(back, name) == getattr(made, name)
     assert type(back.sweep) is type(sweep)
+    if sweep is not None:
+        here = np.array([3.0, 99.0]), np.array([250.0, 17.0])
+        np.testing.assert_array_equal(back.sweep.raw_position(*here), sweep.raw_position(*here))
 
 
-def test_another_file_is_no_camera(tmp_path):
+def test_other_files_are_no_camera(tmp_path):
     (tmp_path / "camera.h5").write_bytes(b"not a camera")
     with pytest.raises(FileFormatError, match="not an HDF5 file"):
         Camera.load(tmp_path / "camera.h5")
+    with pytest.raises(FileFormatError, match=r"a\.h5: holds an unknown sweep 'spline_sweep'"):
+        sweep_from_record(Record("spline_sweep", origin="a.h5"))
 
 
-@pytest.mark.parametrize("rows", [40, 41])
-def test_no_shot_settles_the_sign_of_all_angles(rows: int) -> None:
-    """With every sign turned round, the picture upside down explains any shot as well, however
-    unequal the angles are and whatever the shear: nothing can be warned of.
-    """
-    angles = np.deg2rad([-55.0, -30, -18, 3, 22, 35, 60])
-    camera = Camera(np.linspace(80.0, 320.0, 7), angles, (rows, 50), 400)
-    turned = camera.replace(angles=-angles)
-    picture = np.zeros((rows, 50))
-    picture[5:-5, 5:-5] = np.random.default_rng(0).random((rows - 10, 40))
-    # About the optical axis, which is the row rows // 2.
-    upside_down = np.roll(picture[::-1], 1 - rows % 2, axis=0)
-    for shear in (0.0, 1.5):
-        seen = camera.operator(shear, np.float64)(picture)
-        np.testing.assert_allclose(
-            turned.operator(shear, np.float64)(upside_down), seen, atol=1e-9 * seen.max()
-        )
-        assert np.abs(turned.operator(shear, np.float64)(picture) - seen).max() > 0.1 * seen.max()
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (SkewSweep, ([1.0, 2.0], [0.0], [0.0, 0.0]), r"\(views,\) in all three arrays"),
+        (SkewSweep, ([], [], []), "sweep centres"),
+        (SkewSweep, ([2.0, 1.0], [0.0, 0.0], [0.0, 0.0]), "centres must increase"),
+        (SkewSweep, ([1.0, 1.0], [0.0, 0.0], [0.0, 0.0]), "centres must increase"),
+        (SkewSweep, ([1.0, np.nan], [0.0, 0.0], [0.0, 0.0]), "centres must increase"),
+        (PolynomialSweep, (np.ones(6), np.ones(5), *np.ones((4, 2))), r"\(6,\), got \(5,\)"),
+        (PolynomialSweep, (np.ones(6), np.ones(6), *np.zeros((4, 2))), "must not be zero"),
+        (ProjectiveSweep, (np.eye(2),), r"\(3, 3\)"),
+    ],
+)
+def test_numbers_that_describe_no_sweep_are_refused(kind, settings, message) -> None:
+    with pytest.raises(InputError, match=message):
+        kind(*settings)
+
+
+SEVEN = 60.0 + 90 * np.arange(7)
+optical = partial(Camera, SEVEN, np.linspace(-0.7, 0.8, 7), (16, 16), 660, focal_length_px=250.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    pitch=st.floats(1e-4, 1e-2),
+    focus=st.floats(0.3, 20.0),
+    distances=st.lists(
+        st.floats(0.3, 8.0), min_size=2, max_size=6, unique_by=lambda d: round(d, 2)
+    ),
+)
+def test_the_camera_s_own_shears_give_its_parallax_back(pitch, focus, distances):
+    made = optical(lenslet_pitch=pitch, focus_distance=focus)
+    if np.ptp(1 / np.array(distances)) < 0.05:
+        return
+    found = fit_parallax_to_shears(made.shear_at(distances), distances).apply_to(optical())
+    assert found.lenslet_pitch == pytest.approx(pitch, rel=1e-6)
+    assert 1 / found.focus_distance == pytest.approx(1 / focus, abs=1e-6)
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_slit_centres_at_known_distances_give_the_parallax_and_its_sense(sense):
+    distances = np.array([0.5, 0.8, 1.5, 4.0])
+    truth = optical(lenslet_pitch=4e-3, focus_distance=1.2)
+    moved = sense * np.outer(truth.view_positions, truth.shear_at(distances))
+    moved += SEVEN[:, np.newaxis] + [0.0, 3.0, -1.0, 2.0]  # the target was put up at other places
+    found = fit_parallax_to_centres(optical(), moved, distances)
+    assert found.misfit_px == pytest.approx(0, abs=1e-9)
+    fitted = found.apply_to(optical())
+    assert fitted.lenslet_pitch == pytest.approx(4e-3)
+    assert fitted.focus_distance == pytest.approx(1.2)
+    np.testing.assert_array_equal(fitted.view_positions, sense * truth.view_positions)
+
+
+@pytest.mark.parametrize("name", ["lif_desense_HelicalFiber", "lif_dof_HelicalFiber"])
+def test_the_fibre_recordings_centres_follow_the_inverse_of_distance(shared_data, name):
+    with np.load(shared_data / "lift" / f"{name}.npz") as archive:
+        centres = archive["lens_centre_px_by_depth"] - 1.0
+        lens, _, pitch = archive["depth_fit_coeff"] * 1e-3
+        pixel = float(archive["pixel_size_mm"]) * 1e-3
+    spacing = np.diff(centres, axis=0).mean(axis=0)
+    distances = lens * pitch / (spacing * pixel - pitch)  # the authors' own formula
+    made = Camera(centres[:, -1], np.zeros(7), (180, 180), 1344, focal_length_px=lens / pixel)
+    found = fit_parallax_to_centres(made, centres, distances)
+    assert found.strength < 0  # seen through lenses: near objects move the other way along the slit
+    fitted = found.apply_to(made)
+    # the least-squares spacing of seven views is not quite the mean one of the authors; centres are
+    # good to 1 px
+    assert fitted.lenslet_pitch == pytest.approx(pitch, rel=0.03)
+    assert found.misfit_px < 1.0
+    assert fitted.focus_distance == pytest.approx(distances[-1], rel=0.05)
+    assert fitted.shear_at(distances[0]) < fitted.shear_at(distances[-1])
+
+
+def test_a_focus_beyond_infinity_counts_as_infinity():
+    found = fit_parallax_to_shears([-2.1, -1.1, -0.6], [0.5, 1.0, 2.0])
+    assert found.focus_dioptres < 0
+    assert found.apply_to(optical()).focus_distance == np.inf
+    assert np.all(optical().shear_at([0.5, 5.0]) == 0)
+
+
+def test_a_parallax_is_found_above_its_errors_only():
+    distances = np.linspace(1.0, 4.0, 12)
+    noise = np.random.default_rng(2).standard_normal(12)
+    found = fit_parallax_to_shears(-0.8 * (1 / distances - 0.4) + 0.02 * noise, distances)
+    assert found.strength == pytest.approx(0.8, abs=0.1)
+    for deviation in (0.0, 0.05):
+        with pytest.raises(CalibrationError, match="do not determine a parallax"):
+            fit_parallax_to_shears(0.3 + deviation * noise, distances)
+
+
+DARK = Measurement(np.zeros((660, 4), np.float32), np.ones((660, 4), bool))
+
+
+@pytest.mark.parametrize(
+    ("attempt", "message"),
+    [
+        (lambda: fit_parallax_to_shears([0.0, 1.0], [1.0, 1.0]), "two or more"),
+        (lambda: fit_parallax_to_shears([0.0, np.nan], [1.0, 2.0]), "two or more"),
+        (lambda: fit_parallax_to_shears([0.0, 1.0], [-1.0, 2.0]), "two or more"),
+        (lambda: fit_parallax_to_shears([0.0, 1.0], [1.0]), "must have shape"),
+        (lambda: fit_parallax_to_centres(optical(), np.zeros((6, 2)), [1.0, 2.0]), "slit centres"),
+        (lambda: find_sharpest_shears(DARK, optical(), [slice(0, 4)], [0.0]), "two finite shears"),
+    ],
+)
+def test_numbers_that_give_no_parallax_are_refused(attempt, message):
+    with pytest.raises(InputError, match=message):
+        attempt()
+
+
+def test_sharpness_counts_how_few_pixels_hold_the_light():
+    picture = np.zeros((1, 8, 8), np.float32)
+    assert measure_sharpness(picture) == 0
+    assert measure_sharpness(picture + 1) == pytest.approx(1)
+    picture[0, 2:4, 2:4] = 5
+    assert measure_sharpness(picture) == pytest.approx(16)
+    curve = find_sharpest_shears(DARK, optical(), [slice(0, 4)], [-1.0, 0.0, 1.0])
+    assert not curve.agreement.any()
+    assert not curve.weight.any()
+
+
+def test_displacement_is_the_part_of_parallax_that_moves_the_picture():
+    even = Camera(SEVEN, np.arctan(0.3 * np.arange(-3.0, 4.0) + 0.05), (16, 16), 660)
+    # slit: X - Y tan + s u with u = (tan - 0.05)/0.3, so Y shows up s/0.3 too high and X by -s/6
+    # aside
+    assert even.displacement_per_shear == pytest.approx((-1 / 0.3, -0.05 / 0.3))
+    assert Camera([60.0], [0.2], (16, 16), 121).displacement_per_shear == (0.0, 0.0)

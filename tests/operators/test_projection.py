@@ -1,4 +1,6 @@
-"""Projections, codes and shears against what can be written down, beyond the contract of operators."""
+"""Projections, codes, shears, convolutions and sensors against what can be written down, beyond the
+contract of operators.
+"""
 
 from __future__ import annotations
 
@@ -12,22 +14,33 @@ from hypothesis import strategies as st
 
 from tofclip.arrays import ComputeDevice, to_numpy
 from tofclip.camera import Camera
+from tofclip.errors import InputError
 from tofclip.operators import (
+    DenseSensor,
     FourierShear,
     HadamardCodes,
     LinearShear,
     LineProjection,
+    MaskedSensor,
     MeanWeighting,
+    PitchedSensor,
+    PointSpreadConvolution,
     RadonProjection,
+    SliceConvolution,
     SparseMatrix,
     estimate_squared_norm,
     sparse,
 )
+from tofclip.operators.convolution import make_coded_line
 from tofclip.operators.sparse import make_product
 
 angles = st.floats(-1.0, 1.0)
-centres = st.floats(40.0, 60.0)
 offsets = st.integers(-8, 8)
+sizes = st.integers(1, 9)
+
+
+def draw(seed: int, *shape: int) -> np.ndarray:
+    return np.random.default_rng(seed).random(shape)
 
 
 def centroid(slit: np.ndarray) -> float:
@@ -40,11 +53,15 @@ def point(shape: tuple[int, int], x: int, y: int) -> np.ndarray:
     return picture
 
 
+def lines(shape: tuple[int, int], slit: int, *views: tuple[float, float, float]) -> LineProjection:
+    """Views as (centre, angle, gain)."""
+    return LineProjection(shape, slit, *zip(*views, strict=True), np.float64)
+
+
 @settings(max_examples=60, deadline=None)
-@given(angle=angles, centre=centres, x=offsets, y=offsets, gain=st.floats(0.2, 3.0))
+@given(angle=angles, centre=st.floats(40.0, 60.0), x=offsets, y=offsets, gain=st.floats(0.2, 3.0))
 def test_a_point_falls_where_the_geometry_says(angle, centre, x, y, gain):
-    operator = LineProjection((17, 19), 101, [centre], [angle], [gain], np.float64)
-    slit = operator(point((17, 19), x, y))
+    slit = lines((17, 19), 101, (centre, angle, gain))(point((17, 19), x, y))
     assert centroid(slit) == pytest.approx(centre + x - y * np.tan(angle), abs=1e-9)
     assert slit.sum() == pytest.approx(gain, rel=1e-12)
     assert np.count_nonzero(slit) <= 2
@@ -57,13 +74,13 @@ def test_refocusing_moves_each_view_by_its_position(angle, shear, x, y):
     slit = camera.operator(shear, np.float64)(point((17, 19), x, y))
     for centre, position in zip(camera.centres_px, (-1, 0, 1), strict=True):
         window = slice(int(centre) - 30, int(centre) + 30)
-        seen = centroid(slit[window]) + window.start
-        assert seen == pytest.approx(centre + x - y * np.tan(angle) + shear * position, abs=1e-9)
+        expected = centre + x - y * np.tan(angle) + shear * position
+        assert centroid(slit[window]) + window.start == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("shape", [(20, 20), (21, 20), (20, 21), (21, 21)])
 def test_the_optical_axis_of_even_and_odd_pictures_is_their_middle_pixel(shape):
-    projection = LineProjection(shape, 101, [50.0], [0.5], [1.0], np.float64)
+    projection = lines(shape, 101, (50.0, 0.5, 1.0))
     for row, column in ((10, 10), (3, 5), (0, 19)):
         picture = np.zeros(shape)
         picture[row, column] = 1
@@ -71,79 +88,50 @@ def test_the_optical_axis_of_even_and_odd_pictures_is_their_middle_pixel(shape):
         assert centroid(projection(picture)) == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_vertical_line_response_sums_columns():
-    picture = np.random.default_rng(0).random((7, 9))
-    slit = LineProjection((7, 9), 9, [4.0], [0.0], [1.0], np.float64)(picture)
-    np.testing.assert_allclose(slit, picture.sum(axis=0), rtol=1e-14)
-
-
 def test_overlapping_views_add_their_light():
-    picture = np.random.default_rng(1).random((15, 15))
-    both = LineProjection((15, 15), 40, [15.2, 22.9], [0.3, -0.4], [1.0, 0.7], np.float64)(picture)
-    first = LineProjection((15, 15), 40, [15.2], [0.3], [1.0], np.float64)(picture)
-    second = LineProjection((15, 15), 40, [22.9], [-0.4], [0.7], np.float64)(picture)
-    np.testing.assert_allclose(both, first + second, rtol=1e-13)
+    picture, views = draw(1, 15, 15), ((15.2, 0.3, 1.0), (22.9, -0.4, 0.7))
+    alone = [lines((15, 15), 40, view)(picture) for view in views]
+    np.testing.assert_allclose(lines((15, 15), 40, *views)(picture), sum(alone), rtol=1e-13)
 
 
 def test_light_beyond_the_slit_is_lost_and_only_that():
-    operator = LineProjection((5, 5), 10, [8.0], [0.0], [1.0], np.float64)
-    slit = operator(np.ones((5, 5)))
-    assert slit.sum() == 5 * 4  # columns 6..9 of 6..10 remain
+    operator = lines((5, 5), 10, (8.0, 0.0, 1.0))
+    # columns 6..9 of 6..10 remain
+    np.testing.assert_array_equal(operator(np.ones((5, 5))), [0] * 6 + [5] * 4)
     assert operator(point((5, 5), 2, 0)).sum() == 0
 
 
-def test_the_sign_of_the_angles_mirrors_the_picture():
-    picture = np.random.default_rng(2).random((9, 9))
-    plus = LineProjection((9, 9), 40, [20.0], [0.5], [1.0], np.float64)
-    minus = LineProjection((9, 9), 40, [20.0], [-0.5], [1.0], np.float64)
-    np.testing.assert_allclose(plus(picture), minus(picture[::-1]), rtol=1e-12)
-
-
 def test_squared_norm_is_the_largest_eigenvalue():
-    operator = LineProjection((9, 8), 30, [8.0, 20.0], [0.4, -0.3], [1.0, 1.3], np.float64)
-    dense = operator.matrix.toarray()
-    assert estimate_squared_norm(operator, 200) == pytest.approx(
-        np.linalg.norm(dense, 2) ** 2, rel=1e-6
-    )
-
-
-def test_squared_norm_refuses_a_blind_operator():
-    from tofclip.errors import InputError
-
-    with pytest.raises(InputError, match="to zero"):
-        estimate_squared_norm(LineProjection((3, 3), 5, [200.0], [0.0], [1.0]))
-
-
-def test_squared_norm_of_a_matrix_with_both_signs():
-    """The largest eigenvector has entries of both signs, which a walk that drops them never finds."""
+    operator = lines((9, 8), 30, (8.0, 0.4, 1.0), (20.0, -0.3, 1.3))
+    largest = np.linalg.norm(operator.matrix.toarray(), 2) ** 2
+    assert estimate_squared_norm(operator, 200) == pytest.approx(largest, rel=1e-6)
+    # The largest eigenvector has entries of both signs, which a walk that drops them never finds.
     matrix = scipy.sparse.csr_array(np.array([[1.0, -0.9], [-0.9, 1.0]]))
     found = estimate_squared_norm(SparseMatrix(matrix, (2,), (2,)), 200)
     assert found == pytest.approx(1.9**2, rel=1e-3)
-
-
-def blob(shape: tuple[int, int], x: float, y: float) -> np.ndarray:
-    rows, columns = np.indices(shape)
-    return np.exp(-((columns - shape[1] // 2 - x) ** 2 + (rows - shape[0] // 2 - y) ** 2) / 18)
+    with pytest.raises(InputError, match="to zero"):
+        estimate_squared_norm(lines((3, 3), 5, (200.0, 0.0, 1.0)))
 
 
 def test_at_right_angles_a_projection_sums_columns_and_rows():
-    picture = np.random.default_rng(0).random((8, 8))
+    picture = draw(0, 8, 8)
     measurements = RadonProjection((8, 8), 8, [0.0, np.pi / 2], [0.0, 0.0], np.float64)(picture)
-    np.testing.assert_allclose(measurements[:8], picture.sum(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(measurements[8:], picture.sum(axis=1), rtol=1e-12)
+    expected = np.concatenate([picture.sum(axis=0), picture.sum(axis=1)])
+    np.testing.assert_allclose(measurements, expected, rtol=1e-12)
 
 
 def test_offsetting_the_detector_shears_the_picture():
     """A_k B_k by offset is A_k after the shear; linear interpolation twice or once on a blob of 3
     px differs by 1 %.
     """
-    shear, view = -0.6, (-3, 2)
-    angles = np.deg2rad([0, 23, 77, 140])
-    picture = blob((61, 67), 4, -3)
-    offsets = shear * (view[1] * np.cos(angles) + view[0] * np.sin(angles))
-    offset = RadonProjection((61, 67), 67, angles, offsets, np.float64)(picture)
-    plain = RadonProjection((61, 67), 67, angles, np.zeros(4), np.float64)
-    sheared = plain(LinearShear((61, 67), shear, view, dtype=np.float64)(picture))
+    shear, view, shape = -0.6, (-3, 2), (61, 67)
+    directions = np.deg2rad([0, 23, 77, 140])
+    rows, columns = np.indices(shape)
+    picture = np.exp(-((columns - 37) ** 2 + (rows - 27) ** 2) / 18)
+    offsets = shear * (view[1] * np.cos(directions) + view[0] * np.sin(directions))
+    offset = RadonProjection(shape, 67, directions, offsets, np.float64)(picture)
+    plain = RadonProjection(shape, 67, directions, np.zeros(4), np.float64)
+    sheared = plain(LinearShear(shape, shear, view, dtype=np.float64)(picture))
     assert np.linalg.norm(offset - sheared) < 0.01 * np.linalg.norm(sheared)
     assert np.linalg.norm(plain(picture) - sheared) > 0.1 * np.linalg.norm(sheared)
 
@@ -157,10 +145,9 @@ def test_a_lone_picture_is_projected_as_by_the_matrix(count):
     offsets = random.uniform(-9, 9, count)
     operator = RadonProjection((12, 17), 9, random.uniform(0, np.pi, count), offsets, np.float64)
     picture, measurements = random.random((12, 17)), random.random(9 * count)
+    back = operator.adjoint(measurements).ravel()
     np.testing.assert_allclose(operator(picture), operator.matrix @ picture.ravel(), atol=1e-13)
-    np.testing.assert_allclose(
-        operator.adjoint(measurements).ravel(), operator.matrix.T @ measurements, atol=1e-13
-    )
+    np.testing.assert_allclose(back, operator.matrix.T @ measurements, atol=1e-13)
     assert operator(picture).sum() < count * picture.sum()
 
 
@@ -171,46 +158,37 @@ def test_hadamard_codes_are_rows_of_a_hadamard_matrix_with_signs():
     np.testing.assert_allclose(codes @ codes.T, 32 * np.eye(32), atol=1e-12)
 
 
-def test_codes_are_zeros_and_ones_half_of_them_open():
-    codes = HadamardCodes((13, 16), 60, 3, np.float64)(np.eye(208).reshape(13, 16, 208))
-    assert set(np.unique(codes)) == {0.0, 1.0}
+def test_codes_are_half_open_and_decided_by_their_seed():
+    first, again, other = (
+        HadamardCodes((13, 16), 60, seed, np.float64)(np.eye(208).reshape(13, 16, 208))
+        for seed in (3, 3, 4)
+    )
+    assert set(np.unique(first)) == {0.0, 1.0}
     # 60 x 208 fair draws: the mean's standard deviation is 0.0045.
-    assert codes.mean() == pytest.approx(0.5, abs=0.02)
-    assert len(np.unique(codes, axis=0)) == 60
-
-
-def test_the_seed_decides_the_codes():
-    picture = np.random.default_rng(1).random((8, 8))
-    np.testing.assert_array_equal(
-        HadamardCodes((8, 8), 9, 5)(picture), HadamardCodes((8, 8), 9, 5)(picture)
-    )
-    assert not np.allclose(
-        HadamardCodes((8, 8), 9, 5)(picture), HadamardCodes((8, 8), 9, 6)(picture)
-    )
+    assert first.mean() == pytest.approx(0.5, abs=0.02)
+    assert len(np.unique(first, axis=0)) == 60
+    np.testing.assert_array_equal(first, again)
+    assert not np.allclose(first, other)
 
 
 def test_every_view_keeps_its_own_share_of_its_mean():
     measurements = np.array([1.0, 3.0, 10.0, 20.0, 60.0])
+    expected = measurements - 0.9 * np.array([2, 2, 30, 30, 30])
     weighted = MeanWeighting([2, 3], 0.1, np.float64)(measurements)
-    np.testing.assert_allclose(
-        weighted, measurements - 0.9 * np.array([2, 2, 30, 30, 30]), rtol=1e-14
-    )
+    np.testing.assert_allclose(weighted, expected, rtol=1e-14)
 
 
-both = pytest.mark.parametrize("kind", [LinearShear, FourierShear])
-
-
-@both
-def test_near_objects_move_against_the_view(kind):
-    """Negative shear: a view to the right and below sees the object further left and up, by whole
-    pixels.
-    """
-    picture = np.zeros((9, 12))
-    picture[6, 8] = 1
-    seen = kind((9, 12), -2.0, (1, 3), (0, 1), np.float64)(picture)
-    expected = np.zeros((9, 12))
-    expected[4, 4] = 1
-    np.testing.assert_allclose(seen, expected, atol=1e-14)
+@pytest.mark.parametrize("kind", [LinearShear, FourierShear])
+def test_a_view_is_moved_against_the_shear(kind):
+    """Negative shear: a view to the right and below sees near objects further left and up."""
+    seen = kind((9, 12), -2.0, (1, 3), (0, 1), np.float64)(point((9, 12), 2, 2))
+    np.testing.assert_allclose(seen, point((9, 12), -2, 0), atol=1e-14)
+    # Linear interpolation of a sine with 32 pixels a period is off by at most (2 pi / 32)^2 / 8 =
+    # 0.5 %.
+    x = 2 * np.pi * np.arange(32) / 32
+    seen = kind((7, 32), 0.3, (0, 1), dtype=np.float64)(np.tile(np.cos(x), (7, 1)))
+    bound = 5e-3 if kind is LinearShear else 1e-12
+    assert np.abs(seen - np.cos(x - 0.3 * 2 * np.pi / 32))[:, 1:].max() < bound
 
 
 def test_light_leaves_over_the_border_with_linear_and_returns_with_fourier():
@@ -223,38 +201,102 @@ def test_light_leaves_over_the_border_with_linear_and_returns_with_fourier():
 @settings(max_examples=40, deadline=None)
 @given(s=st.floats(-0.9, 0.9), v=st.integers(-4, 3), u=st.integers(-4, 3), r=st.floats(-1.0, 1.0))
 def test_the_centroid_moves_by_the_shear_times_the_distance_from_the_reference(s, v, u, r):
-    picture = np.zeros((21, 23))
-    picture[10, 11] = 1
-    seen = LinearShear((21, 23), s, (v, u), (r, -r), np.float64)(picture)
-    rows, columns = np.indices(picture.shape)
+    seen = LinearShear((21, 23), s, (v, u), (r, -r), np.float64)(point((21, 23), 0, 0))
+    rows, columns = np.indices(seen.shape)
     assert np.sum(rows * seen) == pytest.approx(10 + s * (v - r), abs=1e-9)
     assert np.sum(columns * seen) == pytest.approx(11 + s * (u + r), abs=1e-9)
 
 
-@both
-def test_a_band_limited_picture_is_shifted(kind):
-    x = 2 * np.pi * np.arange(32) / 32
-    seen = kind((7, 32), 0.3, (0, 1), dtype=np.float64)(np.tile(np.cos(x), (7, 1)))
-    # Linear interpolation of a sine with 32 pixels a period is off by at most (2 pi / 32)^2 / 8 =
-    # 0.5 %.
-    bound = 5e-3 if kind is LinearShear else 1e-12
-    assert np.abs(seen - np.cos(x - 0.3 * 2 * np.pi / 32))[:, 1:].max() < bound
-
-
 @pytest.mark.parametrize("shift", [0.3, 0.5, -1.2])
-def test_the_finest_pattern_fades_with_a_fractional_shift_and_moves_no_other_way(shift):
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_finest_pattern_fades_with_a_fractional_shift_and_moves_no_other_way(shift, axis):
     """A pattern at the Nyquist frequency has no phase: shifted, only its cosine is left."""
-    rows, columns = np.indices((8, 16))
-    finest, wave = (-1.0) ** rows, np.cos(2 * np.pi * 3 * columns / 16)
-    seen = FourierShear((8, 16), shift, (1, 0), dtype=np.float64)(finest * wave)
-    np.testing.assert_allclose(seen, np.cos(np.pi * shift) * finest * wave, atol=1e-12)
-    finest, wave = (-1.0) ** columns, np.cos(2 * np.pi * 3 * rows / 8)
-    seen = FourierShear((8, 16), shift, (0, 1), dtype=np.float64)(finest * wave)
-    np.testing.assert_allclose(seen, np.cos(np.pi * shift) * finest * wave, atol=1e-12)
+    along, across = np.indices((8, 16))[:: 1 - 2 * axis]
+    picture = (-1.0) ** along * np.cos(2 * np.pi * 3 * across / (16 if axis == 0 else 8))
+    seen = FourierShear((8, 16), shift, (1 - axis, axis), dtype=np.float64)(picture)
+    np.testing.assert_allclose(seen, np.cos(np.pi * shift) * picture, atol=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(rows=sizes, columns=sizes, down=sizes, right=sizes, sensor_rows=sizes, sensor_columns=sizes)
+def test_every_point_puts_the_point_spread_about_its_own_place(
+    rows, columns, down, right, sensor_rows, sensor_columns
+):
+    """Every size of picture, PSF and sensor: no light wraps around, none is lost but beside the
+    sensor.
+    """
+    spread, picture = draw(0, min(down, rows), min(right, columns)), draw(1, rows, columns)
+    sensor = (sensor_rows, sensor_columns)
+    seen = PointSpreadConvolution((rows, columns), spread, sensor, np.float64)(picture)
+    expected = np.zeros(sensor)
+    top = rows // 2 - sensor_rows // 2 + spread.shape[0] // 2
+    left = columns // 2 - sensor_columns // 2 + spread.shape[1] // 2
+    for (y, x), light in np.ndenumerate(picture):
+        for (j, i), share in np.ndenumerate(spread):
+            row, column = y + j - top, x + i - left
+            if 0 <= row < sensor_rows and 0 <= column < sensor_columns:
+                expected[row, column] += light * share
+    np.testing.assert_allclose(seen, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("sensor", [5, 14, 31])
+@pytest.mark.parametrize(
+    ("rows", "columns", "spread"), [(12, 9, (12, 9)), (11, 14, (11, 14)), (12, 14, (5, 6))]
+)
+def test_a_1d_sensor_reads_the_middle_row_of_the_convolution(rows, columns, spread, sensor):
+    picture, spreads = draw(0, rows, columns), draw(1, 3, *spread)
+    seen = SliceConvolution((rows, columns), spreads, sensor, np.float64)(picture)
+    for line, each in zip(seen.reshape(3, sensor), spreads, strict=True):
+        whole = PointSpreadConvolution((rows, columns), each, (rows, sensor), np.float64)(picture)
+        np.testing.assert_allclose(line, whole[(rows - 1) // 2], atol=1e-12)
+
+
+def test_behind_a_tilted_spread_a_point_falls_where_the_line_s_angle_says():
+    """x = X - Y tan(angle), as for `LineProjection`; the sensor's row stands for Y = 0."""
+    tilted = np.zeros((21, 21))
+    for row in range(21):
+        place = 10 + 0.5 * (row - 10)
+        tilted[row] = np.interp(np.arange(21), [place - 1, place, place + 1], [0, 1, 0])
+    seen = SliceConvolution((21, 31), tilted[None], dtype=np.float64)(point((21, 31), -3, 4))
+    assert centroid(seen) - 15 == pytest.approx(-3 - 4 * 0.5, abs=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, -np.pi / 4, 0.6])
+def test_a_coded_line_runs_along_its_angle_and_about_half_of_it_is_open(angle):
+    line = make_coded_line((64, 128), 1, angle, np.random.default_rng(1))
+    rows, columns = np.nonzero(line > 1e-12)
+    # Each row's light lies on the two columns nearest to the line.
+    assert np.abs(columns - 64 - np.tan(angle) * (rows - 32)).max() < 1
+    assert line.sum() == pytest.approx(1)
+    # 64 fair draws: four standard deviations are a quarter.
+    assert np.unique(rows).size / 64 == pytest.approx(0.5, abs=0.25)
+
+
+def test_a_wide_code_fills_its_width_and_is_cut_at_the_border():
+    line = make_coded_line((32, 40), 40, 0.5, np.random.default_rng(2))
+    assert np.count_nonzero(line.sum(axis=0)) == 40
+    narrow = make_coded_line((32, 40), 5, 0.0, np.random.default_rng(2))
+    np.testing.assert_array_equal(np.flatnonzero(narrow.any(axis=0)), np.arange(18, 23))
+    for width, angle in ((0, 0.0), (41, 0.0), (1, np.pi / 2)):
+        with pytest.raises(InputError):
+            make_coded_line((32, 40), width, angle, np.random.default_rng(0))
+
+
+def test_sensors_read_the_pixels_that_they_say():
+    picture, live = draw(3, 9, 11).astype(np.float32), draw(4, 9, 11) < 0.6
+    np.testing.assert_array_equal(DenseSensor((9, 11))(picture), picture.ravel())
+    np.testing.assert_array_equal(MaskedSensor(live)(picture), picture[live])
+    pitched = PitchedSensor((9, 11), (2, 3), (1, 2))
+    np.testing.assert_array_equal(pitched(picture).reshape(pitched.grid_shape), picture[1::2, 2::3])
+    # 13 pitches of 30 / 26 pixels are 15, but for a rounding error downwards.
+    assert 15 * 15 in PitchedSensor((30, 15), (30 / 26, 1)).pixels
+    uneven = PitchedSensor((128, 128), (128 / 91, 128 / 90))
+    assert uneven.grid_shape == (91, 90)
+    assert np.unique(uneven.pixels).size == 91 * 90
 
 
 MATRIX = scipy.sparse.random_array((31, 17), density=0.2, rng=np.random.default_rng(1)).tocsr()
-BLOCK = np.random.default_rng(2).random((17, 6))
+BLOCK = draw(2, 17, 6)
 STRICT = ComputeDevice("array_api_strict")
 
 

@@ -1,5 +1,6 @@
 """Depth-locked refocus: one shot of targets from 0.5 to 5 m, each recovered at the shear of its own
-range.
+range; and shadows on a wall, which come out as holes in its part of the cloud, as in the paper's
+Supplementary Figure 22: letters in front of a wall, lit from the side by a round, uneven beam.
 """
 
 from __future__ import annotations
@@ -9,10 +10,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
 from tofclip import Frames, depth, nmse, point_cloud
 from tofclip.camera import Camera, Measurement, SkewSweep, measure
 from tofclip.errors import CalibrationError, InputError, ShapeError
+from tofclip.lidar import Detection
 from tofclip.recovery import (
     DepthLockedFocus,
     FixedFocus,
@@ -28,12 +31,14 @@ from tofclip.simulate import (
     Instrument,
     Scene,
     StreakDetector,
+    make_default_instrument,
     make_plate,
     render_true_frames,
     simulate_shot,
 )
 from tofclip.simulate.bodies import Body
-from tofclip.simulate.patterns import cut_pattern, make_letter, make_plain_pattern
+from tofclip.simulate.demo import FOCAL_LENGTH_PX
+from tofclip.simulate.patterns import TEXELS, cut_pattern, make_letter, make_plain_pattern
 from tofclip.solvers import Backprojection, Sparse, TotalVariation
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -61,15 +66,22 @@ def camera(order: tuple[int, ...] = (3, 0, 5, 1, 6, 2, 4)) -> Camera:
     )
 
 
-def plate(name: str, place: tuple[int, int], distance: float) -> Body:
-    pixel = distance / FOCAL
-    pattern = cut_pattern(make_letter(name), make_plain_pattern(0.8))
-    return make_plate(
-        (place[0] * pixel, place[1] * pixel, distance), (18 * pixel, 18 * pixel), pattern
+def make_facing_plate(pattern, place_px, side_px: float, distance: float, focal=FOCAL) -> Body:
+    """So many pixels large and aside, seen from the reference view."""
+    x, y, side = (number * distance / focal for number in (*place_px, side_px))
+    return make_plate((x, y, distance), (side, side), pattern)
+
+
+def letter(name: str, brightness: float) -> np.ndarray:
+    return cut_pattern(make_letter(name), make_plain_pattern(brightness))
+
+
+SCENE = Scene(
+    tuple(
+        make_facing_plate(letter(name, 0.8), place, 18, distance)
+        for name, place, distance in zip("UCLAU", PLACES, RANGES, strict=True)
     )
-
-
-SCENE = Scene(tuple(plate(n, p, d) for n, p, d in zip("UCLAU", PLACES, RANGES, strict=True)))
+)
 
 
 def instrument(made: Camera) -> Instrument:
@@ -148,14 +160,10 @@ def test_frames_remember_their_shears(locked, shot, tmp_path):
 def test_heights_come_out_true_in_the_depth_of_field_arrangement(focus):
     shot = simulate_shot(SCENE, instrument(camera(order=(0, 1, 2, 3, 4, 5, 6))), seed=0)
     frames = recover(shot.streak, shot.camera, METHOD, focus=focus)
-    returns = depth(frames)
-    cloud, as_seen = (
-        point_cloud(returns),
-        point_cloud(depth(frames, shot.camera.replace(lenslet_pitch=0.0))),
-    )
+    cloud = point_cloud(depth(frames))
     nearest = np.abs(cloud.range - 0.5) < 0.05
-    height = np.median(cloud.xyz[nearest, 1]) * FOCAL / 0.5
-    seen = np.median(as_seen.xyz[nearest, 1]) * FOCAL / 0.5
+    as_seen = point_cloud(depth(frames, shot.camera.replace(lenslet_pitch=0.0)))
+    height, seen = (np.median(one.xyz[nearest, 1]) * FOCAL / 0.5 for one in (cloud, as_seen))
     # the median height of the letter U's surface lies 1 px below its middle; noise and defocus cost
     # a pixel
     assert height == pytest.approx(-17, abs=2)
@@ -164,12 +172,8 @@ def test_heights_come_out_true_in_the_depth_of_field_arrangement(focus):
 
 def test_a_stack_finds_the_shears_that_the_ranges_ask_for(shot):
     made = shot.camera.replace(lenslet_pitch=0.0)
-    part = replace(
-        shot.streak,
-        counts=shot.streak.counts[:128],
-        row_times=shot.streak.row_times[:128],
-        saturated=None,
-    )
+    counts, times = shot.streak.counts[:128], shot.streak.row_times[:128]
+    part = replace(shot.streak, counts=counts, row_times=times, saturated=None)
     frames = recover(part, made, Backprojection(), focus=SharpestFocus(-2.5, 0.5, 7))
     assert frames.figures["focus"] == "stack:-2.5:0.5:7"
     # the target at 0.5 m lies in the first gate; light of the one at 0.9 m arrives later than both
@@ -193,16 +197,8 @@ def test_names_of_foci():
     assert parse_focus("depth-locked") == DepthLockedFocus()
     assert parse_focus("fixed:-0.5") == FixedFocus(-0.5)
     assert parse_focus("stack:-2:1:7") == SharpestFocus(-2.0, 1.0, 7)
-    for text in (
-        "",
-        "fixed",
-        "fixed:a",
-        "fixed:nan",
-        "stack:0:1",
-        "stack:1:0:3",
-        "stack:0:1:1",
-        "depth-locked:1",
-    ):
+    wrong = ", fixed, fixed:a, fixed:nan, stack:0:1, stack:1:0:3, stack:0:1:1, depth-locked:1"
+    for text in wrong.split(", "):
         with pytest.raises(InputError, match=r"focus|shear"):
             parse_focus(text)
     with pytest.raises(InputError, match="tolerance"):
@@ -233,3 +229,62 @@ def test_pieces_weigh_a_prior_as_the_whole_shot_does(method):
     np.testing.assert_allclose(parts.frames, whole.frames, atol=1e-4 * whole.frames.max())
     dim = whole.frames[5:]
     np.testing.assert_allclose(parts.frames[5:], dim, atol=1e-2 * dim.max())
+
+
+WALL_DEPTH_M = 2.8
+WALL_SIDE_PX = 112
+BEAM_RADIUS_FRACTION = 0.46  # of the wall's side
+RIM_BRIGHTNESS_FRACTION = 0.45  # of the middle's
+LAMP_POSITION_M = (-0.14, -0.1, 0.0)
+LETTERS = (("U", (-22, -18), 2.2), ("L", (24, -14), 2.35), ("C", (2, 22), 2.25))
+LETTER_SIDE_PX = 30
+
+
+def make_shadow_scene() -> Scene:
+    """Three letters between 2.2 and 2.35 m, a wall at 2.8 m, a lamp 0.17 m up and to the left.
+
+    The beam's profile is printed on the wall, where it matters; the letters are evenly bright.
+    """
+    across = (np.arange(TEXELS) + 0.5) / TEXELS - 0.5
+    radius = np.hypot(across[:, np.newaxis], across) / BEAM_RADIUS_FRACTION
+    beam = np.where(radius <= 1, 0.9 * RIM_BRIGHTNESS_FRACTION ** (radius**2), 0)
+    plates = [(letter(name, 0.7), place, LETTER_SIDE_PX, z) for name, place, z in LETTERS]
+    plates.append((beam.astype(np.float32), (0, 0), WALL_SIDE_PX, WALL_DEPTH_M))
+    bodies = tuple(make_facing_plate(*one, FOCAL_LENGTH_PX) for one in plates)
+    return Scene(bodies, LAMP_POSITION_M)
+
+
+def find_lit_and_shadow() -> list[np.ndarray]:
+    """Pixels whose whole neighbourhood is lit wall, or wall in shadow, by the ray caster."""
+    scene, made = make_shadow_scene(), make_default_instrument().camera
+    rows, columns = np.indices(made.image_shape).reshape(2, -1)
+    down, right = rows - made.optical_axis_px[0], columns - made.optical_axis_px[1]
+    ahead = np.full(rows.size, made.focal_length_px)
+    hits = scene.trace(np.zeros(3), np.stack([right, down, ahead], axis=-1) / ahead[:, np.newaxis])
+    wall = (hits.body == 3) & (np.hypot(right, down) < 0.9 * BEAM_RADIUS_FRACTION * WALL_SIDE_PX)
+    around = np.ones((3, 3))
+    return [
+        binary_erosion((wall & chosen).reshape(made.image_shape), around)
+        for chosen in (hits.reflectance > 0, hits.reflectance == 0)
+    ]
+
+
+def test_shadows_are_recovered_as_holes_in_the_wall():
+    lit, shadow = find_lit_and_shadow()
+    assert lit.sum() > 1500
+    assert shadow.sum() > 150
+    shot = simulate_shot(make_shadow_scene(), make_default_instrument(), seed=0)
+    method = TotalVariation(iterations=40)
+    frames = recover(shot.streak, shot.camera, method, focus=DepthLockedFocus())
+    at_wall = np.abs(frames.times * SPEED_OF_LIGHT / 2 - WALL_DEPTH_M) < 0.06
+    bright = np.tensordot(frames.times[at_wall] ** 2, frames.values[at_wall], 1)
+    # light of the lit wall leaks into the shadows, a few pixels wide, through the seven views' blur
+    assert np.median(bright[shadow]) < 0.45 * np.median(bright[lit])
+    # the beam's rim is 0.45 as bright as its middle, so that a quarter lies between it and the
+    # shadows
+    found = depth(frames, detection=Detection(min_time_bin_fraction=0.25))
+    on_wall = np.zeros(lit.shape, bool)
+    at_wall = np.abs(found.range - WALL_DEPTH_M) < 0.1
+    on_wall[found.y[at_wall], found.x[at_wall]] = True
+    assert on_wall[lit].mean() > 0.9
+    assert on_wall[shadow].mean() < 0.3

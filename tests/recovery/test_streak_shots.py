@@ -1,4 +1,6 @@
-"""Shots by a forward model of their own (tests/oracles), clean and dirty, from counts to returns."""
+"""Shots from counts to returns, clean and dirty: by a forward model of their own (tests/oracles), and
+simulated ones whose hot pixels, traces of particles and dead columns are found, masked and without effect.
+"""
 
 from __future__ import annotations
 
@@ -7,31 +9,36 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import streak_shots as oracle
+from three_view_shot import CAMERA
 
 from tofclip.camera import Camera, SkewSweep
+from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar import Returns, depth
-from tofclip.recovery import make_method, open_shot, plan_recovery
-from tofclip.shots import Streak
+from tofclip.recovery import make_method, open_shot, plan_recovery, recover
+from tofclip.recovery.defects import estimate_noise, find_clipping_level, find_defects
+from tofclip.shots import Frames, Streak
+from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
+from tofclip.simulate.demo import make_default_camera
+from tofclip.simulate.patterns import make_plain_pattern
+from tofclip.solvers import PlugAndPlay, TotalVariation
+
+ORACLE_CAMERA = Camera(
+    oracle.CENTRES,
+    np.radians(oracle.DEGREES),
+    (oracle.PICTURE, oracle.PICTURE),
+    oracle.SLIT,
+    gains=oracle.GAINS,
+    sweep=SkewSweep(oracle.CENTRES, oracle.LATE_ROWS, 0 * oracle.LATE_ROWS),
+    time_zero=-oracle.FIRST_ROW_S,
+    pulse_fwhm=oracle.PULSE_S,
+    focal_length_px=oracle.FOCAL_PX,
+)
 
 
-def make_camera() -> Camera:
-    return Camera(
-        oracle.CENTRES,
-        np.radians(oracle.DEGREES),
-        (oracle.PICTURE, oracle.PICTURE),
-        oracle.SLIT,
-        gains=oracle.GAINS,
-        sweep=SkewSweep(oracle.CENTRES, oracle.LATE_ROWS, 0 * oracle.LATE_ROWS),
-        time_zero=-oracle.FIRST_ROW_S,
-        pulse_fwhm=oracle.PULSE_S,
-        focal_length_px=oracle.FOCAL_PX,
-    )
-
-
-def locate(counts: np.ndarray, method: str, iterations: int | None = None) -> Returns:
-    streak = Streak(counts, np.arange(oracle.ROWS) * oracle.ROW_S, camera=make_camera())
-    return depth(plan_recovery(open_shot(streak), make_method(method, iterations=iterations)).run())
+def recover_frames(counts: np.ndarray, method: str, iterations: int | None = None) -> Frames:
+    streak = Streak(counts, np.arange(oracle.ROWS) * oracle.ROW_S, camera=ORACLE_CAMERA)
+    return plan_recovery(open_shot(streak), make_method(method, iterations=iterations)).run()
 
 
 def compute_range_z(returns: Returns, scene: oracle.Scene) -> float:
@@ -49,12 +56,6 @@ def room() -> oracle.Scene:
 @pytest.fixture(scope="module")
 def light(room) -> np.ndarray:
     return oracle.compute_light(room)
-
-
-@pytest.mark.parametrize("method", ["tv", "l1"])
-def test_ranges_are_off_by_what_they_say(room, light, method) -> None:
-    returns = locate(oracle.count_photons(light), method)
-    assert 0.8 < compute_range_z(returns, room) < 1.5
 
 
 RETRO_WALL = 0.12
@@ -102,7 +103,7 @@ def spoil(kind: str, counts: np.ndarray) -> np.ndarray:
 
 
 def check_returns(kind: str, method: str, scene: oracle.Scene, counts: np.ndarray) -> None:
-    returns = locate(counts, method)
+    returns = depth(recover_frames(counts, method))
     missed, false = oracle.score(returns.y, returns.x, returns.range, scene)
     assert missed <= EXPECTED[kind][0]
     assert false <= EXPECTED[kind][1]
@@ -110,8 +111,8 @@ def check_returns(kind: str, method: str, scene: oracle.Scene, counts: np.ndarra
     assert np.all(returns.false_alarm <= 0.5)
 
 
-FAST = {("clean", "l1"), ("dark", "l1"), ("tracks", "l1"), ("retroreflector", "l1")}
-FAST |= {("dark", "tv"), ("clipped", "tv")}
+FAST = {("clean", "l1"), ("clean", "tv"), ("dark", "l1"), ("tracks", "l1")}
+FAST |= {("retroreflector", "l1"), ("dark", "tv"), ("clipped", "tv")}
 
 
 @pytest.mark.parametrize(
@@ -126,20 +127,23 @@ def test_returns_are_found_and_few_are_false(room, light, kind, method) -> None:
     check_returns(kind, method, *take_shot(kind, room, light))
 
 
-def test_another_scene_in_the_dark() -> None:
-    """l1 ends before it follows the noise; with 40 iterations 0.40 were missed."""
-    steps = oracle.make_steps()
-    counts = oracle.count_photons(oracle.compute_light(steps), 20.0, seed=1)
-    check_returns("dark", "l1", steps, counts)
-
-
-@SLOW
-@pytest.mark.parametrize("method", ["tv", "l1"])
-@pytest.mark.parametrize("kind", ["hot pixels", "tracks", "dead stripe", "clipped"])
-def test_another_scene_with_defects(kind, method) -> None:
-    steps = oracle.make_steps()
-    counts = spoil(kind, oracle.count_photons(oracle.compute_light(steps), seed=2))
-    check_returns(kind, method, steps, counts)
+@pytest.mark.parametrize(
+    ("kind", "method"),
+    [
+        # l1 ends before it follows the noise; with 40 iterations 0.40 were missed.
+        ("dark", "l1"),
+        *(
+            pytest.param(kind, method, marks=SLOW)
+            for kind in ("hot pixels", "tracks", "dead stripe", "clipped")
+            for method in ("tv", "l1")
+        ),
+    ],
+)
+def test_another_scene(kind, method) -> None:
+    steps, dark = oracle.make_steps(), kind == "dark"
+    light = oracle.compute_light(steps)
+    counts = oracle.count_photons(light, 20.0 if dark else 2000.0, seed=1 if dark else 2)
+    check_returns(kind, method, steps, spoil(kind, counts))
 
 
 @SLOW
@@ -163,11 +167,10 @@ def test_a_bright_shot_is_iterated_until_the_rim_of_thin_bars_is_gone() -> None:
     """
     steps = oracle.make_steps()
     counts = oracle.count_photons(oracle.compute_light(steps), seed=6)
-    scores = []
-    for iterations in (40, None):
-        returns = locate(counts, "l1", iterations)
-        scores.append(oracle.score(returns.y, returns.x, returns.range, steps))
-    (_, usual), (missed, false) = scores
+    found = (depth(recover_frames(counts, "l1", iterations)) for iterations in (40, None))
+    (_, usual), (missed, false) = (
+        oracle.score(returns.y, returns.x, returns.range, steps) for returns in found
+    )
     assert false < 0.9 * usual
     assert false <= 0.018
     assert missed <= 0.02
@@ -175,19 +178,149 @@ def test_a_bright_shot_is_iterated_until_the_rim_of_thin_bars_is_gone() -> None:
 
 def test_the_probability_of_a_false_alarm_is_kept(room, light) -> None:
     """In the dark, where noise is all there is; a third of the points said to be wrong with probability 1/3 are."""
-    streak = Streak(
-        oracle.count_photons(light, 20.0),
-        np.arange(oracle.ROWS) * oracle.ROW_S,
-        camera=make_camera(),
-    )
-    frames = plan_recovery(open_shot(streak), "l1").run()
+    frames = recover_frames(oracle.count_photons(light, 20.0), "l1")
     strict, lenient = depth(frames, false_alarm=0.1), depth(frames)
     assert len(strict) < len(lenient)
     assert strict.false_alarm.max() <= 0.1
     near = np.abs(lenient.range[:, None] - room.nearby_ranges[lenient.y, lenient.x]) < 0.009
-    false = 1 - near.any(axis=1).mean()
-    assert false <= lenient.false_alarm.mean()
+    assert 1 - near.any(axis=1).mean() <= lenient.false_alarm.mean()
     with pytest.raises(InputError, match="between 0 and 1"):
         depth(frames, false_alarm=0.0)
     with pytest.raises(InputError, match="recover them again"):
         depth(replace(frames, figures={}), false_alarm=0.1)
+
+
+PULSE_ROWS = 3.0
+
+
+@pytest.fixture(scope="module")
+def clean() -> Streak:
+    plates = (
+        make_plate((-0.15, 0.0, 0.8), (0.2, 0.2), make_plain_pattern(0.8)),
+        make_plate((0.15, 0.0, 1.1), (0.25, 0.25), make_plain_pattern(0.5)),
+    )
+    near = make_default_camera().replace(time_zero=-2.5e-9, pulse_fwhm=60e-12)
+    return simulate_shot(Scene(plates), Instrument(near, StreakDetector(300, 20e-12)), 0).streak
+
+
+def locate(streak: Streak) -> np.ndarray:
+    return depth(recover(streak, streak.camera, method="linear")).image("range")
+
+
+@pytest.fixture(scope="module")
+def ranges(clean) -> np.ndarray:
+    return locate(clean)
+
+
+def check_ranges(spoilt: Streak, expected: np.ndarray, missed: float, false: float) -> None:
+    """Fractions of returns that may be missed and false."""
+    found = locate(spoilt)
+    known, seen = np.isfinite(expected), np.isfinite(found)
+    right = np.sum(known & seen & (np.abs(found - expected) < 0.01))
+    assert 1 - right / known.sum() <= missed
+    assert 1 - right / max(seen.sum(), 1) <= false
+
+
+def change(streak: Streak, places: tuple[object, object], value: float) -> Streak:
+    counts = streak.counts.astype(np.float32).copy()
+    counts[places] = value
+    return replace(streak, counts=counts)
+
+
+def test_the_noise_of_the_dark_and_of_light_is_estimated() -> None:
+    """Of so many measurements the deviation is known to less than a percent; a gain of 3 counts for
+    each photon to a few, and never to less than it is: the careful side.
+    """
+    random = np.random.default_rng(0)
+    dark_noise = random.normal(100, 7, (200, 300)).astype(np.float32)
+    dark, noise, gain = estimate_noise(dark_noise)
+    assert dark == pytest.approx(100, abs=0.2)
+    assert noise == pytest.approx(7, rel=0.02)
+    assert gain == 1
+    photons = 400 * np.exp(-((np.arange(200) - 100) ** 2) / (2 * 12.0**2))
+    lit = dark_noise + 3 * random.poisson(photons[:, np.newaxis], (200, 300))
+    assert estimate_noise(lit.astype(np.float32))[2] == pytest.approx(3, rel=0.15)
+
+
+def test_a_clean_shot_stays_as_it_is(clean, ranges) -> None:
+    assert np.isfinite(ranges).sum() > 1000
+    assert open_shot(clean).streak is clean
+
+
+@pytest.mark.parametrize("number", [1, 60])
+def test_hot_pixels_have_no_effect(clean, ranges, number) -> None:
+    noise = np.random.default_rng(number)
+    rows, columns = clean.counts.shape
+    places = noise.integers(2, rows - 2, number), noise.integers(0, columns, number)
+    hot = change(clean, places, 30 * float(clean.counts.max()))
+    opened = open_shot(hot).streak
+    assert opened.saturated[places].all()
+    assert opened.metadata["defective_readings"] == str(int(opened.saturated.sum()))
+    check_ranges(hot, ranges, 0.02, 0.02)
+
+
+def test_traces_of_particles_and_a_dead_stripe_have_little_effect(clean, ranges) -> None:
+    struck = oracle.add_tracks(clean.counts.astype(np.float32), 40)
+    check_ranges(replace(clean, counts=struck), ranges, 0.12, 0.03)
+    dead = change(clean, (slice(None), slice(200, 212)), 0.0)
+    assert find_defects(dead, PULSE_ROWS).columns[200:212].all()
+    check_ranges(dead, ranges, 0.08, 0.03)
+
+
+def test_light_is_no_defect(clean) -> None:
+    """A point that lasts as long as the pulse, and single photons."""
+    pulse = np.exp2(-((2 * (np.arange(clean.counts.shape[0]) - 150.3) / PULSE_ROWS) ** 2))
+    point = change(
+        clean, (slice(None), 300), clean.counts[:, 300] + 40 * clean.counts.max() * pulse
+    )
+    assert find_defects(point, PULSE_ROWS).count == 0
+    counts = np.random.default_rng(0).poisson(0.02, (200, 300)).astype(np.float32)
+    counts += np.random.default_rng(1).poisson(5, (200, 300)) * (np.arange(200) == 90)[:, None]
+    photons = Streak(counts, np.arange(200) * 20e-12)
+    assert find_defects(photons, PULSE_ROWS).count < 0.001 * np.count_nonzero(counts)
+
+
+def test_a_plateau_is_the_sensors_limit_and_a_dim_shot_has_none(clean) -> None:
+    counts = clean.counts.astype(np.float32)
+    level = np.float32(0.3) * counts.max()
+    assert find_clipping_level(np.minimum(counts, level)) == level
+    dim = np.random.default_rng(0).poisson(0.5, (200, 300)).astype(np.float32)
+    for whole in (counts, dim, np.ones((20, 30), np.float32)):
+        assert find_clipping_level(whole) == np.inf
+
+
+def test_what_strikes_the_sensor_is_not_taken_for_the_lights_own_noise() -> None:
+    rows, columns = np.mgrid[:240, :300]
+    light = 900 * np.exp(-0.5 * ((rows - 60 - columns / 3) / 1.5) ** 2) * (columns / 300)
+    noise = np.random.default_rng(4)
+    counts = (3 * noise.poisson(light + 2.0)).astype(np.float32)
+    struck = counts.copy()
+    struck[noise.integers(0, 240, 300), noise.integers(0, 300, 300)] = 30 * counts.max()
+    gain, beside = (estimate_noise(image)[2] for image in (counts, struck))
+    # three counts for a photon; what a pulse bends may add to it, what strikes the sensor may not
+    assert gain >= 3
+    assert beside == pytest.approx(gain, rel=0.25)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [TotalVariation(iterations=300), PlugAndPlay(TotalVariation(iterations=300), calls=1)],
+    ids=lambda method: method.name,
+)
+def test_light_that_is_cut_off_is_recovered_whatever_the_dark_level_is(method) -> None:
+    """Where the sensor ends there is as much light or more: a picture is not flattened to it."""
+    picture = np.zeros((16, 16), np.float32)
+    picture[3:13, 6:10] = 1
+    pulse = np.exp(-(((np.arange(40) - 18.3) / 4) ** 2))
+    light = pulse[:, np.newaxis] * CAMERA.operator()(picture) * 300
+    light += np.random.default_rng(0).normal(0, 1, light.shape)
+    limit = np.float32(0.7 * light.max())
+    found = []
+    for dark, most in ((0, np.inf), (0, limit), (800, limit)):
+        counts = (np.minimum(light, most) + dark).astype(np.float32)
+        frames = recover(Streak(counts, camera=CAMERA).with_bin_width(20e-12), method=method)
+        assert MeasurementNoise.from_figures(frames.figures) is not None
+        found.append(frames.values.max())
+    whole, cut, raised = found
+    assert cut == pytest.approx(whole, rel=0.1)
+    assert raised == pytest.approx(cut, rel=0.01)

@@ -42,87 +42,64 @@ def clean() -> np.ndarray:
     return picture.astype(np.float32)
 
 
-def noise(shape: tuple[int, int]) -> np.ndarray:
-    return np.random.default_rng(0).normal(0, DEVIATION, shape).astype(np.float32)
+@pytest.fixture(scope="module")
+def noisy(clean) -> np.ndarray:
+    return clean + np.random.default_rng(0).normal(0, DEVIATION, clean.shape).astype(np.float32)
 
 
 def left_over(found: np.ndarray, clean: np.ndarray) -> float:
     """Share of the noise's energy."""
+    assert found.dtype == clean.dtype
     return float(np.mean((found - clean) ** 2)) / DEVIATION**2
 
 
-def test_non_local_means_remove_most_of_the_noise(clean):
-    noisy = clean + noise(clean.shape)
-    found = NonlocalMeans()(noisy, noisy, DEVIATION)
-    assert found.dtype == noisy.dtype
-    assert left_over(found, clean) < 0.25
+@pytest.mark.parametrize("kind", [NonlocalMeans, BlockMatching])
+def test_most_of_the_noise_is_removed(clean, noisy, kind):
+    if kind is BlockMatching:
+        pytest.importorskip("bm3d", reason="the package bm3d is optional")
+    assert left_over(kind()(noisy, noisy, DEVIATION), clean) < 0.25
 
 
-def test_the_collaborative_filter_gets_better_with_its_pilot(clean):
+def test_the_collaborative_filter_gets_better_with_its_pilot(clean, noisy):
     """From a blurred pilot onwards, each result the pilot of the next; the truth as pilot is the
     bound.
     """
-    noisy = clean + noise(clean.shape)
-    denoiser = CollaborativeWiener()
-    found = [gaussian_filter(noisy, 1)]
+    denoiser, found = CollaborativeWiener(), [gaussian_filter(noisy, 1)]
     for _ in range(4):
         found.append(denoiser(noisy, found[-1], DEVIATION))
-    shares = [left_over(picture, clean) for picture in found]
-    assert found[-1].dtype == noisy.dtype
-    assert (
-        shares[1]
-        > shares[2]
-        > shares[3]
-        > shares[4]
-        > left_over(denoiser(noisy, clean, DEVIATION), clean)
-    )
-    assert shares[4] < 0.25
+    shares = [left_over(picture, clean) for picture in found[1:]]
+    shares.append(left_over(denoiser(noisy, clean, DEVIATION), clean))
+    assert np.all(np.diff(shares) < 0)
+    assert shares[3] < 0.25
 
 
-def test_an_even_picture_stays_even():
+def test_what_is_clean_stays_and_a_turned_picture_is_filtered_alike(clean, noisy):
     even = np.full((20, 31), 0.4, np.float32)
     np.testing.assert_allclose(CollaborativeWiener()(even, even, DEVIATION), 0.4, atol=1e-5)
-
-
-def test_without_noise_nothing_changes(clean):
     np.testing.assert_allclose(CollaborativeWiener()(clean, clean, 1e-4), clean, atol=1e-3)
+    # with every patch in the group, ties do not matter
+    everyone, part = CollaborativeWiener(group=10_000), noisy[:27, :30]
+    turned = everyone(part.T, part.T, DEVIATION)
+    np.testing.assert_allclose(turned.T, everyone(part, part, DEVIATION), atol=2e-5)
 
 
-def test_the_filter_turns_with_the_picture(clean):
-    noisy = (clean + noise(clean.shape))[:27, :30]
-    everyone = CollaborativeWiener(
-        group=10_000
-    )  # with every patch in the group, ties do not matter
-    turned = everyone(noisy.T, noisy.T, DEVIATION)
-    np.testing.assert_allclose(turned.T, everyone(noisy, noisy, DEVIATION), atol=2e-5)
-
-
-def test_pictures_that_do_not_fit_are_refused(clean):
+def test_what_cannot_be_denoised_is_refused(clean, monkeypatch):
     with pytest.raises(ShapeError):
         CollaborativeWiener()(clean, clean[:-1], DEVIATION)
     with pytest.raises(InputError, match="smaller than a patch"):
         CollaborativeWiener()(clean[:4], clean[:4], DEVIATION)
-
-
-def test_bm3d_says_how_to_get_it(clean, monkeypatch):
     monkeypatch.setitem(sys.modules, "bm3d", None)
     with pytest.raises(MissingDependencyError, match="non-commercial"):
         BlockMatching()(clean, clean, DEVIATION)
-
-
-def test_bm3d_denoises(clean):
-    pytest.importorskip("bm3d", reason="the package bm3d is optional")
-    noisy = clean + noise(clean.shape)
-    found = BlockMatching()(noisy, noisy, DEVIATION)
-    assert left_over(found, clean) < 0.25
+    with pytest.raises(InputError, match="call"):
+        PlugAndPlay(TotalVariation(), calls=0)
+    with pytest.raises(InputError, match="positive"):
+        PlugAndPlay(TotalVariation(), strength=0)
 
 
 SHAPE = (48, 45)
-
-
-@pytest.fixture(scope="module")
-def projections() -> RadonProjection:
-    return RadonProjection(SHAPE, 48, np.arange(14) * np.pi / 14, np.zeros(14), dtype=np.float64)
+OPERATOR = RadonProjection(SHAPE, 48, np.arange(14) * np.pi / 14, np.zeros(14), dtype=np.float64)
+SMALL = RadonProjection((7, 6), 7, np.arange(5) * np.pi / 5, np.zeros(5), dtype=np.float64)
 
 
 @pytest.fixture(scope="module")
@@ -133,124 +110,96 @@ def truth() -> np.ndarray:
     return picture
 
 
-def unchanged(noisy: np.ndarray, pilot: np.ndarray, deviation: float) -> np.ndarray:
-    return noisy
+def measure(*pictures: np.ndarray) -> np.ndarray:
+    return np.stack([OPERATOR(picture) for picture in pictures], axis=1)
 
 
-def readings_with_noise(operator: RadonProjection, truth: np.ndarray) -> np.ndarray:
-    clean = operator(truth)
-    return (clean + 0.04 * clean.max() * np.random.default_rng(0).standard_normal(clean.shape))[
-        :, np.newaxis
-    ]
+def recover(method: object, measurements: np.ndarray) -> np.ndarray:
+    return method.recover(OPERATOR, measurements).frames
 
 
 def test_the_quadratic_step_is_the_dense_solution():
-    operator = RadonProjection((7, 6), 7, np.arange(5) * np.pi / 5, np.zeros(5), dtype=np.float64)
-    dense = np.stack([operator(row.reshape(7, 6)) for row in np.eye(42)], axis=1)
+    dense = np.stack([SMALL(row.reshape(7, 6)) for row in np.eye(42)], axis=1)
     rng = np.random.default_rng(1)
-    measurements, anchor = rng.random(operator.shape_out), rng.random((7, 6))
-    found = solve_data_step(
-        operator, LeastSquares(measurements[:, np.newaxis]), anchor, 0.7, iterations=60
-    )
-    known = np.linalg.solve(
-        dense.T @ dense + 0.7 * np.eye(42), dense.T @ measurements + 0.7 * anchor.ravel()
-    )
+    measurements, anchor = rng.random(SMALL.shape_out), rng.random((7, 6))
+    term = LeastSquares(measurements[:, np.newaxis])
+    found = solve_data_step(SMALL, term, anchor, 0.7, iterations=60)
+    right = dense.T @ measurements + 0.7 * anchor.ravel()
+    known = np.linalg.solve(dense.T @ dense + 0.7 * np.eye(42), right)
     np.testing.assert_allclose(found.ravel(), known, atol=1e-8)
 
 
 def test_bad_readings_hardly_pull_with_huber_s_weights():
-    operator = RadonProjection((7, 6), 7, np.arange(5) * np.pi / 5, np.zeros(5), dtype=np.float64)
     anchor = np.random.default_rng(2).random((7, 6))
-    corrupted = operator(anchor)[:, np.newaxis]
+    corrupted = SMALL(anchor)[:, np.newaxis]
     corrupted[3] += 1e4
-    pulled = solve_data_step(operator, Huber(corrupted, threshold=0.01), anchor, 1.0)
-    assert np.abs(pulled - anchor).max() < 0.01  # at most threshold / coupling
-    assert (
-        np.abs(solve_data_step(operator, LeastSquares(corrupted), anchor, 1.0) - anchor).max() > 100
+    robust, squares = (
+        np.abs(solve_data_step(SMALL, term, anchor, 1.0) - anchor).max()
+        for term in (Huber(corrupted, threshold=0.01), LeastSquares(corrupted))
     )
+    assert robust < 0.01  # at most threshold / coupling
+    assert squares > 100
 
 
-def test_without_a_denoiser_the_data_are_met(projections, truth):
+def test_without_a_denoiser_the_data_are_met(truth):
     """A denoiser that changes nothing leaves the iterations of proximal points: they end at the
     least residual.
     """
-    measurements = projections(truth)[:, np.newaxis]
-    start = TotalVariation(0.05, 20)
-    found = PlugAndPlay(start, unchanged, calls=40).recover(projections, measurements)
-    before = np.linalg.norm(
-        projections(start.recover(projections, measurements).frames[0]) - measurements[:, 0]
+    measurements, start = measure(truth), TotalVariation(0.05, 20)
+    unchanged = PlugAndPlay(start, lambda noisy, pilot, deviation: noisy, calls=40)
+    before, after = (
+        np.linalg.norm(OPERATOR(recover(method, measurements)[0]) - measurements[:, 0])
+        for method in (start, unchanged)
     )
-    assert np.linalg.norm(projections(found.frames[0]) - measurements[:, 0]) < 0.1 * before
+    assert after < 0.1 * before
 
 
-def test_it_improves_on_its_start(projections, truth):
-    measurements = readings_with_noise(projections, truth)
+def test_it_improves_on_its_start(truth):
+    measurements = measure(truth)
+    noise = np.random.default_rng(0).standard_normal(measurements.shape)
+    measurements += 0.04 * measurements.max() * noise
     start = TotalVariation(0.004, 200, 1e-4)  # too small a weight: the start is noisy
-    before = nmse(start.recover(projections, measurements).frames[0], truth)
-    result = PlugAndPlay(start).recover(projections, measurements)
-    assert nmse(result.frames[0], truth) < 0.8 * before
+    result = PlugAndPlay(start).recover(OPERATOR, measurements)
+    assert nmse(result.frames[0], truth) < 0.8 * nmse(recover(start, measurements)[0], truth)
     assert result.frames.min() >= 0
     assert result.stop_reason == "8 calls of the denoiser done"
 
 
-def blurred(noisy: np.ndarray, pilot: np.ndarray, deviation: float) -> np.ndarray:
+def blur(noisy: np.ndarray, pilot: np.ndarray, deviation: float) -> np.ndarray:
     return gaussian_filter(noisy, 1.0)
 
 
-def test_regularisation_by_denoising_ends_at_its_equation(projections, truth):
+def test_regularisation_by_denoising_ends_at_its_equation(truth):
     """``A'(A h - f) + coupling (h - denoise(h)) = 0`` holds at the end; the iteration contracts for
     a blur.
     """
-    measurements = projections(gaussian_filter(truth, 2) + 0.5)[
-        :, np.newaxis
-    ]  # so that nothing is cut at 0
-    method = RegularisationByDenoising(TotalVariation(0.02, 20), blurred, calls=80)
-    picture = method.recover(projections, measurements).frames[0]
-    coupling = method.coupling * estimate_squared_norm(projections)
-    pull = projections.adjoint(measurements[:, 0] - projections(picture))
+    measurements = measure(gaussian_filter(truth, 2) + 0.5)  # so that nothing is cut at 0
+    method = RegularisationByDenoising(TotalVariation(0.02, 20), blur, calls=80)
+    picture = recover(method, measurements)[0]
+    coupling = method.coupling * estimate_squared_norm(OPERATOR)
+    pull = OPERATOR.adjoint(measurements[:, 0] - OPERATOR(picture))
     push = coupling * (picture - gaussian_filter(picture, 1.0))
     assert picture.min() > 0
     # ten steps of conjugate gradients a call leave a hundredth
     assert np.linalg.norm(pull - push) < 0.03 * np.linalg.norm(pull)
 
 
-def test_many_frames_are_recovered_one_by_one(projections, truth):
-    measurements = np.concatenate(
-        [projections(truth)[:, np.newaxis], projections(truth[::-1].copy())[:, np.newaxis]], 1
-    )
+def test_many_frames_are_recovered_one_by_one_and_dark_ones_stay_dark(truth):
+    measurements = measure(truth, truth[::-1].copy(), np.zeros(SHAPE))
     method = PlugAndPlay(TotalVariation(0.02, 30), calls=2)
-    both = method.recover(projections, measurements).frames
-    alone = method.recover(projections, measurements[:, :1].copy()).frames
-    np.testing.assert_allclose(
-        both[0], alone[0], atol=5e-3
-    )  # a batch sets one weight for all its frames
+    whole, alone = recover(method, measurements), recover(method, measurements[:, :1].copy())
+    # a batch sets one weight for all its frames
+    np.testing.assert_allclose(whole[0], alone[0], atol=5e-3)
+    assert whole[2].max() == 0
 
 
-def test_a_frame_without_light_stays_dark(projections, truth):
-    measurements = np.stack([projections(truth), np.zeros(projections.shape_out)], axis=1)
-    frames = (
-        PlugAndPlay(TotalVariation(0.02, 10), calls=2).recover(projections, measurements).frames
+def test_huber_s_term_reaches_the_denoiser_s_loop(truth):
+    measurements = measure(truth)
+    peak, size = measurements.max(), measurements.size
+    measurements[np.random.default_rng(3).permutation(size)[: size // 20]] = peak
+    term = partial(Huber, threshold=0.02 * peak)
+    squares, robust = (
+        nmse(recover(PlugAndPlay(start), measurements)[0], truth)
+        for start in (TotalVariation(0.02, 200), TotalVariation(0.005, 200, 0.0, term))
     )
-    assert frames[1].max() == 0
-
-
-def test_huber_s_term_reaches_the_denoiser_s_loop(projections, truth):
-    measurements = projections(truth)[:, np.newaxis].copy()
-    bad = np.random.default_rng(3).permutation(measurements.size)[: measurements.size // 20]
-    clean_peak = measurements.max()
-    measurements[bad] = clean_peak
-    squares = PlugAndPlay(TotalVariation(0.02, 200)).recover(projections, measurements).frames[0]
-    term = partial(Huber, threshold=0.02 * clean_peak)
-    robust = (
-        PlugAndPlay(TotalVariation(0.005, 200, 0.0, term))
-        .recover(projections, measurements)
-        .frames[0]
-    )
-    assert nmse(robust, truth) < 0.5 * nmse(squares, truth)
-
-
-def test_settings_without_sense_are_refused():
-    with pytest.raises(InputError, match="call"):
-        PlugAndPlay(TotalVariation(), calls=0)
-    with pytest.raises(InputError, match="positive"):
-        PlugAndPlay(TotalVariation(), strength=0)
+    assert robust < 0.5 * squares
