@@ -28,9 +28,8 @@ from apps.benchmarks.harness import Prepare, PreparedCase
 from apps.viewer.page import Page
 from apps.viewer.points import DetailChooser
 from apps.viewer.session import Session
-from apps.viewer.source import Source, View
+from apps.viewer.source import Source, View, make_cloud
 from apps.viewer.source_factory import open_source
-from apps.viewer.sources import make_cloud
 
 FLAGS = (
     "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "
@@ -152,8 +151,8 @@ def play_sheet(points: int, whole: bool) -> PreparedCase:
         number, sent = next(numbers), threading.Event()
 
         def move() -> None:
-            page.session.play()
-            page.session.jump(number)
+            page.session.clock.play()
+            page.session.clock.jump(number)
             sent.set()
 
         page.post(move)

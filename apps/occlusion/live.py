@@ -13,21 +13,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.occlusion.experiment import Experiment, ExperimentSettings
 from apps.occlusion.scenes import BASELINE_M, OCCLUDER_DISTANCE_M, OcclusionScene
-from apps.viewer.source import Capabilities, Gate, Inflow, Setting, Source, View
-from apps.viewer.sources import ShotSource, TransientSource, make_cloud
+from apps.viewer.source import Inflow, Picture, Setting, Source, View, make_cloud
+from apps.viewer.sources import RecoveredSource, TransientSource
 from tofclip.errors import InputError
 from tofclip.files import format_error_line
-from tofclip.lidar.processing import select_points
 from tofclip.occlusion import TimedMeasurements, separate_occluder
 from tofclip.shots import Frames
 from tofclip.simulate.light_fields import CameraArray
 from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT
-
-Picture = NDArray[np.float32]
 
 WALK_REACH_M, WALK_STEPS = 18e-3, 14  # to either side
 
@@ -99,13 +95,11 @@ class WalkSource(Source):
         oldest = self._count - len(self._frames)
         return Inflow(oldest, is_live, rate, self._seconds, failure_text=self._failure_text)
 
-    def describe_frame(self, number: int) -> str:
-        return self._find_frame(number).description
-
     def view(self, number: int) -> View:
-        return self._find_frame(number).view
+        step = self._find_frame(number)
+        return replace(step.view, text=step.description)
 
-    def pictures(self, number: int, gate: Gate) -> Mapping[str, Picture]:
+    def pictures(self, number: int) -> Mapping[str, Picture]:
         pictures = self._find_frame(number).pictures
         return {
             f"{left} | {right}": pair_pictures(pictures[left], pictures[right])
@@ -219,7 +213,7 @@ class GatedSource(Source):
     """
 
     def __init__(self, shots: Source) -> None:
-        if not isinstance(shots, TransientSource | ShotSource):
+        if not isinstance(shots, RecoveredSource):
             raise InputError(
                 f"{shots.title}: a gate needs light over time: give shots, frames or an instrument"
             )
@@ -241,7 +235,6 @@ class GatedSource(Source):
         super().__init__(
             f"{shots.title}, behind a gate",
             min(shots.rate, 10.0),
-            Capabilities(),
             frame_name="shot",
             notes=shots.notes,
             settings=(self._gate,),
@@ -258,10 +251,9 @@ class GatedSource(Source):
     def view(self, number: int) -> View:
         whole = self._shots.view(number)
         behind = whole.cloud.range >= self._gate.value
-        pixels = None if whole.pixels is None else whole.pixels[behind]
-        return View(select_points(whole.cloud, behind), pixels)
+        return View(whole.cloud, whole.pixels).select(behind)
 
-    def pictures(self, number: int, gate: Gate) -> Mapping[str, Picture]:
+    def pictures(self, number: int) -> Mapping[str, Picture]:
         frames = self._recover(number)
         distance: Any = SPEED_OF_LIGHT * frames.times / 2
         behind = frames.values[distance >= self._gate.value].sum(axis=0)

@@ -61,10 +61,15 @@ def view(
 
     Example: tofclip view frames.h5 --png scene.png
     """
-    from apps.viewer.desktop import open_window
     from apps.viewer.session import Session
-    from apps.viewer.source_factory import ShotOptions, announce_nothing, open_source
-    from apps.viewer.still import choose_frames, choose_renderer, save_film, save_picture
+    from apps.viewer.source_factory import ShotOptions, open_source
+    from apps.viewer.still import (
+        choose_frames,
+        choose_renderer,
+        open_window,
+        save_film,
+        save_picture,
+    )
 
     # Truth values add up: more than one was asked for.
     if desktop + (png is not None) + (mp4 is not None) > 1:
@@ -78,7 +83,7 @@ def view(
     # Closing stops a live source and its threads, however the view ends.
     with contextlib.closing(door), contextlib.ExitStack() as opened:
         with show_activity(f"opening {source}"):
-            announce = partial(door.open_waiting, source) if is_page else announce_nothing
+            announce = partial(door.open_waiting, source) if is_page else lambda _: None
             known = ShotOptions(camera, bin_width, time_zero, method)
             found = opened.enter_context(contextlib.closing(open_source(source, known, announce)))
             session = Session(found)

@@ -14,14 +14,14 @@ from apps.viewer.look import render_pictures
 from apps.viewer.panels import (
     NO_SHADOWS,
     Controls,
-    SelectionPanel,
-    Status,
     add_export,
+    add_selection,
     format_page_title,
     render_page_html,
-    render_waiting_html,
+    render_status_html,
+    render_text_html,
 )
-from apps.viewer.points import POINT_STYLE, FramePacer, Points, RateCounter, draw_furniture
+from apps.viewer.points import POINT_STYLE, FramePacer, Points, draw_furniture
 from apps.viewer.server import LOOPBACK, start_server, stop_server
 from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.viewpoint import Box, Viewpoint, make_presets, move_camera, place_viewpoint
@@ -30,14 +30,13 @@ from tofclip.errors import TofclipError
 if TYPE_CHECKING:
     import viser
 
-TICK_S = 1 / 60  # s between two looks at the clock
-# s; words, controls and flat pictures need not follow every frame: they cost the browser more than
-# the points do
+TICK_S = 1 / 60  # between two looks at the clock
+# words, controls and flat pictures need not follow every frame: they cost the browser more than the
+# points do
 STATUS_PERIOD_S, PICTURES_PERIOD_S = 0.25, 0.5
 # width over height of the scene between two panels, on a usual screen: until a browser says its own
 SCENE_ASPECT = 0.9
 PANEL_PX, PICTURES_PANEL_PX = 352, 240
-
 MANY_POINTS = 10**9  # more than any cloud has
 AMBIENT_INTENSITY = 2.0  # light from everywhere, so that no side of a surface is black
 SURFACE_COLOUR = (216, 210, 196)
@@ -54,7 +53,7 @@ class WaitingPage:
     ) -> None:
         self.server, self.address = start_server(port, host)
         _set_up_panel(self.server, title)
-        self._words = self.server.gui.add_html(render_waiting_html(words))
+        self._words = self.server.gui.add_html(render_text_html("waiting", f"{words} ..."))
 
     def hand_over(self) -> tuple[viser.ViserServer, str]:
         """Return the server, its page empty again, and its address."""
@@ -80,7 +79,7 @@ class Page:
         waiting: WaitingPage | None = None,
     ) -> None:
         self.session = session
-        self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._commands: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._stopping, self._woken = threading.Event(), threading.Event()
         first = session.frame_at(time.monotonic())
         self._framed_cloud = first.cloud.xyz
@@ -88,24 +87,26 @@ class Page:
         self.server, self.address = (
             start_server(port, host) if waiting is None else waiting.hand_over()
         )
-        self._pace, self._frames = FramePacer(), RateCounter()
-        self.points = Points(self.server, self.post)
+        server, title = self.server, session.source.title
+        self._pace, self.points = FramePacer(), Points(server, self.post)
+        _set_up_panel(server, title)
         self._set_up_scene()
-        self._pictures_panel, self._pictures_tab = self._add_pictures_panel()
-        self.controls = Controls(self.server, session, self.post, first, self._resize_points)
+        left = server.gui.add_panel()
+        self._pictures_tab = left.add_tab("pictures")
+        left.dock_left()
+        left.set_width(PICTURES_PANEL_PX)
+        self.controls = Controls(server, session, self.post, first, self._resize_points)
         self._add_furniture(first)
-        self._selection_panel = SelectionPanel(
-            self.server, session, self.post, self._pictures_panel
-        )
-        add_export(self.server, session, self.post, self._list_views, self.points.drawn_whole)
-        self.server.gui.add_html(render_page_html(session.source.title))
+        add_selection(server, session, self.post, left)
+        add_export(server, session, self.post, self._list_views, self.points.drawn_whole)
+        server.gui.add_html(render_page_html(title))
         self._pictures: dict[str, Any] = {}
         self._drawn: DisplayedFrame | None = None
-        self._status_at = self._pictures_at = 0.0
         self._pictured: DisplayedFrame | None = None
-        self.server.on_client_connect(self._welcome)
+        self._status_at = self._pictures_at = 0.0
+        server.on_client_connect(self._welcome)
 
-    def post(self, command: Callable[[], None]) -> None:
+    def post(self, command: Callable[[], object]) -> None:
         """Have a command carried out by the thread that owns the session."""
         self._commands.put(command)
         self._woken.set()
@@ -132,30 +133,48 @@ class Page:
             self.session.max_playing_points = self.points.detail.count(MANY_POINTS, moving=True)
             shown = self.session.frame_at(now) if self._pace.can_send(now) else self._drawn
             if shown is not None and shown is not self._drawn:
-                self._draw(shown, now)
+                # Browsers get points and surface of one frame together.
+                with self.server.atomic():
+                    self._draw(shown)
+                self.server.flush()
+                self._drawn = shown
+                self._pace.record_sent(now, len(shown.cloud))
             self.points.update(now)
-            self._update_status(now)
+            if shown is not None:
+                self._describe(shown, now)
         except TofclipError as fault:
-            self._notify_error(fault)
+            for client in self.server.get_clients().values():
+                look: Any = {"auto_close_seconds": 6.0, "color": "red"}
+                client.add_notification("that cannot be", str(fault), **look)
 
     def _set_up_scene(self) -> None:
-        server = self.server
-        _set_up_panel(server, self.session.source.title)
-        server.scene.set_up_direction("-y")
+        scene = self.server.scene
+        scene.set_up_direction("-y")
         # Shadows and reflections say nothing here, and take a software renderer ten seconds to
         # prepare for.
-        server.scene.configure_default_lights(enabled=True, cast_shadow=False)
-        server.scene.configure_environment_map(hdri=None)
-        server.scene.add_light_ambient("/light", intensity=AMBIENT_INTENSITY)
-        move_camera(server.initial_camera, self.viewpoint)
-        server.scene.add_frame("/camera", show_axes=False)
+        scene.configure_default_lights(enabled=True, cast_shadow=False)
+        scene.configure_environment_map(hdri=None)
+        scene.add_light_ambient("/light", intensity=AMBIENT_INTENSITY)
+        move_camera(self.server.initial_camera, self.viewpoint)
+        scene.add_frame("/camera", show_axes=False)
         # The page makes a new material for every frame's points, and forgets the compiled shader
         # with the last old one. Two points that stay keep it: compiling it again for every frame
         # would take twenty times as long as drawing.
         staying = np.zeros((2, 3), np.float32)
-        server.scene.add_point_cloud(
-            "/camera/staying", staying, staying, point_size=1e-4, **POINT_STYLE
-        )
+        scene.add_point_cloud("/camera/staying", staying, staying, point_size=1e-4, **POINT_STYLE)
+
+    def _add_furniture(self, first: DisplayedFrame) -> None:
+        """Draw what gives the scene its scale, and a switch for it."""
+        if len(first.cloud) == 0:
+            return
+        drawn = draw_furniture(self.server.scene, Box.around(first.cloud.xyz))
+        hint = "box with lengths, scale bar and axes of the first cloud"
+        switch = self.server.gui.add_checkbox("box", True, hint=hint)
+
+        @switch.on_update
+        def _(_: Any) -> None:
+            for node in drawn:
+                node.visible = switch.value
 
     def _welcome(self, client: Any) -> None:
         """Frame the scene for the window of a browser that has just come, until the first move."""
@@ -173,9 +192,12 @@ class Page:
             self.viewpoint = viewpoint
             move_camera(camera, viewpoint)
 
+        def redraw_pictures() -> None:
+            self._pictures_at, self._pictured = 0.0, None
+
         follow_window(client.camera)
         client.camera.on_update(follow_window)
-        self.post(self._redraw_pictures)
+        self.post(redraw_pictures)
 
     def _list_views(self, aspect: float) -> dict[str, Viewpoint]:
         """Places to look from, for a window of that aspect."""
@@ -183,44 +205,14 @@ class Page:
             return {"start": self.viewpoint}
         return make_presets(self._framed_cloud, aspect)
 
-    def _add_furniture(self, first: DisplayedFrame) -> None:
-        """Draw what gives the scene its scale, and a switch for it."""
-        if len(first.cloud) == 0:
-            return
-        drawn = draw_furniture(self.server.scene, Box.around(first.cloud.xyz))
-        shown = self.server.gui.add_checkbox(
-            "box", True, hint="box with lengths, scale bar and axes of the first cloud"
-        )
-
-        @shown.on_update
-        def _(_: Any) -> None:
-            for node in drawn:
-                node.visible = shown.value
-
-    def _redraw_pictures(self) -> None:
-        """Show the flat pictures at once on a page that has just opened."""
-        self._pictures_at, self._pictured = 0.0, None
-
-    def _draw(self, shown: DisplayedFrame, now: float) -> None:
-        server = self.server
-        # Browsers get points and surface of one frame together.
-        with server.atomic():
-            self._draw_scene(shown)
-        server.flush()
-        self._drawn = shown
-        self._frames.add(now)
-        self._pace.record_sent(now, len(shown.cloud))
-
-    def _draw_scene(self, shown: DisplayedFrame) -> None:
-        scene = self.server.scene
-        if shown.surface is not None:
-            faces, vertices = shown.surface.faces, shown.surface.vertices
-            scene.add_mesh_simple(
-                "/surface", vertices, faces, color=SURFACE_COLOUR, side="double", **NO_SHADOWS
-            )
+    def _draw(self, shown: DisplayedFrame) -> None:
+        scene, surface = self.server.scene, shown.surface
+        if surface is not None:
+            look: Any = {"color": SURFACE_COLOUR, "side": "double", **NO_SHADOWS}
+            scene.add_mesh_simple("/surface", surface.vertices, surface.faces, **look)
         elif self._drawn is not None and self._drawn.surface is not None:
             scene.remove_by_name("/surface")
-        xyz = shown.cloud.xyz if shown.surface is None else shown.cloud.xyz[:0]
+        xyz = shown.cloud.xyz if surface is None else shown.cloud.xyz[:0]
         self.points.draw(xyz, shown.colours, self._size_points(shown))
 
     def _size_points(self, shown: DisplayedFrame) -> float:
@@ -231,60 +223,23 @@ class Page:
         if self._drawn is not None:
             self.points.resize(self._size_points(self._drawn))
 
-    def _update_status(self, now: float) -> None:
+    def _describe(self, shown: DisplayedFrame, now: float) -> None:
         """Bring words and flat pictures up to date, now and then."""
-        shown = self._drawn
-        if shown is None:
-            return
         if now - self._status_at > STATUS_PERIOD_S:
             self._status_at = now
-            self.controls.show(shown, self._status(shown, now))
+            drawn = self.points.drawn if shown.surface is None else None
+            rate = self._pace.per_second(now)
+            self.controls.show(shown, render_status_html(self.session, shown, rate, drawn))
         if now - self._pictures_at > PICTURES_PERIOD_S and shown is not self._pictured:
             self._pictures_at, self._pictured = now, shown
-            self._show_pictures(shown)
-
-    def _status(self, shown: DisplayedFrame, now: float) -> Status:
-        source = self.session.source
-        times = source.capabilities.times
-        return Status(
-            self.session.label,
-            shown.frame,
-            len(source),
-            shown.points,
-            self._frames.per_second(now),
-            source.inflow,
-            float("nan") if times is None else float(times[shown.frame]),
-            source.frame_name,
-            source.describe_frame(shown.frame),
-            self.session.notes,
-            source.whole_name,
-            None if shown.surface is not None else self.points.drawn,
-        )
-
-    def _show_pictures(self, shown: DisplayedFrame) -> None:
-        images = render_pictures(self.session.pictures(shown), shown.scale)
-        if not self._pictures:
+            images = render_pictures(self.session.pictures(shown), shown.scale)
             with self._pictures_tab:
-                self._pictures = {
-                    name: self.server.gui.add_image(one, label=name) for name, one in images.items()
-                }
-            return
-        for name, image in images.items():
-            self._pictures[name].image = image
-
-    def _add_pictures_panel(self) -> tuple[Any, Any]:
-        """The panel on the left, and its tab for flat pictures."""
-        panel = self.server.gui.add_panel()
-        tab = panel.add_tab("pictures")
-        panel.dock_left()
-        panel.set_width(PICTURES_PANEL_PX)
-        return panel, tab
-
-    def _notify_error(self, fault: TofclipError) -> None:
-        for client in self.server.get_clients().values():
-            client.add_notification(
-                "that cannot be", str(fault), auto_close_seconds=6.0, color="red"
-            )
+                for name, image in images.items():
+                    if name in self._pictures:
+                        self._pictures[name].image = image
+                    else:
+                        handle = self.server.gui.add_image(image, label=name)
+                        self._pictures[name] = handle
 
 
 def _set_up_panel(server: viser.ViserServer, title: str) -> None:

@@ -1,30 +1,42 @@
-"""The server of the page, for whoever has its address with the token."""
+"""The server of the page, for whoever has its address with the token, and none of the browser's other
+pages.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import gc
 import http.client
 import io
 import ipaddress
+import secrets
 import socket
 from http import HTTPStatus
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
 
-from apps.viewer.guard import install_guard
 from tofclip.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
     import viser
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
 
-LOOPBACK = "127.0.0.1"
-FIRST_PORT = 8080
+LOOPBACK, FIRST_PORT = "127.0.0.1", 8080
+REFUSAL = "Open the address that tofclip printed, with its token.\n"
+# They keep the token of the address to this page, and the page out of another's frame.
+ANSWER_HEADERS = {
+    "Referrer-Policy": "no-referrer",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+}
 
 
 def start_server(port: int | None = None, host: str = LOOPBACK) -> tuple[viser.ViserServer, str]:
-    """Start a server that lets in whoever knows the token in its address.
+    """Start a server that lets in whoever knows the token in its address, which is returned too.
 
     `port`: by default the first free one from 8080 on; `host`: an IP address of this computer;
-    0.0.0.0 or :: for all of them. Returns `address`: to open in a browser.
+    0.0.0.0 or :: for all of them.
     """
     try:
         import viser
@@ -40,17 +52,25 @@ def start_server(port: int | None = None, host: str = LOOPBACK) -> tuple[viser.V
             """Open no tunnel."""
             return None
 
-    _require_free_port(host, port or 0)
+    # A port that is taken is refused: viser would silently take the next one.
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port or 0))
+        except (OSError, OverflowError) as fault:
+            raise InputError(f"cannot listen at {host}, port {port or 0}: {fault}") from fault
     # viser greets on standard output, which belongs to --json.
     with contextlib.redirect_stdout(io.StringIO()):
         server = LocalServer(host=host, port=FIRST_PORT if port is None else port, verbose=False)
     token = install_guard(server.get_port(), is_local(host))
-    if token is None or not _refuses_strangers(host, server.get_port()):
+    everywhere = ipaddress.ip_address(host).is_unspecified
+    nearest = ("::1" if ":" in host else LOOPBACK) if everywhere else host
+    if token is None or not _refuses_strangers(nearest, server.get_port()):
         stop_server(server)
         raise MissingDependencyError(
             f"viser {viser.__version__} would show the page to everybody: pip install viser==1.1.1"
         )
-    named = socket.gethostname() if _is_everywhere(host) else host
+    named = socket.gethostname() if everywhere else host
     name = f"[{named}]" if ":" in named else named
     return server, f"http://{name}:{server.get_port()}/?token={token}"
 
@@ -78,25 +98,95 @@ def is_local(host: str) -> bool:
     return ipaddress.ip_address(host).is_loopback
 
 
-def _is_everywhere(host: str) -> bool:
-    return ipaddress.ip_address(host).is_unspecified
-
-
 def _refuses_strangers(host: str, port: int) -> bool:
     """Ask for the page without the token: another version of a library may not ask the guard."""
-    if _is_everywhere(host):
-        host = "::1" if ":" in host else LOOPBACK
     with contextlib.closing(http.client.HTTPConnection(host, port, timeout=10)) as connection:
         connection.request("GET", "/")
         return connection.getresponse().status == HTTPStatus.FORBIDDEN
 
 
-def _require_free_port(host: str, port: int) -> None:
-    """Refuse a port that is taken: viser would silently take the next one."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+class Guard:
+    """Sees every request first, that for a WebSocket as well, and refuses it or passes it on.
+
+    Browsers send the cookie to every port of this computer and with what any page there asks for:
+    hence Origin has to be the page's own. The name in Host has to be this computer's, for anybody's
+    DNS can point another one here.
+
+    `serve`: answers what is passed on; websockets' ``process_request``; `is_local`: whether only
+    this computer reaches the server.
+    """
+
+    def __init__(self, serve: Any, is_local: bool) -> None:
+        self.token = secrets.token_urlsafe()
+        self._serve, self._is_local = serve, is_local
+
+    def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer a request, or return None for a WebSocket that may be opened."""
+        cookie = self._admit(request)
+        if cookie is None:
+            return connection.respond(HTTPStatus.FORBIDDEN, REFUSAL)
+        answer: Response | None = self._serve(connection, request)
+        if answer is not None:
+            answer.headers["Set-Cookie"] = (
+                f"{cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+            )
+            answer.headers.update(ANSWER_HEADERS)
+        return answer
+
+    def _admit(self, request: Request) -> str | None:
+        """Return the name of the cookie, or None where the request is refused."""
         try:
-            probe.bind((host, port))
-        except (OSError, OverflowError) as fault:
-            raise InputError(f"cannot listen at {host}, port {port}: {fault}") from fault
+            (host,) = request.headers.get_all("Host")
+            place = urlsplit(f"http://{host}")
+            # The port that the browser sees: through ssh it may be another one.
+            cookie = f"tofclip-{place.port or 80}"
+            tokens = parse_qs(urlsplit(request.path).query).get("token", [])
+        except ValueError:
+            return None
+        # SimpleCookie would drop all of them for one of another server's that it cannot read.
+        for header in request.headers.get_all("Cookie"):
+            pairs = (pair.strip().partition("=") for pair in header.split(";"))
+            tokens += [value for name, _, value in pairs if name == cookie]
+        own = self.token.encode()
+        is_admitted = (
+            self._is_own_name(place.hostname or "")
+            and all(origin == f"http://{host}" for origin in request.headers.get_all("Origin"))
+            and any(secrets.compare_digest(t.encode(errors="replace"), own) for t in tokens)
+        )
+        return cookie if is_admitted else None
+
+    def _is_own_name(self, name: str) -> bool:
+        try:
+            return ipaddress.ip_address(name).is_loopback or not self._is_local
+        except ValueError:
+            is_own = not self._is_local and name == socket.gethostname().lower()
+            return name == "localhost" or is_own
+
+
+def install_guard(port: int, is_local: bool) -> str | None:
+    """Guard the server of websockets that listens at a port of this process, which only this computer
+    reaches where it `is_local`. Return the token; None where there is no such server.
+
+    viser has no parameter for ``process_request`` and keeps its server of websockets to itself.
+    Behind a proxy its own port would stay open to every page, hence that server is looked for.
+    """
+    from websockets.asyncio.server import Server
+
+    for server in gc.get_objects():
+        if (
+            type(server) is Server
+            and not isinstance(server.process_request, Guard)
+            and port in [listener.getsockname()[1] for listener in server.sockets]
+        ):
+            break
+    else:
+        return None
+    guard = Guard(server.process_request, is_local)
+
+    async def begin() -> None:
+        server.process_request = guard
+        for early in list(server.handlers):
+            early.transport.abort()
+
+    asyncio.run_coroutine_threadsafe(begin(), server.get_loop()).result()
+    return guard.token

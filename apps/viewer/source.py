@@ -1,37 +1,25 @@
-"""What can be looked at: anything that gives a cloud for each of its frames."""
+"""What can be looked at: anything that gives a view of points, and facts about it, for each of its
+frames.
+"""
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.camera import Camera
-from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
+from tofclip.lidar.cloud import OPTIONAL_COLUMNS
+from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class View:
-    """What a source shows in one frame."""
-
-    cloud: PointCloud
-    # (n, 2), row and column of the pixel that saw each point
-    pixels: NDArray[np.int32] | None = None
-
-
-@dataclass(frozen=True)
-class Waveform:
-    """A pixel's signal over time."""
-
-    times: FloatArray  # (n,), time of flight, s
-    counts: NDArray[np.float32]  # (n,)
+Picture = NDArray[np.float32]  # (rows, columns)
+Limits = tuple[float, float]  # both inclusive
+NO_LIMITS: Limits = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True)
@@ -43,25 +31,24 @@ class TriangleMesh:
 
 
 @dataclass(frozen=True)
-class Gate:
-    """Frames of a transient from `first` up to, not including, `stop`."""
+class View:
+    """What a source shows in one frame, and the facts about it."""
 
-    first: int
-    stop: int
+    cloud: PointCloud
+    pixels: NDArray[np.int32] | None = None  # (n, 2), row and column that saw each point
+    surface: TriangleMesh | None = None  # drawn instead of the points
+    # points of other times of flight, s, are not shown, though they count for the colours
+    times: Limits = NO_LIMITS
+    time: float = np.nan  # time of flight of the frame, s; NaN where frames have none
+    whole_name: str = ""  # what is shown where it is not one frame, such as a maximum projection
+    text: str = ""  # what the frame is beyond its number and time, in a few words
+    caption: str = ""  # of which frames the points are, where that is not the one frame
+    notes: tuple[str, ...] = ()  # what has to be known about this view
 
-    @property
-    def frames(self) -> slice:
-        """As an index."""
-        return slice(self.first, self.stop)
-
-
-@dataclass
-class DisplayModes:
-    """How a source shows itself, where it can be shown in several ways."""
-
-    names: tuple[str, ...] = ()  # the ways there are; empty where there is one only
-    current: str = ""
-    threshold: float = 0.3  # share of the brightest voxel below which nothing is shown
+    def select(self, chosen: NDArray[Any]) -> Self:
+        """Return a view of some of the points, by mask or by numbers."""
+        pixels = None if self.pixels is None else self.pixels[chosen]
+        return replace(self, cloud=self.cloud[chosen], pixels=pixels)
 
 
 @dataclass
@@ -76,15 +63,14 @@ class Setting:
     hint: str = ""
 
 
-@dataclass(frozen=True)
-class Capabilities:
-    """What a source can do beyond showing its frames."""
+@dataclass
+class Choice:
+    """A word that is chosen from a list while one looks."""
 
-    # (frames,), time of flight of each frame, s, of a source whose frames are the instants of one
-    # transient
-    times: FloatArray | None = None
-    # least and largest shear of a refocus, pixels per view step; None where it cannot be refocused
-    shears: tuple[float, float] | None = None
+    name: str
+    options: tuple[str, ...]
+    value: str
+    hint: str | None = None
 
 
 @dataclass(frozen=True)
@@ -96,7 +82,7 @@ class Inflow:
     data_rate: float = 0.0  # frames per second
     # from when the instrument took a shot, by its own clock where it sends one, until it could be
     # shown, s; NaN where nothing comes in
-    latency: float = float("nan")
+    latency: float = np.nan
     lost: int = 0  # shots that were taken and are not shown, wherever they were lost
     failure_text: str = ""  # what ended it early, in a line
 
@@ -107,12 +93,12 @@ class Source(abc.ABC):
 
     title: str  # what the page calls it
     rate: float  # frames per second at natural speed
-    capabilities: Capabilities = field(default_factory=Capabilities)
-    display_modes: DisplayModes = field(default_factory=DisplayModes)
     frame_name: str = "frame"  # what a frame is: an instant's frame, a slice, a shot or a cloud
+    # (frames,), time of flight of each frame, s, where frames are the instants of one transient
+    times: FloatArray | None = None
     # what has to be known about everything that is shown, such as that ranges have no time zero
     notes: tuple[str, ...] = ()
-    settings: tuple[Setting, ...] = ()  # what is set by sliders, beyond what all sources have
+    settings: tuple[Setting | Choice, ...] = ()  # what is set while one looks; `view` obeys them
     # counts; dimmer points are left out until the filters are reset. 0 for none
     min_intensity: float = 0.0
 
@@ -129,57 +115,35 @@ class Source(abc.ABC):
         """What comes in while one looks."""
         return Inflow()
 
-    @property
-    def refocus_note(self) -> str:
-        """What has to be said while a refocus is shown; empty where there is nothing to say."""
-        return ""
-
-    @property
-    def whole_name(self) -> str:
-        """What is shown where it is all frames, such as a maximum projection; empty where it is one."""
-        return ""
-
-    def describe_frame(self, number: int) -> str:
-        """Say in a few words what frame `number` is, beyond its time, if anything."""
-        return ""
-
-    def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
-        """Return pictures of frame `number`, or of a transient's gate, by name: "streak",
-        "intensity", "depth" (m, NaN where there is none).
+    def pictures(self, number: int) -> Mapping[str, Picture]:
+        """Return pictures of frame `number` by name: "streak", "intensity", "depth" (m, NaN where
+        there is none).
         """
         return {}
 
-    def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform | None:
-        """Return the signal of a pixel (row, column) in frame `number`, None where it is not known."""
-        return None
-
-    def refocus(self, number: int, shear: float, gate: Gate) -> View:
-        """Recover the frames of a gate once more, at another shear, pixels per view step."""
-        raise InputError(f"{self.title} holds no measurements, so it cannot be refocused")
-
-    def surface(self) -> TriangleMesh | None:
-        """Return the surface to draw instead of points, None where points are shown."""
+    def waveform(self, number: int, pixel: tuple[int, int]) -> FloatArray | None:
+        """Return times of flight, s, and the counts of a pixel (row, column) in frame `number`, (2,
+        n); None where they are not known.
+        """
         return None
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
         """Let go of files and instruments."""
 
 
-NO_TIME_ZERO_NOTE = "no time zero: ranges are right up to a constant (--time-zero-ns)"
-LINEAR_NOTE = "quick look (linear): --method tv shows it sharper"
-LINEAR_FRAMES_NOTE = "quick look (linear): tofclip recover --method tv gives sharper frames"
-
-
-def list_camera_notes(camera: Camera) -> tuple[str, ...]:
-    """Return what has to be said about ranges that a camera measured: without a time zero all of them
-    are off by one constant.
+def make_cloud(xyz: NDArray[Any], known: Mapping[str, NDArray[Any]] | None = None) -> PointCloud:
+    """Make a cloud of positions (n, 3), m; columns that are not known follow from them, or are 0.
+    ``"brightness"`` counts as intensity.
     """
-    return (NO_TIME_ZERO_NOTE,) if camera.time_zero == 0 else ()
-
-
-def make_empty_cloud() -> PointCloud:
-    """Return a cloud without points."""
-    empty: Any = np.empty(0, np.float32)
-    return PointCloud(
-        np.empty((0, 3), np.float32), empty, empty, empty, np.empty(0, np.uint8), empty
-    )
+    known, distance = known or {}, np.linalg.norm(xyz, axis=1)
+    nothing = np.zeros(len(distance), np.float32)
+    columns: dict[str, Any] = {
+        "intensity": known.get("intensity", known.get("brightness", nothing)),
+        # Files of earlier versions call it confidence.
+        "range_sigma": known.get("range_sigma", known.get("confidence", nothing)),
+        "range": known.get("range", distance),
+        "return_number": known.get("return_number", np.ones(len(distance), np.uint8)),
+        "time": known.get("time", 2 * distance / SPEED_OF_LIGHT),  # light travels the range twice
+        **{name: known[name] for name in OPTIONAL_COLUMNS if name in known},
+    }
+    return PointCloud(xyz=xyz, **columns)

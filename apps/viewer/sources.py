@@ -1,5 +1,5 @@
-"""What can be looked at: clouds in files; the recovered frames of one shot, refocused at any shear;
-raw shots, recovered as they are looked at, from files or while they come in; hidden volumes.
+"""Sources: clouds in files; hidden volumes; the recovered frames of one shot, refocused at any shear;
+raw shots, recovered as they are looked at, from files or while they come in.
 """
 
 from __future__ import annotations
@@ -16,39 +16,34 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apps.verbs.photons import DEFAULT_FIELD_OF_VIEW_DEG
 from apps.viewer.source import (
-    LINEAR_FRAMES_NOTE,
-    LINEAR_NOTE,
-    Capabilities,
-    DisplayModes,
+    NO_LIMITS,
+    Choice,
     FloatArray,
-    Gate,
     Inflow,
+    Picture,
+    Setting,
     Source,
     TriangleMesh,
     View,
-    Waveform,
-    list_camera_notes,
+    make_cloud,
 )
 from devices.transients import TrackedShots
-from nlos import Volume
 from tofclip.camera import Camera, Rectifier
 from tofclip.errors import FileFormatError, InputError, TofclipError
 from tofclip.files import format_error_line
 from tofclip.lidar import Detection, PointCloud, Returns, depth, point_cloud
-from tofclip.lidar.cloud import OPTIONAL_COLUMNS
 from tofclip.lidar.export import read_table
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.photons import make_pinhole
-from tofclip.lidar.processing import select_points
 from tofclip.lidar.significance import SCENE_BRIGHTNESS_QUANTILE
-from tofclip.loading import load, outline
+from tofclip.loading import CLOUD_SUFFIXES, load
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
@@ -57,70 +52,15 @@ from tofclip.solvers import LinearInverse, Method
 from tofclip.storage import Record
 from tofclip.units import SPEED_OF_LIGHT
 
-Readings = NDArray[np.float32]
+if TYPE_CHECKING:
+    from apps.verbs.nlos_stream import VolumeStream
+    from nlos import Volume
 
-SHEAR_LIMITS = (-3.0, 3.0)  # pixels per view step between which a picture can be refocused
-# of the strongest return of its pixel; weaker ones before it are mostly rays, which would hide it
-MIN_PIXEL_SHARE = 0.3
-MIN_FRAMES = 3  # without a neighbour on either side no return is located
-
-
-class ShotRecovery:
-    """Turns the measurements of one camera into frames, at any shear. `times` (frames,): time of
-    flight of each column of measurements, s. By default the linear inverse: one operator and one
-    matrix (columns, columns) for each of the last 16 shears, which every recovery of this process
-    shares. Safe to share by threads.
-    """
-
-    def __init__(self, camera: Camera, times: FloatArray, method: Method | None = None) -> None:
-        self.camera, self.times = camera, times
-        self.method: Method = LinearInverse() if method is None else method
-        self._cached_camera = get_cached_camera(camera)
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether frames are a quick look, by the linear inverse."""
-        return isinstance(self.method, LinearInverse)
-
-    def frames(self, measurements: Readings, shear: float, gate: Gate) -> Frames:
-        """Recover the frames of a gate from the rectified measurements (columns, frames) of a shot."""
-        part = np.ascontiguousarray(measurements[:, gate.frames])
-        if self.is_linear:
-            # Rounded, because sliders give numbers that differ by rounding only.
-            operator = self._cached_camera.operator(round(shear, 6))
-            inverse = prepare_inverse(LinearInverse(), operator, ~self.camera.dead_columns)
-            found = inverse.recover(part).frames
-        elif part.max(initial=0.0) > 0:
-            valid = np.broadcast_to(~self.camera.dead_columns[:, np.newaxis], part.shape)
-            found = self.method.recover(self.camera.operator(shear), part, valid).frames
-        else:  # a dark gate has no brightest frame to set a prior's weight by
-            found = np.zeros((part.shape[1], *self.camera.image_shape), np.float32)
-        times = self.times[gate.frames]
-        return Frames(found, times, self.camera, shears=np.full(times.size, shear))
-
-    def view(
-        self, measurements: Readings, shear: float, gate: Gate, least_intensity: float = 0.0
-    ) -> View:
-        """Recover the frames of a gate and locate their returns. `least_intensity`, counts,
-        referred to 1 m: weaker returns are left out: a threshold relative to the gate would find
-        noise in a dark one.
-        """
-        first = max(0, min(gate.first, self.times.size - MIN_FRAMES))
-        widened = Gate(first, max(gate.stop, first + MIN_FRAMES))
-        view = make_view(depth(self.frames(measurements, shear, widened)))
-        return view if least_intensity <= 0 else select_brighter(view, least_intensity)
-
-
-def list_recovery_notes(recovery: ShotRecovery) -> tuple[str, ...]:
-    """Return what has to be said about clouds that were recovered while one looks."""
-    quick = (LINEAR_NOTE,) if recovery.is_linear else ()
-    return quick + list_camera_notes(recovery.camera)
-
-
-def make_view(returns: Returns, cloud: PointCloud | None = None) -> View:
-    """Return the points of returns and which pixel saw them; `cloud`: of these, where it is known."""
-    points = point_cloud(returns) if cloud is None else cloud
-    return View(points, np.stack([returns.y, returns.x], axis=-1))
+CLOUD_RATE_HZ = SHOT_RATE_HZ = 10.0
+MAX_CACHED_CLOUDS, MAX_CACHED_VIEWS, MAX_CACHED_SHOTS = 32, 16, 32
+MIN_PIXEL_FRACTION = (
+    0.3  # of the strongest return of a pixel; weaker ones before it hide it as rays
+)
 
 
 def find_min_intensity(whole: PointCloud) -> float:
@@ -133,31 +73,17 @@ def find_min_intensity(whole: PointCloud) -> float:
     return scene * Detection().min_scene_fraction
 
 
-def select_brighter(view: View, intensity: float) -> View:
-    """Return the points with a minimum number of counts."""
-    return _select(view, view.cloud.intensity >= intensity)
-
-
 def leave_out_rays(view: View) -> View:
     """Return a view without dim points: of the whole scene, and beside a brighter one of their
     pixel.
     """
-    found = select_brighter(view, find_min_intensity(view.cloud))
-    if found.pixels is None or len(found.cloud) == 0:
-        return found
-    strongest = np.zeros(found.pixels.max(axis=0) + 1, np.float32)
-    row, column = found.pixels.T
-    np.maximum.at(strongest, (row, column), found.cloud.intensity)
-    return _select(found, found.cloud.intensity >= MIN_PIXEL_SHARE * strongest[row, column])
-
-
-def _select(view: View, kept: NDArray[np.bool_]) -> View:
-    return View(select_points(view.cloud, kept), None if view.pixels is None else view.pixels[kept])
-
-
-CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57")
-CLOUD_RATE_HZ = 10.0
-MAX_CACHED_CLOUDS = 32
+    bright = view.select(view.cloud.intensity >= find_min_intensity(view.cloud))
+    if bright.pixels is None or len(bright.cloud) == 0:
+        return bright
+    strongest = np.zeros(bright.pixels.max(axis=0) + 1, np.float32)
+    row, column = bright.pixels.T
+    np.maximum.at(strongest, (row, column), bright.cloud.intensity)
+    return bright.select(bright.cloud.intensity >= MIN_PIXEL_FRACTION * strongest[row, column])
 
 
 class CloudSource(Source):
@@ -165,12 +91,8 @@ class CloudSource(Source):
 
     def __init__(self, title: str, paths: Sequence[Path]) -> None:
         super().__init__(title, CLOUD_RATE_HZ, frame_name="cloud")
-        self._paths = list(paths)
-        self._read = functools.lru_cache(MAX_CACHED_CLOUDS)(
-            lambda number: View(read_cloud(self._paths[number]))
-        )
-        if not self._paths:
-            raise InputError(f"{title}: there is no cloud to show")
+        self._paths = paths
+        self._read = functools.lru_cache(MAX_CACHED_CLOUDS)(read_cloud)
         cloud = self.view(0).cloud
         # Of a cloud of this program: the dim rays that few views leave around bright things would
         # hide the others. What intensities of other programs mean is not known.
@@ -180,82 +102,238 @@ class CloudSource(Source):
     def __len__(self) -> int:
         return len(self._paths)
 
-    def describe_frame(self, number: int) -> str:
-        """Name the file of cloud `number`."""
-        return self._paths[number].name if len(self._paths) > 1 else ""
-
     def view(self, number: int) -> View:
-        return self._read(number)
-
-
-def find_clouds(folder: Path) -> list[Path]:
-    """Return the files of a folder that are clouds by their names, in order."""
-    return sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in CLOUD_SUFFIXES and path.name[0] != "."
-    )
+        path = self._paths[number]
+        return View(self._read(path), text=path.name if len(self) > 1 else "")
 
 
 def read_cloud(path: Path) -> PointCloud:
-    """Read a cloud of this program, or another's table of points with at least x, y and z in
-    metres.
+    """Read a cloud or a picture of ranges of this program, or another's table of points with at
+    least x, y and z in metres.
     """
-    if path.suffix.lower() == ".h5":
-        return PointCloud.load(path)
-    record = None if path.suffix.lower() not in (".npz", ".exr") else outline(path)
-    if record is not None and record.kind in ("range image", "depth picture"):
-        return _place_pixels(load(path))
-    table = read_table(path)
-    if missing := [axis for axis in "xyz" if axis not in table]:
-        raise FileFormatError(path, f"has no column '{missing[0]}', so it is not a point cloud")
-    xyz = np.stack([table[axis] for axis in "xyz"], axis=-1)
-    return make_cloud(xyz[np.all(np.isfinite(xyz), axis=1)] if len(table) == 3 else xyz, table)
-
-
-def _place_pixels(picture: Record) -> PointCloud:
-    """Points of a picture that does not say its camera, seen by a pinhole of the field of view that
-    `tofclip lidar photons` takes where none is given: ranges are the file's, widths are not.
-    """
-    fields = {name: one.values for name, one in picture.fields.items()}
+    try:
+        content = load(path)
+    except FileFormatError:  # a table of another program may have fewer columns
+        if path.suffix.lower() not in CLOUD_SUFFIXES:
+            raise
+        table = read_table(path)
+        if missing := [axis for axis in "xyz" if axis not in table]:
+            raise FileFormatError(
+                path, f"has no column '{missing[0]}', so it is not a point cloud"
+            ) from None
+        xyz = np.stack([np.ravel(table.pop(axis)) for axis in "xyz"], axis=-1)
+        there = np.isfinite(xyz).all(axis=1)
+        return make_cloud(xyz[there], {name: np.ravel(one)[there] for name, one in table.items()})
+    if isinstance(content, PointCloud):
+        return content
+    if not isinstance(content, Record):
+        raise FileFormatError(path, "is not a point cloud")
+    fields = {name: one.values for name, one in content.fields.items()}
     distance = fields["range_m"] if "range_m" in fields else fields.get("Z")
     if distance is None or distance.ndim != 2:
-        raise FileFormatError(picture.origin, "has no picture of ranges or depths to show")
+        raise FileFormatError(path, "has no picture of ranges or depths to show")
+    # The picture does not say its camera: a pinhole of the field of view that `tofclip lidar photons`
+    # takes where none is given sees ranges as they are, widths maybe not.
     rows, columns = np.nonzero(np.isfinite(distance) & (distance > 0))
     focal_length_px = distance.shape[1] / 2 / np.tan(np.deg2rad(DEFAULT_FIELD_OF_VIEW_DEG) / 2)
     camera = make_pinhole(distance.shape, float(focal_length_px), 1e-10)
     rays = compute_ray_directions(camera, rows, columns)
-    rays /= rays[:, 2:] if "range_m" not in fields else 1
+    rays /= 1 if "range_m" in fields else rays[:, 2:]
     brightness = fields.get("intensity", fields.get("Y", np.ones_like(distance)))
-    return make_cloud(
-        distance[rows, columns, np.newaxis] * rays, {"intensity": brightness[rows, columns]}
-    )
+    xyz = distance[rows, columns, np.newaxis] * rays
+    return make_cloud(xyz, {"intensity": brightness[rows, columns]})
 
 
-def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) -> PointCloud:
-    """Make a cloud of positions (n, 3), m; columns that are not known follow from them, or are 0.
-    ``"brightness"`` counts as intensity.
+VOXEL_MODE, SURFACE_MODE, SLICE_MODE = "voxels", "surface", "slices"
+PROJECTION_MODE = "maximum projection"
+THRESHOLD_HINT = "share of the brightest voxel below which nothing is shown"
+VOLUME_PLAY_TIME_S = 8.0
+BRIGHT_FRACTION = 0.3  # of the brightest voxel: brighter ones are shown
+
+
+class VolumeSource(Source):
+    """A volume; frame `n` is slice `n` in z, which matters where slices are shown."""
+
+    def __init__(self, title: str, volume: Volume) -> None:
+        rate = max(1.0, volume.grid.z.size / VOLUME_PLAY_TIME_S)
+        can_have_surface = min(volume.grid.shape) > 1 and bool(volume.magnitude.any())
+        surface = (SURFACE_MODE,) if can_have_surface else ()
+        modes = (PROJECTION_MODE, VOXEL_MODE, *surface, SLICE_MODE)
+        self.mode = Choice("show as", modes, PROJECTION_MODE)
+        self.threshold = Setting("threshold", 0.02, 0.98, 0.01, BRIGHT_FRACTION, THRESHOLD_HINT)
+        super().__init__(title, rate, frame_name="slice", settings=(self.mode, self.threshold))
+        self.volume = volume
+        self._magnitude = volume.magnitude.astype(np.float32)
+        self._make_view = functools.lru_cache(1)(self._make_view_of)
+
+    def __len__(self) -> int:
+        return int(self.volume.grid.z.size)
+
+    def view(self, number: int) -> View:
+        mode = self.mode.value
+        if mode == SLICE_MODE:
+            view = self._make_view(mode, self.threshold.value, number)
+            return replace(view, text=f"z {self.volume.grid.z[number]:.3f} m")
+        text = f"of all {len(self)} slices"
+        view = self._make_view(mode, self.threshold.value, 0)
+        return replace(view, whole_name=mode, text=text, caption=f"{mode} {text}")
+
+    def pictures(self, number: int) -> Mapping[str, Picture]:
+        projection = self.volume.maximum_projection()
+        bright = projection.brightness >= self.threshold.value * self._magnitude.max()
+        is_slice = self.mode.value == SLICE_MODE
+        return {
+            "intensity": self._magnitude[number] if is_slice else projection.brightness,
+            "depth": np.where(bright, projection.depth, np.nan).astype(np.float32),
+        }
+
+    def _make_view_of(self, mode: str, threshold: float, number: int) -> View:
+        if mode == SURFACE_MODE:
+            mesh = self.volume.surface(min(max(threshold, 0.01), 0.99))
+            light = np.ones(len(mesh.vertices), np.float32)
+            surface = TriangleMesh(mesh.vertices, mesh.faces)
+            return View(_place_behind_wall(mesh.vertices, light), surface=surface)
+        bright = (self._magnitude >= threshold * self._magnitude.max()) & (self._magnitude > 0)
+        if mode == SLICE_MODE:
+            bright[:] = False
+            bright[number] = True  # all of it: a slice shows the dark as well
+        elif mode == PROJECTION_MODE:
+            front = np.zeros_like(bright)
+            np.put_along_axis(front, self._magnitude.argmax(axis=0)[np.newaxis], True, axis=0)
+            bright &= front
+        z, y, x = np.nonzero(bright)
+        grid = self.volume.grid
+        xyz = np.stack([grid.x[x], grid.y[y], grid.z[z]], axis=-1)
+        return View(_place_behind_wall(xyz, self._magnitude[z, y, x]))
+
+
+def _place_behind_wall(xyz: NDArray[Any], brightness: NDArray[Any]) -> PointCloud:
+    """A cloud whose ranges are depths behind the wall: more useful than distances from the origin."""
+    cloud = make_cloud(xyz, {"brightness": brightness})
+    return replace(cloud, range=cloud.xyz[:, 2])
+
+
+class VolumeStreamSource(Source):
+    """The newest volume of a stream that has one; every volume is a frame, the last one is kept."""
+
+    def __init__(self, title: str, stream: VolumeStream) -> None:
+        super().__init__(title, 1.0, frame_name="volume")
+        self._stream = stream
+
+    def __len__(self) -> int:
+        return max(self._stream.delivered, 1)
+
+    @property
+    def inflow(self) -> Inflow:
+        stream, oldest = self._stream, len(self) - 1
+        is_live = not stream.ended.is_set()
+        return Inflow(oldest, is_live, latency=stream.latency, lost=stream.failed)
+
+    def view(self, number: int) -> View:
+        xyz, brightness = self._stream.latest[-1].points(BRIGHT_FRACTION)
+        return View(make_cloud(xyz, {"brightness": np.asarray(brightness)}))
+
+
+NO_TIME_ZERO_NOTE = "no time zero: ranges are right up to a constant (--time-zero-ns)"
+LINEAR_NOTE = "quick look (linear): --method tv shows it sharper"
+LINEAR_FRAMES_NOTE = "quick look (linear): tofclip recover --method tv gives sharper frames"
+
+Readings = NDArray[np.float32]  # rectified measurements of a shot, (columns, frames)
+SHEAR_LIMITS = (-3.0, 3.0)  # pixels per view step between which a picture can be refocused
+SHEAR_HINT = "recovers the gate once more, at this shear in pixels per view step; 0: as it was"
+MIN_FRAMES = 3  # without a neighbour on either side no return is located
+ALL_FRAMES = slice(None)
+
+
+class ShotRecovery:
+    """Turns measurements of one camera into frames, at any shear. `times` (frames,): time of flight
+    of each column of measurements, s; `method`: by default the linear inverse: one operator and one
+    matrix (columns, columns) for each of the last 16 shears, which every recovery of this process
+    shares. Safe to share by threads.
     """
-    known = known or {}
-    distance = np.linalg.norm(xyz, axis=1)
-    nothing = np.zeros(len(xyz), np.float32)
-    columns: dict[str, Any] = {
-        "intensity": known.get("intensity", known.get("brightness", nothing)),
-        # Files of earlier versions call it confidence.
-        "range_sigma": known.get("range_sigma", known.get("confidence", nothing)),
-        "range": known.get("range", distance),
-        "return_number": known.get("return_number", np.ones(len(xyz), np.uint8)),
-        # Light travels the range twice.
-        "time": known.get("time", 2 * distance / SPEED_OF_LIGHT),
-        **{name: known[name] for name in OPTIONAL_COLUMNS if name in known},
-    }
-    return PointCloud(xyz=xyz, **columns)
+
+    def __init__(self, camera: Camera, times: FloatArray, method: Method | None = None) -> None:
+        self.camera, self.times = camera, times
+        self.method: Method = LinearInverse() if method is None else method
+        self.is_linear = isinstance(self.method, LinearInverse)  # a quick look
+        self._cached_camera = get_cached_camera(camera)
+
+    def frames(
+        self, measurements: Readings, shear: float = 0.0, gate: slice = ALL_FRAMES
+    ) -> Frames:
+        """Recover the frames of a gate."""
+        part = np.ascontiguousarray(measurements[:, gate])
+        if self.is_linear:
+            # Rounded, because sliders give numbers that differ by rounding only.
+            operator = self._cached_camera.operator(round(shear, 6))
+            inverse = prepare_inverse(LinearInverse(), operator, ~self.camera.dead_columns)
+            values = inverse.recover(part).frames
+        elif part.max(initial=0.0) > 0:
+            valid = np.broadcast_to(~self.camera.dead_columns[:, np.newaxis], part.shape)
+            values = self.method.recover(self.camera.operator(shear), part, valid).frames
+        else:  # a dark gate has no brightest frame to set a prior's weight by
+            values = np.zeros((part.shape[1], *self.camera.image_shape), np.float32)
+        times = self.times[gate]
+        return Frames(values, times, self.camera, shears=np.full(times.size, shear))
+
+    def view(self, measurements: Readings, shear: float, gate: slice = ALL_FRAMES) -> View:
+        """Recover the frames of a gate and locate their returns."""
+        first, stop, _ = gate.indices(self.times.size)
+        first = max(0, min(first, self.times.size - MIN_FRAMES))
+        widened = slice(first, max(stop, first + MIN_FRAMES))
+        return make_view(depth(self.frames(measurements, shear, widened)))
+
+
+class RecoveredSource(Source):
+    """Light over time that one camera measured, from which frames can be recovered at any shear."""
+
+    def __init__(self, title: str, rate: float, recovery: ShotRecovery) -> None:
+        super().__init__(title, rate)
+        self.recovery = recovery
+        self.refocus = Setting("refocus", *SHEAR_LIMITS, 0.1, 0.0, SHEAR_HINT)
+        self.settings = (self.refocus,) if recovery.camera.views > 1 else ()
+        # Without a time zero all ranges are off by one constant.
+        self.notes = (NO_TIME_ZERO_NOTE,) if recovery.camera.time_zero == 0 else ()
+
+    @abc.abstractmethod
+    def measurements(self, number: int) -> Readings:
+        """Return the rectified measurements of a shot."""
+
+    def recover_frames(self, number: int) -> Frames:
+        """Return all frames of shot `number`."""
+        return self.recovery.frames(self.measurements(number))
+
+    def waveform(self, number: int, pixel: tuple[int, int]) -> FloatArray:
+        frames, (row, column) = self.recover_frames(number), pixel
+        return np.stack([frames.times, frames.values[:, row, column]])
+
+
+def make_view(returns: Returns, cloud: PointCloud | None = None) -> View:
+    """Return the points of returns and which pixel saw them; `cloud`: of these, where it is known."""
+    points = point_cloud(returns) if cloud is None else cloud
+    return View(points, np.stack([returns.y, returns.x], axis=-1))
+
+
+def render_depth(view: View, shape: tuple[int, int]) -> Picture:
+    """Return the range of each pixel's most intense return, m; NaN where nothing came back."""
+    picture = np.full(shape, np.nan, np.float32)
+    if view.pixels is not None:
+        upwards = np.argsort(view.cloud.intensity, kind="stable")  # the last one written wins
+        row, column = view.pixels[upwards].T
+        picture[row, column] = view.cloud.range[upwards]
+    return picture
 
 
 TRANSIENT_PLAY_TIME_S = 12.0  # a whole transient at natural speed
+# which points of a transient are shown: those of light that has come back by now, comes back now,
+# or ever does
+GATE_UP_TO_FRAME, GATE_AROUND_FRAME = "up to the frame", "around the frame"
+GATE_ALL_TIMES = "all times"
+GATE_HINT = "which points of the transient are shown: those whose light has come back by the current frame, ..."
+HALF_GATE_HINT = "frames before and after the current one, for 'around the frame'"
 
 
-class TransientSource(Source):
+class TransientSource(RecoveredSource):
     """Recovered frames: frame `n` of the source is instant `n`; the cloud is that of all instants.
 
     Refocusing needs measurements. Where they are not at hand, as with a file of frames,
@@ -273,52 +351,76 @@ class TransientSource(Source):
         measurements: Readings | None = None,
         method: Method | None = None,
     ) -> None:
-        shears = SHEAR_LIMITS if frames.camera.views > 1 else None
-        capabilities = Capabilities(frames.times, shears)
-        super().__init__(title, frames.times.size / TRANSIENT_PLAY_TIME_S, capabilities)
-        self.frames = frames
-        self._recovery = ShotRecovery(frames.camera, frames.times, method)
-        self.notes = list_camera_notes(frames.camera)
-        if measurements is not None:
-            self.notes = list_recovery_notes(self._recovery)
-        elif frames.figures.get("method") == LinearInverse.name:
+        rate = frames.times.size / TRANSIENT_PLAY_TIME_S
+        super().__init__(title, rate, ShotRecovery(frames.camera, frames.times, method))
+        self.times = frames.times
+        self.frames, self._measured = frames, measurements
+        if measurements is not None and self.recovery.is_linear:
+            self.notes = (LINEAR_NOTE, *self.notes)
+        elif measurements is None and frames.figures.get("method") == LinearInverse.name:
             self.notes = (LINEAR_FRAMES_NOTE, *self.notes)
-        self._measured = measurements
+        modes = (GATE_UP_TO_FRAME, GATE_AROUND_FRAME, GATE_ALL_TIMES)
+        self.gate = Choice("time gate", modes, GATE_UP_TO_FRAME, GATE_HINT)
+        self.half_gate = Setting("half gate", 1, 200, 1, 12, HALF_GATE_HINT)
+        self.settings = (self.gate, self.half_gate, *self.settings)
+        self._refocus = functools.lru_cache(1)(self._refocus_gate)
 
     def __len__(self) -> int:
         return int(self.frames.times.size)
 
+    def find_gate(self, number: int) -> range:
+        """Return the frames whose points are shown."""
+        half, count = int(self.half_gate.value), len(self)
+        if self.gate.value == GATE_AROUND_FRAME:
+            return range(max(0, number - half), min(count, number + half + 1))
+        return range(number + 1 if self.gate.value == GATE_UP_TO_FRAME else count)
+
     def view(self, number: int) -> View:
-        return self._full_view
+        gate, every = self.find_gate(number), range(len(self))
+        # Only a gate around the frame changes with it; else all instants are recovered once.
+        recovered = gate if self.gate.value == GATE_AROUND_FRAME else every
+        shear = self.refocus.value
+        view = self._refocus(shear, recovered) if shear else self._whole_view
+        times, limits = self.frames.times, NO_LIMITS
+        if gate != every:
+            half = (times[-1] - times[0]) / (2 * max(1, times.size - 1))
+            first = times[gate.start] - half if gate.start > 0 else -np.inf
+            limits = float(first), float(times[gate.stop - 1] + half)
+        return replace(
+            view,
+            times=limits,
+            time=float(times[number]),
+            caption=f"all {gate.stop} frames"
+            if gate == every
+            else f"frames {gate.start} to {gate.stop - 1}",
+            notes=(LINEAR_NOTE,) if shear and self.recovery.is_linear else (),
+        )
+
+    def measurements(self, number: int) -> Readings:
+        return self._measurements
 
     def recover_frames(self, number: int) -> Frames:
-        """Return the frames of the one shot that there is."""
         return self.frames
 
-    def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
-        distance = np.maximum(self.frames.times[gate.frames], 0) * SPEED_OF_LIGHT / 2
+    def pictures(self, number: int) -> Mapping[str, Picture]:
+        gate = self.find_gate(number)
+        frames = slice(gate.start, gate.stop)
+        distance = np.maximum(self.frames.times[frames], 0) * SPEED_OF_LIGHT / 2
         # As the intensity of a point, referred to 1 m: far objects would be lost beside near ones.
-        light = np.tensordot((distance**2).astype(np.float32), self.frames.values[gate.frames], 1)
+        light = np.tensordot((distance**2).astype(np.float32), self.frames.values[frames], 1)
         return {
             "streak": self._measurements.T,
             "intensity": light,
-            "depth": render_depth(self._full_view, self.frames.camera.image_shape),
+            "depth": render_depth(self._whole_view, self.recovery.camera.image_shape),
         }
 
-    @property
-    def refocus_note(self) -> str:
-        return LINEAR_NOTE if self._recovery.is_linear else ""
-
-    def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
-        row, column = pixel
-        return Waveform(self.frames.times, self.frames.values[:, row, column])
-
-    def refocus(self, number: int, shear: float, gate: Gate) -> View:
-        least = find_min_intensity(self._full_view.cloud)
-        return self._recovery.view(self._measurements, shear, gate, least)
+    def _refocus_gate(self, shear: float, gate: range) -> View:
+        view = self.recovery.view(self._measurements, shear, slice(gate.start, gate.stop))
+        # a threshold relative to the gate would find noise in a dark one
+        return view.select(view.cloud.intensity >= find_min_intensity(self._whole_view.cloud))
 
     @cached_property
-    def _full_view(self) -> View:
+    def _whole_view(self) -> View:
         # Surfaces were found with their points; frames are searched for theirs.
         if self.frames.returns is not None:
             return make_view(self.frames.returns)
@@ -327,9 +429,7 @@ class TransientSource(Source):
 
     @cached_property
     def _measurements(self) -> Readings:
-        """What the camera read or would read, (columns, frames); neighbouring frames of one shear
-        share an operator.
-        """
+        """What the camera read or would read; neighbouring frames of one shear share an operator."""
         if self._measured is not None:
             return self._measured
         frames, shears = self.frames, self.frames.shears
@@ -337,92 +437,47 @@ class TransientSource(Source):
         cuts = np.flatnonzero(np.concatenate([[True], np.diff(shears) != 0, [True]]))
         for first, stop in pairwise(cuts.tolist()):
             operator = frames.camera.operator(float(shears[first]))
-            measurements[:, first:stop] = operator(
-                np.ascontiguousarray(np.moveaxis(frames.values[first:stop], 0, -1))
-            )
+            values = np.ascontiguousarray(np.moveaxis(frames.values[first:stop], 0, -1))
+            measurements[:, first:stop] = operator(values)
         return measurements
 
 
-def render_depth(view: View, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Return the range of each pixel's most intense return, m; NaN where nothing came back."""
-    picture = np.full(shape, np.nan, np.float32)
-    if view.pixels is not None:
-        upwards = np.argsort(view.cloud.intensity, kind="stable")  # the last one written wins
-        row, column = view.pixels[upwards].T
-        picture[row, column] = view.cloud.range[upwards]
-    return picture
-
-
-SHOT_RATE_HZ = 10.0
-MAX_CACHED_VIEWS = 16
-
-
-class ShotSource(Source):
+class ShotSource(RecoveredSource):
     """Shots of one camera, wherever they come from; frame `n` is the cloud of shot `n`. `row_times`
-    (rows,): instant of each row, s; `method`: the linear inverse by default.
+    (rows,): instant of each row, s.
     """
 
     def __init__(
-        self,
-        title: str,
-        camera: Camera,
-        row_times: NDArray[np.float64],
-        method: Method | None = None,
+        self, title: str, camera: Camera, row_times: FloatArray, method: Method | None = None
     ) -> None:
-        self.recovery = ShotRecovery(camera, row_times - camera.time_zero, method)
-        super().__init__(
-            title,
-            SHOT_RATE_HZ,
-            Capabilities(shears=SHEAR_LIMITS if camera.views > 1 else None),
-            frame_name="shot",
-            notes=list_recovery_notes(self.recovery),
-        )
+        recovery = ShotRecovery(camera, row_times - camera.time_zero, method)
+        super().__init__(title, SHOT_RATE_HZ, recovery)
+        self.frame_name = "shot"
+        if self.recovery.is_linear:
+            self.notes = (LINEAR_NOTE, *self.notes)
         self._recover_view = functools.lru_cache(MAX_CACHED_VIEWS)(
-            lambda number: self.recovery.view(self.measurements(number), 0.0, self._full_gate)
+            lambda number, shear: self.recovery.view(self.measurements(number), shear)
         )
-
-    @cached_property
-    def rectifier(self) -> Rectifier:
-        """What takes the sweep off a shot."""
-        return Rectifier(self.recovery.camera, self.recovery.times.size)
-
-    @abc.abstractmethod
-    def measurements(self, number: int) -> Readings:
-        """Return the rectified measurements of a shot, (columns, rows)."""
-
-    def rectify(self, streak: Streak) -> Readings:
-        """Take dark level and sweep off a shot."""
-        return self.rectifier.measure(streak.counts, streak.saturated).values
 
     def view(self, number: int) -> View:
-        return self._recover_view(number)
+        return self.view_at(number, self.refocus.value)
 
-    def recover_frames(self, number: int) -> Frames:
-        """Return all frames of shot `number`."""
-        return self.recovery.frames(self.measurements(number), 0.0, self._full_gate)
+    def view_at(self, number: int, shear: float) -> View:
+        """Return the points of shot `number`, recovered at a shear."""
+        return self._recover_view(number, shear)
 
-    def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
+    def pictures(self, number: int) -> Mapping[str, Picture]:
         measurements = self.measurements(number)
         # the 64 frames about the brightest one: a picture of all would cost as much as the cloud
         brightest = int(measurements.sum(axis=0).argmax())
-        about = Gate(max(0, brightest - 32), min(int(self.recovery.times.size), brightest + 32))
-        bright = self.recovery.frames(measurements, 0.0, about)
+        bright = self.recovery.frames(
+            measurements, 0.0, slice(max(0, brightest - 32), brightest + 32)
+        )
         return {
             "streak": measurements.T,
             "intensity": bright.values.sum(axis=0),
-            "depth": render_depth(self.view(number), self.recovery.camera.image_shape),
+            "depth": render_depth(self.view_at(number, 0.0), self.recovery.camera.image_shape),
         }
-
-    def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
-        frames = self.recover_frames(number)
-        return Waveform(frames.times, frames.values[:, pixel[0], pixel[1]].copy())
-
-    def refocus(self, number: int, shear: float, gate: Gate) -> View:
-        return self.recovery.view(self.measurements(number), shear, self._full_gate)
-
-    @property
-    def _full_gate(self) -> Gate:
-        return Gate(0, int(self.recovery.times.size))
 
 
 class StoredShotSource(ShotSource):
@@ -435,149 +490,25 @@ class StoredShotSource(ShotSource):
         camera: Camera,
         method: Method | None = None,
     ) -> None:
-        super().__init__(title, camera, shots[0]().times, method)
+        first = shots[0]()
+        super().__init__(title, camera, first.times, method)
         self._shots = shots
-        self._last: tuple[int, Readings] | None = None
+        rectifier = Rectifier(camera, first.times.size)
+
+        @functools.lru_cache(1)
+        def rectify(number: int) -> Readings:
+            shot = shots[number]()
+            return rectifier.measure(shot.counts, shot.saturated).values
+
+        self._rectify = rectify
 
     def __len__(self) -> int:
         return len(self._shots)
 
     def measurements(self, number: int) -> Readings:
-        if self._last is None or self._last[0] != number:
-            self._last = (number, self.rectify(self._shots[number]()))
-        return self._last[1]
+        return self._rectify(number)
 
 
-VOXEL_MODE, SURFACE_MODE, PROJECTION_MODE, SLICE_MODE = (
-    "voxels",
-    "surface",
-    "maximum projection",
-    "slices",
-)
-VOLUME_PLAY_TIME_S = 8.0
-
-
-class VolumeSource(Source):
-    """A volume; frame `n` is slice `n` in z, which matters where slices are shown."""
-
-    def __init__(self, title: str, volume: Volume) -> None:
-        super().__init__(
-            title, max(1.0, volume.grid.z.size / VOLUME_PLAY_TIME_S), frame_name="slice"
-        )
-        can_have_surface = min(volume.grid.shape) > 1 and bool(volume.magnitude.any())
-        surface = (SURFACE_MODE,) if can_have_surface else ()
-        names = (PROJECTION_MODE, VOXEL_MODE, *surface, SLICE_MODE)
-        self.display_modes = DisplayModes(names, PROJECTION_MODE)
-        self.volume = volume
-        self._magnitude = volume.magnitude.astype(np.float32)
-        self._views: dict[tuple[str, float, int], View] = {}
-
-    def __len__(self) -> int:
-        return int(self.volume.grid.z.size)
-
-    @property
-    def whole_name(self) -> str:
-        return "" if self.display_modes.current == SLICE_MODE else self.display_modes.current
-
-    def describe_frame(self, number: int) -> str:
-        if self.whole_name:
-            return f"of all {len(self)} slices"
-        return f"z {self.volume.grid.z[number]:.3f} m"
-
-    def view(self, number: int) -> View:
-        chosen = self.display_modes.current
-        key = (chosen, self.display_modes.threshold, number if chosen == SLICE_MODE else 0)
-        if key not in self._views:
-            self._views = {key: self._make_view(number)}
-        return self._views[key]
-
-    def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
-        projection = self.volume.maximum_projection()
-        bright = projection.brightness >= self.display_modes.threshold * self._magnitude.max()
-        return {
-            "intensity": self._magnitude[number]
-            if self.display_modes.current == SLICE_MODE
-            else projection.brightness,
-            "depth": np.where(bright, projection.depth, np.nan).astype(np.float32),
-        }
-
-    def surface(self) -> TriangleMesh | None:
-        if self.display_modes.current != SURFACE_MODE:
-            return None
-        mesh = self.volume.surface(min(max(self.display_modes.threshold, 0.01), 0.99))
-        return TriangleMesh(mesh.vertices, mesh.faces)
-
-    def _make_view(self, number: int) -> View:
-        if self.display_modes.current == SURFACE_MODE:
-            mesh = self.surface()
-            vertices = np.empty((0, 3), np.float32) if mesh is None else mesh.vertices
-            return View(self._make_cloud(vertices, np.ones(len(vertices), np.float32)))
-        if self.display_modes.current not in self.display_modes.names:
-            raise InputError(
-                f"a volume is shown as {', '.join(self.display_modes.names)}, not as '{self.display_modes.current}'"
-            )
-        shown = self._select_voxels(number)
-        z, y, x = np.nonzero(shown)
-        grid = self.volume.grid
-        xyz = np.stack([grid.x[x], grid.y[y], grid.z[z]], axis=-1)
-        return View(self._make_cloud(xyz, self._magnitude[z, y, x]))
-
-    def _select_voxels(self, number: int) -> NDArray[np.bool_]:
-        """Which voxels are drawn, (z, y, x)."""
-        bright: NDArray[np.bool_] = (
-            self._magnitude >= self.display_modes.threshold * self._magnitude.max()
-        ) & (self._magnitude > 0)
-        if self.display_modes.current == SLICE_MODE:
-            bright[:] = False
-            bright[number] = True  # all of it: a slice shows the dark as well
-        elif self.display_modes.current == PROJECTION_MODE:
-            front = np.zeros_like(bright)
-            np.put_along_axis(front, self._magnitude.argmax(axis=0)[np.newaxis], True, axis=0)
-            bright &= front
-        return bright
-
-    def _make_cloud(self, xyz: NDArray[Any], brightness: NDArray[Any]) -> PointCloud:
-        cloud = make_cloud(xyz, {"brightness": brightness})
-        # Depth behind the wall is more useful than the distance from the origin of its coordinates.
-        return replace(cloud, range=cloud.xyz[:, 2])
-
-
-BRIGHT_FRACTION = 0.3  # of the brightest voxel: brighter ones are shown
-
-
-class VolumeFeed(Protocol):
-    """What a stream of volumes reports while it runs."""
-
-    latency: float
-    delivered: int
-    failed: int
-    ended: threading.Event
-
-    latest: deque[Volume]  # the newest alone
-
-
-class VolumeStreamSource(Source):
-    """The newest volume of a stream that has one; every volume is a frame, the last one is kept."""
-
-    def __init__(self, title: str, feed: VolumeFeed) -> None:
-        super().__init__(title, 1.0, frame_name="volume")
-        self._feed = feed
-
-    def __len__(self) -> int:
-        return max(self._feed.delivered, 1)
-
-    @property
-    def inflow(self) -> Inflow:
-        feed = self._feed
-        is_live = not feed.ended.is_set()
-        return Inflow(len(self) - 1, is_live, latency=feed.latency, lost=feed.failed)
-
-    def view(self, number: int) -> View:
-        xyz, brightness = self._feed.latest[-1].points(BRIGHT_FRACTION)
-        return View(make_cloud(xyz, {"brightness": np.asarray(brightness)}))
-
-
-MAX_CACHED_SHOTS = 32
 STOP_TIMEOUT_S = 10.0  # for the shot under way and for letting go of the instrument
 RATE_WINDOW_SHOTS = 8  # arrivals over which the data rate is averaged
 
@@ -614,10 +545,10 @@ class LiveShotSource(ShotSource):
         self._count, self._failure_text = 0, ""
         self._latency, self._lost = float("nan"), 0
         self._pipeline = RangingPipeline(camera, first.times)
-        self.rectifier = self._pipeline.rectifier  # knows the sweep already
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._ended = False
-        measurements = self.rectify(first)
+        rectifier = self._pipeline.rectifier
+        measurements = rectifier.measure(first.counts, first.saturated).values
         self._append_entry(measurements, make_view(self._pipeline.find_returns(measurements)))
         self._thread = threading.Thread(target=self._run, name="live shots", daemon=True)
         self._thread.start()
@@ -636,8 +567,8 @@ class LiveShotSource(ShotSource):
             state = (self._latency, self._lost, self._failure_text)
             return Inflow(oldest, not self._ended, rate, *state)
 
-    def view(self, number: int) -> View:
-        return self._find_entry(number)[1]
+    def view_at(self, number: int, shear: float) -> View:
+        return super().view_at(number, shear) if shear else self._find_entry(number)[1]
 
     def measurements(self, number: int) -> Readings:
         return self._find_entry(number)[0]
@@ -677,7 +608,7 @@ class LiveShotSource(ShotSource):
     def _append_entry(self, measurements: Readings, view: View) -> None:
         if not self.recovery.is_linear:
             # seconds of work, meanwhile the newest shot waits and older ones are dropped
-            view = self.recovery.view(measurements, 0.0, self._full_gate)
+            view = self.recovery.view(measurements, 0.0)
         with self._lock:
             self._cache.append((measurements, view))
             self._count += 1

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.viewer.source import FloatArray
 from tofclip.errors import InputError
 
 FIELD_OF_VIEW_RAD = math.radians(35.0)
@@ -21,7 +22,6 @@ SIDEWAYS_TILT_RAD, UPWARD_TILT_RAD = math.radians(-1.0), math.radians(0.8)
 # factor, points are strays, for which the others are not made small
 VIEW_MARGIN, TIP_MARGIN, MAX_TIP = 1.1, 1.02, 1.3
 DOWN = np.array([0.0, 1.0, 0.0])
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -61,17 +61,15 @@ class Viewpoint:
         right, down, depth = self.axes @ (np.asarray(xyz, dtype=np.float64) - self.eye).T
         depth = np.where(depth > 0, depth, np.nan)
         focal = shape[0] / 2 / np.tan(self.field_of_view / 2)
-        return (
-            (shape[0] - 1) / 2 + focal * down / depth,
-            (shape[1] - 1) / 2 + focal * right / depth,
-            depth,
-        )
+        row = (shape[0] - 1) / 2 + focal * down / depth
+        return row, (shape[1] - 1) / 2 + focal * right / depth, depth
 
 
 SCALE_BAR_FRACTION = 0.4  # the scale bar is at most as long as this fraction of the box's width
 # fractions of the box's depth, from its front: little stands before the scale bar, which farther in
 # front would need much of the window, and neither hides the other's words from any side
 SCALE_BAR_DEPTH, Z_MARK_DEPTH = 0.3, 0.85
+EDGES = [(n, n | bit) for bit in (1, 2, 4) for n in range(8) if not n & bit]  # by their corners
 
 
 @dataclass(frozen=True)
@@ -88,24 +86,29 @@ class Box:
         return cls(low, high)
 
     @property
-    def corners(self) -> FloatArray:
-        """Corner n has the larger x, y or z where bit 0, 1 or 2 of n is set, (8, 3)."""
-        bits = (np.arange(8)[:, np.newaxis] >> np.arange(3)) & 1
-        return np.where(bits, self.high, self.low)
+    def middle(self) -> FloatArray:
+        """(3,), m."""
+        return (self.low + self.high) / 2
 
     @property
-    def edges(self) -> list[tuple[int, int]]:
-        """The twelve edges, by their corners."""
-        return [(n, n | bit) for bit in (1, 2, 4) for n in range(8) if not n & bit]
+    def reach(self) -> float:
+        """Half of the diagonal, m."""
+        return float(np.linalg.norm(self.high - self.low)) / 2
+
+    @property
+    def edges(self) -> FloatArray:
+        """Both ends of the twelve edges, (12, 2, 3) in m."""
+        bits = (np.arange(8)[:, np.newaxis] >> np.arange(3)) & 1
+        edges: FloatArray = np.where(bits, self.high, self.low)[np.array(EDGES)]
+        return edges
 
     @property
     def scale_bar(self) -> FloatArray:
         """Ends of a bar of a round length across the floor, near the front, (2, 3) in m."""
         width = float(self.high[0] - self.low[0])
         length = round_length_down(SCALE_BAR_FRACTION * width) if width > 0 else 0.0
-        middle = (self.low + self.high) / 2
         depth = (1 - SCALE_BAR_DEPTH) * self.low[2] + SCALE_BAR_DEPTH * self.high[2]
-        start = np.array([middle[0] - length / 2, self.high[1], depth])
+        start = np.array([self.middle[0] - length / 2, self.high[1], depth])
         return np.stack([start, start + np.array([length, 0.0, 0.0])])
 
     @property
@@ -114,11 +117,9 @@ class Box:
         far side, which is always in the picture, and of the floor close to it.
         """
         (left, ceiling, front), (right, floor, back) = self.low, self.high
-        middle = (self.low + self.high) / 2
+        x, y, _ = self.middle
         near_back = (1 - Z_MARK_DEPTH) * front + Z_MARK_DEPTH * back
-        return np.array(
-            [[middle[0], ceiling, back], [left, middle[1], back], [right, floor, near_back]]
-        )
+        return np.array([[x, ceiling, back], [left, y, back], [right, floor, near_back]])
 
 
 MAX_NEIGHBOUR_POINTS = 20_000  # points among which neighbours are looked for
@@ -143,71 +144,78 @@ def round_length_down(length: float) -> float:
 
 
 def make_presets(xyz: NDArray[np.float32], aspect: float = 1.5) -> dict[str, Viewpoint]:
-    """Return places to look at a cloud from, by name. `xyz` (n, 3): m; not empty; `aspect`: width
-    of the picture over its height. Returns ``"start"`` is `place_viewpoint`'s; ``"front"``,
-    ``"top"`` and ``"side"`` see the whole cloud; ``"camera"`` is where it was taken from.
+    """Return places to look at a cloud (n, 3), m, not empty, from, by name: ``"start"`` is
+    `place_viewpoint`'s; ``"front"``, ``"top"`` and ``"side"`` see the whole cloud; ``"camera"`` is
+    where it was taken from. `aspect`: width of the picture over its height.
     """
     box = Box.around(xyz)
-    middle = (box.low + box.high) / 2
-    reach = float(np.linalg.norm(box.high - box.low)) / 2
     # the narrower side of the picture has to hold the ball around the box
     half_angle = np.arctan(np.tan(FIELD_OF_VIEW_RAD / 2) * min(1.0, aspect))
-    away = VIEW_MARGIN * max(reach, 0.01) / np.sin(half_angle)
+    away = VIEW_MARGIN * max(box.reach, 0.01) / np.sin(half_angle)
     # straight down, no direction would be up on the page
     directions = {"front": (0.0, 0.0, -1.0), "top": (0.0, -1.0, -0.01), "side": (1.0, 0.0, 0.0)}
     views = {"start": place_viewpoint(xyz, aspect)}
-    views |= {
-        name: Viewpoint(middle + away * np.array(towards), middle)
-        for name, towards in directions.items()
-    }
-    if np.linalg.norm(middle) > reach:  # the camera is outside of the cloud
-        camera = Viewpoint(np.zeros(3), middle)
-        wide = max(_fit_field_of_view(camera, one, aspect) for one in (xyz, box.scale_bar))
-        views["camera"] = Viewpoint(np.zeros(3), middle, min(wide, np.deg2rad(120.0)))
+    for name, towards in directions.items():
+        views[name] = Viewpoint(box.middle + away * np.array(towards), box.middle)
+    if np.linalg.norm(box.middle) > box.reach:  # the camera is outside of the cloud
+        wide = _fit_field_of_view(Viewpoint(np.zeros(3), box.middle), xyz, box, aspect)
+        views["camera"] = Viewpoint(np.zeros(3), box.middle, min(wide, np.deg2rad(120.0)))
     return views
 
 
 def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
-    """Return a viewpoint close to the camera's own, the origin, from which a cloud is seen whole.
-    `xyz` (n, 3): m; `aspect`: width of the picture over its height.
+    """Return a viewpoint close to the camera's own, the origin, from which a cloud (n, 3), m, is seen
+    whole. `aspect`: width of the picture over its height.
     """
     if len(xyz) == 0:
         return Viewpoint(np.array([0.0, 0.0, -1.0]), np.zeros(3))
-    low, high = np.percentile(xyz, (0.5, 99.5), axis=0).astype(np.float64)
-    middle = (low + high) / 2
+    box = Box.around(xyz)
+    middle, is_in_front = box.middle, box.low[2] > 0
     away = float(np.linalg.norm(middle))
-    backwards = -middle / away if low[2] > 0 else np.array([0.0, 0.0, -1.0])
+    backwards = -middle / away if is_in_front else np.array([0.0, 0.0, -1.0])
     aside = np.array([np.tan(SIDEWAYS_TILT_RAD), -np.tan(UPWARD_TILT_RAD), 0.0])
     direction = (backwards + aside) / np.linalg.norm(backwards + aside)
     near = Viewpoint(middle + max(away, 1e-3) * direction, middle)
-    if low[2] > 0:
-        # the scale bar may lie lower in the picture than any point
-        bar = Box(low, high).scale_bar
-        found = max(_fit_field_of_view(near, one, aspect) for one in (xyz, bar))
-        if found <= MAX_FIELD_OF_VIEW_RAD:
-            return Viewpoint(near.eye, middle, found)
-    half_width, half_height, half_depth = np.abs(near.axes) @ (
-        (high - low) / 2
-    )  # of the tilted box
+    if (
+        is_in_front
+        and (wide := _fit_field_of_view(near, xyz, box, aspect)) <= MAX_FIELD_OF_VIEW_RAD
+    ):
+        return Viewpoint(near.eye, middle, wide)
+    # of the tilted box
+    half_width, half_height, half_depth = np.abs(near.axes) @ ((box.high - box.low) / 2)
     slope = np.tan(FIELD_OF_VIEW_RAD / 2)
     away = half_depth + VIEW_MARGIN * max(half_height / slope, half_width / (slope * aspect), 0.05)
     far = Viewpoint(middle + away * direction, middle)
     # seen aslant, or with points outside of the box, a cloud is wider than its box from the front
-    wide = max(_fit_field_of_view(far, one, aspect) for one in (xyz, Box(low, high).scale_bar))
-    return Viewpoint(far.eye, middle, max(far.field_of_view, wide))
+    wide = max(FIELD_OF_VIEW_RAD, _fit_field_of_view(far, xyz, box, aspect))
+    return Viewpoint(far.eye, middle, wide)
+
+
+def _fit_field_of_view(viewpoint: Viewpoint, xyz: NDArray[Any], box: Box, aspect: float) -> float:
+    """Return the field of view that holds nearly all points, and the scale bar of the box around
+    them, which may lie lower than any.
+    """
+    fields = []
+    for points in (xyz, box.scale_bar):
+        right, down, depth = np.abs(viewpoint.axes @ (points - viewpoint.eye).T)
+        slopes = np.maximum(down, right / aspect) / np.maximum(depth, 1e-6)
+        # One stray point must not make everything else small: within bounds its tip may be cut off.
+        most, farthest = np.percentile(slopes, (99.5, 100.0))
+        tips = TIP_MARGIN * min(farthest, MAX_TIP * most)
+        fields.append(2 * np.arctan(max(VIEW_MARGIN * most, tips)))
+    return float(max(fields))
 
 
 def move_camera(camera: Any, viewpoint: Viewpoint) -> None:
     """Move a camera of the page, or the one that pages start with, to a viewpoint."""
     camera.position, camera.look_at = viewpoint.eye, viewpoint.target
-    camera.fov = max(viewpoint.field_of_view, float(np.deg2rad(5.0)))
+    camera.fov = max(viewpoint.field_of_view, math.radians(5.0))
 
 
-def _fit_field_of_view(viewpoint: Viewpoint, xyz: NDArray[Any], aspect: float) -> float:
-    """Return the field of view that holds nearly all points."""
-    right, down, depth = np.abs(viewpoint.axes @ (xyz - viewpoint.eye).T)
-    slopes = np.maximum(down, right / aspect) / np.maximum(depth, 1e-6)
-    # One stray point must not make everything else small: within bounds its tip may be cut off.
-    most, farthest = np.percentile(slopes, (99.5, 100.0))
-    tips = TIP_MARGIN * min(farthest, MAX_TIP * most)
-    return float(2 * np.arctan(max(VIEW_MARGIN * most, tips)))
+def aim_plotter(plotter: Any, viewpoint: Viewpoint) -> None:
+    """Turn the camera of a pyvista plotter to a viewpoint."""
+    camera = plotter.camera
+    camera.position, camera.focal_point = viewpoint.eye.tolist(), viewpoint.target.tolist()
+    # VTK turns the picture so that this points up; y of the clouds points down.
+    camera.up, camera.view_angle = (-DOWN).tolist(), math.degrees(viewpoint.field_of_view)
+    plotter.renderer.reset_camera_clipping_range()

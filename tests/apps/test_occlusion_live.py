@@ -83,14 +83,14 @@ def test_a_person_walks_while_one_looks(monkeypatch: pytest.MonkeyPatch) -> None
         assert session.label == "LIVE"
         beside, below = session.pictures(session.frame_at(0.0))
         assert beside == f"{ONE_CAMERA} | {CLIP_GATED}"
-        first = source.pictures(0, session.gate_at(0))[below]
+        first = source.pictures(0)[below]
         width, _ = source.settings
         width.value = 15.0
         until = time.monotonic() + 20
         while len(source) < 4 and time.monotonic() < until:
             time.sleep(0.02)
-        assert "nothing is promised" in source.describe_frame(len(source) - 1)
-        assert not np.allclose(source.pictures(3, session.gate_at(3))[below], first)
+        assert "nothing is promised" in source.view(len(source) - 1).text
+        assert not np.allclose(source.pictures(3)[below], first)
         # Steps come one after the other, each after its wait.
         assert 0.05 <= source.inflow.latency < time.monotonic() - began - 3 * 0.05
     assert not source.inflow.is_live

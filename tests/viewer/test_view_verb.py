@@ -16,10 +16,10 @@ from viewer_scenes import frames, plane, streak
 import tofclip
 from apps.cli import main
 from apps.viewer import still
-from apps.viewer.desktop import DesktopWindow, open_window
 from apps.viewer.page import Page
 from apps.viewer.session import Session
 from apps.viewer.sources import TransientSource
+from apps.viewer.still import DesktopWindow, open_window
 from tofclip.errors import InputError, MissingDependencyError
 from tofclip.recovery import Shot
 
@@ -76,7 +76,7 @@ def test_a_window_without_a_display_says_what_is_missing(
     assert main(["view", str(cloud), "--desktop"]) == 2
     assert "DISPLAY" in capsys.readouterr().err
     monkeypatch.setenv("DISPLAY", ":99")
-    monkeypatch.setattr("apps.viewer.desktop.has_working_graphics", lambda: False)
+    monkeypatch.setattr("apps.viewer.still.has_working_graphics", lambda: False)
     with pytest.raises(MissingDependencyError, match="OpenGL"):
         open_window(Session(TransientSource("frames", frames())))
 
@@ -130,7 +130,7 @@ def test_the_window_follows_its_keys() -> None:
     session = Session(TransientSource("frames", frames()))
     window = DesktopWindow(session, pyvista.Plotter(off_screen=True, window_size=(320, 240)))
     assert window.plotter.screenshot(return_img=True).std() > 1
-    keys = window.keys()
+    keys = window.keys
     keys["Home"]()
     window.update()
     assert session.latest is not None

@@ -24,12 +24,10 @@ from apps.viewer.look import (
     load_palette,
     make_pick,
     make_scale,
-    measure_distance,
 )
 from apps.viewer.panels import mark_times
 from apps.viewer.session import Filters
-from apps.viewer.source import make_empty_cloud
-from apps.viewer.sources import make_cloud
+from apps.viewer.source import make_cloud
 from apps.viewer.viewpoint import (
     SCALE_BAR_DEPTH,
     SCALE_BAR_FRACTION,
@@ -77,7 +75,7 @@ def test_height_counts_upwards_and_time_is_in_nanoseconds() -> None:
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("equalised", [False, True])
 def test_clouds_of_one_value_or_none_have_colours_too(quantity: str, equalised: bool) -> None:
-    for cloud in (make_empty_cloud(), column([2.0, 2.0])):
+    for cloud in (make_cloud(np.empty((0, 3))), column([2.0, 2.0])):
         scale = make_scale(cloud, Colouring(quantity, equalised=equalised))
         assert scale.limits[0] < scale.limits[1]
         assert colour_points(cloud, scale, find_full_light(cloud)).shape == (len(cloud), 3)
@@ -142,7 +140,7 @@ def test_the_point_in_front_is_meant_and_a_miss_means_none() -> None:
     assert find_point_on_ray(cloud.xyz, (0, 0, 1.5), (0, 0, 1)) == 0
     assert find_point_on_ray(cloud.xyz, (0, 0, 4), (0, 0, 1)) is None  # all are behind the eye
     assert find_point_on_ray(cloud.xyz, (0, 0, 0), (0.2, 0, 1)) is None
-    assert find_point_on_ray(make_empty_cloud().xyz, (0, 0, 0), (0, 0, 1)) is None
+    assert find_point_on_ray(make_cloud(np.empty((0, 3))).xyz, (0, 0, 0), (0, 0, 1)) is None
 
 
 def test_what_is_known_about_a_pick() -> None:
@@ -150,7 +148,6 @@ def test_what_is_known_about_a_pick() -> None:
         np.array([[0.3, 0.4, 1.2], [0.0, 0, 0]]), {"range_sigma": np.array([0.002, 0.0])}
     )
     first, second = replace(make_pick(cloud, 0), pixel=(3, 4)), make_pick(cloud, 1)
-    assert measure_distance(first, second) == pytest.approx(1.3)
     assert first.description.splitlines()[:2] == [
         "x 0.3000, y 0.4000, z 1.2000 m",
         "range 1.3000 m ± 2 mm",

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from viewer_scenes import PlaneSource
 
-from apps.viewer.points import MIN_DRAWN_POINTS, DetailChooser, FramePacer, RateCounter
+from apps.viewer.points import MIN_DRAWN_POINTS, DetailChooser, FramePacer
 from apps.viewer.session import Session
 
 
 def test_frames_of_the_last_two_seconds_are_counted() -> None:
-    counter = RateCounter()
+    counter = FramePacer()
     for now in (0.0, 1.0, 1.5, 2.5):
-        counter.add(now)
+        counter.record_sent(now, 1)
     assert counter.per_second(2.6) == 1.5
 
 
@@ -29,15 +29,14 @@ def test_the_slowest_browser_decides_how_many_points_are_drawn() -> None:
     detail = DetailChooser()
     assert detail.count(2_000_000, moving=False) == MIN_DRAWN_POINTS  # nothing is known yet
     assert detail.count(100, moving=True) == 100
-    detail.record(1, 1_000_000, 0.02)
+    detail.points_per_s[1] = 1_000_000 / 0.02
     assert detail.count(2_000_000, moving=True) == 2_000_000
-    detail.record(2, 100_000, 0.1)
+    detail.points_per_s[2] = 100_000 / 0.1
     assert detail.count(2_000_000, moving=False) == 500_000  # in half a second
     assert detail.count(2_000_000, moving=True) == 80_000
-    detail.record(2, 100_000, 1000.0)
+    detail.points_per_s[2] = 100.0
     assert detail.count(2_000_000, moving=True) == MIN_DRAWN_POINTS
-    detail.forget(2)
-    assert not detail.knows(2)
+    del detail.points_per_s[2]
     assert detail.count(2_000_000, moving=False) == 2_000_000
 
 
@@ -57,7 +56,7 @@ def test_a_cloud_is_sent_again_for_clearly_more_or_fewer_points(
     drawn: int, rate: float, worthwhile: bool
 ) -> None:
     detail = DetailChooser()
-    detail.record(1, int(rate), 1.0)
+    detail.points_per_s[1] = rate
     assert detail.is_worthwhile(drawn, 2_000_000) == worthwhile
 
 
@@ -65,7 +64,7 @@ def test_a_large_cloud_is_thinned_while_frames_pass() -> None:
     session = Session(PlaneSource(points=4000))
     session.max_playing_points = 500
     assert len(session.frame_at(0.0).cloud) == 4000
-    session.play()
+    session.clock.play()
     playing = session.frame_at(0.1)
     # drawn by lot with replacement: of 500 about 30 meet another one
     assert 440 < len(playing.cloud) <= 500
@@ -73,5 +72,5 @@ def test_a_large_cloud_is_thinned_while_frames_pass() -> None:
     whole = session.source.view(playing.frame).cloud.xyz
     assert set(map(tuple, playing.cloud.xyz.tolist())) <= set(map(tuple, whole.tolist()))
     assert np.allclose(playing.cloud.xyz.mean(axis=0), whole.mean(axis=0), atol=0.06)
-    session.pause()
+    session.clock.pause()
     assert session.frame_at(0.2).points == len(session.frame_at(0.2).cloud) == 4000

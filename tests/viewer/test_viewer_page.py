@@ -18,8 +18,14 @@ from matplotlib.image import imread
 from viewer_scenes import PlaneSource, frames, volume
 
 from apps.viewer.page import Page, WaitingPage
-from apps.viewer.session import GATE_AROUND_FRAME, Session
-from apps.viewer.sources import SLICE_MODE, SURFACE_MODE, TransientSource, VolumeSource
+from apps.viewer.session import Session
+from apps.viewer.sources import (
+    GATE_AROUND_FRAME,
+    SLICE_MODE,
+    SURFACE_MODE,
+    TransientSource,
+    VolumeSource,
+)
 from apps.viewer.viewpoint import Viewpoint
 from tofclip.lidar import PointCloud
 
@@ -196,7 +202,7 @@ def test_it_loads(seen: Seen) -> None:
     assert seen.tab.title() == "tofclip · frames <b>.h5"
     assert "where you look from is your own" in seen.tab.locator("#shared").inner_text()
     assert seen.tab.get_by_text("10.5 ns").is_visible()  # the time line
-    instant = seen.page.session.source.capabilities.times[95]
+    instant = seen.page.session.source.times[95]
     words = seen.tab.locator("#instant").inner_text()
     assert words == f"{1e9 * instant:.2f} ns, range {299792458 * instant / 2:.3f} m"
     whole = picture(seen)
@@ -371,7 +377,9 @@ def test_refocus(seen: Seen) -> None:
     seen.type("refocus", "1")
     until(lambda: "quick look (linear)" in seen.tab.inner_text("body"), "it says how")
     until(
-        lambda: seen.page.session.shear == 1.0 and seen.page.session.latest is not before,
+        lambda: (
+            seen.page.session.source.refocus.value == 1.0 and seen.page.session.latest is not before
+        ),
         "it is recovered anew",
     )
     after = seen.page.session.latest
@@ -380,7 +388,7 @@ def test_refocus(seen: Seen) -> None:
     assert after.pixels is not None
     assert after.pixels[:, 0].mean() > before.pixels[:, 0].mean() + 1
     seen.type("refocus", "0")
-    until(lambda: seen.page.session.shear is None, "it is as it was")
+    until(lambda: seen.page.session.source.refocus.value == 0, "it is as it was")
 
 
 def test_screenshot_export_and_bookmark(seen: Seen, tmp_path: Path) -> None:
@@ -484,9 +492,7 @@ def test_a_volume_as_a_surface(browser: Any) -> None:
         until(lambda: seen.tab.locator("#depth").inner_text() == "z 0.500 m", "its depth is said")
         seen.choose("show as", SURFACE_MODE)
         seen.type("threshold", "0.6")
-        until(
-            lambda: seen.page.session.source.display_modes.threshold == 0.6, "the threshold is set"
-        )
+        until(lambda: seen.page.session.source.threshold.value == 0.6, "the threshold is set")
         until(lambda: picture(seen).std() > 0.02, "the surface is drawn")
         assert seen.complaints == []
     finally:

@@ -13,8 +13,8 @@ from viewer_scenes import PlaneSource, plane, volume
 
 from apps.viewer import still as stills
 from apps.viewer.session import Session
-from apps.viewer.source import make_empty_cloud
-from apps.viewer.sources import SURFACE_MODE, VolumeSource, make_cloud
+from apps.viewer.source import make_cloud
+from apps.viewer.sources import SURFACE_MODE, VolumeSource
 from apps.viewer.still import (
     BACKGROUND,
     PICTURE_SHAPE_PX,
@@ -72,7 +72,8 @@ def test_near_points_hide_far_ones() -> None:
         assert picture[62:65, 62:65].reshape(-1, 3).tolist() == [[0, 0, 255]] * 9
         assert (picture == BACKGROUND).all(axis=-1).sum() == 101 * 101 - 18
     assert (
-        rasterise_points(make_empty_cloud().xyz, colours[:0], AHEAD, (11, 11), 3) == BACKGROUND
+        rasterise_points(make_cloud(np.empty((0, 3))).xyz, colours[:0], AHEAD, (11, 11), 3)
+        == BACKGROUND
     ).all()
 
 
@@ -124,7 +125,7 @@ def test_a_picture_of_nothing_and_of_a_surface() -> None:
     )
     if has_working_graphics():
         source = VolumeSource("ball", volume())
-        source.display_modes.current = SURFACE_MODE
+        source.mode.value = SURFACE_MODE
         shown = Session(source).frame_at(0.0)
         drawn = PyvistaRenderer().draw(shown, place_viewpoint(shown.cloud.xyz), PICTURE_SHAPE_PX, 3)
         assert (drawn != BACKGROUND).any(axis=-1).mean() > 0.1

@@ -13,8 +13,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from apps.viewer import server as served
-from apps.viewer.guard import Guard, install_guard
-from apps.viewer.server import parse_host, start_server, stop_server
+from apps.viewer.server import Guard, install_guard, parse_host, start_server, stop_server
 from tofclip.errors import InputError, MissingDependencyError
 
 EVIL = "https://evil.example"

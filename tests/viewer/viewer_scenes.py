@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from apps.viewer.source import Gate, Source, View
-from apps.viewer.sources import make_cloud
+from apps.viewer.source import Source, View, make_cloud
 from nlos import Grid, Volume
 from tofclip.camera import Camera, SkewSweep
 from tofclip.lidar import PointCloud
@@ -86,6 +85,3 @@ class PlaneSource(Source):
 
     def view(self, number: int) -> View:
         return View(plane(self._points, 2 + number / 100))
-
-    def refocus(self, number: int, shear: float, gate: Gate) -> View:
-        return View(plane(self._points, 2 + shear))
