@@ -106,11 +106,12 @@ def test_what_touches_a_saturated_pixel_and_dead_columns_are_masked():
     np.testing.assert_array_equal(~measured.valid, np.repeat(dead[:, np.newaxis], ROWS, axis=1))
 
 
+@pytest.mark.parametrize("sweep", [ProjectiveSweep(TURN), skew(-3.17, 4.2)])
 @pytest.mark.parametrize("delay", [0.0, 0.4, -7.3])
-def test_a_sweep_that_moves_light_across_columns_is_undone_bilinearly(delay):
-    turned = camera(sweep=ProjectiveSweep(TURN), dead_columns=np.arange(WIDTH) == 20)
+def test_sweeps_are_undone_bilinearly_however_late_a_shot_is(sweep, delay):
+    turned = camera(sweep=sweep, dead_columns=np.arange(WIDTH) == 20)
     counts, saturated = streak(), np.zeros((ROWS, WIDTH), bool)
-    saturated[35, 30] = True
+    saturated[35, 30] = saturated[50, 31] = True
     rectifier = Rectifier(turned, ROWS)
     found = rectifier.measure(counts, saturated, delay=delay)
     row, column = turned.sweep.raw_position(*np.mgrid[:ROWS, :WIDTH].astype(float))

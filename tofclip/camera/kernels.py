@@ -63,6 +63,25 @@ def sample_rows(counts, dark, raw_row, runs, run_starts, numbers, measurements):
         sample_row(counts, dark, raw_row[row], own, measurements[place])
 
 
+@compile_loop(fastmath=True, _nrt=True)
+def sample_delayed_rows(counts, dark, raw_row, delay, measurements):
+    """Sample rows at ``raw_row + delay``, whose runs are found on the way."""
+    rows, columns = counts.shape
+    beyond, lowest, last = np.int32(rows), np.int32(max(rows - 2, 0)), np.float32(rows - 1)
+    position, tops = np.empty(columns, np.float32), np.empty(columns, np.int32)
+    runs = np.empty((columns, 3), np.uint64)
+    for row in range(raw_row.shape[0]):
+        for column in range(columns):
+            y = position[column] = raw_row[row, column] + delay
+            tops[column] = min(np.int32(y), lowest) if y >= 0 and y <= last else beyond
+        first = found = 0
+        for column in range(1, columns + 1):
+            if column == columns or tops[column] != tops[first]:
+                runs[found, 0], runs[found, 1], runs[found, 2] = first, column, tops[first]
+                first, found = column, found + 1
+        sample_row(counts, dark, position, runs[:found], measurements[row])
+
+
 @inlined
 def add_rows(rows, total):
     """``total = rows.sum(axis=0)``, for (rows, columns) float32 arrays."""

@@ -221,7 +221,7 @@ class Rectifier:
         numbers: NDArray[np.int64] | None = None,
     ) -> FloatImage:
         """Some or all rectified rows, (rows, columns)."""
-        from tofclip.camera.kernels import sample_bilinear, sample_rows
+        from tofclip.camera.kernels import sample_bilinear, sample_delayed_rows, sample_rows
 
         self._require_shape(counts)
         raw, level, shift = _as_counts(counts), np.float32(dark), np.float32(delay)
@@ -233,6 +233,8 @@ class Rectifier:
             if self._stays_in_column and delay == 0:
                 which = np.arange(size)[piece] if numbers is None else some
                 sample_rows(raw, level, self._raw_row, *self._runs, which, measurements[piece])
+            elif self._stays_in_column:
+                sample_delayed_rows(raw, level, self._raw_row[some], shift, measurements[piece])
             else:
                 column = np.ascontiguousarray(self._raw_column[some])
                 sample_bilinear(raw, level, self._raw_row[some], column, shift, measurements[piece])

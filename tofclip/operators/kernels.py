@@ -262,14 +262,24 @@ def transform_walsh_hadamard(values):
     """Multiply (n, columns) values by Sylvester's Hadamard matrix of n = 2^k rows, in place."""
     count, columns = values.shape
     half = 1
-    while half < count:
-        for start in range(0, count, 2 * half):
+    while 2 * half < count:
+        # two levels of the butterfly at once: half as many passes through memory
+        for start in range(0, count, 4 * half):
             for row in range(start, start + half):
                 for column in range(columns):
                     a, b = values[row, column], values[row + half, column]
-                    values[row, column] = a + b
-                    values[row + half, column] = a - b
-        half *= 2
+                    c, d = values[row + 2 * half, column], values[row + 3 * half, column]
+                    values[row, column] = (a + b) + (c + d)
+                    values[row + half, column] = (a - b) + (c - d)
+                    values[row + 2 * half, column] = (a + b) - (c + d)
+                    values[row + 3 * half, column] = (a - b) - (c - d)
+        half *= 4
+    if half < count:  # an odd number of levels leaves one
+        for row in range(half):
+            for column in range(columns):
+                a, b = values[row, column], values[row + half, column]
+                values[row, column] = a + b
+                values[row + half, column] = a - b
 
 
 @compile_loop(fastmath=FASTMATH, _nrt=True)
