@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,7 +49,7 @@ def list_returns(y, x, measured, signal, sigma, camera: Camera) -> Returns:
 class World:
     """An instrument whose faults are known, in front of a target."""
 
-    def __init__(self, seed: int, jitter_m: float = 0.0) -> None:
+    def __init__(self, seed: int, jitter_m: float = 0.0):
         self.random = np.random.default_rng(seed)
         self.offsets = self.random.normal(0, OFFSET_M, SHAPE)
         self.response = np.exp(self.random.normal(0, 0.05, SHAPE))
@@ -58,35 +57,31 @@ class World:
 
     def see(self, distance: float, photons: float, percent: float = np.nan) -> TargetShot:
         """A shot of a plate that sends back this many photons from the axis."""
-        y, x = (place.ravel() for place in np.indices(SHAPE))
+        y, x = np.indices(SHAPE).reshape(2, -1)
         cosine = compute_ray_directions(CAMERA, y, x)[:, 2]
         true = distance / cosine
         bright = photons * cosine * (distance / true) ** 2 * self.response.ravel()
         signal = self.random.poisson(bright).clip(1).astype(float)
         sigma = NOISE_M / np.sqrt(bright)
-        measured = (
-            true
-            + LATE_S * SPEED_OF_LIGHT / 2
-            + walk_at(signal)
-            + self.offsets.ravel()
-            + self.random.normal(0, self.jitter_m)
-            + self.random.normal(0, sigma)
-        )
+        measured = true + LATE_S * SPEED_OF_LIGHT / 2 + walk_at(signal) + self.offsets.ravel()
+        measured += self.random.normal(0, self.jitter_m) + self.random.normal(0, sigma)
         returns = list_returns(y, x, measured, signal, sigma, CAMERA)
         return TargetShot(returns, distance, RECORD, f"a plate at {distance:g} m", percent)
 
     def see_all(self) -> list[TargetShot]:
         """Five shots whose brightness spans a factor of 100."""
-        return [
-            self.see(distance, photons)
-            for distance, photons in ((1.0, 5000), (1.5, 1500), (2.0, 500), (2.5, 150), (3.0, 50))
-        ]
+        return list(map(self.see, (1.0, 1.5, 2.0, 2.5, 3.0), (5000, 1500, 500, 150, 50)))
+
+
+def find_lateness(fit) -> float:
+    """Time zero that a fit should have found: it holds at the reference signal, which it chooses."""
+    return LATE_S + 2 / SPEED_OF_LIGHT * walk_at(fit.calibration.reference_signal)
 
 
 @pytest.mark.parametrize("jitter_m", [0.0, 1e-3])
-def test_deviations_are_true_over_seeds(jitter_m: float) -> None:
-    """Time zero off by 300 ps, 2 mm of walk a decade, offsets of 1 mm, with and without shots that
-    jitter by 1 mm: what a thousand of a thousand and one runs of 64 seeds would give.
+def test_deviations_are_true_over_seeds(jitter_m: float):
+    """Time zero off by 300 ps, 2 mm of walk a decade, offsets of 1 mm, with and without jitter of
+    1 mm: what a thousand of a thousand and one runs of 64 seeds would give.
     """
     seeds = 64
     zero, walk, offsets, errors = [], [], [], []
@@ -94,9 +89,7 @@ def test_deviations_are_true_over_seeds(jitter_m: float) -> None:
         world = World(seed, jitter_m)
         fit = fit_range_calibration(world.see_all())
         known = fit.calibration
-        # Time zero holds at the reference signal, which the fit chooses.
-        late = LATE_S + 2 / SPEED_OF_LIGHT * walk_at(known.reference_signal)
-        zero.append((fit.camera.time_zero - late) / known.time_zero_sigma)
+        zero.append((fit.camera.time_zero - find_lateness(fit)) / known.time_zero_sigma)
         measured, sigma = known.compute_walk(known.signal_range)
         truth = walk_at(known.signal_range) - walk_at(known.reference_signal)
         walk.append(((measured - truth) / sigma)[0])  # that at the other end is the same
@@ -112,7 +105,7 @@ def test_deviations_are_true_over_seeds(jitter_m: float) -> None:
     assert np.mean(errors) < 0.3 * OFFSET_M
 
 
-def test_corrected_ranges_are_true() -> None:
+def test_corrected_ranges_are_true():
     """A plate that the fit never saw, by the camera that it made."""
     world = World(3)
     camera = fit_range_calibration(world.see_all()).camera
@@ -136,21 +129,20 @@ def test_corrected_ranges_are_true() -> None:
     np.testing.assert_allclose(corrected.intensity, signal * corrected.range**2, rtol=1e-5)
 
 
-def test_one_shot_gives_time_zero_and_reflectance() -> None:
+def test_one_shot_gives_time_zero_and_reflectance():
     fit = fit_range_calibration([World(0).see(1.0, 2000, percent=40.0)])
     known = fit.calibration
     assert known.walk.size == known.offsets.size == known.response.size == 0
     assert "three shots" in fit.walk_note.replace("3", "three")
     assert "one shot" in fit.offsets_note
     # Offsets of 1 mm in 270 pixels are noise here, and the walk of 2000 counts is part of it.
-    late = LATE_S + 2 / SPEED_OF_LIGHT * walk_at(known.reference_signal)
-    assert abs(fit.camera.time_zero - late) < 4 * known.time_zero_sigma
+    assert abs(fit.camera.time_zero - find_lateness(fit)) < 4 * known.time_zero_sigma
     assert 0.1e-12 < known.time_zero_sigma < 1e-12
     # 2000 photons from 1 m are 40 %; light and gain of 270 pixels vary by 5 %.
     assert known.reflectance_scale == pytest.approx(40 / 2000, rel=0.02)
 
 
-def test_one_return_of_a_single_pixel_is_as_sure_as_it_says() -> None:
+def test_one_return_of_a_single_pixel_is_as_sure_as_it_says():
     shot = World(0).see(1.0, 2000)
     chosen = np.zeros(len(shot.returns), bool)
     chosen[0] = True
@@ -165,7 +157,7 @@ def test_one_return_of_a_single_pixel_is_as_sure_as_it_says() -> None:
     assert fit.calibration.time_zero_sigma == pytest.approx(sigma, rel=1e-6)
 
 
-def test_response_and_reflectance_of_several_shots() -> None:
+def test_response_and_reflectance_of_several_shots():
     world = World(1)
     shots = [world.see(d, n, p) for d, n, p in ((1, 2000, 40), (1.5, 1000, 45), (2, 500, 40))]
     known = fit_range_calibration(shots).calibration
@@ -176,7 +168,7 @@ def test_response_and_reflectance_of_several_shots() -> None:
     assert brightness[0] == pytest.approx(40 / known.response[0, 0], rel=0.02)
 
 
-def test_neighbours_that_share_errors_and_stray_returns() -> None:
+def test_neighbours_that_share_errors_and_stray_returns():
     """Deviations grow where errors are shared; a tenth of other things in the picture do not pull."""
     world = World(2)
     shot = world.see(1.0, 1000)
@@ -188,29 +180,25 @@ def test_neighbours_that_share_errors_and_stray_returns() -> None:
     strays = shot.returns.range.copy()
     strays[::10] = world.random.uniform(0.5, 3, strays[::10].size)
     fit = fit_range_calibration([replace(shot, returns=replace(shot.returns, range=strays))])
-    late = LATE_S + 2 / SPEED_OF_LIGHT * walk_at(fit.calibration.reference_signal)
-    assert abs(fit.camera.time_zero - late) < 4 * fit.calibration.time_zero_sigma
+    assert abs(fit.camera.time_zero - find_lateness(fit)) < 4 * fit.calibration.time_zero_sigma
     assert fit.target_fraction == pytest.approx(0.9, abs=0.03)
 
 
-def test_what_cannot_be_told_is_refused() -> None:
+def test_what_cannot_be_told_is_refused():
     world = World(4)
     one = world.see(1.0, 1000)
     nothing = np.zeros(one.returns.y.size, bool)
     two = one.returns.range + np.where(one.returns.x < 9, 0.0, 0.5)
     few = nothing.copy()
     few[:2] = True
+    other, far = world.see(1.5, 1000), replace(world.see(2.0, 99), distance=2.3)
     refused = {
         "no return stands out": [replace(one, returns=one.returns[nothing])],
         "in 3 or more pixels": [replace(one, returns=one.returns[few])],
         "needs 3 shots": [one, world.see(1.5, 100)],
-        "grey filter": [one, world.see(1.5, 1000), world.see(2.0, 1100)],
-        "out of the record": [one, replace(world.see(1.0, 1000), distance=20.0)],
-        "where the other shots": [
-            one,
-            world.see(1.5, 1000),
-            replace(world.see(2.0, 99), distance=2.3),
-        ],
+        "grey filter": [one, other, world.see(2.0, 1100)],
+        "out of the record": [one, replace(one, distance=20.0)],
+        "where the other shots": [one, other, far],
         "two surfaces": [replace(one, returns=replace(one.returns, range=two))],
         "cut off": [replace(one, record=(0.0, float(np.median(one.returns.time))))],
         "give each shot's own": [world.see(1.0, 1000, 50), world.see(1.0, 100, 50)],
@@ -218,10 +206,9 @@ def test_what_cannot_be_told_is_refused() -> None:
     for words, shots in refused.items():
         with pytest.raises(CalibrationError, match=words):
             fit_range_calibration(shots, walk=True if "shots" in words or "grey" in words else None)
-    with pytest.raises(InputError, match="positive length"):
-        replace(one, distance=-1.0)
-    with pytest.raises(InputError, match="percentage"):
-        replace(one, reflectance_percent=0.0)
+    for wrong in ({"distance": -1.0}, {"reflectance_percent": 0.0}):
+        with pytest.raises(InputError, match="positive"):
+            replace(one, **wrong)
 
 
 ROOM = (40, 48)
@@ -232,7 +219,7 @@ ROOM_CAMERA = Camera(
 
 def draw_scene(kind: str, random: np.random.Generator) -> np.ndarray:
     """Depths of a scene without a plate, m; NaN where nothing comes back."""
-    y, x = (place.ravel() for place in np.indices(ROOM))
+    y, x = np.indices(ROOM).reshape(2, -1)
     ray = compute_ray_directions(ROOM_CAMERA, y, x)
     ray = ray / ray[:, 2:]
     if kind == "room":
@@ -266,7 +253,7 @@ def draw_scene(kind: str, random: np.random.Generator) -> np.ndarray:
 
 def see_depths(depth_m: np.ndarray, photons: float, random: np.random.Generator) -> TargetShot:
     """A shot of these depths, said to be of a target at 2 m."""
-    y, x = (place.ravel() for place in np.indices(ROOM))
+    y, x = np.indices(ROOM).reshape(2, -1)
     y, x, depth_m = (part[np.isfinite(depth_m)] for part in (y, x, depth_m))
     true = depth_m / compute_ray_directions(ROOM_CAMERA, y, x)[:, 2]
     signal = random.poisson(photons * (2 / true) ** 2).clip(1).astype(float)
@@ -276,22 +263,21 @@ def see_depths(depth_m: np.ndarray, photons: float, random: np.random.Generator)
 
 
 @pytest.mark.parametrize("kind", ["room", "slanted", "bush", "relief", "walls", "empty"])
-def test_a_scene_without_a_plate_is_refused(kind: str) -> None:
+def test_a_scene_without_a_plate_is_refused(kind: str):
     """Twelve seeds, bright and dim; a picosecond was stated for ranges wrong by metres."""
     for seed in range(12):
         random = np.random.default_rng(seed)
         shot = see_depths(draw_scene(kind, random), (1000, 30)[seed % 2], random)
-        with pytest.raises(CalibrationError, match=r"plate|no return|two surfaces|cut off") as seen:
+        with pytest.raises(CalibrationError, match=r"^.*(plate|no return|two surfaces|cut off).*$"):
             fit_range_calibration([shot])
-        assert "\n" not in str(seen.value)
 
 
 @pytest.mark.parametrize("kind", ["near", "dim", "tilted", "small", "before a wall"])
-def test_a_plate_is_one(kind: str) -> None:
+def test_a_plate_is_one(kind: str):
     """Seven seeds: time zero is within four of its deviations, which are what photons make them."""
     for seed in range(7):
         random = np.random.default_rng(seed)
-        y, x = (place.ravel() for place in np.indices(ROOM))
+        y, x = np.indices(ROOM).reshape(2, -1)
         depth_m = np.full(y.size, 2.0)
         if kind == "tilted":  # 30 mm, half of a pulse's length, from edge to edge
             depth_m += 0.03 * (x - 23.5) / 47
@@ -309,7 +295,7 @@ def test_a_plate_is_one(kind: str) -> None:
             assert fit.calibration.time_zero_sigma == pytest.approx(ideal, rel=0.15)
 
 
-def test_traces_of_something_bright_are_no_plate() -> None:
+def test_traces_of_something_bright_are_no_plate():
     """Flat, but with a hundredth of the counts that the picture shows elsewhere."""
     random = np.random.default_rng(0)
     shot = see_depths(np.full(ROOM[0] * ROOM[1], 2.0), 20, random)
@@ -321,14 +307,12 @@ def test_traces_of_something_bright_are_no_plate() -> None:
         fit_range_calibration([shot.cut(corner)])
 
 
-def test_a_camera_file_carries_it(tmp_path: Path) -> None:
+def test_a_camera_file_carries_it(tmp_path):
     camera = fit_range_calibration(World(5).see_all()).camera
     camera.save(tmp_path / "camera.h5")
     known, read = camera.range_calibration, Camera.load(tmp_path / "camera.h5").range_calibration
-    assert known is not None
-    assert read is not None
-    for one in fields(known):
-        np.testing.assert_array_equal(getattr(read, one.name), getattr(known, one.name))
+    for name, value in vars(known).items():
+        np.testing.assert_array_equal(getattr(read, name), value)
     # Files of cameras without one, as all were before, are read as they were.
     CAMERA.save(tmp_path / "bare.h5")
     assert Camera.load(tmp_path / "bare.h5").range_calibration is None
@@ -338,7 +322,7 @@ def test_a_camera_file_carries_it(tmp_path: Path) -> None:
         RangeCalibration(0.0, walk=np.array([np.nan]), walk_covariance=np.eye(1))
 
 
-def test_returns_of_frames_are_corrected_once() -> None:
+def test_returns_of_frames_are_corrected_once():
     """A walk of 2 mm a decade and an offset of 1 mm, off the range and into the deviation."""
     bare = Camera(np.array([8.0]), np.zeros(1), (4, 5), 16, pulse_fwhm=60e-12)
     times = np.arange(100) * 10e-12
@@ -346,16 +330,10 @@ def test_returns_of_frames_are_corrected_once() -> None:
     cube[:, 2, 3] = 50 * np.exp(-0.5 * ((times - 400e-12) / 25.5e-12) ** 2)
     offsets = np.zeros((4, 5))
     offsets[2, 3] = 1e-3
-    known = RangeCalibration(
-        0.0,
-        walk=np.array([2e-3]),
-        walk_covariance=np.array([[9e-8]]),
-        reference_signal=10.0,
-        signal_range=np.array([10.0, 1e5]),
-        offsets=offsets,
-        offset_sigma=np.full((4, 5), 4e-4),
-        reflectance_scale=0.5,
-    )
+    walk = {"walk": np.array([2e-3]), "walk_covariance": np.array([[9e-8]])}
+    walk |= {"reference_signal": 10.0, "signal_range": np.array([10.0, 1e5])}
+    own = {"offsets": offsets, "offset_sigma": np.full((4, 5), 4e-4)}
+    known = RangeCalibration(0.0, **walk, **own, reflectance_scale=0.5)
     frames = Frames(cube, times, bare)
     measured = depth(frames)
     corrected = depth(frames, bare.replace(range_calibration=known))

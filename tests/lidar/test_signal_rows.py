@@ -1,0 +1,236 @@
+"""Rows with light separated from rows without, frames in which a pixel stands out, and what leaving
+the dark ones out does to the returns.
+"""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+from tofclip.camera import Camera, SkewSweep
+from tofclip.errors import InputError
+from tofclip.lidar import Detection, depth
+from tofclip.lidar.pulse_tables import TraceBins
+from tofclip.lidar.signal_rows import BrightFrameFinder, RowBlock, SignalRowFinder
+from tofclip.operators.sparse import Tiles
+from tofclip.recovery import DepthLockedFocus, FixedFocus, recover
+from tofclip.sequences.ranger import RangingPipeline
+from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
+from tofclip.simulate.patterns import make_checkerboard
+from tofclip.solvers import LinearInverse
+from tofclip.solvers.direct import GROUP_PIXELS, InverseTraces, order_by_patch
+from tofclip.threads import LANES
+
+CENTRES = 30.0 + 45 * np.arange(5)
+ROWS, REACH = 600, 8
+BIN = 20e-12
+SHAPE = (32, 32)
+NOISE = 3.0
+
+
+def camera() -> Camera:
+    sweep = SkewSweep(CENTRES, np.array([-2.0, 1.0, 0.0, 0.5, 3.0]), np.zeros(5))
+    angles = np.arctan([0.6, -0.7, 0.3, -0.1, 0.9])
+    optics = {"focal_length_px": 100.0, "lenslet_pitch": 2e-3, "focus_distance": 1.3}
+    return Camera(CENTRES, angles, SHAPE, 240, sweep=sweep, time_zero=-6e-9, **optics)
+
+
+@pytest.fixture(scope="module")
+def inverse():
+    return InverseTraces(LinearInverse().prepare(camera().operator()), order_by_patch(SHAPE))
+
+
+@pytest.fixture(scope="module")
+def find_bins(inverse):
+    """What is looked at of some measurements, by a search with a limit, in successive blocks."""
+
+    def find(measurements, limit=5.0, cuts=(0, ROWS)):
+        blocks = [RowBlock(slice(*ends), inverse) for ends in pairwise(cuts)]
+        finder = SignalRowFinder(blocks, 3.0, limit, REACH)
+        return finder.bins(finder.sum_measurements(measurements))
+
+    return find
+
+
+def dark(seed: int) -> np.ndarray:
+    """Noise about a level of its own in each column, as a sensor has it."""
+    random = np.random.default_rng(seed)
+    level = random.normal(0, 2 * NOISE, (240, 1))
+    return (level + random.normal(0, NOISE, (240, ROWS))).astype(np.float32)
+
+
+def with_pixel(
+    measurements: np.ndarray, pixel: tuple[int, int], row: float, strength: float
+) -> np.ndarray:
+    """Add a pulse of one pixel that stands out by `strength` where every reading of it is matched."""
+    picture = np.zeros(SHAPE, np.float32)
+    picture[pixel] = 1
+    seen = np.asarray(camera().operator()(picture))
+    pulse = np.exp2(-((2 * (np.arange(ROWS) - row) / 3.0) ** 2))
+    light = np.outer(seen, pulse)
+    return measurements + (strength * NOISE / np.linalg.norm(light) * light).astype(np.float32)
+
+
+def test_noise_is_dark_whatever_the_level_of_each_column(find_bins):
+    shares = []
+    for seed in range(5):
+        bins = find_bins(dark(seed))
+        shares.append(bins.search_mask.sum() / ROWS)
+        assert bins.numbers.size % LANES == 0
+        assert bins.bin_weights.sum() == pytest.approx(ROWS)
+        assert np.all(np.diff(bins.numbers) > 0)
+    # 200 instants, of which the brightest of 1024 pixels exceeds 6 deviations once in 500
+    assert np.mean(shares) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_light_of_a_single_pixel_is_seen_wherever_it_is(find_bins, seed):
+    random = np.random.default_rng(100 + seed)
+    pixel = int(random.integers(2, 30)), int(random.integers(2, 30))
+    row = random.uniform(20, ROWS - 20)
+    # half-way between two instants a pulse stands out by 0.74 of its strength, so by 8.9 +- 1 here,
+    # with 6 needed
+    bins = find_bins(with_pixel(dark(seed), pixel, row, 12.0))
+    where = np.searchsorted(bins.numbers, round(row))
+    assert bins.numbers[where] == round(row)
+    assert bins.search_mask[where]
+    around = np.arange(round(row) - REACH, round(row) + REACH + 1)
+    assert np.isin(around, bins.numbers[bins.bin_weights == 1]).all()
+
+
+def test_a_higher_limit_looks_at_less(find_bins):
+    measurements = with_pixel(dark(3), (16, 16), 300.0, 12.0)
+    assert not find_bins(measurements, 15.0).search_mask.any()
+
+
+@pytest.mark.parametrize("case", ["no limit", "nowhere dark", "nothing measured"])
+def test_everything_is_searched_where_nothing_tells_the_dark(find_bins, case):
+    measurements = np.zeros((240, ROWS), np.float32) if case == "nothing measured" else dark(0)
+    for row in range(10, ROWS, 25) if case == "nowhere dark" else ():
+        measurements = with_pixel(measurements, (16, 16), row, 200.0)
+    bins = find_bins(measurements, 0.0 if case == "no limit" else 5.0)
+    assert bins.search_mask.all()
+    np.testing.assert_array_equal(bins.numbers, np.arange(ROWS))
+    np.testing.assert_array_equal(bins.bin_weights, np.ones(ROWS))
+
+
+def test_columns_and_rows_that_were_never_measured_are_not_taken_for_the_darkest(find_bins):
+    measurements = dark(1)
+    measurements[:, :60] = 0
+    measurements[40:90] = 0
+    bins = find_bins(with_pixel(measurements, (16, 16), 300.0, 40.0))
+    assert bins.search_mask.sum() < 60
+    assert 300 in bins.numbers[bins.search_mask]
+
+
+def test_blocks_with_an_operator_of_their_own_have_their_own_instants(find_bins):
+    lit = with_pixel(dark(4), (10, 20), 150.0, 20.0)
+    bins = find_bins(lit, cuts=[0, 7, 150, 151, 400, ROWS])
+    assert 150 in bins.numbers[bins.search_mask]
+    assert bins.bin_weights.sum() == pytest.approx(ROWS)
+
+
+def see_plates(seed: int, **settings):
+    """A shot of three plates and what makes its cloud."""
+
+    def make(distance, place):
+        at = place * distance / 100
+        return make_plate((at, at, distance), (0.08, 0.08), make_checkerboard(3, 0.3, 0.9))
+
+    scene = Scene((make(1.05, -6), make(1.3, 7), make(1.6, 0)))
+    made = Instrument(camera(), StreakDetector(ROWS, BIN, peak_photons=2000.0))
+    shot = simulate_shot(scene, made, seed).streak
+    pipeline = RangingPipeline(camera(), shot.times, **settings)
+    return shot, pipeline, pipeline.rectifier.measure(shot.counts).values
+
+
+@pytest.mark.parametrize("focus", [FixedFocus(), DepthLockedFocus()])
+def test_returns_are_those_of_all_rows(focus, monkeypatch):
+    _, pipeline, measurements = see_plates(0, focus=focus)
+    some = pipeline.find_returns(measurements)
+    monkeypatch.setattr(SignalRowFinder, "bins", lambda self, _: TraceBins.all_bins(self.rows))
+    everything = pipeline.find_returns(measurements)
+    places = [
+        set(zip(one.y, one.x, np.round(one.time / BIN), strict=True)) for one in (some, everything)
+    ]
+    assert len(places[1]) > 300
+    # background and noise come from a sample of the dark rows: a return at a limit may fall on its
+    # other side
+    assert len(places[0] ^ places[1]) <= 0.01 * len(places[1])
+    if len(some) == len(everything):
+        # 64 rows know the background of a pixel to an eighth of its noise, which moves no symmetric
+        # pulse
+        np.testing.assert_allclose(np.median(np.abs(some.range - everything.range)), 0, atol=1e-6)
+        np.testing.assert_allclose(some.intensity, everything.intensity, rtol=0.05)
+
+
+def test_frames_that_are_there_are_searched_everywhere():
+    every = replace(Detection(), signal_to_noise=0.0)
+    shot, pipeline, measurements = see_plates(1, detection=every)
+    alone = depth(recover(shot, camera(), method="linear"), detection=every)
+    assert abs(len(pipeline.find_returns(measurements)) - len(alone)) <= 2
+
+
+NARROW = (21, 37)
+
+
+def narrow_camera(dead: int | None = None) -> Camera:
+    """Of three views, of which the first two overlap."""
+    angles, dead_columns = np.radians([-40.0, 5.0, 35.0]), np.arange(170) == dead
+    return Camera(np.array([30.0, 52.4, 140.2]), angles, NARROW, 170, dead_columns=dead_columns)
+
+
+def filter_responses(matrix: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """Largest response of the matched filter in each frame."""
+    length = np.linalg.norm(matrix, axis=0)
+    return (matrix.T @ block / np.where(length > 0, length, 1)[:, np.newaxis]).max(axis=0)
+
+
+@pytest.mark.parametrize("limit", [2.5, 3.5, 4.5])
+@pytest.mark.parametrize("light", [0.0, 12.0])
+def test_bright_frames_are_those_of_the_whole_filter(limit, light):
+    operator = narrow_camera().operator()
+    tiles = InverseTraces(LinearInverse().prepare(operator), order_by_patch(NARROW)).tiles
+    random = np.random.default_rng(3)
+    block = random.standard_normal((170, 8 * LANES)).astype(np.float32)
+    matrix = operator.matrix.toarray()
+    for frame in range(0, block.shape[1], 3):
+        column = matrix[:, random.integers(matrix.shape[1])]
+        block[:, frame] += light * random.random() * column / max(np.linalg.norm(column), 1)
+    # more than a word of frames, and not whole ones
+    span = slice(LANES, 6 * LANES)
+    expected = filter_responses(matrix, block)[span]
+    assert np.abs(expected - limit).min() > 1e-5
+    bright = BrightFrameFinder(tiles, 170, GROUP_PIXELS).find(block, span, limit)
+    np.testing.assert_array_equal(bright, expected >= limit)
+
+
+def test_dead_measurements_are_left_out_of_the_filter():
+    alive = np.arange(170) != 60
+    prepared = LinearInverse().prepare(narrow_camera(60).operator(), alive)
+    tiles = InverseTraces(prepared, order_by_patch(NARROW)).tiles
+    block = np.random.default_rng(0).standard_normal((170, 4 * LANES)).astype(np.float32)
+    expected = filter_responses(prepared.operator.matrix.toarray() * alive[:, np.newaxis], block)
+    bright = BrightFrameFinder(tiles, 170, GROUP_PIXELS).find(block, slice(0, 4 * LANES), 3.2)
+    np.testing.assert_array_equal(bright, expected >= 3.2)
+
+
+def test_any_nonnegative_matrix_and_any_limit_will_do():
+    random = np.random.default_rng(1)
+    matrix = scipy.sparse.random_array((50, 90), density=0.1, rng=random).astype(np.float32)
+    finder = BrightFrameFinder(Tiles.from_csr(matrix.T.tocsr()), 50, GROUP_PIXELS)
+    block = random.standard_normal((50, 2 * LANES)).astype(np.float32)
+    span = slice(0, 2 * LANES)
+    expected = filter_responses(matrix.toarray(), block)
+    np.testing.assert_array_equal(finder.find(block, span, 3.0), expected >= 3.0)
+    assert finder.find(block, span, 0.0).all()
+    assert not finder.find(block, span, 100.0).any()
+    assert not finder.find(-np.abs(block), span, 1e-3).any()
+
+
+def test_negative_entries_are_refused():
+    matrix = scipy.sparse.csr_array(np.array([[1.0, -1.0]], np.float32))
+    with pytest.raises(InputError, match="negative entries"):
+        BrightFrameFinder(Tiles.from_csr(matrix), 2, GROUP_PIXELS)
