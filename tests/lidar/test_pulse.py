@@ -1,7 +1,5 @@
 """Pulse shapes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -34,28 +32,17 @@ def test_samples_are_scaled_and_the_origin_shifts_them():
     assert pulse([0.0, 0.5e-12, 1e-12, -1e-12, 5e-12]) == pytest.approx([1.0, 0.75, 0.5, 0.0, 0.0])
     # half maximum at 0.5 samples on the way up and at sample 2 on the way down
     assert pulse.fwhm == pytest.approx(1.5e-12)
-
-
-def test_a_pulse_that_never_falls_ends_with_its_samples():
+    # one that never falls ends with its samples
     assert Pulse([1.0, 1.0, 1.0], 1e-12, origin=0.0).fwhm == pytest.approx(2e-12)
 
 
-@pytest.mark.parametrize(
-    ("samples", "spacing", "origin"),
-    [
-        ([1.0, 2.0], 1e-12, 0.0),
-        ([0.0, 0.0, 0.0], 1e-12, 0.0),
-        ([0.0, np.nan, 0.0], 1e-12, 0.0),
-        ([[1.0, 2.0, 1.0]], 1e-12, 0.0),
-        ([0.0, 1.0, 0.0], 0.0, 0.0),
-        ([0.0, 1.0, 0.0], np.nan, 0.0),
-        ([0.0, 1.0, 0.0], 1e-12, 3.0),
-        ([0.0, 1.0, 0.0], 1e-12, np.nan),
-    ],
-)
-def test_unusable_shapes_are_refused(samples, spacing, origin):
-    with pytest.raises(InputError):
-        Pulse(samples, spacing, origin)
+def test_a_binned_pulse_sums_up_the_light():
+    pulse = Pulse.gaussian(60e-12)
+    shape = pulse.integrate_bins(60e-12)
+    middles = np.arange(-8, 9) * 60e-12 + 6e-12
+    assert np.sum(shape(middles)) * 60e-12 == pytest.approx(shape.area, rel=1e-4)
+    assert shape.area / shape(0.0) > pulse.area
+    assert shape.slope_at(0.0) == pytest.approx(0, abs=1e-6 / 20e-12)
 
 
 @pytest.mark.parametrize("times", [1e300, 1e-300, 1e6, 1e-6])
@@ -69,7 +56,22 @@ def test_widths_of_different_units_are_refused_before_memory_is_taken(times):
             Pulse.exponentially_modified(60e-12, 60e-12 * times)
 
 
-@pytest.mark.parametrize("fwhm", [0.0, -1e-12, np.nan, np.inf])
-def test_unusable_widths_are_refused(fwhm):
-    with pytest.raises(InputError, match="positive time"):
-        Pulse.gaussian(fwhm)
+USUAL = ([0.0, 1.0, 0.0], 1e-12, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "settings"),
+    [
+        *((Pulse, (samples, 1e-12, 0.0)) for samples in ([1.0, 2.0], [0.0] * 3, [[1.0, 2.0, 1.0]])),
+        (Pulse, ([0.0, np.nan, 0.0], 1e-12, 0.0)),
+        *((Pulse, (USUAL[0], spacing, 0.0)) for spacing in (0.0, np.nan)),
+        *((Pulse, (*USUAL[:2], origin)) for origin in (3.0, np.nan)),
+        *((Pulse.gaussian, (fwhm,)) for fwhm in (0.0, -1e-12, np.nan, np.inf)),
+        (Pulse.exponentially_modified, (0, 1e-12)),
+        (Pulse.exponentially_modified, (1e-12, np.inf)),
+        (Pulse.gaussian(1e-12).integrate_bins, (0.0,)),
+    ],
+)
+def test_unusable_shapes_and_widths_are_refused(make, settings):
+    with pytest.raises(InputError):
+        make(*settings)

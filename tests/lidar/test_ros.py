@@ -1,7 +1,5 @@
 """Clouds with stamps, read by programs of others."""
 
-from __future__ import annotations
-
 import sqlite3
 import sys
 
@@ -27,7 +25,7 @@ def cloud() -> PointCloud:
     return make_cloud(np.random.default_rng(1).normal(size=(40, 3)))
 
 
-def test_mcap_reads_the_stamps_and_the_points(cloud, tmp_path) -> None:
+def test_mcap_reads_the_stamps_and_the_points(cloud, tmp_path):
     reading = pytest.importorskip("mcap_ros2.reader")
     doubt = {name: np.linspace(0, 0.5, 7) for name in ("false_alarm", "reflectance")}
     other = make_cloud(cloud.xyz[:7], 3, **doubt)
@@ -42,14 +40,12 @@ def test_mcap_reads_the_stamps_and_the_points(cloud, tmp_path) -> None:
         assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamped.stamp_ns
         assert (message.height, message.width) == (1, len(stamped.cloud))
         # The layout as the message itself describes it; 7 and 2 are ROS's float32 and uint8.
-        layout = np.dtype(
-            {
-                "names": [field.name for field in message.fields],
-                "formats": [{7: "<f4", 2: "u1"}[field.datatype] for field in message.fields],
-                "offsets": [field.offset for field in message.fields],
-                "itemsize": message.point_step,
-            }
-        )
+        kinds = [(field.name, {7: "<f4", 2: "u1"}[field.datatype]) for field in message.fields]
+        layout = np.dtype(kinds)
+        assert layout.itemsize == message.point_step
+        assert [layout.fields[field.name][1] for field in message.fields] == [
+            field.offset for field in message.fields
+        ]
         rows = np.frombuffer(bytes(message.data), layout)
         np.testing.assert_array_equal(rows["y"], stamped.cloud.xyz[:, 1])
         np.testing.assert_array_equal(rows["return_number"], stamped.cloud.return_number)
@@ -60,7 +56,7 @@ def test_mcap_reads_the_stamps_and_the_points(cloud, tmp_path) -> None:
     np.testing.assert_array_equal(rows["reflectance"], other.reflectance)
 
 
-def test_sqlite_and_the_standard_show_what_is_in_a_bag(cloud, tmp_path) -> None:
+def test_sqlite_and_the_standard_show_what_is_in_a_bag(cloud, tmp_path):
     assert write_bag([StampedCloud(cloud, 5)], tmp_path / "bag") == 1
     assert "sensor_msgs/msg/PointCloud2" in (tmp_path / "bag" / "metadata.yaml").read_text()
     (database,) = (tmp_path / "bag").glob("*.db3")
@@ -74,7 +70,7 @@ def test_sqlite_and_the_standard_show_what_is_in_a_bag(cloud, tmp_path) -> None:
         write_bag([StampedCloud(cloud, 5)], tmp_path / "bag")
 
 
-def test_recordings_that_cannot_be_are_refused(cloud, tmp_path, monkeypatch) -> None:
+def test_recordings_that_cannot_be_are_refused(cloud, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="no cloud"):
         write_bag([], tmp_path / "none.mcap")
     with pytest.raises(InputError, match="stamps"):
@@ -85,7 +81,7 @@ def test_recordings_that_cannot_be_are_refused(cloud, tmp_path, monkeypatch) -> 
         write_bag([StampedCloud(cloud, 5)], tmp_path / "absent.mcap")
 
 
-def test_kiss_icp_follows_a_moving_camera(tmp_path, monkeypatch) -> None:
+def test_kiss_icp_follows_a_moving_camera(tmp_path, monkeypatch):
     """Its own reader of ROS 2 bags and its own pipeline, as they are."""
     loading = pytest.importorskip("kiss_icp.datasets.rosbag")
     pipeline = pytest.importorskip("kiss_icp.pipeline")
@@ -96,12 +92,8 @@ def test_kiss_icp_follows_a_moving_camera(tmp_path, monkeypatch) -> None:
         wall[:, axis] = (6, 2, 14)[axis]
     room = np.concatenate(walls) + np.array([0, 0, 2.0])
     step = np.array([0.05, 0.0, 0.2])
-    clouds = [
-        StampedCloud(
-            make_cloud(room - number * step + random.normal(0, 0.01, room.shape)), number * 10**8
-        )
-        for number in range(6)
-    ]
+    seen = [room - number * step + random.normal(0, 0.01, room.shape) for number in range(6)]
+    clouds = [StampedCloud(make_cloud(xyz), number * 10**8) for number, xyz in enumerate(seen)]
     write_bag(clouds, tmp_path / "drive")
     odometry = pipeline.OdometryPipeline(loading.RosbagDataset(tmp_path / "drive", ""))
     monkeypatch.chdir(tmp_path)  # it writes its results beside where it runs
