@@ -11,9 +11,7 @@ from tofclip.io.lift import RelayWall
 ROW, COLUMN = np.meshgrid([0.0, 4.0, 11.0], [0.0, 17.5, 59.0], indexing="ij")
 
 
-def test_angles_and_centres_give_the_slit_columns_of_the_archives_formula(
-    write_lift, lift_entries
-):
+def test_angles_and_centres_give_the_slit_columns_of_the_archives_formula(write_lift, lift_entries):
     """``s = column cos(theta) + row sin(theta)``, slit column ``centre + s / cos(theta)``, theta =
     90 - lens angle.
     """
@@ -43,9 +41,7 @@ def test_the_picture_width_rounds_halves_up(write_lift, region_px, width_px):
     assert camera.image_shape == (width_px, width_px)
 
 
-def test_the_polynomial_map_in_the_archives_own_pixels(
-    write_lift, lift_entries
-):
+def test_the_polynomial_map_in_the_archives_own_pixels(write_lift, lift_entries):
     sweep = read_streak(write_lift()).camera.sweep
     assert isinstance(sweep, PolynomialSweep)
     xy, uv = lift_entries["rectify_norm_xy"], lift_entries["rectify_norm_uv"]
@@ -104,9 +100,7 @@ def test_counts_times_and_metadata(write_lift, lift_entries):
     np.testing.assert_allclose(given, np.arange(12) * 1e-12, rtol=1e-15)
 
 
-def test_the_relay_wall_travels_along(
-    write_lift, lift_entries, tmp_path
-):
+def test_the_relay_wall_travels_along(write_lift, lift_entries, tmp_path):
     read_streak(write_lift()).save(tmp_path / "shot.h5")
     wall = read_streak(tmp_path / "shot.h5").attachments["relay_wall"]
     assert wall.kind == "relay_wall"
@@ -207,9 +201,7 @@ def test_impossible_content_is_refused(write_lift, name, value, problem):
         ("lif_dof_HelicalFiber", 1016, None, 180),
     ],
 )
-def test_recorded_archives(
-    shared_data, name, rows, bin_width, width_px
-):
+def test_recorded_archives(shared_data, name, rows, bin_width, width_px):
     streak = read_streak(shared_data / "lift" / f"{name}.npz")
     assert streak.counts.shape == (rows, 1344)
     assert streak.camera.views == 7
