@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from tofclip.camera import Camera, SkewSweep
 from tofclip.io.streaks import save_stack
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.bodies import Body
-from tofclip.simulate.patterns import make_checkerboard
+from tofclip.simulate.patterns import make_checkerboard, make_plain_pattern
 
 CENTRES = 40.0 + 60 * np.arange(5)
 SHOTS = 6
@@ -45,28 +45,35 @@ def camera() -> Camera:
     sweep = SkewSweep(CENTRES, np.array([-2.0, 1.0, 0.0, 0.5, 3.0]), np.zeros(5))
     angles = np.arctan([0.5, -0.8, 0.9, -0.4, 0.1])
     optics = {"focal_length_px": 100.0, "lenslet_pitch": 5e-3, "focus_distance": 1.3}
-    return Camera(
-        CENTRES, angles, (32, 32), 320, sweep=sweep, time_zero=-6e-9, pulse_fwhm=150e-12, **optics
-    )
+    times = {"time_zero": -6e-9, "pulse_fwhm": 150e-12}
+    return Camera(CENTRES, angles, (32, 32), 320, sweep=sweep, **times, **optics)
+
+
+def make_body(distance: float, place_px: float, side_px: float = 9, pattern=None) -> Body:
+    """A plate across the axis, so many pixels wide and aside."""
+    at, side = place_px * distance / 100, side_px * distance / 100
+    pattern = make_checkerboard(3, 0.3, 0.9) if pattern is None else pattern
+    return make_plate((at, at, distance), (side, side), pattern)
 
 
 @pytest.fixture(scope="package")
-def streaks(camera: Camera) -> list[Streak]:
+def see() -> Callable[..., Streak]:
+    """Simulate a shot of a camera: of two plates, or of one plain one."""
+
+    def simulate(camera: Camera, seed: int = 0, peak: float = 5e4, side_px: float = 0) -> Streak:
+        plates = make_body(1.1, -8), make_body(1.5, 8)
+        if side_px:
+            plates = (make_body(1.3, 0, side_px, make_plain_pattern(0.8)),)
+        made = Instrument(camera, StreakDetector(128, 50e-12, peak_photons=peak))
+        return simulate_shot(Scene(plates), made, seed).streak
+
+    return simulate
+
+
+@pytest.fixture(scope="package")
+def streaks(camera: Camera, see: Callable[..., Streak]) -> list[Streak]:
     """Shots of two plates that differ in their noise."""
-
-    def plate(distance: float, place_px: float) -> Body:
-        pixel = distance / 100.0
-        return make_plate(
-            (place_px * pixel, place_px * pixel, distance),
-            (9 * pixel, 9 * pixel),
-            make_checkerboard(3, 0.3, 0.9),
-        )
-
-    made = Instrument(camera, StreakDetector(128, 50e-12, peak_photons=5e4))
-    return [
-        simulate_shot(Scene((plate(1.1, -8), plate(1.5, 8))), made, seed).streak
-        for seed in range(SHOTS)
-    ]
+    return [see(camera, seed) for seed in range(SHOTS)]
 
 
 @pytest.fixture(scope="package")

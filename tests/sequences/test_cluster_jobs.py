@@ -1,11 +1,10 @@
 """Jobs here and on workers: none is lost, none is done twice, none spoils the others."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from odd_jobs import die, meet, refuse, squares, stumble
@@ -54,8 +53,8 @@ def test_a_failure_is_told_and_stops_nothing(tmp_path):
 
 def test_workers_do_what_is_done_here_however_many_jobs_there_are(scheduler, tmp_path):
     here, there = tmp_path / "here", tmp_path / "there"
-    here.mkdir()
-    there.mkdir()
+    for folder in (here, there):
+        folder.mkdir()
     run_jobs(squares(here, MANY))
     summary = run_jobs(squares(there, MANY), scheduler)
     assert (summary.done, summary.failures) == (MANY, ())
@@ -66,10 +65,7 @@ def test_workers_do_what_is_done_here_however_many_jobs_there_are(scheduler, tmp
 def test_the_processes_that_took_part_are_counted(scheduler, tmp_path):
     """Two jobs that wait for each other need two processes, however busy the machine is."""
     one, other = tmp_path / "one.txt", tmp_path / "other.txt"
-    jobs = [
-        Job("one", one, partial(meet, one, other)),
-        Job("other", other, partial(meet, other, one)),
-    ]
+    jobs = [Job(a.stem, a, partial(meet, a, b)) for a, b in ((one, other), (other, one))]
     summary = run_jobs(jobs, scheduler)
     assert (summary.done, summary.failures, summary.processes) == (2, (), 2)
 
@@ -83,12 +79,9 @@ def test_a_killed_worker_costs_at_most_the_job_that_kills_every_one(scheduler, t
     assert [failure.name for failure in summary.failures] == ["always"]
     assert "died" in summary.failures[0].problem
     assert summary.done == 31
-    found = contents(tmp_path)
-    assert found.pop("once.died") == found.pop("always.died") == ""
-    assert found == {
-        **{f"{n:03d}.txt": str(n**2) for n in range(30)},
-        "once.txt": "49",
-    }  # and no temporary file
+    numbers = {f"{n:03d}.txt": str(n**2) for n in range(30)}
+    died = {"once.died": "", "always.died": ""}
+    assert contents(tmp_path) == {**numbers, "once.txt": "49", **died}  # and no temporary file
     assert [job.name for job in select_unfinished(jobs)] == ["always"]
 
 
@@ -102,34 +95,13 @@ def test_leftovers_of_killed_writers_go_and_other_hidden_files_stay(tmp_path):
     assert sorted(contents(tmp_path)) == [".999.txt.abcd_123.txt", ".profile", "000.txt"]
 
 
-@pytest.mark.parametrize(
-    ("where", "number"), [("local:3", 3), ("tcp://host:8786", 0), ("tls://host:1", 0)]
-)
-def test_names_of_clusters(where, number):
-    assert count_local_workers(where) == number
-
-
-def test_local_alone_means_the_cores(monkeypatch):
+def test_names_of_clusters(monkeypatch):
     monkeypatch.setenv("TOFCLIP_THREADS", "5")
-    assert count_local_workers("local") == 5
-
-
-@pytest.mark.parametrize(
-    "where",
-    ["", "local:", "local:0", "local:-1", "local:two", "host:8786", "http://host", "tcp://"],
-)
-def test_other_names_are_refused(where):
-    with pytest.raises(InputError, match="local:N"):
-        count_local_workers(where)
-
-
-def test_a_cluster_that_is_not_there(monkeypatch):
-    monkeypatch.setattr("tofclip.sequences.jobs.WAIT_SECONDS", 0.3)
-    with (
-        pytest.raises(InputError, match="no scheduler answers"),
-        connect_workers("tcp://127.0.0.1:9"),
-    ):
-        pass
+    names = {"local": 5, "local:3": 3, "tcp://host:8786": 0, "tls://host:1": 0}
+    assert {name: count_local_workers(name) for name in names} == names
+    for wrong in "", "local:", "local:0", "local:-1", "local:two", "a:8786", "http://a", "tcp://":
+        with pytest.raises(InputError, match="local:N"):
+            count_local_workers(wrong)
 
 
 def test_without_the_library_it_says_what_to_install(monkeypatch, tmp_path):
@@ -138,50 +110,38 @@ def test_without_the_library_it_says_what_to_install(monkeypatch, tmp_path):
         run_jobs(squares(tmp_path, 1), "local:1")
 
 
-def test_workers_of_another_version_are_refused(scheduler, monkeypatch):
-    monkeypatch.setattr("tofclip.sequences.jobs.__version__", "0.0.0-of-the-test")
-    with pytest.raises(InputError, match="install the same"), connect_workers(scheduler):
+def refuse_to_connect(where: str, problem: str) -> None:
+    with pytest.raises(InputError, match=problem), connect_workers(where):
         pass
 
 
-def test_workers_without_this_program_are_refused(scheduler, monkeypatch):
+def test_workers_without_this_program_or_of_another_version_are_refused(scheduler, monkeypatch):
     def missing() -> str:
         raise ModuleNotFoundError("No module named 'tofclip'")
 
-    monkeypatch.setattr("tofclip.sequences.jobs._version", missing)
-    with pytest.raises(InputError, match="have no tofclip"), connect_workers(scheduler):
-        pass
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs_module, "_version", missing)
+        refuse_to_connect(scheduler, "have no tofclip")
+    monkeypatch.setattr(jobs_module, "__version__", "0.0.0-of-the-test")
+    refuse_to_connect(scheduler, "install the same")
 
 
-def test_a_scheduler_without_workers_is_refused(monkeypatch):
+def test_a_scheduler_that_is_not_there_or_has_no_workers_is_refused(monkeypatch):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is an extra")
-    monkeypatch.setattr("tofclip.sequences.jobs.WAIT_SECONDS", 0.3)
+    monkeypatch.setattr(jobs_module, "WAIT_SECONDS", 0.3)
+    refuse_to_connect("tcp://127.0.0.1:9", "no scheduler answers")
     nobody = distributed.LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", silence_logs=50)
-    with (
-        nobody,
-        pytest.raises(InputError, match="has no worker"),
-        connect_workers(nobody.scheduler_address),
-    ):
-        pass
+    with nobody:
+        refuse_to_connect(nobody.scheduler_address, "has no worker")
 
 
-def test_workers_that_are_gone_for_good_are_not_waited_for_for_ever(monkeypatch, tmp_path):
-    class Finished:
-        """A job that was given out, and never comes back."""
-
-        def is_empty(self):
-            return False
-
-        has_ready = is_empty
-
-    class Scheduler:
-        def nthreads(self):
-            return {}
-
+def test_workers_that_are_gone_for_good_are_not_waited_for_for_ever(monkeypatch):
+    # A job that was given out, and never comes back.
+    finished = SimpleNamespace(is_empty=lambda: False, has_ready=lambda: False)
     monkeypatch.setattr(jobs_module, "RECOUNT_INTERVAL_S", 0.01)
     monkeypatch.setattr(jobs_module, "MAX_WORKERLESS_S", 0.1)
     with pytest.raises(InputError, match="no worker for"):
-        next(jobs_module._iterate_finished(Scheduler(), Finished()))
+        next(jobs_module._iterate_finished(SimpleNamespace(nthreads=dict), finished))
 
 
 @pytest.mark.parametrize("size", [10, MAX_HASHED_BYTES + 1])
@@ -204,10 +164,11 @@ def test_a_folder_belongs_to_the_content_of_its_inputs(tmp_path, size):
 
 def test_a_folder_belongs_to_its_settings(tmp_path):
     folder = tmp_path / "new" / "results"
-    lock_output_folder(folder, {"method": "tv", "camera": Path("camera.h5"), "weight": None})
-    lock_output_folder(folder, {"method": "tv", "camera": Path("camera.h5"), "weight": None})
+    settings = {"method": "tv", "camera": Path("camera.h5"), "weight": None}
+    lock_output_folder(folder, settings)
+    lock_output_folder(folder, settings)
     with pytest.raises(InputError, match="method tv instead of l1"):
-        lock_output_folder(folder, {"method": "l1", "camera": Path("camera.h5"), "weight": None})
+        lock_output_folder(folder, settings | {"method": "l1"})
     for text in ("{", "[]"):
         (folder / "settings.json").write_text(text)
         with pytest.raises(FileFormatError):

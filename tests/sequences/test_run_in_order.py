@@ -1,11 +1,9 @@
 """Work on a stream: order, overlap, bounded numbers, measured times, ends."""
 
-from __future__ import annotations
-
 import gc
 import threading
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from time import sleep
 
@@ -32,7 +30,14 @@ def keep(value: int) -> int:
     return value
 
 
-def stream_threads() -> list[threading.Thread]:
+def count(number: int, seconds: float = 0.0, begun: Callable[[int], object] = keep):
+    for value in range(number):
+        sleep(seconds)
+        begun(value)
+        yield value
+
+
+def stream_threads():
     return [thread for thread in threading.enumerate() if thread.name.startswith("stream ")]
 
 
@@ -56,13 +61,7 @@ def test_work_overlaps_and_its_latency_is_measured():
 
 def test_a_slow_consumer_holds_the_source_back(worker):
     brought: list[int] = []
-
-    def source() -> Iterator[int]:
-        for number in range(50):
-            brought.append(number)
-            yield number
-
-    stream = run_in_order(source(), keep, worker, at_once=2, queue_size=2)
+    stream = run_in_order(count(50, begun=brought.append), keep, worker, at_once=2, queue_size=2)
     next(stream)
     sleep(4 * STEP)
     # two before the work and two in it, the one handed out, and the one that the reader holds
@@ -71,12 +70,8 @@ def test_a_slow_consumer_holds_the_source_back(worker):
 
 
 def test_slow_work_drops_the_oldest_where_that_is_wanted(worker):
-    def source() -> Iterator[int]:
-        for number in range(20):
-            sleep(STEP / 5)
-            yield number
-
-    items = list(run_in_order(source(), slow, worker, at_once=1, policy="drop_oldest"))
+    source = count(20, STEP / 5)
+    items = list(run_in_order(source, slow, worker, at_once=1, policy="drop_oldest"))
     numbers = [item.number for item in items]
     assert numbers[-1] == 19  # the newest is never dropped
     assert numbers == sorted(numbers)
@@ -85,14 +80,10 @@ def test_slow_work_drops_the_oldest_where_that_is_wanted(worker):
 
 
 def test_a_slow_consumer_gets_the_newest_where_that_is_wanted():
-    def source() -> Iterator[int]:
-        for number in range(40):
-            sleep(STEP / 5)
-            yield number
-
+    source = count(40, STEP / 5)
     with ThreadPoolExecutor(3) as workers:
         items = []
-        for item in run_in_order(source(), keep, workers, at_once=3, policy="drop_oldest"):
+        for item in run_in_order(source, keep, workers, at_once=3, policy="drop_oldest"):
             items.append(item)
             sleep(2 * STEP)
     assert items[-1].number == 39
@@ -105,7 +96,7 @@ def test_results_that_nobody_took_make_room_for_others():
     together, waited = threading.Barrier(3), threading.Event()
     done: list[int] = []
 
-    def source() -> Iterator[int]:
+    def source():
         yield from range(6)
         waited.wait(30)
         yield from (100, 101, 102)
@@ -133,7 +124,7 @@ def test_few_things_are_alive(worker):
     alive: weakref.WeakSet[Thing] = weakref.WeakSet()
     highest = 0
 
-    def source() -> Iterator[Thing]:
+    def source():
         nonlocal highest
         for _ in range(30):
             thing = Thing()
@@ -154,7 +145,7 @@ def test_few_things_are_alive(worker):
 
 @pytest.mark.parametrize("place", ["source", "work"])
 def test_a_fault_is_raised_behind_what_was_done(place, worker):
-    def source() -> Iterator[int]:
+    def source():
         yield from range(3)
         if place == "source":
             raise OSError("unplugged")
@@ -175,7 +166,7 @@ def test_a_fault_is_raised_behind_what_was_done(place, worker):
 def test_leaving_early_ends_the_threads_and_closes_the_source(worker):
     closed = threading.Event()
 
-    def source() -> Iterator[int]:
+    def source():
         try:
             while True:
                 yield 0
@@ -198,27 +189,18 @@ def test_what_fails_is_told_and_the_stream_goes_on(worker):
 
     failed: list[tuple[int, str]] = []
     source = [0, InputError("half written"), 2, 3]
-    items = run_in_order(
-        source,
-        work,
-        worker,
-        1,
-        on_failure=lambda number, fault: failed.append((number, str(fault))),
-    )
+
+    def note(number: int, fault: Exception) -> None:
+        failed.append((number, str(fault)))
+
+    items = run_in_order(source, work, worker, 1, on_failure=note)
     assert [(item.number, item.value) for item in items] == [(0, 0), (3, 3)]
     assert failed == [(1, "half written"), (2, "dark")]
     with pytest.raises(InputError, match="half written"):
         list(run_in_order(source, work, worker, 1))
 
 
-@pytest.mark.parametrize(
-    ("settings", "problem"),
-    [
-        ({"at_once": 0}, "one entry"),
-        ({"queue_size": 0}, "one entry"),
-        ({"policy": "all"}, "policy"),
-    ],
-)
-def test_unusable_streams_are_refused(worker, settings, problem):
-    with pytest.raises(InputError, match=problem):
-        next(run_in_order([], keep, worker, **{"at_once": 1, **settings}))
+def test_unusable_streams_are_refused(worker):
+    for wrong in ({"at_once": 0}, {"queue_size": 0}, {"policy": "all"}):
+        with pytest.raises(InputError, match=r"one entry|policy"):
+            next(run_in_order([], keep, worker, **{"at_once": 1, **wrong}))

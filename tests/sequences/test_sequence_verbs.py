@@ -1,7 +1,5 @@
 """The verbs on sequences: what they write, say and return."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -143,9 +141,8 @@ def test_studies_on_a_cluster(run, scheduler, tmp_path):
     (folder / "table1.json").write_text("{")  # damaged: made again
     status, out, err = run(line)
     assert (status, json.loads(out)["results"]) == (0, 1), err
-    assert {path.name for path in folder.iterdir()} == {
-        f"table1.{ending}" for ending in ("md", "csv", "png", "json")
-    }
+    names = {f"table1.{ending}" for ending in ("md", "csv", "png", "json")}
+    assert {path.name for path in folder.iterdir()} == names
     assert "tofclip reproduce table1" in (tmp_path / "made" / "reproduction.md").read_text()
     made = (folder / "table1.json").stat().st_mtime_ns
     reported = json.loads(run(line)[1])
@@ -171,11 +168,11 @@ def test_captures_on_a_cluster_are_imaged_as_here(run, scheduler, tmp_path):
     captures.mkdir()
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 12), np.linspace(-0.5, 0.5, 12))
     wall = np.stack([x, y, 0.1 * x**2], axis=-1)
+    axis = TimeAxis(256, 32e-12)
     for number in range(3):
         scene = PointScene([[0.1 * number, 0.0, 0.6]])
-        scene.simulate_capture(wall, [0.1, 0.0, 0.0], TimeAxis(256, 32e-12), 150e-12).save(
-            captures / f"{number}.h5"
-        )
+        made = scene.simulate_capture(wall, [0.1, 0.0, 0.0], axis, 150e-12)
+        made.save(captures / f"{number}.h5")
     (captures / "broken.h5").write_text("no capture")
     line = f"nlos reconstruct {captures} --method hybrid --wavelength-mm 300 --voxel-mm 60"
     here, there = tmp_path / "here", tmp_path / "there"
@@ -206,9 +203,8 @@ def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path, af
     )
     command = [sys.executable, "-m", "tofclip", *line.split()]
     # A terminal sends Ctrl-C to a whole group of processes.
-    process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=ROOT
-    )
+    options = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True, "cwd": ROOT}
+    process = subprocess.Popen(command, **options)
     try:
         # a worker and a tracker
         while process.poll() is None and len(psutil.Process(process.pid).children()) < 2:

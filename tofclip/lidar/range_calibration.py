@@ -15,7 +15,7 @@ measurements do not show is pulled to zero and standard deviations hold whatever
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,54 +46,42 @@ SPAN_PERCENTILES = (2.0, 98.0)
 
 WINDOW_PULSES = 0.5  # returns of one surface lie within this many pulse widths
 
-MIN_TARGET_PIXELS = 3
-"""With the target's return. In the dark a detector announces one in a pixel of a hundred, at any
-range: the camera of such a shot would be wrong by the length of the record."""
-
-MIN_TARGET_FRACTION = 0.005
-"""Of the picture's pixels: rays and false alarms agree by chance in patches of a few pixels across."""
-
-MIN_TARGET_BRIGHTNESS = 0.02
-"""Of the whole picture's brightest returns. What is dimmer may be a trace that a recovery leaves of
-them elsewhere: in the dark corners of a recorded scene these had 0.2 to 0.5 % (method tv)."""
-
-BRIGHTEST_PERCENTILE = 99.0
-# Of the returns that are not that dim: a plate is most of what is seen. Cluttered scenes have 0.05 to
-# 0.5.
+# In the dark a detector announces a return in a pixel of a hundred, at any range; rays and false
+# alarms agree by chance in patches of a few pixels across.
+MIN_TARGET_PIXELS, MIN_TARGET_FRACTION = 3, 0.005
+# Of the whole picture's brightest returns. What is dimmer may be a trace that a recovery leaves of
+# them elsewhere: in the dark corners of a recorded scene these had 0.2 to 0.5 % (method tv).
+MIN_TARGET_BRIGHTNESS, BRIGHTEST_PERCENTILE = 0.02, 99.0
+# Of the returns that are not that dim: a plate is most of what is seen, cluttered scenes 0.05 to 0.5.
 MIN_TARGET_SHARE = 0.5
-
+# Returns up to a window's width before and behind the target, over the target's: none beside a plate,
+# as many as within on a surface that goes on in depth.
 MAX_FLANK_RATIO = 0.25
-"""Returns up to a window's width before and behind the target, over the target's: none beside a plate,
-as many as within on a surface that goes on in depth."""
-
+# Median distance from the target's plane in half widths of the window, which holds six deviations: a
+# plate's noise makes 0.11 of it at most, depths that fill the window evenly make 0.5.
 MAX_ROUGHNESS = 0.2
-"""Median distance from the target's plane in half widths of the window. A plate's noise makes 0.11 of
-it at most (the window holds six deviations), depths that fill the window evenly make 0.5."""
-
 MAX_RIVAL_FRACTION = 0.7  # of the target's returns, that another surface may have
 MAX_SHOT_SPREAD_PULSES = 1.0  # by which the shots' time zeros may differ
 MAX_BRIGHTNESS_RATIO = 1.5  # of shots that are said to show one reflectance
 SHOW_A_PLATE = "show a flat plate that faces the camera, or cut the picture to it (`region`)"
 
 
-@dataclass(frozen=True)
-class Measurements:
-    """Measurements of one quantity in many pixels and several shots."""
+class Measurements(NamedTuple):
+    """Measurements of one quantity in many pixels and several shots, (n,) each."""
 
-    value: FloatArray  # (n,)
-    sigma: FloatArray  # (n,), one standard deviation, right up to a factor
+    value: FloatArray
+    sigma: FloatArray  # one standard deviation, right up to a factor
     design: FloatArray  # (n, effects), fixed effects
-    shot: NDArray[np.int64]  # (n,), numbers from 0
-    pixel: NDArray[np.int64]  # (n,), numbers from 0
-    y: NDArray[np.int64]  # (n,), row and column of the pixel
+    shot: NDArray[np.int64]  # numbers from 0
+    pixel: NDArray[np.int64]  # numbers from 0
+    y: NDArray[np.int64]  # row and column of the pixel
     x: NDArray[np.int64]
 
-    def __getitem__(self, chosen: NDArray[np.bool_]) -> Measurements:
-        return Measurements(*(getattr(self, part.name)[chosen] for part in fields(self)))
+    def keep(self, chosen: NDArray[np.bool_]) -> Measurements:
+        return Measurements(*(part[chosen] for part in self))
 
 
-@dataclass(frozen=True)
-class Variances:
+class Variances(NamedTuple):
     """What varies."""
 
     noise: float  # factor of the measurements' own variances
@@ -101,65 +89,55 @@ class Variances:
     pixels: float
 
 
-@dataclass(frozen=True)
-class Effects:
+class Effects(NamedTuple):
     """What was found."""
 
-    fixed: FloatArray  # (effects,)
-    covariance: FloatArray  # (effects, effects), of the fixed effects
-    shots: FloatArray  # (shots,), each shot's own
-    pixels: FloatArray  # (pixels,), each pixel's own, and its standard deviation
-    pixel_sigma: FloatArray
+    fixed: FloatArray
+    covariance: FloatArray  # of the fixed effects
+    shots: FloatArray  # each shot's own
+    pixels: FloatArray  # each pixel's own, and its variance
+    pixel_variance: FloatArray
     variances: Variances
-    inliers: NDArray[np.bool_]  # (n,), measurements that were used
+    inliers: NDArray[np.bool_]  # measurements that were used
 
 
-@dataclass(frozen=True)
-class _Solution:
+class _Solution(NamedTuple):
     fixed: FloatArray
     shots: FloatArray
     pixels: FloatArray
-    covariance: FloatArray  # of the fixed effects and the shots'
     pixel_variance: FloatArray
+    covariance: FloatArray  # of the fixed effects and the shots'
     residual: FloatArray
     fitted_variance: FloatArray  # of what is fitted to each measurement
 
 
-def fit_effects(data: Measurements, with_shots: bool = True, with_pixels: bool = True) -> Effects:
+def fit_effects(data: Measurements, with_shots: bool, with_pixels: bool) -> Effects:
     """Estimate all effects and what they vary by; shots and pixels have effects of their own or not."""
     sizes = int(data.shot.max()) + 1, int(data.pixel.max()) + 1
     step = -(-sizes[1] // MAX_FITTED_PIXELS)
     inliers = np.ones(data.value.size, bool)
     for rounds in EM_ROUNDS:
-        chosen = inliers & (data.pixel % step == 0)
-        variances = _estimate_variances(data[chosen], sizes, (with_shots, with_pixels), rounds)
-        found = _solve(data[inliers], variances, sizes)
+        some = data.keep(inliers & (data.pixel % step == 0))
+        variances = _estimate_variances(some, sizes, (with_shots, with_pixels), rounds)
+        found = _solve(data.keep(inliers), variances, sizes)
         predicted = data.design @ found.fixed + found.shots[data.shot] + found.pixels[data.pixel]
         distance = np.abs(data.value - predicted) / (data.sigma * np.sqrt(variances.noise))
         inliers = distance < OUTLIER_SIGMA
-    used = data[inliers]
+    used = data.keep(inliers)
     found = _solve(used, variances, sizes)
     shared = measure_correlation(found.residual / (used.sigma * np.sqrt(variances.noise)), used)
     # Errors that neighbours share do not average out: as many measurements as are independent.
-    fewer = replace(variances, noise=variances.noise * shared)
+    fewer = variances._replace(noise=variances.noise * shared)
     effects = data.design.shape[1]
     covariance = _solve(used, fewer, sizes).covariance[:effects, :effects]
     if variances.shots > 0:
-        still = replace(fewer, shots=0.0)
-        without = _solve(used, still, sizes).covariance[:effects, :effects]
+        without = _solve(used, fewer._replace(shots=0.0), sizes).covariance[:effects, :effects]
         # What a handful of shots say of their own spread is uncertain itself: Student's t.
         freedom = max(sizes[0] - effects, 1)
         widened = float(scipy.special.stdtrit(freedom, scipy.special.ndtr(1.0))) ** 2
         covariance = without + widened * (covariance - without)
-    return Effects(
-        found.fixed,
-        covariance,
-        found.shots,
-        found.pixels,
-        np.sqrt(found.pixel_variance),
-        variances,
-        inliers,
-    )
+    own = found.shots, found.pixels, found.pixel_variance
+    return Effects(found.fixed, covariance, *own, variances, inliers)
 
 
 def measure_correlation(standardised: FloatArray, data: Measurements) -> float:
@@ -167,10 +145,8 @@ def measure_correlation(standardised: FloatArray, data: Measurements) -> float:
     standard deviations, over blocks of pixels, over that of independent errors; 1 where the difference
     is within chance.
     """
-    blocks = np.stack(
-        [data.shot, data.y // CORRELATION_BLOCK_PX, data.x // CORRELATION_BLOCK_PX], axis=1
-    )
-    _, block, number = np.unique(blocks, axis=0, return_inverse=True, return_counts=True)
+    blocks = np.stack([data.shot, *(np.stack(data[-2:]) // CORRELATION_BLOCK_PX)])
+    _, block, number = np.unique(blocks, axis=1, return_inverse=True, return_counts=True)
     sums = np.bincount(block.ravel(), standardised)
     large = number > CORRELATION_BLOCK_PX
     if large.sum() < 2:
@@ -207,19 +183,13 @@ def _estimate_variances(
         found = _solve(data, now, sizes)
         squares = (found.residual**2 + found.fitted_variance) / data.sigma**2
         own = np.diagonal(found.covariance)[data.design.shape[1] :]
-        before, now = (
-            now,
-            Variances(
-                max(float(np.mean(squares)), TINY),
-                present[0] * float(np.mean(found.shots**2 + own)),
-                present[1] * float(np.mean((found.pixels**2 + found.pixel_variance)[seen])),
-            ),
+        before = np.array(now)
+        now = Variances(
+            max(float(np.mean(squares)), TINY),
+            present[0] * float(np.mean(found.shots**2 + own)),
+            present[1] * float(np.mean((found.pixels**2 + found.pixel_variance)[seen])),
         )
-        if all(
-            abs(getattr(now, part.name) - getattr(before, part.name))
-            <= EM_TOLERANCE * getattr(before, part.name)
-            for part in fields(now)
-        ):
+        if np.all(np.abs(now - before) <= EM_TOLERANCE * before):
             break
     return now
 
@@ -257,9 +227,8 @@ def _solve(data: Measurements, variances: Variances, sizes: tuple[int, int]) -> 
     residual = data.value - design @ theta - own[data.pixel]
     if variances.shots == 0:
         theta, covariance = np.pad(theta, (0, shots)), np.pad(covariance, (0, shots))
-    return _Solution(
-        theta[:effects], theta[effects:], own, covariance, own_variance, residual, fitted
-    )
+    both = theta[:effects], theta[effects:]
+    return _Solution(*both, own, own_variance, covariance, residual, fitted)
 
 
 def correct_returns(returns: Returns) -> Returns:
@@ -269,13 +238,8 @@ def correct_returns(returns: Returns) -> Returns:
     known = returns.camera.range_calibration
     if known is None:
         return returns
-    distance, intensity, sigma = correct_ranges(
-        known,
-        returns.range,
-        returns.intensity / square_range(returns.range),
-        returns.confidence.astype(np.float64),
-        (returns.y, returns.x),
-    )
+    seen = returns.range, count_signal(returns), returns.confidence.astype(np.float64)
+    distance, intensity, sigma = correct_ranges(known, *seen, (returns.y, returns.x))
     return replace(
         returns,
         range=distance,
@@ -301,24 +265,21 @@ def correct_ranges(
     return corrected, signal * corrected**2, np.hypot(sigma, further)
 
 
-def square_range(distance: FloatArray) -> FloatArray:
-    """Square of measured ranges, by which their intensities were referred to 1 m; never 0."""
-    return np.maximum(distance**2, np.finfo(np.float64).tiny)
+def count_signal(returns: Returns) -> FloatArray:
+    """Counts of returns, which list what they would have at 1 m."""
+    return np.asarray(returns.intensity / np.maximum(returns.range**2, np.finfo(np.float64).tiny))
 
 
 @dataclass(frozen=True)
 class TargetShot:
     """What was seen of a target at a known distance."""
 
-    # as they were measured, without a range calibration; ranges from the camera's time zero
-    returns: Returns
+    returns: Returns  # as measured, without a range calibration, from the camera's time zero
     distance: float  # of the target along the optical axis, m
-    # first and last time of flight of the record, s, from the same time zero
-    record: tuple[float, float]
+    record: tuple[float, float]  # its first and last time of flight, s, from the same time zero
     name: str = "the shot"  # for messages
     reflectance_percent: float = np.nan  # of the target; NaN where it is not known
-    # counts of the brightest returns of the whole picture, where `returns` are those of a part of
-    # it; by default of `returns`
+    # counts of the whole picture's brightest returns, where `returns` are those of a part of it
     brightest: float = np.nan
 
     def __post_init__(self) -> None:
@@ -331,14 +292,13 @@ class TargetShot:
 
     def cut(self, inside: NDArray[np.bool_]) -> TargetShot:
         """Return the shot with a part of its returns, and what is known of the others."""
-        brightest = self.measure_brightest() if np.isnan(self.brightest) else self.brightest
-        return replace(self, returns=self.returns[inside], brightest=brightest)
+        return replace(self, returns=self.returns[inside], brightest=self.measure_brightest())
 
     def measure_brightest(self) -> float:
-        """Counts of the brightest returns."""
-        if not len(self.returns):
-            return 0.0
-        return float(np.percentile(_count_signal(self.returns), BRIGHTEST_PERCENTILE))
+        """Counts of the whole picture's brightest returns."""
+        if not np.isnan(self.brightest) or not len(self.returns):
+            return float(np.nan_to_num(self.brightest))
+        return float(np.percentile(count_signal(self.returns), BRIGHTEST_PERCENTILE))
 
 
 @dataclass(frozen=True)
@@ -349,12 +309,10 @@ class RangeFit:
     jitter: float  # one standard deviation of the shots' own time zeros, s; NaN of a single shot
     offset_spread: float  # one standard deviation of the pixels' offsets, m; NaN of a single shot
     signal: FloatArray  # (n,), counts of the returns that were fitted
-    # (n,), what they measured too long, offsets of pixels and shots taken off, m
-    excess: FloatArray
+    excess: FloatArray  # (n,), m that they measured too long, but for offsets of pixels and shots
     target_fraction: float  # of the pixels with a return, those whose return is the target's
     walk_note: str  # why a part was not fitted; empty where it was
-    offsets_note: str
-    response_note: str
+    offsets_note: str  # of the response as well
 
     @property
     def calibration(self) -> RangeCalibration:
@@ -367,10 +325,10 @@ class RangeFit:
 class _Sample(NamedTuple):
     """The target's returns of one shot or of all, side by side."""
 
-    y: NDArray[np.int64]
-    x: NDArray[np.int64]
     shot: NDArray[np.int64]
     pixel: NDArray[np.int64]
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
     excess: FloatArray
     sigma: FloatArray
     signal: FloatArray
@@ -395,10 +353,8 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
             f"the targets lie {np.ptp(distances):.3g} m apart, and the record shows {length:.3g} m: "
             "one of them is out of the record"
         )
-    samples, shares = zip(
-        *(_select_target(number, shot, base, pulse) for number, shot in enumerate(shots)),
-        strict=True,
-    )
+    found = [_select_target(number, shot, base, pulse) for number, shot in enumerate(shots)]
+    samples, shares = zip(*found, strict=True)
     sample = _Sample(*map(np.concatenate, zip(*samples, strict=True)))
     _require_agreement(shots, sample, pulse)
     span = np.percentile(np.log10(sample.signal), SPAN_PERCENTILES)
@@ -410,18 +366,10 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
     # brightness: hence decades. From the usual brightness, so that the constant is the time zero of
     # a usual return.
     decades = np.log10(sample.signal / reference)
-    data = Measurements(
-        sample.excess,
-        sample.sigma,
-        decades[:, np.newaxis] ** np.arange(order + 1),
-        sample.shot,
-        sample.pixel,
-        sample.y,
-        sample.x,
-    )
+    walks = decades[:, np.newaxis] ** np.arange(order + 1)
+    data = Measurements(sample.excess, sample.sigma, walks, *sample[:4])
     repeated = len(shots) > 1
     effects = fit_effects(data, repeated, repeated)
-    once = "one shot does not tell the pixels' own from noise: give two or more"
     calibration = RangeCalibration(
         time_zero_sigma=float(np.sqrt(effects.covariance[0, 0]) * 2 / SPEED_OF_LIGHT),
         walk=effects.fixed[1:],
@@ -429,29 +377,27 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
         reference_signal=reference,
         signal_range=10**span,
     )
-    shape = base.image_shape
+    jitter, spread = np.nan, np.nan
     if repeated:
+        jitter, spread = (float(np.sqrt(value)) for value in effects.variances[1:])
+        sigma = np.sqrt(effects.pixel_variance)
         calibration = replace(
             calibration,
-            offsets=_to_picture(effects.pixels, shape),
-            offset_sigma=_to_picture(
-                effects.pixel_sigma, shape, float(np.sqrt(effects.variances.pixels))
-            ),
+            offsets=_to_picture(effects.pixels, base.image_shape),
+            offset_sigma=_to_picture(sigma, base.image_shape, spread),
         )
     calibration = _add_brightness(calibration, shots, sample, effects, base)
     late = float(effects.fixed[0]) * 2 / SPEED_OF_LIGHT
-    left = (sample.excess - effects.shots[sample.shot] - effects.pixels[sample.pixel])[
-        effects.inliers
-    ]
+    excess = sample.excess - effects.shots[sample.shot] - effects.pixels[sample.pixel]
+    once = "one shot does not tell the pixels' own from noise: give two or more"
     return RangeFit(
         base.replace(time_zero=late, range_calibration=calibration),
-        float(np.sqrt(effects.variances.shots)) * 2 / SPEED_OF_LIGHT if repeated else np.nan,
-        float(np.sqrt(effects.variances.pixels)) if repeated else np.nan,
+        jitter * 2 / SPEED_OF_LIGHT,
+        spread,
         sample.signal[effects.inliers],
-        left - effects.fixed[0],
+        excess[effects.inliers] - effects.fixed[0],
         min(shares),
         walk_note,
-        "" if repeated else once,
         "" if repeated else once,
     )
 
@@ -477,14 +423,14 @@ def _select_target(
     )
     if len(found) == 0:
         raise missing
-    brightest = shot.measure_brightest() if np.isnan(shot.brightest) else shot.brightest
-    clear = _count_signal(found) >= MIN_TARGET_BRIGHTNESS * brightest
+    signal, brightest = count_signal(found), shot.measure_brightest()
+    clear = signal >= MIN_TARGET_BRIGHTNESS * brightest
     if not clear.any():
         raise CalibrationError(
-            f"{shot.name}: no plate: its returns have {np.median(_count_signal(found)):.3g} counts at "
+            f"{shot.name}: no plate: its returns have {np.median(signal):.3g} counts at "
             f"most places, the picture's brightest {brightest:.3g}: a trace of these; {SHOW_A_PLATE}"
         )
-    found = found[clear]
+    found, signal = found[clear], np.maximum(signal[clear], TINY)
     # A plate across the axis is farther along slanted lines of sight: its distance is over the
     # cosine.
     cosine = compute_ray_directions(camera, found.y, found.x)[:, 2]
@@ -506,23 +452,9 @@ def _select_target(
     # Whatever time zero the shot was recovered with is put back: it is what is to be found.
     zero = SPEED_OF_LIGHT / 2 * shot.returns.camera.time_zero
     y, x = found.y[target].astype(np.int64), found.x[target].astype(np.int64)
-    sample = _Sample(
-        y,
-        x,
-        np.full(y.size, number),
-        y * camera.image_shape[1] + x,
-        excess[target] + zero,
-        sigma[target],
-        _count_signal(found)[target],
-        cosine[target],
-    )
-    return sample, float(target.mean())
-
-
-def _count_signal(returns: Returns) -> FloatArray:
-    """Counts of returns, which list what they would have at 1 m."""
-    signal = returns.intensity / square_range(returns.range)
-    return np.asarray(np.maximum(signal, np.finfo(np.float32).tiny), dtype=np.float64)
+    place = np.full(y.size, number), y * camera.image_shape[1] + x, y, x
+    seen = (part[target] for part in (excess + zero, sigma, signal, cosine))
+    return _Sample(*place, *seen), float(target.mean())
 
 
 def _require_plate(
@@ -561,18 +493,18 @@ def _require_plate(
 def _find_cluster(excess: FloatArray, width: float, name: str) -> NDArray[np.bool_]:
     """Say which returns lie in the window that holds most of them, and refuse a rival to it."""
 
-    def find_fullest(values: FloatArray) -> tuple[FloatArray, int]:
+    def find_fullest(values: FloatArray) -> FloatArray:
         """What lies in the fullest of the windows that begin at each value."""
         order = np.sort(values)
         inside = np.searchsorted(order, order + width, side="right") - np.arange(order.size)
         first = int(np.argmax(inside))
-        return order[first : first + inside[first]], int(inside[first])
+        return order[first : first + inside[first]]
 
-    middle = float(np.median(find_fullest(excess)[0]))
+    middle = float(np.median(find_fullest(excess)))
     target: NDArray[np.bool_] = np.abs(excess - middle) <= width
     if not target.all():
-        rival, number = find_fullest(excess[~target])
-        if number > MAX_RIVAL_FRACTION * target.sum():
+        rival = find_fullest(excess[~target])
+        if rival.size > MAX_RIVAL_FRACTION * target.sum():
             raise CalibrationError(
                 f"{name}: two surfaces as large as each other, {abs(rival[0] - middle):.3g} m apart: "
                 "which is the target? Cut the picture to it (`region`)"
@@ -595,9 +527,9 @@ def _require_agreement(shots: Sequence[TargetShot], sample: _Sample, pulse: floa
 
 def _explain_missing_walk(shots: int, span: FloatArray, asked: bool | None) -> str:
     """Say why no walk can be fitted, if so; refuse where one is asked for."""
-    note = ""
     if asked is False:
         return "not asked for"
+    note = ""
     if shots < MIN_WALK_SHOTS:
         note = f"a range walk needs {MIN_WALK_SHOTS} shots of different brightness, got {shots}"
     elif np.ptp(span) < MIN_WALK_SPAN_DECADES:
@@ -620,25 +552,15 @@ def _add_brightness(
     """Add the pixels' response and the scale of reflectance, from logarithms of intensities; `effects`
     of the ranges say what belongs to the target.
     """
-    used = effects.inliers
-    shot, pixel = sample.shot[used], sample.pixel[used]
+    used = _Sample(*(part[effects.inliers] for part in sample))
     # The range that the calibration gives: that of the target, up to noise.
-    distance = np.array([one.distance for one in shots])[shot] / sample.cosine[used]
-    intensity = sample.signal[used] * distance**2
-    brightness = fit_effects(
-        Measurements(
-            # A surface that faces the camera looks darker at an angle, by Lambert's law.
-            np.log(intensity / sample.cosine[used]),
-            1 / np.sqrt(np.maximum(sample.signal[used], 1.0)),
-            (shot[:, np.newaxis] == np.arange(len(shots))).astype(np.float64),
-            shot,
-            pixel,
-            sample.y[used],
-            sample.x[used],
-        ),
-        with_shots=False,
-        with_pixels=len(shots) > 1,
-    )
+    distance = np.array([one.distance for one in shots])[used.shot] / used.cosine
+    # A surface that faces the camera looks darker at an angle, by Lambert's law.
+    value = np.log(used.signal * distance**2 / used.cosine)
+    sigma = 1 / np.sqrt(np.maximum(used.signal, 1.0))
+    design = (used.shot[:, np.newaxis] == np.arange(len(shots))).astype(np.float64)
+    data = Measurements(value, sigma, design, *used[:4])
+    brightness = fit_effects(data, with_shots=False, with_pixels=len(shots) > 1)
     if len(shots) > 1:
         response = _to_picture(np.exp(brightness.pixels), camera.image_shape, 1.0)
         calibration = replace(calibration, response=response)
@@ -653,15 +575,11 @@ def _add_brightness(
             f"the shots' brightness differs by a factor of {ratio:.3g} at the reflectance given: "
             "give each shot's own, with the transmission of its filter"
         )
-    own = brightness.covariance[np.ix_(known, known)]
-    sigma = float(np.sqrt(own.mean()))
+    doubt = float(np.sqrt(brightness.covariance[np.ix_(known, known)].mean()))
     if scales.size > 1:
-        sigma = max(sigma, float(np.std(scales, ddof=1) / np.sqrt(scales.size)))
-    return replace(
-        calibration,
-        reflectance_scale=float(np.exp(scales.mean())),
-        reflectance_scale_sigma=sigma,
-    )
+        doubt = max(doubt, float(np.std(scales, ddof=1) / np.sqrt(scales.size)))
+    scale = float(np.exp(scales.mean()))
+    return replace(calibration, reflectance_scale=scale, reflectance_scale_sigma=doubt)
 
 
 def _to_picture(values: FloatArray, shape: tuple[int, int], missing: float = 0.0) -> FloatArray:
