@@ -42,11 +42,6 @@ class Alignment:
     rms: float  # root mean square distance to these neighbours, m
 
 
-def select_points(cloud: PointCloud, chosen: NDArray[Any]) -> PointCloud:
-    """Return some points of a cloud, by mask or by numbers."""
-    return cloud[chosen]
-
-
 def transform_cloud(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
     """Return a cloud in another frame, such as that of a mount or of a map; ranges stay those from
     the camera. `pose` (4, 4): extrinsics: rotation and translation (m) from the camera's frame to
@@ -88,11 +83,6 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     columns["range_sigma"] = np.sqrt(mean(cloud.range_sigma.astype(np.float64) ** 2) / number)
     positions = np.stack([mean(axis) for axis in cloud.xyz.T], axis=-1).astype(np.float32)
     return replace(cloud, xyz=positions, return_number=first, **columns)
-
-
-def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0) -> PointCloud:
-    """Leave out what `find_outliers` finds."""
-    return cloud[~find_outliers(cloud, neighbours, deviations)]
 
 
 def find_outliers(

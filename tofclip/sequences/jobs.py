@@ -43,16 +43,6 @@ from tofclip.version import __version__
 if TYPE_CHECKING:
     from distributed import Client, Future, as_completed
 
-__all__ = [
-    "Failure",
-    "Job",
-    "Report",
-    "Summary",
-    "lock_output_folder",
-    "run_jobs",
-    "select_unfinished",
-]
-
 SETTINGS_NAME = "settings.json"
 INPUTS_KEY = "inputs"
 
@@ -60,24 +50,10 @@ INPUTS_KEY = "inputs"
 def lock_output_folder(
     folder: Path, settings: Mapping[str, Any], inputs: Mapping[str, Path] | None = None
 ) -> None:
-    """Make a folder for the results of a run, or check that the one there holds results of the same
-    settings and inputs.
-
-    Parameters
-    ----------
-    folder : Path
-        Made with its parents if it is missing.
-    settings : mapping
-        Whatever a result depends on, besides its input: names to strings, numbers and None.
-    inputs : mapping of str to Path, optional
-        Files by the names of their results. The folder may hold results of more, or of less.
-
-    Raises
-    ------
-    InputError
-        The folder belongs to other settings, or a file has changed since its result was made.
-    StorageError, FileFormatError
-        It cannot be made, read or written.
+    """Make a folder for the results of a run, or refuse one that holds results of other settings or
+    of files that have changed since. `settings`: whatever a result depends on besides its input,
+    strings, numbers and None; `inputs`: files by the names of their results, of which the folder may
+    hold more or less.
     """
     path = folder / SETTINGS_NAME
     try:
@@ -265,26 +241,13 @@ class Job:
 
 @dataclass(frozen=True)
 class Report:
-    """What became of a job.
-
-    Parameters
-    ----------
-    name : str
-    problem : str
-        Empty if it went well.
-    figures : object
-        What its work returned; None as well where the result was there already.
-    process : str
-        Which process did it; empty where none did.
-    peak_bytes : int
-        Most memory that this process has held so far; 0 where the system does not report it.
-    """
+    """What became of a job."""
 
     name: str
-    problem: str = ""
-    figures: Any = None
-    process: str = ""
-    peak_bytes: int = 0
+    problem: str = ""  # empty if it went well
+    figures: Any = None  # what its work returned; None as well where the result was there already
+    process: str = ""  # which process did it; empty where none did
+    peak_bytes: int = 0  # most memory that this process has held so far, where the system says
 
 
 @dataclass(frozen=True)
@@ -297,25 +260,12 @@ class Failure:
 
 @dataclass(frozen=True)
 class Summary:
-    """What became of many jobs.
+    """What became of many jobs."""
 
-    Parameters
-    ----------
-    done : int
-        Jobs whose result is there now.
-    failures : tuple of Failure
-        The others.
-    processes : int
-        How many processes took part.
-    peak_bytes : int
-        Most memory that one of them held, its program and libraries included.
-    seconds : float
-    """
-
-    done: int
-    failures: tuple[Failure, ...]
-    processes: int
-    peak_bytes: int
+    done: int  # jobs whose result is there now
+    failures: tuple[Failure, ...]  # the others
+    processes: int  # how many took part
+    peak_bytes: int  # most memory that one of them held, its program and libraries included
     seconds: float
 
 
@@ -365,33 +315,14 @@ def run_jobs(
     cluster: str | None = None,
     on_report: Callable[[Report], object] | None = None,
 ) -> Summary:
-    """Attempt every job once; one that fails is reported in the summary and stops none of the
-    others.
+    """Attempt every job once; one that fails is in the summary and stops none of the others. `cluster`
+    as of `connect_workers`, by default one job after the other in this process; scripts that start
+    local workers need ``if __name__ == "__main__":``. `on_report` is called in this thread.
 
-    Parameters
-    ----------
-    jobs : sequence of Job
-        Independent of each other. `select_unfinished` leaves out those whose result is there.
-    cluster : str, optional
-        ``local``, ``local:N`` or ``tcp://HOST:PORT``, see
-        `tofclip.sequences.jobs.connect_workers`; by default one job after the other in this
-        process. Scripts that start local workers need ``if __name__ == "__main__":``.
-    on_report : callable, optional
-        Called in this thread with the report of each job as it comes.
-
-    Returns
-    -------
-    Summary
-
-    Notes
-    -----
     A job whose worker dies (killed, out of memory, power failure) is given to another. One that
     outlives too many workers (the scheduler's ``allowed-failures``) may be innocent, because those
-    that wait beside it are blamed as well: at the end each of them gets another chance, alone. A
-    worker that died in the middle of writing leaves a file under a temporary name, which is removed
-    at the end.
-
-    Memory here: a few hundred bytes for each job. A worker holds what one job needs.
+    that wait beside it are blamed as well: at the end each of them gets another chance, alone. What a
+    worker that died was writing, under a temporary name, is removed at the end.
     """
     started = time.perf_counter()
     done, peak = 0, 0

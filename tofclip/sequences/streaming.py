@@ -70,30 +70,17 @@ def run_in_order(
     worked on.
 
     The source is read on a thread of its own; closing the generator stops it, and closes the source
-    there if it can be closed. At most ``queue_size + at_once + 1`` things are alive besides the one
-    handed out: those that wait, those that are worked on or done before their turn, and the one
-    that the reader holds.
+    there if it can be closed. In the place of a thing that cannot be read may come its
+    `TofclipError`. At most ``queue_size + at_once + 1`` things are alive besides the one handed out:
+    those that wait, those that the executor (threads, processes, a cluster's workers) works on or has
+    done before their turn, and the one that the reader holds.
 
-    Parameters
-    ----------
-    source : iterable
-        In the place of a thing that cannot be read may come its `TofclipError`.
-    work : callable
-        Called by the executor; must not depend on the order in which things are done.
-    executor : Executor
-        Threads, processes or a cluster's workers; where they are processes, work and things have to
-        survive pickling.
-    at_once : int
-        Things that the executor has at a time, at most.
-    queue_size : int
-        Things that wait before it, at most.
-    policy : str
-        ``"block"`` lets the source wait: nothing is lost of a file, and an instrument's own buffer
-        fills up. ``"drop_oldest"`` keeps the latency low: what has waited longest is dropped, and
-        of results that were finished while the consumer was busy it gets the newest.
-    on_failure : callable, optional
-        Called with the number of a thing of which nothing can be made, and its error; the stream
-        goes on. By default the error ends it.
+    Policy ``"block"`` lets the source wait: nothing is lost of a file, and an instrument's own buffer
+    fills up. ``"drop_oldest"`` keeps the latency low: what has waited longest is dropped, and of
+    results that were finished while the consumer was busy it gets the newest.
+
+    `on_failure` is called with the number of a thing of which nothing can be made, and its error; by
+    default the error ends the stream.
     """
     for what, number in (("works on", at_once), ("holds", queue_size)):
         if number < 1:
@@ -258,24 +245,13 @@ def stream_clouds(
     at_once: int | None = None,
     on_failure: OnFailure | None = None,
 ) -> Generator[StreamedCloud, None, None]:
-    """Yield the cloud of every shot as soon as it is made; arguments not named here as in
-    `run_in_order`.
+    """Yield the cloud of every shot as soon as it is made, see `run_in_order`; by a `RangingPipeline`
+    for the camera that the first shot carries if no other is given.
 
-    Parameters
-    ----------
-    pipeline : CloudPipeline, optional
-        By default a `RangingPipeline` for the camera that the first shot carries.
-    executor : Executor, optional
-        By default a core for each shot: shared out among all, a shot would be done sooner, but
-        cores would wait for each other. Where a shot begins at what the last one showed, all cores
-        work on it.
-    at_once : int, optional
-        By default as many as there are cores, and one more where all shots are worth waiting for.
-
-    Notes
-    -----
-    Memory: ``queue_size + at_once + 1`` shots, one more for each core with what is recovered of it,
-    and what the pipeline takes.
+    By default a shot has a core: shared out among all, it would be done sooner, but cores would wait
+    for each other. Where a shot begins at what the last one showed, all cores work on it. Memory:
+    ``queue_size + at_once + 1`` shots, one more for each core with what is recovered of it, and what
+    the pipeline takes.
     """
     coming = iter(shots)
     if pipeline is None:
