@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -75,31 +76,24 @@ def list_npz_entries(path: Path) -> dict[str, ArchiveEntry]:
             claimed = math.prod(shape) * dtype.itemsize
             packed = member.compress_type != zipfile.ZIP_STORED
             require_bounded_size(path, name, claimed, member.compress_size, packed)
-            entries[name] = ArchiveEntry(shape, dtype, _make_npz_loader(path, member))
+            entries[name] = ArchiveEntry(shape, dtype, partial(_load_npz_member, path, member))
     return entries
 
 
 def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Read shape and type of an ``.npy`` file, up to its first value."""
-    is_first = np.lib.format.read_magic(file) == (1, 0)
-    reader = np.lib.format
-    read = reader.read_array_header_1_0 if is_first else reader.read_array_header_2_0
+    layout = np.lib.format
+    is_first = layout.read_magic(file) == (1, 0)
+    read = layout.read_array_header_1_0 if is_first else layout.read_array_header_2_0
     shape, _, dtype = read(file)
     if dtype.hasobject:
         raise ValueError("it holds pickled Python objects, which are never loaded")
     return shape, dtype
 
 
-def _make_npz_loader(path: Path, member: zipfile.ZipInfo) -> Callable[[], NDArray[Any]]:
-    def load() -> NDArray[Any]:
-        with (
-            BoundedFile(path) as opened,
-            zipfile.ZipFile(opened) as archive,
-            archive.open(member) as file,
-        ):
-            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
-
-    return load
+def _load_npz_member(path: Path, member: zipfile.ZipInfo) -> NDArray[Any]:
+    with BoundedFile(path) as opened, zipfile.ZipFile(opened) as archive:
+        return np.asarray(np.lib.format.read_array(archive.open(member), allow_pickle=False))
 
 
 def list_mat_entries(path: Path) -> dict[str, ArchiveEntry]:
@@ -120,57 +114,45 @@ def list_mat_entries(path: Path) -> dict[str, ArchiveEntry]:
         order = {b"IM": "<", b"MI": ">"}[file.read(MAT_HEADER_BYTES)[126:]]
         while file.tell() + 8 <= size:
             kind, length = struct.unpack(f"{order}II", file.read(8))
-            start, packed = file.tell(), kind == MAT_COMPRESSED
+            start = file.tell()
             if start + length > size:
                 raise FileFormatError(path, DAMAGED_MAT)
+            read = partial(_read_element, path, order, kind, start, length)
             # Only the beginning is unpacked: name and shape are wanted here, not the values.
-            first = file.read(min(length, PEEKED_BYTES))
-            if packed:
-                first = zlib.decompressobj().decompress(first, PEEKED_BYTES)
-                kind, first = struct.unpack(f"{order}I", first[:4])[0], first[8:]
-            if kind == MAT_MATRIX:
-                element = _MatElement(path, order, start, length, packed)
-                entries.update(element.list_entries(_MatMatrix(path, order, first)))
+            matrix = read(PEEKED_BYTES)
+            if matrix is not None and matrix.kind == MAT_STRUCT and math.prod(matrix.shape) == 1:
+                for name, part in read().fields():
+                    if part.is_readable:
+                        entry = ArchiveEntry(part.shape, part.dtype, part.values)
+                        entries[f"{matrix.name}.{name}"] = entry
+            elif matrix is not None and matrix.is_readable:
+                if matrix.kind != MAT_CELL:
+                    # A number takes at least one byte in the file, whatever its class.
+                    packed, number = kind == MAT_COMPRESSED, math.prod(matrix.shape)
+                    require_bounded_size(path, matrix.name, number, length, packed)
+                entries[matrix.name] = ArchiveEntry(
+                    matrix.shape, matrix.dtype, lambda read=read: read().values()
+                )
             file.seek(start + length)
     return entries
 
 
-@dataclass(frozen=True)
-class _MatElement:
-    """Where a matrix lies in a file: its bytes from `start` on, compressed ones where `packed`."""
-
-    path: Path
-    order: str
-    start: int
-    length: int
-    packed: bool
-
-    def list_entries(self, matrix: _MatMatrix) -> Iterator[tuple[str, ArchiveEntry]]:
-        if matrix.kind == MAT_STRUCT and math.prod(matrix.shape) == 1:
-            for name, part in self.read().fields():
-                if part.is_readable:
-                    label = f"{matrix.name}.{name}"
-                    yield label, ArchiveEntry(part.shape, part.dtype, part.values)
-        elif matrix.is_readable:
-            if matrix.kind != MAT_CELL:
-                # A number takes at least one byte in the file, whatever its class.
-                number = math.prod(matrix.shape)
-                require_bounded_size(self.path, matrix.name, number, self.length, self.packed)
-            yield (
-                matrix.name,
-                ArchiveEntry(matrix.shape, matrix.dtype, lambda: self.read().values()),
-            )
-
-    def read(self) -> _MatMatrix:
-        with guard(self.path, DAMAGED_MAT), open(self.path, "rb") as file:
-            file.seek(self.start)
-            content = file.read(self.length)
-            if self.packed:
-                unpacker = zlib.decompressobj()
-                claimed = struct.unpack(f"{self.order}I", unpacker.decompress(content, 8)[4:])[0]
-                require_bounded_size(self.path, "a variable", claimed, self.length, True)
-                content = unpacker.decompress(unpacker.unconsumed_tail, claimed + 1)
-            return _MatMatrix(self.path, self.order, content)
+def _read_element(
+    path: Path, order: str, kind: int, start: int, length: int, most: int | None = None
+) -> Any:
+    """Return the matrix of the element whose values begin at byte `start`, None where it is another;
+    of no more than the first bytes, where `most` says how many.
+    """
+    with guard(path, DAMAGED_MAT), open(path, "rb") as file:
+        file.seek(start)
+        content = file.read(length if most is None else min(length, most))
+        if kind == MAT_COMPRESSED:
+            unpacker = zlib.decompressobj()
+            kind, claimed = struct.unpack(f"{order}II", unpacker.decompress(content, 8))
+            if most is None:
+                require_bounded_size(path, "a variable", claimed, length, True)
+            content = unpacker.decompress(unpacker.unconsumed_tail, most or claimed + 1)
+        return _MatMatrix(path, order, content) if kind == MAT_MATRIX else None
 
 
 class _MatMatrix:

@@ -68,9 +68,7 @@ BIN_WIDTH_NAMES = {
 class _PhotonFile:
     """What a file says it holds."""
 
-    arrays: Mapping[
-        str, ArchiveEntry
-    ]  # by name; of objects where pixels have lists of times (cells)
+    arrays: Mapping[str, ArchiveEntry]  # of objects where pixels have lists of times (cells)
     bin_width: float | None = None  # s, where the file says it
     axes: str = ""  # order of the axes of a cube where the format says it
     image_shape: tuple[int, int] | None = None  # of the picture of events where the format says it
@@ -149,9 +147,10 @@ def _find_layout(
 ) -> tuple[str, list[ArchiveEntry]]:
     """Choose the arrays that hold the photons."""
     arrays = opened.arrays
-    small = {name: one for name, one in arrays.items() if len(one.shape) == 3 and not _is_cell(one)}
+    numbers = {name: one for name, one in arrays.items() if not _is_cell(one)}
+    small = {name: one for name, one in numbers.items() if len(one.shape) == 3}
     thick = {name: sum(length != 1 for length in one.shape) for name, one in arrays.items()}
-    cubes = {n: one for n, one in arrays.items() if thick[n] == 3 and not _is_cell(one)}
+    cubes = {name: one for name, one in numbers.items() if thick[name] == 3}
     if axes or opened.axes:  # known: there may be one row, or one pixel
         cubes = cubes or small
     named = [one for n, one in cubes.items() if n.rpartition("/")[2].lower() in CUBE_NAMES]
@@ -264,14 +263,17 @@ def _open_npy(path: Path) -> _PhotonFile:
     return _PhotonFile({"array": ArchiveEntry(shape, dtype, load)})
 
 
-def _open_npz(path: Path) -> _PhotonFile:
-    entries = list_npz_entries(path)
+def _open_archive(
+    list_entries: Callable[[Path], Mapping[str, ArchiveEntry]], path: Path
+) -> _PhotonFile:
+    """Tell the bin width from the arrays of an NPZ file, or of a MAT file of version 5."""
+    entries = list_entries(path)
     scalars = {
-        name: one.load()
-        for name, one in entries.items()
-        if not one.shape and one.dtype.kind in "uif"
+        name: entry.load()
+        for name, entry in entries.items()
+        if name in BIN_WIDTH_NAMES and math.prod(entry.shape) == 1 and entry.dtype.kind in "uif"
     }
-    arrays = {name: one for name, one in entries.items() if one.shape}
+    arrays = {n: entry for n, entry in entries.items() if entry.shape and n not in scalars}
     return _PhotonFile(arrays, _find_bin_width(scalars))
 
 
@@ -282,17 +284,6 @@ def _find_bin_width(scalars: Mapping[str, Any]) -> float | None:
             if math.isfinite(value) and value > 0:
                 return value
     return None
-
-
-def _open_mat(path: Path) -> _PhotonFile:
-    """Version 5; version 7.3 is HDF5."""
-    arrays, scalars = {}, {}
-    for name, entry in list_mat_entries(path).items():
-        if name in BIN_WIDTH_NAMES and math.prod(entry.shape) == 1:
-            scalars[name] = entry.load()
-        else:
-            arrays[name] = entry
-    return _PhotonFile(arrays, _find_bin_width(scalars))
 
 
 def _open_hdf5(path: Path) -> _PhotonFile:
@@ -384,10 +375,8 @@ def _open_ptu(path: Path) -> _PhotonFile:
         _, rows, columns, _, bins = file.shape
         shape, claimed = (rows, columns, bins), rows * columns * bins * 4
         if claimed > MAX_IMAGE_BYTES:  # the file does not bound it: it is sparse
-            raise FileFormatError(
-                path,
-                f"'image' claims {claimed} bytes, more than the {MAX_IMAGE_BYTES} that are read",
-            )
+            problem = f"'image' claims {claimed} bytes, more than the {MAX_IMAGE_BYTES}"
+            raise FileFormatError(path, f"{problem} that are read")
         width = float(file.tcspc_resolution)
         start = int(file.record_offset)
         # Where the end was cut off, what is there counts.
@@ -437,9 +426,10 @@ def _open_sdt(path: Path) -> _PhotonFile:
     return _PhotonFile({"image": ArchiveEntry(shape, dtype, load)}, width, "yxt")
 
 
+_open_mat = partial(_open_archive, list_mat_entries)
 READERS_BY_SIGNATURE: dict[bytes, _PhotonReader] = {
     b"\x93NUMPY": _open_npy,
-    b"PK\x03\x04": _open_npz,
+    b"PK\x03\x04": partial(_open_archive, list_npz_entries),
     b"MATLAB 5": _open_mat,
     HDF5_SIGNATURE: _open_hdf5,
     b"II*\0": _open_tiff,
