@@ -130,9 +130,8 @@ def list_mat_entries(path: Path) -> dict[str, ArchiveEntry]:
                     # A number takes at least one byte in the file, whatever its class.
                     packed, number = kind == MAT_COMPRESSED, math.prod(matrix.shape)
                     require_bounded_size(path, matrix.name, number, length, packed)
-                entries[matrix.name] = ArchiveEntry(
-                    matrix.shape, matrix.dtype, lambda read=read: read().values()
-                )
+                load = partial(_MatMatrix.load, read)
+                entries[matrix.name] = ArchiveEntry(matrix.shape, matrix.dtype, load)
             file.seek(start + length)
     return entries
 
@@ -214,6 +213,11 @@ class _MatMatrix:
                 raise FileFormatError(self._path, DAMAGED_MAT)
             values = np.frombuffer(self._content, stored, number, start)
             return values.astype(self.dtype, copy=False).reshape(self.shape, order="F")
+
+    @staticmethod
+    def load(read: Callable[[], _MatMatrix]) -> NDArray[Any]:
+        """Return the values of a matrix that has to be read."""
+        return read().values()
 
     def fields(self) -> Iterator[tuple[str, _MatMatrix]]:
         """Yield names and contents of the fields of a struct."""

@@ -78,7 +78,7 @@ class Measurements(NamedTuple):
     x: NDArray[np.int64]
 
     def keep(self, chosen: NDArray[np.bool_]) -> Measurements:
-        return Measurements(*(part[chosen] for part in self))
+        return Measurements._make(part[chosen] for part in self)
 
 
 class Variances(NamedTuple):
@@ -366,7 +366,7 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
     # brightness: hence decades. From the usual brightness, so that the constant is the time zero of
     # a usual return.
     decades = np.log10(sample.signal / reference)
-    walks = decades[:, np.newaxis] ** np.arange(order + 1)
+    walks = np.vander(decades, order + 1, increasing=True)
     data = Measurements(sample.excess, sample.sigma, walks, *sample[:4])
     repeated = len(shots) > 1
     effects = fit_effects(data, repeated, repeated)
@@ -552,7 +552,7 @@ def _add_brightness(
     """Add the pixels' response and the scale of reflectance, from logarithms of intensities; `effects`
     of the ranges say what belongs to the target.
     """
-    used = _Sample(*(part[effects.inliers] for part in sample))
+    used = _Sample._make(part[effects.inliers] for part in sample)
     # The range that the calibration gives: that of the target, up to noise.
     distance = np.array([one.distance for one in shots])[used.shot] / used.cosine
     # A surface that faces the camera looks darker at an angle, by Lambert's law.

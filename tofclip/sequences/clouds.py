@@ -9,11 +9,9 @@ from pathlib import Path
 
 from tofclip.arrays import parse_device
 from tofclip.errors import InputError
-from tofclip.files import require_apart
 from tofclip.lidar import PointCloud, Returns, depth, point_cloud
 from tofclip.lidar.cloud import save_organised
-from tofclip.sequences.inputs import make_result_paths
-from tofclip.sequences.jobs import Job, lock_output_folder
+from tofclip.sequences.jobs import Job, list_jobs
 from tofclip.sequences.recovering import normalise_device
 from tofclip.shots import RETURN_CHOICES, Frames
 from tofclip.units import SPEED_OF_LIGHT
@@ -76,10 +74,8 @@ class CloudSettings:
         if returns is None:
             device = parse_device(self.device)
             with device.activate():
-                returns = depth(
-                    replace(frames, values=device.put(frames.values)),
-                    false_alarm=self.false_alarm,
-                )
+                there = replace(frames, values=device.put(frames.values))
+                returns = depth(there, false_alarm=self.false_alarm)
         if len(returns) == 0:
             raise InputError(f"{origin}: {_explain_empty_cloud(frames)}")
         returns = returns.select(self.returns)
@@ -92,20 +88,15 @@ class CloudSettings:
         """Return one job for each file of frames, by name, which writes its cloud into `folder` in the
         format of `suffix`; see `RecoverySettings.jobs`.
         """
-        settings = {
-            "verb": "cloud",
-            **asdict(self),
-            "suffix": suffix,
-            "device": normalise_device(self.device),
-        }
-        require_apart([folder / f"{name}{suffix}" for name in frames], frames.values())
-        # Before the paths are made: a folder of other settings stays untouched.
-        lock_output_folder(folder, settings, frames)
-        paths = make_result_paths(frames, folder, suffix)
-        return [
-            Job(name, paths[name], partial(write_cloud, self, file, paths[name]))
-            for name, file in frames.items()
-        ]
+        device = normalise_device(self.device)
+        settings = {"verb": "cloud", **asdict(self), "suffix": suffix, "device": device}
+        return list_jobs(
+            folder,
+            suffix,
+            settings,
+            frames,
+            lambda name, result: partial(write_cloud, self, frames[name], result),
+        )
 
 
 def _explain_empty_cloud(frames: Frames) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -136,14 +135,6 @@ def list_files(source: str | Path) -> dict[str, Path]:
             )
         named[name] = path
     return named
-
-
-def make_result_paths(names: Mapping[str, object], folder: Path, suffix: str) -> dict[str, Path]:
-    """Return where the result of each input goes, absolute, and make the folders for them."""
-    paths = {name: folder.resolve() / f"{name}{suffix}" for name in names}
-    for parent in {path.parent for path in paths.values()}:
-        parent.mkdir(parents=True, exist_ok=True)
-    return paths
 
 
 def _is_stack(path: Path) -> bool:

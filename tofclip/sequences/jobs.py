@@ -35,6 +35,7 @@ from tofclip.files import (
     format_error_line,
     identify_file,
     remove_temporary_files,
+    require_apart,
     translate_read_errors,
 )
 from tofclip.threads import THREADS_VARIABLE, limit_blas_threads, thread_count
@@ -42,6 +43,16 @@ from tofclip.version import __version__
 
 if TYPE_CHECKING:
     from distributed import Client, Future, as_completed
+
+__all__ = [
+    "Failure",
+    "Job",
+    "Report",
+    "Summary",
+    "lock_output_folder",
+    "run_jobs",
+    "select_unfinished",
+]
 
 SETTINGS_NAME = "settings.json"
 INPUTS_KEY = "inputs"
@@ -272,6 +283,28 @@ class Summary:
 def select_unfinished(jobs: Iterable[Job]) -> list[Job]:
     """Return the jobs whose result is not there yet."""
     return [job for job in jobs if not job.result.exists()]
+
+
+def list_jobs(
+    folder: Path,
+    suffix: str,
+    settings: Mapping[str, Any],
+    inputs: Mapping[str, Path],
+    make_work: Callable[[str, Path], Callable[[], Any]],
+    others: Iterable[Path | None] = (),
+) -> list[Job]:
+    """Return a job for each input, which writes its result, of the same name, into a folder that is
+    made for the settings, or is that of the same ones; refuse one that would overwrite an input, or
+    one of the `others` that are read.
+    """
+    # Workers have another working directory.
+    paths = {name: folder.resolve() / f"{name}{suffix}" for name in inputs}
+    require_apart(paths.values(), {*inputs.values(), *others})
+    # Before the folders inside are made: a folder of other settings stays untouched.
+    lock_output_folder(folder, settings, inputs)
+    for parent in {path.parent for path in paths.values()}:
+        parent.mkdir(parents=True, exist_ok=True)
+    return [Job(name, path, make_work(name, path)) for name, path in paths.items()]
 
 
 def run_job(job: Job) -> Report:

@@ -95,24 +95,19 @@ class RangingPipeline:
         pieces = focus.plan_segments(camera, self.times, nothing)
         cached = get_cached_camera(camera)
         alive, self.pixels = ~camera.dead_columns, order_by_patch(camera.image_shape)
+        operators = [cached.operator(piece.shear) for piece in pieces]
         self.places = [
             RowBlock(
-                piece.frames,
-                InverseTraces(
-                    prepare_inverse(inverse, cached.operator(piece.shear), alive), self.pixels
-                ),
+                piece.frames, InverseTraces(prepare_inverse(inverse, operator, alive), self.pixels)
             )
-            for piece in pieces
+            for piece, operator in zip(pieces, operators, strict=True)
         ]
         self._warm_start: WarmStartedRecovery | None = None
         if isinstance(self.method, ProximalMethod):
             if len(pieces) > 1:
-                raise InputError(
-                    f"{self.method.name} of a stream has one shear for all shots: use fixed:S"
-                )
-            self._warm_start = WarmStartedRecovery(
-                self.method, cached.operator(pieces[0].shear), alive
-            )
+                name = self.method.name
+                raise InputError(f"{name} of a stream has one shear for all shots: use fixed:S")
+            self._warm_start = WarmStartedRecovery(self.method, operators[0], alive)
         shears = np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces])
         self._search = ReturnSearch(camera, self.times, detection, shears=shears)
         # mean duration of a row: the sweep is nearly even

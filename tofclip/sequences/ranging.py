@@ -92,13 +92,9 @@ class RangingSettings:
         The folder is made, and locked for these settings (`lock_output_folder`). What is prepared
         for all shots is kept there; a run that goes on uses it again.
         """
-        plan, readers = folder.resolve() / PLAN_NAME, list(shots.values())
-        names = list(shots)
-        # Rounded up: what is left over at the end makes one more cloud.
-        parts = [
-            slice(number * self.average, (number + 1) * self.average)
-            for number in range(-(-len(readers) // self.average))
-        ]
+        plan, readers, names = folder.resolve() / PLAN_NAME, list(shots.values()), list(shots)
+        # What is left over at the end makes one more cloud.
+        parts = [slice(at, at + self.average) for at in range(0, len(names), self.average)]
         results = [folder.resolve() / f"{name_cloud(names[part])}{suffix}" for part in parts]
         require_apart([plan, *results], {self.camera, *(shot.path for shot in readers)})
         # Made before the folder is claimed, and saved after: a first shot that cannot be used
@@ -112,12 +108,9 @@ class RangingSettings:
             made.save(plan)
         # a worker that holds an older plan notices by the hash
         version = compute_sha256(plan)
+        make = partial(write_average_cloud, plan, version)
         return [
-            Job(
-                result.stem,
-                result,
-                partial(write_average_cloud, plan, version, tuple(readers[part]), result),
-            )
+            Job(result.stem, result, partial(make, tuple(readers[part]), result))
             for part, result in zip(parts, results, strict=True)
         ]
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from tofclip.arrays import CPU
 from tofclip.errors import InputError
-from tofclip.files import compute_sha256, require_apart
+from tofclip.files import compute_sha256
 from tofclip.recovery import (
     RecoveryPlan,
     SurfaceRecovery,
@@ -21,8 +21,8 @@ from tofclip.recovery import (
     plan_recovery,
 )
 from tofclip.sequences.cache import CachedInverse, get_cached_camera
-from tofclip.sequences.inputs import Shot, make_result_paths
-from tofclip.sequences.jobs import Job, lock_output_folder
+from tofclip.sequences.inputs import Shot
+from tofclip.sequences.jobs import Job, list_jobs
 from tofclip.shots import Streak
 from tofclip.solvers import LinearInverse, Method
 
@@ -83,31 +83,23 @@ class RecoverySettings:
         The folder is made, and locked for these settings (`lock_output_folder`); `InputError` where
         it belongs to others, or a shot bears the name of a result.
         """
-        results = [folder / f"{name}{FRAMES_SUFFIX}" for name in shots]
-        require_apart(results, {self.camera, *(shot.path for shot in shots.values())})
-        lock_output_folder(
-            folder,
-            self.settings() | {"bin_width": next(iter(shots.values())).bin_width},
-            {name: shot.path for name, shot in shots.items()},
-        )
         # Workers have another working directory.
         here = self if self.camera is None else replace(self, camera=self.camera.resolve())
-        paths = make_result_paths(shots, folder, FRAMES_SUFFIX)
-        return [
-            Job(name, paths[name], partial(recover_shot, here, shot, paths[name]))
-            for name, shot in shots.items()
-        ]
+        return list_jobs(
+            folder,
+            FRAMES_SUFFIX,
+            self.settings() | {"bin_width": next(iter(shots.values())).bin_width},
+            {name: shot.path for name, shot in shots.items()},
+            lambda name, result: partial(recover_shot, here, shots[name], result),
+            [self.camera],
+        )
 
     def settings(self) -> dict[str, Any]:
         """Return what a result depends on besides the shot."""
         # The content counts, not the name: a camera calibrated anew gives other frames.
         camera = None if self.camera is None else compute_sha256(self.camera)
-        return {
-            "verb": "recover",
-            **asdict(self),
-            "camera": camera,
-            "device": normalise_device(self.device),
-        }
+        device = normalise_device(self.device)
+        return {"verb": "recover", **asdict(self), "camera": camera, "device": device}
 
 
 def normalise_device(device: str) -> str | None:
@@ -123,11 +115,10 @@ def recover_shot(recovery: RecoverySettings, shot: Shot, result: Path) -> None:
     """
     plan = recovery.plan(shot())
     if plan.shot.camera.sweep is not None:  # otherwise it is fitted to the shot, another for each
-        method = (
-            CachedInverse(plan.method) if isinstance(plan.method, LinearInverse) else plan.method
-        )
         known = replace(plan.shot, camera=get_cached_camera(plan.shot.camera))
-        plan = replace(plan, shot=known, method=method)
+        plan = replace(plan, shot=known)
+        if isinstance(plan.method, LinearInverse):
+            plan = replace(plan, method=CachedInverse(plan.method))
     plan.add_provenance(plan.run()).save(result)
 
 
