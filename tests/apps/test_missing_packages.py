@@ -61,7 +61,7 @@ NEEDED = {
         (*CLOUD, "--drop-outliers"),
     ),  # it fits planes and finds normals, in Python only
     "OpenEXR": ("OpenEXR", ("cloud", "{frames}", "--out", "{new}/depth.exr")),
-    "pyfftw": (None, ("info", "{files}/camera.h5")),  # images: tests/nlos/test_fourier_plans.py
+    "pyfftw": (None, ("info", "{files}/camera.h5")),  # images: tests/nlos/test_diffraction.py
     "pyvista": (None, ("view", "{frames}", "--png", "{new}/view.png")),
     "scipy": ("scipy", RECOVER),
     "tifffile": ("tifffile", ("info", "{files}/streak.tif")),

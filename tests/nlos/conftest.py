@@ -1,18 +1,23 @@
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 
 import pytest
-from relay_walls import AXIS, HIDDEN, JITTER, planar_wall
+from scenes import AXIS, HIDDEN, JITTER, planar_wall
 
 from nlos import Capture
+from nlos.illumination import AliasingWarning
 from nlos.simulate import PointScene
 from tofclip.threads import limit_blas_threads
 
 
 @pytest.fixture(autouse=True)
-def _one_thread_for_products() -> Iterator[None]:
-    """Small matrices gain nothing from threads, which on a busy machine wait for each other."""
+def _small_scenes() -> Iterator[None]:
+    """Small matrices gain nothing from threads, which on a busy machine wait for each other; and
+    small walls are coarse ones, of which `test_capture.py` holds what is said.
+    """
+    warnings.filterwarnings("ignore", category=AliasingWarning)
     with limit_blas_threads():
         yield
 

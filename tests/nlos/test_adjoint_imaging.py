@@ -1,10 +1,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from refusals import find_refusal
+from scenes import HIDDEN, find_refusal, see
 
 import apps.studies.hidden_scene_adjoint as study_module
 from apps.studies.hidden_scene_adjoint import (
@@ -17,18 +18,16 @@ from apps.studies.hidden_scene_adjoint import (
 from nlos import Backprojection, Capture, Grid, PlanarRSD, Volume
 from nlos.capture import TimeAxis
 from nlos.compressed import AdjointImaging, CompressedCapture
-from nlos.simulate import PointScene, build_relay_wall
-from tofclip.errors import InputError, ShapeError
+from nlos.simulate import build_relay_wall
+from tofclip.errors import InputError
 from tofclip.operators import SparseMatrix
 from tofclip.solvers import LinearInverse
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
-
-HIDDEN = (0.15, -0.2, 0.65)
 WALL = build_relay_wall("planar", 24, 1.2)
-SCENE = PointScene([HIDDEN]).simulate_capture(WALL, [0.0, 0.0, 0.0], TimeAxis(256, 24e-12), 20e-12)
+SCENE = see([HIDDEN], WALL, [0.0, 0.0, 0.0], TimeAxis(256, 24e-12))
 GRID = Grid.box((-0.3, 0.45), (-0.4, 0.2), (0.45, 0.85), 0.05)
 SOLVER = Backprojection(0.15)
+BEHIND, SPOT = Grid(GRID.x, GRID.y, GRID.z - 2), np.zeros(3)
 EMPTY = Volume(np.zeros(GRID.shape, np.float32), GRID)
 
 
@@ -71,25 +70,27 @@ def test_masked_wall_points_are_read_as_dark() -> None:
     assert not compressed.recover_transients().valid[3, 4]
 
 
-def test_what_does_not_fit_is_refused() -> None:
-    operator = build_tomography(24, 0.25)
-    fitting = CompressedCapture.of(SCENE, operator)
-    with pytest.raises(ShapeError, match="measurements"):
-        CompressedCapture(fitting.measurements[:-1], operator, WALL, SCENE.laser, 1e-11)
-    with pytest.raises(ShapeError, match="wall"):
-        CompressedCapture(fitting.measurements, operator, WALL[:-1], SCENE.laser, 1e-11)
-    with pytest.raises(InputError, match="NaN"):
-        CompressedCapture(fitting.measurements * np.nan, operator, WALL, SCENE.laser, 1e-11)
-    with pytest.raises(ShapeError, match="signal"):
-        CompressedCapture.of(SCENE, build_tomography(20, 0.25))
-    with pytest.raises(InputError, match="threshold"):
-        AdjointImaging(SOLVER, threshold=2)
-    with pytest.raises(InputError, match="no projection"):
-        build_tomography(24, 0.01)
-    behind = Grid(GRID.x, GRID.y, GRID.z - 2)
-    assert "behind" in find_refusal(AdjointImaging(SOLVER), fitting, behind)
-    with pytest.raises(InputError, match="behind"):
-        AdjointImaging(SOLVER).reconstruct(fitting, behind)
+TOMOGRAPHY = build_tomography(24, 0.25)
+FITTING = CompressedCapture.of(SCENE, TOMOGRAPHY)
+MEASURED = FITTING.measurements
+
+
+@pytest.mark.parametrize(
+    ("attempt", "message"),
+    [
+        (lambda: CompressedCapture(MEASURED[:-1], TOMOGRAPHY, WALL, SPOT, 1e-11), "measurements"),
+        (lambda: CompressedCapture(MEASURED, TOMOGRAPHY, WALL[:-1], SPOT, 1e-11), "wall"),
+        (lambda: CompressedCapture(MEASURED * np.nan, TOMOGRAPHY, WALL, SPOT, 1e-11), "NaN"),
+        (lambda: CompressedCapture.of(SCENE, build_tomography(20, 0.25)), "signal"),
+        (lambda: AdjointImaging(SOLVER, threshold=2), "threshold"),
+        (lambda: build_tomography(24, 0.01), "no projection"),
+        (lambda: AdjointImaging(SOLVER).reconstruct(FITTING, BEHIND), "behind"),
+    ],
+)
+def test_what_does_not_fit_is_refused(attempt: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        attempt()
+    assert "behind" in find_refusal(AdjointImaging(SOLVER), FITTING, BEHIND)
 
 
 def test_the_study_on_a_small_office_reaches_the_papers_finding(

@@ -103,18 +103,17 @@ def test_the_samples_are_fine_enough_for_linear_interpolation() -> None:
     assert (band.axis.spacing / spacing) % 1 == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize("wavelength", [1e-4, 2 * AXIS.spacing])
-def test_bins_too_coarse_for_the_wavelength_are_an_empty_band(wavelength: float) -> None:
-    with pytest.raises(InputError, match="empty band"):
-        Band(VirtualPulse(wavelength, 3), AXIS)
-
-
 @pytest.mark.parametrize(
-    ("wavelength", "cycles"), [(0, 3), (-1, 3), (np.nan, 3), (0.1, 0), (0.1, np.inf)]
+    ("wavelength", "cycles", "message"),
+    [
+        *((wave, 3, "empty band") for wave in (1e-4, 2 * AXIS.spacing)),
+        *((wave, 3, "virtual pulse must be a positive") for wave in (0, -1, np.nan)),
+        *((0.1, cycles, "virtual pulse must be a positive") for cycles in (0, np.inf)),
+    ],
 )
-def test_a_pulse_needs_positive_numbers(wavelength: float, cycles: float) -> None:
-    with pytest.raises(InputError, match="virtual pulse must be a positive"):
-        VirtualPulse(wavelength, cycles)
+def test_what_is_no_band_is_refused(wavelength: float, cycles: float, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Band(VirtualPulse(wavelength, cycles), AXIS)
 
 
 def test_tails_too_small_for_normal_numbers_change_nothing() -> None:

@@ -1,26 +1,51 @@
+"""Captures: what they hold and refuse, how fine their walls are, and how frames become one."""
+
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes
+from relay_frames import (
+    BIN_WIDTH,
+    CAMERA,
+    DELAY_BINS,
+    HIDDEN,
+    LASER,
+    frames_of,
+    relay_wall,
+    see_by_camera,
+    wall_of,
+)
+from scenes import find_refusal, planar_wall
 
-from nlos import Capture
+from nlos import Backprojection, Capture, Grid
+from nlos.band import Band
+from nlos.capture import TimeAxis, remove_device_legs, unwarp_signal
+from nlos.illumination import AliasingWarning, warn_of_aliasing
 from tofclip.errors import FileFormatError, InputError, ShapeError
+from tofclip.storage import Record
 from tofclip.units import SPEED_OF_LIGHT
 
 WALL = np.random.default_rng(1).normal(size=(3, 4, 3))
 SIGNAL = np.random.default_rng(2).normal(size=(5, 3, 4))
+METHOD = Backprojection(0.2, 5)
+SPACING = SPEED_OF_LIGHT * BIN_WIDTH
+
+
+def capture_of(wall: np.ndarray, laser: object = (0.1, 0.0, 0.0)) -> Capture:
+    return Capture(np.ones((300, *wall.shape[:-1])), wall, laser, 16e-12)
 
 
 def test_points_and_traces_agree_and_leave_masked_points_out() -> None:
-    wall = WALL.copy()
-    wall[1, 2, 0] = np.nan
-    signal = SIGNAL.copy()
-    signal[:, 1, 2] = np.inf
+    wall, signal = WALL.copy(), SIGNAL.copy()
+    wall[1, 2, 0], signal[:, 1, 2] = np.nan, np.inf
     capture = Capture(signal, wall, [0, 0, 0], 1e-12)
     assert capture.valid.sum() == 11
     assert capture.points.shape == (11, 3)
@@ -29,13 +54,6 @@ def test_points_and_traces_agree_and_leave_masked_points_out() -> None:
     assert np.array_equal(capture.traces(slice(6, 8)), capture.traces()[6:8])
     assert capture.traces().dtype == np.float32
     assert capture.traces().flags.c_contiguous
-
-
-@pytest.mark.parametrize("start", [0.0, 0.2, -1.3])
-def test_the_first_bin_is_at_the_start_of_the_record(start: float) -> None:
-    capture = Capture(SIGNAL, WALL, [0, 0, 0], 1e-10, start)
-    assert capture.axis.paths[0] == start
-    assert np.diff(capture.axis.paths) == pytest.approx(SPEED_OF_LIGHT * 1e-10)
 
 
 def test_lasers_follow_the_points() -> None:
@@ -47,6 +65,12 @@ def test_lasers_follow_the_points() -> None:
     assert Capture(SIGNAL, WALL, [1, 2, 3], 1e-12).lasers.tolist() == [[1, 2, 3]]
 
 
+@pytest.mark.parametrize("start", [0.0, 0.2, -1.3])
+def test_the_first_bin_is_at_the_start_of_the_record(start: float) -> None:
+    axis = Capture(SIGNAL, WALL, [0, 0, 0], 1e-10, start).axis
+    assert axis.paths == pytest.approx(start + SPEED_OF_LIGHT * 1e-10 * np.arange(5))
+
+
 @pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float64, bool])
 def test_counts_of_any_type_become_float32(dtype: type) -> None:
     capture = Capture(np.ones((5, 3, 4), dtype), WALL, WALL, 1e-12)
@@ -55,39 +79,42 @@ def test_counts_of_any_type_become_float32(dtype: type) -> None:
 
 
 @pytest.mark.parametrize(
-    ("signal", "wall", "laser"),
-    [
-        (SIGNAL, WALL[..., :2], [0, 0, 0]),
-        (SIGNAL, np.float64(3), [0, 0, 0]),
-        (SIGNAL[:, :2], WALL, [0, 0, 0]),
-        (SIGNAL.reshape(5, 12), WALL, [0, 0, 0]),
-        (SIGNAL[0], WALL, [0, 0, 0]),
-        (SIGNAL, WALL, [0, 0]),
-        (SIGNAL, WALL, WALL[0]),
-    ],
-)
-def test_shapes_that_disagree_are_refused(signal: object, wall: object, laser: object) -> None:
-    with pytest.raises(ShapeError):
-        Capture(signal, wall, laser, 1e-12)
-
-
-@pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"wall": WALL[..., :2]}, "shape"),
+        ({"wall": np.float64(3)}, "shape"),
+        ({"signal": SIGNAL[:, :2]}, "shape"),
+        ({"signal": SIGNAL.reshape(5, 12)}, "shape"),
+        ({"signal": SIGNAL[0]}, "shape"),
+        ({"laser": [0, 0]}, "shape"),
+        ({"laser": WALL[0]}, "shape"),
         ({"signal": np.where(SIGNAL > 1, np.nan, SIGNAL)}, "samples of the signal are NaN"),
         ({"signal": SIGNAL * 1j}, "real numbers"),
-        ({"wall": np.full_like(WALL, np.nan)}, "every wall point is NaN"),
-        ({"laser": [0, np.nan, 0]}, "laser spot must be finite"),
-        ({"bin_width": 0.0}, "bin width"),
-        ({"bin_width": -1e-12}, "bin width"),
-        ({"start": np.nan}, "path length of bin 0"),
         ({"signal": SIGNAL[:1]}, "at least 2 time bins"),
+        ({"wall": np.full_like(WALL, np.nan)}, "every wall point is NaN"),
+        ({"wall": planar_wall(3, 4) * 1e4}, "give its points in metres"),
+        ({"laser": [0, np.nan, 0]}, "laser spot must be finite"),
+        ({"laser": [0.1, 0.05, -1.0]}, "laser spot lies 1 m behind the hindmost wall point"),
+        ({"laser": planar_wall(3, 4) - [0, 0, 1.0]}, "1 m behind the hindmost wall point"),
+        ({"bin_width": 0.0}, "bin width must be a positive"),
+        ({"bin_width": -1e-12}, "bin width must be a positive"),
+        ({"bin_width": np.nan}, "bin width must be a positive"),
+        ({"bin_width": 16.0}, "check the unit of `bin_width`"),
+        ({"bin_width": 1e-16}, "check the unit of `bin_width`"),
+        ({"start": np.nan}, "path length of bin 0"),
+        ({"start": np.inf}, "path length of bin 0"),
     ],
 )
-def test_unusable_numbers_are_refused(changes: dict[str, object], message: str) -> None:
-    arguments = {"signal": SIGNAL, "wall": WALL, "laser": [0, 0, 0], "bin_width": 1e-12, **changes}
-    with pytest.raises(InputError, match=message):
-        Capture(**arguments)
+def test_what_is_no_capture_is_refused_in_one_line(changes: dict[str, Any], message: str) -> None:
+    given = {"signal": SIGNAL, "wall": planar_wall(3, 4), "laser": [0, 0, 0], "bin_width": 1e-12}
+    with pytest.raises(InputError, match=message) as refused:
+        Capture(**{**given, **changes})
+    assert isinstance(refused.value, ShapeError) == (message == "shape")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_laser_a_little_behind_a_curved_wall_is_no_fault() -> None:
+    assert replace(capture_of(planar_wall()), laser=[0, 0, -0.3]).lasers[0, 2] == -0.3
 
 
 @given(
@@ -107,22 +134,15 @@ def test_files_give_back_what_was_saved(
     bin_width: float,
     compressed: bool,
 ) -> None:
-    random = np.random.default_rng(0)
-    wall = random.normal(size=(*wall_shape, 3))
-    signal = random.normal(size=(bins, *wall_shape))
-    saved = Capture(
-        signal, wall, wall if confocal else [1, 2, 3], bin_width, start, {"made": "here"}
-    )
+    random, made = np.random.default_rng(0), {"made": "here"}
+    wall, signal = random.normal(size=(*wall_shape, 3)), random.normal(size=(bins, *wall_shape))
+    saved = Capture(signal, wall, wall if confocal else [1, 2, 3], bin_width, start, made)
     path = tmp_path_factory.mktemp("capture") / "wall.h5"
     saved.save(path, compressed)
     loaded = Capture.load(path)
     for name in ("signal", "wall", "laser"):
         assert np.array_equal(getattr(loaded, name), getattr(saved, name))
-    assert (loaded.bin_width, loaded.start, loaded.provenance) == (
-        bin_width,
-        start,
-        {"made": "here"},
-    )
+    assert (loaded.bin_width, loaded.start, loaded.provenance) == (bin_width, start, made)
 
 
 def test_a_file_without_a_wall_says_so(tmp_path: Path) -> None:
@@ -131,3 +151,173 @@ def test_a_file_without_a_wall_says_so(tmp_path: Path) -> None:
     record.save(tmp_path / "broken.h5")
     with pytest.raises(FileFormatError, match="no field 'wall'"):
         Capture.load(tmp_path / "broken.h5")
+
+
+# --- how fine a wall is
+
+
+def test_the_spacing_is_that_of_neighbours_however_they_are_listed() -> None:
+    wall = planar_wall(11, 13)  # 10 cm by 10 cm
+    assert capture_of(wall).spacing == pytest.approx(0.1)
+    assert capture_of(wall.reshape(-1, 3)[::-1]).spacing == pytest.approx(0.1)
+    lasers = np.array([[0.0, 0, 0], [0.2, 0, 0]])
+    several = Capture.exhaustive(np.ones((20, 2, 11, 13)), wall, lasers, 16e-12)
+    assert several.spacing == pytest.approx(0.1)
+    lone = capture_of(wall[:1, 0])
+    assert lone.spacing == np.inf
+    warn_of_aliasing(lone, Band(METHOD.pulse, lone.axis))
+    assert "one wall point" in find_refusal(METHOD, lone, Grid([0.0], [0.0], [0.5]))
+
+
+@pytest.mark.parametrize(
+    ("waves_apart", "confocal", "warned"),
+    [(0.45, False, False), (0.55, False, True), (0.3, True, True), (0.2, True, False)],
+)
+def test_a_coarse_wall_is_warned_of(waves_apart: float, confocal: bool, warned: bool) -> None:
+    shortest = 2 * np.pi / Band(METHOD.pulse, capture_of(planar_wall()).axis).wavenumbers[-1]
+    wall = planar_wall() * (waves_apart * shortest / 0.06)
+    wall[..., 1] *= 0.96  # rows are 6.25 cm apart, columns 6 cm
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        capture = capture_of(wall, wall if confocal else [0.0, 0, 0])
+        METHOD.reconstruct(capture, Grid([0.0], [0.0], [0.5]))
+    assert [w.category for w in caught] == [AliasingWarning] * warned
+    assert all("too coarse for waves of" in str(w.message) for w in caught)
+
+
+def test_an_exhaustive_capture_pairs_every_laser_with_every_point() -> None:
+    wall, lasers = planar_wall(3, 4), np.arange(6.0).reshape(2, 3) / 10
+    signal = np.random.default_rng(1).normal(size=(5, 2, 3, 4))
+    capture = Capture.exhaustive(signal, wall, lasers, 16e-12, 0.3, {"shot": 7})
+    assert capture.signal.shape == (5, 2, 3, 4)
+    assert np.array_equal(capture.wall[1], wall)
+    assert np.array_equal(capture.laser[1, 2, 3], lasers[1])
+    assert (capture.start, capture.provenance) == (0.3, {"shot": 7})
+    masked = wall.copy()
+    masked[0, 0] = np.nan
+    assert len(Capture.exhaustive(signal, masked, lasers, 16e-12).points) == 2 * 11
+    for wrong, what in (
+        ((signal, wall[..., :2], lasers), "shape"),
+        ((signal, wall, lasers[:, :2]), "shape"),
+        ((signal[:, :1], wall, lasers), "signal"),
+    ):
+        with pytest.raises(InputError, match=what):
+            Capture.exhaustive(*wrong, 16e-12)
+
+
+# --- frames of a camera that looks at the wall
+
+
+def test_frames_become_a_capture_that_shows_the_hidden_point_where_it_is() -> None:
+    wall, late = wall_of(15, 19), 3e-10
+    frames = frames_of(see_by_camera(wall), {"relay_wall": relay_wall(wall)})
+    capture = Capture.from_frames(frames)
+    assert capture.signal.shape == (800, 15, 19)
+    assert capture.start == pytest.approx(DELAY_BINS * SPACING)
+    assert capture.bin_width == pytest.approx(BIN_WIDTH)
+    assert capture.provenance == {"shot": 7}
+    grid = Grid.box((-0.2, 0.2), (-0.2, 0.2), (0.2, 0.4), 0.02)  # holds the point itself
+    brightest = Backprojection(0.06).reconstruct(capture, grid).find_brightest()
+    assert brightest == pytest.approx(HIDDEN, abs=1e-9)
+    path = np.linalg.norm(LASER - brightest) + np.linalg.norm(wall - brightest, axis=-1)
+    centroid = np.tensordot(capture.axis.paths, capture.signal, 1) / capture.signal.sum(axis=0)
+    # Linear interpolation keeps the centroid; float32 sums of 800 bins leave 1e-4 of a bin.
+    assert np.max(np.abs(centroid - path)) < 1e-3 * capture.axis.spacing
+    moved = Capture.from_frames(replace(frames, times=frames.times + late))
+    assert moved.start == pytest.approx(SPEED_OF_LIGHT * (late + DELAY_BINS * BIN_WIDTH))
+
+
+@settings(max_examples=30, deadline=None)
+@given(shift=st.floats(-30, 30))
+def test_a_shifted_pulse_matches_the_analytic_one(shift: float) -> None:
+    bins, width = np.arange(200), 6.0
+    # A camera on the axis behind the laser: a wall point further along the axis is late by its
+    # distance.
+    wall = np.array([[0.0, 0.0, shift * SPACING]])
+    signal = np.exp(-0.5 * ((bins - 100.0 - shift) / width) ** 2)[:, None]
+    found = unwarp_signal(signal, wall, np.array([0.0, 0, -1]), np.zeros(3), BIN_WIDTH)[:, 0]
+    # Linear interpolation errs by at most 1/8 of the second derivative, 1 / (8 * 36); the rest is
+    # float32.
+    expected = np.exp(-0.5 * ((bins - 100.0) / width) ** 2)
+    assert np.max(np.abs(found - expected)) < 1 / (8 * width**2) + 1e-5
+
+
+def test_whole_bins_are_moved_exactly_and_what_lies_outside_is_zero() -> None:
+    wall = np.zeros((5, 3))
+    wall[:, 2] = np.array([0, 2, -3, np.nan, 100]) * SPACING
+    signal = np.tile(np.arange(1.0, 9.0)[:, None], (1, 5))
+    found = unwarp_signal(signal, wall, np.array([0.0, 0, -1]), np.zeros(3), BIN_WIDTH)
+    # Distances of 1 m in float64 place a sample to 1e-10 bins; at a record's edge that may fall
+    # outside.
+    assert found[:, 0] == pytest.approx(np.arange(1, 9))
+    assert found[:5, 1] == pytest.approx([3, 4, 5, 6, 7])
+    assert found[4:, 2] == pytest.approx([2, 3, 4, 5])
+    for dark in (found[6:, 1], found[:3, 2], found[:, 3:]):
+        assert np.all(dark == 0)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_both_legs_to_the_device_are_taken_off(moving: bool) -> None:
+    wall = wall_of(9, 11)
+    laser = wall[:, ::-1] if moving else LASER
+    source, start = np.array([0.4, -0.2, 1.3]), 2.0
+    legs = np.linalg.norm(laser - source, axis=-1) + np.linalg.norm(wall - CAMERA, axis=-1)
+    path = np.linalg.norm(laser - HIDDEN, axis=-1) + np.linalg.norm(wall - HIDDEN, axis=-1)
+    arrival = (path + legs - start) / SPACING
+    signal = np.exp(-0.5 * ((np.arange(1500)[:, None, None] - arrival) / 5) ** 2)
+    wall[0, 0] = np.nan  # must not decide what is common to all
+    raw = Capture(signal, wall, laser, BIN_WIDTH, start)
+    capture = remove_device_legs(raw, source, CAMERA)
+    traces = capture.traces().astype(np.float64)
+    centroid = traces @ capture.axis.paths / traces.sum(axis=1)
+    # Linear interpolation keeps centroids; float32 leaves 1e-3 of a bin.
+    assert np.max(np.abs(centroid - path[capture.valid])) < 5e-3 * SPACING
+    with pytest.raises(InputError, match="source position"):
+        remove_device_legs(raw, [0, np.nan, 0], CAMERA)
+
+
+UNEVEN = BIN_WIDTH * np.array([0, 1, 2.1, 3])
+
+
+@pytest.mark.parametrize(
+    ("attached", "times", "error", "message"),
+    [
+        (None, None, InputError, "carry no relay wall"),
+        (Record("shopping_list"), None, InputError, "carry no relay wall"),
+        (relay_wall(wall_of(4, 4), without="camera"), None, FileFormatError, "no field 'camera'"),
+        (relay_wall(wall_of(4, 4), row_offset=-1), None, InputError, "does not fit"),
+        (relay_wall(wall_of(4, 4), row_offset=6), None, InputError, "does not fit"),
+        (relay_wall(wall_of(4, 4), column_offset=7), None, InputError, "does not fit"),
+        (relay_wall(wall_of(4, 4)), UNEVEN, InputError, "evenly"),
+    ],
+)
+def test_frames_that_are_no_capture_say_why(
+    attached: Record | None, times: np.ndarray | None, error: type, message: str
+) -> None:
+    attachments = {} if attached is None else {"relay_wall": attached}
+    with pytest.raises(error, match=message):
+        Capture.from_frames(frames_of(np.ones((4, 9, 10)), attachments, times))
+
+
+@pytest.mark.parametrize(
+    ("signal", "wall", "camera", "laser", "message"),
+    [
+        ((5, 2, 3), (2, 2, 3), CAMERA, LASER, "wall"),
+        ((5, 2), (2, 3), [0, np.nan, 0], LASER, "camera position"),
+        ((5, 2), (2, 3), CAMERA, [0, 0], "laser position"),
+    ],
+)
+def test_unwarping_checks_what_it_is_given(
+    signal: Any, wall: Any, camera: Any, laser: Any, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        unwarp_signal(np.ones(signal), np.zeros(wall), camera, laser, BIN_WIDTH)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [((1, 1e-12, 0.0), "at least 2 time bins"), ((9, 0.0, 0.0), "bin width must be a positive")],
+)
+def test_a_time_axis_refuses_nonsense(arguments: tuple[int, float, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        TimeAxis(*arguments)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from relay_walls import planar_wall
+from scenes import planar_wall, voxels_of
 
 from nlos import Capture, Grid, PlanarRSD, Volume
 from nlos.capture import TimeAxis
@@ -15,7 +15,6 @@ from nlos.normals import DirectionalLightCone, FrontSurface, find_front_surface
 from nlos.simulate import HiddenScene, Surface
 from tofclip.errors import InputError
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 WALL = planar_wall(32, 32)
 CENTRE = np.array([0.05, -0.05, 0.7])
 GRID = Grid.box((-0.25, 0.35), (-0.35, 0.25), (0.5, 0.9), 0.02)
@@ -73,23 +72,26 @@ def test_a_surface_is_written_with_normals(tmp_path: Path) -> None:
         found.save(tmp_path / "surface.vti")
 
 
-def test_what_shows_no_surface_is_refused() -> None:
-    dark = Volume(np.zeros(GRID.shape), GRID)
-    flat = Grid(GRID.x, GRID.y, GRID.z[:2])
-    for volume, fraction, reason in (
-        (dark, 0.3, "and light"),
-        (Volume(np.ones(flat.shape), flat), 0.3, "3 voxels along every axis"),
-        (dark, 1.5, "a fraction from 0 to 1"),
-    ):
-        with pytest.raises(InputError, match=reason):
-            find_front_surface(volume, fraction)
+DARK, FLAT = Volume(np.zeros(GRID.shape), GRID), Grid(GRID.x, GRID.y, GRID.z[:2])
+
+
+@pytest.mark.parametrize(
+    ("volume", "fraction", "reason"),
+    [
+        (DARK, 0.3, "and light"),
+        (Volume(np.ones(FLAT.shape), FLAT), 0.3, "3 voxels along every axis"),
+        (DARK, 1.5, "a fraction from 0 to 1"),
+    ],
+)
+def test_what_shows_no_surface_is_refused(volume: Volume, fraction: float, reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
+        find_front_surface(volume, fraction)
 
 
 def test_a_sphere_has_its_normals() -> None:
     """A bright shell about a centre: brightness changes most towards it."""
-    z, y, x = np.meshgrid(GRID.z, GRID.y, GRID.x, indexing="ij")
     centre, radius = CENTRE + np.array([0, 0, 0.15]), 0.3
-    away = np.stack([x, y, z], axis=-1) - centre
+    away = voxels_of(GRID) - centre
     shell = np.exp(-(((np.linalg.norm(away, axis=-1) - radius) / 0.03) ** 2))
     # Only its front half is seen.
     found = find_front_surface(Volume(shell * (away[..., 2] < 0), GRID), 0.5)

@@ -1,25 +1,20 @@
-"""Scans of many laser spots: several fields added up, roles swapped, and pairs at their midpoints."""
+"""Scans of many laser spots: several fields added up, and roles swapped."""
 
 from __future__ import annotations
 
 import tracemalloc
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+from scenes import scaled_error
 
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD, Refinement, settings_for
-from nlos import preparation as moveout
 from nlos.capture import TimeAxis
 from nlos.illumination import choose_roles
-from nlos.preparation import MidpointImaging, MidpointJoin, join_near_lasers
-from nlos.refinement.photons import PhotonRefinement
 from nlos.simulate import PointScene, add_poisson_noise
-from tofclip.errors import InputError
 from tofclip.solvers import Sparse
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 AXIS, JITTER, WAVELENGTH = TimeAxis(320, 32e-12), 40e-12, 0.2
 HIDDEN = [[0.1, -0.2, 0.7], [-0.2, 0.1, 0.9]]
 SCENE = PointScene(HIDDEN, [400.0, 500.0])
@@ -44,18 +39,6 @@ def exhaustive(kind: str, points: int = 16) -> Capture:
     return Capture.exhaustive(signal, LASERS, wall, AXIS.bin_width)
 
 
-def pairs(apart: float, points: int = 24) -> Capture:
-    wall = lattice(points)
-    lasers = wall + np.array([apart, 0, 0])
-    return SCENE.simulate_capture(wall, lasers, AXIS, JITTER)
-
-
-def difference(found: np.ndarray, exact: np.ndarray) -> float:
-    """Relative difference of two images, whose scale does not matter."""
-    scale = np.vdot(exact, found) / np.vdot(exact, exact)
-    return float(np.linalg.norm(found / scale - exact) / np.linalg.norm(exact))
-
-
 @pytest.mark.parametrize("kind", ["planar", "curved", "planar, scanned", "curved, scanned"])
 def test_many_spots_show_what_backprojection_shows(kind: str) -> None:
     capture = exhaustive(kind)
@@ -63,7 +46,7 @@ def test_many_spots_show_what_backprojection_shows(kind: str) -> None:
     exact = Backprojection(WAVELENGTH).reconstruct(capture, GRID)
     found = method.reconstruct(capture, GRID)
     # The tolerance of each way, and of waves that meet no distance any more.
-    assert difference(found.values, exact.values) < 0.02
+    assert scaled_error(found.values, exact.values) < 0.02
     assert found.provenance["imaging"]["method"] in ("rsd", "hybrid")
 
 
@@ -133,56 +116,3 @@ def test_scans_by_the_laser_are_refined() -> None:
     assert spread[1] < 0.5 * spread[0]
     nearest = np.linalg.norm(np.array(HIDDEN) - refined.find_brightest(), axis=1).min()
     assert nearest < 0.12
-
-
-@pytest.mark.parametrize(("apart", "error"), [(0.05, 0.02), (0.12, 0.05)])
-def test_pairs_a_decimetre_apart_are_imaged_at_their_midpoint(apart: float, error: float) -> None:
-    capture = pairs(apart)
-    joined = join_near_lasers(capture)
-    assert np.array_equal(joined.laser, joined.wall)
-    exact = Backprojection(WAVELENGTH).reconstruct(capture, GRID).values
-    found = MidpointImaging(PlanarRSD(WAVELENGTH)).reconstruct(capture, GRID).values
-    assert difference(found, exact) < error
-    # Without moveout the path is too long by a part of the offset's square.
-    bare = PlanarRSD(WAVELENGTH).reconstruct(replace(joined, signal=capture.signal), GRID).values
-    assert difference(bare, exact) > 1.4 * difference(found, exact)
-    assert settings_for(capture, wavelength=WAVELENGTH).method == "rsd"
-
-
-def test_paths_of_pairs_are_found_once_for_many_captures(monkeypatch: pytest.MonkeyPatch) -> None:
-    capture = pairs(0.1, 12)
-    kept = MidpointJoin(capture)
-    monkeypatch.setattr(moveout, "MAX_KEPT_BYTES", 0)  # found again every time
-    anew = MidpointJoin(capture)
-    found, path_of = [], moveout._path_of
-    monkeypatch.setattr(moveout, "_path_of", lambda *a: found.append(1) or path_of(*a))
-    for factor in (1, 3):
-        brighter = replace(capture, signal=capture.signal * np.float32(factor))
-        joined = kept.join(brighter)
-        assert not found
-        assert joined.signal.any()
-        assert np.array_equal(joined.signal, anew.join(brighter).signal)
-        assert found
-        found.clear()
-    with pytest.raises(InputError, match="planned for"):
-        kept.join(replace(capture, start=0.1))
-
-
-def test_pairs_far_apart_stay_as_they_are() -> None:
-    mirrored = SCENE.simulate_capture(lattice(16), lattice(16)[::-1], AXIS, JITTER)
-    assert join_near_lasers(mirrored) is mirrored
-    assert settings_for(mirrored, wavelength=WAVELENGTH).method == "backprojection"
-    fine = pairs(0.25, 40)
-    assert join_near_lasers(fine) is fine
-
-
-def test_counts_of_near_pairs_are_refined_as_they_are() -> None:
-    counts = np.random.default_rng(0).poisson(pairs(0.1, 12).signal * 0.2 + 0.01)
-    capture = replace(pairs(0.1, 12), signal=counts.astype(np.float32))
-    settings = settings_for(capture, wavelength=WAVELENGTH)
-    assert np.array_equal(settings.prepare_counts(capture).laser, capture.laser)
-    method = PhotonRefinement(MidpointImaging(PlanarRSD(WAVELENGTH)), iterations=3)
-    refined = method.reconstruct(capture, GRID)
-    assert "refined" not in refined.provenance["imaging"]["stopped_because"]
-    nearest = np.linalg.norm(np.array(HIDDEN) - refined.find_brightest(), axis=1).min()
-    assert nearest < 0.06

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
-from point_score import find_near_voxels, score_brightest
+from scenes import distance_to_nearest, energy_fraction, planar_wall, see
 
-from nlos import Capture, Grid, Hybrid
+from nlos import Capture, Grid, Hybrid, Volume
 from nlos.capture import TimeAxis
 from nlos.refinement.photons import (
+    HELD_OUT_FRACTION,
     LINEAR_SHOWN,
     CountedPhotons,
     LikelihoodGain,
+    PhotonFit,
     PhotonRefinement,
+    build_response,
+    compute_beam,
     fit_brightness,
+    judge,
 )
 from nlos.refinement.time_of_flight import TimeOfFlight
 from nlos.simulate import HiddenScene, PointScene, Surface, add_poisson_noise, build_relay_wall
 from tofclip.errors import InputError
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination.AliasingWarning")
 POINTS = np.array(
     [[0.0, 0.05, 0.7], [0.3, -0.25, 0.8], [-0.35, 0.2, 0.85], [0.2, 0.4, 0.95], [-0.3, -0.4, 1.05]]
 )
@@ -58,7 +64,7 @@ def count(wall: str, scene: str, photons: float, points: int, seed: int) -> Capt
 def mask_of(scene: str, grid: Grid) -> np.ndarray:
     """Voxels within 4 cm of a point, or that hold a piece of a letter."""
     if scene == "points":
-        return find_near_voxels(grid, POINTS, 0.04)
+        return distance_to_nearest(grid, POINTS) <= 0.04
     mask = np.zeros(grid.shape, bool)
     for surface in letters().surfaces:
         for position in surface.positions:
@@ -66,8 +72,10 @@ def mask_of(scene: str, grid: Grid) -> np.ndarray:
     return mask
 
 
-def energy(values: np.ndarray, near: np.ndarray) -> float:
-    return float(np.sum(values[near].astype(float) ** 2) / np.sum(values.astype(float) ** 2))
+def score_brightest(volume: Volume, occupied: np.ndarray) -> float:
+    """Of the K brightest voxels, the fraction that is occupied, where K voxels are."""
+    brightest = np.argsort(-volume.magnitude, axis=None, kind="stable")
+    return float(np.mean(occupied.ravel()[brightest[: np.count_nonzero(occupied)]]))
 
 
 @pytest.mark.parametrize("obliquity", [0, 2])
@@ -93,8 +101,7 @@ def test_a_small_voxels_light_is_that_of_a_point() -> None:
     response = np.exp(-((np.arange(-4, 5) / (20 / 32)) ** 2) / 2)
     model = TimeOfFlight(capture, grid, response / response.sum())
     light = model.compute_light(np.ones(1), np.zeros(1, int), np.arange(64))
-    alone = PointScene(POINTS[1:2]).simulate_capture(capture.wall, capture.laser, AXIS, 20e-12)
-    true = alone.traces()
+    true = see(POINTS[1:2], capture.wall, capture.laser, AXIS).traces()
     assert np.allclose(light.sum(axis=1), true.sum(axis=1), rtol=3e-4)
     arrival, exact = ((one * AXIS.paths).sum(axis=1) / one.sum(axis=1) for one in (light, true))
     # float32 paths
@@ -109,7 +116,7 @@ def test_few_photons_show_points(wall: str) -> None:
     refined = PhotonRefinement(LINEAR, iterations=4).reconstruct(capture, COARSE)
     linear = LINEAR.reconstruct(capture, COARSE)
     assert refined.values.min() >= 0
-    assert energy(refined.values, near) >= 0.75  # the linear image has 0.23
+    assert energy_fraction(refined.values, near) >= 0.75  # the linear image has 0.23
     assert score_brightest(refined, near) >= score_brightest(linear, near)
     history = refined.provenance["imaging"]
     assert history["obliquity"] == 0
@@ -136,7 +143,7 @@ def test_points_at_all_levels(wall: str, photons: float, least: float) -> None:
     for seed in range(5):
         capture = count(wall, "points", photons, 64, seed)
         refined = PhotonRefinement(LINEAR).reconstruct(capture, FINE)
-        assert energy(refined.values, near) >= least
+        assert energy_fraction(refined.values, near) >= least
         linear = score_brightest(LINEAR.reconstruct(capture, FINE), near)
         assert score_brightest(refined, near) >= linear
 
@@ -186,18 +193,98 @@ def test_the_walls_own_light_is_left_out_of_account() -> None:
     assert np.allclose(plain, blanked, atol=1e-6 * plain.max())
 
 
-def test_what_is_not_counted_is_refused() -> None:
-    capture = count("planar", "points", 20, 8, seed=0)
-    for change, reason in (
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
         (lambda signal: signal - 1, "negative signals"),
         (lambda signal: signal * np.pi + (signal > 1), "multiples of one step"),
         (lambda signal: 0 * signal, "every signal is 0"),
-    ):
-        signal = change(capture.signal)
-        changed = Capture(signal, capture.wall, capture.laser, capture.bin_width)
-        with pytest.raises(InputError, match=reason) as refused:
-            CountedPhotons.of(changed)
-        assert "\n" not in str(refused.value)
+    ],
+)
+def test_what_is_not_counted_is_refused(change: Any, reason: str) -> None:
+    capture = count("planar", "points", 20, 8, seed=0)
+    with pytest.raises(InputError, match=reason) as refused:
+        CountedPhotons.of(replace(capture, signal=change(capture.signal)))
+    assert "\n" not in str(refused.value)
     # counts on another scale are counts
-    tenfold = Capture(capture.signal * 10, capture.wall, capture.laser, capture.bin_width)
+    tenfold = replace(capture, signal=capture.signal * 10)
     assert np.array_equal(CountedPhotons.of(tenfold).counts, CountedPhotons.of(capture).counts)
+
+
+# --- a fit of known light: brightness, sharpness, and a judge that is fair
+
+SHORT, WALL = TimeAxis(256, 32e-12), planar_wall(8, 8)
+GRID = Grid(np.linspace(-0.4, 0.4, 9), np.linspace(-0.4, 0.4, 9), np.linspace(0.5, 1.0, 6))
+
+
+def make_fit(wall: np.ndarray, grid: Grid, albedo: np.ndarray, sigma: float = 0.0) -> PhotonFit:
+    """A fit that explains the photons of this albedo, without noise, and of a background."""
+    capture = Capture(np.ones((SHORT.bins, *wall.shape[:2])), wall, wall, SHORT.bin_width)
+    model = TimeOfFlight(capture, grid, build_response(sigma))
+    voxels, everyone = np.arange(grid.size), np.arange(len(capture.points))
+    light = model.compute_light(albedo, voxels, everyone)
+    counts = (1000 * light / light.sum(axis=1).mean() + 0.5).astype(np.float32)
+    photons = CountedPhotons(capture, counts, np.ones(counts.shape, bool))
+    return PhotonFit(photons, model, voxels, np.maximum(albedo, 1e-3), 0.0)
+
+
+def point_albedo(grid: Grid, *places: tuple[float, float, float]) -> np.ndarray:
+    albedo = np.zeros(grid.shape)
+    for place in places:
+        albedo[grid.find_nearest(place)] = 1
+    return albedo.ravel()
+
+
+def test_photons_set_aside_prefer_the_fit_that_is_as_bright_as_the_scene() -> None:
+    fit = make_fit(WALL, GRID, point_albedo(GRID, (0.1, 0.0, 0.7), (-0.2, 0.2, 0.9)))
+    fit.improve(1)
+    # What the kept photons are of is what this fit expects; of all photons a tenth was set aside.
+    fit.photons = replace(fit.photons, counts=fit.expect())
+    held = fit.photons.counts * HELD_OUT_FRACTION / (1 - HELD_OUT_FRACTION)
+    light = fit.model.compute_light(np.ones(GRID.size), fit.voxels, np.arange(64))
+    albedo, background, gains = fit.albedo, fit.background, {}
+    for scale in (0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2):
+        fit.albedo, fit.background = albedo * np.float32(scale), background * np.float32(scale)
+        gains[scale] = judge(fit, light, held).nats
+    assert max(gains, key=lambda scale: gains[scale]) == 1.0
+
+
+def test_what_voxels_pay_does_not_depend_on_the_parts_of_the_wall() -> None:
+    """Subsets are quicker, and end at the same light."""
+    ends = []
+    for subsets in (1, 4):
+        fit = make_fit(WALL, GRID, point_albedo(GRID, (0.1, 0.0, 0.7)))
+        for _ in range(40):
+            fit.improve(subsets, prior_weight=20.0)
+        ends.append(fit)
+    one, four = (float(fit.expected_photons.sum()) for fit in ends)
+    free = make_fit(WALL, GRID, point_albedo(GRID, (0.1, 0.0, 0.7)))
+    for _ in range(40):
+        free.improve(1, prior_weight=0.0)
+    paid = float(free.expected_photons.sum()) - one
+    assert four == pytest.approx(one, abs=0.2 * paid)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 2.0])
+def test_a_point_is_as_sharp_as_response_bin_and_wall_make_it(sigma: float) -> None:
+    """Two rings of wall points about a point's foot, each lit where it is seen: paths of 2 *
+    hypot(radius, depth), whose light falls with the fourth power of the distance.
+    """
+    depth, radii = 0.5, np.array([0.1, 1.0])
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(24)], axis=-1)
+    wall = radii[:, np.newaxis, np.newaxis] * circle
+    step = np.array([-1e-3, 0.0, 1e-3])
+    grid = Grid(step, step, depth + step)
+    fit = make_fit(wall, grid, point_albedo(grid, (0, 0, depth)))
+    fit.albedo = point_albedo(grid, (0, 0, depth)).astype(np.float32)
+    fit.response_sigma = sigma
+    distance = np.hypot(radii, depth)
+    weights = distance**-4 / np.sum(distance**-4)
+    along = np.sqrt(np.sum(weights * (2 * depth / distance) ** 2))
+    across = np.sqrt(np.sum(weights * (2 * radii / distance) ** 2) / 2)
+    # An even spread over a bin has the standard deviation 1 / sqrt(12).
+    path = SHORT.spacing * np.sqrt(sigma**2 + 1 / 12)
+    assert compute_beam(fit) == pytest.approx(
+        [path / along, path / across, path / across], rel=1e-3
+    )

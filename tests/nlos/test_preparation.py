@@ -1,22 +1,35 @@
+"""Captures cropped, rebinned, gated, faded and mirrored; and pairs of near lasers and detectors as one
+confocal scan at their midpoints.
+"""
+
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from portable_libraries import LIBRARIES, find_device
+from scenes import planar_wall, scaled_error, see
 
-from nlos import Capture
-from nlos.capture import remove_device_legs
-from nlos.compressed import CompressedCapture
-from nlos.preparation import crop_capture, rebin_capture, remove_first_bounce
-from nlos.simulate import add_poisson_noise
-from tofclip.arrays import to_numpy
+from nlos import Backprojection, Capture, Grid, PlanarRSD, preparation, settings_for
+from nlos.capture import TimeAxis
+from nlos.preparation import (
+    MidpointImaging,
+    MidpointJoin,
+    crop_capture,
+    fade_record_end,
+    flip_capture,
+    join_near_lasers,
+    rebin_capture,
+    remove_first_bounce,
+)
+from nlos.refinement.photons import PhotonRefinement
 from tofclip.errors import InputError
 from tofclip.units import SPEED_OF_LIGHT
 
-WALL = np.array([[0.0, 0, 0], [0.3, 0, 0], [np.nan, 0, 0]])
+THREE = np.array([[0.0, 0, 0], [0.3, 0, 0], [np.nan, 0, 0]])
 SPACING = 0.01
 SIGNAL = np.random.default_rng(3).normal(size=(100, 3))
-CAPTURE = Capture(SIGNAL, WALL, [0.0, 0, 0], SPACING / SPEED_OF_LIGHT, 0.2, {"shot": 7})
+CAPTURE = Capture(SIGNAL, THREE, [0.0, 0, 0], SPACING / SPEED_OF_LIGHT, 0.2, {"shot": 7})
 
 
 def test_cropping_keeps_every_bin_at_its_path() -> None:
@@ -52,25 +65,125 @@ def test_the_first_bounce_comes_later_far_from_the_laser() -> None:
         remove_first_bounce(CAPTURE, -1)
 
 
-@pytest.mark.parametrize("library", LIBRARIES)
-def test_a_capture_is_prepared_where_it_lives(library: str) -> None:
-    moved = CAPTURE.on(find_device(library))
-    for prepared in (
-        lambda one: crop_capture(one, 0.395, 0.605),
-        lambda one: rebin_capture(one, 8),
-        lambda one: remove_first_bounce(one, 0.25),
-    ):
-        found, expected = prepared(moved), prepared(CAPTURE)
-        assert found.device == moved.device
-        assert found.axis == expected.axis
-        np.testing.assert_allclose(to_numpy(found.signal), expected.signal, rtol=1e-6, atol=1e-6)
+WALL = planar_wall(24, 24) * 0.6
+AXIS = TimeAxis(400, 16e-12)
 
 
-def test_what_has_compiled_loops_refuses_other_arrays() -> None:
-    moved = CAPTURE.on(find_device("torch"))
-    with pytest.raises(InputError, match="unwarping works on NumPy arrays"):
-        remove_device_legs(moved, np.zeros(3), np.zeros(3))
-    with pytest.raises(InputError, match="drawing photons works on NumPy arrays"):
-        add_poisson_noise(moved, 10)
-    with pytest.raises(InputError, match="compressed measurements works on NumPy arrays"):
-        CompressedCapture(moved.signal, None, WALL, np.zeros(3), 1e-11)  # type: ignore[arg-type]
+def see_one(wall: np.ndarray = WALL, laser: object = None) -> Capture:
+    laser = wall if laser is None else laser
+    return see([[0.05, -0.1, 0.8]], wall, laser, AXIS, 40e-12, [400.0])
+
+
+def test_the_ends_of_the_record_are_soft() -> None:
+    flat = replace(see_one(), signal=np.ones_like(see_one().signal))
+    gated = remove_first_bounce(flat, 0.3, 0.2).signal[:, 3, 3]
+    assert gated.min() == 0
+    assert np.all(np.diff(gated) >= 0)
+    assert np.max(np.diff(gated)) < 0.05
+    faded = fade_record_end(flat, 0.2).signal[:, 3, 3]
+    assert faded[0] == 1
+    assert faded[-1] == 0
+    assert np.max(np.abs(np.diff(faded))) < 0.05
+    for bad in (-1.0, np.nan):
+        with pytest.raises(InputError):
+            remove_first_bounce(flat, 0.1, bad)
+        with pytest.raises(InputError):
+            fade_record_end(flat, bad)
+
+
+def test_a_picture_is_mirrored_along_an_axis() -> None:
+    grid = Grid.box((-0.3, 0.3), (-0.3, 0.3), (0.7, 0.9), 0.05)
+    for axis, expected in (("x", (-0.05, -0.1)), ("y", (0.05, 0.1))):
+        found = PlanarRSD(0.2).reconstruct(flip_capture(see_one(), axis), grid).find_brightest()
+        assert found[:2] == pytest.approx(expected, abs=0.03)
+    with pytest.raises(InputError, match="mirrored along x or y"):
+        flip_capture(see_one(), "z")
+
+
+# --- lasers near their detectors
+
+WAVELENGTH = 0.2
+HIDDEN = [[0.1, -0.2, 0.7], [-0.2, 0.1, 0.9]]
+GRID = Grid.box((-0.4, 0.4), (-0.4, 0.4), (0.55, 1.0), 0.04)
+
+
+def see_pairs(apart: float | None, points: int = 24) -> Capture:
+    """Two points seen from a wall of 1 m x 1 m whose lasers are so far apart, m, or mirrored."""
+    wall = planar_wall(points, points) * [1 / 1.2, 1, 1]
+    lasers = wall[::-1] if apart is None else wall + np.array([apart, 0, 0])
+    return see(HIDDEN, wall, lasers, TimeAxis(320, 32e-12), 40e-12, [400.0, 500.0])
+
+
+@pytest.mark.parametrize(("apart", "error"), [(1e-7, 0.02), (1e-3, 0.05), (15e-3, 0.1)])
+def test_a_laser_near_its_detector_is_confocal(apart: float, error: float) -> None:
+    lasers = WALL + np.array([apart, 0, 0])
+    capture = see_one(laser=lasers)
+    settings = settings_for(capture)
+    assert settings.method == "rsd"
+    grid = Grid.box((-0.2, 0.3), (-0.35, 0.15), (0.7, 0.9), 0.05)
+    fast = settings.make_method().reconstruct(settings.prepare(capture), grid).values
+    # The same record, with the geometry as it is.
+    true = replace(settings.prepare(capture), wall=WALL, laser=lasers)
+    exact = settings.make_method("backprojection").reconstruct(true, grid)
+    assert scaled_error(fast, exact.values) < error
+
+
+def test_a_small_walls_lasers_may_be_two_centimetres_away() -> None:
+    small = replace(see_one(), wall=WALL / 2, laser=WALL / 2 + np.array([0.019, 0, 0]))
+    joined = join_near_lasers(small)
+    assert np.array_equal(joined.laser, joined.wall)
+    tiny = replace(see_one(), wall=WALL / 10, laser=WALL / 10 + np.array([0.019, 0, 0]))
+    assert join_near_lasers(tiny) is tiny
+
+
+@pytest.mark.parametrize(("apart", "error"), [(0.05, 0.02), (0.12, 0.05)])
+def test_pairs_a_decimetre_apart_are_imaged_at_their_midpoint(apart: float, error: float) -> None:
+    capture = see_pairs(apart)
+    joined = join_near_lasers(capture)
+    assert np.array_equal(joined.laser, joined.wall)
+    exact = Backprojection(WAVELENGTH).reconstruct(capture, GRID).values
+    found = MidpointImaging(PlanarRSD(WAVELENGTH)).reconstruct(capture, GRID).values
+    assert scaled_error(found, exact) < error
+    # Without moveout the path is too long by a part of the offset's square.
+    bare = PlanarRSD(WAVELENGTH).reconstruct(replace(joined, signal=capture.signal), GRID).values
+    assert scaled_error(bare, exact) > 1.4 * scaled_error(found, exact)
+    assert settings_for(capture, wavelength=WAVELENGTH).method == "rsd"
+
+
+def test_paths_of_pairs_are_found_once_for_many_captures(monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = see_pairs(0.1, 12)
+    kept = MidpointJoin(capture)
+    monkeypatch.setattr(preparation, "MAX_KEPT_BYTES", 0)  # found again every time
+    anew = MidpointJoin(capture)
+    found, path_of = [], preparation._path_of
+    monkeypatch.setattr(preparation, "_path_of", lambda *a: found.append(1) or path_of(*a))
+    for factor in (1, 3):
+        brighter = replace(capture, signal=capture.signal * np.float32(factor))
+        joined = kept.join(brighter)
+        assert not found
+        assert joined.signal.any()
+        assert np.array_equal(joined.signal, anew.join(brighter).signal)
+        assert found
+        found.clear()
+    with pytest.raises(InputError, match="planned for"):
+        kept.join(replace(capture, start=0.1))
+
+
+def test_pairs_far_apart_stay_as_they_are() -> None:
+    mirrored = see_pairs(None, 16)
+    assert join_near_lasers(mirrored) is mirrored
+    assert settings_for(mirrored, wavelength=WAVELENGTH).method == "backprojection"
+    fine = see_pairs(0.25, 40)
+    assert join_near_lasers(fine) is fine
+
+
+def test_counts_of_near_pairs_are_refined_as_they_are() -> None:
+    counts = np.random.default_rng(0).poisson(see_pairs(0.1, 12).signal * 0.2 + 0.01)
+    capture = replace(see_pairs(0.1, 12), signal=counts.astype(np.float32))
+    settings = settings_for(capture, wavelength=WAVELENGTH)
+    assert np.array_equal(settings.prepare_counts(capture).laser, capture.laser)
+    method = PhotonRefinement(MidpointImaging(PlanarRSD(WAVELENGTH)), iterations=3)
+    refined = method.reconstruct(capture, GRID)
+    assert "refined" not in refined.provenance["imaging"]["stopped_because"]
+    nearest = np.linalg.norm(np.array(HIDDEN) - refined.find_brightest(), axis=1).min()
+    assert nearest < 0.06

@@ -1,82 +1,107 @@
+"""From a wall of any shape to a plane: directly, in time, and by Fourier transforms of few terms, all
+against the definition or the direct sum; and the plane that the hybrid method chooses.
+"""
+
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
-from scene_shapes import SHAPES, SPOT, shaped_capture, shaped_wall
+from scenes import (
+    SHAPED_JITTER,
+    SHAPED_POINTS,
+    SHAPED_SPOT,
+    SHAPES,
+    relative_error,
+    see,
+    see_shaped,
+    shaped_wall,
+    voxels_of,
+)
 
-from nlos import Capture, Grid, propagate
+import nlos.phasor.wall_to_plane_compiled
+from nlos import Capture, Grid, Hybrid, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
+from nlos.illumination import build_waves, group_by_illumination
 from nlos.phasor import wall_to_plane
-from nlos.phasor.transfer import SphericalWaves
-from nlos.phasor.wall_to_plane import WallBeforePlane, plan_transforms
-from nlos.plane import Plane, WallLattice, choose_virtual_plane
-from nlos.simulate import PointScene
-from tofclip.errors import InputError
+from nlos.phasor.transfer import Offsets, SphericalWaves, find_fast_length, find_min_periods
+from nlos.phasor.wall_to_plane import (
+    WallBeforePlane,
+    WallToPlanePlan,
+    find_common_period,
+    plan_transforms,
+)
+from nlos.phasor.wall_to_plane_compiled import (
+    estimate_strength,
+    propagate_direct,
+    propagate_low_rank,
+)
+from nlos.plane import Plane, StraightPaths, VirtualPlane, WallLattice, choose_virtual_plane
 
 PULSE = VirtualPulse(0.25, 4.24)
+BAND = Band(PULSE, TimeAxis(512, 32e-12))
+K = BAND.wavenumbers
+WAVES = SphericalWaves(float(K[0]), float(K[1] - K[0]), K.size, continued=False)
 PLANE = Plane(np.linspace(-1.4, 1.5, 14), np.linspace(-1.5, 1.3, 11), 0.4)
+STEP = 2 / 31  # of walls with 32 points along a side
+FITTING = Plane(STEP * np.arange(-20, 24), STEP * np.arange(-21, 18), 0.4)
+OTHER = Plane(np.linspace(-1.3, 1.1, 37), np.linspace(-0.8, 1.5, 29), 0.42)
+FINE = Plane(np.linspace(-1.2, 1.3, 40), np.linspace(-1.1, 1.0, 33), 0.4)
+BOX = Grid([-0.5, 0.5], [-0.5, 0.5], [1.0])
 
 
-def definition(capture: Capture, plane: Plane, pulse: VirtualPulse) -> np.ndarray:
+@pytest.fixture
+def always(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Walls as small as those of these tests would go by direct sums."""
+    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
+
+
+def definition(capture: Capture, plane: Plane = PLANE) -> np.ndarray:
     """The field on the plane, summed term by term in float64."""
-    band = Band(pulse, capture.axis)
-    passes = 2 if len(capture.lasers) > 1 else 1
+    band = Band(PULSE, capture.axis)
+    legs = 2 if len(capture.lasers) > 1 else 1
     phasors = band.compute_phasors(capture.traces().astype(np.float64))
-    distance = np.linalg.norm(plane.points[..., np.newaxis, :] - capture.points, axis=-1)
-    waves = (
-        np.exp(1j * passes * distance[..., np.newaxis] * band.wavenumbers)
-        / distance[..., np.newaxis]
-    )
+    distance = np.linalg.norm(plane.points[..., None, :] - capture.points, axis=-1)[..., None]
+    waves = np.exp(1j * legs * distance * band.wavenumbers) / distance
     return np.einsum("yxpk,pk->yxk", waves, phasors)
 
 
-def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
-    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
-
-
 @pytest.mark.parametrize("shape", SHAPES)
-def test_the_spectral_way_is_the_direct_sum(shape: str) -> None:
-    capture = shaped_capture(shape, 17)
+def test_the_spectral_field_is_the_definition(shape: str) -> None:
+    capture = see_shaped(shape, 17)
     field = propagate(capture, PLANE, PULSE)
     assert field.values.shape == (11, 14, field.wavenumbers.size)
     assert field.values.dtype == np.complex64
     # float32: distances of 3 m at 42 rad/m are good to 2e-5, and sums of 289 terms to 1e-6.
-    assert relative_error(field.values, definition(capture, PLANE, PULSE)) < 2e-5
+    assert relative_error(field.values, definition(capture)) < 2e-5
+    corner = propagate(capture, Plane(PLANE.x[:2], PLANE.y[:2], PLANE.z), PULSE).values
+    assert relative_error(corner, field.values[:2, :2]) < 4e-5  # fewer than the loops take at once
 
 
 def test_confocal_waves_run_at_doubled_wavenumbers() -> None:
-    wall = shaped_wall("wavy", 13)
-    capture = shaped_capture("wavy", 13, wall)
+    capture = see_shaped("wavy", 13, "confocal")
     field = propagate(capture, PLANE, PULSE)
     assert field.wavenumbers == pytest.approx(2 * Band(PULSE, capture.axis).wavenumbers)
-    assert relative_error(field.values, definition(capture, PLANE, PULSE)) < 4e-5
+    assert relative_error(field.values, definition(capture)) < 4e-5
 
 
-@pytest.mark.parametrize("confocal", [False, True])
-def test_the_way_in_time_arrives_at_the_same_field(confocal: bool) -> None:
-    wall = shaped_wall("relief", 13)
-    fine = TimeAxis(1024, 16e-12)
-    capture = PointScene([[0.2, 0.1, 1.0]]).simulate_capture(
-        wall, wall if confocal else SPOT, fine, 60e-12
-    )
-    exact = definition(capture, PLANE, PULSE)
-    error = relative_error(propagate(capture, PLANE, PULSE, "time").values, exact)
-    # Linear interpolation loses (k * bin)^2 / 12 in the mean: 1.2 % at the carrier, 4 % at the
-    # shortest wave.
-    assert 1e-3 < error < 2e-2
+def error_in_time(shape: str, count: int, laser: Any, bin_width: float) -> float:
+    axis = TimeAxis(round(512 * 32e-12 / bin_width), bin_width)
+    capture = see([[0.2, 0.1, 1.0]], shaped_wall(shape, count), laser, axis, SHAPED_JITTER)
+    return relative_error(propagate(capture, PLANE, PULSE, "time").values, definition(capture))
 
 
-def test_the_way_in_time_grows_exact_with_finer_bins() -> None:
-    wall = shaped_wall("cylinder", 9)
-    errors = []
-    for bin_width in (32e-12, 16e-12, 8e-12):
-        axis = TimeAxis(round(512 * 32e-12 / bin_width), bin_width)
-        capture = PointScene([[0.2, 0.1, 1.0]]).simulate_capture(wall, SPOT, axis, 60e-12)
-        field = propagate(capture, PLANE, PULSE, "time")
-        errors.append(relative_error(field.values, definition(capture, PLANE, PULSE)))
+def test_propagation_in_time_arrives_at_the_same_field_and_grows_exact_with_finer_bins() -> None:
+    for laser in (SHAPED_SPOT, "confocal"):
+        # Linear interpolation loses (k * bin)^2 / 12 in the mean: 1.2 % at the carrier, 4 % at the
+        # shortest wave.
+        assert 1e-3 < error_in_time("relief", 13, laser, 16e-12) < 2e-2
+    errors = [error_in_time("cylinder", 9, SHAPED_SPOT, width) for width in (32e-12, 16e-12, 8e-12)]
     # Errors of linear interpolation fall with the square of the bins' width.
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.2)
     assert errors[1] / errors[2] == pytest.approx(4, rel=0.2)
@@ -84,7 +109,7 @@ def test_the_way_in_time_grows_exact_with_finer_bins() -> None:
 
 @pytest.mark.parametrize("propagation", ["spectral", "time"])
 def test_pieces_of_a_wall_add_up(propagation: str) -> None:
-    capture = shaped_capture("plates", 15)
+    capture = see_shaped("plates", 15)
     left, right = (
         replace(capture, wall=np.where((capture.wall[..., :1] < 0) == side, capture.wall, np.nan))
         for side in (True, False)
@@ -95,50 +120,198 @@ def test_pieces_of_a_wall_add_up(propagation: str) -> None:
     assert relative_error(parts[0] + parts[1], whole) < 1e-5
 
 
-def test_the_number_of_points_on_the_plane_does_not_matter() -> None:
-    """Fewer than the loops take at once."""
-    capture = shaped_capture("relief", 7)
-    whole = propagate(capture, PLANE, PULSE).values
-    corner = Plane(PLANE.x[:2], PLANE.y[:2], PLANE.z)
-    assert (
-        relative_error(propagate(capture, corner, PULSE).values, whole[:2, :2]) < 4e-5
-    )  # float32 distances
+# --- by Fourier transforms
+
+
+@cache
+def phasors(count: int) -> np.ndarray:
+    """Independent numbers: no symmetry of a scene hides an error."""
+    random = np.random.default_rng(2)
+    values = random.normal(size=(count, K.size)) + 1j * random.normal(size=(count, K.size))
+    return (values * BAND.weights / BAND.weights.max()).astype(np.complex64)
+
+
+def points_of(shape: str, count: int = 32) -> np.ndarray:
+    wall = shaped_wall(shape, count)
+    return wall[np.isfinite(wall).all(axis=-1)]
+
+
+def make_plan(
+    points: np.ndarray, plane: Plane, tolerance: float, strength: np.ndarray = BAND.weights
+) -> WallToPlanePlan:
+    wall = WallBeforePlane.of(points, plane)
+    found = plan_transforms(wall, WAVES, strength, tolerance, scattered=wall.lattice is None)
+    assert found is not None
+    return found
+
+
+def list_clouds() -> Iterator[tuple[np.ndarray, Plane, tuple[float, ...]]]:
+    """Points, planes and tolerances; the first on a lattice, which may repeat its spectrum."""
+    for shape in SHAPES:
+        yield from ((points_of(shape), plane, (1e-2, 1e-3)) for plane in (FITTING, OTHER))
+    sparse, coarse = Plane(FITTING.x[::4], FITTING.y[::3], FITTING.z), points_of("wavy", 11)
+    # Points up to two wavelengths apart, on either side.
+    yield from ((coarse, FITTING, (1e-2,)), (coarse, sparse, (1e-2,)))
+    yield points_of("wavy"), sparse, (1e-2,)
+    # In any order, some missing.
+    yield np.random.default_rng(7).permutation(points_of("relief"))[:900], FITTING, (1e-2,)
+
+
+def list_scattered() -> Iterator[tuple[np.ndarray, Plane, tuple[float, ...]]]:
+    for plane in (FINE, Plane(FINE.x[::3], FINE.y[::4], 0.42)):
+        yield CLOUD, plane, (1e-2, 1e-3)
+    line = [np.linspace(-1, 1, 60) ** 3, np.full(60, 0.2), np.linspace(0, 0.3, 60)]
+    yield np.stack(line, axis=1), FINE, (1e-2,)
+    yield np.concatenate([CLOUD[:80], CLOUD[:80]]), FINE, (1e-2,)  # points that coincide
+    yield CLOUD * [1, 1, 0], FINE, (1e-2,)
+
+
+CLOUD = np.random.default_rng(5).uniform([-1, -0.7, 0], [1, 0.9, 0.3], (900, 3))
+LATTICES, SCATTERED = list(list_clouds()), list(list_scattered())
+
+
+@pytest.mark.usefixtures("always")
+@pytest.mark.parametrize("number", range(len(LATTICES) + len(SCATTERED)))
+def test_it_is_the_direct_sum_within_the_tolerance(number: int) -> None:
+    points, plane, tolerances = [*LATTICES, *SCATTERED][number]
+    if number >= len(LATTICES):
+        pytest.importorskip("finufft", reason="finufft is optional")
+    values = phasors(len(points))
+    exact = propagate_direct(points, values, plane, K)
+    for tolerance in tolerances:
+        found = propagate_low_rank(make_plan(points, plane, tolerance), values)
+        assert found.dtype == np.complex64
+        assert relative_error(found, exact) < tolerance
+
+
+def test_few_depths_take_few_terms(always: None) -> None:
+    """One for a planar wall, two for two plates, whatever their distance; more for a smooth relief."""
+
+    def counts(points: np.ndarray, tolerance: float = 1e-2) -> list[int]:
+        return make_plan(points, FITTING, tolerance).low_rank_transfer.term_counts
+
+    assert set(counts(points_of("planar"))) == {1}
+    assert max(counts(points_of("plates"))) == 2
+    relief = points_of("relief")
+    assert sum(counts(points_of("cylinder"))) < sum(counts(relief)) < sum(counts(relief, 1e-3))
+    pytest.importorskip("finufft", reason="finufft is optional")
+    assert set(counts(CLOUD * [1, 1, 0])) == {1}
+
+
+def test_it_is_linear(always: None) -> None:
+    points = points_of("cylinder")
+    plan, first = make_plan(points, FITTING, 1e-2), phasors(len(points))
+    second = np.random.default_rng(1).normal(size=first.shape).astype(np.complex64)
+    apart = 2 * propagate_low_rank(plan, first) - 3j * propagate_low_rank(plan, second)
+    assert relative_error(apart, propagate_low_rank(plan, 2 * first - 3j * second)) < 1e-5
+
+
+def test_silence_and_a_single_frequency_pass(always: None) -> None:
+    points = points_of("relief")
+    values = np.zeros_like(phasors(len(points)))
+    assert estimate_strength(values).tolist() == [1.0] * K.size
+    assert not propagate_low_rank(make_plan(points, FITTING, 1e-2), values).any()
+    values[:, 9] = phasors(len(points))[:, 9]
+    assert np.flatnonzero(estimate_strength(values)).tolist() == [9]
+    plan = make_plan(points, FITTING, 1e-2, estimate_strength(values))
+    exact = propagate_direct(points, values, FITTING, K)
+    assert relative_error(propagate_low_rank(plan, values), exact) < 1e-2
+
+
+def test_scattered_points_stand_above_no_lattice(always: None) -> None:
+    cloud = np.random.default_rng(3).uniform([-1, -1, 0], [1, 1, 0.2], (100, 3))
+    for points in (cloud, np.concatenate([points_of("wavy", 5)] * 2)):
+        wall = WallBeforePlane.of(points, FITTING)
+        assert plan_transforms(wall, WAVES, BAND.weights, 1e-2) is None
+
+
+@pytest.mark.parametrize(
+    ("scattered", "count", "tolerance", "taken"),
+    [
+        (False, 64**2, 1e-2, True),
+        (False, 9**2, 1e-2, False),
+        (False, 64**2, 1e-4, False),
+        (True, 20000, 1e-2, True),
+        (True, 300, 1e-2, False),
+        (True, 20000, 1e-4, False),
+    ],
+)
+def test_large_problems_take_it_and_small_or_strict_ones_do_not(
+    scattered: bool, count: int, tolerance: float, taken: bool
+) -> None:
+    if scattered:
+        pytest.importorskip("finufft", reason="finufft is optional")
+    side = 128 if scattered else 64
+    plane = Plane(np.linspace(-1, 1, side), np.linspace(-1, 1, side), 0.4)
+    points = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 0.3], (count, 3))
+    points = points if scattered else points_of("relief", round(count**0.5))
+    waves = SphericalWaves(40.0, 1.0, 100, continued=False) if scattered else WAVES
+    wall = WallBeforePlane.of(points, plane)
+    plan = plan_transforms(wall, waves, np.ones(waves.count), tolerance, scattered)
+    assert (plan is not None) == taken
+
+
+def test_scattered_points_take_it_where_it_is_faster_and_installed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else the direct sum is, which the field shows by its accuracy."""
+    pytest.importorskip("finufft", reason="finufft is optional")
+    capture = see(SHAPED_POINTS, CLOUD, SHAPED_SPOT, TimeAxis(512, 32e-12), SHAPED_JITTER)
+    exact = propagate(capture, FINE, PULSE, tolerance=1e-4).values
+    errors = {}
+    for faster, installed in ((True, True), (True, False), (False, True)):
+        monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_, f=faster: f)
+        monkeypatch.setattr(
+            nlos.phasor.wall_to_plane_compiled, "has_finufft", lambda there=installed: there
+        )
+        errors[faster, installed] = relative_error(propagate(capture, FINE, PULSE).values, exact)
+    assert 1e-5 < errors[True, True] < 1e-2
+    assert errors[True, False] == errors[False, True] == 0
+
+
+def test_periods_suit_wall_and_plane() -> None:
+    assert [find_fast_length(n) for n in (3, 17, 100, 129, 145, 161, 300, 321, 385, 481, 641)] == [
+        16, 32, 128, 144, 160, 192, 320, 384, 400, 512, 1024,
+    ]  # fmt: skip
+    assert find_common_period(4.9, 0.1, 0.1, 30) == (64, 64.0)
+    assert find_common_period(4.9, 0.1, 0.2, 30) == (64, 32.0)
+    assert find_common_period(4.9, 0.1, 0.12, 30) == (64, pytest.approx(64 / 1.2))
+    assert find_common_period(3.9, 0.1, 0.12, 30) == (48, 40.0)
+    assert find_common_period(4.9, 0.1, 0.0777, 30) == (64, pytest.approx(6.4 / 0.0777))
+
+
+# --- the virtual plane
+
+
+def waves_of(shortest: float) -> SphericalWaves:
+    return SphericalWaves(2 * np.pi / shortest, 0.0, 1, True)
 
 
 def test_the_virtual_plane_keeps_its_distance_and_samples_the_shortest_wave() -> None:
-    points = shaped_wall("relief", 9).reshape(-1, 3)
-    small = Grid([-0.5, 0.5], [-0.5, 0.5], [1.0])
+    points, waves = points_of("relief", 9), waves_of(0.07)
     for shortest, gap in ((0.01, 0.05), (0.07, 0.07), (0.5, 0.1)):
-        plane = choose_virtual_plane(
-            points, small, SphericalWaves(2 * np.pi / shortest, 0.0, 1, True), 0.0
-        )
+        plane = choose_virtual_plane(points, BOX, waves_of(shortest), 0.0)
         assert plane.z == pytest.approx(points[:, 2].max() + gap)
         assert max(plane.steps) <= shortest / 2
-        # All straight ways to voxels within the wall's outline pass within it too.
+        # All straight paths to voxels within the wall's outline pass within it too.
         assert (plane.x[0], plane.x[-1], plane.y[-1]) == pytest.approx((-1, 1, 1))
-    waves = SphericalWaves(2 * np.pi / 0.07, 0.0, 1, True)
-    assert choose_virtual_plane(points, small, waves, 1.0, 0.9).z == 0.9
+    assert choose_virtual_plane(points, BOX, waves, 1.0, 0.9).z == 0.9
     gap = 0.07 + np.ptp(points[:, 2])
-    roomy = choose_virtual_plane(points, small, waves, 2.0)
+    roomy = choose_virtual_plane(points, BOX, waves, 2.0)
     assert roomy.x[-1] == pytest.approx(1 + 2 * np.sqrt(0.07 * gap))
-    plane_z = points[:, 2].max() + 0.07
-    wide = choose_virtual_plane(points, Grid([-3, 3], [-0.5, 0.5], [plane_z + gap]), waves, 0.0)
+    depth = points[:, 2].max() + 0.07 + gap
+    wide = choose_virtual_plane(points, Grid([-3, 3], [-0.5, 0.5], [depth]), waves, 0.0)
     assert wide.x[-1] == pytest.approx(2)  # half way to a voxel at 3 m
 
 
 @pytest.mark.parametrize("shortest", [0.09, 0.52, 2.1])
-def test_the_virtual_plane_suits_the_walls_lattice(
-    shortest: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_virtual_plane_suits_the_walls_lattice(shortest: float, always: None) -> None:
     """Finer and coarser than its points, 0.25 m apart: Fourier transforms lead there and back."""
-    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
-    points = shaped_wall("relief", 9).reshape(-1, 3)
-    waves = SphericalWaves(2 * np.pi / shortest, 0.0, 1, True)
-    box = Grid([-0.5, 0.5], [-0.5, 0.5], [1.0])
+    points, waves = points_of("relief", 9), waves_of(shortest)
     lattice = WallLattice.find(points)
     assert lattice is not None
-    plane = choose_virtual_plane(points, box, waves, 1.0, wall=lattice)
-    free = choose_virtual_plane(points, box, waves, 1.0)
+    plane = choose_virtual_plane(points, BOX, waves, 1.0, wall=lattice)
+    free = choose_virtual_plane(points, BOX, waves, 1.0)
     for axis, unfitted in ((plane.x, free.x), (plane.y, free.y)):
         step = axis[1] - axis[0]
         ratio = max(0.25 / step, step / 0.25)
@@ -152,10 +325,9 @@ def test_the_virtual_plane_suits_the_walls_lattice(
     assert plan.plane_lattice == tuple(map(round, plan.plane_lattice))
 
 
-def test_the_field_fades_towards_the_rim_beside_the_straight_ways_only() -> None:
-    points = shaped_wall("planar", 9).reshape(-1, 3)
-    waves = SphericalWaves(2 * np.pi / 0.07, 0.0, 1, True)
-    plane = choose_virtual_plane(points, Grid([-0.5, 1.5], [-0.5, 0.5], [0.5]), waves, 2.0)
+def test_the_field_fades_towards_the_rim_beside_the_straight_paths_only() -> None:
+    points, grid = points_of("planar", 9), Grid([-0.5, 1.5], [-0.5, 0.5], [0.5])
+    plane = choose_virtual_plane(points, grid, waves_of(0.07), 2.0)
     weights = plane.weights / np.prod(plane.steps)
     assert weights.shape == plane.shape
     assert weights.max() == pytest.approx(1)
@@ -164,22 +336,57 @@ def test_the_field_fades_towards_the_rim_beside_the_straight_ways_only() -> None
     assert weights[0].max() < 0.05  # half a step from where nothing is left
     # Voxels beside the wall along x ask for more room there than along y.
     assert plane.fade[1] > plane.fade[0] == pytest.approx(0.75 * 2 * 0.07)
-    sharp = choose_virtual_plane(points, Grid([-0.5, 0.5], [-0.5, 0.5], [0.5]), waves, 0.0)
-    np.testing.assert_allclose(sharp.weights, np.prod(sharp.steps), rtol=1e-6)
 
 
-def test_what_cannot_be_propagated_is_refused() -> None:
-    capture = shaped_capture("relief", 7)
-    with pytest.raises(InputError, match="in front of the wall"):
-        propagate(capture, Plane(PLANE.x, PLANE.y, 0.2), PULSE)
-    with pytest.raises(InputError, match="one of spectral, time"):
-        propagate(capture, PLANE, PULSE, "magic")  # type: ignore[arg-type]
-    walls = np.stack([capture.wall, capture.wall])
-    spots = np.broadcast_to(np.array([[0.1, 0, 0], [0.3, 0, 0]])[:, None, None], walls.shape)
-    several = replace(
-        capture, wall=walls, laser=spots, signal=np.stack([capture.signal] * 2, axis=1)
+NEAR = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.8, 9), [0.6, 0.7, 0.9])
+
+
+def test_no_straight_path_leads_farther() -> None:
+    points = points_of("relief", 9)
+    plane = VirtualPlane(np.linspace(-1.4, 1.4, 30), np.linspace(-1.3, 1.3, 28), 0.35, (0.2, 0.3))
+    paths, strict = (StraightPaths.find(points, plane, NEAR, tol) for tol in (0.1, 1e-3))
+    assert paths is not None
+    assert strict is not None
+    voxels = voxels_of(NEAR).reshape(-1, 1, 3)
+    across = np.linalg.norm((voxels - points)[..., :2], axis=-1)
+    before = (plane.z - points[:, 2]) / (voxels - points)[..., 2]
+    for fraction, bound in ((before, paths.wall_to_plane), (1 - before, paths.plane_to_voxels)):
+        farthest = (fraction * across).max()
+        # points at the ends in depth need not stand in the corners
+        assert farthest <= bound < 1.35 * farthest
+    assert paths.rim == pytest.approx((0.14, 0.21))
+    assert paths.first_depth == 0.6
+    assert strict.wall_to_plane > paths.wall_to_plane
+    assert strict.rim < paths.rim
+    # Voxels before the plane leave no way out.
+    assert StraightPaths.find(points, replace(plane, z=0.65), NEAR, 1e-2) is None
+
+
+def test_a_period_holds_a_plane_that_is_wider_than_the_windows() -> None:
+    """Many zones beside a small wall: the plane's own width decides."""
+    sources = VirtualPlane(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), 0.2, (1.4, 1.4))
+    axis = np.linspace(-0.1, 0.1, 3)
+    offsets = Offsets.between(sources, axis, axis).limit(0.2, (0.7, 0.7))
+    assert find_min_periods(offsets, 1e-2) == pytest.approx((2.1, 2.1))
+
+
+def test_lattices_are_as_short_as_the_paths_allow() -> None:
+    """From the wall to a plane before it, and from there to depths as from a planar wall."""
+    wall, axis = shaped_wall("relief", 64), np.linspace(-1, 1, 64)
+    capture = see([[0, 0, 2.0]], wall, SHAPED_SPOT, TimeAxis(64, 32e-12), SHAPED_JITTER)
+    plan = Hybrid(0.125, 4.24).plan(capture, Grid(axis, axis, np.linspace(0.6, 1.6, 4)))
+    limited = plan.groups[0].plane_to_depths
+    whole = replace(limited, paths=None)
+    assert (limited.lattice, whole.lattice) == ((160, 160), (192, 192))
+    assert limited.plane_wave_count < 0.75 * whole.plane_wave_count
+    waves = build_waves(group_by_illumination(capture)[0], plan.band, continued=False)
+    geometry = replace(WallBeforePlane.of(capture.points, limited.plane), paths=limited.paths)
+    narrow, wide = (
+        plan_transforms(some, waves, np.ones(waves.count), 6e-3)
+        for some in (geometry, replace(geometry, paths=None))
     )
-    with pytest.raises(InputError, match="2 laser spots"):
-        propagate(several, PLANE, PULSE)
-    with pytest.raises(InputError, match="empty band"):
-        propagate(capture, PLANE, VirtualPulse(1e-3))
+    assert narrow is not None
+    assert wide is not None
+    assert (narrow.lattice, wide.lattice) == ((144, 144), (192, 192))
+    # What fades before it reaches a voxel is left out, which are many waves of low frequencies.
+    assert narrow.lateral_limits[0] < 0.85 * wide.lateral_limits[0]

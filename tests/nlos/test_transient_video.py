@@ -2,24 +2,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
-from relay_walls import curved_wall, planar_wall
+from scenes import curved_wall, planar_wall, see
 
 import nlos.video
 from nlos import Capture, Grid, Hybrid, PlanarRSD, TransientImaging
 from nlos.capture import TimeAxis
 from nlos.method import MEMORY_LIMIT_BYTES
-from nlos.simulate import PointScene
-from nlos.video import TransientVideo
+from nlos.video import DepthAverage, TransientVideo
 from tofclip.errors import InputError, ShapeError
 from tofclip.units import SPEED_OF_LIGHT
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.illumination.AliasingWarning"
-)  # small walls are coarse ones
 LASER = np.array([0.12, 0.05, 0.0])
 POINTS = np.array([[0.15, -0.2, 0.6], [-0.2, 0.15, 0.95]])
 ARRIVALS = np.linalg.norm(POINTS - LASER, axis=1) / SPEED_OF_LIGHT
@@ -30,7 +27,7 @@ METHODS = {"rsd": PlanarRSD(0.15, 4), "hybrid": Hybrid(0.15, 4)}
 
 def seen(method: str, points: np.ndarray = POINTS) -> Capture:
     wall = planar_wall(19, 21) if method == "rsd" else curved_wall(19, 21)
-    return PointScene(points).simulate_capture(wall, LASER, AXIS, 40e-12)
+    return see(points, wall, LASER, AXIS, 40e-12)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -133,24 +130,100 @@ def test_the_film_shows_the_point_where_it_is(tmp_path: Path) -> None:
         # the way down.
         assert rows.mean() + 60 < lit.shape[0] / 3
         assert 0.4 * lit.shape[1] < columns.mean() < 0.65 * lit.shape[1]
-    with pytest.raises(InputError, match=r"must end in \.gif"):
-        video.save_film(tmp_path / "film.mp4")
 
 
-def test_what_cannot_be_filmed_is_refused() -> None:
-    imaging, capture = TransientImaging(METHODS["rsd"]), seen("rsd")
-    scanned = replace(capture, laser=capture.wall)
-    with pytest.raises(InputError, match="need one laser spot"):
-        imaging.video(scanned, GRID, ARRIVALS)
-    with pytest.raises(InputError, match="behind the hindmost"):
-        imaging.front_views(capture, Grid(GRID.x, GRID.y, GRID.z - 2), ARRIVALS)
-    with pytest.raises(InputError, match=r"GiB allowed: ask for fewer"):
-        imaging.video(capture, GRID, np.zeros(MEMORY_LIMIT_BYTES // (4 * GRID.size) + 1))
-    with pytest.raises(ShapeError, match="instants"):
-        imaging.video(capture, GRID, [])
-    with pytest.raises(InputError, match="must be finite"):
-        imaging.video(capture, GRID, [np.nan])
-    with pytest.raises(InputError, match="open before it closes"):
-        imaging.image_gate(capture, GRID, 2e-9, 1e-9)
-    with pytest.raises(ShapeError, match="transient video"):
-        TransientVideo(np.zeros((2, 3, 3), np.float32), np.zeros(2), GRID)
+IMAGING = TransientImaging(METHODS["rsd"])
+FILM = np.zeros((3, *GRID.shape), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("attempt", "error", "message"),
+    [
+        (
+            lambda c: IMAGING.video(replace(c, laser=c.wall), GRID, ARRIVALS),
+            InputError,
+            "need one laser spot",
+        ),
+        (
+            lambda c: IMAGING.front_views(c, Grid(GRID.x, GRID.y, GRID.z - 2), ARRIVALS),
+            InputError,
+            "behind the hindmost",
+        ),
+        (
+            lambda c: IMAGING.video(c, GRID, np.zeros(MEMORY_LIMIT_BYTES // (4 * GRID.size) + 1)),
+            InputError,
+            r"GiB allowed: ask for fewer",
+        ),
+        (lambda c: IMAGING.video(c, GRID, []), ShapeError, "instants"),
+        (lambda c: IMAGING.video(c, GRID, [np.nan]), InputError, "must be finite"),
+        (lambda c: IMAGING.image_gate(c, GRID, 2e-9, 1e-9), InputError, "open before it closes"),
+        (
+            lambda _: TransientVideo(np.zeros((2, 3, 3), np.float32), np.zeros(2), GRID),
+            ShapeError,
+            "transient video",
+        ),
+        (
+            lambda _: TransientVideo(FILM, np.arange(3.0), GRID).save_film("film.mp4"),
+            InputError,
+            r"must end in \.gif",
+        ),
+        (lambda _: DepthAverage(GRID, 0.0, 0), InputError, "1 capture or more"),
+    ],
+)
+def test_what_cannot_be_filmed_is_refused(attempt: Any, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        attempt(seen("rsd"))
+
+
+# --- running means over more captures the farther away: less noise there, no trail near by
+
+FAR_AXIS, FAR, CAPTURES, LONG_WAVES = TimeAxis(320, 40e-12), (0.1, -0.1, 1.4), 9, PlanarRSD(0.3)
+DEEP = Grid.box((-0.4, 0.4), (-0.4, 0.4), (0.3, 1.5), 0.1)
+
+
+def see_moving(place: float) -> Capture:
+    """A bright point near by that moves along x, and a faint one far away that stands still."""
+    wall = planar_wall(12, 12) * [1 / 1.2, 1, 1]
+    points = [place, 0.1, 0.4], FAR
+    return see(points, wall, [0.0, 0.0, 0.0], FAR_AXIS, 60e-12, [1.0, 20.0])
+
+
+def test_far_things_stand_out_and_near_ones_leave_no_trail() -> None:
+    places = np.linspace(-0.3, 0.3, CAPTURES)
+    plan = LONG_WAVES.plan(see_moving(0.0), DEEP)
+    average = DepthAverage(DEEP, 0.0, CAPTURES)
+    assert average.windows[[0, -1]].tolist() == [2, CAPTURES]
+    assert np.all(np.diff(average.windows) >= 0)
+    random, clean = np.random.default_rng(0), plan.image(see_moving(places[-1])).values
+    noise = 0.02 * float(see_moving(0.0).signal.max())
+    for place in places:
+        capture = see_moving(place)
+        noisy = capture.signal + noise * random.standard_normal(capture.signal.shape)
+        field = plan.field(Capture(noisy, capture.wall, capture.laser, FAR_AXIS.bin_width))
+        averaged = average.add(field).values
+    single, far = np.abs(field.values), slice(9, None)
+    errors = [np.linalg.norm(one[far] - clean[far]) for one in (averaged, single)]
+    # Noise falls with the root of 7 to 9 captures; the near point's waves, which change, stay.
+    assert errors[0] < 0.55 * errors[1]
+    row = DEEP.find_nearest((places[-1], 0.1, 0.4))
+    # Two captures at the near point's depth, which moved less than a voxel between them.
+    along = averaged[row[0], row[1]]
+    assert along.argmax() == single[row[0], row[1]].argmax() == row[2]
+    start = DEEP.find_nearest((places[0], 0.1, 0.4))[2]
+    assert along[start] < 0.5 * along.max()
+
+
+def test_the_nearest_depths_show_the_newest_capture_alone() -> None:
+    grid = Grid([0.0, 0.1], [0.0], [0.1, 0.5, 1.0])
+    average = DepthAverage(grid, 0.0, 4)
+    assert average.windows.tolist() == [1, 2, 4]
+    plan = LONG_WAVES.plan(see_moving(0.0), Grid([0.0, 0.1], [0.0, 0.1], grid.z))
+    field = plan.field(see_moving(0.0))
+    average = DepthAverage(field.grid, 0.0, 4)
+    first, second = (
+        average.add(one).values
+        for one in (field, replace(field, values=np.float32(3) * field.values))
+    )
+    assert np.allclose(first, np.abs(field.values))
+    # The newest alone, then the mean of both that there are.
+    assert np.allclose(second, np.abs(field.values) * np.array([3, 2, 2])[:, None, None])

@@ -1,0 +1,148 @@
+"""Walls, hidden points and devices that the tests of imaging around corners share, and how alike two
+fields are.
+
+Where there is a GPU, ``TOFCLIP_TEST_DEVICES=cuda pytest tests/nlos -k portable`` tests it as well.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from nlos import Capture, Grid
+from nlos.capture import TimeAxis
+from nlos.simulate import PointScene
+from tofclip.arrays import ComputeDevice, parse_device, to_numpy
+from tofclip.errors import InputError
+
+AXIS = TimeAxis(bins=256, bin_width=16e-12, start=0.4)
+LONG = TimeAxis(560, AXIS.bin_width, 0.4)  # holds every path by way of the voxels of most tests
+JITTER = 20e-12
+# Off every symmetry axis and between no two alike: a swapped or mirrored axis puts it elsewhere.
+HIDDEN = (0.15, -0.2, 0.65)
+THREE_POINTS = (HIDDEN, (-0.2, 0.1, 0.75), (0.05, -0.05, 0.5))
+SPOTS = np.array([[0.12, 0.05, 0.0], [-0.3, 0.2, 0.0]])
+
+# Before walls of 2 m x 2 m.
+SHAPES = ("planar", "cylinder", "wavy", "relief", "plates")
+SHAPED_SPOT = np.array([0.1, 0.05, 0.02])
+SHAPED_POINTS = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4], [-0.6, -0.6, 1.1]])
+SHAPED_JITTER, SHAPED_AXIS = 60e-12, TimeAxis(512, 32e-12)
+
+LIBRARIES = ("torch", "array_api_strict", *os.environ.get("TOFCLIP_TEST_DEVICES", "").split())
+
+
+def planar_wall(rows: int = 17, columns: int = 21) -> NDArray[np.float64]:
+    """A wall of 1.2 m x 1 m at z = 0, rows downwards."""
+    x, y = np.meshgrid(np.linspace(-0.6, 0.6, columns), np.linspace(-0.5, 0.5, rows))
+    return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+
+def curved_wall(rows: int = 17, columns: int = 21) -> NDArray[np.float64]:
+    """A cylinder about the vertical, bulging 7 cm towards the scene, with ripples of 1.5 cm."""
+    wall = planar_wall(rows, columns)
+    wall[..., 2] = 0.07 - 0.2 * wall[..., 0] ** 2 + 0.015 * np.cos(7 * wall[..., 1])
+    return wall
+
+
+def shaped_wall(shape: str, count: int) -> NDArray[np.float64]:
+    """A wall of 2 m x 2 m: planar, a cylinder of radius 2.5 m, waves of 0.1 m, relief of 0.3 m, or
+    two plates.
+    """
+    x, y = np.meshgrid(np.linspace(-1, 1, count), np.linspace(-1, 1, count))
+    depths = {
+        "planar": 0 * x,
+        "cylinder": 2.5 - np.sqrt(2.5**2 - x**2),
+        "wavy": 0.1 * np.sin(5 * x) * np.cos(4 * y),
+        "relief": 0.15 * (1 + np.sin(3 * x + 1) * np.cos(2 * y)),
+        "plates": np.where(x < 0, 0.0, 0.15),
+    }
+    wall = np.stack([x, y, depths[shape]], axis=-1)
+    if shape == "plates":
+        wall[np.abs(x) < 0.15] = np.nan
+    return wall
+
+
+def see(
+    points: Any,
+    wall: NDArray[np.float64],
+    laser: Any,
+    axis: TimeAxis = AXIS,
+    jitter: float = JITTER,
+    albedo: Any = None,
+) -> Capture:
+    """Hidden points seen from a wall that is lit at one spot, at several (n, 3) one after the other,
+    confocally, or at another spot for every wall point (paired).
+    """
+    named = {"confocal": wall, "paired": wall[::-1] + np.array([0.01, -0.02, 0.0])}
+    named["single"] = np.array([0.12, 0.05, 0.01])
+    laser = named[laser] if isinstance(laser, str) else np.asarray(laser)
+    if laser.ndim == 2 and wall.ndim == 3:
+        wall = np.stack([wall] * len(laser))
+        laser = np.broadcast_to(laser[:, None, None], wall.shape)
+    return PointScene(points, albedo).simulate_capture(wall, laser, axis, jitter)
+
+
+def see_shaped(shape: str, count: int, laser: Any = SHAPED_SPOT) -> Capture:
+    """Four hidden points seen from a wall of 2 m x 2 m."""
+    return see(SHAPED_POINTS, shaped_wall(shape, count), laser, SHAPED_AXIS, SHAPED_JITTER)
+
+
+def voxels_of(grid: Grid) -> NDArray[np.float64]:
+    """Positions of all voxels, (z, y, x, 3), m."""
+    z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
+    return np.stack([x, y, z], axis=-1)
+
+
+def around(point: Any, half: float = 0.12, voxel: float = 0.04) -> Grid:
+    """Voxels about a point, which is the middle one."""
+    steps = voxel * np.arange(-round(half / voxel), round(half / voxel) + 1)
+    return Grid(*(c + steps for c in point))
+
+
+def distance_to_nearest(grid: Grid, points: Any) -> NDArray[np.float64]:
+    """From every voxel (z, y, x) to the nearest of some points, m."""
+    distances: NDArray[np.float64] = cKDTree(np.asarray(points)).query(voxels_of(grid))[0]
+    return distances
+
+
+def energy_fraction(values: NDArray[Any], near: NDArray[np.bool_]) -> float:
+    """Energy of some voxels over that of all."""
+    energy = np.abs(values).astype(np.float64) ** 2
+    return float(energy[near].sum() / energy.sum())
+
+
+def relative_error(found: Any, expected: NDArray[Any]) -> float:
+    return float(np.linalg.norm(to_numpy(found) - expected) / np.linalg.norm(expected))
+
+
+def scaled_error(found: NDArray[Any], expected: NDArray[Any]) -> float:
+    """Relative difference after one scale factor."""
+    return relative_error(np.vdot(found, expected) / np.vdot(found, found) * found, expected)
+
+
+def find_refusal(method: Any, capture: Capture, grid: Grid) -> str:
+    """Return the reason that a plan is refused for; empty if it is not."""
+    try:
+        method.plan(capture, grid)
+    except InputError as refused:
+        return str(refused)
+    return ""
+
+
+def find_device(library: str) -> ComputeDevice:
+    """Return a library's processor, or the device of that name; skip the test where the library is
+    not installed.
+    """
+    if library == "array_api_strict":
+        return ComputeDevice.of(pytest.importorskip(library).asarray([0.0]))
+    if library != "torch":
+        return parse_device(library)
+    # Waking other threads up takes longer than what there is to do.
+    pytest.importorskip(library).set_num_threads(1)
+    return parse_device("torch:cpu")

@@ -1,0 +1,367 @@
+"""Planar diffraction and the hybrid method: what they show, depths that are interpolated, transforms
+there and back, progress, and what they refuse.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from exact_phasor_field import compute_exact_phasor_field
+from hypothesis import given
+from hypothesis import strategies as st
+from sampled_diffraction import diffract_by_convolution
+from scenes import (
+    AXIS,
+    HIDDEN,
+    JITTER,
+    LONG,
+    SHAPED_JITTER,
+    SHAPED_POINTS,
+    SHAPED_SPOT,
+    SPOTS,
+    THREE_POINTS,
+    curved_wall,
+    distance_to_nearest,
+    energy_fraction,
+    find_refusal,
+    planar_wall,
+    relative_error,
+    scaled_error,
+    see,
+    see_shaped,
+    shaped_wall,
+)
+
+import nlos.phasor.depth_steps
+import nlos.phasor.to_depths_compiled
+from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
+from nlos.capture import TimeAxis
+from nlos.illumination import build_waves, choose_unaliased_band, group_by_illumination
+from nlos.method import SubProgress
+from nlos.phasor import fourier, wall_to_plane
+from nlos.phasor.depth_steps import AxialSpectrum, choose_depths
+from nlos.phasor.propagate import CompiledBackend
+from nlos.phasor.to_depths_compiled import DEPTH_ERROR_FRACTION, CompiledDiffraction
+from nlos.plane import Plane
+from tofclip.errors import InputError
+
+GRID = Grid(np.arange(-0.3, 0.42, 0.05), np.arange(-0.4, 0.25, 0.06), [0.45, 0.5, 0.56, 0.65, 0.8])
+METHOD, HYBRID = PlanarRSD(wavelength=0.125, cycles=3), Hybrid(wavelength=0.25, cycles=4.24)
+SHAPED = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.85, 12), [0.62, 0.8, 1.0, 1.1, 1.45])
+
+
+def scene(laser: Any = SPOTS[0], wall: np.ndarray | None = None) -> Capture:
+    wall = planar_wall() if wall is None else wall
+    return see(THREE_POINTS, wall, laser, LONG, JITTER, [1.0, 0.6, 0.3])
+
+
+@cache
+def truth(shape: str) -> tuple[Capture, np.ndarray]:
+    capture = see_shaped(shape, 25)
+    return capture, compute_exact_phasor_field(capture, SHAPED, HYBRID.pulse).values
+
+
+def test_they_show_what_backprojection_shows() -> None:
+    found, expected = (one.reconstruct(scene(), GRID) for one in (METHOD, Backprojection(0.125, 3)))
+    assert found.find_brightest() == expected.find_brightest()
+    assert relative_error(found.values, expected.values) < 1e-2
+    wall = shaped_wall("cylinder", 64)
+    capture = see(SHAPED_POINTS, wall, SHAPED_SPOT, TimeAxis(512, 32e-12), SHAPED_JITTER)
+    grid = Grid(np.linspace(0.18, 0.42, 9), np.linspace(-0.32, -0.08, 9), np.linspace(0.9, 1.1, 5))
+    image, expected = (
+        one.reconstruct(capture, grid).values
+        for one in (Hybrid(0.125, 4.24), Backprojection(0.125, 4.24))
+    )
+    assert scaled_error(image, expected) < 1e-2
+
+
+def test_a_planar_wall_gives_what_planar_diffraction_gives() -> None:
+    capture, _ = truth("planar")
+    found = HYBRID.phasor_field(capture, SHAPED).values
+    assert scaled_error(found, PlanarRSD(0.25, 4.24).phasor_field(capture, SHAPED).values) < 1e-2
+
+
+def test_the_hidden_points_stand_out() -> None:
+    """Energy about hidden points and contrast, as sharp as by the exact sum."""
+    capture, exact = truth("cylinder")
+    image = HYBRID.reconstruct(capture, SHAPED).values
+    near = distance_to_nearest(SHAPED, SHAPED_POINTS) < 0.1
+    assert energy_fraction(image, near) == pytest.approx(energy_fraction(exact, near), rel=5e-3)
+    assert image[near].mean() > 3 * image[~near].mean()
+
+
+def test_propagation_in_time_shows_the_same_points() -> None:
+    wall = shaped_wall("relief", 11)
+    capture = see(SHAPED_POINTS[:1], wall, SHAPED_SPOT, TimeAxis(1024, 16e-12), SHAPED_JITTER)
+    grid = Grid(np.linspace(0.1, 0.5, 5), np.linspace(-0.4, 0.0, 5), [0.9, 1.0, 1.1])
+    in_time = replace(HYBRID, propagation="time").reconstruct(capture, grid)
+    assert in_time.find_brightest() == pytest.approx(tuple(SHAPED_POINTS[0]))
+    assert scaled_error(in_time.values, HYBRID.reconstruct(capture, grid).values) < 3e-2
+    assert in_time.provenance["imaging"]["propagation"] == "time"
+
+
+def test_the_plane_may_stand_elsewhere_and_before_it_voxels_stay_sensible() -> None:
+    capture, exact = truth("planar")
+    moved = replace(HYBRID, plane_z=0.7)
+    assert moved.plan(capture, SHAPED).plane.z == 0.7
+    found = moved.phasor_field(capture, SHAPED).values
+    # Behind the plane only what passes beside it is missing; before it, the steepest waves are.
+    assert scaled_error(found[2:], exact[2:]) < 0.15
+    assert scaled_error(found[:1], exact[:1]) < 0.5
+
+
+def test_the_sampled_wave_is_the_exact_sum() -> None:
+    wall = planar_wall(9, 11)
+    capture = see([HIDDEN], wall, wall, TimeAxis(900, AXIS.bin_width, 0.4))
+    grid = Grid(wall[0, :8, 0] + 0.31, wall[:7, 0, 1] - 0.1, [0.3, 0.6])
+    band = choose_unaliased_band(capture, grid, METHOD.pulse)
+    (group,) = group_by_illumination(capture)
+    plane, waves = Plane(wall[0, :, 0], wall[:, 0, 1], 0.0), build_waves(group, band, False)
+    values = CompiledBackend(band).compute_phasors(capture, group).reshape(9, 11, -1)
+    found = diffract_by_convolution(values, plane, grid, waves).sum(axis=0)
+    exact = compute_exact_phasor_field(capture, grid, METHOD.pulse).values
+    assert relative_error(found, exact) < 1e-5  # the phasors are float32
+    assert relative_error(METHOD.phasor_field(capture, grid).values, found) < 1e-2
+    with pytest.raises(InputError, match="as far from each other"):
+        diffract_by_convolution(values, plane, GRID, waves)
+
+
+def test_light_from_outside_the_record_stays_dark() -> None:
+    far = Grid(np.linspace(-0.2, 0.2, 5), np.linspace(-0.2, 0.2, 5), [5.0, 5.2])
+    brightest = METHOD.reconstruct(scene(), GRID).values.max()
+    # The band's edge, where the pulse's spectrum is cut at 1 %, rings that far.
+    assert METHOD.reconstruct(scene(), far).values.max() < 2e-2 * brightest
+
+
+def test_a_single_voxel_and_a_single_row() -> None:
+    whole, row, voxel = (
+        METHOD.phasor_field(scene(), grid).values
+        for grid in (
+            GRID,
+            Grid(GRID.x, GRID.y[3:4], GRID.z[3:4]),
+            Grid(GRID.x[9:10], GRID.y[3:4], GRID.z[3:4]),
+        )
+    )
+    size = np.abs(whole).max()
+    assert np.abs(row[0, 0] - whole[3, 3]).max() < 1e-2 * size
+    assert abs(voxel[0, 0, 0] - whole[3, 3, 9]) < 1e-2 * size
+
+
+UNEVEN = planar_wall()
+UNEVEN[:, 4, 0] += 0.02
+UNEVEN_VOXELS = Grid([0.0, 0.1, 0.3], GRID.y, GRID.z)
+
+
+@pytest.mark.parametrize(
+    ("method", "capture", "grid", "reason"),
+    [
+        (METHOD, scene(wall=curved_wall()), GRID, "not a plane"),
+        (METHOD, scene(wall=UNEVEN), GRID, "not evenly spaced along x"),
+        (METHOD, scene("paired"), GRID, "laser spots"),
+        (METHOD, scene(), UNEVEN_VOXELS, "voxels are not evenly spaced along x"),
+        (METHOD, scene(), Grid(GRID.x, GRID.y, [0.0, 0.5]), "must begin in front of the wall"),
+        (METHOD, scene(wall=planar_wall(1, 30)), GRID, "two different y"),
+        (HYBRID, see_shaped("relief", 9), UNEVEN_VOXELS, "evenly spaced along x"),
+        (
+            replace(HYBRID, plane_z=0.1),
+            see_shaped("relief", 9),
+            SHAPED,
+            "virtual plane must lie in front",
+        ),
+    ],
+)
+def test_what_cannot_be_imaged_is_refused(
+    method: PlanarRSD | Hybrid, capture: Capture, grid: Grid, reason: str
+) -> None:
+    assert reason in find_refusal(method, capture, grid)
+    with pytest.raises(InputError, match=reason):
+        method.reconstruct(capture, grid)
+
+
+def test_too_many_plane_waves_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nlos.phasor.depth_steps, "MEMORY_LIMIT_BYTES", 1 << 16)
+    assert "plane waves" in find_refusal(METHOD, scene(), GRID)
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        (([0.0], [0.0, 1.0], 0.0), "axis x"),
+        *(((x, [0.0, 1.0], 0.0), "evenly spaced") for x in ([0.0, 1, 3], [1.0, 0], [0.0, np.nan])),
+        (([0.0, 1.0], [0.0, 1.0], np.inf), "finite z"),
+    ],
+)
+def test_planes_are_checked(axes: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Plane(*axes)
+    assert Plane([0.0, 1.0], [0.0, 2.0, 4.0], 0.5).points[2, 1].tolist() == [1.0, 4.0, 0.5]
+
+
+# --- transforms
+
+
+def test_both_ways_back_from_the_spectrum_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    for grid in (
+        GRID,
+        Grid(GRID.x[::4], GRID.y[::3], GRID.z),
+        Grid(np.arange(-0.2, 0.2, 0.01), GRID.y, GRID.z[:1]),
+    ):
+        fields = []
+        # Matrix products, Fourier transforms, and a few spectra of these at a time.
+        for rate, cached in ((0, 1 << 19), (np.inf, 1 << 19), (0, 12_000), (np.inf, 12_000)):
+            monkeypatch.setattr(nlos.phasor.to_depths_compiled, "PRODUCT_SPEEDUP", rate)
+            monkeypatch.setattr(nlos.phasor.to_depths_compiled, "CACHE_BYTES", cached)
+            fields.append(METHOD.phasor_field(scene(), grid).values)
+        assert all(relative_error(field, fields[0]) < 1e-5 for field in fields)
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_fftw_and_scipy_give_the_same_transforms(
+    inverse: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pyfftw")
+    found = []
+    for absent in (False, True):
+        if absent:
+            monkeypatch.setattr(fourier, "pyfftw", None)
+        source, target = (fourier.allocate_zeros((3, 40)) for _ in range(2))
+        plan = fourier.plan_transform(source[:, :24], target[:, :24], 1, inverse)
+        chance = np.random.default_rng(1)
+        for _ in range(2):  # the second time with other buffers
+            source[:, :24] = chance.normal(size=(3, 24)) + 1j * chance.normal(size=(3, 24))
+            plan.execute()
+            found.append(target[:, :24].copy())
+            source, target = (fourier.allocate_zeros((3, 40)) for _ in range(2))
+            plan.update_arrays(source[:, :24], target[:, :24])
+    np.testing.assert_allclose(found[:2], found[2:], rtol=1e-5, atol=1e-5)
+
+
+def test_an_image_without_fftw(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_fftw = METHOD.reconstruct(scene(), GRID).values
+    monkeypatch.setattr(fourier, "pyfftw", None)
+    without = METHOD.reconstruct(scene(), GRID).values
+    np.testing.assert_allclose(without, with_fftw, atol=1e-4 * with_fftw.max())
+
+
+def test_transforms_load_neither_dask_nor_pandas() -> None:
+    pytest.importorskip("pyfftw")
+    code = (
+        "import sys, nlos.phasor.fourier as plans;"
+        "assert plans.pyfftw is not None; assert not {'dask', 'pandas'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# --- depths that are interpolated instead of computed
+
+WAVENUMBERS = np.linspace(20.0, 80.0, 31)
+STRENGTH = np.exp(-(((WAVENUMBERS - 50) / 14) ** 2))
+SPECTRUM = AxialSpectrum.of(WAVENUMBERS, STRENGTH, 50.0, (0.0, 1.0))
+EVEN = 0.5 + np.arange(60) / 64
+
+
+@pytest.mark.parametrize("error", [1e-2, 2e-3, 2e-4])
+def test_waves_along_z_are_interpolated_within_the_promised_error(error: float) -> None:
+    """Waves of all frequencies and directions at random phases, as the spectrum has them."""
+    random, chosen = np.random.default_rng(0), choose_depths(EVEN, SPECTRUM, error)
+    assert chosen.nodes[[0, -1]].tolist() == [0, EVEN.size - 1]
+    assert chosen.nodes.size < 0.7 * EVEN.size
+    steps = (np.arange(40) + 0.5) / 40
+    field = np.zeros((200, EVEN.size), np.complex128)
+    for k, strength in zip(WAVENUMBERS, STRENGTH, strict=True):
+        cosine, laser = random.choice(steps, (2, 200, 1))
+        waves = np.exp(1j * (k * cosine + (k - 50) * laser) * EVEN)
+        field += strength * np.exp(2j * np.pi * random.random((200, 1))) * waves
+    found = np.concatenate(
+        [field[:, chosen.nodes[some.nodes]] @ some.weights.T for some in chosen.blocks], axis=1
+    )
+    errors = np.linalg.norm(found - field, axis=0) / np.linalg.norm(field, axis=0)
+    # 200 draws know a root mean square to some 5 %, and float32 weights to 1e-6
+    assert errors.max() < 1.15 * error
+    assert errors[chosen.nodes].max() < 0.2 * error
+
+
+def test_what_errors_and_neighbours_allow_is_interpolated() -> None:
+    counts = [choose_depths(EVEN, SPECTRUM, e).nodes.size for e in (1e-1, 1e-2, 1e-3, 1e-4)]
+    assert counts == sorted(counts)
+    assert counts[0] < counts[-1] <= 60
+    for few_or_coarse in (np.array([0.7]), np.linspace(0.5, 0.9, 8), np.linspace(0.5, 6.0, 60)):
+        chosen = choose_depths(few_or_coarse, SPECTRUM, 2e-3)
+        assert np.array_equal(chosen.nodes, np.arange(few_or_coarse.size))
+        assert not chosen.blocks
+    chosen = choose_depths(np.concatenate([[0.3], EVEN, [2.0]]), SPECTRUM, 2e-3)
+    assert {0, 1, 60, 61} <= set(chosen.nodes.tolist())  # far from their neighbours
+    assert chosen.nodes.size < 50
+
+
+@pytest.mark.parametrize(
+    "laser",
+    [[0.12, 0.05, 0.0], [0.1, 0.0, 0.3], planar_wall()],
+    ids=["single", "ahead", "confocal"],
+)
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
+def test_interpolated_depths_are_those_that_are_computed(
+    laser: Any, tolerance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Signals of noise: light from everywhere at any time; depths an eighth of a wavelength apart."""
+    grid = Grid(np.linspace(-0.3, 0.4, 5), np.linspace(-0.4, 0.2, 4), 0.4 + np.arange(32) / 64)
+    signal = np.random.default_rng(1).normal(size=(LONG.bins, 17, 21)).astype(np.float32)
+    capture = Capture(signal, planar_wall(), np.array(laser), LONG.bin_width, LONG.start)
+    method = replace(METHOD, tolerance=tolerance)
+    found = method.phasor_field(capture, grid).values
+    monkeypatch.setattr(nlos.phasor.depth_steps, "SPACING_RATIOS", ())
+    expected = method.phasor_field(capture, grid).values
+    assert 0 < relative_error(found, expected) < DEPTH_ERROR_FRACTION * tolerance
+
+
+# --- progress of several steps
+
+FEW = Grid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.5, 0.5, 7), [0.7, 0.9, 1.0])
+
+
+@given(pieces=st.lists(st.integers(0, 1000)), portion=st.integers(0, 10**6))
+def test_pieces_of_a_portion_make_up_the_portion(pieces: list[int], portion: int) -> None:
+    pieces, reported = [*pieces, 1], []
+    report = SubProgress(reported.append, sum(pieces), portion)
+    for piece in pieces:
+        report(piece)
+    assert sum(reported) == portion
+    assert min(reported) >= 0
+
+
+@pytest.mark.parametrize(
+    ("propagation", "faster", "fraction"),
+    [("spectral", False, 0.4), ("spectral", True, 0.4), ("time", False, 0.95)],
+)
+def test_propagation_to_the_plane_is_a_part_of_all_voxels(
+    propagation: str, faster: bool, fraction: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether by direct sums, Fourier transforms or in time; it may be interrupted."""
+    done: list[int] = []
+    before: list[tuple[int, int]] = []
+    add = CompiledDiffraction.add
+
+    def notice(diffraction: CompiledDiffraction, *rest: Any) -> None:
+        before.append((len(done), sum(done)))
+        add(diffraction, *rest)
+
+    def stop(_: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(CompiledDiffraction, "add", notice)
+    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: faster)
+    method = Hybrid(0.25, 4.24, propagation)
+    method.reconstruct(see_shaped("wavy", 17), FEW, done.append)
+    ((reports, voxels),) = before
+    assert reports > 1
+    assert voxels == int(fraction * FEW.size)
+    assert sum(done) == FEW.size
+    with pytest.raises(KeyboardInterrupt):
+        method.reconstruct(see_shaped("wavy", 17), FEW, stop)
+    assert len(before) == 1  # not reached again

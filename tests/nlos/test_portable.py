@@ -1,0 +1,434 @@
+"""Imaging on other libraries' arrays: the same sums as by the compiled loops, on one device from end
+to end, in little memory, and with one plan for many captures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import (
+    HIDDEN,
+    JITTER,
+    LIBRARIES,
+    LONG,
+    SPOTS,
+    THREE_POINTS,
+    curved_wall,
+    find_device,
+    find_refusal,
+    planar_wall,
+    relative_error,
+    see,
+    see_shaped,
+)
+
+import nlos.backprojection_arrays
+import nlos.phasor.to_depths
+import nlos.phasor.wall_to_plane_arrays
+from nlos import (
+    Backprojection,
+    Capture,
+    FilteredBackprojection,
+    FKMigration,
+    Grid,
+    Hybrid,
+    LightCone,
+    PlanarRSD,
+    Refinement,
+    TransientImaging,
+    Volume,
+    propagate,
+)
+from nlos.backprojection import Weighting
+from nlos.backprojection_arrays import BYTES_PER_PAIR
+from nlos.capture import remove_device_legs
+from nlos.compressed import CompressedCapture
+from nlos.phasor import wall_to_plane
+from nlos.phasor.arrays import ArrayLibrary
+from nlos.preparation import crop_capture, rebin_capture, remove_first_bounce
+from nlos.simulate import add_poisson_noise
+from tofclip.arrays import ComputeDevice, to_numpy
+from tofclip.errors import InputError
+
+libraries = pytest.mark.parametrize("library", LIBRARIES)
+# Odd and even sizes, off the wall's middle, depths unevenly spaced.
+GRID = Grid(np.arange(-0.3, 0.42, 0.05), np.arange(-0.4, 0.25, 0.06), [0.45, 0.5, 0.56, 0.65, 0.8])
+FINE = Grid(GRID.x[:4], GRID.y[:3], 0.4 + np.arange(32) / 64)
+# Unevenly spaced; the record (paths up to 1.63 m) ends before the farthest voxels.
+UNEVEN = Grid([-0.3, -0.1, 0.05, 0.15, 0.4], np.linspace(-0.4, 0.3, 7), [0.05, 0.4, 0.65, 1.2])
+SHAPED = Grid.box((-0.7, 0.6), (-0.5, 0.5), (0.7, 1.1), (0.13, 0.11, 0.1))
+RSD, HYBRID, BACKPROJECTION = PlanarRSD(0.125), Hybrid(0.4), Backprojection(0.15)
+
+
+def see_planar(laser: Any = SPOTS[0]) -> Capture:
+    return see(THREE_POINTS, planar_wall(), laser, LONG, JITTER, [1.0, 0.6, 0.3])
+
+
+def see_curved(laser: str) -> Capture:
+    return see([HIDDEN, (-0.2, 0.1, 0.5)], curved_wall(9, 11), laser)
+
+
+def mask(capture: Capture, *places: tuple[int, int]) -> Capture:
+    wall = capture.wall.copy()
+    for place in places:
+        wall[place] = np.nan
+    return replace(capture, wall=wall)
+
+
+def shuffle(capture: Capture) -> Capture:
+    """The same wall points as a list in any order."""
+    order = np.random.default_rng(5).permutation(len(capture.points))
+    return replace(capture, wall=capture.points[order], signal=capture.traces().T[:, order])
+
+
+def scatter(capture: Capture) -> Capture:
+    """Move the wall points about, so that they stand above no lattice."""
+    wall, confocal = capture.wall.copy(), capture.laser.ndim > 1
+    wall[..., :2] += np.random.default_rng(1).uniform(-0.05, 0.05, (*wall.shape[:-1], 2))
+    return replace(capture, wall=wall, laser=wall if confocal else capture.laser)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is imaged how, and how far the field may be off that of the compiled loops.
+
+    Both compute the same sums in single precision. Of diffraction 1e-6 is measured, of propagation
+    2e-6; paths of back-projection are in single precision to a thousandth of a sample, 1e-4 of a
+    wave, and measured 1e-6 to 5e-6.
+    """
+
+    method: Any
+    capture: Capture
+    grid: Grid
+    agreement: float
+    faster: bool | None = None  # what is said of Fourier transforms from the wall to the plane
+
+
+def list_cases() -> Iterator[tuple[str, Case]]:
+    for name, laser in (("single", SPOTS[0]), ("two spots", SPOTS), ("confocal", "confocal")):
+        strict = replace(RSD, tolerance=1e-3 if name == "single" else 1e-2)
+        yield f"rsd, {name}", Case(strict, see_planar(laser), GRID, 1e-5)
+        yield f"rsd, fine depths, {name}", Case(RSD, see_planar(laser), FINE, 2e-5)
+    masked = mask(see_planar(), (3, 5), (0, 0))
+    yield "rsd, masked", Case(RSD, masked, GRID, 1e-5)
+    yield "rsd, listed", Case(RSD, shuffle(masked), GRID, 1e-5)
+    # A single voxel has no spacing, and one straight before the laser no way across.
+    yield "rsd, one voxel", Case(RSD, see_planar(), Grid([0.12], [0.05], [0.6]), 1e-5)
+    row = Grid(GRID.x, GRID.y[3:4], GRID.z[3:4])
+    yield "rsd, one row", Case(RSD, see_planar("confocal"), row, 1e-5)
+    spot = np.array([0.1, 0.05, 0.02])
+    for shape, laser in (("wavy", spot), ("plates", "confocal"), ("cylinder", "confocal")):
+        capture = see_shaped(shape, 12, laser)
+        yield f"hybrid, transforms, {shape}", Case(HYBRID, capture, SHAPED, 5e-5, True)
+    for laser in (spot, "confocal"):
+        capture = scatter(see_shaped("relief", 12, laser))
+        yield f"hybrid, direct, {np.ndim(laser)}", Case(HYBRID, capture, SHAPED, 5e-5, False)
+    several = see_shaped("cylinder", 12, np.array([[0.1, 0.05, 0.02], [-0.4, 0.1, 0.05]]))
+    for faster in (True, False):
+        yield f"hybrid, spots, {faster}", Case(HYBRID, several, SHAPED, 5e-5, faster)
+    for laser in ("single", "confocal", "paired"):
+        yield f"backprojection, {laser}", Case(BACKPROJECTION, see_curved(laser), UNEVEN, 2e-5)
+    for weighting in (Weighting(0.0), Weighting(1.0, 1.0), Weighting(2.5, 0.5)):
+        weighted = replace(BACKPROJECTION, weighting=weighting)
+        yield f"{weighting}", Case(weighted, see_curved("paired"), UNEVEN, 2e-5)
+    masked = mask(see_curved("single"), (2, 3))
+    yield "backprojection, masked", Case(BACKPROJECTION, masked, UNEVEN, 2e-5)
+    x, y, z = masked.wall[4, 5]
+    # A lone voxel hears the point that it touches and no other, with that one's error.
+    touching = Grid([x], [y], [max(z, 0.04)])
+    yield "backprojection, touching", Case(BACKPROJECTION, masked, touching, 1e-4)
+
+
+CASES = dict(list_cases())
+
+
+@pytest.fixture
+def case(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Case:
+    """Walls as small as those of these tests would all go by direct sums."""
+    case = CASES[request.param]
+    if case.faster is not None:
+        monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: case.faster)
+    return case
+
+
+@libraries
+@pytest.mark.parametrize("case", CASES, indirect=True)
+def test_the_field_is_that_of_the_compiled_loops(case: Case, library: str) -> None:
+    moved = case.capture.on(find_device(library))
+    found = case.method.phasor_field(moved, case.grid)
+    expected = case.method.phasor_field(case.capture, case.grid)
+    assert found.device == find_device(library)
+    assert found.provenance == expected.provenance
+    assert relative_error(found.values, expected.values) < case.agreement
+    assert found.find_brightest() == expected.find_brightest()
+
+
+def test_the_field_on_a_plane_is_that_of_the_compiled_loops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
+    capture = see_shaped("cylinder", 12)
+    plane = HYBRID.plan(capture, SHAPED).plane
+    # A lattice that suits the plane no better than the wall.
+    uneven = replace(plane, x=plane.x * 1.01)
+    # At the stricter tolerance rounding decides which of the last terms is taken.
+    for tolerance, agreement in ((1e-2, 5e-5), (1e-3, 2e-4)):
+        expected, found = (
+            propagate(one, uneven, HYBRID.pulse, tolerance=tolerance)
+            for one in (capture, capture.on(find_device("torch")))
+        )
+        assert np.array_equal(found.wavenumbers, expected.wavenumbers)
+        assert relative_error(found.values, expected.values) < agreement
+
+
+@libraries
+def test_a_volume_looks_the_same_wherever_it_lives(library: str, tmp_path: Path) -> None:
+    expected = RSD.reconstruct(see_planar(), GRID)
+    found = RSD.reconstruct(see_planar().on(find_device(library)), GRID)
+    here = found.on(ComputeDevice())
+    projection, front = found.maximum_projection(), expected.maximum_projection()
+    assert relative_error(projection.brightness, front.brightness) < 1e-5
+    assert found.threshold(0.5).device == find_device(library)
+    assert np.array_equal(found.threshold(0.5).magnitude > 0, expected.threshold(0.5).magnitude > 0)
+    assert Grid.around(found, 0.05).shape == Grid.around(expected, 0.05).shape
+    found.save(tmp_path / "volume.h5")
+    found.save_picture(tmp_path / "volume.png")
+    assert np.array_equal(Volume.load(tmp_path / "volume.h5").values, here.values)
+    for suffix in (".npz", ".vti", ".exr", ".ply"):
+        even = Volume(found.values, Grid(GRID.x, GRID.y, np.arange(5.0)))
+        even.export(tmp_path / f"volume{suffix}")
+    assert np.array_equal(np.load(tmp_path / "volume.npz")["values"], here.values)
+
+
+@libraries
+def test_a_capture_is_checked_stored_and_prepared_where_it_lives(
+    library: str, tmp_path: Path
+) -> None:
+    capture, device = see_planar(), find_device(library)
+    moved = capture.on(device)
+    assert moved.device == device
+    assert moved.on(device).signal is moved.signal
+    moved.save(tmp_path / "capture.h5")
+    assert np.array_equal(Capture.load(tmp_path / "capture.h5").signal, capture.signal)
+    whole_numbers = device.put(np.round(1000 * capture.signal).astype(np.int32))
+    assert replace(capture, signal=whole_numbers).signal.dtype == moved.signal.dtype
+    bad = capture.signal.copy()
+    bad[5, 2, 3] = np.nan
+    with pytest.raises(InputError, match="1 samples of the signal are NaN"):
+        replace(capture, signal=device.put(bad))
+    # a masked point may hold anything
+    replace(capture, wall=mask(capture, (2, 3)).wall, signal=device.put(bad))
+    with pytest.raises(InputError, match="real numbers"):
+        replace(capture, signal=device.put(capture.signal.astype(np.complex64)))
+    for prepare in PREPARATIONS:
+        found, expected = prepare(moved), prepare(capture)
+        assert found.device == device
+        assert found.axis == expected.axis
+        np.testing.assert_allclose(to_numpy(found.signal), expected.signal, rtol=1e-6, atol=1e-6)
+
+
+PREPARATIONS: tuple[Callable[[Capture], Capture], ...] = (
+    lambda capture: crop_capture(capture, 0.495, 0.805),
+    lambda capture: rebin_capture(capture, 8),
+    lambda capture: remove_first_bounce(capture, 0.25),
+)
+
+# --- plans and memory
+
+
+@pytest.mark.parametrize("library", [*LIBRARIES, "numpy"])
+@pytest.mark.parametrize(
+    "case", ["rsd, single", "hybrid, spots, True", "hybrid, spots, False"], indirect=True
+)
+def test_what_is_planned_images_many_captures(library: str, case: Case) -> None:
+    first = case.capture
+    other = replace(first, signal=0.7 * first.signal[:, ::-1])
+    device = ComputeDevice() if library == "numpy" else find_device(library)
+    plan = case.method.plan(first.on(device), case.grid)
+    for one in (first, other, first):
+        found = plan.image(one.on(device))
+        expected = case.method.plan(first, case.grid).image(one)
+        assert relative_error(found.magnitude, expected.magnitude) < case.agreement
+        assert found.provenance == expected.provenance
+
+
+def test_what_is_planned_refuses_other_captures() -> None:
+    capture = see_planar().on(find_device("torch"))
+    plan = RSD.plan(capture, GRID)
+    for other, reason in (
+        (replace(capture, wall=capture.wall + 0.01), "the wall is not"),
+        (replace(capture, laser=capture.laser + 0.01), "the laser is not"),
+        (replace(capture, start=0.41), "planned for TimeAxis"),
+        (capture.on(ComputeDevice()), "planned for signals on torch:cpu, got one on cpu"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            plan.image(other)
+
+
+@pytest.mark.parametrize("kept", [1 << 30, 0])
+def test_depths_may_be_treated_one_by_one_and_planned_anew(
+    kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = see_planar().on(find_device("array_api_strict"))
+    whole = RSD.reconstruct(capture, GRID)
+    monkeypatch.setattr(ArrayLibrary, "chunk_bytes", 1)
+    monkeypatch.setattr(nlos.phasor.to_depths, "MAX_CACHE_BYTES", kept)
+    counted: list[int] = []
+    plan = RSD.plan(capture, GRID)
+    for _ in range(2):
+        assert relative_error(plan.image(capture, counted.append).magnitude, whole.magnitude) < 1e-6
+    assert counted == [GRID.size // 5] * 10  # every depth alone, twice
+
+
+def test_little_memory_means_smaller_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
+    capture = see_shaped("wavy", 12).on(find_device("array_api_strict"))
+    plane = HYBRID.plan(capture, SHAPED).plane
+    whole = to_numpy(propagate(capture, plane, HYBRID.pulse).values)
+    monkeypatch.setattr(ArrayLibrary, "chunk_bytes", 1 << 16)
+    assert relative_error(propagate(capture, plane, HYBRID.pulse).values, whole) < 1e-6
+
+
+@pytest.mark.parametrize("laser", ["single", "paired"])
+def test_pieces_of_a_backprojection_make_up_the_whole_and_progress_counts_them(
+    laser: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = see_curved(laser).on(find_device("array_api_strict"))
+    layer = Grid(UNEVEN.x, UNEVEN.y, UNEVEN.z[1:2])
+    whole = to_numpy(BACKPROJECTION.phasor_field(capture, layer).values)
+    for table, pairs in ((1 << 20, 40), (1, 1 << 20), (1 << 20, 1)):
+        monkeypatch.setattr(nlos.backprojection_arrays, "TABLE_BYTES", table)
+        monkeypatch.setattr(ArrayLibrary, "chunk_bytes", pairs * BYTES_PER_PAIR)
+        counted: list[int] = []
+        found = BACKPROJECTION.phasor_field(capture, layer, counted.append).values
+        assert relative_error(found, whole) < 1e-6
+        assert sum(counted) == len(capture.points) * layer.size
+        assert len(counted) > 10
+
+
+# --- nothing hides on the processor
+
+
+@pytest.mark.parametrize(
+    ("laser", "method"),
+    [
+        ("confocal", LightCone()),
+        ("confocal", FKMigration()),
+        ("single", FilteredBackprojection()),
+        ("single", Refinement(Hybrid(0.125))),
+        ("single", Hybrid(0.4, propagation="time")),
+    ],
+)
+def test_methods_of_compiled_loops_refuse_in_one_line(laser: str, method: Any) -> None:
+    reason = find_refusal(method, see_planar(laser).on(find_device("torch")), GRID)
+    assert "NumPy arrays only" in reason
+    assert "\n" not in reason
+    assert "NumPy" not in find_refusal(method, see_planar(laser), GRID)
+
+
+def test_other_steps_of_compiled_loops_refuse_too() -> None:
+    capture, spot = see_planar().on(find_device("torch")), np.zeros(3)
+    plane = HYBRID.plan(see_planar(), GRID).plane
+    for attempt, reason in (
+        (lambda: TransientImaging(RSD).image_gate(capture, GRID, 1e-9, 2e-9), "NumPy arrays only"),
+        (capture.traces, "works on NumPy arrays"),
+        (lambda: propagate(capture, plane, HYBRID.pulse, "time"), "propagation in time works on"),
+        (lambda: remove_device_legs(capture, spot, spot), "unwarping works on NumPy arrays"),
+        (lambda: add_poisson_noise(capture, 10), "drawing photons works on NumPy arrays"),
+        (
+            lambda: CompressedCapture(capture.signal, None, capture.wall, spot, 1e-11),  # type: ignore[arg-type]
+            "compressed measurements works on NumPy arrays",
+        ),
+    ):
+        with pytest.raises(InputError, match=reason):
+            attempt()
+
+
+class StrictDevice:
+    """A device of array-api-strict that mixes with no other, and gives NumPy nothing."""
+
+    def __init__(self) -> None:
+        self.library = pytest.importorskip("array_api_strict")
+        self.device = ComputeDevice("array_api_strict", self.library.Device("device1"))
+
+    def fetch(self, array: Any) -> np.ndarray:
+        return np.asarray(array.to_device(self.library.Device("CPU_DEVICE")))
+
+
+@pytest.fixture
+def elsewhere() -> StrictDevice:
+    return StrictDevice()
+
+
+def test_the_device_is_as_strict_as_it_is_meant_to_be(elsewhere: StrictDevice) -> None:
+    there = elsewhere.device.put(np.ones(3, np.float32))
+    with pytest.raises(ValueError, match="different devices"):
+        _ = there + elsewhere.library.ones(3, dtype=elsewhere.library.float32)
+    with pytest.raises(RuntimeError, match="convert array on the 'array_api_strict"):
+        np.asarray(there)
+
+
+SMALL = Grid(np.arange(-0.3, 0.3, 0.1), np.arange(-0.2, 0.3, 0.1), [0.5, 0.6, 0.75])
+
+
+@pytest.mark.parametrize(
+    ("method", "laser", "faster", "agreement"),
+    [
+        (PlanarRSD(0.2), "single", None, 2e-5),
+        (PlanarRSD(0.2), "confocal", None, 2e-5),
+        (Backprojection(0.2, weighting=Weighting(1, 1)), "single", None, 2e-5),
+        (Hybrid(0.3), "single", True, 5e-5),
+        (Hybrid(0.3), "single", False, 5e-5),
+    ],
+)
+def test_fields_stay_on_their_device(
+    method: Any,
+    laser: str,
+    faster: bool | None,
+    agreement: float,
+    elsewhere: StrictDevice,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sizes: list[int] = []
+
+    def fetch(array: Any) -> np.ndarray:
+        sizes.append(array.size)
+        return elsewhere.fetch(array)
+
+    monkeypatch.setattr(nlos.phasor.wall_to_plane_arrays, "to_numpy", fetch)
+    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: faster)
+    wall = planar_wall(9, 11) if faster is None else curved_wall(9, 11)
+    capture = mask(see([HIDDEN], wall, laser), (2, 3))
+    found = method.phasor_field(capture.on(elsewhere.device), SMALL).values
+    expected = method.phasor_field(capture, SMALL).values
+    assert relative_error(elsewhere.fetch(found), expected) < agreement
+    # On purpose only the sample of phasors that terms are chosen by is fetched.
+    assert len(sizes) == (faster is not None)
+    assert all(size < 1024 * 100 for size in sizes)
+
+
+def test_preparation_stays_on_its_device(elsewhere: StrictDevice) -> None:
+    capture = mask(see_planar(), (2, 3))
+    for prepare in PREPARATIONS:
+        found = elsewhere.fetch(prepare(capture.on(elsewhere.device)).signal)
+        np.testing.assert_allclose(found, prepare(capture).signal, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("method", [RSD, HYBRID, BACKPROJECTION])
+def test_pytorch_differentiates_through_it(method: Any) -> None:
+    find_device("torch")
+    import torch
+
+    capture = see_planar()
+    signal = torch.tensor(capture.signal, requires_grad=True)
+    brightness = method.phasor_field(replace(capture, signal=signal), GRID).values[2, 4, 9].real
+    brightness.backward()
+    # The field is linear in the signal: its gradient, applied to the signal, is the field. Sums in
+    # single precision.
+    found = float(torch.sum(signal.grad * signal.detach()))
+    assert found == pytest.approx(float(brightness.detach()), rel=1e-3)
