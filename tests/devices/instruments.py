@@ -1,7 +1,11 @@
-"""What tests of instruments share: reading a source, and emulated time taggers with other habits."""
+"""What tests of instruments share: reading a source, a feed that repeats itself, and emulated time
+taggers with other habits.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
@@ -13,37 +17,56 @@ from devices.emulation.timetag import (
     EmulationOptions,
     PoissonStream,
 )
-from devices.source import Batch, Records, Source, as_bytes
+from devices.source import Batch, Codec, Info, Ledger, Records, Source, as_bytes
+from devices.stream import Transfer
 from devices.timetag_codec import TimeTagCodec
 from tofclip.errors import DeviceTimeoutError
 
 TAGS = TimeTagCodec()
-KIND: dict[str, Any] = {
-    "clear_is_level": False,
-    "holds_packets": False,
-    "stale_replies": 0,
-    "old_records": 0,
-    "jammed_bytes": 0,
-}
-"""Habits of the instrument that the first driver was written for."""
 
 
 def make_tagger(
     base: type[EmulatedTimeTagger] = EmulatedTimeTagger, seed: int = 1, **unlike: Any
-) -> EmulatedTimeTagger:
+) -> Any:
     """Return an emulated time tagger whose habits (attributes of its class) or options differ."""
     options = {name: unlike.pop(name) for name in list(unlike) if name in EmulationOptions.names()}
     rate = options.pop("rate", 1e6)
-    kind = type("Tagger", (base,), unlike)
     light = lambda resets: PoissonStream(rate, CLOCK_HZ, seed + 100_000 * resets)  # noqa: E731
-    made: EmulatedTimeTagger = kind(light, EmulationOptions(**options), "T1")
-    return made
+    return type("Tagger", (base,), unlike)(light, EmulationOptions(**options), "T1")
 
 
 def true_records(seed: int, count: int, resets: int = 0, rate: float = 1e6) -> Records:
     """Return what a `make_tagger` sees after its counter was reset so often."""
     words = PoissonStream(rate, CLOCK_HZ, seed + 100_000 * resets).next_words(count, MAX_TICK)
     return TAGS.decode(as_bytes(words), TAGS.start).records
+
+
+class RepeatingFeed:
+    """Pieces as they are made of their numbers, so many, and each not before it is due."""
+
+    info, calibration = Info("pieces"), None
+
+    def __init__(
+        self, codec: Codec, make: Callable[[int], bytes], pieces: int, interval: float = 0.0
+    ) -> None:
+        self.codec, self.ledger = codec, Ledger()
+        self._make, self._pieces, self._interval, self._number = make, pieces, interval, 0
+
+    def start(self) -> None:
+        self._began = monotonic()
+
+    def pull(self, timeout: float) -> Transfer | None:
+        if self._number >= self._pieces:
+            return None
+        self._number += 1
+        sleep(max(0.0, self._began + self._number * self._interval - monotonic()))
+        return Transfer(memoryview(self._make(self._number - 1)), taken_at=monotonic())
+
+    def stop(self) -> None:
+        self._pieces = 0
+
+    def close(self) -> None:
+        """Hold nothing."""
 
 
 def take(source: Source, records: int) -> list[Any]:
@@ -68,9 +91,7 @@ def read_gaps(source: Source, records: int) -> list[bool]:
 
 def finish(source: Source) -> None:
     """Stop, read the rest and close; the accounts balance."""
-    source.stop()
-    while source.read(10) is not None:
-        pass
+    source.drain()
     source.close()
     assert source.stats.is_balanced, source.stats
     assert source.stats.unread == 0

@@ -28,37 +28,39 @@ def write_ptu(path: Path, decays: NDArray[Any]) -> None:
     ptufile.imwrite(path, image, **options)
 
 
-def tag(name: str, kind: int, value: bytes) -> bytes:
-    return struct.pack("<32siI8s", name.encode(), -1, kind, value)
+def tag(name: str, number: int, kind: int, value: bytes) -> bytes:
+    return struct.pack("<32siI8s", name.encode(), number, kind, value)
 
 
-def integer(name: str, value: int) -> bytes:
-    return tag(name, 0x10000008, struct.pack("<q", value))
+def integer(name: str, value: int, number: int = -1) -> bytes:
+    return tag(name, number, 0x10000008, struct.pack("<q", value))
 
 
 def real(name: str, value: float) -> bytes:
-    return tag(name, 0x20000008, struct.pack("<d", value))
+    return tag(name, -1, 0x20000008, struct.pack("<d", value))
+
+
+TAGS_END = tag("Header_End", -1, 0xFFFF0008, bytes(8))
 
 
 def write_phu(path: Path, decays: NDArray[Any]) -> None:
     """Header, tags, histograms of uint32."""
+    channels, bins = decays.shape
 
     def content(offset: int) -> bytes:
         tags = [
             integer("Measurement_Mode", 0),
             integer("Measurement_SubMode", 1),
             real("MeasDesc_Resolution", RESOLUTION),
-            integer("HistoResult_NumberOfCurves", len(decays)),
+            integer("HistoResult_NumberOfCurves", channels),
             integer("HistoResult_BitsPerBin", 32),
         ]
-        for number in range(len(decays)):
-            for name, value in (
-                ("HistResDscr_DataOffset", offset + number * decays.shape[1] * 4),
-                ("HistResDscr_HistogramBins", decays.shape[1]),
-            ):
-                tags.append(struct.pack("<32siIq", name.encode(), number, 0x10000008, value))
-        tags.append(tag("Header_End", 0xFFFF0008, bytes(8)))
-        return b"PQHISTO\0" + b"1.0".ljust(8, b"\0") + b"".join(tags)
+        for number in range(channels):
+            tags += [
+                integer("HistResDscr_DataOffset", offset + number * bins * 4, number),
+                integer("HistResDscr_HistogramBins", bins, number),
+            ]
+        return b"PQHISTO\0" + b"1.0".ljust(8, b"\0") + b"".join([*tags, TAGS_END])
 
     path.write_bytes(content(len(content(0))) + decays.astype("<u4").tobytes())
 
@@ -86,10 +88,8 @@ def write_sdt(path: Path, decays: NDArray[Any]) -> None:
     blocks = b""
     for curve in decays:
         one = np.zeros(1, block)
-        one["data_offs"], one["next_block_offs"] = (
-            at + block.itemsize,
-            at + block.itemsize + size,
-        )
+        one["data_offs"] = at + block.itemsize
+        one["next_block_offs"] = at + block.itemsize + size
         one["block_length"] = size
         blocks += one.tobytes() + curve.astype("<u2").tobytes()
         at += block.itemsize + size
@@ -107,37 +107,23 @@ def write_ptu_t2(
     markers: NDArray[Any] | None = None,
     scan: dict[str, float] | None = None,
 ) -> None:
-    """Events tagged by absolute times, as HydraHarps do (version 2).
-
-    Parameters
-    ----------
-    path : Path
-    pulses : (n,) int array
-        Ticks of the laser's pulses.
-    photons : (m, 2) int array
-        Tick and channel (from 0) of each photon.
-    markers : (k, 2) int array, optional
-        Tick and bits of each marker; by default one with every tenth pulse.
-    scan : dict, optional
-        Tags of a scanner's picture.
+    """Events tagged by absolute times, as HydraHarps do (version 2): ticks of the laser's `pulses`,
+    ticks and channels (from 0) of the `photons`, ticks and bits of the `markers` (by default one with
+    every tenth pulse); `scan`: tags of a scanner's picture.
     """
     if markers is None:
         markers = np.stack([pulses[::10], np.ones_like(pulses[::10])], axis=1)
     ticks = np.concatenate([pulses, markers[:, 0], photons[:, 0]])
     # special events: the pulses on channel 0, markers on 1 to 15, overflows on 63
-    words = np.concatenate(
-        [
-            np.full(len(pulses), 1 << 31),
-            1 << 31 | markers[:, 1] << 25,
-            photons[:, 1] << 25,
-        ]
-    )
+    special = 1 << 31
+    marks = special | markers[:, 1] << 25
+    words = np.concatenate([np.full(len(pulses), special), marks, photons[:, 1] << 25])
     order = np.argsort(ticks, kind="stable")
     found: list[int] = []
     turns = 0
     for tick, word in zip(ticks[order].tolist(), words[order].tolist(), strict=True):
         if tick // T2_OVERFLOW > turns:
-            found.append(1 << 31 | 63 << 25 | tick // T2_OVERFLOW - turns)
+            found.append(special | 63 << 25 | tick // T2_OVERFLOW - turns)
             turns = tick // T2_OVERFLOW
         found.append(word | tick % T2_OVERFLOW)
     tags = [
@@ -152,7 +138,7 @@ def write_ptu_t2(
         integer("TTResult_NumberOfRecords", len(found)),
         real("MeasDesc_GlobalResolution", T2_TICK),
         real("MeasDesc_Resolution", T2_TICK),
-        tag("Header_End", 0xFFFF0008, bytes(8)),
+        TAGS_END,
     ]
     head = b"PQTTTR\0\0" + b"1.0.00".ljust(8, b"\0") + b"".join(tags)
     path.write_bytes(head + np.array(found, "<u4").tobytes())

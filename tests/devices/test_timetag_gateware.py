@@ -10,20 +10,15 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
+from instruments import TAGS, make_tagger
 
-from devices.emulation.timetag import (
-    CLOCK_HZ,
-    COMMAND,
-    EmulatedTimeTagger,
-    EmulationOptions,
-    PoissonStream,
-)
+from devices.emulation.timetag import COMMAND, EmulatedTimeTagger
 from devices.emulation.usb import VirtualUsb
 from devices.source import as_bytes
 from devices.timetag import USB_IDENTITY, Capture, Register, TimeTagger
-from devices.timetag_codec import TimeTagCodec
 from devices.usb import UsbLink
 
 BENCH = Path(__file__).with_name("timetag_bench.v")
@@ -40,11 +35,7 @@ pytestmark = pytest.mark.skipif(
 class Eavesdropper(EmulatedTimeTagger):
     """Notes the commands that it gets."""
 
-    stale_replies = jammed_bytes = old_records = 0
-
-    def __init__(self) -> None:
-        super().__init__(lambda _: PoissonStream(1e6, CLOCK_HZ, 1), EmulationOptions())
-        self.heard: list[bytes] = []
+    heard: ClassVar[list[bytes]] = []
 
     def receive(self, endpoint: int, data: bytes) -> None:
         self.heard.append(data)
@@ -53,7 +44,7 @@ class Eavesdropper(EmulatedTimeTagger):
 
 def driver_commands() -> tuple[list[bytes], list[bytes]]:
     """Return what the driver sends to begin an acquisition, and to end it and count."""
-    instrument = Eavesdropper()
+    instrument = make_tagger(Eavesdropper, stale_replies=0, jammed_bytes=0, old_records=0, heard=[])
     tagger = TimeTagger(UsbLink(USB_IDENTITY, "", VirtualUsb(instrument)))
     tagger.reset()
     tagger.run(0xF, 0)
@@ -90,7 +81,7 @@ def simulate(folder: Path, beginning: list[bytes], ending: list[bytes]) -> tuple
 
 def test_what_the_gateware_counts_is_delivered(tmp_path: Path) -> None:
     counted, delivered = simulate(tmp_path, *driver_commands())
-    found = TimeTagCodec().decode(as_bytes(delivered), TimeTagCodec.start)
+    found = TAGS.decode(as_bytes(delivered), TAGS.start)
     assert counted == PHOTONS
     assert len(delivered) == 6 * counted
     assert (len(found.records), found.malformed) == (counted, 0)

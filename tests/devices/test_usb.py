@@ -5,13 +5,12 @@ from __future__ import annotations
 import array
 import errno
 import sys
-from typing import Any
 
 import pytest
 import usb.backend.libusb1
 import usb.core
 
-from devices import timetag as timetag
+from devices import timetag
 from devices.address import Uri
 from devices.emulation.usb import VirtualDevice, VirtualUsb, make_usb_error
 from devices.timetag import BARE_CHIP_IDENTITY, find_timetaggers, open_timetag
@@ -86,6 +85,13 @@ def test_the_serial_number_chooses() -> None:
     assert linked(Echo("")).serial == ""
 
 
+def test_another_program_holds_it() -> None:
+    instrument = Echo()
+    instrument.is_claimed_elsewhere = True
+    with pytest.raises(DeviceBusyError, match="another program"):
+        linked(instrument)
+
+
 def test_no_permission_shows_the_rule_to_add() -> None:
     instrument = Echo()
     instrument.is_accessible = False
@@ -95,13 +101,6 @@ def test_no_permission_shows_the_rule_to_add() -> None:
     rule = 'SUBSYSTEM=="usb", ATTR{idVendor}=="04b4", ATTR{idProduct}=="1004", TAG+="uaccess"'
     assert rule in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_another_program_holds_it() -> None:
-    instrument = Echo()
-    instrument.is_claimed_elsewhere = True
-    with pytest.raises(DeviceBusyError, match="another program"):
-        linked(instrument)
 
 
 @pytest.mark.parametrize(
@@ -157,25 +156,21 @@ def test_a_partial_write_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
         link.write(OUT, b"hello", 0.1)
 
 
-def test_an_unconfigured_device_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen: list[int] = []
-    monkeypatch.setattr(VirtualUsb, "get_configuration", lambda *_: 0)
-    monkeypatch.setattr(VirtualUsb, "set_configuration", lambda _, __, value: chosen.append(value))
+def test_a_device_is_configured_and_taken_from_a_kernels_driver(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[tuple[str, int]] = []
+    for name, answer in (("get_configuration", 0), ("is_kernel_driver_active", True)):
+        monkeypatch.setattr(VirtualUsb, name, lambda *_, answer=answer: answer)
+    for name in ("set_configuration", "detach_kernel_driver"):
+        note = lambda _, __, value, name=name: done.append((name, value))  # noqa: E731
+        monkeypatch.setattr(VirtualUsb, name, note)
     linked(Echo())
-    assert chosen == [1]
-
-
-def test_a_kernel_driver_is_detached(monkeypatch: pytest.MonkeyPatch) -> None:
-    detached: list[int] = []
-    monkeypatch.setattr(VirtualUsb, "is_kernel_driver_active", lambda *_: True)
-    monkeypatch.setattr(
-        VirtualUsb, "detach_kernel_driver", lambda _, __, interface: detached.append(interface)
-    )
-    linked(Echo())
-    assert detached == [0]
+    assert sorted(done) == [("detach_kernel_driver", 0), ("set_configuration", 1)]
 
 
 def test_no_usb_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert system_backend() is not None  # the system has one
     monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda **_: None)
     with pytest.raises(UsbBackendError, match="libusb-package"):
         system_backend()
@@ -196,10 +191,6 @@ def test_exceptions_that_pyusb_disguises() -> None:
         raise ValueError("a defect")
 
 
-def test_the_system_has_a_usb_library() -> None:
-    assert system_backend() is not None
-
-
 def test_instruments_are_discovered(monkeypatch: pytest.MonkeyPatch) -> None:
     shut = Echo("S9")
     shut.is_accessible = False
@@ -215,13 +206,13 @@ def test_instruments_are_discovered(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "firmware" in found[2].note
 
 
-def test_a_chip_without_firmware_is_told_from_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def behind(*instruments: VirtualDevice) -> Any:
-        return lambda: VirtualUsb(*instruments)
-
-    monkeypatch.setattr(timetag, "system_backend", behind(Echo("", BARE_CHIP_IDENTITY)))
-    with pytest.raises(DeviceNotFoundError, match="without firmware"):
-        open_timetag(Uri.parse("timetag://"))
-    monkeypatch.setattr(timetag, "system_backend", behind())
-    with pytest.raises(DeviceNotFoundError, match="04b4:1004 is connected"):
+@pytest.mark.parametrize(
+    ("bus", "said"),
+    [([Echo("", BARE_CHIP_IDENTITY)], "without firmware"), ([], "04b4:1004 is connected")],
+)
+def test_a_chip_without_firmware_is_told_from_nothing(
+    bus: list[Echo], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(timetag, "system_backend", lambda: VirtualUsb(*bus))
+    with pytest.raises(DeviceNotFoundError, match=said):
         open_timetag(Uri.parse("timetag://"))

@@ -1,0 +1,686 @@
+"""Cameras behind TCP: RemoteEx's and the SPAD512's messages, and the drivers against emulated cameras
+and scripted servers that can fail.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given
+from instruments import finish, read_gaps, take
+
+import devices
+from devices.counted_photons import read_photons
+from devices.emulation.harness import HOST, Connection, Fault, LoopbackServer
+from devices.emulation.remoteex import EmulatedStreakCamera
+from devices.emulation.scenes import (
+    EmulatedLight,
+    render_array_delays,
+    render_array_light,
+    simulate_demonstration_light,
+    simulate_line_light,
+)
+from devices.emulation.spad512 import EmulatedSpadArray
+from devices.frames import GateScan
+from devices.remoteex import (
+    REFUSAL_REASONS,
+    TERMINATOR,
+    Answer,
+    AnswerCode,
+    Command,
+    RemoteExClient,
+)
+from devices.source import Source
+from devices.spad512 import BIT_DEPTHS, IMAGE_WIDTHS_PX, ROWS, ExposureRequest, find_error_text
+from devices.tcp import TcpLink
+from tofclip.camera import Camera
+from tofclip.errors import (
+    DeviceBusyError,
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    InputError,
+    ProtocolError,
+    ShapeError,
+)
+
+LIGHT = EmulatedLight(
+    np.random.default_rng(1).uniform(0, 50, (12, 20)),
+    np.cumsum(np.linspace(18e-12, 20e-12, 12)),
+    full_scale=60,
+    seed=3,
+)
+ARRAY_LIGHT = np.random.default_rng(2).uniform(0, 2e5, (ROWS, ROWS))
+DELAYS_S = np.full((ROWS, ROWS), 8e-9)
+Make = Callable[..., Any]
+
+
+@contextmanager
+def switched_off_in_the_end() -> Iterator[list[Any]]:
+    made: list[Any] = []
+    yield made
+    for server in made:
+        server.close()
+
+
+@pytest.fixture
+def camera() -> Iterator[Make]:
+    """Make emulated streak cameras with these faults, which differ in attributes of their class."""
+    with switched_off_in_the_end() as made:
+
+        def make(*faults: Fault, rate: float = 100.0, **unlike: object) -> EmulatedStreakCamera:
+            made.append(type("Camera", (EmulatedStreakCamera,), unlike)(LIGHT, rate, 1000, faults))
+            return made[-1]
+
+        yield make
+
+
+@pytest.fixture
+def array() -> Iterator[Make]:
+    """Make emulated SPAD arrays, likewise."""
+    with switched_off_in_the_end() as made:
+
+        def make(
+            *faults: Fault, light: Any = ARRAY_LIGHT, delays: Any = None, **unlike: object
+        ) -> EmulatedSpadArray:
+            kind = type("Array", (EmulatedSpadArray,), unlike)
+            made.append(kind(light, 7, faults=faults, delays=delays))
+            return made[-1]
+
+        yield make
+
+
+def opened(server: Any, **values: object) -> Source:
+    """Open the driver of an emulated or scripted server."""
+    if isinstance(server, EmulatedStreakCamera):
+        port, values["data_port"] = server.ports
+        address = f"remoteex://{HOST}:{port}"
+    else:
+        address, values = f"spad512://{HOST}:{server.port}", {"width": 64, **values}
+    return devices.open(f"{address}?" + "&".join(f"{name}={values[name]}" for name in values))
+
+
+def require_pictures(frames: list[Any]) -> None:
+    """Require the streak camera's pictures, bit for bit, by their numbers."""
+    for frame in frames:
+        np.testing.assert_array_equal(frame["counts"], LIGHT.draw_frame(int(frame["number"])))
+
+
+# What drivers of both have in common
+
+
+@pytest.fixture(params=["camera", "array"])
+def either(request: pytest.FixtureRequest) -> Make:
+    make: Make = request.getfixturevalue(request.param)
+    return make
+
+
+def test_after_an_unplugged_cable_the_stream_goes_on(either: Make) -> None:
+    with opened(either(Fault(5, "unplug"))) as source:
+        gaps = read_gaps(source, 20)
+        finish(source)
+    assert (source.stats.reconnects, gaps.count(True)) == (1, 1)
+
+
+def test_late_answers_are_waited_for_and_not_asked_for_again(either: Make) -> None:
+    """Later than the time to wait: the picture comes all the same, and no other is taken for it."""
+    server = either(Fault(3, "timeout", 5), Fault(6, "short", 5))
+    is_streak_camera = isinstance(server, EmulatedStreakCamera)
+    with opened(server, timeout_s=0.2 if is_streak_camera else 5) as source:
+        frames = take(source, 15)
+        finish(source)
+    assert source.stats.timeouts >= 2
+    assert source.stats.reconnects == 0
+    if is_streak_camera:
+        require_pictures(frames)
+    else:
+        assert [int(frame["number"]) for frame in frames] == list(range(len(frames)))
+
+
+def test_one_that_stays_away(either: Make) -> None:
+    server = either()
+    with opened(server, reconnect_s=0.3) as source:
+        take(source, 1)
+        server.close()
+        with pytest.raises(DeviceDisconnectedError, match=r"no answer came for 0\.3 s"):
+            take(source, 10_000)
+    assert source.stats.is_balanced
+
+
+@pytest.mark.parametrize("scheme", ["remoteex", "spad512"])
+def test_nobody_there(scheme: str) -> None:
+    with pytest.raises(DeviceNotFoundError, match="is its program running"):
+        devices.open(f"{scheme}://{HOST}:1")
+
+
+@pytest.mark.parametrize("kind", ["corrupt", "overflow", "stall"])
+def test_after_nonsense_the_stream_ends_and_the_gain_is_down(either: Make, kind: Any) -> None:
+    """A picture larger than any is refused before memory is taken."""
+    try:
+        server = either(Fault(3, kind))
+    except InputError:
+        return  # not one of its faults
+    values = {"mcp_gain": 20} if isinstance(server, EmulatedStreakCamera) else {}
+    with opened(server, **values) as source, pytest.raises(DeviceError):
+        take(source, 100)
+    assert getattr(server, "gain", "0") == "0"
+    assert source.stats.is_balanced
+
+
+def test_no_thread_is_left_behind(either: Make) -> None:
+    before = threading.active_count()
+    server = either()
+    with opened(server) as source:
+        take(source, 3)
+    server.close()
+    deadline = time.monotonic() + 5
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert threading.active_count() == before
+
+
+def test_servers_are_for_this_computer_only() -> None:
+    with LoopbackServer(lambda connection: None) as server:
+        assert server.server_address[0] == HOST
+        others = socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+        for address in {str(entry[4][0]) for entry in others} - {HOST}:
+            with pytest.raises(OSError, match="refused"):
+                socket.create_connection((address, server.port), 1)
+
+
+# RemoteEx's messages
+
+names = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,20}", fullmatch=True)
+letters = st.characters(codec="latin-1", exclude_characters=",()", exclude_categories=["Cc"])
+arguments = st.lists(st.text(letters, max_size=9), max_size=5).filter(lambda words: words != [""])
+
+
+@given(st.sampled_from(AnswerCode), names, arguments)
+def test_messages_come_back(code: AnswerCode, name: str, words: list[str]) -> None:
+    for message in (Answer(code, name, tuple(words)), Command(name, tuple(words))):
+        assert type(message).decode(message.encode().removesuffix(TERMINATOR)) == message
+
+
+@pytest.mark.parametrize(
+    ("message", "sent"),
+    [
+        (Command("DevParamSet", ("TD", "MCP Gain", "0")), b"DevParamSet(TD,MCP Gain,0)"),
+        (Command("DevParamSet", ("TD", "10 µs")), b"DevParamSet(TD,10 \xb5s)"),  # Latin-1
+        (Command("AcqStop"), b"AcqStop()"),
+        (Answer(AnswerCode.DONE, "DevParamGet", ("10 µs",)), b"0,DevParamGet,10 \xb5s"),
+        (Answer(AnswerCode.MESSAGE, "LiveMonitor", ("14",)), b"4,LiveMonitor,14"),
+    ],
+)
+def test_messages_as_the_handbook_writes_them(message: Command | Answer, sent: bytes) -> None:
+    assert message.encode() == sent + b"\r"
+    assert type(message).decode(sent) == message
+
+
+@pytest.mark.parametrize("words", [("a,b",), ("(",), ("a\r",), ("",), ("Ω",)])
+def test_what_the_protocol_cannot_carry(words: tuple[str, ...]) -> None:
+    for message in (Command("AcqStart", words), Answer(AnswerCode.DONE, "Acq Start")):
+        with pytest.raises(InputError):
+            message.encode()
+
+
+@pytest.mark.parametrize(
+    "message",
+    [b"", b"0", b"0,", b"11,Name", b"x,Name", b"-1,Name", b"\xff\xfe", b"\xb2,Name", b"0,A\nB"],
+)
+def test_answers_that_are_none(message: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        Answer.decode(message)
+
+
+@pytest.mark.parametrize("code", REFUSAL_REASONS)
+def test_every_refusal_is_explained(code: AnswerCode) -> None:
+    with pytest.raises(DeviceError, match=r"refused AcqStart\(Live\): .*\(why\)") as caught:
+        Answer(code, "AcqStart", ("why",)).require_done(Command("AcqStart", ("Live",)))
+    assert isinstance(caught.value, DeviceBusyError) == (code is AnswerCode.NOT_NOW)
+
+
+@contextmanager
+def scripted(
+    data: bytes = b"", greeting: bytes = b"RemoteEx Ready\r", **answers: bytes
+) -> Iterator[RemoteExClient]:
+    """Connect to a server that answers each request by a script, and an unknown one not at all."""
+
+    def serve(connection: Connection) -> None:
+        connection.send(greeting)
+        while (request := connection.read_request(TERMINATOR)) is not None:
+            connection.send(answers.get(request.decode(), b""))
+
+    def serve_data(connection: Connection) -> None:
+        connection.send(b"RemoteEx Data Ready\r")
+        time.sleep(0.1)  # what comes before the question is thrown away
+        connection.send(data)
+        connection.read_request(TERMINATOR)
+
+    with LoopbackServer(serve) as commands, LoopbackServer(serve_data) as pictures:
+        link = RemoteExClient(HOST, commands.port, pictures.port, 0.5)
+        yield link
+        link.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "problem"),
+    [
+        (b"0,ImgRingBufferGet\r", "described a picture by 0 words"),
+        (b"0,ImgRingBufferGet,a,2,2,0,0\r", "expected a whole number"),
+        (b"0,ImgRingBufferGet,2,2,3,0,0\r", "pixels of 3 bytes"),
+        (b"0,ImgRingBufferGet,99999999,99999999,2,0,0\r", "at most"),
+        (b"0,ImgRingBufferGet,2,2,1,0,x\r", "expected a whole number"),
+        (b"0,Other,2,2,1,0,0\r", "answered Other when asked"),
+        (b"x" * 70000, "without the end"),
+    ],
+)
+def test_answers_about_pictures_that_make_no_sense(answer: bytes, problem: str) -> None:
+    with (
+        scripted(b"pixels", **{"ImgRingBufferGet(Data,0)": answer}) as link,
+        pytest.raises(ProtocolError, match=problem),
+    ):
+        link.read_frame(0)
+
+
+def test_messages_are_kept_while_an_answer_is_awaited() -> None:
+    with scripted(**{"AcqStop()": b"4,LiveMonitor,RingBuffer,1\r0,AcqStop\r"}) as link:
+        assert link.ask("AcqStop") == ()
+        assert link.read_message(1).arguments == ("RingBuffer", "1")
+        with pytest.raises(DeviceTimeoutError):
+            link.read_message(0.05)
+        # Then its answer is owed: nothing else is sent before that has come.
+        for name in ("AcqStart", "AcqStop"):
+            with pytest.raises(DeviceTimeoutError, match=r"AcqStart\(\) .*it is not asked again"):
+                link.ask(name)
+
+
+def test_an_error_of_several_lines_does_not_shift_the_answers() -> None:
+    answers = {
+        "AcqStart(Live)": b"7,AcqStart,raw\rdata \xb5\r\nmore\r",
+        "AcqStatus()": b"5,HAcq: odd\rtext\r0,acqstatus,idle\r",
+    }
+    with scripted(**answers) as link:
+        assert not link.is_done("AcqStart", "Live")
+        assert link.ask("AcqStatus") == ("idle",)
+
+
+@pytest.mark.parametrize("greeting", [b"SSH-2.0\r", b"RemoteEx Data Ready\r"])
+def test_another_server_is_recognised(greeting: bytes) -> None:
+    with (
+        pytest.raises(ProtocolError, match="expected 'RemoteEx Ready'"),
+        scripted(greeting=greeting),
+    ):
+        pass
+    with LoopbackServer(lambda connection: connection.send(b"RemoteEx Ready\r")) as server:
+        with pytest.raises(ProtocolError, match="expected 'RemoteEx Data Ready'"):
+            RemoteExClient(HOST, server.port, server.port, 2)
+        with pytest.raises(DeviceNotFoundError):
+            RemoteExClient(HOST, server.port, 1, 2)
+
+
+# The streak camera
+
+
+def test_pictures_come_in_order_and_bit_for_bit(camera: Make) -> None:
+    """And everything that is known of the camera."""
+    server = camera()
+    with opened(server, mcp_gain=30, time_range="100 ns") as source:
+        assert server.gain == "30"
+        info, known = source.info.as_dict(), source.calibration
+        frames = take(source, 12)
+        finish(source)
+    numbers = [int(frame["number"]) for frame in frames]
+    assert numbers == list(range(numbers[0], numbers[0] + 12))
+    require_pictures(frames)
+    assert server.gain == "0"
+    assert (info["time_range"], info["mode"]) == ("100 ns", "Operate")
+    assert (info["rows"], info["columns"]) == (12, 20)
+    assert known is not None
+    # float32 numbers in ns, as the camera sends them.
+    np.testing.assert_allclose(known.array("row_times", float, 1, "s"), LIGHT.row_times, rtol=1e-7)
+
+
+def test_pictures_that_fell_out_of_the_ring_are_accounted_for(camera: Make) -> None:
+    with opened(camera(Fault(4, "lost", 7))) as source:
+        gaps = read_gaps(source, 20)
+        finish(source)
+    assert source.stats.lost_device >= 7
+    assert any(gaps)
+
+
+@pytest.mark.parametrize(
+    "unlike",
+    [
+        {"is_application_up": False},  # HPD-TA is started
+        {"busy_for": 3},  # waited for
+        {"busy_for": 10**9},  # stopped
+        {"stray_bytes": 1000},  # on the data port, thrown away
+    ],
+    ids=str,
+)
+def test_a_camera_as_others_left_it(camera: Make, unlike: dict[str, Any]) -> None:
+    server = camera(**unlike)
+    with opened(server, mcp_gain=9, timeout_s=0.5) as source:
+        require_pictures(take(source, 3))
+        assert server.gain == "9"
+
+
+def test_live_mode_of_an_operator_is_joined_and_goes_on(camera: Make) -> None:
+    server = camera(is_live=True, rate=200.0)
+    server.gain = "13"
+    time.sleep(0.05)
+    with opened(server, mcp_gain=20) as source:
+        frames = take(source, 5)
+        assert server.gain == "20"
+    assert frames[0]["number"] > 0
+    assert server.is_running
+    assert server.gain == "13"
+
+
+def test_numbers_that_restart_are_followed(camera: Make) -> None:
+    numbers: list[int] = []
+    gaps: list[bool] = []
+    with opened(camera(restart_at=20)) as source:
+        while len(numbers) < 40:
+            batch = source.read(5)
+            assert batch is not None
+            numbers += batch.records["number"].tolist()
+            gaps += [batch.after_gap] * len(batch)
+        finish(source)
+    restart = numbers.index(max(numbers[:25])) + 1
+    assert numbers[restart] < 3
+    assert gaps[restart]
+    assert source.stats.malformed == 0
+
+
+def test_a_synchroscan_unit_counts_its_time_in_ps(camera: Make) -> None:
+    with opened(camera(time_range="3")) as source:
+        assert source.calibration is not None
+        times = source.calibration.fields["row_times"].values
+        np.testing.assert_allclose(times, LIGHT.row_times, rtol=1e-6)
+    server = camera(time_range="2", has_scaling_table=False)
+    with opened(server, time_ranges_ps="165,480,1200") as source:
+        assert source.calibration is not None
+        np.testing.assert_allclose(
+            np.diff(source.calibration.fields["row_times"].values), 480e-12 / 12
+        )
+
+
+def test_an_emulated_camera_sees_a_scene() -> None:
+    light = simulate_line_light()
+    address = "sim+remoteex://?seed=4&scene=small&frame_rate=100&frames=4&mcp_gain=5"
+    with devices.open(address) as source:
+        frames, known, info = take(source, 4), source.calibration, source.info
+        finish(source)
+    assert info.instrument.startswith("emulated Hamamatsu")
+    assert known is not None
+    assert Camera.from_record(known.child("camera", "camera")).slit_width_px == 256
+    counts, expected = np.sum([frame["counts"] for frame in frames], axis=0), 4 * light.photons
+    # Poisson of 4 exposures: the sum over 147 456 pixels to a tenth of a percent, bright pixels to
+    # their root.
+    assert counts.sum() == pytest.approx(expected.sum(), rel=5e-3)
+    bright = light.photons > 100
+    noise = (counts - expected)[bright] / np.sqrt(expected[bright])
+    assert np.std(noise) == pytest.approx(1, abs=0.1)
+
+
+def test_the_demonstrations_light_comes_with_what_focus_pictures_tell() -> None:
+    light = simulate_demonstration_light()
+    assert light.photons.shape == (576, 1344)
+    assert light.photons.max() == pytest.approx(2002, rel=1e-6)  # peak and background
+    assert light.camera.sweep is None
+    assert light.camera.gains.tolist() == [1.0] * 7
+
+
+# The SPAD512's messages
+
+exposures = st.builds(
+    ExposureRequest,
+    st.sampled_from(BIT_DEPTHS[1:]),
+    st.integers(1, 10**9).map(lambda nanoseconds: nanoseconds * 1e-9),
+    st.integers(1, 1000),
+    st.sampled_from(IMAGE_WIDTHS_PX),
+)
+
+
+@given(exposures)
+def test_requests_come_back(exposure: ExposureRequest) -> None:
+    found = ExposureRequest.decode(exposure.encode())
+    assert found.seconds == pytest.approx(exposure.seconds, rel=1e-8)  # nine digits travel
+    shape = (exposure.bits, exposure.images, exposure.width)
+    assert (found.bits, found.images, found.width) == shape
+
+
+def test_requests_as_the_makers_examples_write_them() -> None:
+    assert ExposureRequest(8, 2e-3, 3, 128).encode() == b"I,8,2,3,0,1,0,1,128"  # milliseconds
+    assert ExposureRequest(1, 2e-3, 3).encode() == b"I,1,2000,3,0,1,0,1,512"  # microseconds
+    assert ExposureRequest(4, 2e-3, 3, 64).encode() == b"I,4,2000,3,0,1,0,1,64"  # these as well
+    assert ExposureRequest(6, 2e-3, 3).encode() == b"I,6,2,3,0,1,0,1,512"
+    # The vendor's class leaves the width out, and its gated mode has none.
+    assert ExposureRequest.decode(b"I,8,2,3,0,1,0,1") == ExposureRequest(8, 2e-3, 3)
+    gated = ExposureRequest(8, 2e-3, 3, gate=GateScan(10, 36, 5, 100))
+    assert gated.encode() == b"G,8,2,3,10,36,0,5,100,0,1,0,1"
+    assert ExposureRequest.decode(gated.encode()) == gated
+    assert gated.frames == 30
+    assert ExposureRequest(pile_up=True).encode_pile_up() == b"PU,1"
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"I,8", b"I,x,1,1,0,1,0,1,8", b"I,8,1,1,0,1,0,1,9", b"I,8,nan,1,0,1,0,1,8"]
+)
+def test_lines_that_request_nothing(line: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        ExposureRequest.decode(line)
+
+
+@pytest.mark.parametrize(
+    ("exposure", "bits", "frame_bytes"),
+    [
+        (ExposureRequest(1), 1, 32768),
+        (ExposureRequest(4, width=4), 8, 2048),
+        (ExposureRequest(8, width=4), 8, 2048),
+        (ExposureRequest(9, width=4), 16, 4096),
+        # corrected for pile-up, counts of 8 bits go beyond 255
+        (ExposureRequest(8, width=4, pile_up=True), 16, 4096),
+    ],
+)
+def test_lengths_are_computed(exposure: ExposureRequest, bits: int, frame_bytes: int) -> None:
+    assert (exposure.codec.bits, exposure.codec.pixel_bytes) == (bits, frame_bytes)
+
+
+def test_pixels_are_not_taken_for_complaints() -> None:
+    assert find_error_text(b"\x00" * 900 + b"DONE") is None
+    assert find_error_text(b"\x00\x81" * 90) is None
+    assert find_error_text(b"\x81" * 90 + b"The FIFO is full.\nERROR") == "The FIFO is full. ERROR"
+    assert find_error_text(b"\x81" * 90 + b"ERROR: hot\nDONE") == "ERROR: hot DONE"
+
+
+# The SPAD array
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"bits": 1, "width": 512, "exposure_us": 5},
+        {"bits": 8},
+        {"bits": 12, "images": 3},
+        {"bits": 8, "pile_up": 1, "width": 4},
+    ],
+)
+def test_array_pictures_come_bit_for_bit(array: Make, values: dict[str, int]) -> None:
+    server = array()
+    with opened(server, **values) as source:
+        frames, info = take(source, 5), source.info.as_dict()
+        finish(source)
+    known = {"exposure_us": 1000, "images": 1, "width": 64, "pile_up": 0, **values}
+    exposure = ExposureRequest(
+        known["bits"],
+        known["exposure_us"] * 1e-6,
+        known["images"],
+        known["width"],
+        known["pile_up"] == 1,
+    )
+    for place, frame in enumerate(frames):
+        sent = server.draw_frame(*divmod(place, known["images"]), exposure).tobytes()
+        assert exposure.codec.encode(frame.reshape(1)) == exposure.codec.pack_frame(place, sent)
+    assert info["greeting"] == "SPAD512S emulated server, ready"
+    assert info["serial"] == "EMULATED-1"
+    assert (info["rows"], info["columns"]) == (512, known["width"])
+    # Up to 200 photons in the millisecond, or one in five microseconds: the picture is Poisson
+    # about the light, and not turned.
+    counts = np.mean([frame["counts"] for frame in frames], axis=0)
+    correlation = np.corrcoef(counts.ravel(), ARRAY_LIGHT[:, : exposure.width].ravel())[0, 1]
+    assert correlation > (0.5 if values["bits"] == 1 else 0.95)
+
+
+def test_single_bits_lie_as_the_other_depths_do(array: Make) -> None:
+    """The hardware sends them turned by a quarter: one bright corner tells."""
+    corner = np.zeros((ROWS, ROWS))
+    corner[:100, :50] = 1e9
+    with opened(array(light=corner), bits=1, width=512) as source:
+        np.testing.assert_array_equal(take(source, 1)[0]["counts"] > 0, corner > 0)
+        finish(source)
+    with pytest.raises(ShapeError):
+        EmulatedSpadArray(np.ones((3, 4)), 0)
+
+
+def test_pixels_that_spell_the_end_are_pixels() -> None:
+    """DONE at the end of every piece that arrives: only the length tells where a picture ends."""
+    pixels = np.frombuffer(b"DONE" * (512 * 4 // 4), np.uint8)
+
+    def serve(connection: Connection) -> None:
+        connection.send(b"hello")
+        for said in (b"system", b"off"):
+            connection.read_available()
+            connection.send(said)
+        while connection.read_available() is not None:
+            for start in range(0, pixels.size, 512):
+                connection.send(pixels[start : start + 512].tobytes())
+            connection.send(b"DONE")
+
+    with LoopbackServer(serve) as server, opened(server, width=4) as source:
+        for frame in take(source, 3):
+            np.testing.assert_array_equal(frame["counts"].ravel(), pixels)
+
+
+def test_a_picture_that_was_cut_is_malformed(array: Make) -> None:
+    with opened(array(Fault(2, "unplug")), images=2) as source:
+        read_gaps(source, 9)
+        finish(source)
+    assert (source.stats.reconnects, source.stats.malformed) == (1, 1)
+
+
+@pytest.mark.parametrize("amount", [1, 2, 3])
+def test_what_the_server_complains_of_is_passed_on(array: Make, amount: int) -> None:
+    """With the mark behind the text, in front of it, or behind a part of a picture."""
+    with (
+        opened(array(Fault(1, "stall", amount))) as source,
+        pytest.raises(DeviceError, match=r"he FIFO is full\."),
+    ):
+        take(source, 5)
+    assert (source.stats.delivered, source.stats.malformed) == (1, 1)
+
+
+def test_an_answer_of_another_length_is_noticed(array: Make) -> None:
+    with (
+        opened(array(Fault(1, "corrupt"))) as source,
+        pytest.raises(ProtocolError, match="ended in b'GONE'"),
+    ):
+        take(source, 5)
+
+
+def test_a_silent_server_counts_as_gone(array: Make) -> None:
+    with opened(array(Fault(1, "timeout", 20)), timeout_s=0.3, reconnect_s=0.1) as source:
+        take(source, 4)
+        finish(source)
+    assert source.stats.reconnects == 1
+
+
+def test_a_server_that_calibrates_itself_first_and_frames_nothing(array: Make) -> None:
+    with opened(array(is_framed=False, must_calibrate=True)) as source:
+        assert len(take(source, 2)) == 2
+        finish(source)
+
+
+def test_the_emulated_array_looks_at_the_demonstration() -> None:
+    with devices.open("sim+spad512://?seed=3&width=128&bits=8") as source:
+        counts = take(source, 1)[0]["counts"]
+        finish(source)
+    assert counts.shape == (512, 128)
+    assert 0 < counts.mean() < 20  # 20 photons in a millisecond on a white pixel
+
+
+def test_a_gated_array_is_a_flash_lidar() -> None:
+    """Scans of a gate become the scene's ranges in one call."""
+    gated = "mode=gated&gate_steps=30&gate_step_ps=700&binning=16"
+    counted = read_photons(f"sim+spad512://?seed=1&{gated}")
+    assert counted.counts.shape == (30, 32, 32)
+    assert counted.pulse is not None
+    # A pixel shows its light up to the last opening before the light's delay.
+    blocks = render_array_delays().reshape(32, 16, 32, 16)
+    earliest, latest = blocks.min(axis=(1, 3)), blocks.max(axis=(1, 3))
+    bright = render_array_light().reshape(32, 16, 32, 16).mean(axis=(1, 3)) > 0.3
+    even = bright & (latest - earliest < 1e-11)  # NaN where a part of the pixel sees nothing
+    half = (counted.counts.max(axis=0) + counted.counts.min(axis=0)) / 2
+    last = counted.times[29 - np.argmax(counted.counts[::-1] > half, axis=0)]
+    step, edge = counted.bin_width, 2e-10
+    assert even.sum() > 50
+    assert np.all(last[even] - edge <= earliest[even])
+    assert np.all(earliest[even] <= last[even] + step + edge)
+    assert counted.to_image().bins == 30
+
+
+def test_a_scan_that_was_cut_is_left_out(array: Make) -> None:
+    server = array(Fault(0, "unplug"), delays=DELAYS_S)
+    address = f"spad512://{HOST}:{server.port}?mode=gated&gate_steps=4&gate_step_ps=1500"
+    counted = read_photons(f"{address}&scans=2&binning=16")
+    with devices.open(address) as source:
+        assert [int(frame["number"]) for frame in take(source, 4)] == [0, 1, 2, 3]
+    sums = counted.counts.sum(axis=(1, 2))
+    # Open at 5, 6.5 and 8 ns for 5 ns, light at 8: half of it in the third, none in the fourth.
+    assert sums[0] == pytest.approx(sums[1], rel=0.01)
+    assert sums[2] == pytest.approx(sums[0] / 2, rel=0.1)
+    assert sums[3] < sums[0] / 20
+
+
+def test_what_counts_no_photons_in_time() -> None:
+    with pytest.raises(InputError, match="mode=gated"):
+        read_photons("sim+spad512://?seed=1&width=4")
+    with pytest.raises(InputError, match="must be positive"):
+        read_photons("sim+spad512://?mode=gated&scans=0")
+
+
+def test_clients_of_the_vendor_are_answered(array: Make) -> None:
+    """Commands without an end, eight fields, the information first: as others' clients speak."""
+    server = array(is_framed=False, delays=DELAYS_S)
+    with TcpLink(HOST, server.port, 5) as link:
+
+        def ask(command: str) -> list[str]:
+            link.send(command.encode(), 5)
+            return link.read_available(8192, 5).decode().splitlines()
+
+        assert link.read_available(8192, 5).split()[0] == b"SPAD512S"
+        assert len(ask("D")) == 9
+        assert [float(word) for word in ask("R")[0].split(",")][4:] == [4e7, 100.0]
+        assert len(ask("V")[0].split(",")) == 2
+        for command in ("V,3.0", "AE,0,1", "CALIB,0", "PU,1", "PU,0"):
+            assert ask(command)
+        assert ask("F,c0")[0].startswith("ERROR")
+        assert ask("Gf,1,18,5,1")[2:] == [
+            "The number of gate steps is 1388",
+            "The gate offset is 0 ps",
+            "The minimum gate step size is 18 ps",
+        ]
+        for command, pictures in ((b"I,8,1.0,2,0,0,0,1", 2), (b"G,8,1.0,1,3,36,0,5,0,0,1,0,1", 3)):
+            link.send(command, 5)
+            data = link.read_exactly(pictures * ROWS * ROWS + 4, 1 << 22, 10)
+            assert data.endswith(b"DONE")
