@@ -35,22 +35,15 @@ PALETTES = ("viridis", "cividis", "inferno", "magma", "plasma", "turbo", "grey")
 TURBO_ENDS = 0.09, 0.93
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """Something that every point has."""
-
-    unit: str  # of what `extract` returns
-    extract: Callable[[PointCloud], NDArray[Any]]  # takes a cloud, returns (n,) numbers
-
-
-# heights count upwards from the camera, though y points down
-QUANTITIES: Mapping[str, Quantity] = {
-    "range": Quantity("m", lambda cloud: cloud.range),
-    "height": Quantity("m", lambda cloud: -cloud.xyz[:, 1]),
-    "intensity": Quantity("counts", lambda cloud: cloud.intensity),
-    "standard deviation": Quantity("m", lambda cloud: cloud.range_sigma),
-    "return number": Quantity("", lambda cloud: cloud.return_number),
-    "time": Quantity("ns", lambda cloud: cloud.time / np.float32(NANOSECOND)),
+# what every point has: its unit, and how it is taken from a cloud, (n,); heights count upwards from
+# the camera, though y points down
+QUANTITIES: Mapping[str, tuple[str, Callable[[PointCloud], NDArray[Any]]]] = {
+    "range": ("m", lambda cloud: cloud.range),
+    "height": ("m", lambda cloud: -cloud.xyz[:, 1]),
+    "intensity": ("counts", lambda cloud: cloud.intensity),
+    "standard deviation": ("m", lambda cloud: cloud.range_sigma),
+    "return number": ("", lambda cloud: cloud.return_number),
+    "time": ("ns", lambda cloud: cloud.time / np.float32(NANOSECOND)),
 }
 
 
@@ -70,12 +63,6 @@ class Colouring:
     shaded: bool = True
 
     def __post_init__(self) -> None:
-        for what, name, known in (
-            ("colour for", self.quantity, tuple(QUANTITIES)),
-            ("palette is called", self.palette, PALETTES),
-        ):
-            if name not in known:
-                raise InputError(f"no {what} '{name}'; choose one of {', '.join(known)}")
         low, high = self.limits or (0.0, 1.0)
         if not -np.inf < low < high < np.inf:
             raise InputError(f"the limits of the colours must rise, got {low} and {high}")
@@ -121,8 +108,8 @@ class Scale:
 
 def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
     """Return the scale of a cloud's colours."""
-    quantity = QUANTITIES[colouring.quantity]
-    values = quantity.extract(cloud)
+    unit, extract = QUANTITIES[colouring.quantity]
+    values = extract(cloud)
     low, high = colouring.limits or _find_limits(values)
     scale = np.linspace(low, high, PALETTE_SIZE)
     inside = values[(values >= low) & (values <= high)]
@@ -130,7 +117,7 @@ def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
         thinned = inside[:: max(1, inside.size // MAX_RANKED_POINTS)].astype(np.float64)
         scale = np.quantile(thinned, np.linspace(0, 1, PALETTE_SIZE))
         scale[0], scale[-1] = low, high
-    return Scale(colouring.quantity, quantity.unit, colouring.palette, scale)
+    return Scale(colouring.quantity, unit, colouring.palette, scale)
 
 
 def _find_limits(values: NDArray[Any]) -> Limits:
@@ -147,7 +134,7 @@ def colour_points(cloud: PointCloud, scale: Scale, brightest: float = 0.0) -> ND
     """Return each point's red, green and blue, (n, 3), in full light from the intensity `brightest`
     on; all alike where it is 0.
     """
-    colours = scale.colours(QUANTITIES[scale.quantity].extract(cloud))
+    colours = scale.colours(QUANTITIES[scale.quantity][1](cloud))
     if brightest <= 0 or scale.quantity == "intensity":  # which is in the colour already
         return colours
     light = np.clip(cloud.intensity / np.float32(brightest), 0, 1) ** np.float32(GAMMA)
@@ -210,25 +197,28 @@ CLOSE_MISS_RAD = 0.004  # rad; of all points missed by less, the nearest one is 
 class Pick:
     """A point that was chosen."""
 
-    position: tuple[float, float, float]  # x, y, z in m
-    range: float  # m
-    confidence: float  # m, one standard deviation of the range
-    intensity: float  # counts, referred to 1 m
-    return_number: int
-    time: float  # time of flight, s
+    point: PointCloud  # of this one
     pixel: tuple[int, int] | None = None  # row and column that saw it
     waveform: FloatArray | None = None  # (2, n), times of flight, s, and counts of that pixel
-    # time of flight of every return that was found in that pixel and is shown, s
-    return_times: tuple[float, ...] = ()
+    # (k,), time of flight of every return that was found in that pixel and is shown, s
+    return_times: NDArray[Any] | None = None
+
+    @property
+    def position(self) -> NDArray[np.float32]:
+        """x, y, z in m."""
+        position: NDArray[np.float32] = self.point.xyz[0]
+        return position
 
     @property
     def description(self) -> str:
         """One line for each thing that is known."""
-        x, y, z = self.position
+        (x, y, z), point = self.position, self.point
+        return_text = f"{point.intensity[0]:.4g} counts, return {point.return_number[0]}"
         lines = [
             f"x {x:.4f}, y {y:.4f}, z {z:.4f} m",
-            f"range {self.range:.4f} m ± {format_length(self.confidence)}",
-            f"{self.time / NANOSECOND:.3f} ns, {self.intensity:.4g} counts, return {self.return_number}",
+            # give or take one standard deviation
+            f"range {point.range[0]:.4f} m ± {format_length(point.range_sigma[0])}",
+            f"{point.time[0] / NANOSECOND:.3f} ns, {return_text}",
         ]
         if self.pixel is not None:
             lines.append(f"pixel row {self.pixel[0]}, column {self.pixel[1]}")
@@ -254,13 +244,6 @@ def find_point_on_ray(
     if close.size:
         return int(close[np.argmin(depth[close])])
     return int(np.argmin(miss)) if miss.size and miss.min() <= MAX_MISS_RAD else None
-
-
-def make_pick(cloud: PointCloud, number: int) -> Pick:
-    """Return what is known about point `number` of a cloud."""
-    x, y, z = (float(value) for value in cloud.xyz[number])
-    columns = (cloud.range, cloud.range_sigma, cloud.intensity, cloud.return_number, cloud.time)
-    return Pick((x, y, z), *(column[number].item() for column in columns))
 
 
 PICTURE_WHITE_PERCENTILE = 99.7  # a glint does not darken the rest

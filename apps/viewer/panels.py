@@ -245,7 +245,7 @@ class Controls:
         steps = gui.add_button_group("step", tuple(FRAME_STEPS))
         self._on(steps, lambda word: clock.step(FRAME_STEPS[word]))
         speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1")
-        self._on(speed, lambda word: clock.set_speed(SPEEDS[word]))
+        self._on(speed, lambda word: setattr(clock, "speed", SPEEDS[word]))
         self._on(gui.add_checkbox("loop", clock.loop), partial(setattr, clock, "loop"))
 
     def _add_colours(self, first: DisplayedFrame, resize: Callable[[], None]) -> None:

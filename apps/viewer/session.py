@@ -18,7 +18,6 @@ from apps.viewer.look import (
     colour_points,
     find_full_light,
     find_point_on_ray,
-    make_pick,
     make_scale,
     project_front,
 )
@@ -26,7 +25,6 @@ from apps.viewer.source import NO_LIMITS, Limits, Picture, Source, View
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 
-MIN_SPEED, MAX_SPEED = 1 / 16, 16.0
 DIM_NOTE = "dim points are left out (filters, intensity)"
 
 
@@ -78,10 +76,6 @@ class PlaybackClock:
         """Pause, and move by a number of frames, back where it is negative."""
         self.pause()
         self.jump(self.frame + frames)
-
-    def set_speed(self, speed: float) -> None:
-        """Run faster or slower from now on, within bounds."""
-        self.speed = min(max(speed, MIN_SPEED), MAX_SPEED)
 
     def tick(self, now: float) -> int:
         """Let time pass and return the frame that is due."""
@@ -240,26 +234,18 @@ class Session:
         """
         if self.latest is None:
             return None
-        number = find_point_on_ray(self.latest.cloud.xyz, origin, direction)
+        shown = self.latest
+        number = find_point_on_ray(shown.cloud.xyz, origin, direction)
         if number is None:
             self.picks = []
             return None
-        return self.pick_point(number)
-
-    def pick_point(self, number: int) -> Pick:
-        """Choose point `number` of those that are shown."""
-        shown = self.latest
-        if shown is None or not 0 <= number < len(shown.cloud):
-            raise InputError(f"there is no point {number}")
-        pick = make_pick(shown.cloud, number)
+        pick = Pick(shown.cloud[number : number + 1])
         if shown.pixels is not None:
             row, column = shown.pixels[number].tolist()
             beside = np.all(shown.pixels == (row, column), axis=1)
+            waveform = self.source.waveform(shown.frame, (row, column))
             pick = replace(
-                pick,
-                pixel=(row, column),
-                waveform=self.source.waveform(shown.frame, (row, column)),
-                return_times=tuple(shown.cloud.time[beside].astype(float).tolist()),
+                pick, pixel=(row, column), waveform=waveform, return_times=shown.cloud.time[beside]
             )
         self.picks = [*self.picks, pick][-2:]
         return pick

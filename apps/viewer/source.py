@@ -7,7 +7,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,13 @@ from tofclip.lidar import PointCloud
 from tofclip.lidar.cloud import OPTIONAL_COLUMNS
 from tofclip.units import SPEED_OF_LIGHT
 
+if TYPE_CHECKING:
+    from nlos.export import Mesh
+
 FloatArray = NDArray[np.float64]
 Picture = NDArray[np.float32]  # (rows, columns)
 Limits = tuple[float, float]  # both inclusive
 NO_LIMITS: Limits = (-np.inf, np.inf)
-
-
-@dataclass(frozen=True)
-class TriangleMesh:
-    """A surface: vertices (v, 3) in m and corners (f, 3) of each triangle."""
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -36,7 +31,7 @@ class View:
 
     cloud: PointCloud
     pixels: NDArray[np.int32] | None = None  # (n, 2), row and column that saw each point
-    surface: TriangleMesh | None = None  # drawn instead of the points
+    surface: Mesh | None = None  # drawn instead of the points
     # points of other times of flight, s, are not shown, though they count for the colours
     times: Limits = NO_LIMITS
     time: float = np.nan  # time of flight of the frame, s; NaN where frames have none

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 from apps.viewer.sources import (
     CloudSource,
     LiveShotSource,
-    ShotRecovery,
+    Recovery,
     StoredShotSource,
     TransientSource,
     VolumeSource,
@@ -45,6 +45,22 @@ FIRST_LOOK_NOTE = (
 Announce = Callable[[str], None]
 
 
+def make_look_method(name: str | None) -> Method | None:
+    """Return a method quick enough to look by; None where a source is to choose."""
+    if name is None:
+        return None
+    if name == SURFACES:
+        raise InputError(
+            "surfaces take too long for shots one after the other, and need a shot; choose one of "
+            f"{', '.join(LOOK_METHODS)}, or make frames by tofclip recover"
+        )
+    if name not in LOOK_METHODS:
+        known = ", ".join((*LOOK_METHODS, SURFACES))
+        raise InputError(f"unknown method '{name}'; choose one of {known}")
+    iterations = FIRST_LOOK_ITERATIONS if name in ("tv", "l1") else None
+    return cast(Method, make_method(name, iterations=iterations))
+
+
 @dataclass(frozen=True)
 class ShotOptions:
     """What has to be known about raw shots."""
@@ -57,26 +73,6 @@ class ShotOptions:
     # one of `LOOK_METHODS`, ``"surfaces"`` for a single shot. By default a single one by some
     # iterations of ``"l1"``, and one after the other by ``"linear"``
     method: str | None = None
-
-    def make_method(self) -> Method | None:
-        """Return a method quick enough to look by; None where a source is to choose."""
-        name = self.method
-        if name is None:
-            return None
-        if name == SURFACES:
-            raise InputError(
-                "surfaces take too long for shots one after the other, and need a shot; choose one of "
-                f"{', '.join(LOOK_METHODS)}, or make frames by tofclip recover"
-            )
-        if name not in LOOK_METHODS:
-            known = ", ".join((*LOOK_METHODS, SURFACES))
-            raise InputError(f"unknown method '{name}'; choose one of {known}")
-        return _make_quick(name)
-
-
-def _make_quick(name: str) -> Method:
-    iterations = FIRST_LOOK_ITERATIONS if name in ("tv", "l1") else None
-    return cast(Method, make_method(name, iterations=iterations))
 
 
 def open_source(
@@ -119,7 +115,7 @@ def open_source(
     if kind in ("cloud", "range image", "depth picture"):
         return CloudSource(path.name, [path])
     if kind == "frames":
-        return TransientSource(path.name, load(path), method=options.make_method())
+        return TransientSource(path.name, load(path), method=make_look_method(options.method))
     if kind == "volume":
         return VolumeSource(path.name, load(path))
     if kind == "streak":
@@ -143,19 +139,20 @@ def _open_shots(
     first = shots[0]()
     if len(shots) > 1:
         camera = _find_camera(title, first, options, announce)
-        return StoredShotSource(title, shots, camera, options.make_method())
+        return StoredShotSource(title, shots, camera, make_look_method(options.method))
     if options.method == SURFACES:
         opened = open_shot(first, options.camera, options.time_zero)
         announce(f"recovering the surfaces of {title}")
         frames = plan_recovery(opened, SURFACES).run()
         measured = measure(first.counts, first.saturated, frames.camera).values
         # a refocus, which shows frames, is quick
-        return TransientSource(title, frames, measured, _make_quick(FIRST_LOOK_METHOD))
+        return TransientSource(title, frames, measured, make_look_method(FIRST_LOOK_METHOD))
     camera = _find_camera(title, first, options, announce)
     measured = measure(first.counts, first.saturated, camera).values
-    method = options.make_method() or _make_quick(FIRST_LOOK_METHOD)
-    recovery = ShotRecovery(camera, first.times - camera.time_zero, method)
-    source = TransientSource(title, recovery.frames(measured), measured, method)
+    method = make_look_method(options.method or FIRST_LOOK_METHOD)
+    times = first.times - camera.time_zero
+    frames = Recovery(camera, times, method).frames(measured)
+    source = TransientSource(title, frames, measured, method)
     if options.method is None:
         source.notes = (FIRST_LOOK_NOTE, *source.notes)
     return source
@@ -171,7 +168,7 @@ def _open_instrument(address: str, options: ShotOptions, announce: Announce) -> 
     if first is None:
         raise InputError(f"{address}: the source ended before it gave anything")
     camera = _find_camera(address, first, options, announce)
-    return LiveShotSource(address, shots, camera, options.make_method())
+    return LiveShotSource(address, shots, camera, make_look_method(options.method))
 
 
 def _find_camera(title: str, shot: Streak, options: ShotOptions, announce: Announce) -> Camera:

@@ -30,7 +30,6 @@ from apps.viewer.source import (
     Picture,
     Setting,
     Source,
-    TriangleMesh,
     View,
     make_cloud,
 )
@@ -188,29 +187,25 @@ class VolumeSource(Source):
         }
 
     def _make_view_of(self, mode: str, threshold: float, number: int) -> View:
+        surface, grid = None, self.volume.grid
         if mode == SURFACE_MODE:
-            mesh = self.volume.surface(min(max(threshold, 0.01), 0.99))
-            light = np.ones(len(mesh.vertices), np.float32)
-            surface = TriangleMesh(mesh.vertices, mesh.faces)
-            return View(_place_behind_wall(mesh.vertices, light), surface=surface)
-        bright = (self._magnitude >= threshold * self._magnitude.max()) & (self._magnitude > 0)
-        if mode == SLICE_MODE:
-            bright[:] = False
-            bright[number] = True  # all of it: a slice shows the dark as well
-        elif mode == PROJECTION_MODE:
-            front = np.zeros_like(bright)
-            np.put_along_axis(front, self._magnitude.argmax(axis=0)[np.newaxis], True, axis=0)
-            bright &= front
-        z, y, x = np.nonzero(bright)
-        grid = self.volume.grid
-        xyz = np.stack([grid.x[x], grid.y[y], grid.z[z]], axis=-1)
-        return View(_place_behind_wall(xyz, self._magnitude[z, y, x]))
-
-
-def _place_behind_wall(xyz: NDArray[Any], brightness: NDArray[Any]) -> PointCloud:
-    """A cloud whose ranges are depths behind the wall: more useful than distances from the origin."""
-    cloud = make_cloud(xyz, {"brightness": brightness})
-    return replace(cloud, range=cloud.xyz[:, 2])
+            surface = self.volume.surface(min(max(threshold, 0.01), 0.99))
+            xyz, light = surface.vertices, np.ones(len(surface.vertices), np.float32)
+        else:
+            bright = (self._magnitude >= threshold * self._magnitude.max()) & (self._magnitude > 0)
+            if mode == SLICE_MODE:
+                bright[:] = False
+                bright[number] = True  # all of it: a slice shows the dark as well
+            elif mode == PROJECTION_MODE:
+                front = np.zeros_like(bright)
+                np.put_along_axis(front, self._magnitude.argmax(axis=0)[np.newaxis], True, axis=0)
+                bright &= front
+            z, y, x = np.nonzero(bright)
+            xyz = np.stack([grid.x[x], grid.y[y], grid.z[z]], axis=-1)
+            light = self._magnitude[z, y, x]
+        cloud = make_cloud(xyz, {"brightness": light})
+        # Depth behind the wall is more useful than the distance from the origin of its coordinates.
+        return View(replace(cloud, range=cloud.xyz[:, 2]), surface=surface)
 
 
 class VolumeStreamSource(Source):
@@ -245,7 +240,7 @@ MIN_FRAMES = 3  # without a neighbour on either side no return is located
 ALL_FRAMES = slice(None)
 
 
-class ShotRecovery:
+class Recovery:
     """Turns measurements of one camera into frames, at any shear. `times` (frames,): time of flight
     of each column of measurements, s; `method`: by default the linear inverse: one operator and one
     matrix (columns, columns) for each of the last 16 shears, which every recovery of this process
@@ -287,7 +282,7 @@ class ShotRecovery:
 class RecoveredSource(Source):
     """Light over time that one camera measured, from which frames can be recovered at any shear."""
 
-    def __init__(self, title: str, rate: float, recovery: ShotRecovery) -> None:
+    def __init__(self, title: str, rate: float, recovery: Recovery) -> None:
         super().__init__(title, rate)
         self.recovery = recovery
         self.refocus = Setting("refocus", *SHEAR_LIMITS, 0.1, 0.0, SHEAR_HINT)
@@ -352,7 +347,7 @@ class TransientSource(RecoveredSource):
         method: Method | None = None,
     ) -> None:
         rate = frames.times.size / TRANSIENT_PLAY_TIME_S
-        super().__init__(title, rate, ShotRecovery(frames.camera, frames.times, method))
+        super().__init__(title, rate, Recovery(frames.camera, frames.times, method))
         self.times = frames.times
         self.frames, self._measured = frames, measurements
         if measurements is not None and self.recovery.is_linear:
@@ -450,7 +445,7 @@ class ShotSource(RecoveredSource):
     def __init__(
         self, title: str, camera: Camera, row_times: FloatArray, method: Method | None = None
     ) -> None:
-        recovery = ShotRecovery(camera, row_times - camera.time_zero, method)
+        recovery = Recovery(camera, row_times - camera.time_zero, method)
         super().__init__(title, SHOT_RATE_HZ, recovery)
         self.frame_name = "shot"
         if self.recovery.is_linear:

@@ -65,6 +65,11 @@ def plane(points: int, distance: float = 2.0, seed: int = 0) -> PointCloud:
     )
 
 
+def column(ranges: list[float]) -> PointCloud:
+    """Points along the z axis at these ranges."""
+    return make_cloud(np.column_stack([np.zeros((len(ranges), 2)), ranges]))
+
+
 def volume() -> Volume:
     """A bright ball of 4 cm about (0.05, -0.05, 0.5), in a box of 2 cm voxels."""
     grid = Grid.box((-0.2, 0.2), (-0.2, 0.2), (0.3, 0.7), 0.02)

@@ -1,0 +1,395 @@
+"""Which frame is due, which points are shown and in which colours, where they appear on a picture, and how
+often they are drawn: all over values and times that the test sets.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from viewer_scenes import PlaneSource, column, plane
+
+from apps.viewer.look import (
+    PALETTE_SIZE,
+    PALETTES,
+    QUANTITIES,
+    Colouring,
+    Pick,
+    Scale,
+    choose_ticks,
+    colour_points,
+    find_full_light,
+    find_point_on_ray,
+    format_length,
+    load_palette,
+    make_scale,
+    project_front,
+    render_pictures,
+)
+from apps.viewer.panels import bind_user_input, mark_times
+from apps.viewer.points import MIN_DRAWN_POINTS, DetailChooser, FramePacer
+from apps.viewer.session import Filters, PlaybackClock, Session
+from apps.viewer.source import make_cloud
+from apps.viewer.viewpoint import (
+    MAX_FIELD_OF_VIEW_RAD,
+    SCALE_BAR_DEPTH,
+    SCALE_BAR_FRACTION,
+    Box,
+    Viewpoint,
+    place_viewpoint,
+    round_length_down,
+)
+from tofclip.errors import InputError
+
+
+def test_frames_follow_the_time_and_the_speed() -> None:
+    clock = PlaybackClock(8.0, lambda: range(100), loop=False)
+    clock.play()
+    assert [clock.tick(now) for now in (5.0, 5.0625, 5.125, 6.0)] == [0, 0, 1, 8]
+    clock.speed = 4.0
+    assert clock.tick(7.0) == 40
+    clock.pause()
+    assert clock.tick(60.0) == 40
+    clock.play()  # the pause does not count
+    assert clock.tick(70.0) == 40
+    assert (clock.tick(99.0), clock.playing) == (99, False)
+    clock.play()
+    assert clock.frame == 0
+    with pytest.raises(InputError, match="positive"):
+        PlaybackClock(0.0, lambda: range(3))
+
+
+def test_a_loop_runs_through_the_frames_that_are_left_at_their_own_pace() -> None:
+    """Of a live source the first ones are forgotten: frame 10 of 4 to 9 is 4, and so on."""
+    clock = PlaybackClock(10.0, lambda: range(4, 10))
+    clock.jump(4)
+    clock.play()
+    clock.tick(0.0)
+    # In the middle of each frame's tenth of a second.
+    due = [clock.tick(0.05 + number / 10) for number in range(15)]
+    assert due == [4 + number % 6 for number in range(15)]
+
+
+def test_steps_and_jumps_stay_among_the_frames_that_are_left() -> None:
+    clock = PlaybackClock(10.0, lambda: range(5))
+    clock.jump(3)
+    clock.play()
+    clock.step(-1)
+    assert (clock.frame, clock.playing) == (2, False)
+    clock.step(10)
+    assert clock.frame == 4
+    clock.frames = lambda: range(6, 20)
+    assert clock.tick(0.0) == 6
+    clock.jump(-7)
+    assert clock.frame == 6
+    clock.follow()
+    assert clock.tick(0.0) == 19
+
+
+@given(st.floats(0, 1e3), st.integers(1, 50), st.lists(st.floats(0, 1e4), min_size=2, max_size=6))
+def test_there_is_no_other_frame_than_those_that_exist(
+    speed: float, count: int, times: list[float]
+) -> None:
+    clock = PlaybackClock(25.0, lambda: range(count), speed)
+    clock.play()
+    assert all(0 <= clock.tick(now) < count for now in sorted(times))
+
+
+def test_a_number_that_was_typed_outlives_the_frame_that_is_being_shown() -> None:
+    """viser calls coroutines at once, and functions from a thread of its own, later."""
+    commands: list[Any] = []
+    jumps: list[int] = []
+    told: list[Any] = []
+    slider = SimpleNamespace(value=10, on_update=told.append)
+    bind_user_input(slider, commands.append, jumps.append)
+    asyncio.run(told[0](SimpleNamespace(client=object(), target=slider)))
+    slider.value = 0  # the frame that the viewer was drawing, which its control then says
+    asyncio.run(told[0](SimpleNamespace(client=None, target=slider)))
+    for command in commands:
+        command()
+    assert jumps == [10]
+
+
+def test_limits_get_the_outermost_colours_and_the_middle_the_middle_one() -> None:
+    cloud = column([0.5, 1.0, 2.0, 3.0, 9.0])
+    scale = make_scale(cloud, Colouring("range", "grey", (1.0, 3.0)))
+    assert scale.limits == (1.0, 3.0)
+    assert colour_points(cloud, scale)[:, 0].tolist() == [0, 0, 128, 255, 255]
+    for limits in ((2.0, 1.0), (0.0, np.nan), (0.0, np.inf)):
+        with pytest.raises(InputError, match="must rise"):
+            Colouring(limits=limits)
+
+
+def test_an_equalised_scale_gives_every_colour_equally_many_points() -> None:
+    cloud = column(np.exp(np.random.default_rng(1).normal(size=20_000)).tolist())
+    scale = make_scale(cloud, Colouring("range", "grey", equalised=True))
+    inside = (cloud.range >= scale.limits[0]) & (cloud.range <= scale.limits[1])
+    share = np.histogram(colour_points(cloud, scale)[inside, 0], 8, (0, 256))[0] / inside.sum()
+    # 20 000 points in 255 steps: 1/255 at either edge, and rounding
+    assert np.allclose(share, 1 / 8, atol=0.01)
+    assert np.all(np.diff(scale.values) >= 0)
+
+
+def test_height_counts_upwards_and_time_is_in_nanoseconds() -> None:
+    cloud = make_cloud(np.array([[0.0, -0.3, 1.0]]))
+    assert QUANTITIES["height"][1](cloud) == pytest.approx([0.3])
+    # There and back at the speed of light: 6.67 ns for each metre.
+    assert QUANTITIES["time"][1](cloud) == pytest.approx([6.671 * np.hypot(0.3, 1)], rel=1e-3)
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("equalised", [False, True])
+def test_clouds_of_one_value_or_none_have_colours_too(quantity: str, equalised: bool) -> None:
+    for cloud in (column([]), column([2.0, 2.0])):
+        scale = make_scale(cloud, Colouring(quantity, equalised=equalised))
+        assert scale.limits[0] < scale.limits[1]
+        assert colour_points(cloud, scale, find_full_light(cloud)).shape == (len(cloud), 3)
+
+
+def test_palettes_grow_lighter_evenly() -> None:
+    """Perceptually uniform ones rise in lightness; turbo and the two ends of others need not."""
+    for name in set(PALETTES) - {"turbo"}:
+        light = load_palette(name) @ np.array([0.2126, 0.7152, 0.0722])
+        assert np.all(np.diff(light[::16]) > 0), name
+
+
+def test_dim_points_are_darker_where_asked_for() -> None:
+    cloud = make_cloud(np.ones((100, 3)), {"intensity": np.linspace(0, 99, 100)})
+    scale = make_scale(cloud, Colouring("range", "grey", (0.0, 1.0)))
+    shaded = colour_points(cloud, scale, find_full_light(cloud))[:, 0]
+    assert np.all(np.diff(shaded.astype(int)) >= 0)
+    assert (shaded[0], shaded[-1]) == (38, 255)  # 15 % of the light stays
+    assert colour_points(cloud, scale).min() == 255
+
+
+def test_filters_keep_what_lies_within_all_limits() -> None:
+    xyz = np.array([[0.0, 0, 1], [0, 0, 2], [1, 0, 2], [0, 0, 3]])
+    cloud = make_cloud(xyz, {"intensity": np.array([1, 2, 3, 4])})
+    for filters, kept in (
+        (Filters(), [0, 1, 2, 3]),
+        (Filters(range=(1.5, 2.1)), [1]),
+        (Filters(intensity=(2, 3)), [1, 2]),
+        (Filters(z=(2, 3), x=(-0.5, 0.5)), [1, 3]),
+        (Filters(time=(0, 7e-9)), [0]),
+    ):
+        assert np.flatnonzero(filters.select(cloud)).tolist() == kept
+    with pytest.raises(InputError, match="limits of y"):
+        Filters(y=(1, 0))
+
+
+@given(st.integers(0, 399), st.tuples(*[st.floats(-3, 3)] * 2), st.floats(-3, 1))
+def test_a_ray_at_a_point_finds_it(number: int, aside: tuple[float, float], back: float) -> None:
+    cloud, eye = plane(400), np.array([*aside, back])
+    found = find_point_on_ray(cloud.xyz, eye, cloud.xyz[number] - eye)
+    assert found is not None
+    seen, aimed = cloud.xyz[found] - eye, cloud.xyz[number] - eye
+    # Another point may lie within the reach of a click and nearer; it is never further off than
+    # that.
+    angle = np.linalg.norm(np.cross(seen, aimed)) / (np.linalg.norm(seen) * np.linalg.norm(aimed))
+    assert angle < 0.0041
+
+
+def test_the_point_in_front_is_meant_and_a_miss_means_none() -> None:
+    xyz = column([2.0, 1.0, 3.0]).xyz
+    for origin, direction, hit in (
+        ((0, 0, 0), (0, 0, 5), 1),
+        ((0, 0, 1.5), (0, 0, 1), 0),
+        ((0, 0, 4), (0, 0, 1), None),  # all are behind the eye
+        ((0, 0, 0), (0.2, 0, 1), None),
+    ):
+        assert find_point_on_ray(xyz, origin, direction) == hit
+    assert find_point_on_ray(xyz[:0], (0, 0, 0), (0, 0, 1)) is None
+
+
+def test_what_is_known_about_a_pick() -> None:
+    sigma = {"range_sigma": np.array([0.002])}
+    point = make_cloud(np.array([[0.3, 0.4, 1.2]]), sigma)
+    lines = ["x 0.3000, y 0.4000, z 1.2000 m", "range 1.3000 m ± 2 mm"]
+    assert Pick(point, (3, 4)).description.splitlines()[:2] == lines
+    assert Pick(point, (3, 4)).description.endswith("pixel row 3, column 4")
+    assert "pixel" not in Pick(point).description
+
+
+@pytest.mark.parametrize(
+    ("limits", "unit", "labels", "title"),
+    [
+        ((1.5889, 1.6848), "m", ["1.60", "1.62", "1.64", "1.66", "1.68"], "x (m)"),
+        ((0.0, 0.00042), "m", ["0.0", "0.1", "0.2", "0.3", "0.4"], "x (mm)"),
+        ((-1.0, 1.0), "", ["-1.0", "-0.5", "0.0", "0.5", "1.0"], "x"),
+        ((0.0, 61234.0), "counts", ["0", "2.0e4", "4.0e4", "6.0e4"], "x (counts)"),
+    ],
+)
+def test_ticks_are_round_numbers_in_a_suitable_unit(
+    limits: tuple[float, float], unit: str, labels: list[str], title: str
+) -> None:
+    low, high = limits
+    ticks, words = choose_ticks(Scale("x", unit, "grey", np.linspace(low, high, PALETTE_SIZE)))
+    assert ([label for _, label in ticks], words) == (labels, title)
+    # Each lies where the colours have its value.
+    factor = 1e-3 if "mm" in title else 1.0
+    expected = [factor * float(label) for label in labels]
+    assert [low + place * (high - low) for place, _ in ticks] == pytest.approx(expected)
+
+
+def test_lengths_and_instants_are_round_and_in_the_unit_that_a_person_would_use() -> None:
+    lengths = (3.86e-6, 0.00042, 0.0314, 1.853)
+    assert list(map(format_length, lengths)) == ["3.86 um", "0.42 mm", "31.4 mm", "1.85 m"]
+    times = 10.02e-9 + 20e-12 * np.arange(96)
+    assert mark_times(times) == ((24, "10.5 ns"), (49, "11 ns"), (74, "11.5 ns"))
+    assert mark_times(times[:1]) == ((0, "10.02 ns"),)
+
+
+@pytest.mark.parametrize(("longest", "bar"), [(1.0, 1.0), (0.43, 0.2), (0.0199, 0.01), (7.0, 5.0)])
+def test_a_scale_bar_is_one_two_or_five(longest: float, bar: float) -> None:
+    assert round_length_down(longest) == pytest.approx(bar)
+    width = longest / SCALE_BAR_FRACTION
+    ends = Box(np.zeros(3), np.array([width, 1.0, 2.0])).scale_bar
+    assert np.diff(ends, axis=0)[0] == pytest.approx([bar, 0, 0])
+    assert ends.mean(axis=0) == pytest.approx([width / 2, 1.0, 2.0 * SCALE_BAR_DEPTH])
+
+
+@pytest.mark.parametrize("direction", [0, 1, 2])
+def test_lengths_of_the_box_are_written_apart_from_the_scale_bar(direction: int) -> None:
+    """Seen along any axis, no two words stand within a twentieth of the box."""
+    box = Box(np.array([-1.0, -0.5, 1.5]), np.array([1.0, 0.7, 4.0]))
+    places = np.vstack([box.length_marks, box.scale_bar.mean(axis=0)])
+    seen = np.delete((places - box.low) / (box.high - box.low), direction, axis=1)
+    apart = np.linalg.norm(seen[:, np.newaxis] - seen, axis=-1)
+    assert apart[np.triu_indices(4, 1)].min() > 0.05
+
+
+def test_right_is_right_and_down_is_down() -> None:
+    ahead = Viewpoint(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.deg2rad(90.0))
+    places = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [0, 0, -1]])
+    expected = [[50, 50, 75.25, np.nan], [100, 125.25, 100, np.nan], [2, 2, 2, np.nan]]
+    np.testing.assert_allclose(ahead.project(places, (101, 201)), expected)
+    with pytest.raises(InputError, match="itself"):
+        _ = Viewpoint(np.ones(3), np.ones(3)).axes
+
+
+def find_inside(xyz: np.ndarray, framed: np.ndarray, aspect: float, floor: float = 1.0) -> Any:
+    """Which points are in the first picture of a cloud."""
+    shape = 600, round(600 * aspect)
+    row, column, _ = place_viewpoint(framed, aspect).project(xyz, shape)
+    with np.errstate(invalid="ignore"):
+        return (row > 0) & (row < floor * shape[0]) & (column > 0) & (column < shape[1])
+
+
+@given(
+    st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-0.5, 8)),
+    st.floats(0.05, 3),
+    st.floats(1.0, 2.0),
+)
+def test_a_cloud_is_seen_whole(
+    middle: tuple[float, float, float], size: float, aspect: float
+) -> None:
+    xyz = (size * np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3)) + middle).astype(np.float32)
+    # a hundredth at either end is let go
+    assert find_inside(xyz, xyz, aspect).mean() > 0.97
+    assert place_viewpoint(xyz, aspect).field_of_view <= MAX_FIELD_OF_VIEW_RAD
+
+
+@pytest.mark.parametrize("aspect", [0.6, 1.23])
+def test_an_arm_that_sticks_out_is_in_the_first_picture(aspect: float) -> None:
+    """Four points in a thousand lie beside a near square, outside of its box."""
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 60), np.linspace(-0.3, 0.3, 60))
+    arm = np.stack([np.linspace(-0.5, -0.4, 14), np.full(14, 0.3), np.full(14, 0.9)], axis=1)
+    square = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.9)], axis=1)
+    xyz = np.concatenate([square, arm]).astype(np.float32)
+    assert find_inside(xyz, xyz, aspect).all()
+
+
+@pytest.mark.parametrize("aspect", [0.6, 0.9, 1.6])
+def test_the_scale_bar_is_in_the_first_picture(aspect: float) -> None:
+    """Also of a deep cloud whose wide part is far away, so that the bar's place is the lowest."""
+    random = np.random.default_rng(0)
+    far = random.uniform((-0.5, -0.5, 3.0), (0.5, 0.5, 3.01), (400, 3))
+    near = random.uniform((-0.05, -0.05, 1.0), (0.05, 0.05, 1.01), (400, 3))
+    xyz = np.concatenate([far, near]).astype(np.float32)
+    # its length is written below
+    assert find_inside(Box.around(xyz).scale_bar, xyz, aspect, floor=0.97).all()
+
+
+def test_panes_have_a_handy_size_and_dark_holes() -> None:
+    scale = Session(PlaneSource()).frame_at(0.0).scale
+    for name, image in render_pictures(project_front(plane(4000)), scale).items():
+        assert (image.dtype, image.shape) == (np.uint8, (128, 128, 3)), name
+    of_heights = Scale("height", "m", scale.palette, scale.values)
+    empty = render_pictures(project_front(plane(40)), of_heights)["depth"]
+    assert (empty == (32, 36, 44)).all(axis=-1).mean() > 0.9
+    for shape, sides in (((1016, 1344), (339, 336)), ((32, 16), (192, 96))):
+        pane = render_pictures({"streak": np.ones(shape, np.float32)}, scale)["streak"]
+        assert pane.shape[:2] == sides
+
+
+def test_a_camera_with_few_pixels_leaves_no_seams_in_the_panes() -> None:
+    """A surface of 90 x 90 points in a picture of 128 x 128 pixels, but for a hole in it."""
+    x, y = (side.ravel() for side in np.meshgrid(*[np.linspace(-0.5, 0.5, 90)] * 2))
+    xyz = np.column_stack([x, y, np.full(x.size, 2.0)])[np.hypot(x, y) > 0.15]
+    made = project_front(make_cloud(xyz, {"intensity": np.ones(len(xyz))}))
+    radius = np.hypot(*np.meshgrid(*[np.arange(128) / 127 - 0.5] * 2))
+    inside = np.s_[2:-2, 2:-2]  # the outermost points lie outside of the percentiles
+    assert np.isfinite(made["depth"])[inside][radius[inside] > 0.17].all()
+    assert np.isnan(made["depth"])[radius < 0.12].all()
+    assert (made["intensity"][np.isfinite(made["depth"])] == 1).all()
+
+
+def test_frames_of_the_last_two_seconds_count_and_large_clouds_are_sent_less_often() -> None:
+    pace = FramePacer()
+    pace.record_sent(1.0, 100)
+    assert (pace.can_send(1.02), pace.can_send(1.04)) == (False, True)
+    pace.record_sent(2.0, 1_000_000)
+    assert (pace.can_send(2.4), pace.can_send(2.5)) == (False, True)
+    assert [pace.per_second(now) for now in (2.5, 3.5, 4.5)] == [1.0, 0.5, 0.0]
+
+
+def test_the_slowest_browser_decides_how_many_points_are_drawn() -> None:
+    detail = DetailChooser()
+    assert detail.count(2_000_000, moving=False) == MIN_DRAWN_POINTS  # nothing is known yet
+    assert detail.count(100, moving=True) == 100
+    detail.points_per_s[1] = 50e6
+    assert detail.count(2_000_000, moving=True) == 2_000_000
+    detail.points_per_s[2] = 1e6
+    assert detail.count(2_000_000, moving=False) == 500_000  # in half a second
+    assert detail.count(2_000_000, moving=True) == 80_000
+    detail.points_per_s[2] = 100.0
+    assert detail.count(2_000_000, moving=True) == MIN_DRAWN_POINTS
+
+
+@pytest.mark.parametrize(
+    ("drawn", "rate", "worthwhile"),
+    [
+        (15_000, 1e6, True),  # half a million could be
+        (500_000, 1e6, False),
+        (500_000, 1.2e6, False),
+        (500_000, 2e6, True),
+        (500_000, 0.4e6, True),
+        (1_800_000, 1e7, True),  # all of them could
+        (2_000_000, 1e7, False),
+    ],
+)
+def test_a_cloud_is_sent_again_for_clearly_more_or_fewer_points(
+    drawn: int, rate: float, worthwhile: bool
+) -> None:
+    assert DetailChooser({1: rate}).is_worthwhile(drawn, 2_000_000) == worthwhile
+
+
+def test_a_large_cloud_is_thinned_while_frames_pass() -> None:
+    session = Session(PlaneSource(points=4000))
+    session.max_playing_points = 500
+    assert len(session.frame_at(0.0).cloud) == 4000
+    session.clock.play()
+    playing = session.frame_at(0.1)
+    # drawn by lot with replacement: of 500 about 30 meet another one
+    assert 440 < len(playing.cloud) <= 500
+    assert playing.points == 4000
+    whole = session.source.view(playing.frame).cloud.xyz
+    assert set(map(tuple, playing.cloud.xyz.tolist())) <= set(map(tuple, whole.tolist()))
+    assert np.allclose(playing.cloud.xyz.mean(axis=0), whole.mean(axis=0), atol=0.06)
+    session.clock.pause()
+    assert session.frame_at(0.2).points == len(session.frame_at(0.2).cloud) == 4000
