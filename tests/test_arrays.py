@@ -1,6 +1,17 @@
-"""Arrays of other libraries: recognised, fetched, put back, refused."""
+"""Arrays of other libraries: recognised, fetched, put back, refused; and nothing hides on the
+processor.
 
-import array_api_strict
+The second half works on a device of array-api-strict that mixes with no other and gives NumPy
+nothing. So would a graphics processor: whatever stays behind on the processor, or is fetched in
+passing, ends in an error. What is fetched on purpose is counted.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -19,186 +30,267 @@ from tofclip.arrays import (
     to_numpy,
     zeros,
 )
+from tofclip.camera import Camera
 from tofclip.errors import InputError, MissingDependencyError
+from tofclip.lidar import Detection, depth, pulse_tables
+from tofclip.operators import (
+    BlockDiagonal,
+    Diagonal,
+    Integration,
+    LineProjection,
+    Reshape,
+    Stack,
+)
+from tofclip.shots import Frames
+from tofclip.solvers import (
+    Backprojection,
+    Huber,
+    LinearInverse,
+    Poisson,
+    Sparse,
+    TotalVariation,
+    relative_residual,
+)
 
+strict = pytest.importorskip("array_api_strict")
+HERE = strict.Device("CPU_DEVICE")
 VALUES = np.arange(6, dtype=np.float32).reshape(2, 3)
-STRICT = ComputeDevice("array_api_strict", array_api_strict.Device("CPU_DEVICE"))
 
 
-def torch_cpu():
+@pytest.fixture(params=["array_api_strict", "torch"])
+def device(request):
+    if request.param == "array_api_strict":
+        return ComputeDevice("array_api_strict", HERE)
     pytest.importorskip("torch", reason="PyTorch is optional")
     return parse_device("torch:cpu")
 
 
-@pytest.fixture(params=[lambda: STRICT, torch_cpu], ids=["array-api-strict", "torch"])
-def device(request):
-    return request.param()
+class TestDevice:
+    def test_there_and_back(self, device):
+        there = device.put(VALUES)
+        assert not is_numpy(there)
+        assert device.put(there) is there  # what is there already is not copied
+        assert ComputeDevice.of(there) == device
+        assert not device.has_compiled_loops
+        back = to_numpy(there)
+        assert back.dtype == VALUES.dtype
+        np.testing.assert_array_equal(back, VALUES)
+        for odd in (VALUES[::-1], VALUES.T, np.broadcast_to(VALUES[0], (4, 3))):
+            np.testing.assert_array_equal(to_numpy(device.put(odd)), odd)
+        sums = to_numpy(namespace(there).sum(there, axis=0))
+        np.testing.assert_allclose(sums, VALUES.sum(axis=0))
+
+    def test_values_beyond_a_limit_are_replaced_by_it(self, device):
+        values = np.array([-2.0, 0.5, 3.0], np.float32)
+        for limits in ((0.0, 1.0), (0.0, None), (None, 1.0)):
+            found = to_numpy(clip_values(device.put(values), *limits))
+            np.testing.assert_array_equal(found, np.clip(values, *limits))
+            assert found.dtype == np.float32
+        assert type(clip_values(values, 0.0)) is np.ndarray
+
+    def test_numpy_is_the_place_of_numpys_arrays_lists_and_numbers(self, device):
+        assert all(is_numpy(values) for values in (VALUES, VALUES[0, 0], [1.0, 2.0], 3))
+        assert ComputeDevice.of(VALUES) == ComputeDevice() == parse_device("cpu")
+        assert ComputeDevice().put(VALUES) is VALUES
+        np.testing.assert_array_equal(ComputeDevice().put(device.put(VALUES)), VALUES)
+        assert ComputeDevice().has_compiled_loops
+
+    def test_libraries_do_not_mix_and_compiled_loops_refuse_what_is_not_numpys(self, device):
+        with pytest.raises(InputError, match=r"numpy.* do not work together"):
+            namespace(device.put(VALUES), VALUES)
+        require_numpy("the search", VALUES, [1.0])
+        with pytest.raises(InputError, match="the search works on NumPy arrays, not on"):
+            require_numpy("the search", VALUES, device.put(VALUES))
+
+    def test_types_are_changed_where_the_array_is(self, device):
+        there = device.put(VALUES)
+        assert as_type(there, np.float32) is there
+        double = as_type(there, np.float64)
+        assert ComputeDevice.of(double) == device
+        assert to_numpy(double).dtype == np.float64
+        np.testing.assert_array_equal(to_numpy(double), VALUES)
+        turned = as_type(VALUES.T, np.float64)
+        assert turned.flags.c_contiguous
+        np.testing.assert_array_equal(turned, VALUES.T)
+
+    def test_zeros_and_numbers_are_like_what_they_are_for(self, device):
+        for like in (VALUES, device.put(VALUES)):
+            nothing, number = zeros((2, 1), like), scalar_like(1.5, like)
+            assert ComputeDevice.of(nothing) == ComputeDevice.of(like)
+            assert to_numpy(nothing).dtype == to_numpy(number).dtype == VALUES.dtype
+            np.testing.assert_array_equal(to_numpy(nothing), [[0], [0]])
+            assert ComputeDevice.of(number).library == ComputeDevice.of(like).library
+            least = to_numpy(namespace(like).minimum(like, number))
+            np.testing.assert_array_equal(least, np.minimum(VALUES, 1.5))
+
+    def test_what_is_set_up_in_a_place_is_set_up_once(self, device):
+        asked = []
+        copies = PerDevice(lambda where: asked.append(where) or where.put(VALUES))
+        for array in (device.put(VALUES), VALUES, device.put(VALUES[0])):
+            assert ComputeDevice.of(copies.get(array)) == ComputeDevice.of(array)
+        assert asked == [device, ComputeDevice()]
+
+    def test_a_place_says_where_it_is(self, device):
+        assert str(ComputeDevice()) == "cpu"
+        assert str(device).startswith(f"{device.library}:")
+        with device.activate():
+            assert ComputeDevice.of(device.put(VALUES)) == device
+
+    def test_cupy_works_on_its_current_device(self):
+        """No CuPy here: something else that is entered and left, as its devices are, stands in for
+        one.
+        """
+        entered = []
+
+        class Device:
+            id = 1
+
+            def __enter__(self):
+                entered.append(self.id)
+
+            def __exit__(self, *_):
+                entered.append(-self.id)
+
+        device = ComputeDevice("cupy", Device())
+        assert str(device) == "cupy:1"
+        with device.activate():
+            assert entered == [1]
+        assert entered == [1, -1]
+
+    def test_a_tensor_with_a_gradient(self):
+        torch = pytest.importorskip("torch", reason="PyTorch is optional")
+        np.testing.assert_array_equal(to_numpy(torch.ones(3, requires_grad=True) * 2), [2, 2, 2])
+
+    def test_names_of_devices(self, monkeypatch):
+        monkeypatch.setattr(arrays, "GRAPHICS_LIBRARIES", ("a_library_that_nobody_has",))
+        assert parse_device("auto") == ComputeDevice()
+        for name in ("gpu", "cuda:", "cuda:one", "torch", "", "numpy:cpu"):
+            with pytest.raises(InputError, match="is not a device"):
+                parse_device(name)
+        pytest.importorskip("torch", reason="PyTorch is optional")
+        for name in ("cuda", "cuda:1", "torch:cuda:99", "torch:nonsense"):
+            with pytest.raises(MissingDependencyError, match='use `device="cpu"`'):
+                parse_device(name)
+
+    @pytest.mark.parametrize("shape", [(3, 5), (1000, 17), (1,)])
+    def test_aligned_arrays_begin_a_cache_line(self, shape):
+        for dtype in (np.float32, np.float64):
+            made = [empty_aligned(shape, dtype) for _ in range(5)]
+            assert all(one.ctypes.data % 64 == 0 for one in made)
+            assert all(one.shape == shape and one.dtype == dtype for one in made)
+            assert all(one.flags.c_contiguous and one.flags.writeable for one in made)
 
 
-def test_lists_and_numbers_are_numpys():
-    assert all(is_numpy(values) for values in (VALUES, VALUES[0, 0], [1.0, 2.0], 3))
+OTHER_DEVICE = ComputeDevice("array_api_strict", strict.Device("device1"))
+ANGLES = np.deg2rad([-38.0, -20.0, 2.0, 21.0, 40.0])
+CENTRES = np.linspace(20.0, 100.0, 5)
+PROJECTION = LineProjection((16, 15), 120, CENTRES, ANGLES, np.ones(5))
+FRAMES, ITERATIONS = 4, 20
+# Numbers that a solver fetches, of each frame: the peak of A'f, by which a weight is relative; the
+# peak of the data term's gradient, where that is not least squares, by which dark frames are known;
+# and the term's value for a picture of nothing. Then the objective before and after each iteration,
+# all frames together.
+LEAST_SQUARES = [FRAMES, FRAMES, ITERATIONS + 1]
+OTHER_TERM = [FRAMES, *LEAST_SQUARES]
+POISSON = partial(Poisson, deviation=np.full(120, 1.0))
 
 
-def test_there_and_back(device):
-    there = device.put(VALUES)
-    assert not is_numpy(there)
-    assert ComputeDevice.of(there) == device
-    assert not device.has_compiled_loops
-    back = to_numpy(there)
-    assert back.dtype == VALUES.dtype
-    np.testing.assert_array_equal(back, VALUES)
+def brought_here(array):
+    return np.asarray(array.to_device(HERE))
 
 
-@pytest.mark.parametrize("values", [VALUES[::-1], VALUES.T, np.broadcast_to(VALUES[0], (4, 3))])
-def test_values_that_lie_oddly_in_memory(device, values):
-    np.testing.assert_array_equal(to_numpy(device.put(values)), values)
+class TestOtherDevice:
+    @pytest.fixture(autouse=True)
+    def fetched(self, monkeypatch):
+        """Sizes of what is fetched on purpose."""
+        sizes = []
 
+        def fetch(array):
+            if isinstance(array, np.ndarray):
+                return array
+            sizes.append(array.size)
+            return brought_here(array)
 
-def test_what_is_there_already_is_not_copied(device):
-    there = device.put(VALUES)
-    assert device.put(there) is there
+        for name, module in list(sys.modules.items()):
+            if name.startswith("tofclip.") and getattr(module, "to_numpy", None) is to_numpy:
+                monkeypatch.setattr(module, "to_numpy", fetch)
+        return sizes
 
+    def test_it_is_as_strict_as_it_is_meant_to_be(self):
+        there = OTHER_DEVICE.put(np.ones(3, np.float32))
+        with pytest.raises(ValueError, match="different devices"):
+            _ = there + strict.ones(3, dtype=strict.float32)
+        with pytest.raises(RuntimeError, match="convert array on the 'array_api_strict"):
+            np.asarray(there)
 
-def test_the_functions_of_the_standard(device):
-    there = device.put(VALUES)
-    np.testing.assert_allclose(to_numpy(namespace(there).sum(there, axis=0)), VALUES.sum(axis=0))
+    @pytest.mark.parametrize(
+        "operator",
+        [
+            PROJECTION,
+            Diagonal(np.linspace(0, 2, 120)) @ PROJECTION,
+            Stack([PROJECTION, PROJECTION]),
+            BlockDiagonal([PROJECTION, PROJECTION]),
+            Integration([PROJECTION, PROJECTION]),
+            Reshape((120,), (10, 12)) @ PROJECTION,
+            PROJECTION.H,
+        ],
+        ids=lambda operator: type(operator).__name__,
+    )
+    def test_operators(self, operator, fetched):
+        random = np.random.default_rng(1)
+        for apply, shape in ((operator, operator.shape_in), (operator.adjoint, operator.shape_out)):
+            operand = random.random((*shape, 3), np.float32)
+            there = apply(OTHER_DEVICE.put(operand))
+            np.testing.assert_allclose(brought_here(there), apply(operand), rtol=1e-4)
+        assert fetched == []
 
+    @pytest.mark.parametrize(
+        ("method", "fetches"),
+        [
+            (Sparse(iterations=ITERATIONS), LEAST_SQUARES),
+            (TotalVariation(iterations=ITERATIONS, tolerance=1e-9), LEAST_SQUARES),
+            (
+                Sparse(iterations=ITERATIONS, data_term=partial(Huber, threshold=5.0)),
+                OTHER_TERM,
+            ),
+            (TotalVariation(iterations=ITERATIONS, data_term=POISSON), OTHER_TERM),
+            (LinearInverse(), [120]),  # which measurements are dead, before it is prepared
+            (Backprojection(), []),
+        ],
+    )
+    def test_recovery(self, method, fetches, fetched):
+        """A few numbers for each frame are fetched, whatever its size, and nothing in an
+        iteration.
+        """
+        random, square = np.random.default_rng(5), np.zeros((16, 15, 1))
+        square[4:11, 5:10] = 100
+        light = PROJECTION(square * random.uniform(0.5, 1, FRAMES))
+        noisy = light + random.normal(0, 2, (120, FRAMES))
+        measurements = np.maximum(noisy, 0).astype(np.float32)
+        valid = random.random((120, FRAMES)) > 0.03
+        expected = method.recover(PROJECTION, measurements, valid).frames
+        there = OTHER_DEVICE.put(measurements), OTHER_DEVICE.put(valid)
+        frames = method.recover(PROJECTION, *there).frames
+        assert fetched == fetches
+        assert np.linalg.norm(brought_here(frames) - expected) < 1e-4 * np.linalg.norm(expected)
+        residual = relative_residual(PROJECTION, expected, measurements, valid)
+        found = relative_residual(PROJECTION, frames, *there)
+        assert found == pytest.approx(residual, rel=1e-4)
 
-def test_values_beyond_a_limit_are_replaced_by_it(device):
-    values = np.array([-2.0, 0.5, 3.0], np.float32)
-    there = device.put(values)
-    for limits, expected in (
-        ((0.0, 1.0), [0.0, 0.5, 1.0]),
-        ((0.0, None), [0.0, 0.5, 3.0]),
-        ((None, 1.0), [-2.0, 0.5, 1.0]),
-    ):
-        found = to_numpy(clip_values(there, *limits))
-        np.testing.assert_array_equal(found, expected)
-        assert found.dtype == np.float32
-    assert type(clip_values(values, 0.0)) is np.ndarray
-
-
-def test_numpy_is_the_place_of_numpys_arrays(device):
-    assert ComputeDevice.of(VALUES) == ComputeDevice() == parse_device("cpu")
-    assert ComputeDevice().put(VALUES) is VALUES
-    np.testing.assert_array_equal(ComputeDevice().put(device.put(VALUES)), VALUES)
-    assert ComputeDevice().has_compiled_loops
-
-
-def test_libraries_do_not_mix(device):
-    with pytest.raises(InputError, match=r"numpy.* do not work together"):
-        namespace(device.put(VALUES), VALUES)
-
-
-def test_compiled_loops_refuse_what_is_not_numpys(device):
-    require_numpy("the search", VALUES, [1.0])
-    with pytest.raises(InputError, match="the search works on NumPy arrays, not on"):
-        require_numpy("the search", VALUES, device.put(VALUES))
-
-
-def test_types_are_changed_where_the_array_is(device):
-    there = device.put(VALUES)
-    assert as_type(there, np.float32) is there
-    double = as_type(there, np.float64)
-    assert ComputeDevice.of(double) == device
-    assert to_numpy(double).dtype == np.float64
-    np.testing.assert_array_equal(to_numpy(double), VALUES)
-
-
-def test_numpys_are_made_contiguous_with_their_type():
-    changed = as_type(VALUES.T, np.float64)
-    assert changed.flags.c_contiguous
-    np.testing.assert_array_equal(changed, VALUES.T)
-
-
-def test_zeros_are_like_what_they_are_for(device):
-    for like in (VALUES, device.put(VALUES)):
-        nothing = zeros((2, 1), like)
-        assert ComputeDevice.of(nothing) == ComputeDevice.of(like)
-        assert to_numpy(nothing).dtype == VALUES.dtype
-        np.testing.assert_array_equal(to_numpy(nothing), [[0], [0]])
-
-
-def test_numbers_are_like_what_they_are_for(device):
-    for like in (VALUES, device.put(VALUES)):
-        there = scalar_like(1.5, like)
-        assert ComputeDevice.of(there).library == ComputeDevice.of(like).library
-        assert (to_numpy(there).dtype, float(there)) == (VALUES.dtype, 1.5)
-        np.testing.assert_array_equal(
-            to_numpy(namespace(like).minimum(like, there)), np.minimum(VALUES, 1.5)
-        )
-
-
-def test_what_is_set_up_in_a_place_is_set_up_once(device):
-    asked = []
-    copies = PerDevice(lambda where: asked.append(where) or where.put(VALUES))
-    for array in (device.put(VALUES), VALUES, device.put(VALUES[0])):
-        assert ComputeDevice.of(copies.get(array)) == ComputeDevice.of(array)
-    assert asked == [device, ComputeDevice()]
-
-
-def test_a_place_says_where_it_is(device):
-    assert str(ComputeDevice()) == "cpu"
-    assert str(device).startswith(f"{device.library}:")
-    with device.activate():
-        assert ComputeDevice.of(device.put(VALUES)) == device
-
-
-def test_cupy_works_on_its_current_device():
-    """No CuPy here: something else that is entered and left, as its devices are, stands in for one."""
-    entered = []
-
-    class Device:
-        id = 1
-
-        def __enter__(self):
-            entered.append(self.id)
-
-        def __exit__(self, *_):
-            entered.append(-self.id)
-
-    device = ComputeDevice("cupy", Device())
-    assert str(device) == "cupy:1"
-    with device.activate():
-        assert entered == [1]
-    assert entered == [1, -1]
-
-
-def test_a_tensor_with_a_gradient():
-    torch = pytest.importorskip("torch", reason="PyTorch is optional")
-    np.testing.assert_array_equal(to_numpy(torch.ones(3, requires_grad=True) * 2), [2, 2, 2])
-
-
-@pytest.fixture
-def no_graphics(monkeypatch):
-    monkeypatch.setattr(arrays, "GRAPHICS_LIBRARIES", ("a_library_that_nobody_has",))
-
-
-@pytest.mark.usefixtures("no_graphics")
-def test_without_a_graphics_processor():
-    assert parse_device("auto") == ComputeDevice()
-    for name in ("cuda", "cuda:1"):
-        with pytest.raises(MissingDependencyError, match='use `device="cpu"`'):
-            parse_device(name)
-
-
-@pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:one", "torch", "", "numpy:cpu"])
-def test_names_that_are_no_device(name):
-    with pytest.raises(InputError, match="is not a device"):
-        parse_device(name)
-
-
-def test_a_device_that_pytorch_does_not_have():
-    pytest.importorskip("torch", reason="PyTorch is optional")
-    for name in ("cuda:99", "nonsense"):
-        with pytest.raises(MissingDependencyError, match='use `device="cpu"`'):
-            parse_device(f"torch:{name}")
-
-
-@pytest.mark.parametrize("shape", [(3, 5), (1000, 17), (1,)])
-def test_aligned_arrays_begin_a_cache_line(shape):
-    for dtype in (np.float32, np.float64):
-        made = [empty_aligned(shape, dtype) for _ in range(5)]
-        assert all(one.ctypes.data % 64 == 0 for one in made)
-        assert all(one.shape == shape and one.dtype == dtype for one in made)
-        assert all(one.flags.c_contiguous and one.flags.writeable for one in made)
+    def test_the_search_for_returns(self, monkeypatch):
+        """Frames are fetched on purpose, and the same returns found."""
+        random = np.random.default_rng(2)
+        times = 10e-9 + 20e-12 * np.arange(90)
+        arrival = random.uniform(times[5], times[-5], (2, 12, 9))
+        pulses = np.exp(-4 * np.log(2) * ((times[:, None, None, None] - arrival) / 60e-12) ** 2)
+        values = (300 * pulses).sum(axis=1) + random.normal(5, 2, (90, 12, 9))
+        camera = Camera(CENTRES, ANGLES, (12, 9), 120, pulse_fwhm=60e-12)
+        frames = Frames(values.astype(np.float32), times, camera)
+        detection = Detection(min_scene_fraction=0, min_time_bin_fraction=0)
+        expected = depth(frames, detection=detection)
+        assert len(expected) > 108
+        monkeypatch.setattr(pulse_tables, "to_numpy", brought_here)
+        there = replace(frames, values=OTHER_DEVICE.put(frames.values))
+        found = depth(there, detection=detection)
+        np.testing.assert_array_equal([found.y, found.x], [expected.y, expected.x])
+        np.testing.assert_array_equal(found.time, expected.time)

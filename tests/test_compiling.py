@@ -1,4 +1,6 @@
-"""Parts of compiled loops, hearing of the compiler's work, and runs that cannot keep it."""
+"""Parts of compiled loops and their vectors, hearing of the compiler's work, and runs that cannot
+keep it.
+"""
 
 from __future__ import annotations
 
@@ -7,120 +9,199 @@ import logging
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numba import njit
 
 from apps import cli
+from tofclip import vectors
 from tofclip.compiling import compile_as_part
+from tofclip.vectors import (
+    choose,
+    copy_transposed,
+    count_set_lanes,
+    fill_vector,
+    find_first_bit,
+    find_highest_lane,
+    list_set_lanes,
+    load_vector,
+    number_lanes,
+    raise_vector,
+    store_vector,
+    sum_vector,
+)
 
 
-def test_a_part_runs_from_python_and_from_a_compiled_loop(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_part_runs_from_python_and_from_a_compiled_loop(caplog):
     @compile_as_part(fastmath=True)
-    def halve(number):  # type: ignore[no-untyped-def]
+    def halve(number):
         return number / 2
 
     @numba.njit(error_model="python")
-    def quarter(number):  # type: ignore[no-untyped-def]
+    def quarter(number):
         return halve(halve(number))
 
     caplog.set_level(logging.INFO, "tofclip.compiling")
     assert (halve(3.0), caplog.messages) == (1.5, [])
-    assert quarter(3.0) == 0.75
-    assert caplog.messages == ["quarter", "halve"]
-    assert quarter(5.0) == 1.25
-    assert caplog.messages == ["quarter", "halve"]
+    for number in (3.0, 5.0):
+        assert quarter(number) == number / 4
+        assert caplog.messages == ["quarter", "halve"]
 
 
-class Terminal(io.StringIO):
-    """What is printed, as on a terminal or not."""
-
-    def __init__(self, terminal: bool) -> None:
-        super().__init__()
-        self.terminal = terminal
-
-    def isatty(self) -> bool:
-        return self.terminal
-
-
-@pytest.mark.parametrize("terminal", [True, False])
-def test_the_program_announces_compiling_in_one_line_on_a_terminal_only(
-    terminal: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def run(words: list[str], **options: object) -> int:
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_the_program_announces_compiling_in_one_line_on_a_terminal_only(is_terminal, monkeypatch):
+    def run(words, **options):
         double = compile_as_part()(lambda number: 2 * number)
 
         @numba.njit
-        def quadruple(number):  # type: ignore[no-untyped-def]
+        def quadruple(number):
             return double(double(number))
 
         @numba.njit
-        def add_one(number):  # type: ignore[no-untyped-def]
+        def add_one(number):
             return number + 1
 
         return int(add_one(quadruple(2))) - 9
 
-    printed = Terminal(terminal)
+    printed = io.StringIO()
+    printed.isatty = lambda: is_terminal
     monkeypatch.setattr(cli, "app", run)
     monkeypatch.setattr(sys, "stderr", printed)
     assert cli.main([]) == 0
     said = printed.getvalue()
-    assert said.count("compiling loops for this processor, once") == (1 if terminal else 0)
-    assert said.count("\n") == (1 if terminal else 0)
+    assert said.count("compiling loops for this processor, once") == int(is_terminal)
+    assert said.count("\n") == int(is_terminal)
 
 
-def simulate(home: Path, cache: Path | str, *first: str) -> subprocess.CompletedProcess[str]:
-    """Compile and run a loop by the program, in a process without other places for the cache."""
-    code = "import sys; " + "; ".join(first) + CALL_A_VERB
-    places = {"HOME": str(home), "XDG_CACHE_HOME": str(home), "NUMBA_CACHE_DIR": str(cache)}
-    return subprocess.run(
-        [sys.executable, "-c", code, str(home.parent / "made.h5")],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **places},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
-CALL_A_VERB = """
+class TestCache:
+    CALL_A_VERB = """
 from apps.cli import main
 words = "nlos simulate --letters T --facet-mm 200 --wall-points 4 --bin-width-ps 32 --json"
 sys.exit(main([*words.split(), "--out", sys.argv[1]]))
 """
-NOT_KEPT = "tofclip: warning: compiled loops cannot be kept, so every run compiles them again"
+
+    def simulate(self, home, cache, *first: str) -> list[str]:
+        """Compile and run a loop by the program, in a process without other places for the cache;
+        return the lines that it says.
+        """
+        made = home.parent / "made.h5"
+        code = "import sys; " + "; ".join(first) + self.CALL_A_VERB
+        places = {"HOME": str(home), "XDG_CACHE_HOME": str(home), "NUMBA_CACHE_DIR": str(cache)}
+        done = subprocess.run(
+            [sys.executable, "-c", code, str(made)],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **places},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0
+        assert made.is_file()
+        return done.stderr.splitlines()
+
+    def assert_not_kept(self, said: list[str]) -> None:
+        (line,) = said
+        warning = "compiled loops cannot be kept, so every run compiles them again"
+        assert line.startswith(f"tofclip: warning: {warning}")
+        assert "NUMBA_CACHE_DIR" in line
+
+    def test_without_a_place_for_compiled_loops_they_are_compiled_for_the_run(self, tmp_path):
+        """As in an installation that is read-only, for a user without a home."""
+        (tmp_path / "file").touch()  # a folder below it cannot be made by anybody
+        forbid = "from numba.core.caching import InTreeCacheLocator as place"
+        nowhere = "place.get_cache_path = lambda _: '/dev/null/cache'"
+        below = tmp_path / "file" / "cache"
+        self.assert_not_kept(self.simulate(tmp_path / "file", below, forbid, nowhere))
+
+    def test_a_full_disk_of_the_cache_keeps_no_result(self, tmp_path):
+        fill = "from numba.core.caching import IndexDataCacheFile as file"
+        full = "file._save_data = lambda *_: open('/dev/full', 'w', 1).write('loop\\n')"
+        self.assert_not_kept(self.simulate(tmp_path / "home", tmp_path / "cache", fill, full))
+
+    def test_a_damaged_cache_is_passed_over(self, tmp_path):
+        assert self.simulate(tmp_path / "home", tmp_path) == []
+        kept = list(tmp_path.rglob("*.nb[ic]"))
+        assert kept
+        for file in kept:
+            file.write_bytes(b"")
+        self.assert_not_kept(self.simulate(tmp_path / "home", tmp_path))
 
 
-def test_without_a_place_for_compiled_loops_they_are_compiled_for_the_run(tmp_path: Path) -> None:
-    """As in an installation that is read-only, for a user without a home."""
-    (tmp_path / "file").touch()  # a folder below it cannot be made by anybody
-    forbid = "from numba.core.caching import InTreeCacheLocator as place"
-    nowhere = "place.get_cache_path = lambda _: '/dev/null/cache'"
-    done = simulate(tmp_path / "file", tmp_path / "file" / "cache", forbid, nowhere)
-    assert done.returncode == 0
-    assert (tmp_path / "made.h5").is_file()
-    (line,) = done.stderr.splitlines()
-    assert line.startswith(NOT_KEPT)
-    assert "NUMBA_CACHE_DIR" in line
+# Vectors in compiled loops do what NumPy does with sixteen numbers: whole ones, of which float32
+# sums are exact in any order.
+floats = arrays(np.float32, vectors.LENGTH, elements=st.integers(-1000, 1000).map(np.float32))
 
 
-def test_a_full_disk_of_the_cache_keeps_no_result(tmp_path: Path) -> None:
-    fill = "from numba.core.caching import IndexDataCacheFile as file"
-    full = "file._save_data = lambda *_: open('/dev/full', 'w', 1).write('loop\\n')"
-    done = simulate(tmp_path / "home", tmp_path / "cache", fill, full)
-    assert (done.returncode, done.stderr.count("\n")) == (0, 1)
-    assert done.stderr.startswith(NOT_KEPT)
-    assert (tmp_path / "made.h5").is_file()
+@njit
+def _combine(one, other, results):
+    a, b = load_vector(one, np.uintp(0)), load_vector(other, np.uintp(0))
+    store_vector(results[0], np.uintp(0), a + b)
+    store_vector(results[1], np.uintp(0), a - b)
+    store_vector(results[2], np.uintp(0), a * b)
+    store_vector(results[3], np.uintp(0), choose((a > b) & (b >= fill_vector(one[3])), a, b))
+    store_vector(results[4], np.uintp(0), raise_vector(a, b))
+    return sum_vector(a), find_highest_lane(b), list_set_lanes(a >= b), count_set_lanes(a >= b)
 
 
-def test_a_damaged_cache_is_passed_over(tmp_path: Path) -> None:
-    assert simulate(tmp_path / "home", tmp_path).stderr == ""
-    kept = list(tmp_path.rglob("*.nb[ic]"))
-    assert kept
-    for file in kept:
-        file.write_bytes(b"")
-    done = simulate(tmp_path / "home", tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (0, 1)
-    assert done.stderr.startswith(NOT_KEPT)
+@given(floats, floats)
+def test_arithmetic_and_choice(one, other):
+    results = np.empty((5, vectors.LENGTH), np.float32)
+    total, highest, bits, number = _combine(one, other, results)
+    chosen = np.where((one > other) & (other >= one[3]), one, other)
+    expected = [one + other, one - other, one * other, chosen, np.maximum(one, other)]
+    np.testing.assert_array_equal(results, expected)
+    assert (total, highest, number) == (one.sum(), other.max(), (one >= other).sum())
+    assert int(bits) == sum(1 << k for k in np.flatnonzero(one >= other).tolist())
+
+
+@njit
+def _find_bit(word):
+    return find_first_bit(word)
+
+
+@given(st.integers(1, 2**64 - 1))
+def test_bits(word):
+    first = _find_bit(np.uint64(word))
+    assert word % (2 << int(first)) == 1 << int(first)
+
+
+@njit
+def _find_highest_number(numbers):
+    return find_highest_lane(load_vector(numbers, np.uintp(0)))
+
+
+@given(arrays(np.int32, vectors.LENGTH))
+def test_the_highest_whole_number(numbers):
+    assert _find_highest_number(numbers) == numbers.max()
+
+
+@njit
+def _copy_shifted(values, start, numbers):
+    store_vector(numbers, np.uintp(0), number_lanes())
+    store_vector(values, np.uintp(0), load_vector(values, np.uintp(start)))
+
+
+def test_vectors_begin_anywhere():
+    values, numbers = np.arange(40, dtype=np.float32), np.empty(16, np.int32)
+    _copy_shifted(values, 21, numbers)
+    np.testing.assert_array_equal(values, [*range(21, 37), *range(16, 40)])
+    np.testing.assert_array_equal(numbers, np.arange(16))
+
+
+@njit
+def _transpose(source, stride, target, step):
+    copy_transposed(source, np.uintp(3), stride, target, np.uintp(5), step)
+
+
+def test_sixteen_vectors_become_sixteen_others():
+    source = np.arange(3 + 16 * 20, dtype=np.float32)
+    target = np.full(5 + 16 * 19, -1, np.float32)
+    _transpose(source, np.uintp(20), target, np.uintp(19))
+    written = target[5:].reshape(16, 19)
+    np.testing.assert_array_equal(written[:, :16], source[3:].reshape(16, 20)[:, :16].T)
+    assert np.all(target[:5] == -1)
+    assert np.all(written[:, 16:] == -1)

@@ -47,91 +47,92 @@ CHOSEN = "chosen: no study compares it with others"
 
 PROXIMAL = {"tolerance": 0.0, "data_term": LeastSquares, "gap": 1e-3, "further": 0}
 PROXIMAL |= {"noise_fall": 0.0}
-DEFAULTS: list[tuple[Any, str, dict[str, Any]]] = [
-    # recovery of frames and surfaces
-    (LinearInverse, LINEAR, {"damping": 1e-2}),
-    (Sparse, FISTA, {"weight": 2e-3, "iterations": 40, **PROXIMAL}),
-    (TotalVariation, FISTA, {"weight": 1e-3, "iterations": 60, **PROXIMAL}),
-    (Wavelets, CHOSEN, {"weight": 2e-3, "iterations": 60, **PROXIMAL}),
-    (
-        LightFieldVariation,
-        REFOCUS,
-        {"weight": 1e-2, "iterations": 200, "grid": (1, 1), "angular": 0.5, **PROXIMAL},
-    ),
-    (
-        PlugAndPlay,
-        "its docstring",
-        {"denoiser": CollaborativeWiener(), "calls": 8, "strength": 0.12, "coupling": 0.1},
-    ),
-    (
-        RegularisationByDenoising,
-        CHOSEN,
-        {"denoiser": CollaborativeWiener(), "calls": 8, "strength": 0.08, "coupling": 0.3},
-    ),
-    (NonlocalMeans, CHOSEN, {"patch_px": 5, "reach_px": 10, "filtering": 0.6}),
-    (CollaborativeWiener, CHOSEN, {"patch_px": 6, "stride_px": 3, "reach_px": 10, "group": 40}),
-    (
-        SurfaceRecovery,
-        SURFACES,
-        {"weight": 2.0, "iterations": 60, "start": Sparse(), "detection": Detection()},
-    ),
-    (DepthLockedFocus, SHEARS, {"tolerance_px": 0.25}),
-    (FixedFocus, SHEARS, {"shear": 0.0}),
-    # what counts as a return
-    (
-        Detection,
-        RANGES,
-        {
+WIENER = CollaborativeWiener()
+DEFAULTS: dict[str, dict[Any, dict[str, Any]]] = {
+    FISTA: {
+        Sparse: {"weight": 2e-3, "iterations": 40, **PROXIMAL},
+        TotalVariation: {"weight": 1e-3, "iterations": 60, **PROXIMAL},
+    },
+    LINEAR: {LinearInverse: {"damping": 1e-2}},
+    RANGES: {
+        Detection: {
             "signal_to_noise": 5.0,
             "min_scene_fraction": 0.05,
             "min_time_bin_fraction": 0.12,
             "min_pixel_fraction": 0.2,
             "max_returns": 4,
+        }
+    },
+    SURFACES: {
+        SurfaceRecovery: {
+            "weight": 2.0,
+            "iterations": 60,
+            "start": Sparse(),
+            "detection": Detection(),
+        }
+    },
+    SHEARS: {DepthLockedFocus: {"tolerance_px": 0.25}, FixedFocus: {"shear": 0.0}},
+    REFOCUS: {
+        LightFieldVariation: {
+            "weight": 1e-2,
+            "iterations": 200,
+            "grid": (1, 1),
+            "angular": 0.5,
+            **PROXIMAL,
+        }
+    },
+    "its docstring": {
+        PlugAndPlay: {"denoiser": WIENER, "calls": 8, "strength": 0.12, "coupling": 0.1}
+    },
+    HIDDEN: {
+        nlos.Backprojection: {"cycles": 3.0, "weighting": Weighting(1.0, 0.0)},
+        nlos.FilteredBackprojection: {"sigma": 0.02, "weighting": Weighting(0.0, 0.0)},
+        nlos.LightCone: {"signal_to_noise": 0.8, "falloff": 4.0},
+        nlos.FKMigration: {"falloff": 4.0},
+    },
+    BUYS: {
+        nlos.PlanarRSD: {"cycles": 3.0, "tolerance": 1e-2},
+        nlos.Hybrid: {"cycles": 3.0, "propagation": "spectral", "tolerance": 1e-2, "plane_z": None},
+    },
+    REFINED: {
+        nlos.Refinement: {"prior": Sparse(weight=2e-2, iterations=60)},
+        build_total_variation: {"weight": 2e-2, "iterations": 60},
+    },
+    FEW_PHOTONS: {
+        PhotonRefinement: {
+            "iterations": 12,
+            "prior_weight": 1.0,
+            "blank": 0.0,
+            "ramp": 0.0,
+            "response_sigma": None,
+        }
+    },
+    CHOSEN: {
+        Wavelets: {"weight": 2e-3, "iterations": 60, **PROXIMAL},
+        RegularisationByDenoising: {
+            "denoiser": WIENER,
+            "calls": 8,
+            "strength": 0.08,
+            "coupling": 0.3,
         },
-    ),
-    # counted photons
-    (
-        PhotonDetector,
-        CHOSEN,
-        {"false_alarm_rate": 0.01, "max_returns": 1, "min_photons": 20.0, "background": None},
-    ),
-    (Smoothness, CHOSEN, {"slope_cost": 1.0, "jump_cost": 6.0, "reach_px": 1}),
-    (
-        StreakDetector,
-        CHOSEN,
-        {
+        NonlocalMeans: {"patch_px": 5, "reach_px": 10, "filtering": 0.6},
+        CollaborativeWiener: {"patch_px": 6, "stride_px": 3, "reach_px": 10, "group": 40},
+        PhotonDetector: {
+            "false_alarm_rate": 0.01,
+            "max_returns": 1,
+            "min_photons": 20.0,
+            "background": None,
+        },
+        Smoothness: {"slope_cost": 1.0, "jump_cost": 6.0, "reach_px": 1},
+        StreakDetector: {
             "rows": 576,
             "bin_width": 2e-11,
             "peak_photons": 2000.0,
             "background_photons": 2.0,
             "full_scale_photons": 65535.0,
         },
-    ),
-    # hidden scenes
-    (nlos.Backprojection, HIDDEN, {"cycles": 3.0, "weighting": Weighting(1.0, 0.0)}),
-    (nlos.FilteredBackprojection, HIDDEN, {"sigma": 0.02, "weighting": Weighting(0.0, 0.0)}),
-    (nlos.LightCone, HIDDEN, {"signal_to_noise": 0.8, "falloff": 4.0}),
-    (nlos.FKMigration, HIDDEN, {"falloff": 4.0}),
-    (nlos.PlanarRSD, BUYS, {"cycles": 3.0, "tolerance": 1e-2}),
-    (
-        nlos.Hybrid,
-        BUYS,
-        {"cycles": 3.0, "propagation": "spectral", "tolerance": 1e-2, "plane_z": None},
-    ),
-    (nlos.Refinement, REFINED, {"prior": Sparse(weight=2e-2, iterations=60)}),
-    (build_total_variation, REFINED, {"weight": 2e-2, "iterations": 60}),
-    (
-        PhotonRefinement,
-        FEW_PHOTONS,
-        {
-            "iterations": 12,
-            "prior_weight": 1.0,
-            "blank": 0.0,
-            "ramp": 0.0,
-            "response_sigma": None,
-        },
-    ),
-]
+    },
+}
 
 
 def find_defaults(made: Any) -> dict[str, Any]:
@@ -149,10 +150,12 @@ def find_defaults(made: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("made", "where", "expected"), DEFAULTS, ids=[made.__name__ for made, _, _ in DEFAULTS]
+    ("where", "made"),
+    [(where, made) for where, measured in DEFAULTS.items() for made in measured],
+    ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_a_default_is_what_was_measured(made: Any, where: str, expected: dict[str, Any]) -> None:
-    found = find_defaults(made)
+def test_a_default_is_what_was_measured(where: str, made: Any) -> None:
+    expected, found = DEFAULTS[where][made], find_defaults(made)
     for name in sorted(expected.keys() | found.keys()):
         before, now = expected.get(name, "nothing"), found.get(name, "nothing")
         assert before == now, (
@@ -162,9 +165,9 @@ def test_a_default_is_what_was_measured(made: Any, where: str, expected: dict[st
 
 
 def test_the_places_where_defaults_were_measured_exist() -> None:
-    for place in {where for _, where, _ in DEFAULTS if where.startswith("docs/")}:
+    for place in (where for where in DEFAULTS if where.startswith("docs/")):
         page, heading = place.split(": ", 1)
         lines = (ROOT / page).read_text(encoding="utf-8").splitlines()
         assert any(line.startswith(heading) for line in lines), place
-    for made in {made for made, where, _ in DEFAULTS if where == "its docstring"}:
+    for made in DEFAULTS["its docstring"]:
         assert "strength" in str(inspect.getdoc(made)), made.__name__

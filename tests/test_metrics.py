@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tofclip.errors import TofclipError
-from tofclip.metrics import nmse, nmse_energy
+from tofclip.metrics import correlation_coefficient, nmse, nmse_energy
 
 TRUTH = np.array([[0.0, 1.0], [2.0, 3.0]])
 
@@ -25,20 +25,24 @@ def test_border_is_left_out():
     assert nmse(estimate, truth) > 1
 
 
+def test_correlation_knows_no_scale_and_a_dark_picture_shows_nothing():
+    truth = np.random.default_rng(0).random((8, 8))
+    assert correlation_coefficient(3 * truth + 1, truth) == pytest.approx(1)
+    assert correlation_coefficient(-truth, truth) == pytest.approx(-1)
+    assert correlation_coefficient(np.zeros((8, 8)), truth) == 0
+
+
 @pytest.mark.parametrize(
-    ("estimate", "truth", "border"),
+    "compare",
     [
-        (np.zeros((2, 2)), np.zeros((2, 3)), 0),
-        (TRUTH, np.full((2, 2), 3.0), 0),
-        (TRUTH, TRUTH, 1),
-        (np.full((2, 2), np.nan), TRUTH, 0),
+        lambda: nmse(np.zeros((2, 2)), np.zeros((2, 3))),
+        lambda: nmse(TRUTH, np.full((2, 2), 3.0)),
+        lambda: nmse(TRUTH, TRUTH, 1),
+        lambda: nmse(np.full((2, 2), np.nan), TRUTH),
+        lambda: nmse_energy(TRUTH, np.zeros((2, 2))),
+        lambda: correlation_coefficient(TRUTH, np.ones((2, 2))),
     ],
 )
-def test_what_cannot_be_compared_is_refused(estimate, truth, border):
+def test_what_cannot_be_compared_is_refused(compare):
     with pytest.raises(TofclipError):
-        nmse(estimate, truth, border)
-
-
-def test_energy_of_nothing_is_refused():
-    with pytest.raises(TofclipError):
-        nmse_energy(TRUTH, np.zeros((2, 2)))
+        compare()

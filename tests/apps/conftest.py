@@ -2,46 +2,36 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
-from hidden_point import confocal_capture, curved_capture
 from small_instrument import (
     ANGLES,
     BACKGROUND,
     BIN_WIDTH,
     CENTRES_PX,
+    HIDDEN_SCENE,
     IMAGE_SHAPE,
     ROWS,
     SLIT_WIDTH_PX,
     SQUARE_ROWS,
-    Outcome,
-    Run,
+    Shell,
     focus_pictures,
     wall_shot,
 )
 
-from apps.cli import main
 from tofclip.camera import Camera, SkewSweep
 from tofclip.shots import Streak
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run the program in this process."""
-
-    def call(*words: object) -> Outcome:
-        capsys.readouterr()
-        status = main([str(word) for word in words])
-        return Outcome(status, *capsys.readouterr())
-
-    return call
+def shell(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Shell:
+    """Run the program in this process, in the test's own folder."""
+    monkeypatch.chdir(tmp_path)
+    return Shell(request)
 
 
 @pytest.fixture(scope="session")
@@ -88,24 +78,20 @@ def files(tmp_path_factory: pytest.TempPathFactory, camera: Camera, streak: Stre
 
 
 @pytest.fixture(scope="session")
-def curved(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A hidden point before a curved wall."""
-    return curved_capture(tmp_path_factory.mktemp("curved") / "capture.h5")
+def curved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A hidden point before a curved wall of 24 x 24 points."""
+    out = tmp_path_factory.mktemp("curved") / "capture.h5"
+    Shell(request).figures(f"nlos simulate {HIDDEN_SCENE} --wall-points 24 --out {out}")
+    return out
 
 
 @pytest.fixture(scope="session")
-def confocal(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same point before a planar wall, scanned confocally."""
-    return confocal_capture(tmp_path_factory.mktemp("confocal") / "capture.h5")
-
-
-def run_demo(verb: str, out: Path) -> dict[str, Any]:
-    printed, said = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
-        status = main([*verb.split(), "--out", str(out), "--seed", "1", "--json"])
-    assert (status, said.getvalue()) == (0, "")
-    figures: dict[str, Any] = json.loads(printed.getvalue())
-    return figures
+def confocal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same point before a planar wall of 32 x 32 points, scanned confocally."""
+    out = tmp_path_factory.mktemp("confocal") / "capture.h5"
+    scan = f"{HIDDEN_SCENE} --wall planar --scan confocal --wall-points 32"
+    Shell(request).figures(f"nlos simulate {scan} --out {out}")
+    return out
 
 
 @pytest.fixture(scope="session")
@@ -115,12 +101,14 @@ def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def demonstration(demo_folder: Path) -> dict[str, Any]:
+def demonstration(request: pytest.FixtureRequest, demo_folder: Path) -> dict[str, Any]:
     """Figures of `tofclip demo`; who asks for it is in the group ``golden``."""
-    return run_demo("demo", demo_folder)
+    return Shell(request).figures("demo --out {demo_folder} --seed 1")
 
 
 @pytest.fixture(scope="session")
-def hidden_letters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def hidden_letters(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
     """Figures of `tofclip nlos demo`; who asks for it is in the group ``golden``."""
-    return run_demo("nlos demo", tmp_path_factory.mktemp("hidden-letters"))
+    return Shell(request).figures(f"nlos demo --out {tmp_path_factory.mktemp('l')} --seed 1")

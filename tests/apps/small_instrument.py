@@ -1,16 +1,30 @@
-"""A small instrument and its files: seven views of 32 x 32 pixels, two bright squares at two
-ranges.
+"""The program as one types it, and a small instrument: seven views of 32 x 32 pixels, two bright
+squares at two ranges.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
+from apps.cli import main
+from tofclip.io.light_fields import write_light_field
+from tofclip.lidar import compute_ray_directions
+from tofclip.lidar.photons import make_pinhole
+from tofclip.light_field import LightField
+from tofclip.light_field.measurement import CameraSetup, measure
 from tofclip.shots import Streak
 from tofclip.storage import Field, Record
+from tofclip.units import SPEED_OF_LIGHT
 
 CENTRES_PX = np.array([30.4, 70.0, 110.7, 150.0, 190.2, 230.0, 269.6])
 ANGLES = np.deg2rad([-43.0, -26.0, -13.0, 0.5, 23.0, 37.0, 48.0])
@@ -20,6 +34,8 @@ ROWS = 96
 BIN_WIDTH = 20e-12
 SQUARE_ROWS = (30, 62)  # instants at which the two squares send their light back
 BACKGROUND = 20.0
+HIDDEN_POINT = (0.1, -0.05, 0.6)
+HIDDEN_SCENE = "--points 0.1,-0.05,0.6 --wall-width-m 0.8 --bin-width-ps 16 --jitter-ps 15"
 
 
 @dataclass(frozen=True)
@@ -31,7 +47,60 @@ class Outcome:
     err: str
 
 
-Run = Callable[..., Outcome]
+class Names(dict[str, Any]):
+    """What stands in braces: what a test names, or else a fixture's value."""
+
+    def __init__(self, request: pytest.FixtureRequest, names: dict[str, Any]) -> None:
+        super().__init__(names)
+        self.request = request
+
+    def __missing__(self, name: str) -> Any:
+        return self.request.getfixturevalue(name)
+
+
+class Shell:
+    """Runs the program in this process by lines as they are typed, with names in braces."""
+
+    def __init__(self, request: pytest.FixtureRequest) -> None:
+        self.request = request
+
+    def __call__(self, line: str, **names: Any) -> Outcome:
+        known = Names(self.request, names)
+        words = [word.format_map(known) for word in shlex.split(line)]
+        out, err = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            status = main(words)
+        return Outcome(status, out.getvalue(), err.getvalue())
+
+    def figures(self, line: str, status: int = 0, said: str = "", **names: Any) -> dict[str, Any]:
+        """The object of `--json`: nothing else is printed, and nothing said but what is expected."""
+        outcome = self(f"{line} --json", **names)
+        assert outcome.status == status, outcome
+        assert said in outcome.err if said else not outcome.err, outcome
+        assert not status or all(line.startswith("tofclip: ") for line in outcome.err.splitlines())
+        found: dict[str, Any] = json.loads(outcome.out)
+        return found
+
+    def refuses(self, line: str, said: str = "", **names: Any) -> str:
+        """Whether the line is unusable and one line says why; return it."""
+        outcome = self(line, **names)
+        assert (outcome.status, outcome.out, outcome.err.count("\n")) == (2, "", 1), outcome
+        assert outcome.err.startswith("tofclip: error: ")
+        assert said in outcome.err
+        return outcome.err
+
+
+def save_plate(path: Path, distance: float, photons: float, seed: int, late: float) -> None:
+    """Save the photon cube, (5, 6, 80) with bins of 80 ps, of a plate [m] so many seconds late."""
+    noise = np.random.default_rng(seed)
+    y, x = np.indices((5, 6)).reshape(2, -1)
+    cosine = compute_ray_directions(make_pinhole((5, 6), 20.0, 400e-12), y, x)[:, 2]
+    time = 2 * distance / cosine / SPEED_OF_LIGHT + late
+    cube = noise.poisson(0.02, (y.size, 80))
+    pixel = np.repeat(np.arange(y.size), noise.poisson(photons * cosine))
+    arrival = np.rint((time[pixel] + noise.normal(0, 400e-12 / 2.355, pixel.size)) / 80e-12)
+    np.add.at(cube, (pixel, arrival.astype(int)), 1)
+    np.save(path, cube.reshape(5, 6, 80).astype(np.uint16))
 
 
 def wall_shot(streak: Streak) -> Streak:
@@ -66,3 +135,32 @@ def focus_pictures() -> dict[str, np.ndarray]:
         )
     light = {"line": lines, "line_background": 0 * lines, "dot": dots, "dot_background": 0 * dots}
     return {name: noise.poisson(picture + 100).astype(np.uint16) for name, picture in light.items()}
+
+
+def write_views(
+    path: Path, views: list[tuple[int, int]], picture: Callable[..., Any]
+) -> LightField:
+    """Save the light field whose picture at a view (v, u) a function returns."""
+    pictures = np.stack([picture(*view) for view in views]).astype(np.float32)
+    field = LightField(pictures, np.array(views, float))
+    write_light_field(field, path)
+    return field
+
+
+def two_cards(folder: Path) -> None:
+    """A near card before a far one, 48 pixels and 4 x 4 views, what a camera measures of it, and a
+    map of its depths.
+    """
+    y, x = np.mgrid[:48, :48].astype(float)
+
+    def look(v: int, u: int) -> np.ndarray:
+        near = (abs(x + u - 24) < 8) & (abs(y + v - 24) < 8)
+        far = 0.2 + 0.4 * (np.floor((x - u) / 5) % 2)
+        chequers = 0.4 + 0.6 * ((np.floor((x + u) / 3) + np.floor((y + v) / 3)) % 2)
+        return np.where(near, chequers, far)
+
+    views = [(v, u) for v in range(-2, 2) for u in range(-2, 2)]
+    field = write_views(folder / "field.h5", views, look)
+    measure(field, CameraSetup("line-even", 2.0, 0)).save(folder / "meas.h5")
+    near = (abs(x - 24) < 8) & (abs(y - 24) < 8)
+    np.save(folder / "map.npy", np.where(near, -1.0, 1.0))

@@ -4,140 +4,137 @@ graphics processor.
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from small_instrument import Run
 
+from nlos import Volume
 from tofclip import Frames, PointCloud, Streak, arrays, recover
-from tofclip.recovery import DepthLockedFocus, Focus, SharpestFocus
+from tofclip.recovery import DepthLockedFocus, SharpestFocus
 
+torch = pytest.importorskip("torch", reason="PyTorch is optional")
+torch.set_num_threads(1)  # waking others up takes longer than what there is to do
 
-@pytest.fixture(scope="module")
-def torch() -> Any:
-    library = pytest.importorskip("torch", reason="PyTorch is optional")
-    library.set_num_threads(1)  # waking others up takes longer than what there is to do
-    return library
+AGREEMENT = 1e-4
+"""Promised; sums in another order differ by some 1e-6."""
+DEVICES = {"cpu": "cpu", "torch": "torch:cpu"}
 
 
 @pytest.fixture
-def no_graphics(monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_graphics(monkeypatch):
     monkeypatch.setattr(arrays, "GRAPHICS_LIBRARIES", ("a_library_that_nobody_has",))
 
 
-def object_of(run: Run, *words: object) -> dict[str, Any]:
-    outcome = run(*words, "--json")
-    assert (outcome.status, outcome.err) == (0, ""), outcome.out
-    found: dict[str, Any] = json.loads(outcome.out)
-    return found
-
-
-def difference(found: Frames, expected: Frames) -> float:
+def difference(found, expected):
     return float(np.linalg.norm(found.values - expected.values) / np.linalg.norm(expected.values))
 
 
-@pytest.mark.usefixtures("torch")
 @pytest.mark.parametrize("method", ["tv", "linear"])
-def test_frames_and_cloud_are_those_of_the_compiled_loops(
-    run: Run, files: Path, tmp_path: Path, method: str
-) -> None:
-    frames, points, devices = {}, {}, {}
-    for device in ("cpu", "torch:cpu"):
-        out, cloud = (tmp_path / f"{device.replace(':', '-')}{end}" for end in (".h5", ".npz"))
-        words = ("--method", method, "--cloud", cloud, "--device", device)
-        found = object_of(run, "recover", files / "streak.h5", "--out", out, *words)
-        frames[device], points[device] = Frames.load(out), PointCloud.load(cloud)
-        devices[device] = found["device"], frames[device].figures["device"]
-    assert devices == {"cpu": ("cpu", "cpu"), "torch:cpu": ("torch:cpu", "torch:cpu")}
-    there, here = frames["torch:cpu"], frames["cpu"]
-    assert (
-        difference(there, here) < 1e-4
-    )  # what is promised; sums in another order differ by some 1e-6
-    for name in ("iterations", "stopped_because"):
-        assert there.figures[name] == here.figures[name]
-    assert there.figures["relative_residual"] == pytest.approx(
-        here.figures["relative_residual"], rel=1e-4
-    )
+def test_frames_and_cloud_are_those_of_the_compiled_loops(shell, method):
+    frames, points = {}, {}
+    for name, device in DEVICES.items():
+        words = f"--out {name}.h5 --cloud {name}.npz --method {method} --device {device}"
+        found = shell.figures(f"recover {{files}}/streak.h5 {words}")
+        frames[name], points[name] = Frames.load(f"{name}.h5"), PointCloud.load(f"{name}.npz")
+        assert found["device"] == frames[name].figures["device"] == device
+    there, here = frames["torch"], frames["cpu"]
+    assert difference(there, here) < AGREEMENT
+    for figure in ("iterations", "stopped_because"):
+        assert there.figures[figure] == here.figures[figure]
+    residuals = [one.figures["relative_residual"] for one in (there, here)]
+    assert residuals[0] == pytest.approx(residuals[1], rel=AGREEMENT)
     # Many points share one estimate of their false alarms, which may fall on either side of the limit.
     limit = {"tv": 0.4, "linear": np.inf}[method]
-    sure = {device: cloud[~(cloud.false_alarm >= limit)] for device, cloud in points.items()}
-    assert 100 < len(sure["cpu"]) == len(sure["torch:cpu"])
-    off = np.abs(sure["torch:cpu"].range - sure["cpu"].range)
+    sure = {name: cloud[~(cloud.false_alarm >= limit)] for name, cloud in points.items()}
+    assert 100 < len(sure["cpu"]) == len(sure["torch"])
+    off = np.abs(sure["torch"].range - sure["cpu"].range)
     # Compiled loops fit lone returns by a table of phases, which errs by less than a tenth of their
     # own deviation; a tenth of a millimetre is for sums in another order.
     assert np.all(off < 1e-4 + 0.1 * sure["cpu"].range_sigma)
 
 
-@pytest.mark.usefixtures("torch")
-def test_frames_of_a_file_to_a_cloud(run: Run, files: Path, streak: Streak, tmp_path: Path) -> None:
-    recover(streak, method="l1").save(tmp_path / "frames.h5")
-    reported = {}
-    for device in ("cpu", "torch:cpu"):
-        out = tmp_path / f"{device[:3]}.npz"
-        reported[device] = object_of(
-            run, "cloud", tmp_path / "frames.h5", "--out", out, "--device", device
-        )
-    there, here = reported["torch:cpu"], reported["cpu"]
-    assert (there.pop("device"), here.pop("device")) == ("torch:cpu", "cpu")
+def test_frames_of_a_file_to_a_cloud(shell, streak):
+    recover(streak, method="l1").save("frames.h5")
+    here, there = (
+        shell.figures(f"cloud frames.h5 --out {name}.npz --device {device}")
+        for name, device in DEVICES.items()
+    )
+    assert (there["device"], here["device"]) == ("torch:cpu", "cpu")
     assert there["points"] == here["points"] > 50
     np.testing.assert_allclose(there["range_m"], here["range_m"], atol=1e-5)
 
 
-@pytest.mark.usefixtures("torch")
 @pytest.mark.parametrize("focus", [DepthLockedFocus(), SharpestFocus(-0.2, 0.2, 2)], ids=str)
 @pytest.mark.parametrize("method", ["l1", "linear"])
-def test_pieces_of_their_own_shear(streak: Streak, focus: Focus, method: str) -> None:
-    assert streak.camera is not None
-    shot = Streak(streak.counts, camera=streak.camera.replace(lenslet_pitch=1e-3)).with_bin_width(
-        20e-12
-    )
+def test_pieces_of_their_own_shear(streak, focus, method):
+    camera = streak.camera.replace(lenslet_pitch=1e-3)
+    shot = Streak(streak.counts, camera=camera).with_bin_width(20e-12)
     here, there = (
-        recover(shot, method=method, focus=focus, device=device) for device in ("cpu", "torch:cpu")
+        recover(shot, method=method, focus=focus, device=device) for device in DEVICES.values()
     )
     assert len(set(here.shears)) > 1
     np.testing.assert_array_equal(there.shears, here.shears)
-    assert difference(there, here) < 1e-4
+    assert difference(there, here) < AGREEMENT
 
 
-@pytest.mark.usefixtures("torch")
-def test_a_folder_belongs_to_one_device(run: Run, files: Path, tmp_path: Path) -> None:
-    shots = tmp_path / "shots"
-    shots.mkdir()
-    shutil.copy(files / "streak.h5", shots)
-    words = ("recover", shots, "--out", tmp_path / "frames", "--method", "linear")
-    assert object_of(run, *words, "--device", "torch:cpu")["device"] == "torch:cpu"
-    assert Frames.load(tmp_path / "frames" / "streak.h5").figures["device"] == "torch:cpu"
-    outcome = run(*words)
-    assert outcome.status == 2
-    assert "device torch:cpu instead of None" in outcome.err
-    for clouds, device in (("clouds", "torch:cpu"), ("more", "cpu")):
-        found = object_of(
-            run, "cloud", tmp_path / "frames", "--out", tmp_path / clouds, "--device", device
-        )
+def test_a_folder_belongs_to_one_device(shell, files):
+    Path("shots").mkdir()
+    shutil.copy(files / "streak.h5", "shots")
+    line = "recover shots --out frames --method linear"
+    assert shell.figures(f"{line} --device torch:cpu")["device"] == "torch:cpu"
+    assert Frames.load("frames/streak.h5").figures["device"] == "torch:cpu"
+    shell.refuses(line, "device torch:cpu instead of None")
+    for clouds, device in DEVICES.items():
+        found = shell.figures(f"cloud frames --out {clouds} --device {device}")
         assert (found["results"], found["device"]) == (1, device)
 
 
-@pytest.mark.usefixtures("no_graphics")
-@pytest.mark.parametrize("verb", ["recover", "cloud"])
+@pytest.mark.parametrize(
+    ("wall", "method"), [("confocal", "rsd"), ("curved", "hybrid"), ("curved", "backprojection")]
+)
+def test_hidden_scenes_are_the_same_elsewhere(shell, wall, method):
+    line = f"nlos reconstruct {{{wall}}} --voxel-mm 40 --method {method}"
+    here, there = (
+        shell.figures(f"{line} --out {name}.h5 --device {device}")
+        for name, device in DEVICES.items()
+    )
+    assert (here["device"], there["device"]) == ("cpu", "torch:cpu")
+    assert here["peak_m"] == there["peak_m"]
+    found = Volume.load("torch.h5")
+    assert found.provenance["settings"]["device"] == "torch:cpu"
+    assert difference(found, Volume.load("cpu.h5")) < AGREEMENT
+    # Where it was computed is none of the settings that make the volume.
+    assert Path("cpu.toml").read_text() == Path("torch.toml").read_text()
+
+
+def test_what_has_compiled_loops_only_says_so(shell):
+    line = "nlos reconstruct {confocal} --method lct --voxel-mm 40 --out volume.h5 --device"
+    assert "--device cpu" in shell.refuses(f"{line} torch:cpu", "NumPy arrays only")
+    assert shell.figures(f"{line} auto")["device"] == "cpu"
+
+
+def test_the_name_travels_with_a_folders_jobs(shell, curved):
+    words = "--out volumes --voxel-mm 80 --device torch:cpu"
+    shell.figures(f"nlos reconstruct {{curved.parent}} {words}")
+    volume = Volume.load(f"volumes/{curved.stem}.h5")
+    assert volume.provenance["settings"]["device"] == "torch:cpu"
+
+
+@pytest.mark.usefixtures("_no_graphics")
 @pytest.mark.parametrize("device", ["cuda", "cuda:1", "gpu", "torch:nonsense"])
-def test_a_device_that_is_not_there_is_refused_in_one_line(
-    run: Run, files: Path, tmp_path: Path, verb: str, device: str
-) -> None:
-    outcome = run(verb, files / "streak.h5", "--out", tmp_path / "frames.h5", "--device", device)
-    assert (outcome.status, outcome.out, outcome.err.count("\n")) == (2, "", 1)
-    assert "cpu" in outcome.err
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize(
+    "line",
+    ["recover {files}/streak.h5", "cloud {files}/streak.h5", "nlos reconstruct {curved}"],
+)
+def test_a_device_that_is_not_there_is_refused_in_one_line(shell, line, device):
+    shell.refuses(f"{line} --out out.h5 --device {device}", "cpu")
+    assert not list(Path().iterdir())
 
 
-@pytest.mark.usefixtures("no_graphics")
-def test_auto_is_this_processor_where_there_is_no_other(
-    run: Run, files: Path, tmp_path: Path
-) -> None:
-    words = ("recover", files / "streak.h5", "--out", tmp_path / "frames.h5", "--method", "adjoint")
-    assert object_of(run, *words, "--device", "auto")["device"] == "cpu"
-    words = ("cloud", tmp_path / "frames.h5", "--out", tmp_path / "cloud.ply")
-    assert object_of(run, *words, "--device", "auto")["device"] == "cpu"
+@pytest.mark.usefixtures("_no_graphics")
+def test_auto_is_this_processor_where_there_is_no_other(shell):
+    words = "recover {files}/streak.h5 --out frames.h5 --method adjoint --device auto"
+    assert shell.figures(words)["device"] == "cpu"
+    assert shell.figures("cloud frames.h5 --out cloud.ply --device auto")["device"] == "cpu"

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 import typer
-from small_instrument import Run
 from verb_pages import collect_verbs, render_page, write_pages
 
 import tofclip
@@ -26,9 +25,9 @@ VERBS = collect_verbs()
 
 
 @pytest.mark.parametrize("name", VERBS)
-def test_help_of_a_verb(run: Run, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_help_of_a_verb(shell, monkeypatch, name):
     monkeypatch.setenv("TERMINAL_WIDTH", "100")
-    outcome = run(*name.split(), "--help")
+    outcome = shell(f"{name} --help")
     assert outcome.status == 0
     assert f"Usage: tofclip {name} " in outcome.out
     assert "--json" in outcome.out
@@ -38,13 +37,13 @@ def test_help_of_a_verb(run: Run, monkeypatch: pytest.MonkeyPatch, name: str) ->
         assert all(line.strip() in outcome.out for line in wrap_command(example).splitlines())
 
 
-@pytest.mark.parametrize("words", [[], ["lidar"]])
-def test_the_list_of_commands_is_shown_whole(run: Run, words: list[str]) -> None:
-    shown = " ".join(run(*words, "--help").out.split())
+@pytest.mark.parametrize("group", ["", "lidar"])
+def test_the_list_of_commands_is_shown_whole(shell, group):
+    shown = " ".join(shell(f"{group} --help").out.split())
     assert "..." not in shown.partition("Commands:")[2]
 
 
-def test_the_list_of_commands_says_what_the_verbs_say() -> None:
+def test_the_list_of_commands_says_what_the_verbs_say():
     """It is written down, so that no verb needs to be imported for it."""
     group = typer.main.get_group(app)
     for verb, line in LINES.items():
@@ -53,9 +52,7 @@ def test_the_list_of_commands_says_what_the_verbs_say() -> None:
 
 
 @pytest.mark.parametrize("name", VERBS)
-def test_examples_of_a_verb_are_understood(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_examples_of_a_verb_are_understood(name, tmp_path, monkeypatch):
     """Every word of an example is one the verb takes, and none that it needs is missing."""
     monkeypatch.chdir(tmp_path)
     _, examples = split_docstring(VERBS[name].callback.__doc__)
@@ -71,17 +68,17 @@ def test_examples_of_a_verb_are_understood(
             assert context.params
 
 
-@pytest.mark.parametrize("name", VERBS)
-def test_the_map_shows_the_verb(name: str) -> None:
-    group = name.split()[0]
-    assert f"\n  {name} " in VERB_OVERVIEW or f"\n  {group} " in VERB_OVERVIEW
-
-
-def test_the_overview_fits_a_terminal_of_eighty_columns() -> None:
+def test_alone_the_program_shows_a_map_of_all_verbs_on_eighty_columns(shell):
+    shown = shell("")
+    assert (shown.status, shown.err) == (0, "")
     assert max(map(len, VERB_OVERVIEW.splitlines())) <= 80
+    assert VERB_OVERVIEW.strip() in shown.out
+    for name in VERBS:
+        assert f"\n  {name} " in shown.out or f"\n  {name.split()[0]} " in shown.out
+    assert shell("--version").out == f"{tofclip.__version__}\n"
 
 
-def test_prose_is_joined_and_examples_are_taken_out() -> None:
+def test_prose_is_joined_and_examples_are_taken_out():
     prose, examples = split_docstring(
         "Do a\nthing.\n\n  a  table\n\nExample: tofclip do\n    it --now\n\nMore."
     )
@@ -90,7 +87,7 @@ def test_prose_is_joined_and_examples_are_taken_out() -> None:
     assert split_docstring(None) == ([], [])
 
 
-def test_a_long_example_is_still_one_command_for_a_shell() -> None:
+def test_a_long_example_is_still_one_command_for_a_shell():
     command = "tofclip calibrate " + " ".join(
         f"--picture-number-{n} picture_{n}.tif" for n in range(6)
     )
@@ -98,32 +95,32 @@ def test_a_long_example_is_still_one_command_for_a_shell() -> None:
     assert shlex.split(wrap_command(command).replace("\\\n", "")) == shlex.split(command)
 
 
-def asked(run: Run, monkeypatch: pytest.MonkeyPatch, shell: str, line: str) -> str:
-    """Ask for completions of a command line as the shell's function does."""
-    words = line.split(" ")
-    monkeypatch.setenv(COMPLETION_VARIABLE, f"complete_{shell}")
-    monkeypatch.setenv("COMP_WORDS", line)
-    monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
-    monkeypatch.setenv("_TYPER_COMPLETE_ARGS", line)
-    monkeypatch.setenv("_TYPER_COMPLETE_FISH_ACTION", "get-args")
-    outcome = run()
-    assert (outcome.status, outcome.err) == (0, "")
-    return outcome.out
+@pytest.mark.parametrize("shell_name", ["bash", "zsh", "fish"])
+def test_shells_complete_verbs_options_and_names(shell, monkeypatch, shell_name):
+    def complete(line: str) -> str:
+        """Ask for completions of a command line as the shell's function does."""
+        asked = {
+            COMPLETION_VARIABLE: f"complete_{shell_name}",
+            "COMP_WORDS": line,
+            "COMP_CWORD": str(line.count(" ")),
+            "_TYPER_COMPLETE_ARGS": line,
+            "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+        }
+        for name, value in asked.items():
+            monkeypatch.setenv(name, value)
+        outcome = shell("")
+        assert (outcome.status, outcome.err) == (0, "")
+        return outcome.out
 
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_shells_complete_verbs_options_and_names(
-    run: Run, monkeypatch: pytest.MonkeyPatch, shell: str
-) -> None:
-    assert "lidar" in asked(run, monkeypatch, shell, "tofclip lid")
-    assert "parallax" in asked(run, monkeypatch, shell, "tofclip lidar ")
-    assert "--sampling-ratio" in asked(run, monkeypatch, shell, "tofclip clip simulate --samp")
-    assert "adjoint" in asked(run, monkeypatch, shell, "tofclip recover --method ad")
-    assert "tv" not in asked(run, monkeypatch, shell, "tofclip recover --method ad")
+    assert "lidar" in complete("tofclip lid")
+    assert "parallax" in complete("tofclip lidar ")
+    assert "--sampling-ratio" in complete("tofclip clip simulate --samp")
+    assert "adjoint" in complete("tofclip recover --method ad")
+    assert "tv" not in complete("tofclip recover --method ad")
 
 
 @pytest.mark.parametrize("name", VERBS)
-def test_completed_names_are_those_of_the_help(name: str) -> None:
+def test_completed_names_are_those_of_the_help(name):
     command = VERBS[name]
     context = typer.Context(command, info_name=name)
     for param in command.get_params(context):
@@ -132,7 +129,7 @@ def test_completed_names_are_those_of_the_help(name: str) -> None:
                 assert item.value in (param.help or "")
 
 
-def test_every_completed_study_exists() -> None:
+def test_every_completed_study_exists():
     command = VERBS["reproduce"]
     context = typer.Context(command, info_name="reproduce")
     name = next(param for param in command.get_params(context) if param.name == "name")
@@ -142,7 +139,7 @@ def test_every_completed_study_exists() -> None:
         assert find_studies(word)
 
 
-def test_bash_takes_the_script(tmp_path: Path) -> None:
+def test_bash_takes_the_script(tmp_path):
     program = tmp_path / "tofclip"
     program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m tofclip "$@"\n')
     program.chmod(0o755)
@@ -159,7 +156,7 @@ def test_bash_takes_the_script(tmp_path: Path) -> None:
     assert (done.stdout.strip(), done.stderr) == ("verify", "")
 
 
-def test_completion_is_installed_for_the_shell_that_asks(tmp_path: Path) -> None:
+def test_completion_is_installed_for_the_shell_that_asks(tmp_path):
     command = f"{shlex.quote(sys.executable)} -m tofclip --install-completion; exit $?"
     there = {**os.environ, "HOME": str(tmp_path)}
     done = subprocess.run(
@@ -171,7 +168,7 @@ def test_completion_is_installed_for_the_shell_that_asks(tmp_path: Path) -> None
     assert str(script) in (tmp_path / ".bashrc").read_text()
 
 
-def test_a_page_for_each_verb(tmp_path: Path) -> None:
+def test_a_page_for_each_verb(tmp_path):
     (tmp_path / "gone.md").write_text("a verb of an earlier version")
     pages = write_pages(tmp_path)
     assert sorted(tmp_path.iterdir()) == sorted(pages)
@@ -181,12 +178,12 @@ def test_a_page_for_each_verb(tmp_path: Path) -> None:
     assert "tofclip --install-completion" in listed
 
 
-def test_pages_that_are_the_same_stay_untouched(tmp_path: Path) -> None:
+def test_pages_that_are_the_same_stay_untouched(tmp_path):
     before = {path: path.stat().st_mtime_ns for path in write_pages(tmp_path)}
     assert {path: path.stat().st_mtime_ns for path in write_pages(tmp_path)} == before
 
 
-def test_what_a_page_says() -> None:
+def test_what_a_page_says():
     text = render_page("lidar scene", VERBS["lidar scene"])
     assert text.startswith("# tofclip lidar scene\n\nList a scene's objects")
     assert "```sh\ntofclip lidar scene frames.h5 --out scene.png\n```" in text
@@ -195,39 +192,35 @@ def test_what_a_page_says() -> None:
     assert "## Arguments" not in render_page("devices list", VERBS["devices list"])
 
 
-def test_a_page_keeps_the_headings_of_the_help() -> None:
+def test_a_page_keeps_the_headings_of_the_help():
     text = render_page("nlos info", VERBS["nlos info"])
     headings = [line for line in text.splitlines() if line.startswith("## ")]
     assert headings[:2] == ["## Arguments", "## Options"]
     assert headings[2].startswith("## Settings")
-    assert (
-        text.index("## Options")
-        < text.index("`--json`")
-        < text.index("## Settings")
-        < text.index("`--cycles")
-    )
+    places = [text.index(word) for word in ("## Options", "`--json`", "## Settings", "`--cycles")]
+    assert places == sorted(places)
 
 
-def test_the_help_has_the_headings_of_the_page(run: Run) -> None:
+def test_the_help_has_the_headings_of_the_page(shell):
     """Settings apart from options, defaults in words without brackets of their own, prose as wide as
     the terminal even where a line begins with an option, and arguments by their names.
     """
-    shown = run("nlos", "reconstruct", "--help").out
-    places = [
-        shown.index(word) for word in ("\nOptions:", "  --json ", "\nSettings (", "--cycles N")
-    ]
+    shown = shell("nlos reconstruct --help").out
+    words = ("\nOptions:", "  --json ", "\nSettings (", "--cycles N")
+    places = [shown.index(word) for word in words]
     assert places == sorted(places)
     assert "(None)" not in shown
     assert "[default: (" not in shown
     assert "Usage: tofclip nlos reconstruct [OPTIONS] CAPTURE\n" in shown
     assert "refine photons looks for the albedo" in " ".join(shown.split())
     assert max(map(len, shown.splitlines())) <= 80
-    assert "SHOT..." in run("calibrate", "range", "--help").out.splitlines()[0]
-    assert "{" not in run("calibrate", "range", "--help").out.splitlines()[0]
+    usage = shell("calibrate range --help").out.splitlines()[0]
+    assert "SHOT..." in usage
+    assert "{" not in usage
 
 
-def test_a_flag_is_shown_without_a_type(run: Run) -> None:
-    for words in ((), ("recover",), ("lidar",), ("lidar", "sequence")):
-        shown = run(*words, "--help").out
+def test_a_flag_is_shown_without_a_type(shell):
+    for words in ("", "recover", "lidar", "lidar sequence"):
+        shown = shell(f"{words} --help").out
         assert "--help" in shown
         assert "<bool>" not in shown

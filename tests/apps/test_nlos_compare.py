@@ -1,61 +1,59 @@
-"""`tofclip nlos compare` and `demo`: methods side by side, and what they cost."""
+"""`tofclip nlos compare`, `demo` and `film`: methods side by side, what they cost, and the flash."""
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hidden_point import POINT, object_of
-from small_instrument import Run
+from PIL import Image
+from small_instrument import HIDDEN_POINT
 
-from nlos import Capture, Volume
-from nlos.known_scenes import HiddenTruth
+from apps.mp4 import open_film
+from apps.verbs import nlos_scenes
+from apps.verbs.nlos_imaging import _reset_peak_memory, measure_imaging
+from nlos import Capture, Grid, TransientVideo, Volume
+from nlos.known_scenes import HiddenTruth, compare_with_truth, measure_sharpness
+from tofclip.errors import StorageError
+from tofclip.units import SPEED_OF_LIGHT
 
 PNG = b"\x89PNG"
 
 
-def test_a_curved_wall(run: Run, curved: Path, tmp_path: Path) -> None:
-    out, volumes = tmp_path / "compare.png", tmp_path / "volumes"
-    found = object_of(run, "compare", curved, "--voxel-mm", 25, "--out", out, "--volumes", volumes)
+def test_a_curved_wall(shell):
+    words = "--voxel-mm 25 --out compare.png --volumes volumes"
+    found = shell.figures(f"nlos compare {{curved}} {words}")
     methods = found["methods"]
     assert list(methods) == ["hybrid", "backprojection", "filtered-backprojection"]
     assert set(found["left_out"]) == {"rsd", "lct", "fk"}
     assert methods["hybrid"]["correlation"] == pytest.approx(1)
     assert methods["backprojection"]["correlation"] > 0.999
     assert methods["filtered-backprojection"]["correlation"] < 0.999
+    truth = HiddenTruth(np.array([HIDDEN_POINT]), 0.0)
     for name, figures in methods.items():
-        stored = Volume.load(volumes / f"{name}.h5")
-        assert stored.grid.shape == tuple(found["voxels"])
+        grid = Volume.load(f"volumes/{name}.h5").grid
+        assert grid.shape == tuple(found["voxels"])
         assert figures["seconds"] > 0
         assert figures["sharpness"] > 1
         # The ball about the point is a small part of the box, and holds more than that part of the
         # energy: by the unsharpest method 2.5 times as much.
-        share = (
-            HiddenTruth(np.array([POINT]), 0.0)
-            .mask_near(stored.grid, figures["truth_reach_m"])
-            .mean()
-        )
+        share = truth.mask_near(grid, figures["truth_reach_m"]).mean()
         assert figures["energy_near_truth"] > 2 * share
         assert figures["contrast_to_truth"] > 2
-    assert out.read_bytes().startswith(PNG)
+    assert Path("compare.png").read_bytes().startswith(PNG)
 
 
-def test_its_settings_give_the_same_comparison(run: Run, confocal: Path, tmp_path: Path) -> None:
-    words = ["compare", confocal, "--methods", "fk,rsd", "--voxel-mm", 60]
-    one = object_of(run, *words, "--out", tmp_path / "one.png")
-    two = object_of(
-        run, "compare", confocal, "--settings", tmp_path / "one.toml", "--out", tmp_path / "two.png"
-    )
+def test_its_settings_give_the_same_comparison(shell):
+    one = shell.figures("nlos compare {confocal} --methods fk,rsd --voxel-mm 60 --out one.png")
+    two = shell.figures("nlos compare {confocal} --settings one.toml --out two.png")
     for figures in (*one["methods"].values(), *two["methods"].values()):
         del figures["seconds"], figures["peak_mib"]
     assert one == two
 
 
-def test_memory_is_that_of_the_method() -> None:
-    from apps.verbs.nlos_imaging import _reset_peak_memory, measure_imaging
-    from nlos import Grid
-
+def test_memory_is_that_of_the_method():
     if _reset_peak_memory() is None:
         pytest.skip("this system does not tell how much memory a program took")
 
@@ -64,57 +62,31 @@ def test_memory_is_that_of_the_method() -> None:
 
         cost = 1
 
-        def plan(self, _: Capture, grid: Grid) -> Greedy:
+        def plan(self, _, grid):
             self.grid = grid
             return self
 
-        def reconstruct(self, capture: Capture, grid: Grid) -> Volume:
+        def reconstruct(self, capture, grid):
             return self.plan(capture, grid).image(capture)
 
-        def image(self, *_: object) -> Volume:
+        def image(self, *_):
             taken = np.ones(64 << 17)
             return Volume(np.full(self.grid.shape, taken.mean(), np.float32), self.grid)
 
     capture = Capture(np.zeros((4, 2)), np.array([[0.0, 0, 0], [1, 0, 0]]), np.zeros(3), 1e-11)
     found = measure_imaging("greedy", Greedy(), capture, Grid([0.0], [0.0], [1.0]))
-    assert found.peak_bytes is not None
     # The allocator may reuse memory that it holds already, and threads may take a little for
     # themselves.
     assert 48 << 20 < found.peak_bytes < 96 << 20
 
 
-def test_the_demonstration(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As it is, with a coarser wall and fewer voxels."""
-    from apps.verbs import nlos_scenes as demo
-
-    for name, value in {
-        "WALL_POINTS": 24,
-        "FACET_M": 0.06,
-        "WAVELENGTH_M": 0.34,
-        "VOXEL_M": 0.06,
-    }.items():
-        monkeypatch.setattr(demo, name, value)
-    found = object_of(run, "demo", "--out", tmp_path / "demo", "--png", tmp_path / "picture.png")
-    assert found["hybrid"]["correlation"] > 0.999
-    assert found["flat"]["correlation"] < 0.95
-    assert found["flat"]["energy_near_truth"] < found["hybrid"]["energy_near_truth"]
-    assert (tmp_path / "picture.png").read_bytes().startswith(PNG)
-    assert {path.name for path in (tmp_path / "demo").iterdir()} == {
-        "capture.h5",
-        "hybrid.h5",
-        "backprojection.h5",
-    }
-    assert HiddenTruth.load(tmp_path / "demo" / "capture.h5") is not None
-
-
-def test_memory_is_foretold_within_a_factor(run: Run, confocal: Path, tmp_path: Path) -> None:
+def test_memory_is_foretold_within_a_factor(shell):
     """The estimate is within a factor of 4 of what is measured, and 32 MiB that libraries take when
     they are loaded.
     """
-    box = ["--voxel-mm", 12, "--everywhere"]
-    foretold = object_of(run, "info", confocal, *box[:2])["methods"]
-    words = ["compare", confocal, "--methods", "rsd,fk", *box, "--out", tmp_path / "compare.png"]
-    measured = object_of(run, *words)["methods"]
+    foretold = shell.figures("nlos info {confocal} --voxel-mm 12")["methods"]
+    words = "--methods rsd,fk --voxel-mm 12 --everywhere --out compare.png"
+    measured = shell.figures(f"nlos compare {{confocal}} {words}")["methods"]
     for name, figures in measured.items():
         if figures["peak_mib"] is None:
             pytest.skip("this system does not tell how much memory a program took")
@@ -122,31 +94,92 @@ def test_memory_is_foretold_within_a_factor(run: Run, confocal: Path, tmp_path: 
         assert figures["peak_mib"] < 4 * foretold[name]["memory_mib"] + 32
 
 
-def test_figures_of_merit_of_volumes_that_need_no_computing() -> None:
-    from nlos import Grid
-    from nlos.known_scenes import compare_with_truth, measure_sharpness
+def test_the_demonstration(shell, monkeypatch):
+    """As it is, with a coarser wall and fewer voxels."""
+    small = {"WALL_POINTS": 24, "FACET_M": 0.06, "WAVELENGTH_M": 0.34, "VOXEL_M": 0.06}
+    for name, value in small.items():
+        monkeypatch.setattr(nlos_scenes, name, value)
+    found = shell.figures("nlos demo --out demo --png picture.png")
+    assert found["hybrid"]["correlation"] > 0.999
+    assert found["flat"]["correlation"] < 0.95
+    assert found["flat"]["energy_near_truth"] < found["hybrid"]["energy_near_truth"]
+    assert Path("picture.png").read_bytes().startswith(PNG)
+    assert {*os.listdir("demo")} == {"capture.h5", "hybrid.h5", "backprojection.h5"}
+    assert HiddenTruth.load(Path("demo/capture.h5")) is not None
 
+
+def test_figures_of_merit_of_volumes_that_need_no_computing():
     grid = Grid(np.arange(4) * 0.03, np.arange(3) * 0.03, [1.0, 1.03])
     even, single = np.ones(grid.shape, np.float32), np.zeros(grid.shape, np.float32)
     single[1, 2, 3] = 5
     assert measure_sharpness(Volume(even, grid)) == pytest.approx(1)
     assert measure_sharpness(Volume(single, grid)) == pytest.approx(12)  # pixels of the front view
     assert np.isnan(measure_sharpness(Volume(0 * even, grid)))
-    truth = HiddenTruth(np.array([[0.09, 0.06, 1.03]]), 0.0)
+    truth, unknown = HiddenTruth(np.array([[0.09, 0.06, 1.03]]), 0.0), float("nan")
     for values, share, contrast in (
         (even, 4 / 24, 1.0),
-        (single, 1.0, float("nan")),
-        (0 * even, None, None),
+        (single, 1.0, unknown),
+        (0 * even, unknown, unknown),
     ):
         figures = compare_with_truth(Volume(values, grid), truth)
-        assert (
-            figures["truth_reach_m"] == 0.04
-        )  # from a corner: its own voxel and three neighbours, no diagonal
-        assert figures["energy_near_truth"] == pytest.approx(
-            float("nan") if share is None else share, nan_ok=True
-        )
-        assert figures["contrast_to_truth"] == pytest.approx(contrast or float("nan"), nan_ok=True)
-    coarse = Grid(grid.x * 10, grid.y, grid.z)
-    assert compare_with_truth(Volume(even, coarse), truth)["truth_reach_m"] == pytest.approx(
-        0.3
-    )  # no finer than voxels
+        # from a corner: its own voxel and three neighbours, no diagonal
+        assert figures["truth_reach_m"] == 0.04
+        assert figures["energy_near_truth"] == pytest.approx(share, nan_ok=True)
+        assert figures["contrast_to_truth"] == pytest.approx(contrast, nan_ok=True)
+    coarse = Volume(even, Grid(grid.x * 10, grid.y, grid.z))
+    # no finer than voxels
+    assert compare_with_truth(coarse, truth)["truth_reach_m"] == pytest.approx(0.3)
+
+
+def test_the_point_lights_up_when_the_flash_reaches_it(shell, curved):
+    words = "--every-depth --voxel-mm 20 --instants 41 --out film.h5"
+    found = shell.figures(f"nlos film {{curved}} {words}")
+    video = TransientVideo.load("film.h5")
+    assert video.values.shape == (41, *found["voxels"])
+    arrival = np.linalg.norm(Capture.load(curved).laser - HIDDEN_POINT) / SPEED_OF_LIGHT
+    lit = video.times[video.values[:, *video.grid.find_nearest(HIDDEN_POINT)].argmax()]
+    # A tenth of a nanosecond is the distance to the voxel's middle and half the step of time.
+    assert lit == pytest.approx(arrival, abs=0.1e-9)
+    # By default it begins before the flash arrives, and ends after it left.
+    assert found["first_ns"] < arrival / 1e-9 < found["last_ns"]
+    assert video.provenance["settings"]["verb"] == "nlos film"
+
+
+def test_films_and_numbers_of_front_views(shell):
+    pytest.importorskip("cv2")
+    for suffix in ("gif", "mp4", "h5"):
+        words = f"--voxel-mm 40 --instants 5 --first-ns 1 --last-ns 3 --out film.{suffix}"
+        shell.figures(f"nlos film {{curved}} {words}")
+    with Image.open("film.gif") as film:
+        assert film.n_frames == 5
+    assert Path("film.mp4").read_bytes()[4:8] == b"ftyp"
+    video = TransientVideo.load("film.h5")
+    assert video.values.ndim == 3
+    np.testing.assert_allclose(video.times, 1e-9 * np.linspace(1, 3, 5), rtol=1e-12)
+    shell.figures("nlos film {curved} --settings film.toml --out again.h5")
+    again = TransientVideo.load("again.h5")
+    np.testing.assert_array_equal(again.values, video.values)
+    np.testing.assert_array_equal(again.times, video.times)
+
+
+def test_without_opencv_there_is_no_mp4(shell, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    shell.refuses("nlos film {curved} --out film.mp4", "tofclip[film]")
+
+
+@pytest.mark.parametrize("part", [0, 0.3, 0.999])
+def test_a_film_that_the_disk_cut_short_is_no_result(tmp_path, part):
+    pytest.importorskip("cv2")
+    pictures = np.random.default_rng(1).integers(0, 255, (8, 48, 64, 3), dtype=np.uint8)
+
+    def write(name, share):
+        with open_film(tmp_path / name, 10.0) as film:
+            for picture in pictures:
+                film.add(picture)
+            film.close()
+            os.truncate(film.path, int(share * film.path.stat().st_size))
+
+    write("whole.mp4", 1)
+    with pytest.raises(StorageError, match=r"cut\.mp4: cannot be written: the disk is full"):
+        write("cut.mp4", part)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.mp4"]

@@ -1,413 +1,300 @@
-"""`tofclip nlos`: every verb on small simulated captures."""
+"""`tofclip nlos`: captures simulated, described, imaged, refined and traced to surfaces."""
 
 from __future__ import annotations
 
-import os
 import shlex
-import signal
-import subprocess
 import tomllib
+import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+import h5py
 import numpy as np
 import pytest
-from hidden_point import POINT, SCENE, object_of
-from small_instrument import Run
-from test_program import LONGEST_WAIT_S, PROGRAM, ROOT, wait_for
+from small_instrument import HIDDEN_POINT, HIDDEN_SCENE
 from verb_pages import collect_verbs
 
 from apps.help import split_docstring
-from nlos import Capture, Volume
+from nlos import Capture, Grid, Volume
+from nlos.analysis import find_sampling_step, find_shortest_wavelength
+from nlos.band import Band, VirtualPulse
+from nlos.capture import TimeAxis
 from nlos.export import Mesh
-from nlos.illumination import AliasingWarning
-from nlos.known_scenes import HiddenTruth
+from nlos.illumination import AliasingWarning, warn_of_aliasing
+from nlos.io import read_capture
+from nlos.known_scenes import HiddenTruth, compare_with_truth
 from nlos.method import Plan
+from nlos.simulate import HiddenScene, Surface
+from tofclip.errors import InputError
 
-PNG = b"\x89PNG"
+BOX = "--x-m -0.15 0.25 --y-m -0.2 0.2 --near-m 0.4 --far-m 0.7 --everywhere"
+
+
+def peak(figures):
+    return [figures["peak_m"][axis] for axis in "xyz"]
+
+
+def pair(kind=Volume):
+    return kind.load("one.h5"), kind.load("two.h5")
 
 
 class TestSimulate:
-    def test_the_capture_carries_its_truth_and_its_settings(self, curved: Path) -> None:
+    def test_the_capture_carries_its_truth_and_its_settings(self, curved):
         capture, truth = Capture.load(curved), HiddenTruth.load(curved)
-        assert truth is not None
-        np.testing.assert_array_equal(truth.positions, [POINT])
+        np.testing.assert_array_equal(truth.positions, [HIDDEN_POINT])
         assert capture.signal.shape[1:] == (24, 24)
         assert capture.provenance["settings"]["wall"] == "cylinder"
         # The farthest point's light has arrived when the record ends, and no long silence follows.
         last = np.flatnonzero(capture.signal.max(axis=(1, 2)) > 1e-3 * capture.signal.max())[-1]
         assert 0 <= capture.axis.bins - last < 12
 
-    def test_its_settings_give_the_same_capture(self, run: Run, tmp_path: Path) -> None:
-        words = [
-            "simulate",
-            *SCENE,
-            "--wall",
-            "wavy",
-            "--wall-points",
-            6,
-            "--peak-counts",
-            20,
-            "--seed",
-            3,
-        ]
-        object_of(run, *words, "--background", 0.5, "--out", tmp_path / "one.h5")
-        object_of(
-            run, "simulate", "--settings", tmp_path / "one.toml", "--out", tmp_path / "two.h5"
-        )
-        object_of(
-            run,
-            "simulate",
-            "--settings",
-            tmp_path / "one.toml",
-            "--seed",
-            4,
-            "--out",
-            tmp_path / "three.h5",
-        )
-        one, two, three = (
-            Capture.load(tmp_path / f"{name}.h5") for name in ("one", "two", "three")
-        )
+    def test_its_settings_give_the_same_capture(self, shell):
+        counts = "--wall wavy --wall-points 6 --peak-counts 20 --seed 3 --background 0.5"
+        shell.figures(f"nlos simulate {HIDDEN_SCENE} {counts} --out one.h5")
+        shell.figures("nlos simulate --settings one.toml --out two.h5")
+        shell.figures("nlos simulate --settings one.toml --seed 4 --out three.h5")
+        (one, two), three = pair(Capture), Capture.load("three.h5")
         np.testing.assert_array_equal(one.signal, two.signal)
         assert not np.array_equal(one.signal, three.signal)
         assert np.array_equal(one.signal, np.round(one.signal))  # photons
 
-    def test_letters_before_two_plates(self, run: Run, tmp_path: Path) -> None:
-        words = [
-            "simulate",
-            "--letters",
-            "L",
-            "--wall",
-            "plates",
-            "--wall-points",
-            9,
-            "--facet-mm",
-            60,
-        ]
-        found = object_of(run, *words, "--laser-m", -0.5, 0, "--out", tmp_path / "plates.h5")
-        capture = Capture.load(tmp_path / "plates.h5")
-        assert (
-            found["wall_points"] == np.isfinite(capture.wall[..., 0]).sum() == 72
-        )  # the middle column hangs in the gap
+    def test_letters_before_two_plates(self, shell):
+        words = "--letters L --wall plates --wall-points 9 --facet-mm 60 --laser-m -0.5 0"
+        found = shell.figures(f"nlos simulate {words} --out plates.h5")
+        capture, truth = Capture.load("plates.h5"), HiddenTruth.load(Path("plates.h5"))
+        # the middle column hangs in the gap
+        assert found["wall_points"] == np.isfinite(capture.wall[..., 0]).sum() == 72
         assert any(np.array_equal(capture.laser, point) for point in capture.points)  # on the wall
         assert abs(capture.laser[0] + 0.5) < 0.2
-        truth = HiddenTruth.load(tmp_path / "plates.h5")
-        assert truth is not None
         corner = truth.positions[np.argmin(truth.positions[:, 0] - truth.positions[:, 1])]
         assert corner[0] < 0 < corner[1]  # the foot of an L is at the lower left, y down
         assert set(truth.positions[:, 2]) == {1.0}
 
-    def test_a_mesh(self, run: Run, tmp_path: Path) -> None:
+    def test_a_mesh(self, shell):
         corners = np.array([[-0.2, -0.1, 0.8], [-0.2, 0.1, 0.8], [0.2, 0.1, 0.8]], np.float32)
-        Mesh(corners, np.array([[0, 1, 2]], np.int32)).save(tmp_path / "triangle.ply")
-        words = [
-            "simulate",
-            "--mesh",
-            tmp_path / "triangle.ply",
-            "--material",
-            "retroreflecting",
-            "--wall-points",
-            4,
-        ]
-        assert object_of(run, *words, "--out", tmp_path / "capture.h5")["total"] > 0
+        Mesh(corners, np.array([[0, 1, 2]], np.int32)).save("triangle.ply")
+        words = "--mesh triangle.ply --material retroreflecting --wall-points 4"
+        assert shell.figures(f"nlos simulate {words} --out capture.h5")["total"] > 0
+
+    def test_truth_only_where_it_is(self, tmp_path, files):
+        with h5py.File(tmp_path / "foreign.h5", "w") as file:
+            file["data"] = [1.0]
+        (tmp_path / "text.npz").write_text("no HDF5")
+        for path in (tmp_path / "foreign.h5", tmp_path / "text.npz", files / "streak.h5", tmp_path):
+            assert HiddenTruth.load(path) is None
+        with pytest.raises(InputError, match="reach"):
+            HiddenTruth(np.zeros((1, 3)), 0.0).mask_near(Grid([0.0], [0.0], [0.0]), 0.0)
 
 
 class TestInfo:
-    def test_a_curved_wall(self, run: Run, curved: Path) -> None:
-        found = object_of(run, "info", curved)
+    def test_a_curved_wall(self, shell):
+        found = shell.figures("nlos info {curved}")
         wall = found["wall"]
         assert (wall["points"], wall["shape"], found["truth"]) == (576, "no planar lattice", True)
         assert wall["step_m"] == pytest.approx(0.8 / 23, rel=0.01)
-        suits = {name: one["suits"] for name, one in found["methods"].items()}
-        assert suits == {
-            "rsd": False,
-            "hybrid": True,
-            "backprojection": True,
-            "filtered-backprojection": True,
-            "lct": False,
-            "fk": False,
-        }
+        suits = {name for name, method in found["methods"].items() if method["suits"]}
+        assert suits == {"hybrid", "backprojection", "filtered-backprojection"}
+        assert set(found["methods"]) == suits | {"rsd", "lct", "fk"}
         assert "hybrid" in found["methods"]["rsd"]["reason"]
-        assert found["resolution_m"]["x"] == pytest.approx(
-            1.2 * found["wavelength_mm"]["chosen"] * 0.75e-3, rel=0.5
-        )
+        wavelength_m = found["wavelength_mm"]["chosen"] * 1e-3
+        assert found["resolution_m"]["x"] == pytest.approx(1.2 * wavelength_m * 0.75, rel=0.5)
 
-    def test_a_confocal_scan_suits_every_method(self, run: Run, confocal: Path) -> None:
-        found = object_of(run, "info", confocal)
+    def test_a_confocal_scan_suits_every_method(self, shell):
+        found = shell.figures("nlos info {confocal}")
         assert found["laser"] == "confocal"
         assert all(one["suits"] and one["memory_mib"] > 0 for one in found["methods"].values())
-        people = run("nlos", "info", confocal)
+        people = shell("nlos info {confocal}")
         assert people.status == 0
         assert "\nhybrid " in people.out
 
-    def test_the_shortest_wavelength_is_just_not_undersampled(
-        self, run: Run, curved: Path, tmp_path: Path
-    ) -> None:
-        chosen = object_of(run, "info", curved)["wavelength_mm"]
-        words = ["reconstruct", curved, "--out", tmp_path / "volume.h5", "--voxel-mm", 100]
-        object_of(run, *words, "--wavelength-mm", chosen["chosen"])
-        shorter = run("nlos", *words, "--wavelength-mm", 0.95 * chosen["shortest"])
+    def test_the_shortest_wavelength_is_just_not_undersampled(self, shell):
+        chosen = shell.figures("nlos info {curved}")["wavelength_mm"]
+        line = "nlos reconstruct {curved} --out volume.h5 --voxel-mm 100 --wavelength-mm"
+        shell.figures(f"{line} {chosen['chosen']}")
+        shorter = shell(f"{line} {0.95 * chosen['shortest']}")
         assert shorter.status == 0
         assert shorter.err.startswith("tofclip: warning: wall points 0.0348 m apart are too coarse")
         assert shorter.err.count("\n") == 1
 
-    def test_one_wall_point_and_many_lasers_are_sampled_by_the_lasers(self, confocal: Path) -> None:
-        from nlos.analysis import find_sampling_step
+    def test_one_wall_point_and_many_lasers_are_sampled_by_the_lasers(self, confocal):
+        scan = Capture.load(confocal)
+        alone = np.broadcast_to(scan.wall[3, 4], scan.wall.shape)
+        one_detector = Capture(scan.signal, alone, scan.wall, scan.bin_width)
+        assert find_sampling_step(one_detector) == pytest.approx(scan.spacing)
+        corner = scan.wall[0, 0]
+        assert find_sampling_step(Capture(scan.signal[:, 0, 0], corner, corner, 1e-11)) == 0
 
-        capture = Capture.load(confocal)
-        alone = np.broadcast_to(capture.wall[3, 4], capture.wall.shape)
-        one_detector = Capture(capture.signal, alone, capture.wall, capture.bin_width)
-        assert find_sampling_step(one_detector) == pytest.approx(capture.spacing)
-        nowhere = Capture(
-            capture.signal[:, 0, 0], capture.wall[0, 0], capture.wall[0, 0], capture.bin_width
-        )
-        assert find_sampling_step(nowhere) == 0
+    def test_a_recording_under_its_default_settings_warns_of_nothing(self, shared_data):
+        capture = read_capture(shared_data / "nlos" / "otoole2018_diffuse_s.npz")
+        wavelength = find_shortest_wavelength(capture, 3.0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", AliasingWarning)
+            warn_of_aliasing(capture, Band(VirtualPulse(wavelength), capture.axis))
+        with pytest.warns(AliasingWarning):
+            warn_of_aliasing(capture, Band(VirtualPulse(0.9 * wavelength), capture.axis))
 
 
 class TestReconstruct:
-    def test_the_point_is_found_without_a_word(
-        self, run: Run, curved: Path, tmp_path: Path
-    ) -> None:
-        found = object_of(run, "reconstruct", curved, "--out", tmp_path / "volume.h5")
+    def test_the_point_is_found_by_two_images_without_a_word(self, shell, monkeypatch):
+        made, imaged = [], []
+        begin, image = Plan.__init__, Plan.image
+        monkeypatch.setattr(Plan, "__init__", lambda *a: made.append(1) or begin(*a))
+        monkeypatch.setattr(Plan, "image", lambda *a: imaged.append(1) or image(*a))
+        found = shell.figures("nlos reconstruct {curved} --out volume.h5")
         assert found["method"] == "hybrid"
         # A third of the width of its image; the pulse of three waves is as long as the depth is
         # uncertain.
-        assert [found["peak_m"][axis] for axis in "xyz"] == pytest.approx(
-            POINT, abs=found["wavelength_mm"] / 3000
-        )
+        assert peak(found) == pytest.approx(HIDDEN_POINT, abs=found["wavelength_mm"] / 3000)
+        assert len(made) == len(imaged) == 2  # coarse voxels, then the bright part
 
     @pytest.mark.parametrize("method", ["hybrid", "backprojection", "filtered-backprojection"])
-    def test_its_settings_give_the_same_volume(
-        self, run: Run, curved: Path, tmp_path: Path, method: str
-    ) -> None:
-        words = ["reconstruct", curved, "--gate-m", 0.1, "--bins-together", 2, "--voxel-mm", 33.3]
-        object_of(run, *words, "--method", method, "--out", tmp_path / "one.h5")
-        settings = ["--settings", tmp_path / "one.toml"]
-        object_of(run, "reconstruct", curved, *settings, "--out", tmp_path / "two.h5")
-        one, two = (Volume.load(tmp_path / f"{name}.h5") for name in ("one", "two"))
+    def test_its_settings_give_the_same_volume(self, shell, method):
+        words = f"--gate-m 0.1 --bins-together 2 --voxel-mm 33.3 --method {method}"
+        shell.figures(f"nlos reconstruct {{curved}} {words} --out one.h5")
+        shell.figures("nlos reconstruct {curved} --settings one.toml --out two.h5")
+        one, two = pair()
         assert one.values.tobytes() == two.values.tobytes()
         for axis in "xyz":
             assert getattr(one.grid, axis).tobytes() == getattr(two.grid, axis).tobytes()
-        assert (tmp_path / "one.toml").read_text() == (tmp_path / "two.toml").read_text()
+        assert Path("one.toml").read_text() == Path("two.toml").read_text()
 
-    def test_flags_win(self, run: Run, curved: Path, tmp_path: Path) -> None:
-        (tmp_path / "mine.toml").write_text(
-            "voxel_mm = 50\nmethod = 'backprojection'\nx_m = [-0.2, 0.3]\n"
-        )
-        words = [
-            "reconstruct",
-            curved,
-            "--settings",
-            tmp_path / "mine.toml",
-            "--everywhere",
-            "--voxel-mm",
-            100,
-        ]
-        found = object_of(
-            run,
-            *words,
-            "--y-m",
-            -0.1,
-            0.1,
-            "--near-m",
-            0.5,
-            "--far-m",
-            0.6,
-            "--out",
-            tmp_path / "v.h5",
-        )
-        assert (found["voxel_mm"], found["method"], found["voxels"]) == (
-            100.0,
-            "backprojection",
-            [2, 3, 6],
-        )
-        assert tomllib.loads((tmp_path / "v.toml").read_text())["x_m"] == [-0.2, 0.3]
+    def test_flags_win(self, shell):
+        mine = "voxel_mm = 50\nmethod = 'backprojection'\nx_m = [-0.2, 0.3]\n"
+        Path("mine.toml").write_text(mine)
+        box = "--voxel-mm 100 --y-m -0.1 0.1 --near-m 0.5 --far-m 0.6 --everywhere"
+        found = shell.figures(f"nlos reconstruct {{curved}} --settings mine.toml {box} --out v.h5")
+        assert (found["voxel_mm"], found["method"]) == (100.0, "backprojection")
+        assert found["voxels"] == [2, 3, 6]
+        assert tomllib.loads(Path("v.toml").read_text())["x_m"] == [-0.2, 0.3]
 
     @pytest.mark.parametrize("method", ["rsd", "lct", "fk"])
-    def test_confocal_scans(self, run: Run, confocal: Path, tmp_path: Path, method: str) -> None:
-        words = [
-            "reconstruct",
-            confocal,
-            "--method",
-            method,
-            "--voxel-mm",
-            20,
-            "--out",
-            tmp_path / "volume.h5",
-        ]
-        found = object_of(run, *words)
-        assert [found["peak_m"][axis] for axis in "xyz"] == pytest.approx(POINT, abs=0.04)
-        kept = (tmp_path / "volume.toml").read_text()
+    def test_confocal_scans(self, shell, method):
+        found = shell.figures(
+            f"nlos reconstruct {{confocal}} --method {method} --voxel-mm 20 --out v.h5"
+        )
+        assert peak(found) == pytest.approx(HIDDEN_POINT, abs=0.04)
+        kept = Path("v.toml").read_text()
         assert ("falloff = 4" in kept) == (method in ("lct", "fk"))
         assert "sigma_mm" not in kept
 
     @pytest.mark.parametrize("method", ["lct", "fk"])
-    def test_noise_of_the_farthest_depths_is_not_looked_at(
-        self, run: Run, tmp_path: Path, method: str
-    ) -> None:
+    def test_noise_of_the_farthest_depths_is_not_looked_at(self, shell, method):
         """With the factor d^4 by which these methods brighten, photons of chance far away outshine
         the point.
         """
-        words = [
-            "simulate",
-            *SCENE,
-            "--wall",
-            "planar",
-            "--scan",
-            "confocal",
-            "--wall-points",
-            24,
-            "--seed",
-            1,
-        ]
-        object_of(
-            run, *words, "--peak-counts", 10, "--background", 0.5, "--out", tmp_path / "short.h5"
-        )
-        short = Capture.load(tmp_path / "short.h5")
+        scan = f"{HIDDEN_SCENE} --wall planar --scan confocal --wall-points 24 --seed 1"
+        shell.figures(f"nlos simulate {scan} --peak-counts 10 --background 0.5 --out short.h5")
+        short = Capture.load("short.h5")
         later = np.random.default_rng(1).poisson(0.5, (300, *short.signal.shape[1:]))
-        replace(short, signal=np.concatenate([short.signal, later])).save(tmp_path / "long.h5")
-        words = ["reconstruct", tmp_path / "long.h5", "--method", method, "--voxel-mm", 25]
-        found = object_of(run, *words, "--out", tmp_path / "volume.h5")
-        assert [found["peak_m"][axis] for axis in "xyz"] == pytest.approx(POINT, abs=0.05)
+        replace(short, signal=np.concatenate([short.signal, later])).save("long.h5")
+        found = shell.figures(
+            f"nlos reconstruct long.h5 --method {method} --voxel-mm 25 --out volume.h5"
+        )
+        assert peak(found) == pytest.approx(HIDDEN_POINT, abs=0.05)
         # Where the method itself had looked, the box would end at 1.54 m.
-        assert Volume.load(tmp_path / "volume.h5").grid.z[-1] < 1.0
+        assert Volume.load("volume.h5").grid.z[-1] < 1.0
 
-    @pytest.mark.parametrize("suffix", [".vti", ".npz", ".exr", ".ply"])
-    def test_formats(self, run: Run, curved: Path, tmp_path: Path, suffix: str) -> None:
-        starts = {".vti": b"<?xml", ".npz": b"PK", ".exr": b"\x76\x2f\x31\x01", ".ply": b"ply"}
-        out = tmp_path / f"volume{suffix}"
-        object_of(run, "reconstruct", curved, "--voxel-mm", 60, "--out", out)
-        assert out.read_bytes().startswith(starts[suffix])
-
-
-def test_progress_and_an_interruption(curved: Path, tmp_path: Path) -> None:
-    """Some seconds of work are announced on a terminal, and Ctrl-C ends them with nothing written."""
-    import pty  # exists only where the test can run
-
-    words = [
-        "nlos",
-        "reconstruct",
-        curved,
-        "--method",
-        "backprojection",
-        "--everywhere",
-        "--voxel-mm",
-        3,
-    ]
-    terminal, child_side = pty.openpty()
-    process = subprocess.Popen(
-        [*PROGRAM, *map(str, words), "--out", tmp_path / "volume.h5"],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=child_side,
-        text=True,
+    @pytest.mark.parametrize(
+        ("suffix", "start"),
+        [("vti", b"<?xml"), ("npz", b"PK"), ("exr", b"\x76\x2f\x31\x01"), ("ply", b"ply")],
     )
-    os.close(child_side)
-    wait_for(terminal, "imaging")  # the bar is drawn, so the imaging has begun
-    process.send_signal(signal.SIGINT)
-    out, _ = process.communicate(timeout=LONGEST_WAIT_S)
-    assert (process.returncode, out) == (130, "")
-    wait_for(terminal, "tofclip: interrupted")
-    os.close(terminal)
-    assert list(tmp_path.iterdir()) == []
+    def test_formats(self, shell, suffix, start):
+        shell.figures(f"nlos reconstruct {{curved}} --voxel-mm 60 --out volume.{suffix}")
+        assert Path(f"volume.{suffix}").read_bytes().startswith(start)
 
 
-def examples() -> dict[str, list[str]]:
-    """Example commands in the help, by verb."""
-    verbs = {
-        name.partition(" ")[2]: verb
-        for name, verb in collect_verbs().items()
-        if name.startswith("nlos ")
-    }
-    return {name: split_docstring(verb.callback.__doc__)[1] for name, verb in verbs.items()}
+class TestRefine:
+    @pytest.mark.parametrize("prior", ["l1", "tv"])
+    def test_iterations_gather_the_light(self, shell, prior):
+        line = f"nlos reconstruct {{curved}} {BOX} --voxel-mm 20 --wavelength-mm 150 --out"
+        shell.figures(f"{line} one.h5 --method hybrid")
+        found = shell.figures(f"{line} two.h5 --refine {prior} --iterations 8")
+        assert (found["method"], found["refine"], found["iterations"]) == ("hybrid", prior, 8)
+        assert found["stopped_because"] == "iteration limit"
+        plain, refined = pair()
+        axes = np.meshgrid(plain.grid.z, plain.grid.y, plain.grid.x, indexing="ij")
+        near = np.linalg.norm(np.stack(axes[::-1], axis=-1) - HIDDEN_POINT, axis=-1) < 0.04
+        shares = [np.sum(one.values[near] ** 2) / np.sum(one.values**2) for one in (plain, refined)]
+        assert refined.values.min() >= 0
+        assert shares[1] > 1.5 * shares[0]
+        assert peak(found) == pytest.approx(HIDDEN_POINT, abs=0.03)
+        reported = Path("two.toml").read_text()
+        assert f'refine = "{prior}"\niterations = 8\nprior_weight = 0.02\n' in reported
+
+    def test_photons_gather_the_light(self, shell):
+        """One photon and a half for each wall point and thing hidden, and ten of background."""
+        words = "--wall-points 16 --peak-counts 4 --background 0.03 --out counts.h5"
+        shell.figures(f"nlos simulate --points '0.1,0.05,0.7; -0.3,0.2,0.9' {words}")
+        box = "--x-m -0.5 0.5 --y-m -0.4 0.4 --near-m 0.5 --far-m 1.1 --everywhere --voxel-mm 40"
+        shell.figures(f"nlos reconstruct counts.h5 {box} --out one.h5")
+        found = shell.figures(f"nlos reconstruct counts.h5 {box} --refine photons --out two.h5")
+        assert (found["refine"], found["iterations"]) == ("photons", 12)
+        truth = HiddenTruth(np.array([[0.1, 0.05, 0.7], [-0.3, 0.2, 0.9]]), 0.0)
+        plain, refined = (compare_with_truth(one, truth)["energy_near_truth"] for one in pair())
+        assert refined > 0.7 > 0.3 > plain
+        reported = Path("two.toml").read_text()
+        assert 'refine = "photons"\niterations = 12\nprior_weight = 1.0\n' in reported
+
+    def test_its_settings_give_the_same_volume(self, shell):
+        mine = "refine = 'l1'\niterations = 2\nprior_weight = 0.1\nvoxel_mm = 30\n"
+        Path("mine.toml").write_text(mine)
+        words = f"--wavelength-mm 200 {BOX} --settings mine.toml --out one.h5"
+        shell.figures(f"nlos reconstruct {{curved}} {words}")
+        shell.figures("nlos reconstruct {curved} --settings one.toml --out two.h5")
+        one, two = pair()
+        np.testing.assert_array_equal(one.values, two.values)
+
+    def test_it_stays_with_the_compiled_loops(self, shell):
+        pytest.importorskip("torch")
+        words = f"{BOX} --voxel-mm 50 --wavelength-mm 300 --refine l1 --iterations 1 --out v.h5"
+        line = f"nlos reconstruct {{curved}} {words} --device"
+        shell.refuses(f"{line} torch:cpu", "iterative refinement works on NumPy arrays only")
+        assert shell.figures(f"{line} auto")["device"] == "cpu"
+
+    def test_voxels_that_the_wavelength_does_not_resolve(self, shell):
+        words = f"{BOX} --refine l1 --wavelength-mm 100 --voxel-mm 50 --out volume.h5"
+        outcome = shell(f"nlos reconstruct {{curved}} {words}")
+        assert outcome.status == 2
+        assert "too coarse to refine" in outcome.err.splitlines()[-1]
+        assert not list(Path().iterdir())
 
 
-def test_every_verb_explains_itself_with_an_example(run: Run) -> None:
-    for verb, shown in examples().items():
-        assert shown
-        outcome = run("nlos", verb, "--help")
-        assert outcome.status == 0
-        for word in ("--json", "Exit status"):
-            assert word in outcome.out
-    assert set(examples()) == {
-        "reconstruct",
-        "stream",
-        "film",
-        "compare",
-        "simulate",
-        "info",
-        "demo",
-    }
+@pytest.mark.parametrize("confocal", [True, False])
+def test_a_tilted_square_has_its_depth_and_normals(shell, confocal):
+    centre, turn = np.array([0.05, -0.05, 0.7]), np.radians(25.0)
+    x, y = np.meshgrid(np.linspace(-0.6, 0.6, 32), np.linspace(-0.6, 0.6, 32))
+    wall = np.stack([x, y, 0 * x], axis=-1)
+    # A matte square of 0.4 m, turned about y; counter-clockwise as seen from the wall.
+    u, v = 0.2 * np.array([np.cos(turn), 0, np.sin(turn)]), np.array([0, 0.2, 0])
+    corners = centre + np.array([-u - v, u - v, u + v, -u + v])
+    scene = HiddenScene([Surface.mesh(corners, [[0, 2, 1], [0, 3, 2]], 0.04)])
+    laser = wall if confocal else [0.0, 0.0, 0.0]
+    scene.simulate_capture(wall, laser, TimeAxis(200, 50e-12), 60e-12).save("c.h5")
+    box = "--x-m -0.2 0.3 --y-m -0.3 0.2 --near-m 0.5 --far-m 0.9 --voxel-mm 20 --everywhere"
+    words = f"{box} --wavelength-mm 120 --point-fraction 0.3 --surface mesh.ply --out v.h5"
+    outcome = shell(f"nlos reconstruct c.h5 {words}")
+    assert outcome.status == 0
+    source = "directional light-cone transform" if confocal else "gradient of the volume"
+    assert source in outcome.out
+    header, _, data = Path("mesh.ply").read_bytes().partition(b"end_header\n")
+    count = int(header.split(b"element vertex ")[1].split()[0])
+    assert f"{count}\n" in outcome.out
+    vertices = np.frombuffer(data, "<f4", 7 * count).reshape(-1, 7)
+    inner = vertices[np.linalg.norm(vertices[:, :2] - centre[:2], axis=1) < 0.12]
+    assert len(inner) > 40
+    away, normals = inner[:, :3] - centre, inner[:, 3:6]
+    # a bin of path, or a quarter of the wavelength
+    errors = np.abs(away[:, 2] - away[:, 0] * np.tan(turn))
+    assert np.median(errors) < (0.015 if confocal else 0.03)
+    cosines = normals @ [np.sin(turn), 0, -np.cos(turn)]
+    assert np.median(np.degrees(np.arccos(np.clip(cosines, -1, 1)))) < 12
 
 
-def test_the_examples_run_one_after_the_other(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_examples_run_one_after_the_other(shell):
+    verbs = collect_verbs()
     for verb in ("simulate", "info", "reconstruct", "film", "compare"):
-        for example in examples()[verb]:
-            outcome = run(*shlex.split(example)[1:])
+        for example in split_docstring(verbs[f"nlos {verb}"].callback.__doc__)[1]:
+            outcome = shell(shlex.join(shlex.split(example)[1:]))
             assert (outcome.status, outcome.err) == (0, ""), example
     assert "  near truth " in outcome.out  # compare's columns for people
-    assert Path("volume.png").read_bytes().startswith(PNG)
-
-
-def test_truth_only_where_it_is(tmp_path: Path, files: Path) -> None:
-    import h5py
-
-    from tofclip.errors import InputError
-
-    with h5py.File(tmp_path / "foreign.h5", "w") as file:
-        file["data"] = [1.0]
-    (tmp_path / "text.npz").write_text("no HDF5")
-    for path in (tmp_path / "foreign.h5", tmp_path / "text.npz", files / "streak.h5", tmp_path):
-        assert HiddenTruth.load(path) is None
-    with pytest.raises(InputError, match="reach"):
-        HiddenTruth(np.zeros((1, 3)), 0.0).mask_near(
-            Volume(np.zeros((1, 1, 1)), _one_voxel()).grid, 0.0
-        )
-
-
-def _one_voxel() -> Any:
-    from nlos import Grid
-
-    return Grid([0.0], [0.0], [0.0])
-
-
-def test_a_recording_under_its_default_settings_warns_of_nothing(shared_data: Path) -> None:
-    import warnings
-
-    from nlos.analysis import find_shortest_wavelength
-    from nlos.band import Band, VirtualPulse
-    from nlos.illumination import warn_of_aliasing
-    from nlos.io import read_capture
-
-    capture = read_capture(shared_data / "nlos" / "otoole2018_diffuse_s.npz")
-    wavelength = find_shortest_wavelength(capture, 3.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", AliasingWarning)
-        warn_of_aliasing(capture, Band(VirtualPulse(wavelength), capture.axis))
-    with pytest.warns(AliasingWarning):
-        warn_of_aliasing(capture, Band(VirtualPulse(0.9 * wavelength), capture.axis))
-
-
-def test_each_plan_is_made_once_per_image(
-    run: Run, curved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made, imaged = [], []
-    begin, image = Plan.__init__, Plan.image
-
-    def count_plan(plan: Plan, *arguments: object) -> None:
-        made.append(type(plan).__name__)
-        begin(plan, *arguments)  # type: ignore[arg-type]
-
-    def count_image(plan: Plan, *arguments: object) -> object:
-        imaged.append(type(plan).__name__)
-        return image(plan, *arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Plan, "__init__", count_plan)
-    monkeypatch.setattr(Plan, "image", count_image)
-    words = ["reconstruct", curved, "--method", "hybrid", "--out", tmp_path / "volume.h5"]
-    object_of(run, *words)
-    assert len(made) == len(imaged) == 2  # coarse voxels, then the bright part
+    assert Path("volume.png").read_bytes().startswith(b"\x89PNG")

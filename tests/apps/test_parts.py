@@ -1,31 +1,37 @@
-"""The small parts behind the verbs: reports, progress, names of files, and what the pictures choose
-to show.
+"""The small parts behind the verbs: reports, progress, names of files, settings, and what the
+pictures choose to show.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import signal
-import sys
 import threading
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from apps.figures.shot import MAX_MOMENTS, choose_moments, make_preview_figure
 from apps.figures.style import make_figure, save_figure
-from apps.progress import show_activity, show_progress
+from apps.progress import show_progress
 from apps.report import build_provenance, make_folder, report, require_writable, to_json_value
-from tofclip import Camera, Frames, Streak
-from tofclip.errors import StorageError
+from apps.settings import load_settings, save_settings, setting, settings_to_dict
+from apps.verbs.nlos import ReconstructSettings
+from apps.verbs.nlos_scenes import CompareSettings
+from nlos import simulate
+from nlos.known_scenes import WALLS, SceneSettings
+from tofclip import Frames, Streak
+from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.storage import Record
 
 
 class TestReport:
-    def test_json_has_no_nan_and_no_numpy(self, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_json_has_no_nan_and_no_numpy(self, capsys):
         figures = {
             "a": np.float32(0.5),
             "b": np.array([1.0, np.nan]),
@@ -35,93 +41,74 @@ class TestReport:
         report(figures, as_json=True, written=[Path("out.h5")])
         found = json.loads(capsys.readouterr().out)
         assert found == {"a": 0.5, "b": [1.0, None], "c": [1, "x"], "d": {"e": 3}}
+        odd = [np.inf, -np.inf, True, None, "text"]
+        assert to_json_value(odd) == [None, None, True, None, "text"]
 
-    def test_table_for_people(self, capsys: pytest.CaptureFixture[str]) -> None:
-        figures = {"range_m": [1.23456, float("inf")], "points": 3, "at": {"x": 0.5, "z": 12345.6}}
+    @pytest.mark.parametrize(
+        ("figures", "lines"),
+        [
+            (
+                {"range_m": [1.23456, float("inf")], "points": 3, "at": {"x": 0.5, "z": 12345.6}},
+                ["range m  1.235, unknown", "points   3", "at       x 0.5, z 12346"],
+            ),
+            # what is said of several things stands side by side
+            (
+                {
+                    "seed": 0,
+                    "hybrid": {"seconds": 2.2384, "peak_mib": 65.0},
+                    "flat": {"seconds": 1.3, "peak_mib": 40.0},
+                    "lost": {"device_count": 1, "host_count": 2},
+                    "found": {"device_count": 1, "host_count": 2},
+                    "stages_s": {
+                        "read": {"median": 0.25, "p95": 0.5},
+                        "wait": {"median": 1.0, "p95": 2.0},
+                    },
+                    "targets": [
+                        {"distance_m": 0.1, "seen": False},
+                        {"distance_m": 0.2, "seen": True},
+                    ],
+                },
+                [
+                    "seed      0",
+                    "          hybrid  flat",
+                    "seconds   2.238   1.3",
+                    "peak mib  65      40",
+                    "lost      device count 1, host count 2",
+                    "found     device count 1, host count 2",
+                    "stages s",
+                    "        median  p95",
+                    "  read  0.25    0.5",
+                    "  wait  1       2",
+                    "targets",
+                    "     distance m  seen",
+                    "  1  0.1         no",
+                    "  2  0.2         yes",
+                ],
+            ),
+            # units stand behind their figures
+            ({"wall": {"width_m": 2.0, "gap_mm": None}}, ["wall  width 2 m, gap unknown"]),
+            (
+                {"why": {"a": "x" * 60, "long_one": "y" * 60}},
+                ["why", f"  a         {'x' * 60}", f"  long one  {'y' * 60}"],
+            ),
+        ],
+    )
+    def test_table_for_people(self, capsys, figures, lines):
         report(figures, as_json=False, written=[Path("out.h5")])
-        lines = ["range m  1.235, unknown", "points   3", "at       x 0.5, z 12346", "wrote out.h5"]
-        assert capsys.readouterr().out.splitlines() == lines
+        assert capsys.readouterr().out.splitlines() == [*lines, "wrote out.h5"]
 
-    def test_what_is_said_of_several_things_stands_side_by_side(
-        self, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        figures = {
-            "seed": 0,
-            "hybrid": {"seconds": 2.2384, "peak_mib": 65.0},
-            "flat": {"seconds": 1.3, "peak_mib": 40.0},
-            "lost": {"device_count": 1, "host_count": 2},
-            "found": {"device_count": 1, "host_count": 2},
-            "stages_s": {"read": {"median": 0.25, "p95": 0.5}, "wait": {"median": 1.0, "p95": 2.0}},
-            "targets": [{"distance_m": 0.1, "seen": False}, {"distance_m": 0.2, "seen": True}],
-        }
-        report(figures, as_json=False)
-        assert capsys.readouterr().out.splitlines() == [
-            "seed      0",
-            "          hybrid  flat",
-            "seconds   2.238   1.3",
-            "peak mib  65      40",
-            "lost      device count 1, host count 2",
-            "found     device count 1, host count 2",
-            "stages s",
-            "        median  p95",
-            "  read  0.25    0.5",
-            "  wait  1       2",
-            "targets",
-            "     distance m  seen",
-            "  1  0.1         no",
-            "  2  0.2         yes",
-        ]
-
-    def test_many_things_stand_below_each_other_and_units_behind_their_figures(
-        self, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_many_things_stand_below_each_other(self, capsys):
         found = {f"object_{number}": {"range_m": 1.5, "points": 7} for number in range(12)}
         report(found, as_json=False)
-        lines = capsys.readouterr().out.splitlines()
-        assert lines[0].split() == ["range", "m", "points"]
-        assert lines[12].split() == ["object", "11", "1.5", "7"]
-        report({"wall": {"width_m": 2.0, "gap_mm": None}}, as_json=False)
-        assert capsys.readouterr().out == "wall  width 2 m, gap unknown\n"
-        report({"why": {"a": "x" * 60, "long_one": "y" * 60}}, as_json=False)
-        assert capsys.readouterr().out == f"why\n  a         {'x' * 60}\n  long one  {'y' * 60}\n"
-
-    def test_infinity_is_unknown(self) -> None:
-        assert to_json_value([np.inf, -np.inf, True, None, "text"]) == [
-            None,
-            None,
-            True,
-            None,
-            "text",
-        ]
+        lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+        assert (lines[0], lines[12]) == (["range", "m", "points"], ["object", "11", "1.5", "7"])
 
 
 class TestProgress:
-    def test_silent_where_nobody_watches(self, capsys: pytest.CaptureFixture[str]) -> None:
-        with show_progress("working", 10) as advance:
-            advance(10)
-        with show_activity("working"):
-            pass
-        assert capsys.readouterr() == ("", "")
-
-    def test_elapsed_and_left_are_on_a_terminal(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        terminal = io.StringIO()
-        terminal.isatty = lambda: True  # type: ignore[method-assign]
-        monkeypatch.setattr(sys, "stderr", terminal)
-        monkeypatch.setenv("TERM", "xterm")
-        with show_progress("working", 10) as advance:
-            advance(5)
-        with show_activity("waiting"):
-            pass
-        shown = terminal.getvalue()
-        assert "working" in shown
-        assert "0:00:00" in shown
-        assert "left" in shown
-        assert "waiting" in shown
-
-    def test_after_ctrl_c_every_thread_stops(self) -> None:
+    def test_after_ctrl_c_every_thread_stops(self):
         stopped = threading.Event()
 
-        def work() -> None:
+        def work():
             try:
                 while True:
                     advance(1)
@@ -138,10 +125,10 @@ class TestProgress:
             assert stopped.is_set()
         assert signal.getsignal(signal.SIGINT) is before
 
-    def test_other_threads_may_use_it(self) -> None:
-        amounts: list[int] = []
+    def test_other_threads_may_use_it(self):
+        amounts = []
 
-        def work() -> None:
+        def work():
             with show_progress("working", 1) as advance:
                 advance(1)
                 amounts.append(1)
@@ -153,117 +140,197 @@ class TestProgress:
 
 
 class TestFiles:
-    def test_folder_without_permission(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(
-            "os.access", lambda *_: False
-        )  # a test may run as root, whom nothing stops
+    def test_places_that_cannot_be_written_to(self, tmp_path, monkeypatch):
+        with pytest.raises(StorageError, match="is a folder"):
+            require_writable(tmp_path)
+        with pytest.raises(StorageError):
+            save_figure(make_figure(2, 2), tmp_path / "absent" / "look.png")
+        # a test may run as root, whom nothing stops
+        monkeypatch.setattr("os.access", lambda *_: False)
         with pytest.raises(StorageError, match="not permitted"):
             require_writable(tmp_path / "a.h5")
         with pytest.raises(StorageError, match="not permitted"):
             make_folder(tmp_path)
+        assert list(tmp_path.iterdir()) == []
 
-    def test_a_folder_is_no_file(self, tmp_path: Path) -> None:
-        with pytest.raises(StorageError, match="is a folder"):
-            require_writable(tmp_path)
-
-    def test_history_keeps_the_past(self, tmp_path: Path) -> None:
+    def test_history_keeps_the_past(self, tmp_path):
         (tmp_path / "in.txt").write_text("x")
-        reported = build_provenance(
-            {"verb": "test"}, tmp_path / "in.txt", earlier={"software": "older"}
-        )
-        assert reported["earlier"] == {"software": "older"}
+        settings, past = {"verb": "test"}, {"software": "older"}
+        reported = build_provenance(settings, tmp_path / "in.txt", earlier=past)
+        assert reported["earlier"] == past
         # SHA-256 of the letter x
-        assert (
-            reported["inputs"][0]["sha256"]
-            == "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881"
-        )
+        digest = "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881"
+        assert reported["inputs"][0]["sha256"] == digest
         assert "earlier" not in build_provenance({})
 
 
-def frames_with(
-    camera: Camera, energy: np.ndarray, attachments: dict[str, Record] | None = None
-) -> Frames:
+def frames_with(camera, energy, attachments=None):
     """Frames whose only bright pixel has the given brightness over time, at ranges around 3 m."""
-    camera = camera.replace(time_zero=-10e-9)
     values = np.zeros((energy.size, *camera.image_shape), np.float32)
     values[:, 5, 6] = energy
     times = 20e-9 + np.arange(energy.size) * 20e-12
+    camera = camera.replace(time_zero=-10e-9)
     return Frames(values, times, camera, attachments=attachments or {})
 
 
+WALL = {"relay_wall": Record("relay_wall")}
+
+
+def bumps(places, sigma, size=300):
+    return np.exp(-(((np.arange(size)[:, np.newaxis] - places) / sigma) ** 2) / 2)
+
+
 class TestMoments:
-    def test_separate_objects_make_separate_peaks(self, camera: Camera) -> None:
-        rows, bins = np.array([20, 60, 110, 170, 199]), np.arange(200)
-        energy = np.exp(-(((bins[:, np.newaxis] - rows) / 2.5) ** 2) / 2) @ np.array(
-            [5.0, 1, 3, 2, 4]
-        )
+    def test_separate_objects_make_separate_peaks(self, camera):
+        rows = np.array([20, 60, 110, 170, 199])
+        energy = bumps(rows, 2.5, 200) @ np.array([5.0, 1, 3, 2, 4])
         found = choose_moments(frames_with(camera, energy))
         assert [moment.frame for moment in found] == pytest.approx(rows, abs=1)
         # Half height of a Gaussian of 2.5 bins, smoothed by 1.5, is 3.4 bins away from its peak.
         assert [moment.last - moment.first for moment in found[:4]] == pytest.approx([7] * 4, abs=1)
 
-    def test_only_the_strongest_are_shown(self, camera: Camera) -> None:
+    def test_only_the_strongest_are_shown(self, camera):
         energy = np.zeros(600)
         energy[10::30] = np.arange(1, 21)
         found = [moment.frame for moment in choose_moments(frames_with(camera, energy))]
         assert found == list(range(250, 600, 30))
         assert len(found) == MAX_MOMENTS
 
-    def test_light_without_a_pause_is_cut_into_even_shares(self, camera: Camera) -> None:
-        energy = np.exp(-(((np.arange(300) - 150) / 40) ** 2) / 2)
-        moments = choose_moments(frames_with(camera, energy, {"relay_wall": Record("relay_wall")}))
+    def test_light_without_a_pause_is_cut_into_even_shares(self, camera):
+        energy = bumps([150], 40)[:, 0]
+        moments = choose_moments(frames_with(camera, energy, WALL))
         assert len(moments) == MAX_MOMENTS
         shares = [energy[moment.first : moment.last + 1].sum() / energy.sum() for moment in moments]
         # A twelfth each, up to the frame that a cut falls on (at most 1 % of the light).
         np.testing.assert_allclose(shares, 0.98 / MAX_MOMENTS, atol=0.011)
 
-    def test_overlapping_peaks_are_cut_into_even_shares(self, camera: Camera) -> None:
-        bins = np.arange(300)
-        bumps = np.exp(-(((bins[:, np.newaxis] - [90, 120, 150, 180, 210]) / 3) ** 2) / 2).sum(
-            axis=1
-        )
-        energy = (
-            np.exp(-(((bins - 150) / 60) ** 2) / 2) + 0.2 * bumps
-        )  # the middle one stands on all of the others
-        moments = choose_moments(frames_with(camera, energy))
+    def test_overlapping_peaks_are_cut_into_even_shares(self, camera):
+        # the middle one stands on all of the others
+        peaks = bumps([90, 120, 150, 180, 210], 3).sum(axis=1)
+        moments = choose_moments(frames_with(camera, bumps([150], 60)[:, 0] + 0.2 * peaks))
         assert all(earlier.last < later.first for earlier, later in pairwise(moments))
         assert len(moments) == MAX_MOMENTS
 
-    def test_brightness_is_compensated_only_where_time_tells_the_range(
-        self, camera: Camera
-    ) -> None:
+    def test_brightness_is_compensated_only_where_time_tells_the_range(self, camera):
         """A far peak is below the limit as measured, and above it once the fall-off with range is
         undone.
         """
         energy = np.zeros(1000)
         energy[[20, 500, 980]] = [1.0, 0.3, 0.008]
         energy[[100, 200, 300, 400]] = 0.5
-        wall = {"relay_wall": Record("relay_wall")}
-        assert 980 in [moment.frame for moment in choose_moments(frames_with(camera, energy))]
-        assert 980 not in [
-            moment.frame for moment in choose_moments(frames_with(camera, energy, wall))
-        ]
+        for attachments, is_shown in (({}, True), (WALL, False)):
+            found = choose_moments(frames_with(camera, energy, attachments))
+            assert (980 in [moment.frame for moment in found]) == is_shown
 
-    def test_few_frames_are_shown_one_by_one(self, camera: Camera) -> None:
+    def test_few_frames_are_shown_one_by_one(self, camera):
         moments = choose_moments(frames_with(camera, np.ones(5)))
-        assert [(moment.first, moment.last) for moment in moments] == [
-            (frame, frame) for frame in range(5)
-        ]
+        assert [(one.first, one.last) for one in moments] == [(n, n) for n in range(5)]
 
     @pytest.mark.parametrize("energy", [np.ones(1), np.zeros(5), np.zeros(50)])
-    def test_the_picture_can_always_be_drawn(
-        self, camera: Camera, tmp_path: Path, energy: np.ndarray
-    ) -> None:
-        streak = Streak(np.ones((energy.size, camera.slit_width_px)), camera=camera).with_bin_width(
-            20e-12
-        )
+    def test_the_picture_can_always_be_drawn(self, camera, tmp_path, energy):
+        counts = np.ones((energy.size, camera.slit_width_px))
+        streak = Streak(counts, camera=camera).with_bin_width(20e-12)
         save_figure(make_preview_figure(streak, frames_with(camera, energy)), tmp_path / "look.png")
         assert (tmp_path / "look.png").stat().st_size > 10_000
 
 
-def test_a_picture_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    with pytest.raises(StorageError):
-        save_figure(make_figure(2, 2), tmp_path / "absent" / "look.png")
-    assert list(tmp_path.iterdir()) == []
+@dataclass(frozen=True)
+class Sample:
+    """One setting of every type."""
+
+    name: str | None = setting("TEXT", "A text.")
+    length: float | None = setting("M", "A length.", unit="m")
+    facet: float | None = setting("MM", "A short one.", unit="m", written="mm")
+    count: int = setting("N", "A number.", 2)
+    whole: bool = setting(None, "A choice.", False)
+    ends: tuple[float, float] | None = setting("M M", "A pair.", unit="m")
+
+
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+SAMPLES = st.builds(
+    Sample,
+    name=st.none() | st.text(st.characters(exclude_categories=["Cs"])),
+    length=st.none() | NUMBERS,
+    count=st.integers(-(2**63), 2**63 - 1),
+    whole=st.booleans(),
+    ends=st.none() | st.tuples(NUMBERS, NUMBERS),
+)
+
+
+@given(sample=SAMPLES)
+def test_what_is_written_is_read_back_to_the_last_bit(
+    sample: Sample, tmp_path_factory: pytest.TempPathFactory
+):
+    path = tmp_path_factory.getbasetemp() / "sample.toml"
+    save_settings(sample, path, "a sample")
+    assert repr(load_settings(Sample, path, {})) == repr(sample)  # as text, for -0.0 equals 0.0
+
+
+def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path):
+    path = tmp_path / "settings.toml"
+    path.write_text("length_m = 3\ncount = 5\nends_m = [1, 2.5]\n")
+    found = load_settings(Sample, path, {"count": 7, "name": None, "whole": False})
+    assert found == Sample(length=3.0, count=7, ends=(1.0, 2.5))
+    assert isinstance(found.length, float)
+    assert load_settings(Sample, None, {}) == Sample()
+    assert settings_to_dict(Sample(count=3)) == {"count": 3, "whole": False}
+
+
+@given(st.decimals(1, 9999, places=4).map(float))
+def test_lengths_in_mm_are_metres_inside_and_come_back_as_they_were(facet_mm: float):
+    found = load_settings(Sample, None, {"facet_mm": facet_mm})
+    assert found.facet == facet_mm * 1e-3
+    assert settings_to_dict(found)["facet_mm"] == facet_mm
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("lenght_m = 1", "did you mean 'length_m'"),
+        ("zzz = 1", "known are name, length_m, facet_mm, count, whole, ends_m"),
+        ("length_m = 'one'", "length_m must be a finite number, got 'one'"),
+        ("length_m = true", "length_m must be a finite number"),
+        ("length_m = nan", "length_m must be a finite number"),
+        ("count = 1.5", "count must be a whole number"),
+        ("whole = 1", "whole must be true or false"),
+        ("name = 1", "name must be a text in quotes"),
+        ("ends_m = [1, 2, 3]", "ends_m must be a list of 2 finite numbers"),
+        ("ends_m = 1", "ends_m must be a list of 2 finite numbers"),
+        ("[table]\na = 1", "no setting is called 'table'"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(text: str, complaint: str, tmp_path: Path):
+    path = tmp_path / "settings.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"settings\.toml") as caught:
+        load_settings(Sample, path, {})
+    assert complaint in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"length_m = = 1", b"name = '\xff'"])
+def test_files_that_are_no_toml(content: bytes, tmp_path: Path):
+    path = tmp_path / "settings.toml"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match="is not a TOML file of settings"):
+        load_settings(Sample, path, {})
+    with pytest.raises(StorageError, match="no such file"):
+        load_settings(Sample, tmp_path / "absent.toml", {})
+
+
+def test_walls_are_those_of_the_simulation():
+    assert tuple(simulate.WALLS) == WALLS
+
+
+@pytest.mark.parametrize("kind", [ReconstructSettings, CompareSettings, SceneSettings])
+def test_every_setting_can_be_told_by_a_file(kind: type, tmp_path: Path):
+    """Values of each field's own type go out and come back."""
+    examples = {"float": 0.5, "int": 3, "str": "a", "bool": True, "tuple[float, float]": (0.5, 1.5)}
+    values = {
+        field.name: examples[
+            str(field.type).removesuffix(" | None").replace("Limits", "tuple[float, float]")
+        ]
+        for field in fields(kind)
+        if "help" in field.metadata and field.name not in ("gate_found", "reasons")
+    }
+    save_settings(kind(**values), tmp_path / "all.toml", "all of them")
+    assert load_settings(kind, tmp_path / "all.toml", {}) == kind(**values)

@@ -1,9 +1,13 @@
-"""The program as a process: help, exit statuses, interruption, pipes."""
+"""The program as a process: exit statuses, what it loads, interruptions, pipes, terminals, packages
+that are missing, and loops compiled beforehand.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import pty
+import re
 import shlex
 import signal
 import subprocess
@@ -12,53 +16,35 @@ import time
 from pathlib import Path
 
 import pytest
-from small_instrument import Run
-from typer.core import TyperArgument
 from verb_pages import collect_verbs
 
 import tofclip
 from apps import cli
+from apps.verbs import warm_up
+from apps.verbs.nlos_imaging import METHODS
+from tofclip.files import describe_missing_package
 
 PROGRAM = [sys.executable, "-m", "tofclip"]
 ROOT = Path(tofclip.__file__).parents[1]
-LONGEST_WAIT_S = 60.0  # compiling the kernels on a slow, cold machine
+LONGEST_WAIT_S = 120.0  # compiling the kernels on a slow, cold machine
+VERBS = collect_verbs()
 
 
-def ran(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [*PROGRAM, *map(str, words)]
+def start(command, folder: Path = ROOT, path: Path = ROOT, **environment: str):
+    """Run a command until it ends, with a folder before all others on Python's path."""
     return subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=LONGEST_WAIT_S, check=False
+        [*map(str, command)],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": f"{path}{os.pathsep}{ROOT}", **environment},
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_WAIT_S,
+        check=False,
     )
 
 
-def test_alone_it_shows_the_map_of_verbs(run: Run) -> None:
-    outcome = run()
-    assert (outcome.status, outcome.err) == (0, "")
-    for verb in (
-        "demo",
-        "calibrate",
-        "recover",
-        "cloud",
-        "lidar accuracy",
-        "nlos reconstruct",
-        "convert",
-        "info",
-    ):
-        assert f"\n  {verb} " in outcome.out
-
-
-def test_every_verb_explains_itself(run: Run) -> None:
-    for verb in ("demo", "calibrate", "recover", "cloud", "convert", "info"):
-        outcome = run(verb, "--help")
-        assert outcome.status == 0
-        assert f"Usage: tofclip {verb}" in outcome.out
-        assert "--json" in outcome.out
-    assert "--wavelength-mm" in run("nlos", "reconstruct", "--help").out
-    assert "reconstruct" in run("nlos").out
-
-
-def test_version(run: Run) -> None:
-    assert run("--version").out == f"{tofclip.__version__}\n"
+def start_python(code: str, *words: str):
+    return start([sys.executable, "-c", code, *words])
 
 
 HEAVY = {
@@ -67,28 +53,39 @@ HEAVY = {
 }
 
 
-def list_loaded(statement: str) -> set[str]:
-    """Modules that a program loads."""
-    code = f"import sys; from apps.cli import main; {statement}; print(*sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    return set(done.stdout.splitlines()[-1].split())
+class TestLoading:
+    def list_heavy(self, commands):
+        """Heavy packages that the program loads."""
+        run = f"[main(words) for words in {commands}]"
+        done = start_python(f"import sys; from apps.cli import main; {run}; print(*sys.modules)")
+        return HEAVY & set(done.stdout.splitlines()[-1].split())
+
+    def test_helps_load_nothing_heavy(self):
+        assert not self.list_heavy([["--help"], *([*verb.split(), "--help"] for verb in VERBS)])
+
+    def test_a_refusal_loads_no_more_than_the_options(self):
+        refused = [["info", "absent.h5"], ["nlos", "info", "absent.h5"]]
+        assert self.list_heavy(refused) <= {"pydantic", "rich"}
+
+    def test_an_unrelated_package_called_apps_does_not_take_its_place(self, tmp_path):
+        (tmp_path / "apps").mkdir()
+        (tmp_path / "apps" / "__init__.py").write_text("raise RuntimeError('not this one')\n")
+        done = start([*PROGRAM, "--version"], tmp_path, tmp_path)
+        assert (done.returncode, done.stdout) == (0, f"{tofclip.__version__}\n")
+        assert done.stderr == ""
 
 
-def test_helps_load_nothing_heavy() -> None:
-    helps = [["--help"], *([*verb.split(), "--help"] for verb in collect_verbs())]
-    assert HEAVY.isdisjoint(list_loaded(f"[main(words) for words in {helps}]"))
+# verbs that read a file, a folder, a pattern or an address
+READERS = [
+    verb
+    for verb, command in VERBS.items()
+    if any(one.param_type_name == "argument" and one.callback for one in command.params)
+]
 
 
-def test_a_refusal_loads_no_more_than_the_options() -> None:
-    refused = [["info", "absent.h5"], ["nlos", "info", "absent.h5"]]
-    loaded = list_loaded(f"[main(words) for words in {refused}]")
-    assert loaded & HEAVY <= {"pydantic", "rich"}
-
-
-def test_libraries_say_nothing_before_the_one_line_about_an_error() -> None:
-    code = """
+class TestErrors:
+    def test_libraries_say_nothing_before_the_one_line(self):
+        code = """
 import logging, sys, warnings
 from apps import cli
 def work(words, **options):
@@ -98,174 +95,242 @@ def work(words, **options):
 cli.app = work
 sys.exit(cli.main(sys.argv[1:]))
 """
-    command = [sys.executable, "-c", code]
-    plain = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (plain.returncode, plain.stdout) == (2, "")
-    assert plain.stderr == "tofclip: error: photon counts must be finite\n"
-    whole = subprocess.run(
-        [*command, "--debug"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert "RuntimeWarning: invalid value" in whole.stderr
-    assert "read of 5 bytes" in whole.stderr
+        plain, whole = start_python(code), start_python(code, "--debug")
+        assert (plain.returncode, plain.stdout) == (2, "")
+        assert plain.stderr == "tofclip: error: photon counts must be finite\n"
+        assert "RuntimeWarning: invalid value" in whole.stderr
+        assert "read of 5 bytes" in whole.stderr
+
+    def test_statuses_of_the_process(self, files):
+        good = start([*PROGRAM, "info", files / "camera.h5", "--json"])
+        bad = start([*PROGRAM, "info", files / "absent.h5"])
+        assert (good.returncode, good.stderr, json.loads(good.stdout)["kind"]) == (0, "", "camera")
+        assert (bad.returncode, bad.stdout, bad.stderr.count("\n")) == (2, "", 1)
+
+    def test_debug_shows_where_an_error_came_from(self, shell):
+        plain, traced = shell.refuses("info absent"), shell("info absent --debug")
+        assert traced.status == 2
+        assert traced.err.startswith("Traceback")
+        assert traced.err.endswith(plain)
+
+    def test_a_defect_is_one_line_as_well(self, shell, monkeypatch):
+        def fail(*_):
+            raise ZeroDivisionError("a defect\nin two lines")
+
+        monkeypatch.setattr("tofclip.loading.outline", fail)
+        outcome = shell("info {files}/camera.h5")
+        said = "tofclip: error: unforeseen ZeroDivisionError: a defect in two lines"
+        assert outcome.status == cli.EXIT_DEFECT
+        assert outcome.err.startswith(said)
+        assert outcome.err.count("\n") == 1
+
+    def test_a_reader_that_goes_away(self, files):
+        read, write = os.pipe()
+        os.close(read)  # nobody will ever read
+        words = [*PROGRAM, "info", files / "camera.h5"]
+        done = subprocess.run(words, cwd=ROOT, stdout=write, stderr=subprocess.PIPE, check=False)
+        os.close(write)
+        assert (done.returncode, done.stderr) == (cli.EXIT_BROKEN_PIPE, b"")
+
+    def test_a_disk_without_room(self, files, tmp_path):
+        """A limit on the size of files stands for the disk: both refuse to write on, in the middle
+        of a file.
+        """
+        words = [*PROGRAM, "convert", files / "streak.h5", "--out", tmp_path / "copy.h5"]
+        done = start(["bash", "-c", f"ulimit -f 8; exec {shlex.join(map(str, words))}"])
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+        assert "copy.h5: cannot be written" in done.stderr
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize("verb", READERS)
+    def test_a_missing_file_is_refused_before_anything_else(self, shell, verb):
+        said = shell.refuses(f"{verb} absent.h5")
+        assert said == "tofclip: error: absent.h5: no such file\n"
+        assert len(READERS) == 21
 
 
-def test_statuses_of_the_process(files: Path) -> None:
-    good, bad = ran("info", files / "camera.h5", "--json"), ran("info", files / "absent.h5")
-    assert (good.returncode, good.stderr, json.loads(good.stdout)["kind"]) == (0, "", "camera")
-    assert (bad.returncode, bad.stdout, bad.stderr.count("\n")) == (2, "", 1)
-
-
-def test_debug_shows_where_an_error_came_from(run: Run, tmp_path: Path) -> None:
-    plain, traced = run("info", tmp_path / "absent"), run("info", tmp_path / "absent", "--debug")
-    assert "Traceback" not in plain.err
-    assert traced.err.startswith("Traceback")
-    assert traced.err.endswith(plain.err)
-    assert traced.status == 2
-
-
-def test_a_defect_is_one_line_as_well(
-    run: Run, monkeypatch: pytest.MonkeyPatch, files: Path
-) -> None:
-    def fail(*_: object) -> None:
-        raise ZeroDivisionError("a defect\nin two lines")
-
-    monkeypatch.setattr("tofclip.loading.outline", fail)
-    outcome = run("info", files / "camera.h5")
-    assert outcome.status == cli.EXIT_DEFECT
-    assert outcome.err.startswith(
-        "tofclip: error: unforeseen ZeroDivisionError: a defect in two lines"
-    )
-    assert outcome.err.count("\n") == 1
-
-
-def test_a_reader_that_goes_away(files: Path) -> None:
-    read, write = os.pipe()
-    os.close(read)  # nobody will ever read
-    done = subprocess.run(
-        [*PROGRAM, "info", files / "camera.h5"],
-        cwd=ROOT,
-        stdout=write,
-        stderr=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
-    os.close(write)
-    assert (done.returncode, done.stderr) == (cli.EXIT_BROKEN_PIPE, "")
-
-
-def test_a_disk_without_room(files: Path, tmp_path: Path) -> None:
-    """A limit on the size of files stands for the disk: both refuse to write on, in the middle of a
-    file.
-    """
-    limited = f"ulimit -f 8; exec {shlex.join(PROGRAM)} convert {files / 'streak.h5'} --out {tmp_path / 'copy.h5'}"
-    done = subprocess.run(
-        ["bash", "-c", limited], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert "copy.h5: cannot be written" in done.stderr
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_ctrl_c_during_recovery_leaves_nothing_behind(files: Path, tmp_path: Path) -> None:
-    import pty  # exists only where the test can run
-
-    words = [
-        "recover",
-        files / "streak.h5",
-        "--out",
-        tmp_path / "frames.h5",
-        "--iterations",
-        "1000000",
-    ]
-    terminal, child_side = pty.openpty()
-    process = subprocess.Popen(
-        [*PROGRAM, *map(str, words)], cwd=ROOT, stdout=subprocess.PIPE, stderr=child_side, text=True
-    )
-    os.close(child_side)
-    wait_for(terminal, "recovering")  # the bar is drawn, so the iterations have begun
-    process.send_signal(signal.SIGINT)
-    pressed = time.monotonic()
-    out, _ = process.communicate(timeout=LONGEST_WAIT_S)
-    assert process.returncode == 130
-    assert out == ""
-    # A million iterations would take an hour; the end must not wait for them. The margin is for a
-    # busy machine.
-    assert time.monotonic() - pressed < 20
-    assert wait_for(terminal, "tofclip: interrupted").count("Traceback") == 0
-    os.close(terminal)
-    assert list(tmp_path.iterdir()) == []
-
-
-def started_elsewhere(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """Run the installed program's entry point with a folder before all others on the path."""
-    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
-    return subprocess.run(
-        [sys.executable, "-m", "tofclip", *words],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=LONGEST_WAIT_S,
-        check=False,
-    )
-
-
-@pytest.mark.parametrize("module", ["pathlib", "typer"])  # the first of all, and a later one
-def test_ctrl_c_while_the_program_starts_shows_no_traceback(tmp_path: Path, module: str) -> None:
-    (tmp_path / f"{module}.py").write_text("raise KeyboardInterrupt\n")
-    done = started_elsewhere(tmp_path, "--version")
-    assert (done.returncode, done.stdout) == (130, "")
-    assert done.stderr == "tofclip: interrupted\n"
-
-
-def test_little_is_loaded_before_a_ctrl_c_can_be_caught(tmp_path: Path) -> None:
-    (tmp_path / "lazy_loader.py").write_text("raise KeyboardInterrupt\n")
-    done = started_elsewhere(tmp_path, "--version")
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"{tofclip.__version__}\n", "")
-
-
-def test_ctrl_c_while_a_verb_is_imported_shows_no_traceback(tmp_path: Path) -> None:
-    (tmp_path / "h5py.py").write_text("raise KeyboardInterrupt\n")
-    (tmp_path / "there.h5").touch()
-    done = started_elsewhere(tmp_path, "info", "there.h5")
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (130, "", 1)
-
-
-def test_an_unrelated_package_called_apps_does_not_take_its_place(tmp_path: Path) -> None:
-    (tmp_path / "apps").mkdir()
-    (tmp_path / "apps" / "__init__.py").write_text("raise RuntimeError('not this one')\n")
-    done = started_elsewhere(tmp_path, "--version")
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"{tofclip.__version__}\n", "")
-
-
-def wait_for(terminal: int, text: str) -> str:
-    """Read from a terminal until `text` appears."""
+def read_terminal(terminal: int, until: str = "") -> str:
+    """What is written on a terminal: until a text appears, or up to the end."""
     seen = ""
-    while text not in seen:
+    while not until or until not in seen:
         try:
             seen += os.read(terminal, 4096).decode(errors="replace")
         except OSError:  # the other side is closed and everything has been read
-            pytest.fail(f"'{text}' never appeared on the terminal: {seen!r}")
+            assert not until, f"{until!r} never appeared on the terminal: {seen!r}"
+            break
     return seen
 
 
-def is_read(param: TyperArgument) -> bool:
-    """Whether an argument names what is read: a file, a folder, a pattern or an address."""
-    return param.param_type_name == "argument" and param.callback is not None
+def start_on_terminal(command, **options):
+    """Start a command whose messages go to a terminal; return both."""
+    ours, its = pty.openpty()
+    process = subprocess.Popen(command, cwd=ROOT, stderr=its, text=True, **options)
+    os.close(its)
+    return process, ours
 
 
-READERS = [verb for verb, command in collect_verbs().items() if any(map(is_read, command.params))]
-
-
-@pytest.mark.parametrize("verb", READERS)
-def test_a_missing_file_is_refused_before_anything_else(run: Run, verb: str) -> None:
-    outcome = run(*verb.split(), "absent.h5")
-    assert (outcome.status, outcome.out) == (2, "")
-    assert outcome.err == "tofclip: error: absent.h5: no such file\n"
-
-
-def test_all_that_read_files_are_among_them() -> None:
-    assert {*("recover", "cloud", "view", "stream", "info", "convert", "calibrate range")} < set(
-        READERS
+class TestInterruption:
+    @pytest.mark.parametrize(
+        ("line", "bar"),
+        [
+            ("recover {files}/streak.h5 --iterations 1000000", "recovering"),
+            ("nlos reconstruct {curved} --method backprojection --everywhere --voxel-mm 3", "imag"),
+        ],
     )
-    assert len(READERS) == 21
+    def test_ctrl_c_leaves_nothing_behind(self, files, curved, tmp_path, line, bar):
+        words = f"{line} --out {tmp_path}/out.h5".format(files=files, curved=curved).split()
+        process, terminal = start_on_terminal([*PROGRAM, *words], stdout=subprocess.PIPE)
+        read_terminal(terminal, bar)  # it is drawn, so the work has begun
+        process.send_signal(signal.SIGINT)
+        pressed = time.monotonic()
+        out, _ = process.communicate(timeout=LONGEST_WAIT_S)
+        assert (process.returncode, out) == (130, "")
+        # The work would take an hour; the end must not wait for it. The margin is for a busy machine.
+        assert time.monotonic() - pressed < 20
+        assert "Traceback" not in read_terminal(terminal, "tofclip: interrupted")
+        os.close(terminal)
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize(
+        ("module", "words"),  # the first module of all, a later one, and one that a verb imports
+        [("pathlib", "--version"), ("typer", "--version"), ("h5py", "info there.h5")],
+    )
+    def test_ctrl_c_while_the_program_starts_shows_no_traceback(self, tmp_path, module, words):
+        (tmp_path / f"{module}.py").write_text("raise KeyboardInterrupt\n")
+        (tmp_path / "there.h5").touch()
+        done = start([*PROGRAM, *words.split()], tmp_path, tmp_path)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (130, "", 1)
+        assert done.stderr.startswith("tofclip: interrupted")
+
+    def test_little_is_loaded_before_a_ctrl_c_can_be_caught(self, tmp_path):
+        (tmp_path / "lazy_loader.py").write_text("raise KeyboardInterrupt\n")
+        done = start([*PROGRAM, "--version"], tmp_path, tmp_path)
+        assert (done.returncode, done.stdout) == (0, f"{tofclip.__version__}\n")
+
+
+class TestProgress:
+    CODE = """
+import time
+from apps.progress import show_activity, show_progress
+with show_progress("choosing the weight", 4) as advance:
+    for _ in range(4):
+        advance(1)
+        time.sleep(0.15)
+with show_activity("simulating"):
+    time.sleep(0.3)
+print("done")
+"""
+
+    def test_a_bar_shows_what_is_done_how_long_it_took_and_what_is_left(self):
+        terminal = os.environ | {"TERM": "xterm", "COLUMNS": "100", "PYTHONPATH": str(ROOT)}
+        process, ours = start_on_terminal([sys.executable, "-c", self.CODE], env=terminal)
+        seen = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", read_terminal(ours))
+        assert process.wait(LONGEST_WAIT_S) == 0
+        os.close(ours)
+        lines = [line for line in re.split(r"[\r\n]+", seen) if "choosing the weight" in line]
+        assert any("50%" in line for line in lines)
+        assert all(re.search(r"\d:\d\d:\d\d left", line) for line in lines)
+        assert re.search(r"simulating .*0:00:00", seen)
+
+    def test_without_a_terminal_there_is_none(self):
+        ended = start_python(self.CODE)
+        assert (ended.stdout, ended.stderr) == ("done\n", "")
+
+
+RECOVER = "recover {files}/streak.h5 --out {new}/frames.h5 --method linear"
+# For each package, the name to install, or none if all works without, and what needs it.
+NEEDED = {
+    "h5py": ("h5py", "info {files}/camera.h5"),
+    "matplotlib": ("matplotlib", RECOVER),
+    "numba": ("numba", RECOVER),
+    "numpy": ("numpy", "info {files}/camera.h5"),
+    # it fits planes and finds normals, in Python only
+    "open3d": (None, "cloud {frames} --out {new}/scene.ply --drop-outliers"),
+    "OpenEXR": ("OpenEXR", "cloud {frames} --out {new}/depth.exr"),
+    "pyfftw": (None, "info {files}/camera.h5"),  # images: tests/nlos
+    "pyvista": (None, "view {frames} --png {new}/view.png"),
+    "scipy": ("scipy", RECOVER),
+    "tifffile": ("tifffile", "info {files}/streak.tif"),
+    "typer": ("typer", "--version"),
+    "usb": ("pyusb", "devices info timetag://1"),
+    "viser": ("viser", "view {frames} --no-browser"),
+}
+
+
+class TestMissingPackages:
+    """One line says which, where it is needed, and everything else works."""
+
+    ABSENT = """
+import os, sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in os.environ["ABSENT"].split():
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+"""
+
+    @pytest.fixture(scope="class")
+    def hook(self, tmp_path_factory):
+        """Folder whose presence on the path hides packages, also from what the program starts."""
+        folder = tmp_path_factory.mktemp("absent")
+        (folder / "sitecustomize.py").write_text(self.ABSENT)
+        return folder
+
+    @pytest.fixture(scope="class")
+    def frames(self, files, tmp_path_factory):
+        out = tmp_path_factory.mktemp("frames") / "frames.h5"
+        tofclip.recover(tofclip.read_streak(files / "streak.h5"), method="linear").save(out)
+        return out
+
+    @pytest.mark.parametrize("package", NEEDED)
+    def test_without_a_package(self, hook, package, files, frames, tmp_path):
+        distribution, line = NEEDED[package]
+        words = line.format(files=files, frames=frames, new=tmp_path).split()
+        done = start([*PROGRAM, *words], path=hook, ABSENT=package)
+        if distribution is None:
+            assert (done.returncode, done.stderr) == (0, "")
+        else:
+            assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+            assert done.stderr.startswith("tofclip: error: ")
+            assert f"install {distribution}" in done.stderr
+            assert "unforeseen" not in done.stderr
+
+    def test_help_needs_none_of_them(self, hook):
+        hidden = " ".join(set(NEEDED) - {"typer"})
+        done = start([*PROGRAM, "--help"], path=hook, ABSENT=hidden)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "recover" in done.stdout
+
+    def test_a_module_of_our_own_that_is_missing_is_a_defect(self):
+        gone = ModuleNotFoundError("gone", name="tofclip.gone")
+        assert describe_missing_package(gone) is None
+        assert describe_missing_package(ImportError("no name")) is None
+        broken = ImportError("libGL.so.1: not found", name="pyvista")
+        said = "the package 'pyvista' does not load on this machine: libGL.so.1: not found"
+        assert describe_missing_package(broken) == said
+
+
+class TestWarmUp:
+    def test_every_step_is_a_command_that_the_program_takes(self, tmp_path):
+        steps = [step.replace("@", f"{tmp_path}/").split() for step in warm_up.list_steps()]
+        for words in steps:
+            for word in words:
+                if word.startswith(str(tmp_path)):
+                    Path(word).mkdir(parents=True, exist_ok=True)
+            depth = 1 if words[0] in VERBS else 2
+            with VERBS[" ".join(words[:depth])].make_context("step", words[depth:]) as context:
+                assert context.params
+        named = {words[words.index("--method") + 1] for words in steps if "--method" in words}
+        assert named >= {"tv", "l1", "linear", "adjoint", *METHODS}
+
+    def test_it_runs_its_steps(self, shell, monkeypatch):
+        recover = "recover @shots/first.h5 --out @frames.h5 --method linear"
+        steps = [recover, "cloud @frames.h5 --out @cloud.ply"]
+        monkeypatch.setattr(warm_up, "list_steps", lambda: steps)
+        found = shell.figures("warm-up")
+        assert found["steps"] == 2
+        assert found["seconds"] > 0
+
+    def test_a_step_that_fails_is_named(self, shell, monkeypatch):
+        monkeypatch.setattr(warm_up, "list_steps", lambda: ["info absent.h5"])
+        shell.refuses("warm-up", "info absent.h5 failed: absent.h5: no such file")

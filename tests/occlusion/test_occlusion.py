@@ -1,11 +1,16 @@
-"""Occluder and target separated by time, and the model of what the one hides of the other."""
+"""The inactive region, time of flight and shadows of cast rays against geometry that is known;
+occluder and target separated by time, and the model of what the one hides of the other.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from apps.occlusion.experiment import ILLUMINATIONS, Experiment, ExperimentSettings
 from apps.occlusion.probe import probe_target
@@ -27,13 +32,158 @@ from tofclip.occlusion import (
     measure_views,
     separate_occluder,
 )
+from tofclip.simulate.bodies import Body, Lambertian, Rectangle
+from tofclip.simulate.light_fields import (
+    CameraArray,
+    PulsedScene,
+    TimeAxis,
+    render_flash,
+    render_flash_view,
+)
+from tofclip.simulate.patterns import make_plain_pattern
+from tofclip.simulate.rays import cast_rays, compute_irradiance
 from tofclip.units import SPEED_OF_LIGHT
+
+
+def make_plate(width: float, height: float, z: float, x: float = 0.0) -> Body:
+    return Body(
+        Rectangle(width, height), Lambertian(make_plain_pattern(0.5)), np.array([x, 0.0, z])
+    )
+
+
+@pytest.mark.parametrize(
+    ("width", "distance", "length"),
+    [(6, 50, 33.3), (10, 40, 80.0)],  # supplement Note 10
+)
+def test_the_papers_examples(width, distance, length):
+    found = InactiveRegion(15e-3, 1e-3 * width, 1e-3 * distance)
+    assert found.length == pytest.approx(1e-3 * length, rel=2e-3)
+    assert found.is_bounded
+
+
+@given(
+    baseline=st.floats(5, 30),
+    share=st.floats(0.05, 1.6),
+    distance=st.floats(20, 80),
+    across=st.floats(-20, 20),
+    behind=st.floats(0.5, 300),
+)
+@settings(max_examples=200, deadline=None)
+def test_a_point_is_inside_exactly_if_cast_rays_reach_it_from_no_view(
+    baseline, share, distance, across, behind
+):
+    region = InactiveRegion(baseline, share * baseline, distance)
+    plate = make_plate(region.width, 100.0, distance)
+    point = np.array([across, 0.0, distance + behind])
+    places = np.linspace(-0.5, 0.5, 7) * baseline
+    passed = (across * distance + places * behind) / (distance + behind)
+    if np.any(abs(abs(passed) - region.width / 2) < 1e-9):
+        return  # a ray along the very edge may go either way
+    origins = np.stack([places, 0 * places, 0 * places], axis=-1)
+    met = [plate.intersect(origin, (point - origin)[np.newaxis]).distance for origin in origins]
+    reached = np.isinf(met)[:, 0]
+    np.testing.assert_array_equal(region.sees(places, across, behind), reached)
+    assert bool(region.contains(across, behind)) is not reached.any()
+
+
+@given(share=st.floats(0.05, 0.95), distance=st.floats(20, 80), place=st.floats(0.01, 3))
+def test_on_the_axis_the_region_ends_at_its_length(share, distance, place):
+    region = InactiveRegion(15.0, 15.0 * share, distance)
+    assert bool(region.contains(0.0, place * region.length)) == (place < 1) or math.isclose(
+        place, 1, rel_tol=1e-9
+    )
+
+
+@pytest.mark.parametrize("width", [15.0, 20.0])
+def test_behind_a_wide_occluder_nothing_is_promised(width):
+    region = InactiveRegion(15.0, width, 50.0)
+    assert (region.is_bounded, region.length) == (False, math.inf)
+    assert region.contains(0.0, 1e6)
+
+
+ARRAY = CameraArray(
+    (21, 21), 3, focal_length_px=60.0, view_step=5e-3, focus=0.1, samples=1, view_rows=1
+)
+AT_HOME = np.zeros((1, 3))
+CLOCK = TimeAxis.for_ranges(0.02, 0.2, 20e-12, 60e-12)
+SMALL_BEFORE_LARGE = (make_plate(0.01, 0.01, 0.05), make_plate(0.4, 0.4, 0.1))
+
+
+def test_a_row_of_cameras_has_views_to_both_sides():
+    np.testing.assert_array_equal(ARRAY.views, [[0, -1], [0, 0], [0, 1]])
+    np.testing.assert_allclose(ARRAY.position((0.0, 1.0)), [5e-3, 0, 0])
+
+
+@pytest.mark.parametrize("z", [0.06, 0.15])
+def test_light_from_a_plate_arrives_after_the_way_there_and_back_and_fades_with_distance(z):
+    seen = render_flash_view(
+        PulsedScene((make_plate(0.4, 0.4, z),), AT_HOME), ARRAY, CLOCK, (0.0, 0.0)
+    )
+    middle = seen[10, 10]
+    # half the field is 1/6 of the distance: its corners lie 2.7 % further, and half a bin at most
+    # cut off
+    assert middle @ CLOCK.times / middle.sum() == pytest.approx(2 * z / SPEED_OF_LIGHT, abs=1e-13)
+    assert middle.sum() == pytest.approx(0.5 * (ARRAY.focus / z) ** 2, rel=1e-5)
+    corner = seen[0, 0]
+    far = z * np.sqrt(1 + 2 / 36)
+    assert corner @ CLOCK.times / corner.sum() == pytest.approx(2 * far / SPEED_OF_LIGHT, abs=1e-13)
+    assert corner.sum() == pytest.approx(0.5 * ARRAY.focus**2 * z / far**3, rel=1e-5)
+
+
+def test_a_lamp_to_the_side_throws_the_shadow_to_the_other_side():
+    lamp = np.array([[-0.05, 0.0, 0.0]])
+    seen = render_flash_view(PulsedScene(SMALL_BEFORE_LARGE, lamp), ARRAY, CLOCK, (0.0, 0.0))
+    total = seen[10].sum(axis=-1)
+    # the plate's edges at -5 and 5 mm throw shadows to 40 and 60 mm; a pixel of the wall is 1/600 m
+    # wide
+    wall = (np.arange(21) - 10) * 0.1 / 60
+    assert not total[(wall > 0.041) & (wall < 0.059)].any()
+    assert (total[wall < -0.011] > 0).all()
+
+
+@given(
+    width=st.floats(1, 14),
+    distance=st.floats(30, 60),
+    factor=st.floats(0.3, 4),
+    across=st.floats(-0.4, 0.4),
+)
+@settings(max_examples=40, deadline=None)
+def test_lamps_at_the_views_light_a_point_as_often_as_views_see_it(width, distance, factor, across):
+    """With a lamp at each view, light gets there and back by the same lines of sight, or not at
+    all.
+    """
+    region = InactiveRegion(15e-3, width * 1e-3, distance * 1e-3)
+    behind, x = factor * region.length, across * region.width
+    lamps = np.stack([2.5e-3 * np.arange(-3, 4), np.zeros(7), np.zeros(7)], axis=-1)
+    passed = (x * region.distance + lamps[:, 0] * behind) / (region.distance + behind)
+    if np.any(abs(abs(passed) - region.width / 2) < 1e-7):
+        return  # along the very edge
+    speck = make_plate(1e-7, 1e-7, region.distance + behind, x)
+    bar = make_plate(region.width, 1.0, region.distance)
+    sights = [cast_rays((speck, bar), lamp, (speck.centre - lamp)[np.newaxis]) for lamp in lamps]
+    facing, point = np.array([[0.0, 0.0, -1.0]]), speck.centre[np.newaxis]
+    lit = [compute_irradiance((speck, bar), lamp, point, facing)[0] > 0 for lamp in lamps]
+    views = region.sees(lamps[:, 0], x, behind)
+    np.testing.assert_array_equal([sight.body[0] == 0 for sight in sights], views)
+    np.testing.assert_array_equal(lit, views)
+    assert region.contains(x, behind) == (not views.any())
+
+
+def test_every_view_is_rendered_on_its_own_and_a_lamp_beside_one_shows_it_no_shadow():
+    scene = PulsedScene(SMALL_BEFORE_LARGE, AT_HOME)
+    all_views = render_flash(scene, ARRAY, CLOCK)
+    assert all_views.shape == (3, 21, 21, CLOCK.bins)
+    for number in range(3):
+        alone = render_flash_view(scene, ARRAY, CLOCK, (0.0, number - 1.0))
+        np.testing.assert_array_equal(all_views[number], alone)
+    assert all_views[1].sum(axis=-1).min() > 0
+
 
 SMALL = ExperimentSettings(side_px=48, sampling_ratio=1.0)
 
 
 @pytest.fixture(scope="module")
-def plate() -> Experiment:
+def plate():
     return Experiment(make_occlusion_scene("plate"), SMALL)
 
 
@@ -183,13 +333,22 @@ def test_the_solid_part_on_every_scenes_axis_is_as_wide_as_its_region_says(name)
 @pytest.mark.parametrize(
     "fault",
     [
+        *(
+            lambda lengths=lengths: InactiveRegion(*lengths)
+            for lengths in ((0.0, 6.0, 50.0), (15.0, -1.0, 50.0), (15.0, 6.0, math.nan))
+        ),
+        lambda: PulsedScene((), AT_HOME),
+        lambda: PulsedScene(SMALL_BEFORE_LARGE, np.zeros(3)),
+        lambda: TimeAxis(0.0, 0.0, 5, 1e-12),
+        lambda: TimeAxis(np.nan, 1e-12, 5, 1e-12),
+        lambda: CameraArray(view_rows=0),
         lambda: make_occlusion_scene("fog"),
         lambda: ExperimentSettings(illumination="moon"),
         lambda: ExperimentSettings(side_px=8),
         lambda: ExperimentSettings(photons=0.0),
     ],
 )
-def test_bad_settings_are_refused(fault):
+def test_nonsense_is_refused(fault):
     with pytest.raises(InputError):
         fault()
 
@@ -197,12 +356,3 @@ def test_bad_settings_are_refused(fault):
 def test_readings_of_another_rig_are_refused(plate):
     with pytest.raises(ShapeError):
         TimedMeasurements(plate.measurements.values[1:], plate.rig, plate.time_axis)
-
-
-def test_correlation_knows_no_scale_and_a_dark_picture_shows_nothing():
-    truth = np.random.default_rng(0).random((8, 8))
-    assert correlation_coefficient(3 * truth + 1, truth) == pytest.approx(1)
-    assert correlation_coefficient(-truth, truth) == pytest.approx(-1)
-    assert correlation_coefficient(np.zeros((8, 8)), truth) == 0
-    with pytest.raises(InputError):
-        correlation_coefficient(truth, np.ones((8, 8)))

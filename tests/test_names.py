@@ -1,4 +1,6 @@
-"""The public names are pinned, and importing them costs nothing until they are used."""
+"""The public contract: names and signatures are pinned, importing them costs nothing until they are
+used, their docstrings' examples run and name every argument, and the exceptions make a tree.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,12 @@ from typing import Any
 
 import pytest
 
+from tofclip import errors
+
 ROOTS = ("tofclip", "nlos", "devices")
+ROOT = Path(errors.__file__).parents[1]
 GOLDEN = Path(__file__).parent / "golden" / "names.txt"
+API_PAGES = ROOT / "docs" / "api"
 CONTRACT = (
     *("tofclip.read_streak", "tofclip.recover", "tofclip.depth", "tofclip.point_cloud"),
     *("tofclip.nmse", "tofclip.load", "tofclip.recovery.open_shot"),
@@ -87,43 +93,30 @@ def test_public_names_and_signatures_are_those_of_the_file() -> None:
     assert not changed, "\n".join([f"against tests/golden/{GOLDEN.name}:", *changed])
 
 
-@pytest.mark.parametrize("module", ["tofclip", "nlos", "devices"])
+@pytest.mark.parametrize("module", ROOTS)
 def test_a_list_of_names_shows_the_public_ones_only(module: str) -> None:
     home = importlib.import_module(module)
     assert dir(home) == sorted(home.__all__)
+    with pytest.raises(AttributeError, match="lidar_magic"):
+        _ = home.lidar_magic
 
 
-@pytest.mark.parametrize("module", ["tofclip", "nlos"])
-def test_an_unknown_name_is_an_attribute_error(module: str) -> None:
-    with pytest.raises(AttributeError, match=f"{module} attribute lidar_magic"):
-        _ = importlib.import_module(module).lidar_magic
-
-
-def test_importing_the_packages_imports_nothing_heavy() -> None:
-    listing = subprocess.run(
-        [sys.executable, "-c", "import sys, tofclip, nlos; print(*sys.modules)"],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    ).stdout.split()
-    assert {"tofclip", "nlos"} <= set(listing)
-    assert not HEAVY & set(listing)
-
-
-def test_reading_a_streak_image_imports_no_compiler() -> None:
-    """Reading has to be quick: neither numba nor scipy nor a plotting library is needed for it."""
-    listing = subprocess.run(
-        [sys.executable, "-c", "import sys, tofclip.io; print(*sys.modules)"],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    ).stdout.split()
-    assert not (HEAVY - {"numpy"}) & set(listing)
-
-
-API_PAGES = Path(__file__).parents[1] / "docs" / "api"
+@pytest.mark.parametrize(
+    ("modules", "light"),
+    [
+        ("tofclip, nlos", set()),
+        # Reading has to be quick: no compiler and no plotting library is needed for it.
+        ("tofclip.io", {"numpy"}),
+    ],
+)
+def test_importing_the_packages_imports_nothing_heavy(modules: str, light: set[str]) -> None:
+    code = f"import sys, {modules}; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    loaded = set(done.stdout.split())
+    assert set(modules.split(", ")) <= loaded
+    assert not (HEAVY - light) & loaded
 
 
 def public_names() -> dict[str, Any]:
@@ -177,7 +170,7 @@ def test_examples_do_what_they_say() -> None:
                     assert callable(eval(ast.unparse(node.func), test.globs)), test.name
 
 
-def signatures(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+def list_signatures(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     """The annotated things that a public name consists of: itself, and a class's public methods."""
     if inspect.isclass(value) or inspect.isfunction(value):
         yield name, value
@@ -190,12 +183,14 @@ def signatures(name: str, value: Any) -> Iterator[tuple[str, Any]]:
                 yield f"{name}.{own}", function
 
 
-def parts(annotation: Any) -> Iterator[Any]:
+def list_parts(annotation: Any) -> Iterator[Any]:
     """A type and all that it is made of."""
     yield annotation
     for part in typing.get_args(annotation):
         yield from (
-            (one for item in part for one in parts(item)) if isinstance(part, list) else parts(part)
+            (one for item in part for one in list_parts(item))
+            if isinstance(part, list)
+            else list_parts(part)
         )
 
 
@@ -207,11 +202,11 @@ def list_signature_types(names: Mapping[str, Any]) -> Iterator[tuple[str, type]]
     for name, value in names.items():
         if not str(getattr(value, "__module__", "")).startswith(ROOTS):
             continue
-        for where, item in signatures(name, value):
+        for where, item in list_signatures(name, value):
             own = vars(sys.modules[item.__module__])
             scope = {key: one for key, one in by_name.items() if key not in own}
             hints = typing.get_type_hints(item, localns=scope)
-            for one in (part for hint in hints.values() for part in parts(hint)):
+            for one in (part for hint in hints.values() for part in list_parts(hint)):
                 if isinstance(one, type) and one.__module__.startswith(ROOTS):
                     yield where, one
 
@@ -227,3 +222,140 @@ def test_every_type_in_a_public_signature_can_be_imported_from_a_public_place() 
     }
     assert len(found) > 700
     assert not hidden
+
+
+# Sections of docstrings stand where users read them, and only there: in the names that packages
+# export, what their signatures take and return, and the public methods of these.
+SECTION = re.compile(
+    r"^ *(Parameters|Returns|Yields|Raises|Attributes|Notes|See Also)\n *-{3,}", re.M
+)
+
+
+@pytest.fixture(scope="module")
+def public() -> dict[str, Any]:
+    """Public names by the place where they are defined."""
+    packages, names = set(list_packages()), public_names()
+    exported = {name: one for name, one in names.items() if name.rpartition(".")[0] in packages}
+    reached = [
+        one
+        for where, one in list_signature_types(names)
+        if where in exported or where.rpartition(".")[0] in exported
+    ]
+    found = [one for one in (*exported.values(), *reached) if hasattr(one, "__qualname__")]
+    return {f"{one.__module__}.{one.__qualname__}": one for one in found}
+
+
+def list_docstrings() -> Iterator[tuple[str, str]]:
+    """Every docstring with the full name that it belongs to."""
+    for path in (
+        path for package in (*ROOTS, "apps") for path in sorted((ROOT / package).rglob("*.py"))
+    ):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        yield from walk(ast.parse(path.read_text("utf-8")), module)
+
+
+def walk(node: ast.AST, name: str) -> Iterator[tuple[str, str]]:
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    if isinstance(node, documented):
+        yield name, ast.get_docstring(node) or ""
+    for child in ast.iter_child_nodes(node):
+        own = f"{name}.{child.name}" if isinstance(child, documented[1:]) else name
+        yield from walk(child, own)
+
+
+def is_public(name: str, public: dict[str, Any]) -> bool:
+    """A public name, or a method of one that is not private."""
+    home, _, own = name.rpartition(".")
+    return name in public or (home in public and (own[0] != "_" or own.startswith("__")))
+
+
+@pytest.mark.xfail(reason="docstrings of some internals have sections still", strict=False)
+def test_sections_stand_in_public_names_only(public: dict[str, Any]) -> None:
+    wrong = [
+        name
+        for name, text in list_docstrings()
+        if SECTION.search(text) and not is_public(name, public)
+    ]
+    assert not wrong, f"{len(wrong)}: {', '.join(wrong[:20])}, ..."
+
+
+def list_undocumented(name: str, value: Any) -> Iterator[str]:
+    """Arguments that no Parameters section names; a class may describe those of its fields anywhere."""
+    if inspect.isclass(value):
+        described = inspect.getdoc(value) or ""
+        functions = {own: one for own, one in vars(value).items() if own[0] != "_"}
+        functions = {own: getattr(one, "__func__", one) for own, one in functions.items()}
+        own_fields = "\n".join(filter(None, (inspect.getdoc(base) for base in value.__mro__[:-1])))
+        fields = getattr(value, "__dataclass_fields__", {})
+        yield from (
+            f"{name}({field})"
+            for field, one in fields.items()
+            if one.init
+            and field[0] != "_"
+            and not re.search(rf"\b{field}\b", described + own_fields)
+        )
+    else:
+        functions = {"": value}
+    for own, function in functions.items():
+        if not inspect.isfunction(function):
+            continue
+        text = inspect.getdoc(function) or ""
+        if own and inspect.isclass(value):  # an overridden method has the docstring of its base
+            text = inspect.getdoc(getattr(value, own)) or ""
+        for one in inspect.signature(function).parameters:
+            if one not in ("self", "cls") and not re.search(
+                rf"^ *\**[\w, *]*\b{one}\b[\w, *]*( : |$)", text, re.M
+            ):
+                yield f"{name}{'.' * bool(own)}{own}({one})"
+
+
+@pytest.mark.xfail(
+    reason="arguments of public names are not all in a Parameters section yet",
+    strict=False,
+)
+def test_every_public_name_has_its_parameters_documented(public: dict[str, Any]) -> None:
+    missing = [
+        line
+        for name, value in public.items()
+        if inspect.isclass(value) or inspect.isfunction(value)
+        for line in list_undocumented(name, value)
+    ]
+    assert not missing, f"{len(missing)}: {', '.join(missing[:40])}, ..."
+
+
+TREE = {
+    "TofclipError": (Exception,),
+    "InputError": (errors.TofclipError, ValueError),
+    "ShapeError": (errors.InputError,),
+    "CalibrationError": (errors.InputError,),
+    "MissingTimeAxisError": (errors.InputError,),
+    "FileFormatError": (errors.TofclipError, ValueError),
+    "StorageError": (errors.TofclipError, OSError),
+    "MissingDependencyError": (errors.TofclipError, ImportError),
+    "DeviceError": (errors.TofclipError, OSError),
+    "UsbBackendError": (errors.DeviceError,),
+    "DeviceNotFoundError": (errors.DeviceError,),
+    "DevicePermissionError": (errors.DeviceError,),
+    "DeviceBusyError": (errors.DeviceError,),
+    "DeviceTimeoutError": (errors.DeviceError, TimeoutError),
+    "DeviceStalledError": (errors.DeviceError,),
+    "DeviceDisconnectedError": (errors.DeviceError,),
+    "TransferOverflowError": (errors.DeviceError,),
+    "BufferOverflowError": (errors.DeviceError,),
+    "ProtocolError": (errors.DeviceError,),
+}
+
+
+def test_the_tree_of_exceptions() -> None:
+    classes = {name: one for name, one in vars(errors).items() if inspect.isclass(one)}
+    faults = {name: one for name, one in classes.items() if issubclass(one, Exception)}
+    assert {name: fault.__bases__ for name, fault in faults.items()} == TREE
+    assert all(name in errors.__doc__ for name in TREE)
+
+
+def test_messages_say_what_and_where() -> None:
+    fault = errors.ShapeError("frames", (2, 3), (3, 2))
+    assert str(fault) == "frames must have shape (2, 3), got (3, 2)"
+    fault = errors.FileFormatError("shot.tif", "is empty")
+    assert str(fault) == "shot.tif: is empty"
+    assert fault.path == Path("shot.tif")

@@ -1,0 +1,272 @@
+"""What the studies of the paper compute: coded lines, costs of an iteration, the recorded hand, and
+a dictionary of light-field patches.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from apps.studies.coded_line import (
+    LINES,
+    MAX_ANGLE_RAD,
+    LineArm,
+    compute_column_ranks,
+    compute_psnr_db,
+    make_coded_line_sensors,
+    measure_arm,
+    recover_from_lines,
+    select_views,
+)
+from apps.studies.diffuser import (
+    DiffuserRecording,
+    build_diffuser_model,
+    read_diffuser_recording,
+    recover_diffuser_scene,
+)
+from apps.studies.iteration_costs import measure_iteration_costs
+from apps.studies.light_field_dictionary import (
+    LightFieldDictionary,
+    learn_dictionary,
+    recover_with_dictionary,
+)
+from tofclip.errors import FileFormatError, InputError, MissingDependencyError, ShapeError
+from tofclip.io.light_fields import read_light_field
+from tofclip.light_field import LightField
+from tofclip.metrics import nmse
+from tofclip.operators import LinearOperator, LinearShear
+from tofclip.operators.cameras import MarwahCamera
+from tofclip.solvers import NonnegativeTotalVariation
+
+
+class TestCodedLine:
+    def two_views(self, difference: float) -> LightField:
+        """Two views whose sum is the same whatever their difference: so is what shift-and-add makes
+        of them at s = 0.
+        """
+        common, other = np.random.default_rng(3).random((2, 16, 16)).astype(np.float32)
+        pictures = np.stack([common + sign * difference * other for sign in (1, -1)])
+        return LightField(pictures, np.array([[0.0, -1.0], [0.0, 1.0]]))
+
+    @pytest.mark.parametrize("steepest", [0.0, MAX_ANGLE_RAD])
+    @pytest.mark.parametrize("width", [1, 16])
+    def test_a_slice_gives_each_column_of_the_spectrum_one_equation(self, steepest, width):
+        """Supplement Eq. 15 and 16: M slices give M, whatever the PSF; the column has as many
+        unknowns as rows.
+        """
+        for lines in (1, 4):
+            sensors = make_coded_line_sensors((24, 20), lines, width, steepest, 0)
+            assert np.unique(compute_column_ranks(sensors)).tolist() == [lines]
+
+    def test_the_sensors_are_long_enough_for_all_light_of_rotated_lines(self):
+        """An even picture puts each row's light on the sensor as often as it has columns, at any
+        angle.
+        """
+        sensors = make_coded_line_sensors((24, 20), 2, 1, MAX_ANGLE_RAD, 1)
+        along = np.stack([one(np.ones((24, 20))) for one in sensors]).reshape(2, -1).sum(axis=1)
+        # 20 points to a row, and each line's light has the sum 1
+        np.testing.assert_allclose(along, 20, rtol=1e-5)
+
+    @pytest.mark.nightly
+    def test_rotation_gains_four_decibels_on_the_letters(self, shared_data):
+        """Acceptance at N_p = 1, M = 10: the mean of five seeds."""
+        whole = read_light_field(shared_data / "lightfields" / "render_letters.npz")
+        light_field = select_views(whole, LINES)
+        upright, rotated = (
+            measure_arm(light_field, -0.3, 5, LineArm("", 1, angle))[0]
+            for angle in (0.0, MAX_ANGLE_RAD)
+        )
+        gain_db = np.subtract(rotated, upright)
+        assert gain_db.shape == (5,)
+        assert gain_db.mean() >= 4.0
+        assert gain_db.min() > 2.0
+
+    def test_every_line_measures_its_own_view_and_not_the_picture_that_is_sought(self):
+        """Measurements computed from the truth, A x, would be the same for both light fields."""
+        sensors = make_coded_line_sensors((16, 16), 2, 1, MAX_ANGLE_RAD, 0)
+        even, uneven = self.two_views(0.0), self.two_views(0.5)
+        np.testing.assert_allclose(even.refocus(0.0), uneven.refocus(0.0), atol=1e-6)
+        first, second = (recover_from_lines(one, 0.0, sensors, 1e-3)[0] for one in (even, uneven))
+        assert np.abs(first - second).max() > 0.1 * first.max()
+
+    def test_the_weight_is_chosen_without_the_truth(self, monkeypatch):
+        """Shift-and-add of the true views is the truth of this study: nobody may ask for it here."""
+        monkeypatch.setattr(LightField, "refocus", lambda *_: pytest.fail("looked at the truth"))
+        monkeypatch.setattr("apps.studies.coded_line.SEARCH_ITERATIONS", 10)
+        monkeypatch.setattr("apps.studies.coded_line.ITERATIONS", 20)
+        sensors = make_coded_line_sensors((16, 16), 2, 1, MAX_ANGLE_RAD, 0)
+        _, weight = recover_from_lines(self.two_views(0.1), 0.0, sensors)
+        assert weight > 0
+
+    def test_psnr_of_a_known_error(self):
+        truth = np.zeros((4, 5), np.float32)
+        truth[0, 0] = 2
+        assert compute_psnr_db(truth + 0.2, truth) == pytest.approx(20)
+        with pytest.raises(InputError, match="infinite"):
+            compute_psnr_db(truth, truth)
+
+
+class TestCosts:
+    """r N^2, N^2 and m measurements; n_a^2 N^2 unknowns of a light field, N^2 of a picture."""
+
+    MEASUREMENTS = (4 * 4096, 4 * 4096, 4096, 4096, 2048, 2048, 2048, 2048)
+    UNKNOWNS = (*[16 * 4096] * 6, 4096, 4096)
+
+    def measure(self, **settings):
+        views = np.array([(v, u) for v in range(-2, 2) for u in range(-2, 2)], np.float64)
+        pictures = np.random.default_rng(0).random((16, 64, 64)).astype(np.float32)
+        field = LightField(pictures, views)
+        return measure_iteration_costs(field, -0.3, exposures=4, sampling_ratio=0.5, **settings)
+
+    def test_every_method_is_counted_as_in_the_paper_and_timed(self):
+        costs = self.measure(repeats=5)
+        assert [cost.method for cost in costs[:4]] == ["Ashok", "Babacan", "Marwah", "Cai, Antipa"]
+        recovered = ["light field"] * 6 + ["refocused picture"] * 2
+        assert [cost.recovers for cost in costs] == recovered
+        assert tuple(cost.measurements for cost in costs) == self.MEASUREMENTS
+        assert tuple(cost.unknowns for cost in costs) == self.UNKNOWNS
+        assert all(0 < cost.model_seconds < 1 and 0 < cost.seconds < 1 for cost in costs)
+
+    def test_refocusing_one_picture_takes_a_sixteenth_of_the_priors_work(self, monkeypatch):
+        """What is counted is the numbers that an iteration's prior and products handle, not
+        seconds: one product each way of m measurements for all of them.
+        """
+        handled = []
+
+        def count_numbers(action, _):
+            numbers = {"prior": 0, "measurements": 0}
+            sweep, adjoint = NonnegativeTotalVariation.proximal_step, LinearOperator.adjoint
+
+            def counted_sweep(self, current, *rest):
+                numbers["prior"] += current.size
+                return sweep(self, current, *rest)
+
+            def counted_adjoint(self, measurements):
+                numbers["measurements"] += measurements.size
+                return adjoint(self, measurements)
+
+            with pytest.MonkeyPatch.context() as counting:
+                counting.setattr(NonnegativeTotalVariation, "proximal_step", counted_sweep)
+                counting.setattr(LinearOperator, "adjoint", counted_adjoint)
+                action()
+            handled.append((numbers["prior"], numbers["measurements"]))
+            return 1.0
+
+        monkeypatch.setattr("apps.studies.iteration_costs._measure_median_seconds", count_numbers)
+        self.measure()
+        steps, products = handled[::2], handled[1::2]
+        assert steps == list(zip(self.UNKNOWNS, self.MEASUREMENTS, strict=True))
+        assert products == [(0, measured) for measured in self.MEASUREMENTS]
+
+
+class TestDiffuser:
+    """The recorded hand, from a dense and from sparse sensors."""
+
+    @pytest.fixture(scope="class")
+    def hand(self, shared_data):
+        return read_diffuser_recording(shared_data / "diffusercam" / "psf_hand_300x400.npz")
+
+    @pytest.mark.nightly
+    def test_the_hand_explains_the_readings_and_lies_where_it_is(self, hand):
+        """Acceptance: a relative residual below 1 % from the full and from two and three times fewer
+        pixels an axis, which show the same.
+        """
+        recoveries = [recover_diffuser_scene(hand, pitch) for pitch in (1, 2, 3)]
+        assert all(recovery.relative_residual < 0.01 for recovery in recoveries)
+        full = recoveries[0].scene
+        rows, columns = np.nonzero(full > 0.2 * full.max())
+        # Seen by eye: the hand spans rows 220 to 365 and columns 360 to 550, and the rest is dark.
+        assert 220 <= rows.min() < rows.max() <= 365
+        assert 360 <= columns.min() < columns.max() <= 550
+        assert full[220:365, 360:550].sum() > 0.6 * full.sum()
+        for sparse in recoveries[1:]:
+            assert np.corrcoef(full.ravel(), sparse.scene.ravel())[0, 1] > 0.99
+
+    def test_a_mirrored_point_spread_explains_it_much_worse(self, hand):
+        """The residual can tell a wrong model: this is the control for the figure above."""
+        mirrored = DiffuserRecording(hand.point_spread[:, ::-1], hand.measurements)
+        right, wrong = (
+            recover_diffuser_scene(one, 3, 100).relative_residual for one in (hand, mirrored)
+        )
+        assert wrong > 3 * right
+
+    @pytest.mark.parametrize("pitch", [1, 2])
+    def test_a_known_scene_comes_back(self, pitch):
+        """Two points seen through a random PSF, one of them from beside the sensor."""
+        spread = np.random.default_rng(0).random((20, 24)) ** 8
+        scene = np.zeros((40, 48))
+        scene[20, 24], scene[14, 9] = 1.0, 0.6
+        model = build_diffuser_model(DiffuserRecording(spread, np.ones((20, 24))), 1)
+        measurements = model(scene).reshape(20, 24).astype(np.float64)
+        recovery = recover_diffuser_scene(DiffuserRecording(spread, measurements), pitch, 1000)
+        brightest = np.argsort(recovery.scene, axis=None)[-2:]
+        np.testing.assert_array_equal(np.sort(brightest), np.flatnonzero(scene))
+        assert recovery.relative_residual < 0.02
+
+    def test_recordings_that_cannot_be_used_are_refused(self, tmp_path):
+        with pytest.raises(ShapeError, match="like the PSF"):
+            DiffuserRecording(np.ones((3, 4)), np.ones((4, 3)))
+        with pytest.raises(InputError, match="show something"):
+            DiffuserRecording(np.ones((3, 4)), np.zeros((3, 4)))
+        np.savez(tmp_path / "no_background.npz", psf=np.ones((3, 4)), raw=np.ones((3, 4)))
+        with pytest.raises(FileFormatError, match="'background'"):
+            read_diffuser_recording(tmp_path / "no_background.npz")
+
+
+class TestDictionary:
+    VIEWS = tuple((float(v), float(u)) for v in range(-1, 2) for u in range(-1, 2))
+    SHAPE = (40, 44)
+
+    def scene(self, seed: int) -> LightField:
+        """Bright edges at one depth, smooth enough for the shear's interpolation."""
+        noise = gaussian_filter(np.random.default_rng(seed).standard_normal(self.SHAPE), 4)
+        picture = gaussian_filter((noise > 0).astype(np.float32), 0.7)
+        pictures = [LinearShear(self.SHAPE, 0.8, view)(picture) for view in self.VIEWS]
+        return LightField(np.stack(pictures), np.array(self.VIEWS))
+
+    def test_a_light_field_comes_back_from_one_exposure(self, monkeypatch):
+        pytest.importorskip("sklearn")
+        # a quarter of the time
+        monkeypatch.setattr("apps.studies.light_field_dictionary.TRAINING_PATCHES", 500)
+        seen = [self.scene(1), self.scene(2)]
+        dictionary = learn_dictionary(seen, patch_px=6, atoms=48, seed=0)
+        assert (dictionary.atoms.shape, dictionary.patch_px) == ((48, 9, 6, 6), 6)
+        lengths = np.linalg.norm(dictionary.atoms.reshape(48, -1), axis=1)
+        np.testing.assert_allclose(lengths, 1, rtol=1e-5)
+        true, camera = self.scene(3).pictures, MarwahCamera(self.SHAPE, self.VIEWS, 1, 0)
+        exposure = camera.light_field_model()(true).reshape(self.SHAPE)
+        found = recover_with_dictionary(exposure, camera.codes(), dictionary)
+        # A control: the exposure itself, as bright as a view, for every view.
+        plain = np.broadcast_to(exposure / camera.codes().sum(axis=0), true.shape)
+        assert nmse(found, true, 6) < min(0.05, 0.3 * nmse(plain, true, 6))
+
+    def test_a_patch_made_of_few_atoms_is_found(self):
+        """Two of twenty random atoms and brightness: the exposure's 64 pixels tell which, the weight
+        takes its toll.
+        """
+        atoms = np.random.default_rng(0).standard_normal((20, 9, 8, 8)).astype(np.float32)
+        atoms[0] = 1
+        atoms /= np.linalg.norm(atoms.reshape(20, -1), axis=1)[:, None, None, None]
+        true = 30 * atoms[0] + 5 * atoms[7] - 4 * atoms[12]
+        codes = MarwahCamera((8, 8), self.VIEWS, 1, 1).codes()
+        exposure, dictionary = (codes * true).sum(axis=0), LightFieldDictionary(atoms)
+        found = recover_with_dictionary(exposure, codes, dictionary, 1e-4, 2000)
+        np.testing.assert_allclose(found, true, atol=0.02 * np.abs(true).max())
+
+    def test_what_does_not_fit_is_refused(self, monkeypatch):
+        dictionary = LightFieldDictionary(np.ones((2, 9, 6, 6), np.float32))
+        with pytest.raises(ShapeError, match="mask codes"):
+            recover_with_dictionary(np.ones((8, 8)), np.ones((4, 8, 8)), dictionary)
+        with pytest.raises(ShapeError, match="a patch"):
+            recover_with_dictionary(np.ones((5, 8)), np.ones((9, 5, 8)), dictionary)
+        pytest.importorskip("sklearn")
+        with pytest.raises(InputError, match="at least one light field"):
+            learn_dictionary([])
+        with pytest.raises(ShapeError, match="to learn from"):
+            learn_dictionary([self.scene(1)], patch_px=41)
+        monkeypatch.setitem(sys.modules, "sklearn.decomposition", None)
+        with pytest.raises(MissingDependencyError, match=r"tofclip\[learning\]"):
+            learn_dictionary([self.scene(1)])
