@@ -60,12 +60,11 @@ __all__ = [
 class LightFieldCamera(ABC):
     """An encoder A_k for each view, and the two models that follow from them. `image_shape` is that
     of every view's picture, `views` (v, u) of each, `sampling_ratio` measurements over pixels of
-    one picture, `seed` that of everything random. `used_views` get measurements, in the order of
-    the measurements.
+    one picture, `seed` that of everything random. `used_views` get measurements, in their order.
     """
 
     name: ClassVar[str]
-    measurements: int  # how many measurements there are
+    measurements: int
     # consecutive measurements on a detector whose errors are alike; 1 where each stands for itself
     correlation_length: int = 1
 
@@ -83,12 +82,9 @@ class LightFieldCamera(ABC):
         """Set `measurements`; return the numbers of the views that get any."""
 
     @cached_property
+    @abstractmethod
     def encoders(self) -> tuple[LinearOperator, ...]:
         """A_k of the used views."""
-        return self._build_encoders()
-
-    @abstractmethod
-    def _build_encoders(self) -> tuple[LinearOperator, ...]: ...
 
     @abstractmethod
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
@@ -97,15 +93,11 @@ class LightFieldCamera(ABC):
         """
 
     def weighting(self) -> LinearOperator:
-        """Return the weights W that measurements and model get in a recovery: all alike unless the
-        camera has a reason.
-        """
+        """Return the weights W that measurements and model get in a recovery, by default all alike."""
         return Identity((self.measurements,))
 
     def light_field_model(self) -> LinearOperator:
-        """Return the map from the used views' pictures, (views, rows, columns), to the measurements
-        (Eq. 20).
-        """
+        """Return the map from the used views' pictures to the measurements (Eq. 20)."""
         return BlockDiagonal(self.encoders)
 
 
@@ -132,8 +124,8 @@ def count_lines(image_shape: tuple[int, int], detector_px: int, sampling_ratio: 
 def assign_randomly(
     directions: NDArray[np.float64], views: int, random: np.random.Generator
 ) -> AngleAssignment:
-    """Permute the directions, (lines,), and deal them one by one to the views in random order
-    (supplement Note 6); of few directions some views get none.
+    """Permute the directions and deal them one by one to the views in random order (supplement Note
+    6); of few directions some views get none.
     """
     shuffled = random.permutation(directions)
     return _group_by_view(shuffled, np.resize(random.permutation(views), directions.size))
@@ -164,27 +156,19 @@ def assign_evenly(
     tie_break = 1e-6 * random.random(across.shape)
     # rank of every view along every direction, from 0 to 1
     place = (np.argsort(np.argsort(across + tie_break, axis=0), axis=0) + 0.5) / len(views)
-    wanted = np.resize(
-        np.roll(_antithetic_positions(cycle), random.integers(cycle)), directions.size
-    )
+    nearer = np.zeros(1)
+    while 2 * nearer.size < cycle:  # van der Corput's sequence from 0 to 1/2
+        nearer = np.concatenate([nearer, nearer + 0.25 / nearer.size])
+    nearer += 0.5 / cycle
+    # each place is followed by its mirror image, such as 1/8, 7/8, 3/8, 5/8: every pair is balanced
+    places = np.stack([nearer, 1 - nearer], axis=1).ravel()
+    wanted = np.resize(np.roll(places, random.integers(cycle)), directions.size)
     # each view may own several lines, but none more than its share
     copies = -(-directions.size // len(views))
     taken, direction = linear_sum_assignment(np.repeat((place - wanted) ** 2, copies, axis=0))
     owners = np.empty(directions.size, np.intp)
     owners[direction] = taken // copies
     return _group_by_view(directions, owners)
-
-
-def _antithetic_positions(count: int) -> NDArray[np.float64]:
-    """Places spread evenly from 0 to 1, each followed by its mirror image, such as 1/8, 7/8, 3/8,
-    5/8.
-    """
-    nearer = np.zeros(1)
-    while 2 * nearer.size < count:  # van der Corput's sequence from 0 to 1/2
-        nearer = np.concatenate([nearer, nearer + 0.25 / nearer.size])
-    nearer += 0.5 / count
-    # each place is followed by its mirror image, so that every pair is balanced
-    return np.stack([nearer, 1 - nearer], axis=1).ravel()
 
 
 def _group_by_view(directions: NDArray[np.float64], owners: NDArray[np.intp]) -> AngleAssignment:
@@ -212,7 +196,8 @@ class LineCamera(LightFieldCamera):
     def _assign_angles(self, angles: NDArray[np.float64]) -> AngleAssignment:
         return assign_randomly(angles, len(self.views), np.random.default_rng(self.seed))
 
-    def _build_encoders(self) -> tuple[LinearOperator, ...]:
+    @cached_property
+    def encoders(self) -> tuple[LinearOperator, ...]:
         sizes = self.image_shape, self.detector_px
         return tuple(RadonProjection(*sizes, own, np.zeros(own.size)) for own in self.angles)
 
@@ -251,16 +236,12 @@ class EvenAngleLineCamera(LineCamera):
         return assign_evenly(angles, self.views, cycle, np.random.default_rng(self.seed))
 
 
-MAX_LINE_ANGLE_RAD = np.pi / 4
-
-
 class CodedLineCamera(LightFieldCamera):
     """Coded lines one pixel wide, their angles evenly from -45 to 45 degrees, assigned to the views
     at random. Each line has a code and a 1D sensor of its own, as long as the picture is wide.
     """
 
     name: ClassVar[str] = "coded-line"
-    width_px: ClassVar[int] = 1
 
     def _assign_measurements(self) -> tuple[int, ...]:
         detector_px = self.image_shape[1]
@@ -268,15 +249,16 @@ class CodedLineCamera(LightFieldCamera):
         self.measurements = count * detector_px
         self.correlation_length = min(CORRELATION_LENGTH_PX, detector_px)
         random = np.random.default_rng(self.seed)
-        angles = MAX_LINE_ANGLE_RAD * (2 * np.arange(count) + 1 - count) / count
+        angles = np.pi / 4 * (2 * np.arange(count) + 1 - count) / count
         used, dealt = assign_randomly(angles, len(self.views), random)
-        coded = self.image_shape, self.width_px
         self._spreads = [
-            np.stack([make_coded_line(*coded, angle, random) for angle in own]) for own in dealt
+            np.stack([make_coded_line(self.image_shape, 1, angle, random) for angle in own])
+            for own in dealt
         ]
         return used
 
-    def _build_encoders(self) -> tuple[LinearOperator, ...]:
+    @cached_property
+    def encoders(self) -> tuple[LinearOperator, ...]:
         return tuple(SliceConvolution(self.image_shape, spreads) for spreads in self._spreads)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
@@ -309,14 +291,12 @@ class CompressiveCamera(LightFieldCamera):
         return tuple(range(len(self.views)))
 
     @abstractmethod
-    def light_field_model(self) -> LinearOperator:
-        """Return the map from the views' pictures, (views, rows, columns), to the measurements."""
+    def light_field_model(self) -> LinearOperator: ...
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): the light field's model after the shears."""
-        return self.light_field_model() @ ShearedViews(
-            self.image_shape, self.views, shear, reference
-        )
+        views = ShearedViews(self.image_shape, self.views, shear, reference)
+        return self.light_field_model() @ views
 
 
 class ApertureMaskCamera(CompressiveCamera):
@@ -326,7 +306,8 @@ class ApertureMaskCamera(CompressiveCamera):
     def weights(self) -> NDArray[np.float64]:
         """Return the fraction of each view's light that each mask lets pass, (exposures, views)."""
 
-    def _build_encoders(self) -> tuple[LinearOperator, ...]:
+    @cached_property
+    def encoders(self) -> tuple[LinearOperator, ...]:
         sensor, even = DenseSensor(self.image_shape), np.ones(self.image_shape)
         return tuple(
             Stack([sensor @ Diagonal(share * even) for share in own]) for own in self.weights().T
@@ -394,11 +375,11 @@ class MarwahCamera(CompressiveCamera):
 
     def codes(self) -> NDArray[np.float64]:
         """Return the mask as each view sees it, (views, rows, columns)."""
-        return make_sheared_mask(
-            self.image_shape, self.views, MASK_SHEAR_PX, np.random.default_rng(self.seed)
-        )
+        random = np.random.default_rng(self.seed)
+        return make_sheared_mask(self.image_shape, self.views, MASK_SHEAR_PX, random)
 
-    def _build_encoders(self) -> tuple[LinearOperator, ...]:
+    @cached_property
+    def encoders(self) -> tuple[LinearOperator, ...]:
         sensor = DenseSensor(self.image_shape)
         return tuple(sensor @ Diagonal(code) for code in self.codes())
 
@@ -422,19 +403,16 @@ class SinglePixelCamera(LightFieldCamera):
         self.measurements = self.codes * len(self.views)
         return tuple(range(len(self.views)))
 
-    def _build_encoders(self) -> tuple[LinearOperator, ...]:
+    @cached_property
+    def encoders(self) -> tuple[LinearOperator, ...]:
         # independent codes for every view from one seed
         seeds = np.random.SeedSequence(self.seed).generate_state(len(self.views))
         return tuple(HadamardCodes(self.image_shape, self.codes, int(seed)) for seed in seeds)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): every view's codes after its shear, stacked."""
-        return Stack(
-            [
-                encoder @ LinearShear(self.image_shape, shear, self.views[view], reference)
-                for view, encoder in zip(self.used_views, self.encoders, strict=True)
-            ]
-        )
+        shears = (LinearShear(self.image_shape, shear, view, reference) for view in self.views)
+        return Stack([codes @ one for codes, one in zip(self.encoders, shears, strict=True)])
 
     def weighting(self) -> LinearOperator:
         """Return the weights that keep the mean of each view's codes from swamping the rest."""
@@ -462,7 +440,8 @@ class PointSpreadCamera(LightFieldCamera):
         self._spreads = spreads[used]
         return tuple(int(view) for view in used)
 
-    def _build_encoders(self) -> tuple[LinearOperator, ...]:
+    @cached_property
+    def encoders(self) -> tuple[LinearOperator, ...]:
         return tuple(self.sensor @ one for one in self._convolutions)
 
     @property
@@ -477,9 +456,7 @@ class PointSpreadCamera(LightFieldCamera):
         return self.sensor @ PointSpreadConvolution(self.image_shape, spread)
 
     def light_field_model(self) -> LinearOperator:
-        """Return the map from the used views' pictures to the measurements: the sum of what each
-        puts on the sensor.
-        """
+        """Return the sum of what the used views put on the sensor."""
         return self.sensor @ Integration(self._convolutions)
 
 
@@ -534,11 +511,9 @@ class MeasuredCamera:
 
     def model(self, shear: float) -> LinearOperator:
         """Return F(d): from the picture at `shear` to the measurements."""
-        plane = (self.sensor.shape_in[0], self.sensor.shape_in[1])
-        spread = self.point_spreads.interpolate(shear)
-        return self.sensor @ PointSpreadConvolution(
-            self.image_shape, spread, plane, self.sensor.dtype
-        )
+        spread, sensor = self.point_spreads.interpolate(shear), self.sensor
+        plane = sensor.shape_in[0], sensor.shape_in[1]
+        return sensor @ PointSpreadConvolution(self.image_shape, spread, plane, sensor.dtype)
 
 
 def make_sparse_sensor(image_shape: tuple[int, int], sampling_ratio: float) -> PitchedSensor:

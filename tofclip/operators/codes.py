@@ -84,12 +84,19 @@ class PitchedSensor(_Sensor):
         offset_px: tuple[float, float] = (0, 0),
         dtype: DTypeLike = np.float32,
     ) -> None:
-        rows, columns = (
-            _pixel_positions(*axis) for axis in zip(plane_shape, pitch_px, offset_px, strict=True)
-        )
-        super().__init__(
-            plane_shape, (rows[:, np.newaxis] * plane_shape[1] + columns).ravel(), dtype
-        )
+        axes = []
+        for size, pitch, offset in zip(plane_shape, pitch_px, offset_px, strict=True):
+            if not (np.isfinite(pitch) and pitch >= 1):
+                raise InputError(f"a sensor's pitch must be at least one pixel, got {pitch}")
+            if not 0 <= offset < size:
+                raise InputError(
+                    f"a sensor's offset must lie on the plane of {size} px, got {offset}"
+                )
+            # The sum of many pitches must not fall short of a whole number by rounding.
+            axes.append(np.floor(np.arange(offset, size, pitch) + 1e-9).astype(np.intp))
+        rows, columns = axes
+        pixels = (rows[:, np.newaxis] * plane_shape[1] + columns).ravel()
+        super().__init__(plane_shape, pixels, dtype)
         self.grid_shape = (rows.size, columns.size)
         """Rows and columns of the sensor: measurements reshaped to it are a picture."""
 
@@ -110,15 +117,6 @@ class MaskedSensor(_Sensor):
         if mask.ndim != 2:
             raise ShapeError("the mask of live pixels", "(rows, columns)", mask.shape)
         super().__init__((mask.shape[0], mask.shape[1]), np.flatnonzero(mask), dtype)
-
-
-def _pixel_positions(size: int, pitch_px: float, offset_px: float) -> NDArray[np.intp]:
-    if not (np.isfinite(pitch_px) and pitch_px >= 1):
-        raise InputError(f"a sensor's pitch must be at least one pixel, got {pitch_px}")
-    if not 0 <= offset_px < size:
-        raise InputError(f"a sensor's offset must lie on the plane of {size} px, got {offset_px}")
-    # The sum of many pitches must not fall short of a whole number by rounding.
-    return np.floor(np.arange(offset_px, size, pitch_px) + 1e-9).astype(np.intp)
 
 
 class HadamardCodes(LinearOperator):

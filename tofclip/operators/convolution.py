@@ -62,10 +62,8 @@ class PointSpreadConvolution(LinearOperator):
         sensor_shape = image_shape if sensor_shape is None else sensor_shape
         super().__init__(image_shape, sensor_shape, dtype)
         spread, centre = _crop_to_support(validate_point_spread(point_spread, image_shape))
-        first = [
-            image // 2 - sensor // 2
-            for image, sensor in zip(image_shape, sensor_shape, strict=True)
-        ]
+        sides = zip(image_shape, sensor_shape, strict=True)
+        first = [image // 2 - sensor // 2 for image, sensor in sides]
         # long enough that no period's copy of the picture reaches the sensor
         self._padded = tuple(
             scipy.fft.next_fast_len(alias_free_length(*sizes), real=True)
@@ -76,9 +74,7 @@ class PointSpreadConvolution(LinearOperator):
         # pixel (0, 0) of the result is the sensor's first pixel, under the PSF's centre
         shift = [-(begin + middle) for begin, middle in zip(first, centre, strict=True)]
         self._spectrum = scipy.fft.rfft2(np.roll(placed, shift, (0, 1)))[..., np.newaxis]
-
-        # correlation: the conjugate spectrum turns the convolution around
-        self._conjugate = self._spectrum.conj()
+        self._conjugate = self._spectrum.conj()  # correlation: it turns the convolution around
 
     def _forward(self, block: Array) -> Array:
         return self._apply_spectrum(block, self._spectrum, self.shape_out)
@@ -104,10 +100,7 @@ class PointSpreadConvolution(LinearOperator):
 def validate_point_spread(
     point_spread: ArrayLike, image_shape: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Return a point-spread function as float64 once it is known to fit pictures of `image_shape`.
-    `point_spread` (rows, columns); `image_shape`: rows and columns of the picture. Returns (rows,
-    columns).
-    """
+    """Return a PSF as float64 once it is known to fit pictures of `image_shape`."""
     spread = np.asarray(point_spread, dtype=np.float64)
     if spread.ndim != 2 or 0 in spread.shape:
         raise ShapeError("a point-spread function", "(rows, columns)", spread.shape)
@@ -134,15 +127,10 @@ def _crop_to_support(spread: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 
 
 def alias_free_length(image: int, sensor: int, spread: int, first: int, centre: int) -> int:
-    """Least period for which no sensor pixel gets light from a periodic image of the picture.
+    """Least period, pixels, for which no sensor pixel gets light from a periodic image of the picture.
 
     Sensor pixels lie at first ... first + sensor - 1 of the picture's own pixels 0 ... image - 1;
-    the PSF reaches from
-    -centre to spread - 1 - centre.
-
-    `image`: pixels of the picture along the axis; `sensor`: pixels of the sensor; `spread`: pixels
-    of the PSF; `first`: the sensor's first pixel, counted in the picture's; `centre`: the PSF's
-    pixel that stands for no displacement. Returns pixels, as a circular convolution needs them.
+    the PSF reaches from -centre to spread - 1 - centre.
     """
     return max(image, sensor, spread, first + sensor + centre, image - first + spread - 1 - centre)
 
@@ -228,11 +216,9 @@ class SliceConvolution(LinearOperator):
 def make_coded_line(
     shape: tuple[int, int], width_px: int, angle: float, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Make a line PSF times a random 0/1 code (supplement Note 4). `shape`: rows and columns of the
-    PSF; the line runs through all rows; `width_px`: n_p, cells of the code in each row; `angle`: of
-    the line from the vertical, rad; each row's cells are moved by ``row * tan(angle)`` columns, and
-    shared between two columns where that is not a whole number; `random`: of the code. Returns
-    (rows, columns): its sum is 1.
+    """Make a line PSF of sum 1 times a random 0/1 code of `width_px` (n_p) cells in each row (supplement
+    Note 4). Each row's cells are moved by ``row * tan(angle)`` columns, `angle` being that of the line
+    from the vertical, and shared between two columns where that is not a whole number.
     """
     rows, columns = shape
     if not 1 <= width_px <= columns:
@@ -243,12 +229,9 @@ def make_coded_line(
         )
     code = random.integers(0, 2, (rows, width_px))
     code[rows // 2, width_px // 2] = 1  # never dark altogether
-    place = (
-        columns // 2
-        - width_px // 2
-        + np.arange(width_px)
-        + np.tan(angle) * (np.arange(rows)[:, None] - rows // 2)
-    )
+    first = columns // 2 - width_px // 2
+    slant = np.tan(angle) * (np.arange(rows)[:, None] - rows // 2)
+    place = first + np.arange(width_px) + slant
     left = np.floor(place).astype(int)
     spread = np.zeros(shape)
     for column, share in ((left, 1 - place + left), (left + 1, place - left)):

@@ -68,10 +68,8 @@ class CubicPhasePlate:
 
     def trace_rays(self, v: Coordinates, u: Coordinates) -> Rays:
         # 1/2 shifts the PSF as a whole, which lies about its own centre then
-        down, right = np.broadcast_arrays(
-            self.strength_px * (v**2 - 0.5), self.strength_px * (u**2 - 0.5)
-        )
-        return np.ones(down.shape), down, right
+        down, right = (self.strength_px * (pupil**2 - 0.5) for pupil in (v, u))
+        return np.ones((v * u).shape), *np.broadcast_arrays(down, right)
 
 
 @dataclass(frozen=True)
@@ -121,11 +119,10 @@ def trace_view_point_spreads(
     shape: tuple[int, int],
     rays: int = RAYS_PER_SIDE,
 ) -> NDArray[np.float64]:
-    """Trace each view's PSF ``r(x, -u_k)``: the light that passes its patch of the aperture from a
-    point at infinity. `views`: (v, u) of every view; a view's patch is one view step wide, and the
-    patches fill the aperture; `shape`: rows and columns of the PSFs; rays that land beyond are
-    lost; `rays`: along each side of a patch. Returns (views, rows, columns): all PSFs together have
-    the sum 1 for an element that lets all light pass onto `shape`.
+    """Trace each view's PSF ``r(x, -u_k)``, (views, rows, columns): the light that passes its patch of
+    the aperture, one view step wide, from a point at infinity. The patches fill the aperture; all PSFs
+    together have the sum 1 for an element that lets all light pass onto `shape`. There are `rays` along
+    each side of a patch.
     """
     grid = np.asarray(views, dtype=np.float64)
     middle = (grid.max(axis=0) + grid.min(axis=0)) / 2
@@ -148,9 +145,8 @@ def trace_view_point_spreads(
 def shear_point_spreads(
     spreads: NDArray[Any], views: Sequence[View], shear: float, reference: View = (0.0, 0.0)
 ) -> NDArray[np.float64]:
-    """Move each view's PSF by ``s (u - u_ref)``: convolving with it is shearing the picture and
-    convolving then. `spreads` (views, rows, columns); `shear`: s, pixels per view step. Returns
-    (views, rows, columns): their sum over the views is the camera's ``g(x, s)`` (supplement Eq. 4).
+    """Move each view's PSF, (views, rows, columns), by ``s (u - u_ref)``: convolving with it is shearing
+    the picture and convolving then. Their sum is the camera's ``g(x, s)`` (supplement Eq. 4).
     """
     shape = (spreads.shape[1], spreads.shape[2])
     pairs = zip(spreads, views, strict=True)
@@ -169,11 +165,8 @@ class MeasuredPointSpreads:
     def __init__(self, stack: ArrayLike, shears: ArrayLike) -> None:
         spreads, depths = np.asarray(stack, np.float64), np.asarray(shears, np.float64)
         if spreads.ndim != 3 or depths.shape != spreads.shape[:1] or depths.size == 0:
-            raise ShapeError(
-                "PSFs and their shears",
-                "(depths, rows, columns) and (depths,)",
-                (spreads.shape, depths.shape),
-            )
+            expected = "(depths, rows, columns) and (depths,)"
+            raise ShapeError("PSFs and their shears", expected, (spreads.shape, depths.shape))
         light = spreads.sum(axis=(1, 2))
         if not (np.all(np.isfinite(depths)) and np.all(np.isfinite(light)) and np.all(light > 0)):
             raise InputError(
@@ -196,12 +189,8 @@ class MeasuredPointSpreads:
                 "measure a PSF there or refocus nearer"
             )
         # Between two depths the PSFs are mixed: the shape changes slowly from one to the next.
-        place = float(np.interp(shear, self.shears, np.arange(self.shears.size)))
-        below = min(int(place), max(self.shears.size - 2, 0))
-        above = min(below + 1, self.shears.size - 1)
-        part = place - below
-        mixed: NDArray[np.float64] = (1 - part) * self.stack[below] + part * self.stack[above]
-        return mixed
+        weights = [np.interp(shear, self.shears, own) for own in np.eye(self.shears.size)]
+        return np.tensordot(weights, self.stack, 1)
 
 
 def _accumulate_rays(

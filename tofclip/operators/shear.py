@@ -19,12 +19,9 @@ View = tuple[float, float]
 class _Shear(LinearOperator):
     """A shift of the whole picture by s times the view's distance from the reference view.
 
-    View (v, u) sees ``p(x, y) = h(x - s (u - u_ref), y - s (v - v_ref))``. The adjoint is the
+    View (v, u) sees ``p(x, y) = h(x - s (u - u_ref), y - s (v - v_ref))``, s being the shear in
+    pixels per view step; the reference may lie anywhere (viewpoint synthesis). The adjoint is the
     opposite shift, exactly.
-
-    `image_shape`: rows and columns; `shear`: s, pixels per view step; `view, reference`: (v, u) on
-    the view grid. The reference may lie anywhere (viewpoint synthesis); `dtype`: float32 or
-    float64.
     """
 
     def __init__(
@@ -37,9 +34,7 @@ class _Shear(LinearOperator):
     ) -> None:
         super().__init__(image_shape, image_shape, dtype)
         self.shift_px = tuple(float(shear * (a - b)) for a, b in zip(view, reference, strict=True))
-        if not all(
-            abs(shift) < size for shift, size in zip(self.shift_px, image_shape, strict=True)
-        ):
+        if not np.all(np.abs(self.shift_px) < np.asarray(image_shape)):
             raise InputError(
                 f"shear {shear} moves view {view} by {self.shift_px} px, out of a {image_shape} picture; "
                 "take a shear nearer to zero"
@@ -79,15 +74,12 @@ class FourierShear(_Shear):
 
         rows, columns = self.shape_in
         spectrum = scipy.fft.rfft2(block, axes=(0, 1))
-        spectrum *= _shift_spectrum(np.fft.fftfreq(rows), down)[:, np.newaxis, np.newaxis]
-        spectrum *= _shift_spectrum(np.fft.rfftfreq(columns), right)[:, np.newaxis]
+        axes = (np.fft.fftfreq(rows)[:, np.newaxis], down), (np.fft.rfftfreq(columns), right)
+        for cycles_per_px, shift_px in axes:
+            delay = np.exp(-2j * np.pi * cycles_per_px * shift_px)
+            # the Nyquist frequency stands for both signs: its real part alone keeps the picture
+            # real, and the shift back the adjoint
+            delay = np.where(np.abs(cycles_per_px) == 0.5, delay.real, delay)
+            spectrum *= delay[..., np.newaxis]
         shifted = scipy.fft.irfft2(spectrum, s=(rows, columns), axes=(0, 1))
         return np.ascontiguousarray(shifted, dtype=self.dtype)
-
-
-def _shift_spectrum(cycles_per_px: Array, shift_px: float) -> Array:
-    """Spectrum of a shift. At the Nyquist frequency only its real part keeps a real picture real."""
-    delay = np.exp(-2j * np.pi * cycles_per_px * shift_px)
-    # the Nyquist frequency stands for both signs: its real part alone keeps the picture real, and
-    # the shift back the adjoint
-    return np.where(np.abs(cycles_per_px) == 0.5, delay.real, delay)

@@ -156,13 +156,10 @@ class SparseMatrix(LinearOperator):
         """Forward and adjoint. The transpose is a copy: products by rows write each result once,
         products by columns would scatter.
         """
-        return PerDevice(self._make_forward), PerDevice(self._make_adjoint)
-
-    def _make_forward(self, device: ComputeDevice) -> Product:
-        return make_product(self.matrix, device)
-
-    def _make_adjoint(self, device: ComputeDevice) -> Product:
-        return make_product(self.matrix.T.tocsr(), device)
+        return (
+            PerDevice(lambda device: make_product(self.matrix, device)),
+            PerDevice(lambda device: make_product(self.matrix.T.tocsr(), device)),
+        )
 
     def _forward(self, block: Array) -> Array:
         if block.shape[-1] == 1 and is_numpy(block):
@@ -235,21 +232,16 @@ class LineProjection(SparseMatrix):
         rows, columns = image_shape
         y = (np.arange(rows) - rows // 2)[:, np.newaxis]
         x = np.arange(columns) - columns // 2
-        centre, slope = (
-            per_view[:, np.newaxis, np.newaxis]
-            for per_view in (self.centres_px, np.tan(self.angles))
-        )
-        position = centre + x - y * slope
+        views = (np.s_[:], np.newaxis, np.newaxis)
+        position = self.centres_px[views] + x - y * np.tan(self.angles)[views]
         left = np.floor(position).astype(np.int64)
         share = position - left
         # each pixel's light goes to the two slit pixels nearest to where it falls
-        slit, weight = np.stack([left, left + 1]), np.stack([1.0 - share, share])
-        weight *= self.gains[:, np.newaxis, np.newaxis]
+        slit = np.stack([left, left + 1])
+        weight = np.stack([1.0 - share, share]) * self.gains[views]
         # no explicit zeros, which every product would pay for
         seen = (slit >= 0) & (slit < slit_width_px) & (weight != 0)
         pixel = np.broadcast_to(np.arange(rows * columns).reshape(image_shape), slit.shape)
-        matrix = scipy.sparse.csr_array(
-            (weight[seen].astype(dtype), (slit[seen], pixel[seen])),
-            shape=(slit_width_px, rows * columns),
-        )
+        entries = weight[seen].astype(dtype), (slit[seen], pixel[seen])
+        matrix = scipy.sparse.csr_array(entries, shape=(slit_width_px, rows * columns))
         super().__init__(matrix, image_shape, (slit_width_px,))
