@@ -12,8 +12,6 @@ both directions share every pixel alike to the last bit.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -27,13 +25,13 @@ from tofclip.threads import LANES
 INDEX_TYPE = ir.IntType(64)
 
 
-def _make_rows_product(lanes: int, unroll: int) -> Any:
+def _make_rows_product(lanes, unroll):
     """Make the product of a sparse matrix with some lanes of a block, for compiled loops; `unroll`
     accumulators for each lane hide the latency of the fused multiply-add.
     """
 
-    def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        def data(k: int) -> Any:
+    def generate(context, builder, sig, arguments):
+        def data(k):
             return context.make_array(sig.args[k])(context, builder, arguments[k]).data
 
         target, source, index, weight = data(0), data(3), data(4), data(5)
@@ -42,19 +40,18 @@ def _make_rows_product(lanes: int, unroll: int) -> Any:
         selector = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
         undefined = ir.Constant(vector, ir.Undefined)
 
-        def lanes_at(base: Any, place: Any) -> Any:
+        def lanes_at(base, place):
             return builder.bitcast(builder.gep(base, [place]), vector.as_pointer())
 
-        def accumulate(position: Any, accumulator: Any) -> None:
+        def accumulate(position, accumulator):
             column = builder.zext(builder.load(builder.gep(index, [position])), INDEX_TYPE)
             scalar = builder.load(builder.gep(weight, [position]))
             lone = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
             broadcast = builder.shuffle_vector(lone, undefined, selector)
             operand = lanes_at(source, builder.mul(column, row_length))
             product = builder.fmul(broadcast, builder.load(operand, align=4), flags=("contract",))
-            builder.store(
-                builder.fadd(product, builder.load(accumulator), flags=("contract",)), accumulator
-            )
+            total = builder.fadd(product, builder.load(accumulator), flags=("contract",))
+            builder.store(total, accumulator)
 
         destination = lanes_at(target, offset)
         zero = ir.Constant(vector, [0.0] * lanes)
@@ -63,9 +60,7 @@ def _make_rows_product(lanes: int, unroll: int) -> Any:
         accumulators = [cgutils.alloca_once_value(builder, start) for start in starts]
         position = cgutils.alloca_once_value(builder, begin)
         for step in sorted({unroll, 1}, reverse=True):
-            head, body, after = (
-                builder.append_basic_block(name) for name in ("head", "body", "after")
-            )
+            head, body, after = map(builder.append_basic_block, ("head", "body", "after"))
             builder.branch(head)
             builder.position_at_end(head)
             here = builder.load(position)

@@ -19,16 +19,13 @@ from tofclip.solvers.methods import Progress, ignore_progress
 from tofclip.threads import map_parallel
 
 INITIAL_WEIGHT = 10**-1.75  # relative weight that is tried first
-
 WEIGHT_RATIO = 10**0.375  # between one trial and the next
-
-MAX_TRIALS = 10  # maximum number: from the first weight this reaches three decades up or down
-
-# Parts that the measurements are assigned to; each is predicted from the other seven.
-FOLD_COUNT = 8
-
+MAX_TRIALS = 10  # from the first weight this reaches three decades up or down
+FOLD_COUNT = 8  # parts of the measurements; each is predicted from the other seven
 # Runs of measurements of which one fold alone is a fair sample: the others are not tried.
 SINGLE_FOLD_RUNS = 4096
+# Recoveries that a choice of a weight takes at most, and that it reports when it is done.
+MAX_WEIGHT_WORK = MAX_TRIALS * FOLD_COUNT
 
 
 @dataclass(frozen=True)
@@ -39,10 +36,6 @@ class WeightChoice:
     trial_weights: NDArray[np.float64]  # (trials,), ascending
     # (trials,), value of the data term on the measurements held out, all folds together
     errors: NDArray[np.float64]
-
-
-# Recoveries that a choice of a weight takes at most, and that it reports when it is done.
-MAX_WEIGHT_WORK = MAX_TRIALS * FOLD_COUNT
 
 
 def choose_weight(
@@ -92,11 +85,8 @@ def choose_weight(
 
 
 def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
-    """Assign runs of consecutive measurements to folds at random; True where a measurement is left
-    out. `count`: number of measurements; `run`: consecutive measurements that stay together;
-    shortened where there would be fewer runs than `FOLD_COUNT`; `seed`: of the assignment. Returns
-    (count, folds): one column for each fold that is tried: `FOLD_COUNT`, or 1 from
-    `SINGLE_FOLD_RUNS` runs on.
+    """Assign runs of consecutive measurements to folds at random: (count, folds), True where a
+    measurement is left out of a fold that is tried.
     """
     # Too few runs for the folds: shorter ones, although neighbours then know more of each other.
     if -(-count // run) < FOLD_COUNT:
@@ -125,20 +115,13 @@ def _search_downhill(
         if best + direction in errors:
             break
         errors[best + direction] = error(first * WEIGHT_RATIO ** (best + direction))
-    steps = sorted(errors)
-    values = np.array([errors[step] for step in steps])
-    return WeightChoice(
-        float(first * WEIGHT_RATIO ** _parabola_minimum(steps, values)),
-        first * WEIGHT_RATIO ** np.array(steps, float),
-        values,
-    )
-
-
-def _parabola_minimum(steps: list[int], errors: NDArray[np.float64]) -> float:
-    """Return where the parabola through the best step and its neighbours is lowest."""
-    best = int(np.argmin(errors))
-    if not 0 < best < len(steps) - 1:
-        return float(steps[best])
-    # The minimum of the parabola through three trials lies between the tried weights.
-    left, middle, right = errors[best - 1 : best + 2]
-    return steps[best] + float(0.5 * (left - right) / (left - 2 * middle + right))
+    steps = np.array(sorted(errors), float)
+    values = np.array([errors[step] for step in sorted(errors)])
+    number = int(np.argmin(values))
+    lowest = steps[number]
+    if 0 < number < steps.size - 1:
+        # The minimum of the parabola through three trials lies between the tried weights.
+        left, middle, right = values[number - 1 : number + 2]
+        lowest += 0.5 * (left - right) / (left - 2 * middle + right)
+    weights = first * WEIGHT_RATIO**steps
+    return WeightChoice(float(first * WEIGHT_RATIO**lowest), weights, values)

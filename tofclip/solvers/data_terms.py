@@ -36,20 +36,16 @@ class DataTerm(ABC):
 
     def __init__(self, measurements: Array, valid: Mask = None) -> None:
         if valid is not None and valid.shape != measurements.shape:
-            raise ShapeError(
-                "the mask of valid measurements", tuple(measurements.shape), tuple(valid.shape)
-            )
+            shapes = tuple(measurements.shape), tuple(valid.shape)
+            raise ShapeError("the mask of valid measurements", *shapes)
         xp = namespace(measurements)
+        all_good = valid is None or xp.all(valid)
         self.measurements = measurements
-        self.valid = (
-            None if valid is None or xp.all(valid) else xp.astype(valid, measurements.dtype)
-        )
+        self.valid = None if all_good else xp.astype(valid, measurements.dtype)
 
     @abstractmethod
     def value(self, predicted: Array) -> Array:
-        """Return the misfit of each frame, (frames,) float64, for `predicted` of shape
-        (measurements, frames).
-        """
+        """Return the misfit of each frame, (frames,) float64, of (measurements, frames)."""
 
     @abstractmethod
     def weights(self, predicted: Array) -> Array:
@@ -203,17 +199,14 @@ class Poisson(DataTerm):
 
     def value(self, predicted: Array) -> Array:
         xp = namespace(predicted)
+        counts, knee = self._counts, self._knee
         expected = predicted * self.deviation
-        base = xp.maximum(expected, self._knee)
-        short = xp.minimum(expected - self._knee, self._zero)
-        loss = base - self._counts * xp.log(base)
-        loss += (
-            1 - self._counts / self._knee
-        ) * short + self._counts / self._knee**2 * short**2 / 2
+        base = xp.maximum(expected, knee)
+        short = xp.minimum(expected - knee, self._zero)
+        loss = base - counts * xp.log(base)
+        loss += (1 - counts / knee) * short + counts / knee**2 * short**2 / 2
         # the value at predicted = counted, so that a perfect fit costs nothing
-        best = self._counts - self._counts * xp.log(
-            xp.maximum(self._counts, scalar_like(1e-30, self._counts))
-        )
+        best = counts - counts * xp.log(xp.maximum(counts, scalar_like(1e-30, counts)))
         return xp.sum(self._apply_mask(loss - best), axis=0, dtype=xp.float64) / self.CURVATURE
 
     def weights(self, predicted: Array) -> Array:

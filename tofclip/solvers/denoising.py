@@ -234,10 +234,6 @@ def solve_data_step(
     predicted = operator(anchor)[:, np.newaxis]
     weights = misfit.weights(predicted)[:, 0]
 
-    def normal(h: Array) -> Array:
-        product: Array = operator.adjoint(weights * operator(h)) + coupling * h
-        return product
-
     solution = anchor.copy()
     residual: Array = -operator.adjoint(misfit.gradient(predicted)[:, 0])
     direction = residual.copy()
@@ -245,10 +241,9 @@ def solve_data_step(
     for _ in range(iterations):
         if energy == 0:
             break
-        step = normal(direction)
-        length = energy / float(
-            np.vdot(direction, step)
-        )  # a Python number keeps float32 arrays float32
+        step = operator.adjoint(weights * operator(direction)) + coupling * direction
+        # a Python number keeps float32 arrays float32
+        length = energy / float(np.vdot(direction, step))
         solution += length * direction
         residual -= length * step
         before, energy = energy, float(np.vdot(residual, residual))

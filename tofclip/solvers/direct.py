@@ -117,9 +117,8 @@ class LinearInverse(Method):
     ) -> Result:
         measurements = validate_measurements(operator, measurements, valid)
         started = time.perf_counter()
-        prepared = self.prepare(
-            operator, None if valid is None else to_numpy(namespace(valid).any(valid, axis=1))
-        )
+        alive = None if valid is None else to_numpy(namespace(valid).any(valid, axis=1))
+        prepared = self.prepare(operator, alive)
         setup_seconds = time.perf_counter() - started
         return replace(prepared.recover(measurements, progress), setup_seconds=setup_seconds)
 

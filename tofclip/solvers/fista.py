@@ -148,12 +148,9 @@ class Fista:
         # A z by linearity, from products that are known already
         predicted = self.seen + momentum * (self.seen - self._seen_before)
         gradient = self.operator.adjoint(self.data_term.gradient(predicted))
+        step = xp.astype(sizes, self.current.dtype)
         candidate, penalty, distance = self.regulariser.proximal_step(
-            self.current,
-            self.previous,
-            momentum,
-            gradient,
-            xp.astype(sizes, self.current.dtype),
+            self.current, self.previous, momentum, gradient, step
         )
         seen = self.operator(candidate)
         objective = self.data_term.value(seen) + penalty
@@ -262,6 +259,8 @@ class ProximalMethod(Method, ABC):
         """Return this method with its weight multiplied."""
         return replace(self, weight=self.weight * factor)
 
+    # Blocks share the cores already, and a lone picture's products are too small to share.
+    @limit_blas_threads()
     def recover(
         self,
         operator: LinearOperator,
@@ -285,21 +284,8 @@ class ProximalMethod(Method, ABC):
         if not self.portable:
             require_numpy(f"recovery with the prior {type(self).__name__}", measurements)
         measurements = validate_measurements(operator, measurements, valid)
-        # Blocks share the cores already, and a lone picture's products are too small to share.
-        with limit_blas_threads():
-            return self._recover(operator, measurements, valid, progress, start)
-
-    def _recover(
-        self,
-        operator: LinearOperator,
-        measurements: Array,
-        valid: Mask,
-        progress: Progress,
-        start: Array | None,
-    ) -> Result:
-        stopping = StoppingRule(
-            self.iterations, self.tolerance, self.gap, self.further, self.noise_fall
-        )
+        settings = self.iterations, self.tolerance, self.gap, self.further, self.noise_fall
+        stopping = StoppingRule(*settings)
         started = time.perf_counter()
         step = 1 / (NORM_MARGIN * operator.squared_norm)
         blocks = Blocks(operator, measurements)

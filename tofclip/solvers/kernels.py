@@ -161,16 +161,8 @@ def descend_total_variation(
     for row in range(rows + 1):
         if row < rows:
             _descend_row(current[row], previous[row], momentum, gradient[row], step)
-            above = dual[0, row - 1] if row > 0 else dark
-            _make_primal_row(
-                lanes,
-                gradient[row],
-                weight,
-                dual[0, row],
-                above,
-                dual[1, row],
-                scratch[2 + row % 2],
-            )
+            above, made = dual[0, row - 1] if row > 0 else dark, scratch[2 + row % 2]
+            _make_primal_row(lanes, gradient[row], weight, dual[0, row], above, dual[1, row], made)
         if row > 0:
             # The dual of a row needs the primal of the row below it, so that it follows one row
             # behind.
@@ -245,23 +237,14 @@ def compute_light_field_primal(lanes, noisy, dual, weight, angular, room, result
     for v in range(down):
         for u in range(across):
             for row in range(rows):
-                _subtract_rows(
-                    dual[2, v, u, row],
-                    dual[2, v - 1, u, row] if v > 0 else dark,
-                    dual[3, v, u, row],
-                    dual[3, v, u - 1, row] if u > 0 else dark,
-                    between,
-                )
+                before = dual[2, v - 1, u, row] if v > 0 else dark
+                beside = dual[3, v, u - 1, row] if u > 0 else dark
+                _subtract_rows(dual[2, v, u, row], before, dual[3, v, u, row], beside, between)
+                above = dual[0, v, u, row - 1] if row > 0 else dark
+                lines = dual[0, v, u, row], above, dual[1, v, u, row]
+                made = result[v, u, row]
                 _make_light_field_row(
-                    lanes,
-                    noisy[v, u, row],
-                    weight,
-                    dual[0, v, u, row],
-                    dual[0, v, u, row - 1] if row > 0 else dark,
-                    dual[1, v, u, row],
-                    angular,
-                    between,
-                    result[v, u, row],
+                    lanes, noisy[v, u, row], weight, *lines, angular, between, made
                 )
 
 
@@ -301,14 +284,11 @@ def update_light_field_dual(lanes, field, dual, step, angular, square):
                     _ascend_row(dual[0, v, u, row], here, field[v, u, row + 1], step, square)
                 right = dual[1, v, u, row, :inner]
                 _ascend_row(right, here[:inner], here[lanes:], step, square[:inner])
+                aside = step * angular
                 if v + 1 < down:
-                    _ascend_row(
-                        dual[2, v, u, row], here, field[v + 1, u, row], step * angular, square
-                    )
+                    _ascend_row(dual[2, v, u, row], here, field[v + 1, u, row], aside, square)
                 if u + 1 < across:
-                    _ascend_row(
-                        dual[3, v, u, row], here, field[v, u + 1, row], step * angular, square
-                    )
+                    _ascend_row(dual[3, v, u, row], here, field[v, u + 1, row], aside, square)
                 for axis in range(4):
                     _shorten_row(dual[axis, v, u, row], square)
 

@@ -348,13 +348,11 @@ def validate_measurements(operator: LinearOperator, measurements: Array, valid: 
     """
     xp = namespace(measurements) if valid is None else namespace(measurements, valid)
     if measurements.ndim != 2 or measurements.shape[:1] != operator.shape_out:
-        raise ShapeError(
-            "measurements", f"({operator.shape_out[0]}, frames)", tuple(measurements.shape)
-        )
+        expected = f"({operator.shape_out[0]}, frames)"
+        raise ShapeError("measurements", expected, tuple(measurements.shape))
     if valid is not None and valid.shape != measurements.shape:
-        raise ShapeError(
-            "the mask of valid measurements", tuple(measurements.shape), tuple(valid.shape)
-        )
+        shapes = tuple(measurements.shape), tuple(valid.shape)
+        raise ShapeError("the mask of valid measurements", *shapes)
     if not xp.all(xp.isfinite(measurements)):
         raise InputError("measurements must not hold NaN or infinity; mark bad ones in `valid`")
     return as_type(measurements, operator.dtype)
