@@ -73,16 +73,14 @@ class InactiveRegion:
         """
         behind = np.asarray(behind, np.float64)
         passed = np.asarray(across) * self.distance + np.asarray(place) * behind
-        seen: NDArray[Any] = 2 * abs(passed) >= self.width * (self.distance + behind)
-        return seen
+        return np.asarray(2 * abs(passed) >= self.width * (self.distance + behind))
 
     def contains(self, across: ArrayLike, behind: ArrayLike) -> NDArray[Any]:
         """Return whether a point is hidden from the whole aperture; arguments as for `sees`."""
         # a convex occluder on the axis hides a point from the whole aperture if it hides it from
         # both ends
         left, right = (self.sees(end * self.baseline / 2, across, behind) for end in (-1, 1))
-        hidden: NDArray[Any] = ~(left | right)
-        return hidden
+        return np.asarray(~(left | right))
 
 
 Array = NDArray[Any]
@@ -118,11 +116,9 @@ class Rig:
         """
         places = np.stack([self.array.position((v, u)) for v, u in self.array.views])
         points = np.stack([0 * distance, 0 * distance, distance], axis=-1)[:, np.newaxis]
-        ways = (
-            np.linalg.norm(points - ends, axis=-1).mean(axis=1) for ends in (self.lamps, places)
-        )
-        time: Array = sum(ways) / SPEED_OF_LIGHT
-        return time
+        ends = (self.lamps, places)
+        ways = [np.linalg.norm(points - one, axis=-1).mean(axis=1) for one in ends]
+        return np.asarray(sum(ways) / SPEED_OF_LIGHT)
 
 
 @dataclass(frozen=True)
@@ -149,8 +145,7 @@ class TimedMeasurements:
     @property
     def history(self) -> Array:
         """All measurements together at each instant, (bins,)."""
-        total: Array = self.values.sum(axis=0, dtype=np.float64)
-        return total
+        return np.asarray(self.values.sum(axis=0, dtype=np.float64))
 
     def find_returns(self) -> tuple[Return, ...]:
         """Find the two strongest returns, the nearer first; a gate ends at the darkest instant
@@ -159,15 +154,10 @@ class TimedMeasurements:
         peaks, prominences = self._find_peaks()
         if not peaks.size:
             return ()
-        strongest = np.sort(peaks[np.argsort(prominences)[-2:]])
-        between = (
-            int(low + np.argmin(self.history[low:high]))
-            for low, high in pairwise(strongest.tolist())
-        )
-        return tuple(
-            self._locate_return(slice(*ends))
-            for ends in pairwise([0, *between, self.time_axis.bins])
-        )
+        strongest = np.sort(peaks[np.argsort(prominences)[-2:]]).tolist()
+        between = (low + np.argmin(self.history[low:high]) for low, high in pairwise(strongest))
+        cuts = [0, *map(int, between), self.time_axis.bins]
+        return tuple(self._locate_return(slice(*ends)) for ends in pairwise(cuts))
 
     def _find_peaks(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Instants of the history's peaks that are no noise, and their prominences."""
@@ -203,14 +193,12 @@ class TimedMeasurements:
         time = float(weight @ self.time_axis.times[bins] / weight.sum())
         reach = self.time_axis.times[[0, -1]] * SPEED_OF_LIGHT / 2
         distances = np.linspace(0.5 * reach[0], 1.1 * reach[1], DISTANCE_SAMPLES)
-        return Return(
-            float(np.interp(time, self.rig.compute_flight_time(distances), distances)), bins
-        )
+        flight_times = self.rig.compute_flight_time(distances)
+        return Return(float(np.interp(time, flight_times, distances)), bins)
 
     def sum_gate(self, bins: slice) -> Array:
         """Return the measurements summed over some instants, (measurements,) float32."""
-        total: Array = self.values[:, bins].sum(axis=1)
-        return total
+        return np.asarray(self.values[:, bins].sum(axis=1))
 
     def measurement(self, bins: slice) -> ClipMeasurement:
         """Return what an ordinary recovery takes, of some instants."""
@@ -221,9 +209,8 @@ class TimedMeasurements:
 def measure_views(pictures: Array, rig: Rig, time_axis: TimeAxis) -> TimedMeasurements:
     """Measure true views, (views, rows, columns, bins), without noise."""
     camera = rig.camera
-    return TimedMeasurements(
-        camera.light_field_model()(pictures[list(camera.used_views)]), rig, time_axis
-    )
+    values = camera.light_field_model()(pictures[list(camera.used_views)])
+    return TimedMeasurements(values, rig, time_axis)
 
 
 def add_poisson_noise(light: Array, photons_per_unit: float, random: np.random.Generator) -> Array:
@@ -260,11 +247,9 @@ def find_occlusion_mask(occluder: Array) -> Array:
     """Return the pixels that an occluder's picture fills, (rows, columns) from 0 to 1."""
     from skimage.filters import threshold_otsu
 
-    usual = np.minimum(
-        occluder, np.quantile(occluder, GLINT_QUANTILE)
-    )  # what enters the picture from beside it piles up there
-    filled: Array = (usual > threshold_otsu(usual)).astype(np.float32)
-    return filled
+    # what enters the picture from beside it piles up there
+    usual = np.minimum(occluder, np.quantile(occluder, GLINT_QUANTILE))
+    return np.asarray(usual > threshold_otsu(usual), np.float32)
 
 
 def build_occluded_model(
@@ -277,9 +262,8 @@ def build_occluded_model(
     near, far = shears
     camera, array = rig.camera, rig.array
     steps = rig.lamps[:, 1::-1] / array.view_step  # (v, u) of each lamp
-    lit = np.mean(
-        [1 - _shear_mask(occlusion_mask, near - far, (v, u)) for v, u in steps.tolist()], axis=0
-    )
+    shadows = [_shear_mask(occlusion_mask, near - far, (v, u)) for v, u in steps.tolist()]
+    lit = 1 - np.mean(shadows, axis=0)
     views = [camera.views[number] for number in camera.used_views]
     parts = [
         encoder

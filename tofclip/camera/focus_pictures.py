@@ -118,20 +118,7 @@ def calibrate_views(
         raise ShapeError("the dot pictures", f"{signal.shape} like the line pictures", dots.shape)
     slit_row, columns = _find_dots(dots, views)
     fits = [_fit_view(signal, dots, slit_row, column) for column in columns]
-    centre, centre_error, row, angle, angle_error, crossing, first, last = (
-        np.array(values) for values in zip(*fits, strict=True)
-    )
-    return FocusCalibration(
-        centre,
-        angle,
-        centre_error,
-        angle_error,
-        row,
-        np.stack([first, last], axis=1),
-        crossing,
-        signal,
-        dots,
-    )
+    return FocusCalibration(*map(np.array, zip(*fits, strict=True)), signal=signal, dots=dots)
 
 
 def _subtract_background(picture: ArrayLike, background: ArrayLike) -> FloatArray:
@@ -154,9 +141,8 @@ def _find_dots(dots: FloatArray, views: int) -> tuple[int, NDArray[np.intp]]:
     profile = gaussian_filter1d(_crop_slit_band(clean, slit_row).sum(axis=0), 4)
     noise = 1.4826 * float(np.median(np.abs(profile - np.median(profile))))
     distance = max(1, dots.shape[1] // (2 * views + 1))
-    peaks, _ = find_peaks(
-        profile, height=np.median(profile) + MIN_DOT_SNR * noise, distance=distance
-    )
+    height = np.median(profile) + MIN_DOT_SNR * noise
+    peaks, _ = find_peaks(profile, height=height, distance=distance)
     if peaks.size < views:
         raise CalibrationError(
             f"found {peaks.size} dots on the slit, expected {views}: check that the dot picture was taken with the "
@@ -170,9 +156,8 @@ def _crop_slit_band(picture: FloatArray, row: int) -> FloatArray:
     return picture[max(0, row - SLIT_HALF_HEIGHT_PX) : row + SLIT_HALF_HEIGHT_PX + 1]
 
 
-def _fit_view(
-    signal: FloatArray, dots: FloatArray, slit_row: int, column: int
-) -> tuple[float, ...]:
+def _fit_view(signal: FloatArray, dots: FloatArray, slit_row: int, column: int) -> tuple[Any, ...]:
+    """A view's fields of a `FocusCalibration`, in their order."""
     centre, centre_error = _fit_dot(_crop_slit_band(dots, slit_row).sum(axis=0), column)
     around = slice(column - DOT_HALF_WIDTH_PX, column + DOT_HALF_WIDTH_PX + 1)
     band = np.maximum(_crop_slit_band(dots, slit_row)[:, around], 0)
@@ -182,7 +167,7 @@ def _fit_view(
     slope, crossing, slope_error = _fit_principal_line(row - dot_row, col, brightness)
     angle, angle_error = float(np.arctan(slope)), slope_error / (1 + slope**2)
     ends = row.min(), row.max()
-    return (centre, centre_error, dot_row, angle, angle_error, crossing, *ends)
+    return centre, angle, centre_error, angle_error, dot_row, ends, crossing
 
 
 def _fit_dot(profile: FloatArray, column: int) -> tuple[float, float]:
@@ -221,17 +206,14 @@ def _find_line_pixels(
     # than the dot: the brightest pixel near the crossing is where the region begins.
     near = smooth[max(0, slit_row - 5) : slit_row + 6, max(0, column - 6) : column + 7]
     if near.max() <= 0:
-        raise CalibrationError(
-            f"no line crosses the slit near column {column}: is the line picture's slit open?"
-        )
+        raise CalibrationError(f"no line crosses the slit near column {column}: is its slit open?")
     regions, _ = label(smooth > LINE_THRESHOLD * near.max())
     top, left = np.unravel_index(int(near.argmax()), near.shape)
     inside = regions == regions[max(0, slit_row - 5) + top, max(0, column - 6) + left]
     rows, columns = np.nonzero(inside)
     if np.ptp(rows) < 2 * LINE_SEGMENT_COUNT:
-        raise CalibrationError(
-            f"the line near column {column} is only {np.ptp(rows)} px long; no angle can be fitted"
-        )
+        length = f"the line near column {column} is only {np.ptp(rows)} px long"
+        raise CalibrationError(f"{length}; no angle can be fitted")
     return rows.astype(np.float64), columns.astype(np.float64), signal[rows, columns]
 
 

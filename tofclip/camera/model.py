@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from tofclip.camera.range_calibration import RangeCalibration
+from tofclip.camera.range_calibration import RangeCalibration, empty_array
 from tofclip.camera.sweep import FloatArray, Sweep, sweep_from_record
 from tofclip.errors import CalibrationError
 from tofclip.notebook import render_html
@@ -84,19 +84,12 @@ class Camera(Storable):
     angles: FloatArray = field(metadata=stored_array("rad", "view"))
     image_shape: tuple[int, int] = field(metadata=stored_array("px", "yx", dtype=np.int64))
     slit_width_px: int = field(metadata=stored_value("slit_width_px", dtype=int))
-    gains: FloatArray = field(
-        default_factory=lambda: np.empty(0), metadata=stored_array("", "view")
-    )
-    view_positions: FloatArray = field(
-        default_factory=lambda: np.empty(0), metadata=stored_array("view step", "view")
-    )
+    gains: FloatArray = empty_array("", "view")
+    view_positions: FloatArray = empty_array("view step", "view")
     sweep: Sweep | None = field(
         default=None, metadata=stored_child(sweep_from_record, optional=True)
     )
-    dead_columns: NDArray[np.bool_] = field(
-        default_factory=lambda: np.empty(0, dtype=bool),
-        metadata=stored_array("", "column", dtype=bool),
-    )
+    dead_columns: NDArray[np.bool_] = empty_array("", "column", dtype=bool)
     time_zero: float = field(default=0.0, metadata=stored_value("time_zero_s"))
     pulse_fwhm: float = field(default=60e-12, metadata=stored_value("pulse_fwhm_s"))
     focal_length_px: float = field(
@@ -111,13 +104,8 @@ class Camera(Storable):
     distortion: FloatArray = field(
         default_factory=lambda: np.zeros(5), metadata=stored_array("", "coefficient", optional=True)
     )
-    centre_uncertainty_px: FloatArray = field(
-        default_factory=lambda: np.empty(0),
-        metadata=stored_array("px", "view", name="centre_uncertainty"),
-    )
-    angle_uncertainty: FloatArray = field(
-        default_factory=lambda: np.empty(0), metadata=stored_array("rad", "view")
-    )
+    centre_uncertainty_px: FloatArray = empty_array("px", "view", name="centre_uncertainty")
+    angle_uncertainty: FloatArray = empty_array("rad", "view")
     range_calibration: RangeCalibration | None = field(
         default=None,
         metadata=stored_child(RangeCalibration.from_record, "range_calibration", optional=True),
@@ -173,10 +161,8 @@ class Camera(Storable):
         yield np.all(self.gains > 0), f"view gains must be positive, got {self.gains}"
         steep = np.abs(self.angles) >= np.pi / 2
         yield not steep.any(), "line angles must lie within 90 degrees of the vertical"
-        for what, value in (
-            ("pulse width", self.pulse_fwhm),
-            ("focal length", self.focal_length_px),
-        ):
+        lengths = ("pulse width", self.pulse_fwhm), ("focal length", self.focal_length_px)
+        for what, value in lengths:
             yield 0 < value < np.inf, f"the {what} must be a positive number, got {value}"
         yield np.isfinite(self.time_zero), f"time zero must be finite, got {self.time_zero}"
         yield (

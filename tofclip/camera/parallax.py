@@ -216,9 +216,8 @@ def find_sharpest_shears(
                 continue
             frames = GATE_METHOD.recover(operator, measurements, valid, progress).frames
             table[row, column] = relative_residual(operator, frames, measurements, valid) ** -2
-    light = np.array(
-        [np.sum((measurement.values * measurement.valid)[:, gate].clip(0)) for gate in gates]
-    )
+    good = measurement.values * measurement.valid
+    light = np.array([np.sum(good[:, gate].clip(0)) for gate in gates])
     return _fit_focus_curve(table, tried, light)
 
 
@@ -241,9 +240,8 @@ def _fit_focus_curve(table: FloatArray, tried: FloatArray, light: FloatArray) ->
     best = table.argmax(axis=1)
     # At the end of what was tried there is no neighbour on one side: no vertex, no weight.
     inner = best.clip(1, max(1, tried.size - 2))
-    left, centre, right = (
-        table[rows, (inner + side).clip(0, tried.size - 1)] for side in (-1, 0, 1)
-    )
+    around = ((inner + side).clip(0, tried.size - 1) for side in (-1, 0, 1))
+    left, centre, right = (table[rows, columns] for columns in around)
     bend = 2 * centre - left - right
     firm = (best == inner) & (bend > 0)
     beyond = np.divide((right - left) / 2, bend, out=np.zeros_like(centre), where=firm)

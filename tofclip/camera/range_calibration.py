@@ -8,7 +8,9 @@ the camera's own.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +20,12 @@ from tofclip.storage import Storable, stored_array, stored_value
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]
+
+
+def empty_array(units: str, *axes: str, **options: Any) -> Any:
+    """Return the field of a stored array that is empty where nothing is known."""
+    metadata = stored_array(units, *axes, **options)
+    return field(default_factory=lambda: np.empty((0,) * len(axes)), metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -57,25 +65,15 @@ class RangeCalibration(Storable):
     RECORD_KIND = "range_calibration"
 
     time_zero_sigma: float = field(metadata=stored_value("time_zero_sigma_s"))
-    walk: FloatArray = field(
-        default_factory=lambda: np.empty(0), metadata=stored_array("m", "power")
-    )
-    walk_covariance: FloatArray = field(
-        default_factory=lambda: np.empty((0, 0)), metadata=stored_array("m^2", "power", "power")
-    )
+    walk: FloatArray = empty_array("m", "power")
+    walk_covariance: FloatArray = empty_array("m^2", "power", "power")
     reference_signal: float = field(default=1.0, metadata=stored_value("reference_signal_counts"))
     signal_range: FloatArray = field(
         default_factory=lambda: np.array([1.0, 1.0]), metadata=stored_array("count", "end")
     )
-    offsets: FloatArray = field(
-        default_factory=lambda: np.empty((0, 0)), metadata=stored_array("m", "y", "x")
-    )
-    offset_sigma: FloatArray = field(
-        default_factory=lambda: np.empty((0, 0)), metadata=stored_array("m", "y", "x")
-    )
-    response: FloatArray = field(
-        default_factory=lambda: np.empty((0, 0)), metadata=stored_array("", "y", "x")
-    )
+    offsets: FloatArray = empty_array("m", "y", "x")
+    offset_sigma: FloatArray = empty_array("m", "y", "x")
+    response: FloatArray = empty_array("", "y", "x")
     reflectance_scale: float = field(
         default=np.nan, metadata=stored_value("reflectance_percent_of_one_count_at_1_m")
     )
@@ -91,44 +89,32 @@ class RangeCalibration(Storable):
             object.__setattr__(self, name, array)
             if not np.all(np.isfinite(array)):
                 raise CalibrationError(f"{name} of a range calibration must be finite")
-        order, weakest, strongest = self.walk.size, *np.ravel(self.signal_range)[[0, -1]]
-        conditions = (
-            (
-                self.walk.ndim == 1 and self.walk_covariance.shape == (order, order),
-                "the range walk and its covariance must be of one order",
-            ),
-            (
-                self.offsets.ndim == 2 and self.offsets.shape == self.offset_sigma.shape,
-                "the pixels' offsets and their deviations must be of one shape",
-            ),
-            (
-                self.response.ndim == 2 and np.all(self.response > 0),
-                "the pixels' response must be positive numbers (rows, columns)",
-            ),
-            (
-                self.signal_range.shape == (2,)
-                and 0 < weakest <= strongest
-                and self.reference_signal > 0,
-                "the signals of a range calibration must be positive, weak first",
-            ),
-            (
-                0 <= self.time_zero_sigma < np.inf,
-                "the deviation of time zero must be a number of seconds",
-            ),
-        )
-        for holds, message in conditions:
+        for holds, message in self._list_conditions():
             if not holds:
                 raise CalibrationError(message)
+
+    def _list_conditions(self) -> Iterator[tuple[Any, str]]:
+        """What holds of every calibration, and what to say where it does not."""
+        order, signals = self.walk.size, self.signal_range
+        of_one_order = self.walk.ndim == 1 and self.walk_covariance.shape == (order, order)
+        yield of_one_order, "the range walk and its covariance must be of one order"
+        alike = self.offsets.ndim == 2 and self.offsets.shape == self.offset_sigma.shape
+        yield alike, "the pixels' offsets and their deviations must be of one shape"
+        positive = self.response.ndim == 2 and np.all(self.response > 0)
+        yield positive, "the pixels' response must be positive numbers (rows, columns)"
+        ordered = signals.shape == (2,) and 0 < signals[0] <= signals[1]
+        ordered &= self.reference_signal > 0
+        yield ordered, "the signals of a range calibration must be positive, weak first"
+        known = 0 <= self.time_zero_sigma < np.inf
+        yield known, "the deviation of time zero must be a number of seconds"
 
     def require_shape(self, image_shape: tuple[int, int]) -> None:
         """Raise `CalibrationError` where the pixels are those of another picture."""
         for name in ("offsets", "response"):
             known = getattr(self, name)
             if known.size and known.shape != image_shape:
-                raise CalibrationError(
-                    f"{name} of the range calibration are of {known.shape} pixels, the picture has "
-                    f"{image_shape}"
-                )
+                what = f"{name} of the range calibration are of {known.shape} pixels"
+                raise CalibrationError(f"{what}, the picture has {image_shape}")
 
     def compute_walk(self, signal: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return what returns of so many counts, (n,), are measured too long, m, and its deviation."""
@@ -158,7 +144,5 @@ class RangeCalibration(Storable):
         to a range of 1 m, at pixels (y, x). NaN where no target of known reflectance was seen.
         """
         gain = self.response[y, x] if self.response.size else 1.0
-        reflectance: FloatArray = (
-            self.reflectance_scale * np.asarray(intensity, dtype=np.float64) / gain
-        )
-        return reflectance
+        counts = np.asarray(intensity, dtype=np.float64)
+        return np.asarray(self.reflectance_scale * counts / gain)

@@ -1,6 +1,5 @@
-"""From a raw streak image to the measurements that the forward operator predicts.
-
-Sums of successive rectified rows, in one look at a raw streak image.
+"""From a raw streak image to the measurements that the forward operator predicts, and sums of
+successive rectified rows.
 
 Of most shots few rows hold light. To find them, sums over a pulse's length do, for which no
 rectified picture has to be written and read again; nor need the dark level be known beforehand,
@@ -170,7 +169,7 @@ class Rectifier:
         delay : float
             Rows by which this shot's light comes later than the camera's calibration says.
         """
-        self._require_shape(counts)
+        self._prepare(counts)
         bad = np.zeros(counts.shape, bool) if saturated is None else saturated
         valid = self._find_valid(bad, delay)
         if not valid.any():
@@ -184,10 +183,7 @@ class Rectifier:
         return Measurement(measurements, valid)
 
     def rectify(
-        self,
-        counts: FloatImage,
-        dark: float | None = None,
-        delay: float = 0.0,
+        self, counts: FloatImage, dark: float | None = None, delay: float = 0.0
     ) -> FloatImage:
         """Return the measurements alone, (columns, rows), for methods that cannot leave out single ones:
         0 beyond the raw image and in dead columns.
@@ -223,8 +219,7 @@ class Rectifier:
         """Some or all rectified rows, (rows, columns)."""
         from tofclip.camera.kernels import sample_bilinear, sample_delayed_rows, sample_rows
 
-        self._require_shape(counts)
-        raw, level, shift = _as_counts(counts), np.float32(dark), np.float32(delay)
+        raw, level, shift = self._prepare(counts), np.float32(dark), np.float32(delay)
         size = len(self._raw_row) if numbers is None else numbers.size
         measurements = np.empty((size, counts.shape[1]), np.float32)
 
@@ -283,15 +278,12 @@ class Rectifier:
         valid &= ~self.camera.dead_columns
         return valid.T
 
-    def _require_shape(self, counts: FloatImage) -> None:
+    def _prepare(self, counts: FloatImage) -> FloatImage:
+        """Return a streak image that fits as compiled loops take it."""
         require_width(counts, self.camera)
         if counts.shape != self._raw_row.shape:
             raise ShapeError("a streak image of this camera", self._raw_row.shape, counts.shape)
-
-
-def _as_counts(counts: FloatImage) -> FloatImage:
-    """Return a streak image as compiled loops take it."""
-    return np.ascontiguousarray(counts, np.float32)
+        return np.ascontiguousarray(counts, np.float32)
 
 
 class RowSums:
@@ -315,14 +307,12 @@ class RowSums:
         from tofclip.camera.kernels import subtract_dark_level
 
         dark = estimate_dark_level(counts, self._add_rows(counts, sums))
-        lit = np.zeros(self._measured.shape[0], bool)
-        run_blocks(
-            lambda piece: subtract_dark_level(
-                self._measured[piece], np.float32(dark), sums[piece], lit[piece]
-            ),
-            lit.size,
-            -(-lit.size // count_block_threads()),
-        )
+        measured, lit = self._measured, np.zeros(self._measured.shape[0], bool)
+
+        def work(piece: slice) -> None:
+            subtract_dark_level(measured[piece], np.float32(dark), sums[piece], lit[piece])
+
+        run_blocks(work, lit.size, -(-lit.size // count_block_threads()))
         if not lit.any():
             raise InputError(NO_LIGHT_MESSAGE)
         return dark
@@ -332,7 +322,7 @@ class RowSums:
         from tofclip.camera.kernels import sum_boxes, sum_sampled_boxes
 
         rectifier, starts, length = self._rectifier, self._starts, self._length
-        rectifier._require_shape(counts)
+        raw, row_sums = rectifier._prepare(counts), np.empty(len(counts), np.float32)
         lanes = -(-starts.size // (count_block_threads() * LANES)) * LANES
         if not rectifier._stays_in_column:
             rectified = rectifier._sample(counts, 0.0, 0.0)
@@ -342,7 +332,6 @@ class RowSums:
                 lanes,
             )
             return np.asarray(counts @ np.ones(counts.shape[1], np.float32))
-        raw, row_sums = _as_counts(counts), np.empty(len(counts), np.float32)
 
         def work(piece: slice) -> None:
             ends = piece.start, piece.stop

@@ -213,11 +213,13 @@ def register_views(
         model = _Model(camera, groups)
         pictures = model.recover(part, progress)
         predicted = model.predict(pictures)
-        residuals.append(_compute_residual(predicted, part))
+        misfit, good = part.values - predicted, part.valid.astype(bool)
+        residual = np.linalg.norm(misfit[good]) / np.linalg.norm(part.values[good])
+        residuals.append(float(residual))
         best = min(best, (residuals[-1], camera), key=lambda pair: pair[0])
         if number == max_rounds or (number >= MIN_ROUND_COUNT and moved_px < SETTLED_PX):
             break
-        evidence = _Evidence(pictures, groups, part.values - predicted, part.valid, chosen)
+        evidence = _Evidence(pictures, groups, misfit, part.valid, chosen)
         slope = np.gradient(measurement.values, axis=1)[:, chosen]
         before = camera.centres_px
         camera = _refine_camera(camera, start, evidence, slope, times is not None)
@@ -234,9 +236,8 @@ def _select_frames(measurement: Measurement) -> NDArray[np.intp]:
     """Pick instants evenly in cumulated brightness, so that far and dim objects are represented
     too.
     """
-    brightness = np.sqrt(
-        np.maximum((measurement.values * measurement.valid).sum(axis=0, dtype=np.float64), 0)
-    )
+    light = (measurement.values * measurement.valid).sum(axis=0, dtype=np.float64)
+    brightness = np.sqrt(np.maximum(light, 0))
     share = np.cumsum(brightness) / brightness.sum()
     wanted = (np.arange(MAX_FRAMES) + 0.5) / MAX_FRAMES
     return np.unique(np.searchsorted(share, wanted).clip(0, brightness.size - 1))
@@ -279,11 +280,6 @@ class _Model:
         return np.concatenate(seen, axis=1)
 
 
-def _compute_residual(model: Array, part: Measurement) -> float:
-    valid = part.valid.astype(bool)
-    return float(np.linalg.norm((part.values - model)[valid]) / np.linalg.norm(part.values[valid]))
-
-
 def _refine_camera(
     camera: Camera, start: Camera, evidence: _Evidence, slope: Array, knows_times: bool
 ) -> Camera:
@@ -296,13 +292,10 @@ def _refine_camera(
             "only a skew per view can be refined; this camera's sweep was measured as a whole"
         )
     drift = camera.centres_px - start.centres_px
-    corrections = np.array(
-        [
-            evidence.solve_corrections(camera, view, drift[view], slope)
-            for view in range(camera.views)
-        ]
-    )
-    offset, stretch, gain, centre = RELAXATION * corrections.T
+    corrections = [
+        evidence.solve_corrections(camera, view, drift[view], slope) for view in range(camera.views)
+    ]
+    offset, stretch, gain, centre = RELAXATION * np.transpose(corrections)
     centre = CENTRE_RELAXATION / RELAXATION * centre
     reference = int(np.argmin(np.abs(camera.view_positions)))
     gains = np.maximum(camera.gains * (1 + gain), 0.05)
@@ -367,21 +360,17 @@ class _Evidence:
         weight = self.valid[window] / (energy + floor)
         slope, parallax = slope[window], np.gradient(predicted, axis=0)[window]
         effects = [-slope, -slope * self.rows, predicted[window], -parallax]
-        design = np.stack(
-            [(effect * weight).ravel() for effect in effects], axis=1, dtype=np.float64
-        )
-        return _solve_least_squares(design, (self.misfit[window] * weight).ravel(), drift)
-
-
-def _solve_least_squares(design: FloatArray, target: FloatArray, drift: float) -> FloatArray:
-    """Solve the scaled normal equations, with the prior on the last unknown, the centre."""
-    scale = np.linalg.norm(design, axis=0) + np.finfo(np.float64).tiny
-    scaled = design / scale
-    normal, moment = scaled.T @ scaled, scaled.T @ target
-    strength = float(np.mean(target**2)) / CENTRE_PRIOR_PX**2
-    normal[-1, -1] += strength / scale[-1] ** 2
-    moment[-1] -= strength * drift / scale[-1]
-    # A view without any structure leaves a column of zeros: the ridge keeps its numbers as they
-    # are.
-    solution: FloatArray = np.linalg.solve(normal + 1e-9 * np.eye(normal.shape[0]), moment) / scale
-    return solution
+        design = np.stack([(effect * weight).ravel() for effect in effects], axis=1, dtype=float)
+        target = (self.misfit[window] * weight).ravel()
+        # The scaled normal equations, with the prior on the last unknown, the centre.
+        scale = np.linalg.norm(design, axis=0) + np.finfo(np.float64).tiny
+        scaled = design / scale
+        normal, moment = scaled.T @ scaled, scaled.T @ target
+        strength = float(np.mean(target**2)) / CENTRE_PRIOR_PX**2
+        normal[-1, -1] += strength / scale[-1] ** 2
+        moment[-1] -= strength * drift / scale[-1]
+        # A view without any structure leaves a column of zeros: the ridge keeps its numbers as
+        # they are.
+        ridge = 1e-9 * np.eye(normal.shape[0])
+        solution: FloatArray = np.linalg.solve(normal + ridge, moment) / scale
+        return solution

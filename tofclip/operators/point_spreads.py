@@ -68,8 +68,9 @@ class CubicPhasePlate:
 
     def trace_rays(self, v: Coordinates, u: Coordinates) -> Rays:
         # 1/2 shifts the PSF as a whole, which lies about its own centre then
-        down, right = (self.strength_px * (pupil**2 - 0.5) for pupil in (v, u))
-        return np.ones((v * u).shape), *np.broadcast_arrays(down, right)
+        passed = np.ones((v * u).shape)
+        down, right = (self.strength_px * (pupil**2 - 0.5) * passed for pupil in (v, u))
+        return passed, down, right
 
 
 @dataclass(frozen=True)

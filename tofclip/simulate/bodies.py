@@ -66,7 +66,6 @@ class Rectangle(Shape):
 
     @property
     def half_extent(self) -> Array:
-        """Half of width, height and thickness, m."""
         return np.array([self.width, self.height, 0.0]) / 2
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
@@ -96,7 +95,6 @@ class Sphere(Shape):
 
     @property
     def half_extent(self) -> Array:
-        """The radius three times, m."""
         return np.full(3, self.radius)
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
@@ -128,7 +126,6 @@ class Box(Shape):
 
     @property
     def half_extent(self) -> Array:
-        """Half of width, height and thickness, m."""
         return np.array([self.width, self.height, self.thickness]) / 2
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
@@ -139,9 +136,7 @@ class Box(Shape):
         """
         half = self.half_extent
         with np.errstate(divide="ignore", invalid="ignore"):
-            slabs = np.sort(
-                np.stack([(-half - origin) / directions, (half - origin) / directions]), axis=0
-            )
+            slabs = np.sort([(side - origin) / directions for side in (-half, half)], axis=0)
         axis, distance = slabs[0].argmax(axis=1), slabs[0].max(axis=1)
         met = (distance > 0) & (distance <= slabs[1].min(axis=1))
         met_at = np.where(met, distance, 0.0)

@@ -84,12 +84,8 @@ class CameraArray:
     @property
     def views(self) -> NDArray[np.float64]:
         """(v, u) of each camera in raster order, (views, 2)."""
-        numbers = (np.arange(count) - count // 2 for count in self._view_counts)
-        return (
-            np.stack(np.meshgrid(*numbers, indexing="ij"), axis=-1)
-            .reshape(-1, 2)
-            .astype(np.float64)
-        )
+        numbers = (np.arange(float(count)) - count // 2 for count in self._view_counts)
+        return np.stack(np.meshgrid(*numbers, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def position(self, view: View) -> NDArray[np.float64]:
         """Where the camera at (v, u) stands, (x, y, z) in metres; fractions are places between the
@@ -101,11 +97,8 @@ class CameraArray:
         """Shear s in pixels per view step of points at `depth` metres along z (supplement Note 1, s
         = 0 at focus).
         """
-        inverse = 1 / np.asarray(depth, np.float64)
-        shear: NDArray[np.float64] = (
-            self.focal_length_px * self.view_step * (1 / self.focus - inverse)
-        )
-        return shear
+        nearness = 1 / self.focus - 1 / np.asarray(depth, np.float64)
+        return np.asarray(self.focal_length_px * self.view_step * nearness)
 
     def depth(self, shear: float) -> float:
         """Distance along z, m, of points with a shear; `InputError` where it lies beyond infinity."""
@@ -130,10 +123,9 @@ class CameraArray:
         rows, columns = self.image_shape
         origin = self.position(view)
         # in pixels from the middle of the picture's central pixel, number n // 2
+        unit = self.focus / self.focal_length_px
         y, x = (
-            ((np.arange(n * samples) + 0.5) / samples - 0.5 - n // 2)
-            * self.focus
-            / self.focal_length_px
+            ((np.arange(n * samples) + 0.5) / samples - 0.5 - n // 2) * unit
             for n in (rows, columns)
         )
         # all views' pictures agree on the plane in focus: rays of one pixel meet there
@@ -184,7 +176,6 @@ def render_light_field(scene: Scene, array: CameraArray) -> RenderedLightField:
     """
     views = array.views
     pictures = np.empty((len(views), *array.image_shape), np.float32)
-
     _for_each_view(array, pictures, lambda view: render_view(scene, array, view))
     return RenderedLightField(LightField(pictures, views), render_shear_map(scene, array))
 
@@ -318,7 +309,6 @@ def render_flash(
     """
     views = array.views
     pictures = np.empty((len(views), *array.image_shape, time_axis.bins), np.float32)
-
     _for_each_view(array, pictures, lambda view: render_flash_view(scene, array, time_axis, view))
     return pictures
 

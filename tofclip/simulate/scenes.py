@@ -49,46 +49,21 @@ class _SceneBuilder:
 
     array: CameraArray
 
-    def _place(
-        self,
-        shape: Callable[..., Shape],
-        place: tuple[float, float],
-        sides: tuple[float, ...],
-        shear: float,
-        material: Material,
-    ) -> Body:
-        scale = min(self.array.image_shape) / DESIGN_WIDTH_PX
-        lengths = (
-            side * scale / self.array.focal_length_px * self.array.depth(shear) for side in sides
-        )
-        centre = self.array.point(scale * place[0], scale * place[1], shear)
-        return Body(shape(*lengths), material, centre)
-
     def plate(
         self,
         place: tuple[float, float],
-        size: tuple[float, float],
+        size: tuple[float, ...],
         shear: float,
         material: Material,
+        shape: Callable[..., Shape] = Rectangle,
     ) -> Body:
-        """Return a flat plate that faces the cameras, `size` wide and high."""
-        return self._place(Rectangle, place, size, shear, material)
-
-    def ball(
-        self, place: tuple[float, float], radius: float, shear: float, material: Material
-    ) -> Body:
-        """Return a ball whose centre lies at a shear."""
-        return self._place(Sphere, place, (radius,), shear, material)
-
-    def block(
-        self,
-        place: tuple[float, float],
-        size: tuple[float, float],
-        shear: float,
-        material: Material,
-    ) -> Body:
-        """Return a block as thick as it is wide."""
-        return self._place(Box, place, (*size, size[0]), shear, material)
+        """Return a body that faces the cameras: a plate, `size` wide and high, or another shape whose
+        sides these are; its centre lies at the shear.
+        """
+        scale = min(self.array.image_shape) / DESIGN_WIDTH_PX
+        unit = scale / self.array.focal_length_px * self.array.depth(shear)
+        centre = self.array.point(scale * place[0], scale * place[1], shear)
+        return Body(shape(*(side * unit for side in size)), material, centre)
 
     def scene(self, shear: float, backdrop: Pattern, *bodies: Body) -> Scene:
         """Return a scene before a plate that fills every view."""
@@ -136,13 +111,13 @@ EDITS: dict[str, Callable[[Body], Body]] = {
 def _make_still_life(stage: _SceneBuilder) -> Scene:
     text, squares = make_text_pattern("TOF\nCLIP", 0.05, 0.9), make_checkerboard(12, 0.15, 0.95)
     board = stage.plate((26, -14), (52, 52), -0.1, Lambertian(text)).tilt(0.3)
-    ball = stage.ball((-30, 18), 24, -0.8, Lambertian(squares))
+    ball = stage.plate((-30, 18), (24,), -0.8, Lambertian(squares), Sphere)
     return stage.scene(0.5, make_mottled_pattern(0.1, 0.6, 18, seed=1), board, ball)
 
 
 def _make_blocks(stage: _SceneBuilder) -> Scene:
     rings = Lambertian(make_rings(4, 0.2, 0.9)[38:154, 38:154])
-    block = stage.block((24, 16), (40, 44), 0.0, rings).tilt(-0.5)
+    block = stage.plate((24, 16), (40, 44, 40), 0.0, rings, Box).tilt(-0.5)
     card = stage.plate((-26, -14), (50, 56), -0.6, _cut_letter("A"))
     return stage.scene(0.8, make_stripes(18, 0.15, 0.45), block, card)
 
@@ -164,8 +139,8 @@ def _make_slanted_text(stage: _SceneBuilder) -> Scene:
 
 def _make_bolt_and_letters(stage: _SceneBuilder) -> Scene:
     metal = Specular(make_stripes(10, 0.1, 0.35), gloss=0.8, exponent=60)
-    head = stage.ball((-34, 14), 18, -1.0, metal)
-    shank = stage.block((-30, -24), (16, 40), -0.9, metal).tilt(0.6)
+    head = stage.plate((-34, 14), (18,), -1.0, metal, Sphere)
+    shank = stage.plate((-30, -24), (16, 40, 16), -0.9, metal, Box).tilt(0.6)
     near = stage.plate((8, 24), (30, 36), -0.5, _print_text("B", 0.9))
     far = stage.plate((40, -16), (40, 44), 0.2, _print_text("T", 0.8))
     return stage.scene(0.5, make_plain_pattern(0.03), far, near, shank, head)
@@ -194,7 +169,7 @@ def _make_occluded_scene(stage: _SceneBuilder, target: str, occluder: str) -> Sc
         skin = Lambertian(make_mottled_pattern(0.5, 0.95, 10, seed=3))
         # trunk, arms and legs
         parts = (((0, 2), (26, 46)), ((0, -12), (70, 9)), ((-8, 40), (9, 36)), ((8, 40), (9, 36)))
-        bodies = [stage.ball((0, -34), 11, -0.4, skin)]
+        bodies = [stage.plate((0, -34), (11,), -0.4, skin, Sphere)]
         bodies += [stage.plate(place, size, -0.4, skin) for place, size in parts]
     width, places = (9, (-45, -15, 15, 45)) if occluder == "bars" else (14, (-20, 26))
     bodies += [stage.plate((x, 0), (width, 200), OCCLUDER_SHEAR, BLACK_MATERIAL) for x in places]

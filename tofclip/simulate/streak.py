@@ -179,9 +179,7 @@ class StreakDetector:
             raise InputError(
                 f"a detector needs rows and a positive bin width, got {self.rows} and {self.bin_width}"
             )
-        if not (
-            self.peak_photons > 0 and self.background_photons >= 0 and self.full_scale_photons > 0
-        ):
+        if not (self.peak_photons > 0 <= self.background_photons and self.full_scale_photons > 0):
             raise InputError(
                 "peak and full scale must be positive numbers of photons, the background not negative"
             )
@@ -233,16 +231,18 @@ class Instrument:
         """Rays of a picture: X and Y from the optical axis in pixels, flat, sub-pixel by sub-pixel
         in raster order.
         """
-        side = self.rays_per_pixel_side
+        side, camera = self.rays_per_pixel_side, self.camera
         # Middles of the sub-pixels; pixel centres are whole numbers, hence the half taken off.
         down, across = (
             (np.arange(pixels * side) + 0.5) / side - 0.5 - axis
-            for pixels, axis in zip(
-                self.camera.image_shape, self.camera.optical_axis_px, strict=True
-            )
+            for pixels, axis in zip(camera.image_shape, camera.optical_axis_px, strict=True)
         )
         x, y = np.meshgrid(across, down)
         return x.ravel(), y.ravel()
+
+    def look_at(self, scene: Scene, position: float = 0.0) -> RayCast:
+        """Return what all rays of the view at `position` view steps see, in `pixel_grid`'s order."""
+        return scene.trace(self.viewpoint(position), self.directions(*self.pixel_grid(), position))
 
     def directions(
         self, x: NDArray[np.float64], y: NDArray[np.float64], position: float = 0.0
@@ -271,8 +271,7 @@ class RayBundle(NamedTuple):
 
 def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundle:
     """Cast the rays of the view at `position` view steps; those that bring no light are left out."""
-    x, y = instrument.pixel_grid()
-    hits = scene.trace(instrument.viewpoint(position), instrument.directions(x, y, position))
+    (x, y), hits = instrument.pixel_grid(), instrument.look_at(scene, position)
     bright = (hits.body != NO_BODY) & (hits.reflectance > 0)
     share = 1 / instrument.rays_per_pixel_side**2
     return RayBundle(
@@ -367,8 +366,7 @@ class GroundTruth:
     @classmethod
     def from_scene(cls, scene: Scene, instrument: Instrument) -> GroundTruth:
         """Look at `scene` from the reference viewpoint of an instrument."""
-        x, y = instrument.pixel_grid()
-        hits = scene.trace(instrument.viewpoint(0.0), instrument.directions(x, y))
+        hits = instrument.look_at(scene)
         (rows, columns), side = instrument.camera.image_shape, instrument.rays_per_pixel_side
 
         def group_by_pixel(values: NDArray[Any]) -> NDArray[Any]:
@@ -376,24 +374,17 @@ class GroundTruth:
             return by_side.swapaxes(1, 2).reshape(rows, columns, side**2)
 
         plate, path, reflectance = map(group_by_pixel, (hits.body, hits.path, hits.reflectance))
-        filled = np.stack(
-            [np.mean(plate == number, axis=-1) for number in range(len(scene.bodies))]
-        )
-        most = np.argmax(filled, axis=0)[..., np.newaxis]
-        own = plate == most
+        filled = np.stack([np.mean(plate == body, axis=-1) for body in range(len(scene.bodies))])
+        own = plate == np.argmax(filled, axis=0)[..., np.newaxis]
         count = own.sum(axis=-1)
-        distance = np.full(count.shape, np.nan, dtype=np.float32)
-        np.divide(
-            (path * own).sum(axis=-1), count, out=distance, where=count > 0, casting="same_kind"
-        )
-        firm = np.all(reflectance >= MIN_REFLECTANCE, axis=-1)
-        whole = (
-            scipy.ndimage.binary_erosion((share == 1) & firm, np.ones((3, 3))) for share in filled
-        )
+        with np.errstate(invalid="ignore"):  # NaN where there is nothing
+            distance = ((path * own).sum(axis=-1) / count).astype(np.float32)
+        firm, around = np.all(reflectance >= MIN_REFLECTANCE, axis=-1), np.ones((3, 3))
+        whole = [scipy.ndimage.binary_erosion((one == 1) & firm, around) for one in filled]
         return cls(
             range=distance,
             reflectance=reflectance.mean(axis=-1).astype(np.float32),
-            target=np.logical_or.reduce(list(whole)),
+            target=np.logical_or.reduce(whole),
             bin_width=instrument.detector.bin_width,
         )
 
@@ -415,8 +406,7 @@ def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1
         On the time axis of the instrument's streak images, time zero taken off.
     """
     camera, detector = instrument.camera, instrument.detector
-    x, y = instrument.pixel_grid()
-    hits = scene.trace(instrument.viewpoint(0.0), instrument.directions(x, y))
+    hits = instrument.look_at(scene)
     pixel = number_ray_pixels(camera.image_shape, instrument.rays_per_pixel_side)
     seen = hits.body != NO_BODY
     brightness = hits.reflectance[seen] / hits.distance[seen] ** 2
@@ -429,10 +419,8 @@ def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1
     times = detector.row_times - camera.time_zero
     # The reference view itself has no parallax: its pictures are those that the right shear would
     # give.
-    shears = camera.shear_at(
-        np.maximum(SPEED_OF_LIGHT * times / 2, detector.bin_width * SPEED_OF_LIGHT)
-    )
-    return Frames(values, times, camera, shears=shears)
+    distances = np.maximum(SPEED_OF_LIGHT * times / 2, detector.bin_width * SPEED_OF_LIGHT)
+    return Frames(values, times, camera, shears=camera.shear_at(distances))
 
 
 MEDIAN_PER_SIGMA = 0.6745  # of the absolute value of a normal variate, in its deviation
@@ -543,20 +531,14 @@ def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedS
     # saturates.
     exposure = detector.peak_photons / float(light.max())
     counts, saturated = detector.expose(exposure * light, np.random.default_rng(seed))
+    settings = {"seed": seed, "peak_photons": detector.peak_photons, "exposure": exposure}
     streak = Streak(
         counts,
         detector.row_times,
         saturated,
         camera=camera,
         source="simulated streak image",
-        provenance=collect_provenance(
-            {"seed": seed, "peak_photons": detector.peak_photons, "exposure": exposure}
-        ),
+        provenance=collect_provenance(settings),
     )
-    return SimulatedShot(
-        streak,
-        camera,
-        GroundTruth.from_scene(scene, instrument),
-        (exposure * light).astype(np.float32),
-        exposure,
-    )
+    truth, signal = GroundTruth.from_scene(scene, instrument), (exposure * light).astype(np.float32)
+    return SimulatedShot(streak, camera, truth, signal, exposure)
