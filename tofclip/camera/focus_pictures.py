@@ -118,8 +118,8 @@ def calibrate_views(
         raise ShapeError("the dot pictures", f"{signal.shape} like the line pictures", dots.shape)
     slit_row, columns = _find_dots(dots, views)
     fits = [_fit_view(signal, dots, slit_row, column) for column in columns]
-    by_view = map(np.array, zip(*fits, strict=True))
-    return FocusCalibration(*by_view, *(signal, dots))
+    by_view = [np.array(values) for values in zip(*fits, strict=True)]
+    return FocusCalibration(*[*by_view, signal, dots])
 
 
 def _subtract_background(picture: ArrayLike, background: ArrayLike) -> FloatArray:
