@@ -12,12 +12,12 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
 from threading import Condition, Thread
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,14 +47,16 @@ class StreamItem:
     latency: float  # time from when the source brought it until it was handed out, s
 
 
-@dataclass(frozen=True)
-class _Arrival:
+class _Arrival(NamedTuple):
     """One thing as the source brought it, `ready` at a reading of `perf_counter`."""
 
     number: int
     value: Any
     read_seconds: float
     ready: float
+
+
+_Entry = tuple[_Arrival, Future[Any]]
 
 
 def run_in_order(
@@ -88,25 +90,20 @@ def run_in_order(
     if policy not in POLICIES:
         raise InputError(f"a stream's policy is one of {', '.join(POLICIES)}, not '{policy}'")
     drops = policy == "drop_oldest"
-
-    def submit(value: Any) -> Future[Any]:
-        return executor.submit(_raise_or_work, work, value)
-
+    submit = partial(executor.submit, _raise_or_work, work)
     stream = _Stream(source, submit, at_once, queue_size, drops)
     reader = Thread(target=stream.read, name="stream reader", daemon=True)
     reader.start()
     try:
         while (entry := stream.wait_for_next()) is not None:
-            arrival, future = entry
-            fault = future.exception()
+            fault = entry[1].exception()
             stream.make_room()
             if fault is not None:
                 if on_failure is None or not isinstance(fault, TofclipError):
                     raise fault
-                on_failure(arrival.number, fault)
+                on_failure(entry[0].number, fault)
                 continue
-            if drops:
-                arrival, future = stream.skip_to_newest(entry)
+            arrival, future = stream.skip_to_newest(entry) if drops else entry
             seconds = perf_counter() - arrival.ready
             yield StreamItem(arrival.number, future.result(), arrival.read_seconds, seconds)
     finally:
@@ -137,7 +134,7 @@ class _Stream:
         self._source, self._submit, self._room = source, submit, at_once
         self._queue_size, self._drops = queue_size, drops
         self._waiting: deque[_Arrival] = deque()
-        self._started: deque[tuple[_Arrival, Future[Any]]] = deque()
+        self._started: deque[_Entry] = deque()
         # One lock for all fields; every change wakes both sides, which test again in a loop.
         self._changed = Condition()
         self._closed = self._ended = False
@@ -177,10 +174,10 @@ class _Stream:
             arrival = self._waiting.popleft()
             self._room -= 1
             # Without its value: the executor alone holds a shot, until its work is done.
-            self._started.append((replace(arrival, value=None), self._submit(arrival.value)))
+            self._started.append((arrival._replace(value=None), self._submit(arrival.value)))
         self._changed.notify_all()
 
-    def wait_for_next(self) -> tuple[_Arrival, Future[Any]] | None:
+    def wait_for_next(self) -> _Entry | None:
         """Return what was started first; behind the last one None, or the source's fault."""
         with self._changed:
             while not self._started and not self._ended:
@@ -197,7 +194,7 @@ class _Stream:
             self._room += 1
             self._start_waiting()
 
-    def skip_to_newest(self, entry: tuple[_Arrival, Future[Any]]) -> tuple[_Arrival, Future[Any]]:
+    def skip_to_newest(self, entry: _Entry) -> _Entry:
         """Drop results that were finished while the consumer was busy; what failed is not newer."""
         with self._changed:
             while self._started and (later := self._started[0][1]).done() and not later.exception():

@@ -32,9 +32,8 @@ SHADE_RATIO = 1.1  # backgrounds that differ by less share a filter; thresholds 
 MIN_RELATIVE_BACKGROUND = 1e-3  # of a usual bin; no bin is so dark that one photon decides
 NO_PILE_UP = 1e15  # cycles: the rate of any bin is as good as zero
 MAX_THRESHOLDS = 4096  # that are remembered, a number each
-MIN_LIVE_CYCLES = (
-    0.5  # a bin that hardly any cycle reaches says nothing, but not with infinite surety
-)
+# a bin that hardly any cycle reaches says nothing, but not with infinite surety
+MIN_LIVE_CYCLES = 0.5
 SAMPLED_PIXELS = 8192  # that say what the pixels' background has in common
 DETECTED_PIXELS_PER_BLOCK = 1 << 10
 
@@ -90,19 +89,16 @@ def count_live_cycles(
     seen = np.asarray(counts, dtype=np.float64)
     if cycles < 1 or not np.all(np.isfinite(seen) & (seen >= 0)):
         raise InputError(
-            "pile-up needs at least one cycle and counts that are finite and not negative"
+            "pile-up needs a cycle or more and counts that are finite and not negative"
         )
     dead = seen.shape[-1] if dead_bins is None else dead_bins
     if dead < 1:
         raise InputError(f"a dead time lasts at least one bin, got {dead}")
     before = np.cumsum(seen, axis=-1) - seen
-    blind = before.copy()
-    blind[..., dead:] -= before[..., :-dead]
-    live = cycles - blind
+    live = cycles - before
+    live[..., dead:] += before[..., :-dead]
     if np.any(seen > live):
-        raise InputError(
-            f"more photons were counted than {cycles} cycles with this dead time allow"
-        )
+        raise InputError(f"more photons than {cycles} cycles with this dead time allow")
     return seen, live
 
 
@@ -235,12 +231,11 @@ class PhotonDetector:
             raise InputError(
                 f"a histogram needs at least {2 * self._offsets.size} bins, two pulses long; got {self.bins}"
             )
-        if self.background is not None:
-            shape = np.asarray(self.background, dtype=np.float64)
-            if shape.shape != (self.bins,):
-                raise ShapeError("the background of a histogram", (self.bins,), shape.shape)
-            if not (np.all(np.isfinite(shape)) and shape.min() >= 0 and shape.any()):
-                raise InputError("a background must be finite, not negative, and somewhere above 0")
+        shape = np.asarray(np.ones(self.bins) if self.background is None else self.background)
+        if shape.shape != (self.bins,):
+            raise ShapeError("the background of a histogram", (self.bins,), shape.shape)
+        if not (np.all(np.isfinite(shape)) and shape.min() >= 0 and shape.any()):
+            raise InputError("a background must be finite, not negative, and somewhere above 0")
 
     @cached_property
     def shape(self) -> Pulse:
@@ -250,8 +245,7 @@ class PhotonDetector:
     @property
     def times(self) -> FloatArray:
         """Instant of each bin's middle, s; the first is 0."""
-        times: FloatArray = np.arange(self.bins) * np.float64(self.bin_width)
-        return times
+        return np.asarray(np.arange(self.bins) * np.float64(self.bin_width))
 
     @cached_property
     def relative_background(self) -> FloatArray:
@@ -260,8 +254,7 @@ class PhotonDetector:
             return np.ones(self.bins)
         shape = np.asarray(self.background, dtype=np.float64)
         relative = np.maximum(shape / shape.mean(), MIN_RELATIVE_BACKGROUND)
-        even: FloatArray = relative / relative.mean()
-        return even
+        return np.asarray(relative / relative.mean())
 
     @cached_property
     def _kernel_pulse(self) -> Table:

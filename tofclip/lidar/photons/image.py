@@ -97,10 +97,8 @@ class PhotonImage:
         cube = np.asarray(counts)
         if cube.ndim != 3:
             raise ShapeError("counts", "(rows, columns, bins)", cube.shape)
-        if cube.dtype.kind == "f" and not np.all(np.isfinite(cube)):
-            raise InputError("photon counts must be finite")
-        if cube.size and cube.min() < 0:
-            raise InputError("photon counts must not be negative")
+        if not np.all(np.isfinite(cube)) or cube.min(initial=0) < 0:
+            raise InputError("photon counts must be finite and not negative")
         histograms = cube.reshape(-1, cube.shape[2])
         pixel, bin_number = np.nonzero(histograms)
         return cls(
@@ -225,14 +223,11 @@ class PhotonImage:
         return np.asarray(self.table[pixels].toarray(), np.float64)
 
 
+# Photons of a hot pixel's fullest bin over those of the usual pixel's fullest bin, of the bins beside
+# it, and of each neighbour at that time: light of a pulse is in several bins, a surface goes on.
 PEAK_RATIO = 20.0
-"""Photons of a hot pixel's fullest bin over those of the usual pixel's fullest bin, over those of
-the bins beside it, and over those of each neighbour at that time: light of a pulse is in several
-bins, or a surface goes on in the next pixel."""
-
-TOTAL_RATIO = (
-    2.0  # photons of a hot pixel over a usual one; saves looking at the bins of all others
-)
+# photons of a hot pixel over a usual one; saves looking at the bins of all others
+TOTAL_RATIO = 2.0
 USUAL_QUANTILE = 0.9  # of the pixels: up to a tenth of them may be hot
 SAMPLED_PIXELS = 4096
 NEIGHBOUR_BINS = 2  # by which the same surface may lie earlier or later in the next pixel

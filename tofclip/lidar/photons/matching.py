@@ -21,10 +21,9 @@ from tofclip.lidar.photons.scene import MIN_SIGNAL_PHOTONS, Scene
 from tofclip.threads import run_blocks
 
 LABELS_PER_WIDTH = 2  # coarse bins in the full width of the response
+# Memory of the two volumes (pixels, labels) of float32, and of the tables of tiles before them; a longer
+# axis gets coarser labels.
 MAX_VOLUME_BYTES = 1 << 31
-"""Memory of the two volumes (pixels, labels) of float32, and of the tables of tiles before them; a
-longer axis gets coarser labels."""
-
 TILE_PX = 16
 TILE_TABLES = 3  # of (tiles, coarse bins) float64 at once: counts, pooled sums, and a sorted copy
 MIN_TILE_SIGNIFICANCE = 5.0  # above the background, where a tile says that some surface lies there
@@ -32,9 +31,9 @@ PIXELS_PER_BLOCK, ROWS_PER_BLOCK = 1 << 14, 16
 
 PLANE_ROUNDS = 5
 TRIAL_ROUNDS = 3  # of a reach that is tried, from the fit of the reach before
+# A curved surface pulls a plane by the square of its reach: what a plane of half the reach differs by is
+# three quarters of what both miss.
 NESTED_BIAS_RATIO = 4 / 3
-"""A curved surface pulls a plane by the square of its reach: what a plane of half the reach differs
-by is three quarters of what both miss."""
 GATE_WIDTHS = 1.0  # of the response: a neighbour whose surface is further off is another's
 
 

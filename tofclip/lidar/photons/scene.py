@@ -81,14 +81,12 @@ class BinnedResponse:
     def density(self) -> FloatArray:
         """Probability density of a photon's time at each sample, per bin."""
         samples = np.maximum(self.pulse.samples, DENSITY_FLOOR)
-        density: FloatArray = samples / (samples.sum() * self.step)
-        return density
+        return np.asarray(samples / (samples.sum() * self.step))
 
     @cached_property
     def log_slope(self) -> FloatArray:
         """Minus the slope of the density's logarithm at each sample, per bin."""
-        slope: FloatArray = -np.gradient(np.log(self.density), self.step)
-        return slope
+        return np.asarray(-np.gradient(np.log(self.density), self.step))
 
     def coarse_shares(self, coarse: int) -> tuple[FloatArray, int]:
         """Share of the photons in each of the coarse bins, of so many bins, around the one that holds
@@ -245,9 +243,8 @@ MAX_USUAL_COUNT = 500  # photons of a window beyond four times the median: more 
 MAX_COUNTED = 4000  # up to which numbers of photons are told apart one by one; more are rounded
 BUMP_WIDTHS = (1.0, 1.6, 2.5)  # of what a surface may make, in widths of the pulse
 BUMP_SIGNIFICANCE = 5.0
-MAX_MISFIT_SHARE = (
-    0.1  # of a bump's energy beside the pulse's shape; a single bin leaves half of it
-)
+# of a bump's energy beside the pulse's shape; a single bin leaves half of it
+MAX_MISFIT_SHARE = 0.1
 MIN_UNEVENNESS = 0.1  # backgrounds that differ by less, or less than their noise, are even
 
 

@@ -44,12 +44,9 @@ HELD_OUT_FRACTION = 0.25
 SLOPE_COSTS = (1.5, 4.0, 10.0)  # log-likelihood that a change by one label has to bring
 JUMP_COST_RATIO = 7.0  # any larger change costs this many times as much
 
+# Standard deviation of where the surface lies in a response that was learnt from the scene: its shape
+# varies from surface to surface with tilt, material and brightness. One that is given is exact.
 LEARNT_RESPONSE_SIGMA_WIDTHS = 1 / 8
-"""Standard deviation of where the surface lies in a response that was learnt from the scene.
-
-Its shape varies from surface to surface with tilt, material and brightness; a response that is
-given is taken as exact."""
-
 MIN_EXPLAINED_DENSITY = 0.003  # of the response's peak: where it is brighter photons are explained
 # That the background alone shows as many photons at a further surface, in the pixel and in the nine
 # pixels around it.
