@@ -146,24 +146,18 @@ class Streak(Storable):
     @property
     def times(self) -> NDArray[np.float64]:
         """Instant of each row, s; raises `MissingTimeAxisError` where none is known."""
-        self.require_times()
-        return np.asarray(self.row_times)
-
-    def require_times(self) -> None:
-        """Raise `MissingTimeAxisError` where the instants of the rows are not known."""
         if self.row_times is None:
             raise MissingTimeAxisError(
                 f"{self.source} has no time axis: give the duration of a row (`bin_width`)"
             )
+        return np.asarray(self.row_times)
 
     def with_bin_width(self, bin_width: float) -> Streak:
         """Return the same picture with evenly spaced rows of `bin_width` seconds, the first at 0."""
         if not (np.isfinite(bin_width) and bin_width > 0):
             raise InputError(f"bin width must be a positive number of seconds, got {bin_width}")
         require_credible_bin_width(bin_width, longest=MAX_ROW_S)
-        return replace(
-            self, row_times=np.arange(self.counts.shape[0], dtype=np.float64) * float(bin_width)
-        )
+        return replace(self, row_times=np.arange(len(self.counts), dtype=np.float64) * bin_width)
 
 
 def outline_streak(
@@ -392,9 +386,7 @@ class Frames(Storable):
     def __getitem__(self, frames: slice) -> Frames:
         """Return some of the frames, such as ``frames[100:200]``, with the returns of their time."""
         if not isinstance(frames, slice):
-            raise InputError(
-                "frames are selected by a slice, such as frames[100:101] for one of them"
-            )
+            raise InputError("frames are selected by a slice, such as frames[100:101] for one")
         if self.times[frames].size == 0:
             raise InputError(f"no frame is selected of {len(self)}")
         if (frames.step or 1) < 0:
@@ -405,13 +397,8 @@ class Frames(Storable):
             nearest = np.searchsorted((self.times[1:] + self.times[:-1]) / 2, returns.time)
             taken = np.arange(len(self))[frames]
             returns = returns[(taken[0] <= nearest) & (nearest <= taken[-1])]
-        return replace(
-            self,
-            values=self.values[frames],
-            times=self.times[frames],
-            shears=self.shears[frames],
-            returns=returns,
-        )
+        own = {name: getattr(self, name)[frames] for name in ("values", "times", "shears")}
+        return replace(self, **own, returns=returns)
 
     def sel(
         self,
@@ -481,12 +468,8 @@ class Frames(Storable):
         """Return an `xarray.DataArray` (time, y, x), times in s and pixels as coordinates;
         `MissingDependencyError` where xarray is not installed.
         """
-        _, rows, columns = self.values.shape
-        axes = {
-            "time": (self.times, "s"),
-            "y": (np.arange(rows), "px"),
-            "x": (np.arange(columns), "px"),
-        }
+        y, x = map(np.arange, self.values.shape[1:])
+        axes = {"time": (self.times, "s"), "y": (y, "px"), "x": (x, "px")}
         return make_data_array(np.asarray(self), axes, "brightness", "counts")
 
     def to_torch(self) -> Any:

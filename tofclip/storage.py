@@ -128,9 +128,8 @@ class Record:
         """As `attribute`, refusing what is not a finite number."""
         value = self.attribute(name, default)
         if not isinstance(value, numbers.Real) or not math.isfinite(value):
-            raise FileFormatError(
-                self.origin, f"attribute '{name}' must be a number, found {value}"
-            )
+            problem = f"attribute '{name}' must be a number, found {value}"
+            raise FileFormatError(self.origin, problem)
         return float(value)
 
     def child(self, name: str, kind: str) -> Record:
@@ -195,10 +194,8 @@ def is_own_file(path: str | Path) -> bool:
     """Whether a file says that it is one of our HDF5 files, be it damaged otherwise."""
     import h5py
 
-    with (
-        contextlib.suppress(OSError, RuntimeError, TypeError, ValueError),
-        h5py.File(path, "r") as file,
-    ):
+    faults = OSError, RuntimeError, TypeError, ValueError
+    with contextlib.suppress(*faults), h5py.File(path, "r") as file:
         return _read_text(file, "format") == FORMAT_NAME
     return False
 
@@ -354,7 +351,7 @@ class Storable:
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
-        record = Record(self.RECORD_KIND, {}, {}, {}, {})
+        record = Record(self.RECORD_KIND)
         _write_fields(self, record)
         return record
 
@@ -512,10 +509,9 @@ def _read_fields(kind: type, record: Record) -> Any:
             case "attributes" | "provenance":
                 values[name] = getattr(record, how.kind)
             case "attachments":
+                own = {key for key, one in declarations.items() if one.kind in ("child", "texts")}
                 values[name] = {
-                    key: child
-                    for key, child in record.children.items()
-                    if key not in declarations or declarations[key].kind not in ("child", "texts")
+                    key: child for key, child in record.children.items() if key not in own
                 }
             case "origin":
                 if record.origin:

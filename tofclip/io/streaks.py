@@ -126,13 +126,16 @@ class StreakStack:
         """
         import h5py
 
-        try:
-            with h5py.File(path, "r") as file:
-                is_own = isinstance(file.get("counts", getlink=True), h5py.HardLink)
-                counts = file["counts"] if is_own else None
-                return isinstance(counts, h5py.Dataset) and counts.ndim == 3 and counts.size > 0
-        except (OSError, KeyError, RuntimeError):
-            return False
+        refusals = OSError, KeyError, RuntimeError
+        with (
+            contextlib.suppress(*refusals),
+            translate_read_errors(path),
+            h5py.File(path, "r") as file,
+        ):
+            is_own = isinstance(file.get("counts", getlink=True), h5py.HardLink)
+            counts = file["counts"] if is_own else None
+            return isinstance(counts, h5py.Dataset) and counts.ndim == 3 and counts.size > 0
+        return False
 
     def __init__(self, path: str | Path) -> None:
         import h5py
@@ -183,12 +186,8 @@ def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
         for shot in shots:
             if number == 0:
                 shape = shot.counts.shape
-                options = {
-                    "maxshape": (None, *shape),
-                    "chunks": (1, *shape),
-                    "compression": "gzip",
-                    "shuffle": True,
-                }
+                options = {"maxshape": (None, *shape), "chunks": (1, *shape), "shuffle": True}
+                options["compression"] = "gzip"
                 stored = file.create_dataset("counts", (0, *shape), np.float32, **options)
                 if shot.row_times is not None:
                     file.create_dataset("row_times", data=shot.row_times).attrs["units"] = "s"

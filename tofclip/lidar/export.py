@@ -194,12 +194,10 @@ def _list_pcd(path: Path) -> Entries:
         entries = {line[0]: line[1:] for line in _read_header(file, path, "#", "DATA")}
         if entries["DATA"] != ["binary"]:
             raise FileFormatError(path, "is not a binary PCD file")
-        try:
+        with guard(path, "has an incomplete PCD header"):
             kinds = zip(entries["TYPE"], entries["SIZE"], strict=True)
             properties = list(zip(entries["FIELDS"], map(PCD_TYPES.get, kinds), strict=True))
             points = entries["POINTS"][0]
-        except (KeyError, ValueError, IndexError) as fault:
-            raise FileFormatError(path, "has an incomplete PCD header") from fault
         return _list_binary(path, file.tell(), properties, points)
 
 
@@ -254,13 +252,9 @@ def _list_csv(path: Path) -> Entries:
 
     def read() -> Mapping[str, Any]:
         table = np.empty((0, len(labels)))
-        try:
-            if points:
+        if points:
+            with guard(path, "holds something that is not a number"):
                 table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2, encoding="ascii")
-        except ValueError as fault:
-            raise FileFormatError(
-                path, f"holds something that is not a number ({fault})"
-            ) from fault
         if table.shape[1] != len(labels):
             raise FileFormatError(path, f"names {len(labels)} columns, holds {table.shape[1]}")
         return dict(zip(labels, table.T, strict=True))
@@ -289,14 +283,9 @@ def _write_las(path: Path, columns: Columns, shape: tuple[int, int] | None) -> N
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = np.full(3, COORDINATE_STEP_M), np.zeros(3)
     extra = [column for column in columns if column.name not in "xyz"]
-    header.add_extra_dims(
-        [
-            laspy.ExtraBytesParams(
-                DIMENSION_PREFIX + column.name, column.values.dtype, description=column.unit
-            )
-            for column in extra
-        ]
-    )
+    for column in extra:
+        name, kind = DIMENSION_PREFIX + column.name, column.values.dtype
+        header.add_extra_dim(laspy.ExtraBytesParams(name, kind, description=column.unit))
     table = laspy.LasData(header)
     table.x, table.y, table.z = (values[axis].astype(np.float64) for axis in "xyz")
     for column in extra:

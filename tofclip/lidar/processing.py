@@ -69,8 +69,7 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     group = group.ravel()
 
     def mean(values: NDArray[Any]) -> FloatArray:
-        total: FloatArray = np.bincount(group, values.astype(np.float64), number.size) / number
-        return total
+        return np.asarray(np.bincount(group, values.astype(np.float64), number.size) / number)
 
     first = np.full(number.size, 255, np.uint8)
     np.minimum.at(first, group, cloud.return_number)
@@ -83,6 +82,11 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     columns["range_sigma"] = np.sqrt(mean(cloud.range_sigma.astype(np.float64) ** 2) / number)
     positions = np.stack([mean(axis) for axis in cloud.xyz.T], axis=-1).astype(np.float32)
     return replace(cloud, xyz=positions, return_number=first, **columns)
+
+
+def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0) -> PointCloud:
+    """Leave out what `find_outliers` finds."""
+    return cloud[~find_outliers(cloud, neighbours, deviations)]
 
 
 def find_outliers(
@@ -113,8 +117,7 @@ def find_outliers(
     middle = float(np.median(ratio))
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(ratio - middle)))
     limit = max(middle + deviations * sigma, np.log(MIN_SPACING_RATIO))
-    outliers: NDArray[np.bool_] = ratio > limit
-    return outliers
+    return np.asarray(ratio > limit)
 
 
 def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
@@ -155,22 +158,15 @@ def align_clouds(
     guess.
     """
     if min(len(source), len(target)) < 3 or not reach > 0:
-        raise InputError(
-            "registration needs at least three points in each cloud and a positive reach"
-        )
-    registration = import_open3d().pipelines.registration
-    surface = target.to_open3d()
-    surface.normals = import_open3d().utility.Vector3dVector(estimate_normals(target))
-    found = registration.registration_icp(
-        source.to_open3d(),
-        surface,
-        reach,
-        np.eye(4) if start is None else np.asarray(start, dtype=np.float64),
-        registration.TransformationEstimationPointToPlane(),
-    )
-    return Alignment(
-        np.asarray(found.transformation), float(found.fitness), float(found.inlier_rmse)
-    )
+        raise InputError("registration needs three points in each cloud and a positive reach")
+    open3d, surface = import_open3d(), target.to_open3d()
+    surface.normals = open3d.utility.Vector3dVector(estimate_normals(target))
+    registration = open3d.pipelines.registration
+    first = np.eye(4) if start is None else np.asarray(start, dtype=np.float64)
+    to_planes = registration.TransformationEstimationPointToPlane()
+    found = registration.registration_icp(source.to_open3d(), surface, reach, first, to_planes)
+    pose = np.asarray(found.transformation)
+    return Alignment(pose, float(found.fitness), float(found.inlier_rmse))
 
 
 @dataclass(frozen=True)
@@ -196,9 +192,7 @@ def find_objects(cloud: PointCloud, reach: float, min_points: int = 40) -> list[
     if len(cloud) == 0:
         return []
     pairs = scipy.spatial.cKDTree(cloud.xyz).query_pairs(reach, output_type="ndarray")
-    links = scipy.sparse.coo_array(
-        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(cloud), len(cloud))
-    )
+    links = scipy.sparse.coo_array((np.ones(len(pairs)), tuple(pairs.T)), (len(cloud), len(cloud)))
     groups, label = scipy.sparse.csgraph.connected_components(links, directed=False)
     objects = []
     for group in np.flatnonzero(np.bincount(label, minlength=groups) >= min_points):

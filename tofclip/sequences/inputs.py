@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tofclip.errors import InputError, StorageError
-from tofclip.files import translate_read_errors
 from tofclip.io import read_streak
 from tofclip.io.streaks import StreakStack
 from tofclip.sequences.jobs import SETTINGS_NAME
 from tofclip.shots import Streak
-from tofclip.storage import HDF5_SIGNATURE
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ def is_sequence(source: str | Path) -> bool:
     if "://" in text:
         return False
     # A file whose name contains * or [ is that file, not a pattern.
-    return path.is_dir() or (_is_stack(path) if path.exists() else glob.has_magic(text))
+    return path.is_dir() or (StreakStack.is_one(path) if path.exists() else glob.has_magic(text))
 
 
 def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, Shot]:
@@ -135,12 +133,3 @@ def list_files(source: str | Path) -> dict[str, Path]:
             )
         named[name] = path
     return named
-
-
-def _is_stack(path: Path) -> bool:
-    """Say a stack from a single streak image: it has one more dimension."""
-    try:
-        with translate_read_errors(path), open(path, "rb") as file:
-            return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE and StreakStack.is_one(path)
-    except OSError:
-        return False

@@ -90,7 +90,10 @@ def run_in_order(
     if policy not in POLICIES:
         raise InputError(f"a stream's policy is one of {', '.join(POLICIES)}, not '{policy}'")
     drops = policy == "drop_oldest"
-    submit = partial(executor.submit, _raise_or_work, work)
+
+    def submit(value: Any) -> Future[Any]:
+        return executor.submit(_raise_or_work, work, value)
+
     stream = _Stream(source, submit, at_once, queue_size, drops)
     reader = Thread(target=stream.read, name="stream reader", daemon=True)
     reader.start()
