@@ -19,9 +19,8 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
@@ -40,21 +39,15 @@ if TYPE_CHECKING:
 OWN_PACKAGES = ("tofclip", "nlos", "devices", "apps")
 
 # What to install for a module whose distribution has another name.
-DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
-    {
-        "array_api_compat": "array-api-compat",
-        "cupy": "cupy-cuda12x",
-        "cv2": "opencv-python-headless",
-        "lazy_loader": "lazy-loader",
-        "libusb_package": "libusb-package",
-        "PIL": "pillow",
-        "pywt": "pywavelets",
-        "skimage": "scikit-image",
-        "sklearn": "scikit-learn",
-        "tomli_w": "tomli-w",
-        "usb": "pyusb",
-    }
-)
+DISTRIBUTIONS = {
+    "cupy": "cupy-cuda12x",
+    "cv2": "opencv-python-headless",
+    "PIL": "pillow",
+    "pywt": "pywavelets",
+    "skimage": "scikit-image",
+    "sklearn": "scikit-learn",
+    "usb": "pyusb",
+}
 
 
 def describe_missing_package(fault: ImportError) -> str | None:
@@ -68,7 +61,7 @@ def describe_missing_package(fault: ImportError) -> str | None:
     module = (fault.name or "").partition(".")[0]
     if not module or module in OWN_PACKAGES:
         return None
-    distribution = DISTRIBUTIONS.get(module, module)
+    distribution = DISTRIBUTIONS.get(module, module.replace("_", "-"))
     if isinstance(fault, ModuleNotFoundError):
         return f"the package '{distribution}' is missing: pip install {distribution}"
     return f"the package '{distribution}' does not load on this machine: {fault}"
@@ -150,11 +143,9 @@ def find_array_limit(stored: int = 0) -> int:
 
 def _require_array_limit(path: str | Path, name: str, claimed: int, stored: int) -> None:
     if claimed > (limit := find_array_limit(min(stored, os.path.getsize(path)))):
-        raise FileFormatError(
-            path,
-            f"'{name}' claims {claimed} bytes, more than the {limit} that are read; if you trust the "
-            f"file, set {ARRAY_LIMIT_VARIABLE}={-(-claimed >> 30)}",
-        )
+        problem = f"'{name}' claims {claimed} bytes, more than the {limit} that are read"
+        remedy = f"if you trust the file, set {ARRAY_LIMIT_VARIABLE}={-(-claimed >> 30)}"
+        raise FileFormatError(path, f"{problem}; {remedy}")
 
 
 def require_bounded_size(
@@ -165,10 +156,8 @@ def require_bounded_size(
     """
     _require_array_limit(path, name, claimed, stored)
     if claimed > min(stored, os.path.getsize(path)) * (MAX_COMPRESSION if compressed else 1):
-        raise FileFormatError(
-            path,
-            f"is truncated or damaged: '{name}' claims {claimed} bytes, which the file cannot hold",
-        )
+        problem = f"'{name}' claims {claimed} bytes, which the file cannot hold"
+        raise FileFormatError(path, f"is truncated or damaged: {problem}")
 
 
 def iterate_members(
@@ -211,9 +200,8 @@ def require_bounded_dataset(
     if chunk > max(claimed, MAX_CHUNK_BYTES):
         raise FileFormatError(origin, f"is damaged: a chunk of '{name}' claims {chunk} bytes")
     if stored > os.path.getsize(origin) or claimed > MAX_COMPRESSION * stored:
-        raise FileFormatError(
-            origin, f"is damaged: '{name}' claims {claimed} bytes, which the file cannot hold"
-        )
+        problem = f"'{name}' claims {claimed} bytes, which the file cannot hold"
+        raise FileFormatError(origin, f"is damaged: {problem}")
 
 
 def require_suffix(path: str | Path, *suffixes: str) -> None:

@@ -92,6 +92,11 @@ def test_voxels_hold_one_point_each_and_keep_the_mean(points, voxel, seed):
         assert thin.intensity.max() <= cloud.intensity.max()
 
 
+def test_the_mean_of_points_is_known_better_than_each():
+    cloud = cloud_of(np.full((4, 3), 0.5) + 1e-3 * np.eye(4, 3))
+    assert downsample_cloud(cloud, 1.0).range_sigma == pytest.approx([0.5e-3])
+
+
 def test_a_cloud_is_laid_over_another_one():
     random = np.random.default_rng(5)
     corner = np.concatenate(

@@ -64,11 +64,6 @@ StreakFile = tuple[Callable[[], Record], Callable[[], Streak]]
 """What describes the streak image of a file that is open, and what reads it."""
 
 
-def is_hpdta(text: str) -> bool:
-    """Whether an image description is HPD-TA's or HiPic's."""
-    return text.lstrip().startswith("[Application]")
-
-
 def parse_text(text: str) -> dict[str, str]:
     """Split the text into ``{"Section/key": value}``, e.g. ``"Streak camera/Time Range": "20 ns"``."""
     entries: dict[str, str] = {}
@@ -132,9 +127,8 @@ def _read_table(path: str | Path, start: int, count: int) -> NDArray[np.float64]
         )
     times = np.frombuffer(data, dtype="<f4").astype(np.float64)
     if not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
-        raise FileFormatError(
-            path, "its time axis (ScalingYScalingFile) does not increase row by row"
-        )
+        problem = "its time axis (ScalingYScalingFile) does not increase row by row"
+        raise FileFormatError(path, problem)
     return times
 
 
@@ -155,10 +149,10 @@ def _make_streak(
     path: str | Path,
 ) -> Streak:
     """Mark the pixels that reached the sensor's limit; floating-point pictures have none."""
-    if np.any(pixels < 0):
+    if negative := np.count_nonzero(pixels < 0):
         raise InputError(
-            f"{path}: {np.count_nonzero(pixels < 0)} pixels are negative, which raw counts cannot be; "
-            "build a Streak yourself for a picture whose background is already subtracted"
+            f"{path}: {negative} pixels are negative, which raw counts cannot be; build a Streak "
+            "yourself for a picture whose background is already subtracted"
         )
     saturated = None
     if pixels.dtype.kind != "f":
@@ -184,18 +178,15 @@ def open_tiff(path: str | Path) -> Iterator[StreakFile]:
     ):
         page = tiff.pages.first
         require_whole_chain(tiff, path)
-        if len(tiff.pages) != 1:
-            raise FileFormatError(
-                path, f"holds {len(tiff.pages)} pictures, expected one streak image"
-            )
+        if (pages := len(tiff.pages)) != 1:
+            raise FileFormatError(path, f"holds {pages} pictures, expected one streak image")
         if page.ndim != 2 or page.dtype is None or page.dtype.kind not in "uif":
-            raise FileFormatError(
-                path, f"holds a picture of shape {page.shape}, expected grey (rows, columns)"
-            )
+            problem = f"holds a picture of shape {page.shape}, expected grey (rows, columns)"
+            raise FileFormatError(path, problem)
         require_bounded_page(page, path)
         date, times = page.tags.get("DateTime"), None
         metadata = {} if date is None or not date.value else {"DateTime": str(date.value)}
-        if is_hpdta(page.description):
+        if page.description.lstrip().startswith("[Application]"):  # HPD-TA's or HiPic's
             metadata |= parse_text(page.description)
             times = read_row_times(metadata, path, page.shape[0])
         has_limit = page.dtype.kind != "f"

@@ -120,28 +120,25 @@ def read_folder(folder: Path) -> LightField:
     if not paths:
         raise FileFormatError(folder, f"holds no pictures ({', '.join(IMAGE_SUFFIXES)})")
     places = _parse_grid_positions(folder, paths)
-    rows, columns = places.max(axis=0) + 1
-    is_there = np.zeros((rows, columns), bool)
-    is_there[tuple(places.T)] = True
-    if is_there.sum() < len(places):
+    shape = places.max(axis=0) + 1
+    number = np.zeros(shape, np.int64)
+    np.add.at(number, tuple(places.T), 1)
+    if number.max() > 1:
         raise FileFormatError(folder, "two pictures have the same view's number")
-    if not is_there.all():
-        row, column = np.argwhere(~is_there)[0]
+    missing = np.argwhere(number == 0)
+    if missing.size:
         raise FileFormatError(
             folder,
-            f"{np.sum(~is_there)} of {rows} x {columns} views are missing, the first in row {row}, "
-            f"column {column} (counted from 0)",
+            f"{len(missing)} of {shape[0]} x {shape[1]} views are missing, the first in row "
+            f"{missing[0, 0]}, column {missing[0, 1]} (counted from 0)",
         )
-    pictures = [_read_picture(path) for path in paths]
-    for path, picture in zip(paths, pictures, strict=True):
+    order = np.lexsort(places.T[::-1])  # by rows, then by columns
+    pictures = [_read_picture(paths[n]) for n in order]
+    for n, picture in zip(order, pictures, strict=True):
         if picture.shape != pictures[0].shape:
-            raise FileFormatError(
-                path, f"is {picture.shape} px, but the first view is {pictures[0].shape} px"
-            )
-    views = places - (places.max(axis=0) + 1) // 2
-    # The last key of lexsort counts most: rows first, then columns.
-    order = np.lexsort((places[:, 1], places[:, 0]))
-    return LightField(np.stack([pictures[n] for n in order]), views[order].astype(np.float64))
+            problem = f"is {picture.shape} px, but the first view is {pictures[0].shape} px"
+            raise FileFormatError(paths[n], problem)
+    return LightField(np.stack(pictures), (places - shape // 2)[order].astype(np.float64))
 
 
 def compute_luminance(picture: NDArray[Any]) -> NDArray[Any]:
@@ -152,26 +149,21 @@ def compute_luminance(picture: NDArray[Any]) -> NDArray[Any]:
         return picture.astype(np.float32)
     if picture.shape[-1] < 3:
         return picture[..., 0].astype(np.float32)
-    grey: NDArray[Any] = (picture[..., :3] @ LUMA_WEIGHTS).astype(np.float32)
-    return grey
+    return np.asarray(picture[..., :3] @ LUMA_WEIGHTS, np.float32)
 
 
 def _parse_grid_positions(folder: Path, paths: list[Path]) -> NDArray[np.int64]:
     """Row and column of each picture on the grid, from 0, (pictures, 2)."""
-    names = [
-        GRID_NAME_PATTERN.search(path.stem) or RASTER_NAME_PATTERN.search(path.stem)
-        for path in paths
-    ]
-    if not all(names):
-        raise FileFormatError(
-            paths[names.index(None)],
-            "its name must end in the view's row and column, as in view_03_05",
-        )
-    groups = [match.groups() for match in names if match]
+    groups = []
+    for path in paths:
+        found = GRID_NAME_PATTERN.search(path.stem) or RASTER_NAME_PATTERN.search(path.stem)
+        if found is None:
+            problem = "its name must end in the view's row and column, as in view_03_05"
+            raise FileFormatError(path, problem)
+        groups.append(found.groups())
     if all(len(group) == 2 for group in groups):
-        places: NDArray[np.int64] = np.array(groups, np.int64)
-        places -= places.min(axis=0)
-        return places
+        places = np.array(groups, np.int64)
+        return np.asarray(places - places.min(axis=0))
     numbers = np.array([group[-1] for group in groups], np.int64)
     numbers -= numbers.min()
     # One number says nothing about the width of the grid, so that only a square one is certain.
@@ -185,37 +177,37 @@ def _parse_grid_positions(folder: Path, paths: list[Path]) -> NDArray[np.int64]:
 
 
 def _read_picture(path: Path) -> NDArray[Any]:
-    with guard(path, "is a damaged picture"):
+    with guard(path, "is a damaged picture"), BoundedFile(path) as file:
         is_tiff = path.suffix.lower() in TIFF_SUFFIXES
-        picture = _decode_tiff(path) if is_tiff else _decode(path)
+        picture = _decode_tiff(path, file) if is_tiff else _decode(path, file)
     if picture.ndim not in (2, 3):
         raise FileFormatError(path, f"must be one grey or colour picture, found {picture.shape}")
     scale = np.iinfo(picture.dtype).max if picture.dtype.kind in "ui" else 1
     return compute_luminance(picture) / np.float32(scale)
 
 
-def _decode_tiff(path: Path) -> NDArray[Any]:
+def _decode_tiff(path: Path, file: BoundedFile) -> NDArray[Any]:
     import tifffile
 
-    with BoundedFile(path) as file, tifffile.TiffFile(file) as tiff:
+    with tifffile.TiffFile(file) as tiff:
         if len(tiff.pages) != 1:
             raise FileFormatError(path, f"holds {len(tiff.pages)} pictures, expected one view")
         require_bounded_page(tiff.pages.first, path)
         return np.asarray(tiff.pages.first.asarray())
 
 
-def _decode(path: Path) -> NDArray[Any]:
+def _decode(path: Path, file: BoundedFile) -> NDArray[Any]:
     from matplotlib.image import imread
     from PIL import Image
 
-    with BoundedFile(path) as file, Image.open(file) as header:  # reads no pixels yet
-        claimed = math.prod(header.size) * len(header.getbands())
+    header = Image.open(file)  # reads no pixels yet
+    claimed = math.prod(header.size) * len(header.getbands())
     if claimed > MAX_PIXELS:
         raise FileFormatError(path, f"claims an impossible size of {header.size} pixels")
     # JPEG is no deflate, but no photograph is smaller than this either.
     require_bounded_size(path, "pixels", claimed, path.stat().st_size, compressed=True)
-    with BoundedFile(path) as file:
-        return np.asarray(imread(file, format=path.suffix[1:].lower()))
+    file.seek(0)
+    return np.asarray(imread(file, format=path.suffix[1:].lower()))
 
 
 def read_light_field(path: str | Path) -> LightField:
@@ -257,19 +249,15 @@ def read_depth_map(path: str | Path) -> NDArray[np.float64]:
         # mapped, so that a header that claims more than there is takes no memory
         mapped = np.load(source, mmap_mode="r", allow_pickle=False)
     if mapped.ndim != 2 or mapped.dtype.kind not in "fiu":
-        raise FileFormatError(
-            source, f"a map of depths is (rows, columns) numbers, found {mapped.shape}"
-        )
+        problem = f"a map of depths is (rows, columns) numbers, found {mapped.shape}"
+        raise FileFormatError(source, problem)
     return np.array(mapped, np.float64)
 
 
 def _read_archive(path: Path) -> LightField:
     archive = Archive(path)
     pictures = archive.array("lf", None, None, None, None)
-    v, u = (
-        archive.finite_array(name, count)
-        for name, count in zip("vu", pictures.shape[:2], strict=True)
-    )
+    v, u = map(archive.finite_array, "vu", pictures.shape[:2])
     # Pictures may be stored as integers to save space; `scale` turns them into values.
     scaled = pictures.astype(np.float32) * np.float32(archive.finite_array("scale"))
     grid = np.stack(np.meshgrid(v, u, indexing="ij"), axis=-1)

@@ -100,13 +100,11 @@ class PtuEvents:
             self.is_t3 = bool(file.is_t3)
             self.is_image = bool(file.is_image)
             self.kind = str(file.record_type.name)
-            self.tick = float(file.global_resolution)
-            """s, of `Events.time`."""
+            self.tick = float(file.global_resolution)  # s, of `Events.time`
+            # s, of `Events.delay`
             self.resolution = float(file.tcspc_resolution) if self.is_t3 else self.tick
-            """s, of `Events.delay`."""
             rate = float(file.syncrate) if self.is_t3 else 0.0
-            self.period = 1 / rate if rate > 0 else 0.0
-            """s between two pulses in T3 mode; 0 where it is not given."""
+            self.period = 1 / rate if rate > 0 else 0.0  # s between pulses in T3 mode, 0: not given
             self.tags: Mapping[str, Any] = dict(file.tags)
             self._decode_records = file.decode_records
             self._offset, announced = int(file.record_offset), int(file.number_records)
@@ -122,12 +120,8 @@ class PtuEvents:
         """Decode a piece; return its events, and what has to be known behind it."""
         first = piece * CHUNK_EVENTS
         # Read, not mapped: mapped pages would count as this program's memory.
-        words = np.fromfile(
-            self.path,
-            "<u4",
-            min(CHUNK_EVENTS, self.events - first),
-            offset=self._offset + first * RECORD_BYTES,
-        )
+        number, start = min(CHUNK_EVENTS, self.events - first), self._offset + first * RECORD_BYTES
+        words = np.fromfile(self.path, "<u4", number, offset=start)
         # An added event at tick 0 shows by its time how often the counter has run over.
         decoded = self._decode_records(np.append(words, np.uint32(0)))
         overflow = before.overflow + int(decoded["time"][-1])
@@ -272,9 +266,7 @@ def read_sdt_blocks(path: Path) -> tuple[list[NDArray[Any]], float]:
         blocks = [np.asarray(block) for block in file.data]
         steps = {float(times[1] - times[0]) for times in file.times if len(times) > 1}
     if len(steps) != 1:
-        raise FileFormatError(
-            path, f"has blocks of {len(steps)} different resolutions, expected one"
-        )
+        raise FileFormatError(path, f"has blocks of {len(steps)} resolutions, expected one")
     return blocks, steps.pop()
 
 
@@ -305,17 +297,11 @@ def require_bounded_sdt(path: Path) -> None:
             continue
         # A ZIP archive of one member, which could unpack to any size.
         if not 0 <= begin < place <= size:
-            raise FileFormatError(
-                path, f"is truncated or damaged: block {block} lies beyond its end"
-            )
-        with BoundedFile(path) as opened:
-            opened.seek(begin)
-            content = opened.read(place - begin)
+            raise FileFormatError(path, f"is truncated: block {block} lies beyond its end")
+        content = np.fromfile(path, np.uint8, place - begin, offset=begin).tobytes()
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             for member in archive.filelist[:1]:
                 if member.compress_type not in MEMBER_COMPRESSIONS:
-                    raise FileFormatError(
-                        path, f"block {block} is packed in a way that is not read"
-                    )
+                    raise FileFormatError(path, f"block {block} is packed in an unknown way")
                 claimed, held = member.file_size, member.compress_size
                 require_bounded_size(path, f"block {block}", claimed, held, True)

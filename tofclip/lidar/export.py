@@ -111,17 +111,16 @@ def read_table(path: str | Path) -> dict[str, NDArray[Any]]:
     return {name: entry.load() for name, entry in list_columns(path).items()}
 
 
-def _defer(
-    points: int, types: Mapping[str, DTypeLike], read: Callable[[], Mapping[str, Any]]
-) -> Entries:
+def _defer(points: int, types: Mapping[str, DTypeLike], read: Callable[[], Any]) -> Entries:
+    """Entries of columns that are read together, when the first of them is loaded."""
     read_all = functools.cache(read)
+
+    def load(name: str) -> NDArray[Any]:
+        return np.array(read_all()[name], types[name])
+
     return {
-        name: ArchiveEntry(
-            (points,),
-            np.dtype(dtype),
-            lambda name=name, dtype=dtype: np.array(read_all()[name], dtype),  # type: ignore[misc]
-        )
-        for name, dtype in types.items()
+        name: ArchiveEntry((points,), np.dtype(types[name]), functools.partial(load, name))
+        for name in types
     }
 
 
@@ -227,15 +226,9 @@ def _list_binary(
     layout = np.dtype(list(types.items()))
     size = path.stat().st_size - start
     if size != int(points) * layout.itemsize:
-        raise FileFormatError(
-            path, f"should hold {points} points of {layout.itemsize} bytes, found {size} bytes"
-        )
-
-    def read() -> Mapping[str, Any]:
-        rows = np.fromfile(path, layout, offset=start)
-        return {name: rows[name] for name in types}
-
-    return _defer(int(points), types, read)
+        problem = f"should hold {points} points of {layout.itemsize} bytes, found {size} bytes"
+        raise FileFormatError(path, problem)
+    return _defer(int(points), types, functools.partial(np.fromfile, path, layout, offset=start))
 
 
 def _write_csv(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
@@ -312,11 +305,8 @@ def _list_las(path: Path) -> Entries:
     def read() -> Mapping[str, Any]:
         with _open_las(path) as reader:
             table = reader.read()
-        if len(table.points) != points:
-            raise FileFormatError(
-                path,
-                f"is not a complete LAS file: {len(table.points)} of {points} points are there",
-            )
+        if (held := len(table.points)) != points:
+            raise FileFormatError(path, f"is no complete LAS file: {held} of {points} points")
         return {name: table[name if name in "xyz" else DIMENSION_PREFIX + name] for name in types}
 
     return _defer(points, types, read)

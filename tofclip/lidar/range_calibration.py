@@ -240,13 +240,8 @@ def correct_returns(returns: Returns) -> Returns:
         return returns
     seen = returns.range, count_signal(returns), returns.confidence.astype(np.float64)
     distance, intensity, sigma = correct_ranges(known, *seen, (returns.y, returns.x))
-    return replace(
-        returns,
-        range=distance,
-        intensity=intensity.astype(np.float32),
-        confidence=sigma.astype(np.float32),
-        time=2 * distance / SPEED_OF_LIGHT,
-    )
+    single = {"intensity": intensity.astype(np.float32), "confidence": sigma.astype(np.float32)}
+    return replace(returns, range=distance, time=2 * distance / SPEED_OF_LIGHT, **single)
 
 
 def correct_ranges(
@@ -285,10 +280,9 @@ class TargetShot:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.distance) and self.distance > 0):
             raise InputError(f"a target's distance must be a positive length, got {self.distance}")
-        if not (np.isnan(self.reflectance_percent) or 0 < self.reflectance_percent <= 1000):
-            raise InputError(
-                f"a reflectance must be a positive percentage, got {self.reflectance_percent}"
-            )
+        percent = self.reflectance_percent
+        if not (np.isnan(percent) or 0 < percent <= 1000):
+            raise InputError(f"a reflectance must be a positive percentage, got {percent}")
 
     def cut(self, inside: NDArray[np.bool_]) -> TargetShot:
         """Return the shot with a part of its returns, and what is known of the others."""

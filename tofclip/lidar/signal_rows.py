@@ -100,21 +100,14 @@ class BrightFrameFinder:
 
         number = span.stop - span.start
         bright = np.full(number, limit <= 0)
+        table = self._tiles, self._scales, self._group_pixels, self._groups, readings
+
+        def work(piece: slice) -> None:
+            begin = span.start + piece.start
+            find_bright_frames(*table, begin, np.float32(limit), bright[piece])
+
         if limit > 0:
-            run_blocks(
-                lambda piece: find_bright_frames(
-                    self._tiles,
-                    self._scales,
-                    self._group_pixels,
-                    self._groups,
-                    readings,
-                    span.start + piece.start,
-                    np.float32(limit),
-                    bright[piece],
-                ),
-                number,
-                _divide_into_lanes(number, count_block_threads()),
-            )
+            run_blocks(work, number, _divide_into_lanes(number))
         return bright
 
 
@@ -202,13 +195,11 @@ class SignalRowFinder:
 
         sums = self._allocate_sums(measurements.shape[0])
         by_rows = np.ascontiguousarray(measurements.T)  # as the rectifier leaves them: no copy
-        run_blocks(
-            lambda piece: sum_boxes(
-                by_rows, self._starts, self._length, (piece.start, piece.stop), sums
-            ),
-            self._starts.size,
-            _divide_into_lanes(self._starts.size, count_block_threads()),
-        )
+
+        def work(piece: slice) -> None:
+            sum_boxes(by_rows, self._starts, self._length, (piece.start, piece.stop), sums)
+
+        run_blocks(work, self._starts.size, _divide_into_lanes(self._starts.size))
         return sums
 
     def sum_streak(self, counts: FloatImage, rectifier: Rectifier) -> tuple[FloatImage, float]:
@@ -240,17 +231,15 @@ class SignalRowFinder:
         if self.rows - dark.size + number > MAX_ROW_FRACTION * self.rows:
             return TraceBins.all_bins(self.rows)
         bin_weights = kept.astype(np.float32)
-        bin_weights[dark[np.linspace(0, dark.size - 1, number).round().astype(np.intp)]] = (
-            dark.size / number
-        )
+        chosen = np.linspace(0, dark.size - 1, number).round().astype(np.intp)
+        bin_weights[dark[chosen]] = dark.size / number
         numbers = np.flatnonzero(bin_weights)
         return TraceBins(numbers, searched[numbers], bin_weights[numbers])
 
     def _find_signal_bins(self, sums: FloatImage) -> Mask:
         from tofclip.lidar.signal_row_kernels import compute_energies, standardise_columns
 
-        instants, threads = self._starts.size, count_block_threads()
-        room = np.empty((2, instants), np.float32)
+        room = np.empty((2, self._starts.size), np.float32)
         compute_energies(sums, room)
         energy = room[0]
         measured = self._taken & (energy > 0)
@@ -259,19 +248,15 @@ class SignalRowFinder:
         darkest, quiet = np.quantile(energy[measured], [DARKEST_FRACTION, DARK_FRACTION])
         if quiet > MAX_DARK_ENERGY_RATIO * darkest:
             return self._taken
-        counted = (measured & (energy <= max(quiet, NOISE_ENERGY_RATIO * darkest))).astype(
-            np.float32
-        )
-        run_blocks(
-            lambda piece: standardise_columns(sums, counted, (piece.start, piece.stop)),
-            len(sums),
-            -(-len(sums) // threads),
-        )
-        lit = np.concatenate(
-            [finder.find(sums, own, self._threshold) for finder, own in self._owners]
-        )
-        found: Mask = self._taken & lit
-        return found
+        counted = measured & (energy <= max(quiet, NOISE_ENERGY_RATIO * darkest))
+        weights = counted.astype(np.float32)
+
+        def work(piece: slice) -> None:
+            standardise_columns(sums, weights, (piece.start, piece.stop))
+
+        run_blocks(work, len(sums), -(-len(sums) // count_block_threads()))
+        lit = [finder.find(sums, own, self._threshold) for finder, own in self._owners]
+        return np.asarray(self._taken & np.concatenate(lit))
 
     def _mark_rows_near(self, lit: Mask, distance: int) -> Mask:
         """Rows within `distance` of the middle of a lit instant."""
@@ -279,10 +264,9 @@ class SignalRowFinder:
         steps = np.zeros(self.rows + 1, np.int64)
         np.add.at(steps, np.maximum(middles - distance, 0), 1)
         np.add.at(steps, np.minimum(middles + distance + 1, self.rows), -1)
-        near: Mask = np.cumsum(steps[:-1]) > 0
-        return near
+        return np.asarray(np.cumsum(steps[:-1]) > 0)
 
 
-def _divide_into_lanes(instants: int, threads: int) -> int:
+def _divide_into_lanes(instants: int) -> int:
     """Instants that each thread takes, a multiple of `LANES`."""
-    return -(-instants // (threads * LANES)) * LANES
+    return -(-instants // (count_block_threads() * LANES)) * LANES

@@ -71,12 +71,11 @@ def lock_output_folder(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
         raise StorageError(f"{folder}: cannot be made: {fault.strerror or fault}") from fault
-    wanted = {
-        name: str(value) if isinstance(value, Path) else value for name, value in settings.items()
-    }
+    wanted = {name: str(one) if isinstance(one, Path) else one for name, one in settings.items()}
+    inputs = inputs or {}
     # the shots of a stack share a file, which is read once
-    identities = {file: identify_file(file) for file in set((inputs or {}).values())}
-    marks = {name: identities[file] for name, file in (inputs or {}).items()}
+    identities = {file: identify_file(file) for file in set(inputs.values())}
+    marks = {name: identities[file] for name, file in inputs.items()}
     if not path.exists():
         _write_settings(path, wanted, marks)
         return
@@ -185,24 +184,19 @@ def _connect_scheduler(distributed: Any, where: str) -> Client:
         raise InputError(
             f"{where}: no scheduler answers; start one with 'dask scheduler'"
         ) from fault
-    problem = ""
     try:
         client.wait_for_workers(1, timeout=WAIT_SECONDS)
         versions = set(client.run(_version).values())
+        if versions == {__version__}:
+            return client
+        theirs = ", ".join(sorted(versions))
+        problem = f"its workers have tofclip {theirs}, this is {__version__}; install the same"
     except TimeoutError:
         problem = f"the scheduler has no worker; start some with 'dask worker {where}'"
     except Exception as fault:
         problem = f"its workers have no tofclip {__version__}: {fault}"
-    else:
-        if versions != {__version__}:
-            problem = (
-                f"its workers have tofclip {', '.join(sorted(versions))}, this is {__version__}; "
-                "install the same"
-            )
-    if problem:
-        client.close()
-        raise InputError(f"{where}: {problem}")
-    return client
+    client.close()
+    raise InputError(f"{where}: {problem}")
 
 
 def _version() -> str:
@@ -322,9 +316,8 @@ def run_job(job: Job) -> Report:
         problem = format_error_line(fault)
     except Exception as fault:
         problem = f"unforeseen {type(fault).__name__}: {format_error_line(fault)}"
-    return Report(
-        job.name, problem, figures, f"{platform.node()}:{os.getpid()}", measure_peak_memory_bytes()
-    )
+    process = f"{platform.node()}:{os.getpid()}"
+    return Report(job.name, problem, figures, process, measure_peak_memory_bytes())
 
 
 def measure_peak_memory_bytes() -> int:
@@ -389,8 +382,7 @@ def _run_on_cluster(jobs: Sequence[Job], cluster: str) -> Iterator[Report]:
             killers: list[Job] = []
             yield from _run_on_workers(client, [job], killers)
             if killers:
-                problem = "each worker that tried it died; is there enough memory?"
-                yield Report(job.name, problem)
+                yield Report(job.name, "each worker that tried it died; is there enough memory?")
 
 
 def _run_on_workers(client: Client, jobs: Sequence[Job], killers: list[Job]) -> Iterator[Report]:
@@ -417,11 +409,11 @@ def _run_on_workers(client: Client, jobs: Sequence[Job], killers: list[Job]) -> 
             fault = future.exception()
             if isinstance(fault, KilledWorker):
                 killers.append(job)
-            elif fault is not None:
-                problem = f"the cluster did not do it: {type(fault).__name__} {fault}"
-                yield Report(job.name, problem)
-            else:
+            elif fault is None:
                 yield future.result()
+            else:
+                name = type(fault).__name__
+                yield Report(job.name, f"the cluster did not do it: {name} {fault}")
             submit(1)
     finally:
         # Reached early when the caller stops iterating or is interrupted; otherwise nothing is left.

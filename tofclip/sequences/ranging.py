@@ -193,8 +193,7 @@ def compute_light_curve(streak: Streak, camera: Camera) -> FloatArray:
     half = camera.image_shape[1] // 4
     middle = round(camera.centres_px[reference])
     counts = streak.counts[:, max(0, middle - half) : middle + half + 1]
-    light: FloatArray = counts.sum(axis=1, dtype=np.float64)
-    return light
+    return np.asarray(counts.sum(axis=1, dtype=np.float64))
 
 
 def make_average_cloud(

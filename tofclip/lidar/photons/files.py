@@ -106,16 +106,12 @@ def describe_photons(path: str | Path) -> dict[str, Any]:
         # a picture of one row or one pixel, whose axes no shape tells: any order shows its array
         layout = _find_layout(opened, Path(path), "yxt")
         axes = "not recognised: give --axes, e.g. yxt"
-    found: dict[str, Any] = {"kind": "photons", "layout": layout[0]}
-    if opened.bin_width is not None:
-        found["bin_width_s"] = opened.bin_width
-    if axes:
-        found["axes"] = axes
-    found["arrays"] = {
+    arrays = {
         name: f"{' x '.join(map(str, entry.shape))} {'cell' if _is_cell(entry) else entry.dtype}"
         for name, entry in opened.arrays.items()
     }
-    return found
+    found = {"kind": "photons", "layout": layout[0], "bin_width_s": opened.bin_width, "axes": axes}
+    return {name: told for name, told in found.items() if told} | {"arrays": arrays}
 
 
 def _open_photons(path: Path) -> _PhotonFile:
@@ -126,10 +122,9 @@ def _open_photons(path: Path) -> _PhotonFile:
         raise FileFormatError(path, "is empty")
     reader = READERS_BY_SUFFIX.get(path.suffix.lower())
     for signature, known in READERS_BY_SIGNATURE.items():
-        if start.startswith(signature):
+        # MATLAB's HDF5 files begin with a block of their own
+        if start.startswith(signature) or start[512:] == signature:
             reader = known
-    if start[512:520] == HDF5_SIGNATURE:
-        reader = _open_hdf5
     if reader is None:
         raise FileFormatError(
             path, f"is not NPY, NPZ, MAT, HDF5, TIFF, PTU or SDT with photons; {SUITABLE}"
@@ -257,9 +252,7 @@ def _open_npy(path: Path) -> _PhotonFile:
         held = path.stat().st_size - file.tell()
     require_bounded_size(path, "array", math.prod(shape) * dtype.itemsize, held)
 
-    def load() -> NDArray[Any]:
-        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
-
+    load = partial(np.load, path, mmap_mode="r", allow_pickle=False)
     return _PhotonFile({"array": ArchiveEntry(shape, dtype, load)})
 
 
@@ -347,9 +340,8 @@ def _open_tiff(path: Path) -> _PhotonFile:
         require_whole_chain(tiff, path)
         series = tiff.series[0]
         if len(series.shape) != 3 or series.dtype is None:
-            raise FileFormatError(
-                path, f"holds pictures of shape {series.shape}, not one page for each bin (t, y, x)"
-            )
+            problem = f"holds pictures of shape {series.shape}, not one page for each bin (t, y, x)"
+            raise FileFormatError(path, problem)
         packed = sum(sum(page.databytecounts) for page in series.pages if page is not None)
         size = math.prod(series.shape) * series.dtype.itemsize
         require_bounded_size(path, "pictures", size, packed, series.keyframe.compression != 1)
@@ -367,9 +359,8 @@ def _open_ptu(path: Path) -> _PhotonFile:
     ptufile = import_file_reader("ptufile", TCSPC)
     with BoundedFile(path) as opened, ptufile.PtuFile(opened) as file:
         if not file.is_image:
-            raise FileFormatError(
-                path, "holds no image; tofclip recover reads lone pixels (file://run.ptu)"
-            )
+            remedy = "tofclip recover reads lone pixels (file://run.ptu)"
+            raise FileFormatError(path, f"holds no image; {remedy}")
         if not file.is_t3:
             return _open_scan(path)
         _, rows, columns, _, bins = file.shape
@@ -419,10 +410,7 @@ def _open_sdt(path: Path) -> _PhotonFile:
         shapes = ", ".join(" x ".join(map(str, image.shape)) for image in images)
         raise FileFormatError(path, f"holds images of different shapes ({shapes})")
     dtype = np.dtype(np.uint32) if len(images) > 1 else images[0].dtype
-
-    def load() -> NDArray[Any]:
-        return np.asarray(np.sum(np.stack(images), axis=0, dtype=dtype))
-
+    load = partial(np.sum, images, axis=0, dtype=dtype)
     return _PhotonFile({"image": ArchiveEntry(shape, dtype, load)}, width, "yxt")
 
 

@@ -101,14 +101,13 @@ class PhotonImage:
             raise InputError("photon counts must be finite and not negative")
         histograms = cube.reshape(-1, cube.shape[2])
         pixel, bin_number = np.nonzero(histograms)
-        return cls(
-            np.searchsorted(pixel, np.arange(len(histograms) + 1)).astype(np.int64),
-            bin_number.astype(np.float32),
+        offsets = np.searchsorted(pixel, np.arange(len(histograms) + 1)).astype(np.int64)
+        count, when = (
             histograms[pixel, bin_number].astype(np.float32),
-            (cube.shape[0], cube.shape[1]),
-            cube.shape[2],
-            float(bin_width),
+            bin_number.astype(np.float32),
         )
+        rows, columns, bins = cube.shape
+        return cls(offsets, when, count, (rows, columns), bins, float(bin_width))
 
     @classmethod
     def from_events(
@@ -152,9 +151,8 @@ class PhotonImage:
         order = np.argsort(pixel, kind="stable")
         offsets = np.searchsorted(pixel[order], np.arange(image_shape[0] * image_shape[1] + 1))
         ones = np.ones(when.size, np.float32)
-        return cls(
-            offsets.astype(np.int64), when[order], ones, image_shape, length, float(bin_width)
-        )
+        own = offsets.astype(np.int64), when[order], ones
+        return cls(*own, image_shape, length, float(bin_width))
 
     @cached_property
     def pixel(self) -> NDArray[np.int64]:
@@ -196,13 +194,8 @@ class PhotonImage:
         if number == 1:
             return self
         # A bin's middle is its instant: half of the first new bin lies before the record.
-        return replace(
-            self,
-            bin=self.bin / np.float32(number),
-            bins=(self.bins - 1 + number // 2) // number + 1,
-            bin_width=self.bin_width * number,
-            axes="",
-        )
+        when, bins = self.bin / np.float32(number), (self.bins - 1 + number // 2) // number + 1
+        return replace(self, bin=when, bins=bins, bin_width=self.bin_width * number, axes="")
 
     def split(self, fraction: float, seed: int) -> tuple[PhotonImage, PhotonImage]:
         """Divide the photons at random, a fraction of them into the second part, so that one part
@@ -382,10 +375,10 @@ class SurfaceImage:
         order = np.argsort(distance, axis=1)
         pixel, nearness = np.nonzero(np.isfinite(np.take_along_axis(distance, order, axis=1)))
         chosen = pixel, order[pixel, nearness]
-        y, x = np.divmod(pixel, self.range.shape[1])
+        y, x = np.divmod(pixel.astype(np.int32), np.int32(self.range.shape[1]))
         return Returns(
-            y=y.astype(np.int32),
-            x=x.astype(np.int32),
+            y=y,
+            x=x,
             range=distance[chosen],
             intensity=(signal[chosen] * distance[chosen] ** 2).astype(np.float32),
             confidence=sigma[chosen].astype(np.float32),
@@ -416,11 +409,6 @@ def make_pinhole(image_shape: tuple[int, int], focal_length_px: float, pulse_fwh
         Of one view.
     """
     columns = image_shape[1]
-    return Camera(
-        np.array([min(columns / 2, columns - 1)]),
-        np.zeros(1),
-        image_shape,
-        columns,
-        pulse_fwhm=pulse_fwhm,
-        focal_length_px=focal_length_px,
-    )
+    centre = np.array([min(columns / 2, columns - 1)])
+    optics = {"pulse_fwhm": pulse_fwhm, "focal_length_px": focal_length_px}
+    return Camera(centre, np.zeros(1), image_shape, columns, **optics)

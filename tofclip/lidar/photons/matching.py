@@ -126,20 +126,15 @@ def match_labels(
     summed, apart = total.reshape(score.shape), 2 * LABELS_PER_WIDTH
 
     def work(piece: slice) -> None:
-        kernels.find_best_labels(
-            score[piece], summed[piece], np.float32(7), apart, label[piece], margin[piece]
-        )
+        own = score[piece], summed[piece], np.float32(7), apart
+        kernels.find_best_labels(*own, label[piece], margin[piece])
 
     run_blocks(work, score.shape[0], PIXELS_PER_BLOCK)
     return label.reshape(image_shape), margin.reshape(image_shape)
 
 
 def fit_surface(
-    photons: PhotonImage,
-    scene: Scene,
-    surface: FloatArray,
-    reach: int,
-    rounds: int = PLANE_ROUNDS,
+    photons: PhotonImage, scene: Scene, surface: FloatArray, reach: int, rounds: int = PLANE_ROUNDS
 ) -> FloatArray:
     """Move a surface, (rows, columns) in bins, to the likelihood's maximum, plane by plane. Pixels
     up to `reach` away share a plane. Returns (rows, columns, 3): instant, deviation and mean
@@ -187,5 +182,4 @@ def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int, width: flo
         scipy.ndimage.uniform_filter(one, 2 * reach + 1, mode="nearest")
         for one in (known.astype(float), excess)
     )
-    bias: FloatArray = NESTED_BIAS_RATIO**2 * np.maximum(total / np.maximum(number, 1e-9), 0)
-    return bias
+    return np.asarray(NESTED_BIAS_RATIO**2 * np.maximum(total / np.maximum(number, 1e-9), 0))
