@@ -240,8 +240,13 @@ def correct_returns(returns: Returns) -> Returns:
         return returns
     seen = returns.range, count_signal(returns), returns.confidence.astype(np.float64)
     distance, intensity, sigma = correct_ranges(known, *seen, (returns.y, returns.x))
-    single = {"intensity": intensity.astype(np.float32), "confidence": sigma.astype(np.float32)}
-    return replace(returns, range=distance, time=2 * distance / SPEED_OF_LIGHT, **single)
+    return replace(
+        returns,
+        range=distance,
+        intensity=intensity.astype(np.float32),
+        confidence=sigma.astype(np.float32),
+        time=2 * distance / SPEED_OF_LIGHT,
+    )
 
 
 def correct_ranges(

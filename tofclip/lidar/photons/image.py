@@ -410,5 +410,5 @@ def make_pinhole(image_shape: tuple[int, int], focal_length_px: float, pulse_fwh
     """
     columns = image_shape[1]
     centre = np.array([min(columns / 2, columns - 1)])
-    optics = {"pulse_fwhm": pulse_fwhm, "focal_length_px": focal_length_px}
+    optics: Any = {"pulse_fwhm": pulse_fwhm, "focal_length_px": focal_length_px}
     return Camera(centre, np.zeros(1), image_shape, columns, **optics)
