@@ -1,7 +1,6 @@
-"""The laser's wave on a depth plane, as a short sum over what all frequencies have in common.
-
-From a plane to the voxels of many depths: a periodic lattice, its plane waves, the plan that holds
-both, and which depths have to be computed.
+"""From a plane to the voxels of many depths: the laser's wave on a depth plane as a short sum over
+what all frequencies have in common, a periodic lattice, its plane waves, the plan that holds both,
+and which depths have to be computed.
 """
 
 from __future__ import annotations
@@ -138,22 +137,11 @@ class PlaneWaves:
         y, x = (int((lateral + LATERAL_ROUNDING) * side / (2 * np.pi)) for side in self.period)
         return y, x
 
-    @cached_property
-    def _sorted_waves(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """Indices along y and x, and lateral wavenumbers."""
-        rows, columns = (np.arange(-n, n + 1) for n in self.max_indices)
-        return self._sort_waves(rows, columns)
-
-    @cached_property
-    def quadrant(self) -> tuple[IntArray, IntArray, FloatArray]:
-        """The same of the waves without a negative index."""
-        rows, columns = (np.arange(n + 1) for n in self.max_indices)
-        return self._sort_waves(rows, columns)
-
-    def _sort_waves(
-        self, rows: IntArray, columns: IntArray
-    ) -> tuple[IntArray, IntArray, FloatArray]:
-        """Sort the waves of some indices by their lateral wavenumber."""
+    def sort(self, signed: bool) -> tuple[IntArray, IntArray, FloatArray]:
+        """Sort the waves, or those without a negative index, by lateral wavenumber: indices along y
+        and x, and lateral wavenumbers, rad/m.
+        """
+        rows, columns = (np.arange(-n if signed else 0, n + 1) for n in self.max_indices)
         qy, qx = (
             2 * np.pi / side * index
             for side, index in zip(self.period, (rows, columns), strict=True)
@@ -165,21 +153,6 @@ class PlaneWaves:
         inside = np.flatnonzero(lateral <= self.lateral_limits[-1])
         order = inside[np.argsort(lateral[inside], kind="stable")]
         return rows[order // columns.size], columns[order % columns.size], lateral[order]
-
-    @property
-    def row(self) -> IntArray:
-        """Index along y of every wave."""
-        return self._sorted_waves[0]
-
-    @property
-    def column(self) -> IntArray:
-        """Index along x of every wave."""
-        return self._sorted_waves[1]
-
-    @property
-    def lateral_wavenumbers(self) -> FloatArray:
-        """Lateral wavenumber of every wave, rad/m."""
-        return self._sorted_waves[2]
 
 
 # A complex64 phasor of a plane wave at one frequency.
@@ -209,27 +182,24 @@ class DiffractionPlan:
         )
 
     @cached_property
-    def _lattice(self) -> tuple[tuple[int, float], tuple[int, float]]:
-        """Voxels in a period along y and along x, and the period, m: no image of a source may meet
-        a voxel inside the window.
-        """
-        sides = find_min_periods(self._offsets, self.tolerance)
-        found = []
-        for side, axis in zip(sides, (self.grid.y, self.grid.x), strict=True):
-            step = axis_step(axis) if axis.size > 1 else side
-            count = find_fast_length(side / step) if axis.size > 1 else 1
-            found.append((count, count * step))
-        return found[0], found[1]
-
-    @property
     def lattice(self) -> tuple[int, int]:
-        """Voxels in a period along y and x."""
-        return self._lattice[0][0], self._lattice[1][0]
+        """Voxels in a period along y and x: no image of a source may meet a voxel inside the window."""
+        sides = zip(self._min_periods, (self.grid.y, self.grid.x), strict=True)
+        high, wide = (
+            find_fast_length(side / axis_step(axis)) if axis.size > 1 else 1 for side, axis in sides
+        )
+        return high, wide
+
+    @cached_property
+    def _min_periods(self) -> tuple[float, float]:
+        return find_min_periods(self._offsets, self.tolerance)
 
     @property
     def _periods(self) -> tuple[float, float]:
         """Of the lattice along y and x, m."""
-        return self._lattice[0][1], self._lattice[1][1]
+        axes = zip(self.lattice, (self.grid.y, self.grid.x), self._min_periods, strict=True)
+        high, wide = (n * axis_step(axis) if axis.size > 1 else side for n, axis, side in axes)
+        return high, wide
 
     @cached_property
     def _window(self) -> Window:

@@ -39,6 +39,30 @@ class DepthPropagator:
 
     def __init__(self, plan: DiffractionPlan, library: ArrayLibrary) -> None:
         self.plan, self.library, self.xp = plan, library, library.xp
+        row, column, lateral = plan.plane_waves.sort(signed=True)
+        reach = int(np.abs(row).max()), int(np.abs(column).max())
+        cell = (row + reach[0]) * (2 * reach[1] + 1) + column + reach[1]
+        wave = np.full((2 * reach[0] + 1) * (2 * reach[1] + 1), cell.size)
+        wave[cell] = np.arange(cell.size)
+        # Cell of every wave in a full rectangle of them, and number of the wave in every cell, one
+        # too many where there is none.
+        self._cells = library.put(cell), library.put(wave)
+        counted = lateral[:, np.newaxis] <= plan.plane_waves.lateral_limits
+        # 1 / area of a period, or 0 where a wave is left out, (waves, frequencies).
+        self.wave_weights = library.put(counted / np.prod(plan.plane_waves.period))
+        grid, plane = plan.grid, plan.plane
+        (plane_y, voxels_y), (plane_x, voxels_x) = (
+            [
+                np.exp(2j * np.pi / period * np.outer(np.arange(-n, n + 1), axis - voxels[0]))
+                for axis in (points, voxels)
+            ]
+            for points, voxels, period, n in zip(
+                (plane.y, plane.x), (grid.y, grid.x), plan.plane_waves.period, reach, strict=True
+            )
+        )
+        self._from_plane = library.put(plane_y.conj()), library.put(plane_x.conj())
+        self._to_voxels = library.put(voxels_y.T), library.put(voxels_x)
+        self._lateral = lateral
 
     def to_waves(self, values: Array) -> Array:
         """Return the plane waves (waves, frequencies) of a field (y, x, frequencies) on the plane."""
@@ -95,58 +119,11 @@ class DepthPropagator:
         return self.xp.take(self.xp.concat([waves, zeros], axis=-1), self._cells[1], axis=-1)
 
     @cached_property
-    def _max_indices(self) -> tuple[int, int]:
-        """Largest index of a wave along y and x."""
-        waves = self.plan.plane_waves
-        return int(np.abs(waves.row).max()), int(np.abs(waves.column).max())
-
-    @cached_property
-    def _cells(self) -> tuple[Array, Array]:
-        """Cell of every wave in a full rectangle of them, and number of the wave in every cell, one
-        too many where there is none.
-        """
-        waves, (rows, columns) = self.plan.plane_waves, self._max_indices
-        cell = (waves.row + rows) * (2 * columns + 1) + waves.column + columns
-        wave = np.full((2 * rows + 1) * (2 * columns + 1), cell.size)
-        wave[cell] = np.arange(cell.size)
-        return self.library.put(cell), self.library.put(wave)
-
-    @cached_property
-    def wave_weights(self) -> Array:
-        """1 / area of a period, or 0 where a wave is left out at a frequency, shape (waves,
-        frequencies).
-        """
-        waves = self.plan.plane_waves
-        counted = waves.lateral_wavenumbers[:, np.newaxis] <= waves.lateral_limits
-        return self.library.put(counted / np.prod(waves.period))
-
-    @cached_property
-    def _from_plane(self) -> tuple[Array, Array]:
-        """``exp(-1j * q * r)`` along y and along x of the plane's points."""
-        y, x = self._waves_at(self.plan.plane.y, self.plan.plane.x)
-        return self.library.put(y.conj()), self.library.put(x.conj())
-
-    @cached_property
-    def _to_voxels(self) -> tuple[Array, Array]:
-        """``exp(+1j * q * r)`` along y, transposed, and along x of the voxels."""
-        y, x = self._waves_at(self.plan.grid.y, self.plan.grid.x)
-        return self.library.put(y.T), self.library.put(x)
-
-    def _waves_at(self, *axes: FloatArray) -> list[NDArray[np.complex128]]:
-        grid, periods = self.plan.grid, self.plan.plane_waves.period
-        return [
-            np.exp(2j * np.pi / period * np.outer(np.arange(-reach, reach + 1), axis - start[0]))
-            for axis, start, period, reach in zip(
-                axes, (grid.y, grid.x), periods, self._max_indices, strict=True
-            )
-        ]
-
-    @cached_property
     def _node_interpolation(self) -> tuple[Array, list[Array], Array]:
         """First node of every different lateral wavenumber, the weights of all taps, and which of
         these a wave has.
         """
-        lateral, wave = np.unique(self.plan.plane_waves.lateral_wavenumbers, return_inverse=True)
+        lateral, wave = np.unique(self._lateral, return_inverse=True)
         node, weight = self.plan.transfer.interpolation(lateral)
         weights = [self.library.put(weight[:, tap, np.newaxis]) for tap in range(TAPS)]
         return self.library.put(node), weights, self.library.put(wave.ravel())

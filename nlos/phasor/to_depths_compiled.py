@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +49,7 @@ IntArray = NDArray[np.int64]
 FREQUENCIES_PER_BLOCK = 4
 
 
-@dataclass(frozen=True, eq=False)
-class Interpolation:
+class Interpolation(NamedTuple):
     """How every group finds a transfer function between its nodes."""
 
     begin: IntArray  # (groups,), first node
@@ -59,7 +59,6 @@ class Interpolation:
     weights: NDArray[np.float32]  # (some, LANES)
 
 
-@dataclass(frozen=True, eq=False)
 class WaveGroups:
     """Plane waves of neighbouring lateral wavenumbers, with those mirrored in the axes.
 
@@ -68,62 +67,42 @@ class WaveGroups:
     the last group.
     """
 
-    waves: PlaneWaves
-
-    @property
-    def shape(self) -> tuple[int, int, int, int]:
-        """Of the real and imaginary parts of all waves: (groups, 2, MIRRORED, LANES)."""
-        return len(self.first_frequency), 2, MIRROR_IMAGES, LANES
-
-    @cached_property
-    def _quadrant(self) -> tuple[IntArray, IntArray, FloatArray, int]:
-        """Indices and lateral wavenumbers (groups, LANES) of waves without a negative index, and
-        how many there are.
-        """
-        row, column, lateral = self.waves.quadrant
-        count = row.size
-        filled = np.minimum(np.arange(count + -count % LANES), count - 1).reshape(-1, LANES)
-        return row[filled], column[filled], lateral[filled], count
-
-    @cached_property
-    def indices(self) -> tuple[IntArray, IntArray]:
-        """Indices along y and along x, (groups, MIRRORED, LANES)."""
-        row, column, _, _ = self._quadrant
-        return np.stack([row, -row, row, -row], axis=1), np.stack(
-            [column, column, -column, -column], axis=1
+    def __init__(self, waves: PlaneWaves) -> None:
+        self.waves = waves
+        row, column, lateral = waves.sort(signed=False)
+        self._count = row.size
+        places = np.arange(self._count + -self._count % LANES).reshape(-1, LANES)
+        filled = np.minimum(places, self._count - 1)
+        # Of the waves without a negative index, (groups, LANES).
+        row, column, self._lateral = row[filled], column[filled], lateral[filled]
+        self._row, self._column = row, column
+        # Indices of all, and whether a wave stands there for the first time, (groups, MIRRORED,
+        # LANES).
+        self.indices = (
+            np.stack([row, -row, row, -row], axis=1),
+            np.stack([column, column, -column, -column], axis=1),
         )
-
-    @cached_property
-    def is_distinct(self) -> NDArray[np.bool_]:
-        """Whether a wave stands there for the first time, (groups, MIRRORED, LANES)."""
-        row, column, _, count = self._quadrant
-        once = np.arange(row.size).reshape(row.shape) < count
-        return np.stack(
+        once = places < self._count
+        self.is_distinct = np.stack(
             [once, once & (row > 0), once & (column > 0), once & (row > 0) & (column > 0)], axis=1
         )
-
-    @property
-    def leading_zeros(self) -> int:
-        """Zeros before the lowest frequency that make their number a multiple of `FREQUENCY_STEPS`."""
-        return -self.waves.lateral_limits.size % FREQUENCY_STEPS
-
-    @cached_property
-    def first_frequency(self) -> IntArray:
-        """Where every group's frequencies begin, zeros included."""
-        nearest = self._quadrant[2][:, 0]
-        frequency = np.searchsorted(self.waves.lateral_limits, nearest) + self.leading_zeros
-        # whole steps, as the kernel takes them
-        return frequency // FREQUENCY_STEPS * FREQUENCY_STEPS
+        # Zeros before the lowest frequency that make their number a multiple of `FREQUENCY_STEPS`.
+        self.leading_zeros = -waves.lateral_limits.size % FREQUENCY_STEPS
+        # Where every group's frequencies begin, zeros included, in whole steps as the kernel takes
+        # them.
+        frequency = np.searchsorted(waves.lateral_limits, self._lateral[:, 0]) + self.leading_zeros
+        self.first_frequency: IntArray = frequency // FREQUENCY_STEPS * FREQUENCY_STEPS
+        # Of the real and imaginary parts of all waves.
+        self.shape = (len(row), 2, MIRROR_IMAGES, LANES)
 
     def interpolation(self, transfer: TransferFunction) -> Interpolation:
         """Find the groups between the nodes of a transfer function."""
-        lateral = self._quadrant[2]
+        lateral = self._lateral
         node, weight = (
             found.reshape(*lateral.shape, -1) for found in transfer.interpolation(lateral.ravel())
         )
         begin, end = node.min(axis=(1, 2)), node.max(axis=(1, 2)) + TAPS
-        count = end - begin
-        offset = np.concatenate([[0], np.cumsum(count)])
+        offset = np.concatenate([[0], np.cumsum(end - begin)])
         shares = np.zeros((offset[-1], LANES), np.float32)
         place = (offset[:-1] - begin)[:, np.newaxis, np.newaxis] + node + np.arange(TAPS)
         shares[place, np.arange(LANES)[:, np.newaxis]] = weight
@@ -141,10 +120,10 @@ class WaveGroups:
         `values` (y, x, frequencies); `origin`: y and x of the point whose phase is 0, m. Returns
         (groups, ahead + frequencies, 2, MIRRORED, LANES): real and imaginary parts.
         """
-        waves, count = self.waves, values.shape[-1]
-        row, column, lateral, distinct = self._quadrant
+        waves, count, row, column = self.waves, values.shape[-1], self._row, self._column
         weight = (self.is_distinct / np.prod(waves.period)).astype(np.float32)
-        lanes = np.searchsorted(lateral.ravel()[:distinct], waves.lateral_limits, side="right")
+        lateral = self._lateral.ravel()[: self._count]
+        lanes = np.searchsorted(lateral, waves.lateral_limits, side="right")
         y, x = (
             _AxisTransform.of(axis, start, 2 * np.pi / side, reach)
             for axis, start, side, reach in zip(
@@ -591,8 +570,7 @@ class _Workspace:
             nodes.append(self.plan.transfer.evaluate(depth - self.plan.plane.z, delay, zeros))
         shape = (*coefficients.shape[:2], *self.groups.shape)
         terms = self._term_buffer[: int(np.prod(shape))].reshape(shape)
-        weights = (between.begin, between.offset, between.weights)
         propagate_spectrum(
-            spectrum, self.groups.first_frequency, np.stack(nodes), *weights, coefficients, terms
+            spectrum, self.groups.first_frequency, np.stack(nodes), *between, coefficients, terms
         )
         return terms
