@@ -134,16 +134,13 @@ class Band:
         """Length of the Fourier transform, bins."""
         from scipy.fft import next_fast_len
 
-        # the record and the pulse's tails on both sides, so that it does not wrap around into
-        # itself
         return int(next_fast_len(self.axis.bins + 2 * self.tail_bins, real=True))
 
     @cached_property
     def harmonics(self) -> NDArray[np.int64]:
         """Indices of the band's frequencies in the transform, without 0 and without the Nyquist
-        frequency.
+        frequency, which have no phase.
         """
-        # without zero frequency and Nyquist's, which have no phase
         indices = np.arange(1, (self.period_bins + 1) // 2)
         return indices[
             self.pulse.spectrum(indices * self._fundamental_wavenumber) >= BAND_EDGE_LEVEL
@@ -222,7 +219,6 @@ class Band:
         """
         phases = np.outer(self.axis.spacing * np.arange(BLOCK_BINS), self.wavenumbers)
         waves = np.exp(-1j * phases)
-        # within a block all waves of the band are combinations of a few shapes
         shapes, strengths, _ = np.linalg.svd(
             np.concatenate([waves.real, waves.imag], axis=1), full_matrices=False
         )
@@ -244,30 +240,19 @@ class Band:
     @property
     def sample_count(self) -> int:
         """Length of the waveforms."""
-        return self._sample_paths.size
-
-    @cached_property
-    def _sample_spacing(self) -> float:
-        factor = max(
-            1, int(np.ceil(SAMPLES_PER_WAVELENGTH * self.axis.spacing / self.pulse.wavelength))
-        )
-        return self.axis.spacing / factor
-
-    @cached_property
-    def _sample_paths(self) -> NDArray[np.float64]:
-        """Path lengths of the record and of the pulse's tails before and after it, m."""
-        tail = self.tail_bins * self.axis.spacing
-        count = round((self.axis.bins * self.axis.spacing + 2 * tail) / self._sample_spacing)
-        return self.axis.start - tail + self._sample_spacing * np.arange(count, dtype=np.float64)
+        return int(self.carriers[0].shape[1])
 
     @cached_property
     def carriers(self) -> tuple[NDArray[np.complex128], float, float]:
-        """``exp(1j * k * L)``, shape (frequencies, samples); path length of sample 0 and path
-        between samples, m. They are 0 at the first and the last two samples: a path outside is
-        clamped there, and reads silence.
+        """``exp(1j * k * L)`` over the record and the pulse's tails before and after it, shape
+        (frequencies, samples); path length of sample 0 and path between samples, m. They are 0 at
+        the first and the last two samples: a path outside is clamped there, and reads silence.
         """
-        carriers: NDArray[np.complex128] = np.exp(
-            1j * np.outer(self.wavenumbers, self._sample_paths)
-        )
+        fineness = SAMPLES_PER_WAVELENGTH * self.axis.spacing / self.pulse.wavelength
+        spacing = self.axis.spacing / max(1, int(np.ceil(fineness)))
+        tail = self.tail_bins * self.axis.spacing
+        count = round((self.axis.bins * self.axis.spacing + 2 * tail) / spacing)
+        paths = self.axis.start - tail + spacing * np.arange(count, dtype=np.float64)
+        carriers: NDArray[np.complex128] = np.exp(1j * np.outer(self.wavenumbers, paths))
         carriers[:, [0, -2, -1]] = 0
-        return carriers, float(self._sample_paths[0]), self._sample_spacing
+        return carriers, float(paths[0]), spacing

@@ -121,7 +121,7 @@ def complete_settings(capture: Capture, wanted: Wanted) -> Wanted:
         found = found.with_found("wavelength", *choose_wavelength(gated, found.cycles))
     else:
         require_usable_wavelength(capture, found.wavelength, found.cycles)
-    for rule in (_find_bins, _find_voxel, _find_sigma):
+    for rule in (_find_bins, _find_voxel):
         found = _complete(found, rule(capture, found))
     return _complete_box(gated, found)
 
@@ -213,9 +213,6 @@ def _find_voxel(capture: Capture, settings: Settings) -> Found:
         reason = "an eighth of the wavelength"
     extent = float(np.ptp(capture.points, axis=0).max())
     yield "voxel", max(wanted, extent / MAX_VOXELS_PER_SIDE), reason
-
-
-def _find_sigma(capture: Capture, settings: Settings) -> Found:
     yield "sigma", (settings.wavelength or math.nan) / SIGMAS_PER_WAVELENGTH, ""
 
 

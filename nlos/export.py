@@ -18,7 +18,7 @@ from tofclip.errors import InputError
 from tofclip.files import atomic_path, require_suffix
 
 if TYPE_CHECKING:
-    from nlos.volume import FloatArray, Volume
+    from nlos.volume import Volume
 
 # m; thickness given to a volume that is a single voxel deep.
 FLAT_VOXEL_M = 1e-3
@@ -126,8 +126,14 @@ def _write_vti(volume: Volume, path: Path) -> None:
     """Write XML image data (VTK file formats, "XML formats, ImageData"), with the numbers appended
     in binary.
     """
-    origin = " ".join(f"{getattr(volume.grid, name)[0]:.9g}" for name in "xyz")
-    steps = (_find_spacing(getattr(volume.grid, name), name) for name in "xyz")
+    axes = {name: getattr(volume.grid, name) for name in "xyz"}
+    for name, axis in axes.items():
+        if not is_evenly_spaced(axis):
+            raise InputError(
+                f"a VTK image needs evenly spaced voxels along {name}; write .npz or .h5 instead"
+            )
+    origin = " ".join(f"{axis[0]:.9g}" for axis in axes.values())
+    steps = (axis_step(axis) if axis.size > 1 else FLAT_VOXEL_M for axis in axes.values())
     spacing = " ".join(f"{step:.9g}" for step in steps)
     extent = " ".join(f"0 {n - 1}" for n in reversed(volume.grid.shape))
     head = (
@@ -162,16 +168,6 @@ def _write_exr(volume: Volume, path: Path) -> None:
     }
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, channels).write(str(path))
-
-
-def _find_spacing(axis: FloatArray, name: str) -> float:
-    if axis.size == 1:
-        return FLAT_VOXEL_M
-    if not is_evenly_spaced(axis):
-        raise InputError(
-            f"a VTK image needs evenly spaced voxels along {name}; write .npz or .h5 instead"
-        )
-    return axis_step(axis)
 
 
 WRITERS: Mapping[str, Callable[[Volume, Path], None]] = {

@@ -1,7 +1,4 @@
-"""Compiled inner loops of around-the-corner imaging.
-
-Compiled inner loop of f-k migration.
-"""
+"""Compiled inner loops that methods of imaging around corners share, and that of f-k migration."""
 
 from __future__ import annotations
 

@@ -6,13 +6,13 @@ Importing this loads nothing heavy.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from nlos.settings import declare_setting
 from tofclip.errors import FileFormatError, InputError
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -35,13 +35,6 @@ RECORD_KIND = "hidden_scene"
 TRUTH_RADIUS_M = 0.04
 
 
-def _setting(
-    unit: str, meaning: str, default: Any = None, shown: str | None = None, **more: Any
-) -> Any:
-    metadata = {"unit": unit, "help": meaning, "shown": shown, **more}
-    return dataclasses.field(default=default, metadata=metadata)
-
-
 @dataclass(frozen=True)
 class SceneSettings:
     """What is hidden, and how it is captured: letters, points or a mesh before a wall that is
@@ -49,44 +42,44 @@ class SceneSettings:
     `nlos.Settings`.
     """
 
-    letters: str | None = _setting(
+    letters: str | None = declare_setting(
         "", "Flat letters, as read from the wall.", shown="T, if nothing else is given"
     )
-    points: str | None = _setting("", "Points that scatter evenly, in m.", shown="none")
-    mesh: str | None = _setting(
+    points: str | None = declare_setting("", "Points that scatter evenly, in m.", shown="none")
+    mesh: str | None = declare_setting(
         "", "Triangle mesh (.ply, .obj, .stl) in m, in the wall's frame.", shown="none"
     )
-    depth: float = _setting("m", "Depth of the letters.", 1.0)
-    height: float = _setting("m", "Height of a capital letter.", 0.7)
-    material: str = _setting(
+    depth: float = declare_setting("m", "Depth of the letters.", 1.0)
+    height: float = declare_setting("m", "Height of a capital letter.", 0.7)
+    material: str = declare_setting(
         "", f"Of letters or mesh: {' or '.join(MATERIALS)}.", "matte", choices=MATERIALS
     )
-    facet: float = _setting(
+    facet: float = declare_setting(
         "m", "Size of the facets that letters or mesh are cut into.", 0.025, written="mm"
     )
-    wall: str = _setting(
+    wall: str = declare_setting(
         "",
         "planar, cylinder, wavy, relief (hills) or plates (two, hanging apart).",
         "cylinder",
         choices=WALLS,
     )
-    wall_points: int = _setting("1", "Rows of wall points, and columns.", 48)
-    wall_width: float = _setting("m", "Width and height of the wall.", 2.0)
-    scan: str = _setting("", "single (one laser spot) or confocal.", "single", choices=SCANS)
-    laser: tuple[float, float] = _setting(
+    wall_points: int = declare_setting("1", "Rows of wall points, and columns.", 48)
+    wall_width: float = declare_setting("m", "Width and height of the wall.", 2.0)
+    scan: str = declare_setting("", "single (one laser spot) or confocal.", "single", choices=SCANS)
+    laser: tuple[float, float] = declare_setting(
         "m", "Where the laser spot is, in m; the nearest wall point is taken.", (0.0, 0.0)
     )
-    bin_width: float = _setting("s", "Duration of a time bin.", 32e-12, written="ps")
-    jitter: float = _setting(
+    bin_width: float = declare_setting("s", "Duration of a time bin.", 32e-12, written="ps")
+    jitter: float = declare_setting(
         "s", "Standard deviation of the instrument's response.", 30e-12, written="ps"
     )
-    peak_counts: float | None = _setting(
+    peak_counts: float | None = declare_setting(
         "1", "Expected photons in the brightest bin.", shown="no noise"
     )
-    background: float = _setting(
+    background: float = declare_setting(
         "1", "Expected background counts per bin, with --peak-counts.", 0.0
     )
-    seed: int = _setting("1", "Of the photons' chance.", 0)
+    seed: int = declare_setting("1", "Of the photons' chance.", 0)
 
 
 def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:

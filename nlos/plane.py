@@ -5,7 +5,8 @@ are recognised, and fields there.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +16,6 @@ from tofclip.errors import InputError, ShapeError
 if TYPE_CHECKING:
     from nlos.phasor.transfer import SphericalWaves
     from nlos.volume import Grid
-
-
-from functools import cached_property
-from typing import Any
 
 FloatArray = NDArray[np.float64]
 

@@ -106,7 +106,5 @@ def _compute_ideal_width(
 
 
 def _compute_path_lengths(wall: FloatArray, lasers: FloatArray, point: FloatArray) -> FloatArray:
-    lengths: FloatArray = np.linalg.norm(lasers - point, axis=1) + np.linalg.norm(
-        wall - point, axis=1
-    )
-    return lengths
+    legs = (np.linalg.norm(ends - point, axis=1) for ends in (lasers, wall))
+    return np.asarray(sum(legs))

@@ -38,7 +38,7 @@ METHODS_BY_SPEED = ("rsd", "hybrid", "backprojection")
 MIN_PAIRS_PER_IMAGE = 250
 
 
-def _setting(
+def declare_setting(
     unit: str, meaning: str, default: Any = None, shown: str | None = None, **more: Any
 ) -> Any:
     """Declare a setting: its unit, what it means, and in words what it is where it is not given."""
@@ -61,72 +61,76 @@ class Settings:
     those that were found are what they are.
     """
 
-    wavelength: float | None = _setting(
+    wavelength: float | None = declare_setting(
         "m",
         "Carrier of the virtual pulse.",
         shown="the shortest that wall points and time bins carry, and that stands out of the noise",
         written="mm",
     )
-    cycles: float = _setting("wavelengths", "Length of the virtual pulse in wavelengths.", 3.0)
-    voxel: float | None = _setting(
+    cycles: float = declare_setting(
+        "wavelengths", "Length of the virtual pulse in wavelengths.", 3.0
+    )
+    voxel: float | None = declare_setting(
         "m",
         "Distance of neighbouring voxels.",
         shown="an eighth of the wavelength; lct, fk: a third of the path of a bin",
         written="mm",
     )
-    near: float | None = _setting(
+    near: float | None = declare_setting(
         "m",
         "First depth.",
         shown="one voxel beyond the middle of the wall's relief, and of the gate",
     )
-    far: float | None = _setting(
+    far: float | None = declare_setting(
         "m", "Last depth.", shown="as far as the record reaches, at most two wall widths"
     )
-    x: tuple[float, float] | None = _setting("m", "First and last x.", shown="the wall's")
-    y: tuple[float, float] | None = _setting(
+    x: tuple[float, float] | None = declare_setting("m", "First and last x.", shown="the wall's")
+    y: tuple[float, float] | None = declare_setting(
         "m", "First and last y; y points down.", shown="the wall's"
     )
-    everywhere: bool = _setting(
+    everywhere: bool = declare_setting(
         "",
         "Fill all of that box with voxels, not only the part that coarse ones find bright.",
         False,
         shown="no",
     )
-    flip: str | None = _setting(
+    flip: str | None = declare_setting(
         "", "Mirror the picture along x or y.", shown="no", choices=("x", "y")
     )
-    gate: float | None = _setting(
+    gate: float | None = declare_setting(
         "m",
         "Blank what arrives up to so much path after the wall's own light.",
         shown="until it has faded, where the record holds it",
     )
-    gate_ramp: float | None = _setting(
+    gate_ramp: float | None = declare_setting(
         "m", "Signals rise over so much path after the gate.", shown="a quarter of a gate found"
     )
-    fade: float | None = _setting(
+    fade: float | None = declare_setting(
         "m",
         "Signals fade out over so much path before the record ends.",
         shown="a tenth of the record, where light still comes then",
     )
-    bins_together: int | None = _setting(
+    bins_together: int | None = declare_setting(
         "bins", "Time bins added up to one before imaging.", shown="while a wavelength keeps 16"
     )
-    tolerance: float | None = _setting(
+    tolerance: float | None = declare_setting(
         "1", "Error allowed for the sake of speed: rsd, hybrid.", shown="0.01"
     )
-    sigma: float | None = _setting(
+    sigma: float | None = declare_setting(
         "m",
         "Width of the Laplacian: filtered-backprojection.",
         shown="a quarter of the wavelength",
         written="mm",
     )
-    falloff: float | None = _setting(
+    falloff: float | None = declare_setting(
         "1",
         "How light fades with distance: lct, fk; 4 for matte things, 2 for retroreflecting ones.",
         shown="4",
     )
-    signal_to_noise: float | None = _setting("1", "Of the Wiener filter: lct.", shown="0.8")
-    method: str | None = _setting("", "How the hidden scene is imaged.", shown="the quickest")
+    signal_to_noise: float | None = declare_setting("1", "Of the Wiener filter: lct.", shown="0.8")
+    method: str | None = declare_setting(
+        "", "How the hidden scene is imaged.", shown="the quickest"
+    )
     gate_found: bool = False
     reasons: Mapping[str, str] = dataclasses.field(default_factory=dict)
 

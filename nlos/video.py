@@ -341,7 +341,7 @@ class TransientImaging:
         group = self._plan_group(capture, grid, band)
         warn_of_aliasing(capture, band)
         depths = DepthPropagator(group.plane_to_depths, ArrayLibrary())
-        spectrum = depths.to_waves(group.wall_to_plane(capture, ignore_progress))
+        spectrum = depths.to_waves(group.wall_to_plane(capture, ignore_progress, group.group))
         turns = np.exp(1j * SPEED_OF_LIGHT * np.outer(band.wavenumbers, instants)).astype(
             np.complex64
         )

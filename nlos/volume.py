@@ -51,7 +51,13 @@ class Grid:
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "z"):
-            object.__setattr__(self, name, _validate_axis(getattr(self, name), name))
+            axis = np.array(getattr(self, name), dtype=np.float64)
+            if axis.ndim != 1 or axis.size == 0:
+                raise ShapeError(f"grid axis {name}", "(n,) with n >= 1", axis.shape)
+            if not np.all(np.isfinite(axis)) or np.any(np.diff(axis) <= 0):
+                raise InputError(f"grid axis {name} must be finite and strictly increasing")
+            axis.flags.writeable = False
+            object.__setattr__(self, name, axis)
 
     @classmethod
     def box(
@@ -164,8 +170,11 @@ class Grid:
             raise InputError(
                 "the volume is dark everywhere: there is nothing to look at more closely"
             )
-        axes = (volume.grid.z, volume.grid.y, volume.grid.x)
-        z, y, x = (_widen_range(axis, bright) for axis, bright in zip(axes, indices, strict=True))
+        axes = zip((volume.grid.z, volume.grid.y, volume.grid.x), indices, strict=True)
+        z, y, x = (
+            axis[[max(bright.min() - 1, 0), min(bright.max() + 1, axis.size - 1)]]
+            for axis, bright in axes
+        )
         return cls.box(x, y, z, voxel)
 
     @property
@@ -183,24 +192,6 @@ class Grid:
         axes = zip((self.x, self.y, self.z), point, strict=True)
         x, y, z = (int(np.argmin(np.abs(axis - place))) for axis, place in axes)
         return z, y, x
-
-
-def _validate_axis(values: Any, name: str) -> FloatArray:
-    axis = np.array(values, dtype=np.float64)
-    if axis.ndim != 1 or axis.size == 0:
-        raise ShapeError(f"grid axis {name}", "(n,) with n >= 1", axis.shape)
-    if not np.all(np.isfinite(axis)) or np.any(np.diff(axis) <= 0):
-        raise InputError(f"grid axis {name} must be finite and strictly increasing")
-    axis.flags.writeable = False
-    return axis
-
-
-def _widen_range(axis: FloatArray, indices: NDArray[np.intp]) -> tuple[float, float]:
-    """Range of the axis that holds the indexed entries and, where there is one, the next on either
-    side.
-    """
-    first, last = max(indices.min() - 1, 0), min(indices.max() + 1, axis.size - 1)
-    return float(axis[first]), float(axis[last])
 
 
 def _fill_axis(name: str, side: Sequence[float], voxel: float) -> FloatArray:

@@ -43,8 +43,12 @@ class NamedArrays(Archive):
         dimensions = max(1, self._count_axes(name))
         return self.array(name, *[None] * (dimensions - 1), 3).astype(np.float64)
 
-    def number(self, name: str) -> float:
-        """Return entry `name`, a single finite number with or without axes of length 1."""
+    def number(self, name: str, absent: float | None = None) -> float:
+        """Return entry `name`, a single finite number with or without axes of length 1; `absent`
+        where there is none.
+        """
+        if absent is not None and name not in self:
+            return absent
         return float(self.finite_array(name, *[1] * self._count_axes(name)).squeeze())
 
     def flag(self, name: str) -> bool:

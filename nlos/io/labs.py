@@ -1,56 +1,9 @@
-"""Captures of eleven formats, each by its own reader, and turned so that the hidden scene lies at
-larger z.
+"""Captures of other laboratories' formats, each by its own reader, turned so that the hidden scene
+lies at larger z.
 
-Pairs of CC-SOCR, whose points are numbers of a lattice that a MATLAB script beside them scales.
-
-Liu et al., "Non-line-of-sight imaging with arbitrary illumination and detection pattern", Nat.
-Commun. 14, 3230 (2023): ``sub_Sig`` (pairs, t), with laser spots and wall points in ``C_i.mat`` and
-``C_d.mat`` beside it, (pairs, 3), counted in steps (depth, to the left, up) of ``bx``, ``by`` and
-``bz`` metres; ``experimental_setup.m``, in the same folder or the one above, sets these steps and
-``c * delta_t``, the path of a bin. Seen from their wall the second number grows to the left and the
-third upwards: their letters N T read as N T only so.
-
-MATLAB files of the two confocal data sets of Stanford.
-
-* Light-cone transform (O'Toole, Lindell, Wetzstein, Nature 555, 338, 2018): ``rect_data`` (x, y, t)
-  with the light's way to the wall taken off, in bins of 4 ps, and ``width``, half the side of the
-  wall in m; as ``cnlos_reconstruction.m`` of that paper's code takes them. x falls along the first
-  axis: that code reverses x before it shows a volume, and only so their letter S reads as an S.
-* f-k migration (Lindell, Wetzstein, O'Toole, ACM Trans. Graph. 38, 116, 2019): ``meas`` (y, x, t)
-  in bins of 32 ps on a wall of 2 m x 2 m, and in a file beside it ``tofgrid`` (y, x), the arrival
-  of the wall's own light in ps; as ``demo.m`` and ``cnlos_reconstruction.m`` of
-  https://github.com/computational-imaging/nlos-fk take them.
-
-Whether x or y run as in a photograph f-k migration's data set does not say.
-
-HDF5 files of y-tal, the toolkit of the University of Zaragoza.
-
-Field names, meanings and units are those of the class ``NLOSCaptureData`` in
-``tal/io/capture_data.py`` of https://github.com/diegoroyo/tal, version 0.20: lengths and times in m
-(optical path), the relay wall at z = 0 and the hidden scene at z > 0, as here.
-
-NumPy archives, streak images of the LIFT camera, and MATLAB files of lone data sets.
-
-MATLAB files of the two phasor-field data sets of the University of Wisconsin.
-
-Field names, units and the order of axes are those that y-tal 0.20 converts (``tal/io/format.py`` of
-https://github.com/diegoroyo/tal):
-
-* Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572, 620
-  (2019): a struct ``dataset`` with ``data`` (laser spot, camera spot, t), ``deltat`` and ``t0`` in
-  m of path, positions of the spots and of the devices in m. One camera spot and many laser spots:
-  their roles are exchanged here, which changes no path.
-* Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
-  imaging systems", Nat. Commun. 11, 1645 (2020): ``rect_data`` (y, x, t) with the ways to and from
-  the devices taken off, ``ts`` in s, ``sampling_spacing`` in m, and ``SPAD_index``, column and row
-  of the one spot.
-
-HDF5 files of the Zaragoza NLOS data set.
-
-Galindo, Marco, O'Toole, Wetzstein, Gutierrez, Jarabo, "A dataset for benchmarking time-resolved
-non-line-of-sight imaging", SIGGRAPH 2019 posters; https://graphics.unizar.es/nlos_dataset. Field
-names and the two orders of axes that occur are those that y-tal 0.20 converts (``tal/io/format.py``
-of https://github.com/diegoroyo/tal).
+Field names, units and the order of axes of y-tal's own files, of the Zaragoza data set and of the
+two of Wisconsin are those of y-tal 0.20 (``tal/io`` of https://github.com/diegoroyo/tal); of other
+data sets those of the programs that came with the papers, which the readers name.
 """
 
 from __future__ import annotations
@@ -121,9 +74,15 @@ OPERATIONS: Mapping[type[ast.operator], Callable[[float, float], float]] = {
 
 
 def read_curvelet_data(fields: NamedArrays) -> Capture:
-    """Read ``sub_Sig`` with the pairs' points, and the script that scales them, beside the file.
-    Without the script points are metres: (depth, to the left, up) where the first does not vary,
-    else (x, y, z).
+    """Read ``sub_Sig`` (pairs, t), with laser spots and wall points in ``C_i.mat`` and ``C_d.mat``
+    beside it, (pairs, 3), counted in steps (depth, to the left, up) of ``bx``, ``by`` and ``bz``
+    metres; ``experimental_setup.m``, in the same folder or the one above, sets these steps and ``c *
+    delta_t``, the path of a bin. Seen from their wall the second number grows to the left and the
+    third upwards: their letters N T read as N T only so. Without the script points are metres:
+    (depth, to the left, up) where the first does not vary, else (x, y, z).
+
+    Liu et al., "Non-line-of-sight imaging with arbitrary illumination and detection pattern", Nat.
+    Commun. 14, 3230 (2023): CC-SOCR.
     """
     counts = fields.array("sub_Sig", None, None)
     laser, wall = (_read_points(fields, name, len(counts)) for name in ("C_i.mat", "C_d.mat"))
@@ -206,7 +165,13 @@ MIGRATION_WALL_WIDTH_M = 2.0
 
 
 def read_light_cone_data(fields: NamedArrays) -> Capture:
-    """Read a scene of the light-cone transform's data set."""
+    """Read ``rect_data`` (x, y, t) with the light's way to the wall taken off, in bins of 4 ps, and
+    ``width``, half the side of the wall in m, as ``cnlos_reconstruction.m`` of that paper's code
+    takes them. x falls along the first axis: that code reverses x before it shows a volume, and only
+    so their letter S reads as an S.
+
+    O'Toole, Lindell, Wetzstein, Nature 555, 338 (2018).
+    """
     counts = fields.read_time_last("rect_data")
     wall = np.swapaxes(_build_wall(counts.shape[1], counts.shape[0], fields.number("width")), 0, 1)
     wall = wall[::-1]
@@ -214,11 +179,25 @@ def read_light_cone_data(fields: NamedArrays) -> Capture:
 
 
 def read_migration_data(fields: NamedArrays) -> Capture:
-    """Read a scene of f-k migration's data set; ``tofgrid`` from the same file or from a
-    ``tof*.mat`` beside it.
+    """Read ``meas`` (y, x, t) in bins of 32 ps on a wall of 2 m x 2 m, and ``tofgrid`` (y, x), the
+    arrival of the wall's own light in ps, from the same file or from a ``tof*.mat`` beside it, as
+    ``demo.m`` of https://github.com/computational-imaging/nlos-fk takes them. Whether x or y run as
+    in a photograph the data set does not say.
+
+    Lindell, Wetzstein, O'Toole, ACM Trans. Graph. 38, 116 (2019).
     """
-    counts = fields.read_time_last("meas")
-    arrival = _read_arrival_bins(fields, counts.shape[:2])
+    counts, path = fields.read_time_last("meas"), fields.path
+    source = fields
+    if "tofgrid" not in fields:
+        beside = [path.with_name(name) for name in (path.name.replace("meas", "tof"), "tof.mat")]
+        found = next((one for one in beside if one != path and one.is_file()), None)
+        if found is None:
+            raise FileFormatError(
+                path,
+                "has no 'tofgrid', and there is no tof.mat beside it to tell when the wall lit up",
+            )
+        source = read_matlab(found)
+    arrival = source.finite_array("tofgrid", *counts.shape[:2])
     delay_bins = arrival * PICOSECOND / MIGRATION_BIN_WIDTH_S
     by_bin = np.ascontiguousarray(
         np.moveaxis(counts, 2, 0).reshape(counts.shape[2], -1), dtype=np.float32
@@ -235,29 +214,16 @@ def _build_wall(rows: int, columns: int, half_width: float) -> NDArray[np.float6
     return np.stack([x, y, np.zeros_like(x)], axis=-1)
 
 
-def _read_arrival_bins(fields: NamedArrays, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    if "tofgrid" in fields:
-        return fields.finite_array("tofgrid", *shape)
-    name = fields.path.name
-    beside = [fields.path.with_name(other) for other in (name.replace("meas", "tof"), "tof.mat")]
-    found = next((path for path in beside if path != fields.path and path.is_file()), None)
-    if found is None:
-        raise FileFormatError(
-            fields.path,
-            f"has no 'tofgrid', and there is no {Path(beside[1]).name} beside it to tell when the wall lit up",
-        )
-    return read_matlab(found).finite_array("tofgrid", *shape)
-
-
 def read_tal(fields: NamedArrays) -> Capture:
-    """Read ``H`` of the formats T_Sx_Sy, T_Lx_Ly_Sx_Sy, T_Si and T_Li_Si.
+    """Read ``H`` of the formats T_Sx_Sy, T_Lx_Ly_Sx_Sy, T_Si and T_Li_Si of y-tal, the toolkit of the
+    University of Zaragoza; lengths and times in m of path, the scene at z > 0, as here.
 
     A lone laser point is a spot that stands still; as many as sensor points are paired with them,
     or confocal; other numbers are combined with all. Where ``t_accounts_first_and_last_bounces`` is
     true the ways to and from the devices are taken off.
     """
     sensor, laser = (fields.read_coordinates(f"{name}_grid_xyz") for name in ("sensor", "laser"))
-    start = fields.number("t_start") if "t_start" in fields else 0.0
+    start = fields.number("t_start", 0.0)
     bin_width = fields.number("delta_t") / SPEED_OF_LIGHT
     capture = match_lasers_to_sensors(
         fields, fields.read_numbers("H"), sensor, laser, bin_width, start
@@ -327,7 +293,7 @@ def read_numpy_archive(fields: NamedArrays) -> Capture:
         paths = fields.finite_array(times, len(signal)) * (1 if times == "t_m" else SPEED_OF_LIGHT)
         signal, start, spacing = resample_evenly(fields, signal, paths)
         return match_lasers_to_sensors(fields, signal, wall, laser, spacing / SPEED_OF_LIGHT, start)
-    start = fields.number("t_start_m") if "t_start_m" in fields else 0.0
+    start = fields.number("t_start_m", 0.0)
     unit, per_second = ("s", 1.0) if "delta_t_s" in fields else ("m", SPEED_OF_LIGHT)
     bin_width = fields.number(f"delta_t_{unit}") / per_second
     return match_lasers_to_sensors(fields, signal, wall, laser, bin_width, start)
@@ -419,8 +385,12 @@ def read_lift_archive(path: str | Path) -> Capture:
 
 
 def read_phasor_field_data(fields: NamedArrays) -> Capture:
-    """Read a scene of the data set of 2019; coordinates are turned so that the wall's normal
-    becomes +z.
+    """Read the struct ``dataset``: ``data`` (laser spot, camera spot, t), ``deltat`` and ``t0`` in m
+    of path, positions of the spots and of the devices in m. One camera spot and many laser spots:
+    their roles are exchanged here, which changes no path. The wall's normal becomes +z.
+
+    Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572, 620
+    (2019).
     """
     wall, spots = (_read_spots(fields, f"dataset.{name}Pos") for name in ("laser", "camera"))
     data = fields.read_numbers("dataset.data").T
@@ -431,7 +401,7 @@ def read_phasor_field_data(fields: NamedArrays) -> Capture:
         )
     signal = np.ascontiguousarray(data, np.float32)
     bin_width = fields.number("dataset.deltat") / SPEED_OF_LIGHT
-    start = fields.number("dataset.t0") if "dataset.t0" in fields else 0.0
+    start = fields.number("dataset.t0", 0.0)
     capture = match_lasers_to_sensors(fields, signal, wall, spots, bin_width, start)
     # The wall points' device is the laser here, and the lone spot's the camera.
     source, eye = (fields.finite_array(f"dataset.{name}Origin", 3) for name in ("camera", "laser"))
@@ -442,7 +412,12 @@ def read_phasor_field_data(fields: NamedArrays) -> Capture:
 
 
 def read_rectified_data(fields: NamedArrays) -> Capture:
-    """Read a scene of the data set of 2020."""
+    """Read ``rect_data`` (y, x, t) with the ways to and from the devices taken off, ``ts`` in s,
+    ``sampling_spacing`` in m, and ``SPAD_index``, column and row of the one spot.
+
+    Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
+    imaging systems", Nat. Commun. 11, 1645 (2020).
+    """
     counts = fields.read_time_last("rect_data")
     rows, columns, _ = counts.shape
     spacing = fields.number("sampling_spacing")
@@ -477,25 +452,31 @@ def read_zaragoza(fields: NamedArrays) -> Capture:
     taken off. ``data`` is (colour, t, bounce, camera grid, laser grid) where positions are (3,
     ...), and the reverse where they are (..., 3); a confocal file has no laser grid. ``deltaT`` and
     ``t0`` are in m of path. The wall's normals, and the hidden volume where it is given, tell which
-    way the scene lies; coordinates are turned so that it lies at larger z.
+    way the scene lies.
+
+    Galindo, Marco, O'Toole, Wetzstein, Gutierrez, Jarabo, "A dataset for benchmarking time-resolved
+    non-line-of-sight imaging", SIGGRAPH 2019 posters; https://graphics.unizar.es/nlos_dataset.
     """
     first = fields.read_numbers("cameraGridPositions").shape[0] == 3
     signal = _add_up_bounces(fields, first)
     camera, laser = (
         _read_point_grid(fields, f"{name}GridPositions", first) for name in ("camera", "laser")
     )
-    bin_width, start = (
-        fields.number("deltaT") / SPEED_OF_LIGHT,
-        fields.number("t0") if "t0" in fields else 0.0,
-    )
+    bin_width, start = fields.number("deltaT") / SPEED_OF_LIGHT, fields.number("t0", 0.0)
     capture = match_lasers_to_sensors(fields, signal, camera, laser, bin_width, start)
     source, eye = (
         fields.read_numbers(f"{name}Position").astype(np.float64).reshape(3)
         for name in ("laser", "camera")
     )
-    return rotate_to_scene(
-        remove_device_legs(capture, source, eye), _find_scene_direction(fields, camera, first)
-    )
+    capture = remove_device_legs(capture, source, eye)
+    if "cameraGridNormals" not in fields:
+        return capture
+    normal = _read_point_grid(fields, "cameraGridNormals", first).reshape(-1, 3).mean(axis=0)
+    if "hiddenVolumePosition" in fields:
+        hidden = fields.read_numbers("hiddenVolumePosition").reshape(3)
+        hidden = hidden - camera.reshape(-1, 3).mean(axis=0)
+        normal = normal * (np.sign(hidden @ normal) or 1.0)
+    return rotate_to_scene(capture, normal)
 
 
 def _add_up_bounces(fields: NamedArrays, first: bool) -> NDArray[np.float32]:
@@ -527,22 +508,3 @@ def _read_point_grid(fields: NamedArrays, name: str, first: bool) -> NDArray[np.
             fields.path, f"field '{name}' must hold points in three dimensions, found {grid.shape}"
         )
     return grid
-
-
-def _find_scene_direction(
-    fields: NamedArrays, camera: NDArray[np.float64], first: bool
-) -> NDArray[np.float64]:
-    """Direction of the wall's normal that points to the hidden scene; +z where the file says
-    nothing.
-    """
-    if "cameraGridNormals" not in fields:
-        return np.array([0.0, 0.0, 1.0])
-    normal: NDArray[np.float64] = (
-        _read_point_grid(fields, "cameraGridNormals", first).reshape(-1, 3).mean(axis=0)
-    )
-    if "hiddenVolumePosition" in fields:
-        hidden = fields.read_numbers("hiddenVolumePosition").reshape(3) - camera.reshape(
-            -1, 3
-        ).mean(axis=0)
-        normal = normal * (np.sign(hidden @ normal) or 1.0)
-    return normal

@@ -1,6 +1,5 @@
-"""The few things that portable code needs beyond the array API standard.
-
-Signals of a capture as arrays of any library, and their phasors.
+"""What portable code needs beyond the array API standard: signals of a capture as arrays of any
+library, and their phasors.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 
 from nlos.band import Band
 from nlos.capture import Capture
-from nlos.illumination import IlluminationGroup
 from nlos.plane import WallLattice
 from tofclip.arrays import Array, ComputeDevice, namespace
 
@@ -29,11 +27,6 @@ class ArrayLibrary:
 
     device: ComputeDevice = field(default_factory=ComputeDevice)
     double: bool = False
-
-    @classmethod
-    def of(cls, array: Array) -> ArrayLibrary:
-        """Return the library of `array`, where that lives."""
-        return cls(ComputeDevice.of(array))
 
     @cached_property
     def xp(self) -> Any:
@@ -70,11 +63,6 @@ class ArrayLibrary:
         angle = 2 * np.pi * (cycles - self.xp.round(cycles))
         return self.xp.exp(1j * self.xp.astype(angle, self._complex))
 
-    def make_complex(self, real: Array, imaginary: Array) -> Array:
-        """Make complex numbers of real and imaginary parts. `real, imaginary`: of one shape."""
-        xp = self.xp
-        return xp.astype(real, xp.complex64) + 1j * xp.astype(imaginary, xp.complex64)
-
 
 def remove_whole_cycles(cycles: Any) -> NDArray[np.float64]:
     """Leave out whole cycles while there are digits for it: what is left goes well into single
@@ -92,35 +80,28 @@ class BandTransform:
     def __init__(self, band: Band, bins: int, library: ArrayLibrary) -> None:
         paths = band.axis.start + band.axis.spacing * np.arange(bins)
         waves = band.weights * np.exp(-1j * np.outer(paths, band.wavenumbers))
-        self._library, self._real, self._imaginary = (
-            library,
-            library.put(waves.real),
-            library.put(waves.imag),
-        )
+        self._xp = library.xp
+        self._real, self._imaginary = library.put(waves.real), library.put(waves.imag)
 
     def of(self, traces: Array) -> Array:
         """Return the phasors (points, frequencies) of signals (points, t); see
         `nlos.band.Band.compute_phasors`.
         """
-        return self._library.make_complex(traces @ self._real, traces @ self._imaginary)
+        real, imaginary = (
+            self._xp.astype(traces @ part, self._xp.complex64)
+            for part in (self._real, self._imaginary)
+        )
+        return real + 1j * imaginary
 
 
-def get_group_traces(capture: Capture, group: IlluminationGroup) -> Array:
-    """Return the signals of one illumination group. Returns (points, t): in the capture's own
-    library.
-    """
-    return ArrayLibrary.of(capture.signal).xp.permute_dims(
-        _select_signals(capture, group.indices), (1, 0)
-    )
-
-
-def get_traces(capture: Capture, some: slice) -> Array:
-    """Return the signals (points, t) of some valid wall points. `some`: of the valid wall points.
-    Returns (points, t): in the capture's own library.
-    """
-    xp = ArrayLibrary.of(capture.signal).xp
-    indices = np.arange(len(capture.points))[some]
-    return xp.permute_dims(_select_signals(capture, indices), (1, 0))
+def get_traces(capture: Capture, some: slice | NDArray[Any]) -> Array:
+    """Return the signals (points, t) of some valid wall points, in the capture's own library."""
+    library = ArrayLibrary(capture.device)
+    flat = library.xp.reshape(capture.signal, (capture.axis.bins, -1))
+    places = np.flatnonzero(capture.valid)[some]
+    if not np.array_equal(places, np.arange(flat.shape[1])):
+        flat = library.xp.take(flat, library.put(places), axis=1)
+    return library.xp.permute_dims(flat, (1, 0))
 
 
 def arrange_on_lattice(values: Array, wall: WallLattice, library: ArrayLibrary) -> Array:
@@ -132,13 +113,3 @@ def arrange_on_lattice(values: Array, wall: WallLattice, library: ArrayLibrary) 
         padded = xp.concat([values, library.zeros((*values.shape[:-1], 1))], axis=-1)
         values = xp.take(padded, library.put(wall.point_numbers), axis=-1)
     return xp.reshape(values, (*values.shape[:-1], *wall.shape))
-
-
-def _select_signals(capture: Capture, indices: NDArray[Any]) -> Array:
-    """Signals (t, points) of some of the valid wall points."""
-    library = ArrayLibrary.of(capture.signal)
-    flat = library.xp.reshape(capture.signal, (capture.axis.bins, -1))
-    places = np.flatnonzero(capture.valid)[indices]
-    if places.size == flat.shape[1] and np.array_equal(places, np.arange(places.size)):
-        return flat
-    return library.xp.take(flat, library.put(places), axis=1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import sys
 import threading
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,21 +44,9 @@ PLANNING_LOCK = threading.Lock()
 FFTW_FLAGS = ("FFTW_ESTIMATE",)
 
 
-class FourierPlan(Protocol):
-    """A transform along one axis, from one buffer to another."""
-
-    def execute(self) -> None:
-        """Transform."""
-        ...
-
-    def update_arrays(self, source: ComplexArray, target: ComplexArray) -> None:
-        """Go on with other buffers of the same shapes and strides."""
-        ...
-
-
-class ScipyPlan:
-    """The same by scipy.fft, for one or both of the directions that FFTW has. `source, target`:
-    buffers of one shape; `inverse`: ``exp(+1j ...)`` instead of ``exp(-1j ...)``; unscaled as well.
+class FourierPlan:
+    """A transform along one axis by scipy.fft, from one buffer to another of its shape: `inverse`,
+    ``exp(+1j ...)``, or ``exp(-1j ...)``, both unscaled. FFTW's plans are used alike.
     """
 
     def __init__(
@@ -74,7 +62,7 @@ class ScipyPlan:
             self._target[...] = fft.fft(self._source, axis=self._axis)
 
     def update_arrays(self, source: ComplexArray, target: ComplexArray) -> None:
-        """Go on with other buffers."""
+        """Go on with other buffers of the same shapes and strides."""
         self._source, self._target = source, target
 
 
@@ -87,11 +75,9 @@ def allocate_zeros(shape: tuple[int, ...]) -> ComplexArray:
 def plan_transform(
     source: ComplexArray, target: ComplexArray, axis: int, inverse: bool = False
 ) -> FourierPlan:
-    """Plan a transform along one axis on one thread. `source, target`: buffers of one shape;
-    `inverse`: ``exp(+1j ...)`` instead of ``exp(-1j ...)``; neither is scaled.
-    """
+    """Plan a transform along one axis on one thread; see `FourierPlan`."""
     if pyfftw is None:
-        return ScipyPlan(source, target, axis, inverse)
+        return FourierPlan(source, target, axis, inverse)
     direction = "FFTW_BACKWARD" if inverse else "FFTW_FORWARD"
     with PLANNING_LOCK:
         plan: FourierPlan = pyfftw.FFTW(

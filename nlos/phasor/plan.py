@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -38,7 +38,6 @@ from nlos.phasor.depth_steps import BYTES_PER_WAVE, DiffractionPlan
 from nlos.phasor.propagate import (
     Backend,
     Diffraction,
-    GroupToPlane,
     Propagation,
     WallToPlane,
     choose_backend,
@@ -149,7 +148,8 @@ class WavePlan(PhasorPlan):
         group = self.groups[number]
         plane, waves = group.plane_to_depths.plane, group.plane_to_depths.waves
         points = plane.x.size * plane.y.size * waves.count
-        return group.wall_to_plane(capture, SubProgress(progress, points, self._wall_work(number)))
+        part = SubProgress(progress, points, self._wall_work(number))
+        return group.wall_to_plane(capture, part, group.group)
 
     def add_to_depths(self, number: int, on_plane: Array, total: Array, progress: Progress) -> None:
         """Add what the field of one illumination group shows to a volume, in place."""
@@ -284,7 +284,7 @@ class WaveMethod(PhasorMethod):
     @abstractmethod
     def _plan_points(
         self, capture: Capture, group: IlluminationGroup, grid: Grid, band: Band, backend: Backend
-    ) -> tuple[DiffractionPlan, GroupToPlane, float]:
+    ) -> tuple[DiffractionPlan, WallToPlane, float]:
         """Plan an illumination group, and others of the same wall points: their common way from a
         plane to the voxels, what carries each group to that plane, and the fraction of time that
         this takes.
@@ -314,7 +314,7 @@ def plan_groups(
     for same in gather_by_points(capture, groups):
         depths, carry, fraction = method._plan_points(capture, same[0], grid, band, backend)
         depths.require_memory()
-        plans += [GroupPlan(one, partial(carry, group=one), depths, fraction) for one in same]
+        plans += [GroupPlan(one, carry, depths, fraction) for one in same]
     return plans
 
 
@@ -380,7 +380,7 @@ class PlanarRSD(WaveMethod):
 
     def _plan_points(
         self, capture: Capture, group: IlluminationGroup, grid: Grid, band: Band, backend: Backend
-    ) -> tuple[DiffractionPlan, GroupToPlane, float]:
+    ) -> tuple[DiffractionPlan, WallToPlane, float]:
         wall = PlanarWall.of(capture.points[group.indices])
         if grid.z[0] <= wall.plane.z:
             raise InputError(
@@ -463,7 +463,7 @@ class Hybrid(WaveMethod):
 
     def _plan_points(
         self, capture: Capture, group: IlluminationGroup, grid: Grid, band: Band, backend: Backend
-    ) -> tuple[DiffractionPlan, GroupToPlane, float]:
+    ) -> tuple[DiffractionPlan, WallToPlane, float]:
         points = capture.points[group.indices]
         if self.plane_z is not None:
             require_in_front(self.plane_z, points)

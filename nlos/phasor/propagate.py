@@ -8,7 +8,7 @@ in which order, is written once, in `nlos.phasor.plan`. `nlos.propagate` gives t
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, Protocol, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
 from nlos.illumination import IlluminationGroup, build_waves, find_leg_bounds, group_by_illumination
 from nlos.method import Progress, ignore_progress, require_numpy_signal
-from nlos.phasor.arrays import ArrayLibrary, BandTransform, arrange_on_lattice, get_group_traces
+from nlos.phasor.arrays import ArrayLibrary, BandTransform, arrange_on_lattice, get_traces
 from nlos.phasor.depth_steps import DiffractionPlan
 from nlos.phasor.to_depths import PortableDiffraction
 from nlos.phasor.to_depths_compiled import CompiledDiffraction, LaserSource
@@ -34,14 +34,10 @@ from tofclip.threads import run_blocks
 
 Propagation = Literal["spectral", "time"]
 
-WallToPlane = Callable[[Capture, Progress], Array]
-"""Carries what a capture's wall points recorded to a plane: the field (y, x, frequencies) there."""
-
-
-class GroupToPlane(Protocol):
-    """The same for one of several groups of the same wall points."""
-
-    def __call__(self, one: Capture, progress: Progress, group: IlluminationGroup) -> Array: ...
+WallToPlane = Callable[[Capture, Progress, IlluminationGroup], Array]
+"""Carries what one of several groups of the same wall points recorded to a plane: the field (y, x,
+frequencies) there.
+"""
 
 
 POINTS_PER_BLOCK = 64
@@ -90,7 +86,7 @@ class PortableBackend:
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
         """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
-        return self._transform.of(get_group_traces(capture, group))
+        return self._transform.of(get_traces(capture, group.indices))
 
     def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
         """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
@@ -183,7 +179,7 @@ def plan_wall_to_plane(
     backend: Backend,
     propagation: Propagation = "spectral",
     tolerance: float = 1e-2,
-) -> GroupToPlane:
+) -> WallToPlane:
     """Return what carries an illumination group of such captures, or another one of the same wall
     points, onto a plane; see `propagate`. Progress counts points of the plane times frequencies.
     """

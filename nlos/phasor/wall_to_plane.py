@@ -246,16 +246,6 @@ def find_common_period(side: float, wall: float, plane: float, count: int) -> tu
 
 
 @dataclass(frozen=True, eq=False)
-class LowRankTerms:
-    """``K_k(q, d_p) ~ sum_m over_waves[k, q, m] * over_points[m, p]`` at some frequencies."""
-
-    # (frequencies, nodes, n), at the nodes of the transfer functions: all real, then all imaginary
-    # parts, then 0
-    wave_factors: NDArray[np.float32]
-    point_factors: ComplexArray  # (m, points)
-
-
-@dataclass(frozen=True, eq=False)
 class LowRankTransfer:
     """The transfer functions from wall points at many distances to one plane.
 
@@ -326,8 +316,11 @@ class LowRankTransfer:
         """Number of terms of every group."""
         return [vectors.shape[1] for vectors in self.combinations]
 
-    def terms(self, number: int) -> LowRankTerms:
-        """Return the terms of one group."""
+    def terms(self, number: int) -> tuple[NDArray[np.float32], ComplexArray]:
+        """Return the terms of one group, ``K_k(q, d_p) ~ sum_m over_waves[k, q, m] * over_points[m,
+        p]``: factors of waves (frequencies, nodes, n) at the nodes of the transfer functions, all
+        real, then all imaginary parts, then 0; and factors of points (m, points).
+        """
         kept, table = self.combinations[number], self.table[..., self.groups[number]]
         terms = kept.shape[1]
         wave_factors = (kept.T @ table.reshape(len(table), -1)).reshape(terms, *table.shape[1:]).T
@@ -335,7 +328,7 @@ class LowRankTransfer:
         padded = -(-2 * terms // VECTOR_FLOATS) * VECTOR_FLOATS
         parts = np.zeros((*wave_factors.shape[:-1], padded), np.float32)
         parts[..., :terms], parts[..., terms : 2 * terms] = wave_factors.real, wave_factors.imag
-        return LowRankTerms(parts, kept.conj().T @ self.at_points)
+        return parts, kept.conj().T @ self.at_points
 
 
 def _find_distance_basis(
@@ -451,7 +444,12 @@ class LatticeAnalysis:
         # In one piece, whatever its size: compiled loops are quicker then.
         spectra = self._spectra[: len(weights) * count].reshape(len(weights), count, -1)
         for spectrum, weight in zip(spectra, weights, strict=True):
-            self._place_values(values, weight)
+            weighted = values * weight
+            if self._place is not None:
+                placed = np.zeros(self._shape[0] * self._shape[1], np.complex64)
+                placed[self._place] = weighted
+                weighted = placed
+            self._points[:, : self._shape[1]] = weighted.reshape(self._shape)
             self._along_x.execute()
             for number, end in enumerate(ends):
                 turned = middle[number * columns : (number + 1) * columns, :rows]
@@ -460,20 +458,6 @@ class LatticeAnalysis:
             plan.update_arrays(middle, spectrum)
             plan.execute()
         return spectra
-
-    def _place_values(self, values: NDArray[np.complex64], weight: NDArray[np.complex64]) -> None:
-        """Put weighted values into their places."""
-        rows, columns = self._shape
-        if self._place is None:
-            np.multiply(
-                values.reshape(self._shape),
-                weight.reshape(self._shape),
-                out=self._points[:, :columns],
-            )
-        else:
-            flat = np.zeros(rows * columns, np.complex64)
-            flat[self._place] = values * weight
-            self._points[:, :columns] = flat.reshape(self._shape)
 
     def _get_plan(self, columns: int) -> FourierPlan:
         if columns not in self._along_y:

@@ -5,9 +5,9 @@ of `nlos.phasor.wall_to_plane_compiled`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.method import Progress, ignore_progress
 from nlos.phasor.arrays import ArrayLibrary, arrange_on_lattice
@@ -16,7 +16,6 @@ from nlos.phasor.transfer import SphericalWaves
 from nlos.phasor.wall_kernels import MIN_DISTANCE_M
 from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, plan_transforms
 from nlos.phasor.wall_to_plane_compiled import STRENGTH_POINTS, estimate_strength
-from nlos.plane import Plane
 from tofclip.arrays import Array, to_numpy
 from tofclip.threads import split_blocks
 
@@ -67,8 +66,7 @@ class PortablePropagation:
         plan = plan_transforms(self.geometry, self.waves, strength, self.tolerance)
         if plan is not None:
             return _LowRankPropagator(plan, self.library).field
-        points, plane = self.geometry.points, self.geometry.plane
-        return _DirectPropagator(points, plane, self.waves, self.library).field
+        return partial(_propagate_direct, self.geometry, self.waves, self.library)
 
 
 class _LowRankPropagator:
@@ -107,10 +105,10 @@ class _LowRankPropagator:
         # their terms at points (m, n) and at nodes (frequencies, nodes, m)
         self._groups: list[tuple[slice, Array, Array]] = []
         for number, together in enumerate(plan.low_rank_transfer.groups):
-            terms = plan.low_rank_transfer.terms(number)
-            count, parts = len(terms.point_factors), terms.wave_factors
+            parts, over_points = plan.low_rank_transfer.terms(number)
+            count = len(over_points)
             at_nodes = parts[..., :count] + 1j * parts[..., count : 2 * count]
-            at_points = put(terms.point_factors)
+            at_points = put(over_points)
             size = library.chunk_bytes // (8 * count * row.size * column.size)
             for some in split_blocks(len(at_nodes), max(1, size)):
                 frequencies = slice(together.start + some.start, together.start + some.stop)
@@ -134,53 +132,29 @@ class _LowRankPropagator:
         return field
 
 
-class _DirectPropagator:
+def _propagate_direct(
+    geometry: WallBeforePlane, waves: SphericalWaves, library: ArrayLibrary, phasors: Array
+) -> Array:
     """Every wall point's spherical wave, summed; see `nlos.phasor.wall_to_plane_compiled`."""
-
-    def __init__(
-        self,
-        points: NDArray[np.float64],
-        plane: Plane,
-        waves: SphericalWaves,
-        library: ArrayLibrary,
-    ) -> None:
-        self.shape, self.library, self.count = plane.shape, library, waves.count
-        targets = plane.points.reshape(-1, 3)
-        # Distances are what counts: near the middle, single-precision coordinates have most digits.
-        middle = targets.mean(axis=0)
-        self._targets, self._sources = (
-            library.put((ends - middle).T) for ends in (targets, points)
-        )
-        # Products of few coarse and few fine waves make up all frequencies: exponentials cost more
-        # than products.
-        fine = int(np.ceil(np.sqrt(waves.count)))
-        coarse = -(-waves.count // fine)
-        self._coarse = library.put(
-            (waves.first + waves.step * fine * np.arange(coarse)) / (2 * np.pi)
-        )
-        self._fine = library.put(waves.step * np.arange(fine) / (2 * np.pi))
-
-    def field(self, phasors: Array) -> Array:
-        """Return the field (y, x, frequencies) of phasors (n, frequencies)."""
-        xp, sources = self.library.xp, phasors.shape[0]
-        coarse, fine = self._coarse.shape[0], self._fine.shape[0]
-        missing = self.library.zeros((sources, coarse * fine - self.count))
-        padded = xp.reshape(xp.concat([phasors, missing], axis=1), (sources, coarse, fine))
-        targets = self._targets.shape[1]
-        field = self.library.zeros((targets, coarse * fine))
-        for some in split_blocks(
-            targets, max(1, self.library.chunk_bytes // (8 * sources * coarse * fine))
-        ):
-            field[some, :] = xp.reshape(self._sum_waves(some, padded), (-1, coarse * fine))
-        return xp.reshape(field[:, : self.count], (*self.shape, self.count))
-
-    def _sum_waves(self, some: slice, phasors: Array) -> Array:
-        """Field (targets, coarse, fine) at some targets."""
-        xp = self.library.xp
-        across = xp.sum((self._targets[:, some, None] - self._sources[:, None, :]) ** 2, axis=0)
+    xp, shape, sources = library.xp, geometry.plane.shape, phasors.shape[0]
+    ends = geometry.plane.points.reshape(-1, 3), geometry.points
+    # Distances are what counts: near the middle, single-precision coordinates have most digits.
+    middle = ends[0].mean(axis=0)
+    targets, walls = (library.put((one - middle).T) for one in ends)
+    # Products of few coarse and few fine waves make up all frequencies: exponentials cost more than
+    # products.
+    fine = int(np.ceil(np.sqrt(waves.count)))
+    coarse = -(-waves.count // fine)
+    first = waves.first + waves.step * fine * np.arange(coarse)
+    steps = [library.put(k / (2 * np.pi)) for k in (first, waves.step * np.arange(fine))]
+    missing = library.zeros((sources, coarse * fine - waves.count))
+    padded = xp.reshape(xp.concat([phasors, missing], axis=1), (sources, coarse, fine))
+    field = library.zeros((targets.shape[1], coarse * fine))
+    size = max(1, library.chunk_bytes // (8 * sources * coarse * fine))
+    for some in split_blocks(targets.shape[1], size):
+        across = xp.sum((targets[:, some, None] - walls[:, None, :]) ** 2, axis=0)
         distance = xp.sqrt(xp.clip(across, MIN_DISTANCE_M**2, None))[:, :, None]
-        coarse, fine = (
-            self.library.exp_cycles(distance * cycles) for cycles in (self._coarse, self._fine)
-        )
-        waves = (coarse / distance)[:, :, :, None] * fine[:, :, None, :]
-        return xp.sum(waves * phasors, axis=1)
+        slow, fast = (library.exp_cycles(distance * cycles) for cycles in steps)
+        spherical = (slow / distance)[:, :, :, None] * fast[:, :, None, :]
+        field[some, :] = xp.reshape(xp.sum(spherical * padded, axis=1), (-1, coarse * fine))
+    return xp.reshape(field[:, : waves.count], (*shape, waves.count))

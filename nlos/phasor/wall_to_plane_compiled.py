@@ -124,16 +124,17 @@ class _Workspace:
     def propagate_group(self, number: int, phasors: ComplexArray, field: ComplexArray) -> None:
         """Overwrite the field (frequencies, y, x) at one group's frequencies."""
         plan = self.plan
-        group, terms = plan.low_rank_transfer.groups[number], plan.low_rank_transfer.terms(number)
+        group = plan.low_rank_transfer.groups[number]
+        over_waves, over_points = plan.low_rank_transfer.terms(number)
         values = np.ascontiguousarray(phasors[:, group].T)
         shift_y, shift_x = self.phase_shifts
         spectrum = self.inverse.spectra[0]
         for i, frequency in enumerate(range(group.start, group.stop)):
             reach = plan.max_row_indices(frequency)
-            spectra = self.analysis.spectra(values[i], terms.point_factors, reach.size - 1)
+            spectra = self.analysis.spectra(values[i], over_points, reach.size - 1)
             spectrum[:] = 0
             parts = spectra.view(np.float32)
-            wave_factors = terms.wave_factors[i], *plan.node_interpolation
+            wave_factors = over_waves[i], *plan.node_interpolation
             add_low_rank_terms(parts, *wave_factors, reach, shift_x, shift_y, *self.cells, spectrum)
             self.inverse.transform(slice(0, 1))
             np.multiply(self.inverse.images[0], self.inverse.carrier, out=field[frequency])

@@ -18,7 +18,7 @@ from nlos.illumination import IlluminationGroup, build_source, choose_roles, war
 from nlos.method import MEMORY_LIMIT_BYTES, Method, Plan, Progress, require_numpy_signal
 from nlos.phasor.arrays import ArrayLibrary
 from nlos.phasor.depth_steps import DiffractionPlan
-from nlos.phasor.plan import GroupPlan, Hybrid, WavePlan, plan_waves
+from nlos.phasor.plan import Hybrid, WavePlan, plan_waves
 from nlos.phasor.to_depths import PortableDiffraction
 from nlos.phasor.wall_to_plane_compiled import sum_spherical_waves
 from nlos.plane import axis_step
@@ -138,11 +138,6 @@ class WallModel:
     plan: WavePlan  # of the hybrid
     capture: Capture  # of the plan's geometry
 
-    @property
-    def grid(self) -> Grid:
-        """The voxels of the hidden volume."""
-        return self.plan.grid
-
     @cached_property
     def laser_distance(self) -> FloatArray:
         """Mean distance of every voxel from the laser spots, m, shape (z, y, x); 1 for a confocal
@@ -156,7 +151,13 @@ class WallModel:
         """Return the operator from volumes (z, y, x), albedo divided by `laser_distance`, to
         `measurements`.
         """
-        return Stack([self._build_group_operator(one, dtype) for one in self.plan.groups])
+        parts = []
+        for one in self.plan.groups:
+            points = self.capture.points[one.group.indices]
+            bare = HiddenToWall(points, one.plane_to_depths, one.group, self.plan.band, dtype)
+            relative = self.laser_distance / self._compute_laser_distance(one.group)
+            parts.append(bare @ Diagonal(relative, dtype))
+        return Stack(parts)
 
     def measurements(self) -> Array:
         """Return the phasors divided by ``sqrt(G_k)``, as the operator gives them, shape (n, 1),
@@ -174,15 +175,11 @@ class WallModel:
             parts.append(phasors.view(np.float32).ravel())
         return np.concatenate(parts)[:, np.newaxis]
 
-    def _build_group_operator(self, one: GroupPlan, dtype: DTypeLike) -> LinearOperator:
-        points = self.capture.points[one.group.indices]
-        bare = HiddenToWall(points, one.plane_to_depths, one.group, self.plan.band, dtype)
-        return bare @ Diagonal(self.laser_distance / self._compute_laser_distance(one.group), dtype)
-
     def _compute_laser_distance(self, group: IlluminationGroup) -> FloatArray:
         if group.laser is None:
-            return np.ones(self.grid.shape)
-        z, y, x = np.meshgrid(self.grid.z, self.grid.y, self.grid.x, indexing="ij")
+            return np.ones(self.plan.grid.shape)
+        grid = self.plan.grid
+        z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
         return np.asarray(np.linalg.norm(np.stack([x, y, z], axis=-1) - group.laser, axis=-1))
 
 

@@ -57,9 +57,12 @@ def build_relay_wall(name: str, points: int = 64, width: float = 2.0) -> FloatAr
         raise InputError(
             f"a wall needs at least 2 x 2 points and a positive width, got {points} and {width} m"
         )
-    axis = np.linspace(-1, 1, points)
-    x, y = np.meshgrid(axis, axis)
     half = width / 2
+    if name == "cylinder" and half >= CYLINDER_RADIUS_M:
+        raise InputError(
+            f"a cylinder of radius {CYLINDER_RADIUS_M} m is narrower than {width:.3g} m"
+        )
+    x, y = np.meshgrid(*[np.linspace(-1, 1, points)] * 2)
     z = WALLS[name](x, y, half)
     wall = np.stack([half * x, half * y, z], axis=-1)
     wall[np.isnan(z)] = np.nan
@@ -81,22 +84,6 @@ def compute_wall_normals(wall: FloatArray) -> FloatArray:
     return np.where(np.isfinite(found), found * np.sign(found[..., 2:]), normals)
 
 
-def _planar_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
-    return np.zeros_like(x)
-
-
-def _cylinder_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
-    if half >= CYLINDER_RADIUS_M:
-        raise InputError(
-            f"a cylinder of radius {CYLINDER_RADIUS_M} m is narrower than {2 * half:.3g} m"
-        )
-    return np.asarray(np.sqrt(CYLINDER_RADIUS_M**2 - (half * x) ** 2) - CYLINDER_RADIUS_M)
-
-
-def _wavy_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
-    return np.asarray(WAVE_HEIGHT_M * np.sin(2 * np.pi * x) * np.cos(1.5 * np.pi * y))
-
-
 def _relief_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
     hills = np.sin(3 * x + 0.7) * np.cos(2.5 * y - 0.4) + 0.5 * np.sin(5 * y + 2 * x)
     low, high = float(hills.min()), float(hills.max())
@@ -110,9 +97,11 @@ def _plates_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
 
 # Shapes by name.
 WALLS: Mapping[str, DepthFunction] = {
-    "planar": _planar_depth,
-    "cylinder": _cylinder_depth,
-    "wavy": _wavy_depth,
+    "planar": lambda x, y, half: np.zeros_like(x),
+    "cylinder": lambda x, y, half: (
+        np.sqrt(CYLINDER_RADIUS_M**2 - (half * x) ** 2) - CYLINDER_RADIUS_M
+    ),
+    "wavy": lambda x, y, half: WAVE_HEIGHT_M * np.sin(2 * np.pi * x) * np.cos(1.5 * np.pi * y),
     "relief": _relief_depth,
     "plates": _plates_depth,
 }
