@@ -127,30 +127,6 @@ class Capture:
         object.__setattr__(self, "laser", _to_real_array(self.laser, np.float64, "laser"))
         object.__setattr__(self, "bin_width", float(self.bin_width))
         object.__setattr__(self, "start", float(self.start))
-        self._validate()
-
-    def __repr__(self) -> str:
-        points = " x ".join(map(str, self.wall.shape[:-1])) or "1"
-        spots = "one laser spot" if self.laser.shape == (3,) else "a laser spot for each"
-        return (
-            f"Capture({points} wall points, {spots}, {self.signal.shape[0]} bins of "
-            f"{self.bin_width / PICOSECOND:.3g} ps)"
-        )
-
-    def _repr_html_(self) -> str:
-        low, high = self.points.min(axis=0), self.points.max(axis=0)
-        last = self.start + self.signal.shape[0] * self.axis.spacing
-        described = {
-            "signal (time, wall)": " x ".join(map(str, self.signal.shape)),
-            "wall": " x ".join(f"{side:.3f}" for side in high - low) + " m (x, y, z)",
-            "laser": "one spot" if self.laser.shape == (3,) else "a spot for each wall point",
-            "time bin": f"{self.bin_width / PICOSECOND:.4g} ps",
-            "length of path": f"{self.start:.3f} to {last:.3f} m",
-        }
-        picture = to_numpy(self.signal).sum(axis=0) if self.wall.ndim == 3 else None
-        return render_html("Capture", described, picture)
-
-    def _validate(self) -> None:
         if self.wall.ndim == 0 or self.wall.shape[-1] != 3:
             raise ShapeError("wall", "(..., 3)", self.wall.shape)
         if self.signal.ndim != self.wall.ndim or self.signal.shape[1:] != self.wall.shape[:-1]:
@@ -179,6 +155,27 @@ class Capture:
             raise InputError(
                 f"{bad} samples of the signal are NaN or infinite; set them to 0, or their wall points to NaN"
             )
+
+    def __repr__(self) -> str:
+        points = " x ".join(map(str, self.wall.shape[:-1])) or "1"
+        spots = "one laser spot" if self.laser.shape == (3,) else "a laser spot for each"
+        return (
+            f"Capture({points} wall points, {spots}, {self.signal.shape[0]} bins of "
+            f"{self.bin_width / PICOSECOND:.3g} ps)"
+        )
+
+    def _repr_html_(self) -> str:
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        last = self.start + self.signal.shape[0] * self.axis.spacing
+        described = {
+            "signal (time, wall)": " x ".join(map(str, self.signal.shape)),
+            "wall": " x ".join(f"{side:.3f}" for side in high - low) + " m (x, y, z)",
+            "laser": "one spot" if self.laser.shape == (3,) else "a spot for each wall point",
+            "time bin": f"{self.bin_width / PICOSECOND:.4g} ps",
+            "length of path": f"{self.start:.3f} to {last:.3f} m",
+        }
+        picture = to_numpy(self.signal).sum(axis=0) if self.wall.ndim == 3 else None
+        return render_html("Capture", described, picture)
 
     @classmethod
     def exhaustive(

@@ -344,7 +344,7 @@ class PlanarRSD(WaveMethod):
     tolerance makes smaller: 0.3 % for points on a background, 1.2 % for an even background alone.
     Holds the wall's spectrum, 8 bytes per plane wave and frequency (60 MB for 128 x 128 points and
     120 frequencies), the volume, and per thread the waves of all terms of two depths (30 MB). A
-    capture of another library's arrays is imaged in that library; see `nlos.portable`.
+    capture of another library's arrays is imaged in that library.
 
     Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
     imaging systems", Nat. Commun. 11, 1645 (2020).
@@ -423,8 +423,7 @@ class Hybrid(WaveMethod):
     points on a background, 1.1 to 1.6 % for an even background alone.
 
     Voxels between wall and virtual plane are reached backwards, without the waves that left the
-    plane's rim. A capture of another library's arrays is imaged in that library; see
-    `nlos.portable`.
+    plane's rim. A capture of another library's arrays is imaged in that library.
 
     Supplementary Note 12 of X. Feng, Y. Ma, L. Gao, "Compact light field photography towards
     versatile three-dimensional vision", Nat. Commun. 13, 3333 (2022).

@@ -426,21 +426,26 @@ class PhotonPlan(Plan):
         kept, held = photons.hold_out(HELD_OUT_FRACTION, HELD_OUT_SEED)
         linear = self.linear.image(photons.capture, progress)
         start = self.linear.image(kept.capture, progress).magnitude.astype(np.float32) ** 2
-        passes = _PassProgress(progress, self.linear.cost, COARSE_PASSES + self.method.iterations)
-        fit, linear_light = self._look_over(kept, start, passes)
+        # each pass counts as much as the linear image
+        passes = iter([self.linear.cost] * (COARSE_PASSES + self.method.iterations))
+
+        def report_pass() -> None:
+            progress(next(passes))
+
+        fit, linear_light = self._look_over(kept, start, report_pass)
         last = min(FINAL_PASSES, self.method.iterations - 1)
-        stopped = fit.run(self.method.iterations - last, passes.add)
+        stopped = fit.run(self.method.iterations - last, report_pass)
         gain = judge(fit, linear_light, held)
         values = linear.magnitude.astype(np.float32)
         if gain.nats > MIN_GAIN_SIGMAS * gain.sigma:
             fit.take(photons)
             for _ in range(last):
                 fit.improve(1)
-                passes.add()
+                report_pass()
             values = show_with_beam(fit, values)
         else:
             stopped = LINEAR_SHOWN
-        passes.finish()
+        progress(sum(passes))  # those that were not needed
         settings = {
             "method": "photon refinement",
             "linear": type(self.linear).__name__,
@@ -458,7 +463,7 @@ class PhotonPlan(Plan):
         return Volume(values, self.grid, {**capture.provenance, "imaging": settings})
 
     def _look_over(
-        self, photons: CountedPhotons, start: Array, progress: _PassProgress
+        self, photons: CountedPhotons, start: Array, report_pass: Callable[[], None]
     ) -> tuple[PhotonFit, Array]:
         """Fit coarse voxels, choose response and fall of light by them, and return a fit of the
         fine voxels that hold light, and the light (points, bins) of the linear image.
@@ -482,7 +487,7 @@ class PhotonPlan(Plan):
             fit.improve(SUBSETS, method.prior_weight if number else 0.0)
             if number == 0:
                 fit = fit.with_likeliest_model(sigmas)
-            progress.add()
+            report_pass()
         bright = fit.expected_photons >= FAINT_FRACTION * fit.expected_photons.max()
         significant = fit.albedo * fit.compute_sharpness() >= FAINT_SIGMAS
         if np.any(bright & significant):
@@ -536,23 +541,6 @@ def show_with_beam(fit: PhotonFit, linear: Array) -> Array:
     return np.asarray(
         np.maximum(shown, UNDECIDED_FRACTION * float(shown.max()) * undecided), np.float32
     )
-
-
-class _PassProgress:
-    """Progress of passes, each of which counts as much as the linear image."""
-
-    def __init__(self, progress: Progress, cost: int, passes: int) -> None:
-        self._progress, self._cost, self._left = progress, cost, passes
-
-    def add(self) -> None:
-        """Report a pass."""
-        self._progress(self._cost)
-        self._left -= 1
-
-    def finish(self) -> None:
-        """Report the passes that were not needed."""
-        self._progress(self._cost * self._left)
-        self._left = 0
 
 
 def _merge_pairs_of_voxels(grid: Grid) -> Grid:

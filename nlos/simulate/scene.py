@@ -385,6 +385,8 @@ class HiddenScene:
         InputError
             The jitter is not positive.
         """
+        from scipy.ndimage import gaussian_filter1d
+
         if not (np.isfinite(jitter) and jitter > 0):
             raise InputError(f"jitter must be a positive number of seconds, got {jitter}")
         wall, laser = np.asarray(wall, dtype=np.float64), np.asarray(laser, dtype=np.float64)
@@ -392,37 +394,23 @@ class HiddenScene:
             np.zeros((axis.bins, *wall.shape[:-1])), wall, laser, axis.bin_width, axis.start
         )
         normals = compute_wall_normals(wall)[dark.valid]
+        laser_normals = normals
         if len(dark.lasers) == 1:
             # the laser spot lies on the wall: it has the normal of the wall point next to it
             nearest = int(np.argmin(np.linalg.norm(dark.points - dark.laser, axis=1)))
             laser_normals = normals[nearest : nearest + 1]
-        else:
-            laser_normals = normals
-        signal = dark.signal.copy()
-        signal[:, dark.valid] = self._simulate_traces(
-            dark, normals, laser_normals, SPEED_OF_LIGHT * jitter
-        ).T
-        return Capture(signal, wall, laser, axis.bin_width, axis.start)
-
-    def _simulate_traces(
-        self, capture: Capture, normals: FloatArray, laser_normals: FloatArray, sigma: float
-    ) -> NDArray[np.float32]:
-        """Signals (points, t) of the valid wall points."""
-        from scipy.ndimage import gaussian_filter1d
-
-        axis = capture.axis
+        sigma = SPEED_OF_LIGHT * jitter
         fine = axis.spacing / BIN_OVERSAMPLING
         # Room at both ends for light whose response reaches into the record, in whole time bins.
         margin = int(np.ceil(RESPONSE_SIGMAS * sigma / axis.spacing)) + 1
         start = axis.start - margin * axis.spacing - (BIN_OVERSAMPLING - 1) / 2 * fine
-        traces = np.empty((len(capture.points), axis.bins), np.float32)
+        traces = np.empty((len(dark.points), axis.bins), np.float32)
         triangles = np.concatenate([surface.triangles for surface in self.surfaces])
-        laser_normals = np.ascontiguousarray(laser_normals)
 
         def process_block(some: slice) -> None:
             bins = np.zeros((some.stop - some.start, (axis.bins + 2 * margin) * BIN_OVERSAMPLING))
-            own = slice(None) if len(capture.lasers) == 1 else some
-            spots = capture.points[some], normals[some], capture.lasers[own], laser_normals[own]
+            own = slice(None) if len(dark.lasers) == 1 else some
+            spots = dark.points[some], normals[some], dark.lasers[own], laser_normals[own]
             for surface in self.surfaces:
                 stuff = surface.material
                 material = np.array([stuff.diffuse, stuff.retro, stuff.spread])
@@ -436,4 +424,6 @@ class HiddenScene:
             traces[some] = whole[:, margin : margin + axis.bins]
 
         run_blocks(process_block, len(traces), POINTS_PER_BLOCK)
-        return traces
+        signal = dark.signal.copy()
+        signal[:, dark.valid] = traces.T
+        return Capture(signal, wall, laser, axis.bin_width, axis.start)
