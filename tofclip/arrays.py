@@ -220,10 +220,9 @@ class PerDevice(Generic[T]):
 
 
 def parse_device(name: str) -> ComputeDevice:
-    """Return the place that a user asks for. `name`: ``cpu`` for NumPy and the compiled loops;
-    ``cuda`` or ``cuda:1`` for a GPU, through CuPy or else PyTorch; ``auto`` for a GPU where there
-    is one, and ``cpu`` where there is none; or a library with its own name of a device, such as
-    ``torch:cpu`` or ``torch:xpu``.
+    """Return the place that a user asks for: ``cpu`` for NumPy and the compiled loops; ``cuda`` or
+    ``cuda:1`` for a GPU, through CuPy or else PyTorch; ``auto`` for a GPU where there is one, else
+    ``cpu``; or PyTorch with its own name of a device, such as ``torch:xpu``.
     """
     if name == "cpu":
         return ComputeDevice()

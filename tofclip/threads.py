@@ -57,12 +57,9 @@ def _mark_worker() -> None:
 
 @contextmanager
 def open_worker_pool(threads: int | None = None) -> Iterator[Executor]:
-    """Yield an executor with a thread for each core, for jobs that each keep to one core.
-
-    At the end of the block, jobs that have not begun are cancelled and those under way waited for.
-    BLAS has one thread meanwhile.
-
-    `threads`: `thread_count` by default.
+    """Yield an executor with `threads`, by default one for each core, for jobs that each keep to one
+    core; BLAS has one thread meanwhile. At the end of the block, jobs that have not begun are cancelled
+    and those under way waited for.
     """
     pool = ThreadPoolExecutor(threads or thread_count(), "tofclip", _mark_worker)
     with limit_blas_threads():
@@ -83,13 +80,9 @@ def map_parallel(
     """Yield ``work(job)`` for each job, in order, while the other cores work on the next ones.
 
     The one parallel map of this package. Every job has one core to itself: maps within `work` run
-    on its thread, and BLAS products too. Results come one at a time, so that the caller can report
-    progress between them. The first exception is raised in its result's place, and no further job
-    is started.
-
-    `work`: must not depend on the order in which jobs are done; `jobs`: taken one by one, as they
-    are needed; `lookahead`: jobs that may be under way or done before their turn; it bounds the
-    results in memory. By default one per thread. Yields result of each job.
+    on its thread, and BLAS products too. Jobs are taken as they are needed; `lookahead` of them, by
+    default one per thread, may be under way or done before their turn, which bounds the results in
+    memory. The first exception is raised in its result's place, and no further job is started.
 
     Examples
     --------
@@ -117,12 +110,9 @@ def split_blocks(total: int, size: int = LANES) -> Iterator[slice]:
 
 
 def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> None:
-    """Call `work` on every block of ``range(total)``, blocks on all cores; see `map_parallel`.
-
-    An interruption (Ctrl-C) waits for the blocks under way and starts no further ones.
-
-    `work`: called with the slice of a block. Blocks must not write to the same memory; `total`:
-    length of the axis that is cut; `size`: length of a block, at most.
+    """Call `work` on every block of ``range(total)``, blocks on all cores; see `map_parallel`. They must
+    not write to the same memory. An interruption (Ctrl-C) waits for the blocks under way and starts no
+    further ones.
     """
     blocks = list(split_blocks(total, size))
     if len(blocks) == 1:  # on the calling thread, with all threads that BLAS has

@@ -16,7 +16,7 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.arrays import (
     Array,
@@ -297,14 +297,30 @@ def _require_alike(what: str, operators: Sequence[LinearOperator], joined: int) 
     return first
 
 
-class Stack(LinearOperator):
+class _Joined(LinearOperator):
+    """Operators whose results are joined along the first axis, on inputs that have `axes` more."""
+
+    def __init__(self, operators: Sequence[LinearOperator], *axes: int) -> None:
+        first = _require_alike("a stack", operators, 1)
+        rows = sum(operator.shape_out[0] for operator in operators)
+        shapes = (*axes, *first.shape_in), (rows, *first.shape_out[1:])
+        super().__init__(*shapes, first.dtype)
+        self._set_parts(*operators)
+
+    def _split_rows(self, block: Array) -> Iterator[tuple[LinearOperator, Array]]:
+        """Each operator with its part of the results."""
+        first = 0
+        for operator in self.parts:
+            last = first + operator.shape_out[0]
+            yield operator, block[first:last, ...]
+            first = last
+
+
+class Stack(_Joined):
     """Operators on the same input, their results joined along the first axis: ``[A; B; ...] x``."""
 
     def __init__(self, operators: Sequence[LinearOperator]) -> None:
-        first = _require_alike("a stack", operators, 1)
-        rows = sum(operator.shape_out[0] for operator in operators)
-        super().__init__(first.shape_in, (rows, *first.shape_out[1:]), first.dtype)
-        self._set_parts(*operators)
+        super().__init__(operators)
 
     def _forward(self, block: Array) -> Array:
         return namespace(block).concat([operator._forward(block) for operator in self.parts])
@@ -312,12 +328,12 @@ class Stack(LinearOperator):
     def _adjoint(self, block: Array) -> Array:
         # every part has looked at the same input
         total = zeros((*self.shape_in, block.shape[-1]), block)
-        for operator, part in _split_rows(self.parts, block):
+        for operator, part in self._split_rows(block):
             total += operator._adjoint(part)
         return total
 
 
-class BlockDiagonal(LinearOperator):
+class BlockDiagonal(_Joined):
     """One operator for each entry of the input's first axis, their results joined: ``[A_1 x_1; A_2
     x_2; ...]``.
 
@@ -326,18 +342,14 @@ class BlockDiagonal(LinearOperator):
     """
 
     def __init__(self, operators: Sequence[LinearOperator]) -> None:
-        first = _require_alike("a stack", operators, 1)
-        rows = sum(operator.shape_out[0] for operator in operators)
-        shapes = (len(operators), *first.shape_in), (rows, *first.shape_out[1:])
-        super().__init__(*shapes, first.dtype)
-        self._set_parts(*operators)
+        super().__init__(operators, len(operators))
 
     def _forward(self, block: Array) -> Array:
         parts = [operator._forward(block[k, ...]) for k, operator in enumerate(self.parts)]
         return namespace(block).concat(parts)
 
     def _adjoint(self, block: Array) -> Array:
-        parts = [operator._adjoint(part) for operator, part in _split_rows(self.parts, block)]
+        parts = [operator._adjoint(part) for operator, part in self._split_rows(block)]
         return namespace(block).stack(parts)
 
 
@@ -365,18 +377,30 @@ class Integration(LinearOperator):
         return namespace(block).stack([operator._adjoint(block) for operator in self.parts])
 
 
-def _split_rows(
-    operators: Sequence[LinearOperator], block: Array
-) -> Iterator[tuple[LinearOperator, Array]]:
-    """Each operator with its part of their results, which are joined along the first axis."""
-    first = 0
-    for operator in operators:
-        last = first + operator.shape_out[0]
-        yield operator, block[first:last, ...]
-        first = last
+class Selection(LinearOperator):
+    """Some of the pieces that an input is cut into along its first axes, `chosen` by their numbers; the
+    adjoint leaves the others dark.
+    """
+
+    def __init__(
+        self, shape_in: Shape, shape_out: Shape, chosen: NDArray[np.intp], dtype: DTypeLike
+    ) -> None:
+        super().__init__(shape_in, shape_out, dtype)
+        self._chosen = chosen
+        self._pieces = int(np.prod(shape_in)) * chosen.size // int(np.prod(shape_out))
+
+    def _forward(self, block: Array) -> Array:
+        kept: Array = block.reshape(self._pieces, -1)[self._chosen]
+        return kept.reshape(*self.shape_out, -1)
+
+    def _adjoint(self, block: Array) -> Array:
+        whole = np.zeros((*self.shape_in, block.shape[-1]), self.dtype)
+        pieces = whole.reshape(self._pieces, -1)
+        pieces[self._chosen] = block.reshape(self._chosen.size, -1)
+        return whole
 
 
-class ViewSelection(LinearOperator):
+class ViewSelection(Selection):
     """Keeps some of a light field's views; the adjoint leaves the others dark.
 
     Parameters
@@ -402,16 +426,8 @@ class ViewSelection(LinearOperator):
             raise InputError(
                 f"views to keep must be different numbers from 0 to {light_field_shape[0] - 1}"
             )
-        super().__init__(light_field_shape, (self.view_indices.size, *light_field_shape[1:]), dtype)
-
-    def _forward(self, block: Array) -> Array:
-        kept: Array = block[self.view_indices]
-        return kept
-
-    def _adjoint(self, block: Array) -> Array:
-        views = np.zeros((*self.shape_in, block.shape[-1]), self.dtype)
-        views[self.view_indices] = block
-        return views
+        shape = (self.view_indices.size, *light_field_shape[1:])
+        super().__init__(light_field_shape, shape, self.view_indices, dtype)
 
 
 class MeanWeighting(LinearOperator):

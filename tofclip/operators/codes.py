@@ -18,6 +18,7 @@ from tofclip.operators.base import (
     Integration,
     LinearOperator,
     Reshape,
+    Selection,
 )
 from tofclip.operators.shear import LinearShear, View
 
@@ -36,10 +37,8 @@ class DenseSensor(Reshape):
         super().__init__(plane_shape, (plane_shape[0] * plane_shape[1],), dtype)
 
 
-class _Sensor(LinearOperator):
-    """The measurements of `pixels`, flat numbers on the sensor's plane; the adjoint leaves the others
-    dark.
-    """
+class _Sensor(Selection):
+    """The measurements of `pixels`, flat numbers on the sensor's plane."""
 
     def __init__(
         self, plane_shape: tuple[int, int], pixels: NDArray[np.intp], dtype: DTypeLike
@@ -48,17 +47,8 @@ class _Sensor(LinearOperator):
             raise InputError(
                 f"no pixel of the {tuple(plane_shape)} plane is read; check the sensor's mask and offset"
             )
-        super().__init__(plane_shape, (pixels.size,), dtype)
+        super().__init__(plane_shape, (pixels.size,), pixels, dtype)
         self.pixels = pixels
-
-    def _forward(self, block: Array) -> Array:
-        read: Array = block.reshape(-1, block.shape[-1])[self.pixels]
-        return read
-
-    def _adjoint(self, block: Array) -> Array:
-        plane = np.zeros((self.shape_in[0] * self.shape_in[1], block.shape[-1]), self.dtype)
-        plane[self.pixels] = block
-        return plane.reshape(*self.shape_in, -1)
 
 
 class PitchedSensor(_Sensor):
