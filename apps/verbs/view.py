@@ -16,7 +16,7 @@ from apps.report import report, require_writable
 from tofclip.errors import InputError
 
 if TYPE_CHECKING:
-    from apps.viewer.page import WaitingPage
+    from apps.viewer.page import Served
     from apps.viewer.session import Session
 
 METHODS = ("tv", "l1", "linear", "adjoint", "surfaces")
@@ -117,16 +117,16 @@ class PageDoor:
     port: int | None = None  # A free one by default
     no_browser: bool = False  # whether the page is not opened here
     as_json: bool = False  # whether its address is reported as JSON
-    _waiting: WaitingPage | None = None
+    _waiting: Served | None = None
 
     def open_waiting(self, source: str, words: str) -> None:
         """Serve a page that says what is being done with a source, as the user named it."""
-        from apps.viewer.page import WaitingPage
+        from apps.viewer.page import serve_waiting
         from apps.viewer.server import parse_host
 
         title = source if "://" in source else Path(source).name
-        self._waiting = WaitingPage(title, words, self.port, parse_host(self.host))
-        self._show_address(self._waiting.address)
+        self._waiting = serve_waiting(title, words, self.port, parse_host(self.host))
+        self._show_address(self._waiting[1])
 
     def serve(self, session: Session) -> None:
         """Serve a session until Ctrl-C."""
@@ -143,7 +143,9 @@ class PageDoor:
     def close(self) -> None:
         """Stop serving a page that still waits: there will be nothing to look at."""
         if self._waiting is not None:
-            self._waiting.close()
+            from apps.viewer.server import stop_server
+
+            stop_server(self._waiting[0])
 
     def _show_address(self, address: str) -> None:
         import webbrowser

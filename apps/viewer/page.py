@@ -6,13 +6,13 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from apps.viewer.look import render_pictures
 from apps.viewer.panels import (
-    NO_SHADOWS,
     Controls,
     add_export,
     add_selection,
@@ -39,36 +39,25 @@ SCENE_ASPECT = 0.9
 PANEL_PX, PICTURES_PANEL_PX = 352, 240
 MANY_POINTS = 10**9  # more than any cloud has
 AMBIENT_INTENSITY = 2.0  # light from everywhere, so that no side of a surface is black
-SURFACE_COLOUR = (216, 210, 196)
 
 
-class WaitingPage:
-    """A page that says what is being done, until `Page` takes its place: browsers load it meanwhile.
+Served = tuple["viser.ViserServer", str]  # a server and its address
 
-    `title`: of the source; `words`: what is being done; `host`: an IP address of this computer.
+
+def serve_waiting(title: str, words: str, port: int | None = None, host: str = LOOPBACK) -> Served:
+    """Serve a page that says what is being done, until `Page` takes its place: browsers load it
+    meanwhile. `title`: of the source; `host`: an IP address of this computer.
     """
-
-    def __init__(
-        self, title: str, words: str, port: int | None = None, host: str = LOOPBACK
-    ) -> None:
-        self.server, self.address = start_server(port, host)
-        _set_up_panel(self.server, title)
-        self._words = self.server.gui.add_html(render_text_html("waiting", f"{words} ..."))
-
-    def hand_over(self) -> tuple[viser.ViserServer, str]:
-        """Return the server, its page empty again, and its address."""
-        self._words.remove()
-        return self.server, self.address
-
-    def close(self) -> None:
-        """Stop serving."""
-        stop_server(self.server)
+    server, address = start_server(port, host)
+    _set_up_panel(server, title)
+    server.gui.add_html(render_text_html("waiting", f"{words} ..."))
+    return server, address
 
 
 class Page:
     """Serves a session. One thread, in `run`, owns the session; whatever the browsers ask for waits
-    in a queue. `host`: an IP address of this computer; `waiting`: served already, where this page
-    is to be; instead of port and host.
+    in a queue. `host`: an IP address of this computer; `waiting`: what `serve_waiting` returned,
+    instead of port and host.
     """
 
     def __init__(
@@ -76,18 +65,16 @@ class Page:
         session: Session,
         port: int | None = None,
         host: str = LOOPBACK,
-        waiting: WaitingPage | None = None,
+        waiting: Served | None = None,
     ) -> None:
         self.session = session
         self._commands: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._stopping, self._woken = threading.Event(), threading.Event()
         first = session.frame_at(time.monotonic())
-        self._framed_cloud = first.cloud.xyz
         self.viewpoint = place_viewpoint(first.cloud.xyz, SCENE_ASPECT)
-        self.server, self.address = (
-            start_server(port, host) if waiting is None else waiting.hand_over()
-        )
-        server, title = self.server, session.source.title
+        server, self.address = waiting or start_server(port, host)
+        server.gui.reset()
+        self.server, title = server, session.source.title
         self._pace, self.points = FramePacer(), Points(server, self.post)
         _set_up_panel(server, title)
         self._set_up_scene()
@@ -95,10 +82,13 @@ class Page:
         self._pictures_tab = left.add_tab("pictures")
         left.dock_left()
         left.set_width(PICTURES_PANEL_PX)
-        self.controls = Controls(server, session, self.post, first, self._resize_points)
-        self._add_furniture(first)
+        self.controls = Controls(server, session, self.post, first, self.points.resize)
+        if len(first.cloud):
+            draw_furniture(server, Box.around(first.cloud.xyz))
         add_selection(server, session, self.post, left)
-        add_export(server, session, self.post, self._list_views, self.points.drawn_whole)
+        self._framed_cloud = first.cloud.xyz
+        list_views = partial(make_presets, first.cloud.xyz)
+        add_export(server, session, self.post, list_views, self.points.drawn_whole)
         server.gui.add_html(render_page_html(title))
         self._pictures: dict[str, Any] = {}
         self._drawn: DisplayedFrame | None = None
@@ -133,10 +123,7 @@ class Page:
             self.session.max_playing_points = self.points.detail.count(MANY_POINTS, moving=True)
             shown = self.session.frame_at(now) if self._pace.can_send(now) else self._drawn
             if shown is not None and shown is not self._drawn:
-                # Browsers get points and surface of one frame together.
-                with self.server.atomic():
-                    self._draw(shown)
-                self.server.flush()
+                self.points.draw(shown, self.controls.point_size)
                 self._drawn = shown
                 self._pace.record_sent(now, len(shown.cloud))
             self.points.update(now)
@@ -163,19 +150,6 @@ class Page:
         staying = np.zeros((2, 3), np.float32)
         scene.add_point_cloud("/camera/staying", staying, staying, point_size=1e-4, **POINT_STYLE)
 
-    def _add_furniture(self, first: DisplayedFrame) -> None:
-        """Draw what gives the scene its scale, and a switch for it."""
-        if len(first.cloud) == 0:
-            return
-        drawn = draw_furniture(self.server.scene, Box.around(first.cloud.xyz))
-        hint = "box with lengths, scale bar and axes of the first cloud"
-        switch = self.server.gui.add_checkbox("box", True, hint=hint)
-
-        @switch.on_update
-        def _(_: Any) -> None:
-            for node in drawn:
-                node.visible = switch.value
-
     def _welcome(self, client: Any) -> None:
         """Frame the scene for the window of a browser that has just come, until the first move."""
         framed: list[Viewpoint] = []
@@ -198,30 +172,6 @@ class Page:
         follow_window(client.camera)
         client.camera.on_update(follow_window)
         self.post(redraw_pictures)
-
-    def _list_views(self, aspect: float) -> dict[str, Viewpoint]:
-        """Places to look from, for a window of that aspect."""
-        if len(self._framed_cloud) == 0:
-            return {"start": self.viewpoint}
-        return make_presets(self._framed_cloud, aspect)
-
-    def _draw(self, shown: DisplayedFrame) -> None:
-        scene, surface = self.server.scene, shown.surface
-        if surface is not None:
-            look: Any = {"color": SURFACE_COLOUR, "side": "double", **NO_SHADOWS}
-            scene.add_mesh_simple("/surface", surface.vertices, surface.faces, **look)
-        elif self._drawn is not None and self._drawn.surface is not None:
-            scene.remove_by_name("/surface")
-        xyz = shown.cloud.xyz if surface is None else shown.cloud.xyz[:0]
-        self.points.draw(xyz, shown.colours, self._size_points(shown))
-
-    def _size_points(self, shown: DisplayedFrame) -> float:
-        """Side of a point, m: of a thinned frame they are larger, so that surfaces stay closed."""
-        return self.controls.point_size * float(np.sqrt(shown.points / max(len(shown.cloud), 1)))
-
-    def _resize_points(self) -> None:
-        if self._drawn is not None:
-            self.points.resize(self._size_points(self._drawn))
 
     def _describe(self, shown: DisplayedFrame, now: float) -> None:
         """Bring words and flat pictures up to date, now and then."""

@@ -31,7 +31,7 @@ from apps.viewer.look import (
     format_length,
     load_palette,
 )
-from apps.viewer.points import ClipBox, Post, add_lines
+from apps.viewer.points import NO_SHADOWS, ClipBox, Post, add_lines
 from apps.viewer.session import DisplayedFrame, Filters, Session, list_filtered
 from apps.viewer.source import NO_LIMITS, Choice, FloatArray, Limits
 from apps.viewer.still import BACKGROUND, draw_colour_bar
@@ -173,7 +173,7 @@ def bind_user_input(handle: Any, post: Post, act: Callable[[Any], object]) -> No
 
 class Controls:
     """Playback, ways of showing, colours and filters. `first`: its extent is that of the filters until
-    they are narrowed; `resize`: called when points are to have another size.
+    they are narrowed; `resize`: gives points another size, m.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class Controls:
         session: Session,
         post: Post,
         first: DisplayedFrame,
-        resize: Callable[[], None],
+        resize: Callable[[float], None],
     ) -> None:
         self._session, self._post = session, post
         self._gui: Any = server.gui
@@ -248,7 +248,7 @@ class Controls:
         self._on(speed, lambda word: setattr(clock, "speed", SPEEDS[word]))
         self._on(gui.add_checkbox("loop", clock.loop), partial(setattr, clock, "loop"))
 
-    def _add_colours(self, first: DisplayedFrame, resize: Callable[[], None]) -> None:
+    def _add_colours(self, first: DisplayedFrame, resize: Callable[[float], None]) -> None:
         session, gui = self._session, self._gui
         colouring = session.colouring
 
@@ -289,7 +289,7 @@ class Controls:
         side_mm = round(min(max(side_mm, MIN_POINT_SIZE_MM), MAX_POINT_SIZE_MM), 1)
         extent = (MIN_POINT_SIZE_MM, MAX_POINT_SIZE_MM, 0.1, side_mm)
         self._size = gui.add_slider("point size", *extent, hint="mm")
-        self._on(self._size, lambda _: resize())
+        self._on(self._size, lambda _: resize(self.point_size))
 
     def _add_filters(self, first: DisplayedFrame, clip: ClipBox) -> None:
         session, gui = self._session, self._gui
@@ -359,7 +359,6 @@ MARKER_COLOURS = ((255, 80, 80), (80, 220, 255))
 MARKER_RADIUS_FRACTION = 0.006  # of the distance
 # on either side of a detected return that are filled in its pixel's waveform
 RETURN_HALF_WIDTH_BINS = 3.0
-NO_SHADOWS: Any = {"cast_shadow": False, "receive_shadow": False}
 PLOT_LOOK: Any = {
     "series": (
         {"label": "range (m)"},

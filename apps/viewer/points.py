@@ -16,12 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.viewer.look import format_length
+from apps.viewer.session import DisplayedFrame
 from apps.viewer.viewpoint import Box
 
 if TYPE_CHECKING:
     import viser
 
 Post = Callable[[Callable[[], object]], None]
+NO_SHADOWS: Any = {"cast_shadow": False, "receive_shadow": False}
+SURFACE_STYLE: Any = {"color": (216, 210, 196), "side": "double", **NO_SHADOWS}
 POINT_STYLE: Any = {"point_shape": "square", "point_shading": "flat", "precision": "float32"}
 
 RATE_WINDOW_S = 2.0  # over which frames are counted
@@ -103,9 +106,9 @@ def time_frame(client: viser.ClientHandle) -> float:
 
 
 class Points:
-    """The points in the scene. Of a large cloud a part is drawn, larger, so that surfaces stay
-    closed: fewer while it moves, as many as the slowest browser can draw while it stands still.
-    `post`: takes what is to be done by the thread that owns the page.
+    """The points or the surface in the scene. Of a large cloud a part is drawn: fewer while it moves,
+    as many as the slowest browser can draw while it stands still. `post`: takes what is to be done
+    by the thread that owns the page.
     """
 
     def __init__(self, server: viser.ViserServer, post: Post) -> None:
@@ -114,8 +117,9 @@ class Points:
         self.drawn = 0  # how many points are drawn while nothing moves
         self._drawn_moving = 0
         self._xyz = np.empty((0, 3), np.float32)
-        self._colours: Any = (0, 0, 0)  # the page complains about no colours at all
-        self._size_m = 0.0
+        self._colours: Any = None
+        self._points, self._size_m = 0, 0.0
+        self._surface: Any = None
         self._order: NDArray[np.intp] | None = None
         self._still: Any = None
         self._moving: Any = None
@@ -128,14 +132,25 @@ class Points:
         known = self._server.get_clients().keys() <= self.detail.points_per_s.keys()
         return self._order is None or (known and not self._has_to_time and not self._timing)
 
-    def draw(self, xyz: NDArray[np.float32], colours: NDArray[np.uint8], size_m: float) -> None:
-        """Draw points."""
-        self._xyz, self._size_m = xyz, size_m
-        self._colours = colours if len(xyz) else (0, 0, 0)
-        # drawn by lot: every n-th point of rows of pixels would make stripes
-        is_large = len(xyz) > MIN_DRAWN_POINTS
-        self._order = np.random.default_rng(0).permutation(len(xyz)) if is_large else None
-        self._send()
+    def draw(self, shown: DisplayedFrame, size_m: float) -> None:
+        """Draw a frame; browsers get points and surface of it together."""
+        with self._server.atomic():
+            mesh, scene = shown.surface, self._server.scene
+            if mesh is not None:
+                vertices, faces = mesh.vertices, mesh.faces
+                self._surface = scene.add_mesh_simple("/surface", vertices, faces, **SURFACE_STYLE)
+            elif self._surface is not None:
+                self._surface.remove()
+                self._surface = None
+            self._xyz = shown.cloud.xyz if mesh is None else shown.cloud.xyz[:0]
+            # the page complains about no colours at all
+            self._colours = shown.colours if len(self._xyz) else (0, 0, 0)
+            self._points, self._size_m = shown.points, size_m
+            # drawn by lot: every n-th point of rows of pixels would make stripes
+            is_large, random = len(self._xyz) > MIN_DRAWN_POINTS, np.random.default_rng(0)
+            self._order = random.permutation(len(self._xyz)) if is_large else None
+            self._send()
+        self._server.flush()
 
     def resize(self, size_m: float) -> None:
         """Give points another size, m."""
@@ -204,8 +219,8 @@ class Points:
         )
 
     def _widen(self, count: int) -> float:
-        """Side of one of `count` points, m: fewer are larger."""
-        return self._size_m * float(np.sqrt(max(len(self._xyz), 1) / max(count, 1)))
+        """Side of one of `count` points, m: fewer are larger, so that surfaces stay closed."""
+        return self._size_m * float(np.sqrt(max(self._points, 1) / max(count, 1)))
 
     def _time_browser(self, client: viser.ClientHandle) -> None:
         """Time a browser's frames, on a thread of its own; a movement meanwhile makes it void."""
@@ -247,8 +262,9 @@ def add_lines(
     return scene.add_line_segments(name, points, colour, **width)
 
 
-def draw_furniture(scene: Any, box: Box) -> list[Any]:
-    """Draw box, scale bar and axes around a cloud."""
+def draw_furniture(server: viser.ViserServer, box: Box) -> None:
+    """Draw what gives the scene its scale: box, scale bar and axes around a cloud, and a switch."""
+    scene: Any = server.scene
 
     def add_label(name: str, text: str, place: NDArray[Any], anchor: str) -> Any:
         return scene.add_label(name, text, position=place, anchor=anchor, font_screen_scale=0.9)
@@ -270,7 +286,13 @@ def draw_furniture(scene: Any, box: Box) -> list[Any]:
         axis = np.stack([origin, end])[np.newaxis]
         drawn.append(add_lines(scene, f"/axes_{name}", axis, colour, 2.0))
         drawn.append(add_label(f"/axes_{name}_name", name, end, "center-center"))
-    return drawn
+    hint = "box with lengths, scale bar and axes of the first cloud"
+    switch = server.gui.add_checkbox("box", True, hint=hint)
+
+    @switch.on_update
+    def _(_: Any) -> None:
+        for node in drawn:
+            node.visible = switch.value
 
 
 class ClipBox:
@@ -288,16 +310,16 @@ class ClipBox:
 
     def show(self, box: Box) -> None:
         """Draw the box with its handles."""
+        self.hide()
         self._draw_edges(box)
-        if not self._handles:
-            look: Any = {"disable_rotations": True, "disable_sliders": True, "depth_test": False}
-            look["scale"] = 2 * AXES_FRACTION * max(box.reach, 0.01)
-            for name, turned in (("low", UPRIGHT), ("high", POINTING_INWARDS)):
-                handle = self._scene.add_transform_controls(f"/clip/{name}", wxyz=turned, **look)
-                handle.on_update(lambda _: self._report())
-                self._handles.append(handle)
-        for handle, corner in zip(self._handles, (box.low, box.high), strict=True):
-            handle.position = corner
+        look: Any = {"disable_rotations": True, "disable_sliders": True, "depth_test": False}
+        look["scale"] = 2 * AXES_FRACTION * max(box.reach, 0.01)
+        corners = ("low", box.low, UPRIGHT), ("high", box.high, POINTING_INWARDS)
+        for name, corner, turned in corners:
+            place: Any = {"position": corner, "wxyz": turned}
+            handle = self._scene.add_transform_controls(f"/clip/{name}", **place, **look)
+            handle.on_update(lambda _: self._report())
+            self._handles.append(handle)
 
     def hide(self) -> None:
         """Take the box and its handles away."""

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 LOOPBACK, FIRST_PORT = "127.0.0.1", 8080
+ANYWHERE = {"0.0.0.0": LOOPBACK, "::": "::1"}  # all addresses of this computer, and its nearest
 REFUSAL = "Open the address that tofclip printed, with its token.\n"
 # They keep the token of the address to this page, and the page out of another's frame.
 ANSWER_HEADERS = {
@@ -62,10 +63,14 @@ def start_server(port: int | None = None, host: str = LOOPBACK) -> tuple[viser.V
     # viser greets on standard output, which belongs to --json.
     with contextlib.redirect_stdout(io.StringIO()):
         server = LocalServer(host=host, port=FIRST_PORT if port is None else port, verbose=False)
-    token = install_guard(server.get_port(), is_local(host))
-    everywhere = ipaddress.ip_address(host).is_unspecified
-    nearest = ("::1" if ":" in host else LOOPBACK) if everywhere else host
-    if token is None or not _refuses_strangers(nearest, server.get_port()):
+    token, everywhere = install_guard(server.get_port(), is_local(host)), host in ANYWHERE
+    # Another version of a library may not ask the guard: the page is asked for without the token.
+    nearest = ANYWHERE.get(host, host)
+    stranger = http.client.HTTPConnection(nearest, server.get_port(), timeout=10)
+    with contextlib.closing(stranger):
+        stranger.request("GET", "/")
+        is_guarded = stranger.getresponse().status == HTTPStatus.FORBIDDEN
+    if token is None or not is_guarded:
         stop_server(server)
         raise MissingDependencyError(
             f"viser {viser.__version__} would show the page to everybody: pip install viser==1.1.1"
@@ -96,13 +101,6 @@ def parse_host(host: str) -> str:
 def is_local(host: str) -> bool:
     """Say whether only this computer reaches what listens at an IP address."""
     return ipaddress.ip_address(host).is_loopback
-
-
-def _refuses_strangers(host: str, port: int) -> bool:
-    """Ask for the page without the token: another version of a library may not ask the guard."""
-    with contextlib.closing(http.client.HTTPConnection(host, port, timeout=10)) as connection:
-        connection.request("GET", "/")
-        return connection.getresponse().status == HTTPStatus.FORBIDDEN
 
 
 class Guard:

@@ -42,10 +42,6 @@ class PlaybackClock:
     playing: bool = field(default=False, init=False)
     _last_tick_s: float | None = field(default=None, init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        if not self.rate > 0:
-            raise InputError(f"frames per second must be positive, got {self.rate}")
-
     @property
     def frame(self) -> int:
         """The frame that is due."""

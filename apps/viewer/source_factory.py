@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, cast
 from apps.viewer.sources import (
     CloudSource,
     LiveShotSource,
-    Recovery,
     StoredShotSource,
     TransientSource,
     VolumeSource,
@@ -148,11 +147,9 @@ def _open_shots(
         # a refocus, which shows frames, is quick
         return TransientSource(title, frames, measured, make_look_method(FIRST_LOOK_METHOD))
     camera = _find_camera(title, first, options, announce)
-    measured = measure(first.counts, first.saturated, camera).values
     method = make_look_method(options.method or FIRST_LOOK_METHOD)
-    times = first.times - camera.time_zero
-    frames = Recovery(camera, times, method).frames(measured)
-    source = TransientSource(title, frames, measured, method)
+    shot = StoredShotSource(title, [lambda: first], camera, method)
+    source = TransientSource(title, shot.recover_frames(0), shot.measurements(0), method)
     if options.method is None:
         source.notes = (FIRST_LOOK_NOTE, *source.notes)
     return source

@@ -57,9 +57,7 @@ if TYPE_CHECKING:
 
 CLOUD_RATE_HZ = SHOT_RATE_HZ = 10.0
 MAX_CACHED_CLOUDS, MAX_CACHED_VIEWS, MAX_CACHED_SHOTS = 32, 16, 32
-MIN_PIXEL_FRACTION = (
-    0.3  # of the strongest return of a pixel; weaker ones before it hide it as rays
-)
+MIN_PIXEL_FRACTION = 0.3  # of a pixel's strongest return, which weaker ones before it would hide
 
 
 def find_min_intensity(whole: PointCloud) -> float:
@@ -240,20 +238,37 @@ MIN_FRAMES = 3  # without a neighbour on either side no return is located
 ALL_FRAMES = slice(None)
 
 
-class Recovery:
-    """Turns measurements of one camera into frames, at any shear. `times` (frames,): time of flight
-    of each column of measurements, s; `method`: by default the linear inverse: one operator and one
-    matrix (columns, columns) for each of the last 16 shears, which every recovery of this process
-    shares. Safe to share by threads.
+class RecoveredSource(Source):
+    """Light over time that one camera measured, from which frames can be recovered at any shear.
+
+    `measured_times` (frames,): time of flight of each column of measurements, s; `method`: by default
+    the linear inverse: one operator and one matrix (columns, columns) for each of the last 16
+    shears, which every recovery of this process shares. Safe to share by threads.
     """
 
-    def __init__(self, camera: Camera, times: FloatArray, method: Method | None = None) -> None:
-        self.camera, self.times = camera, times
+    def __init__(
+        self,
+        title: str,
+        rate: float,
+        camera: Camera,
+        measured_times: FloatArray,
+        method: Method | None = None,
+    ) -> None:
+        super().__init__(title, rate)
+        self.camera, self.measured_times = camera, measured_times
         self.method: Method = LinearInverse() if method is None else method
         self.is_linear = isinstance(self.method, LinearInverse)  # a quick look
         self._cached_camera = get_cached_camera(camera)
+        self.refocus = Setting("refocus", *SHEAR_LIMITS, 0.1, 0.0, SHEAR_HINT)
+        self.settings = (self.refocus,) if camera.views > 1 else ()
+        # Without a time zero all ranges are off by one constant.
+        self.notes = (NO_TIME_ZERO_NOTE,) if camera.time_zero == 0 else ()
 
-    def frames(
+    @abc.abstractmethod
+    def measurements(self, number: int) -> Readings:
+        """Return the rectified measurements of a shot."""
+
+    def recover(
         self, measurements: Readings, shear: float = 0.0, gate: slice = ALL_FRAMES
     ) -> Frames:
         """Recover the frames of a gate."""
@@ -268,35 +283,21 @@ class Recovery:
             values = self.method.recover(self.camera.operator(shear), part, valid).frames
         else:  # a dark gate has no brightest frame to set a prior's weight by
             values = np.zeros((part.shape[1], *self.camera.image_shape), np.float32)
-        times = self.times[gate]
+        times = self.measured_times[gate]
         return Frames(values, times, self.camera, shears=np.full(times.size, shear))
 
-    def view(self, measurements: Readings, shear: float, gate: slice = ALL_FRAMES) -> View:
+    def recover_view(
+        self, measurements: Readings, shear: float = 0.0, gate: slice = ALL_FRAMES
+    ) -> View:
         """Recover the frames of a gate and locate their returns."""
-        first, stop, _ = gate.indices(self.times.size)
-        first = max(0, min(first, self.times.size - MIN_FRAMES))
+        first, stop, _ = gate.indices(self.measured_times.size)
+        first = max(0, min(first, self.measured_times.size - MIN_FRAMES))
         widened = slice(first, max(stop, first + MIN_FRAMES))
-        return make_view(depth(self.frames(measurements, shear, widened)))
-
-
-class RecoveredSource(Source):
-    """Light over time that one camera measured, from which frames can be recovered at any shear."""
-
-    def __init__(self, title: str, rate: float, recovery: Recovery) -> None:
-        super().__init__(title, rate)
-        self.recovery = recovery
-        self.refocus = Setting("refocus", *SHEAR_LIMITS, 0.1, 0.0, SHEAR_HINT)
-        self.settings = (self.refocus,) if recovery.camera.views > 1 else ()
-        # Without a time zero all ranges are off by one constant.
-        self.notes = (NO_TIME_ZERO_NOTE,) if recovery.camera.time_zero == 0 else ()
-
-    @abc.abstractmethod
-    def measurements(self, number: int) -> Readings:
-        """Return the rectified measurements of a shot."""
+        return make_view(depth(self.recover(measurements, shear, widened)))
 
     def recover_frames(self, number: int) -> Frames:
         """Return all frames of shot `number`."""
-        return self.recovery.frames(self.measurements(number))
+        return self.recover(self.measurements(number))
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> FloatArray:
         frames, (row, column) = self.recover_frames(number), pixel
@@ -347,10 +348,10 @@ class TransientSource(RecoveredSource):
         method: Method | None = None,
     ) -> None:
         rate = frames.times.size / TRANSIENT_PLAY_TIME_S
-        super().__init__(title, rate, Recovery(frames.camera, frames.times, method))
+        super().__init__(title, rate, frames.camera, frames.times, method)
         self.times = frames.times
         self.frames, self._measured = frames, measurements
-        if measurements is not None and self.recovery.is_linear:
+        if measurements is not None and self.is_linear:
             self.notes = (LINEAR_NOTE, *self.notes)
         elif measurements is None and frames.figures.get("method") == LinearInverse.name:
             self.notes = (LINEAR_FRAMES_NOTE, *self.notes)
@@ -388,7 +389,7 @@ class TransientSource(RecoveredSource):
             caption=f"all {gate.stop} frames"
             if gate == every
             else f"frames {gate.start} to {gate.stop - 1}",
-            notes=(LINEAR_NOTE,) if shear and self.recovery.is_linear else (),
+            notes=(LINEAR_NOTE,) if shear and self.is_linear else (),
         )
 
     def measurements(self, number: int) -> Readings:
@@ -406,11 +407,11 @@ class TransientSource(RecoveredSource):
         return {
             "streak": self._measurements.T,
             "intensity": light,
-            "depth": render_depth(self._whole_view, self.recovery.camera.image_shape),
+            "depth": render_depth(self._whole_view, self.camera.image_shape),
         }
 
     def _refocus_gate(self, shear: float, gate: range) -> View:
-        view = self.recovery.view(self._measurements, shear, slice(gate.start, gate.stop))
+        view = self.recover_view(self._measurements, shear, slice(gate.start, gate.stop))
         # a threshold relative to the gate would find noise in a dark one
         return view.select(view.cloud.intensity >= find_min_intensity(self._whole_view.cloud))
 
@@ -445,13 +446,12 @@ class ShotSource(RecoveredSource):
     def __init__(
         self, title: str, camera: Camera, row_times: FloatArray, method: Method | None = None
     ) -> None:
-        recovery = Recovery(camera, row_times - camera.time_zero, method)
-        super().__init__(title, SHOT_RATE_HZ, recovery)
+        super().__init__(title, SHOT_RATE_HZ, camera, row_times - camera.time_zero, method)
         self.frame_name = "shot"
-        if self.recovery.is_linear:
+        if self.is_linear:
             self.notes = (LINEAR_NOTE, *self.notes)
         self._recover_view = functools.lru_cache(MAX_CACHED_VIEWS)(
-            lambda number, shear: self.recovery.view(self.measurements(number), shear)
+            lambda number, shear: self.recover_view(self.measurements(number), shear)
         )
 
     def view(self, number: int) -> View:
@@ -465,13 +465,11 @@ class ShotSource(RecoveredSource):
         measurements = self.measurements(number)
         # the 64 frames about the brightest one: a picture of all would cost as much as the cloud
         brightest = int(measurements.sum(axis=0).argmax())
-        bright = self.recovery.frames(
-            measurements, 0.0, slice(max(0, brightest - 32), brightest + 32)
-        )
+        bright = self.recover(measurements, 0.0, slice(max(0, brightest - 32), brightest + 32))
         return {
             "streak": measurements.T,
             "intensity": bright.values.sum(axis=0),
-            "depth": render_depth(self.view_at(number, 0.0), self.recovery.camera.image_shape),
+            "depth": render_depth(self.view_at(number, 0.0), self.camera.image_shape),
         }
 
 
@@ -485,23 +483,20 @@ class StoredShotSource(ShotSource):
         camera: Camera,
         method: Method | None = None,
     ) -> None:
-        first = shots[0]()
-        super().__init__(title, camera, first.times, method)
-        self._shots = shots
-        rectifier = Rectifier(camera, first.times.size)
-
-        @functools.lru_cache(1)
-        def rectify(number: int) -> Readings:
-            shot = shots[number]()
-            return rectifier.measure(shot.counts, shot.saturated).values
-
-        self._rectify = rectify
+        row_times = shots[0]().times
+        super().__init__(title, camera, row_times, method)
+        self._shots, self._rectifier = shots, Rectifier(camera, row_times.size)
+        self._measured = functools.lru_cache(1)(self._rectify)
 
     def __len__(self) -> int:
         return len(self._shots)
 
     def measurements(self, number: int) -> Readings:
-        return self._rectify(number)
+        return self._measured(number)
+
+    def _rectify(self, number: int) -> Readings:
+        shot = self._shots[number]()
+        return self._rectifier.measure(shot.counts, shot.saturated).values
 
 
 STOP_TIMEOUT_S = 10.0  # for the shot under way and for letting go of the instrument
@@ -601,9 +596,9 @@ class LiveShotSource(ShotSource):
             self._ended = True
 
     def _append_entry(self, measurements: Readings, view: View) -> None:
-        if not self.recovery.is_linear:
+        if not self.is_linear:
             # seconds of work, meanwhile the newest shot waits and older ones are dropped
-            view = self.recovery.view(measurements, 0.0)
+            view = self.recover_view(measurements)
         with self._lock:
             self._cache.append((measurements, view))
             self._count += 1

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.viewer.source import FloatArray
-from tofclip.errors import InputError
 
 FIELD_OF_VIEW_RAD = math.radians(35.0)
 # A cloud that fills more than this is looked at from further back than from where it was taken
@@ -43,11 +42,7 @@ class Viewpoint:
     @property
     def axes(self) -> FloatArray:
         """Directions to the right, down and forward as rows, (3, 3)."""
-        forward = self.target - self.eye
-        length = np.linalg.norm(forward)
-        if not length > 0:
-            raise InputError("an eye cannot look at itself")
-        forward = forward / length
+        forward = (self.target - self.eye) / np.linalg.norm(self.target - self.eye)
         right = np.cross(DOWN, forward)
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(forward, right), forward])
@@ -144,17 +139,19 @@ def round_length_down(length: float) -> float:
 
 
 def make_presets(xyz: NDArray[np.float32], aspect: float = 1.5) -> dict[str, Viewpoint]:
-    """Return places to look at a cloud (n, 3), m, not empty, from, by name: ``"start"`` is
-    `place_viewpoint`'s; ``"front"``, ``"top"`` and ``"side"`` see the whole cloud; ``"camera"`` is
-    where it was taken from. `aspect`: width of the picture over its height.
+    """Return places to look at a cloud (n, 3), m, from, by name: ``"start"`` is `place_viewpoint`'s;
+    ``"front"``, ``"top"`` and ``"side"`` see the whole cloud; ``"camera"`` is where it was taken
+    from. `aspect`: width of the picture over its height.
     """
+    views = {"start": place_viewpoint(xyz, aspect)}
+    if len(xyz) == 0:
+        return views
     box = Box.around(xyz)
     # the narrower side of the picture has to hold the ball around the box
     half_angle = np.arctan(np.tan(FIELD_OF_VIEW_RAD / 2) * min(1.0, aspect))
     away = VIEW_MARGIN * max(box.reach, 0.01) / np.sin(half_angle)
     # straight down, no direction would be up on the page
     directions = {"front": (0.0, 0.0, -1.0), "top": (0.0, -1.0, -0.01), "side": (1.0, 0.0, 0.0)}
-    views = {"start": place_viewpoint(xyz, aspect)}
     for name, towards in directions.items():
         views[name] = Viewpoint(box.middle + away * np.array(towards), box.middle)
     if np.linalg.norm(box.middle) > box.reach:  # the camera is outside of the cloud

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.server
 import io
 import shutil
@@ -17,8 +18,9 @@ import viser
 from matplotlib.image import imread
 from viewer_scenes import PlaneSource, frames, volume
 
-from apps.viewer.page import Page, WaitingPage
+from apps.viewer.page import Page, serve_waiting
 from apps.viewer.session import Session
+from apps.viewer.source import Source
 from apps.viewer.sources import (
     GATE_AROUND_FRAME,
     SLICE_MODE,
@@ -41,14 +43,14 @@ FLAGS = (
 )
 LOADING_MS = 120_000  # a page and its first picture, while all cores compute something else
 PATIENCE_MS = 30_000  # a software renderer on a busy machine draws twice a second
+WINDOW = {"width": 1024, "height": 700}
 SCENE = "canvas[data-engine]"
+# Says whether a page may open a WebSocket and receives something.
 OPEN_SOCKET = """place => new Promise(decide => {
     const socket = new WebSocket(place, ["viser-v" + "VERSION"]);
     socket.onmessage = () => decide(true);
     socket.onclose = () => decide(false);
 })""".replace("VERSION", viser.__version__)
-"""Says whether a page may open a WebSocket and receives something."""
-
 HARMLESS = ("THREE.Clock", "GPU stall", "GroupMarkerNotSet", "Automatic fallback to software WebGL")
 
 
@@ -62,26 +64,51 @@ def browser() -> Iterator[Any]:
         opened.close()
 
 
-class Seen:
-    """A served session and the tab that looks at it."""
+def until(met: Callable[[], Any], what: str, patience_ms: float = PATIENCE_MS) -> None:
+    """Wait for something to become so."""
+    deadline = time.monotonic() + patience_ms / 1e3
+    while not met():
+        assert time.monotonic() < deadline, f"waited in vain until {what}"
+        time.sleep(0.05)
 
-    def __init__(self, browser: Any, session: Session) -> None:
-        self.page, self.complaints = Page(session), []
-        self._thread = threading.Thread(target=self.page.run, daemon=True)
-        self._thread.start()
-        self.tab = browser.new_page(viewport={"width": 1024, "height": 700})
+
+def succeeds(act: Callable[[], Any]) -> bool:
+    """Say whether something could be done; the page may just have drawn its place anew."""
+    try:
+        act()
+    except (playwright.Error, AssertionError):
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def serve(source: Source, waiting: Any = None) -> Iterator[Page]:
+    """A page of a source, while it is served."""
+    page = Page(Session(source), waiting=waiting)
+    thread = threading.Thread(target=page.run, daemon=True)
+    thread.start()
+    yield page
+    page.close()
+    thread.join(10)
+
+
+class Seen:
+    """A served page and the tab that looks at it."""
+
+    def __init__(self, browser: Any, page: Page) -> None:
+        self.page, self.session, self.complaints = page, page.session, []
+        self.tab = browser.new_page(viewport=WINDOW)
         self.tab.set_default_timeout(PATIENCE_MS)
         self.tab.on("console", self._listen)
         self.tab.on("pageerror", lambda fault: self.complaints.append(str(fault)))
-        self.tab.goto(self.page.address)
+        self.tab.goto(page.address)
         self.tab.locator("#label").wait_for(timeout=LOADING_MS)
-        notice = self.tab.locator(
-            "[class*=Notification-closeButton]"
-        )  # that the renderer is a slow one
+        # that the renderer is a slow one
+        notice = self.tab.locator("[class*=Notification-closeButton]")
         notice.first.wait_for(timeout=LOADING_MS)
         notice.first.click()
         until(self.is_framed, "the page has framed the cloud for this window", LOADING_MS)
-        until(lambda: picture(self).std() > 0.02, "the scene is drawn", LOADING_MS)
+        until(lambda: self.picture().std() > 0.02, "the scene is drawn", LOADING_MS)
 
     def _listen(self, line: Any) -> None:
         if line.type in ("error", "warning") and not any(word in line.text for word in HARMLESS):
@@ -104,27 +131,8 @@ class Seen:
         self.row(label).locator("input:not([type=hidden])").first.click()
         self.tab.get_by_role("option", name=option, exact=True).click()
 
-    def is_framed(self) -> bool:
-        """Whether every point lies in the free part of the window, and the cloud fills much of it."""
-        clients = list(self.page.server.get_clients().values())
-        canvas = self.tab.locator(SCENE).bounding_box()
-        if not clients or canvas is None or not self.is_drawn_by(clients[0], canvas):
-            return False
-        shape = round(canvas["height"]), round(canvas["width"])
-        row, column, _ = self.page.viewpoint.project(self.page.session.latest.cloud.xyz, shape)
-        inside = 0 < row.min() < row.max() < shape[0] and 0 < column.min() < column.max() < shape[1]
-        fills = max(np.ptp(row) / shape[0], np.ptp(column) / shape[1]) > 0.6
-        return bool(inside and fills)
-
-    def is_drawn_by(self, client: Any, canvas: Any) -> bool:
-        """Whether the browser has said that it looks from where it was sent, in a window of this size."""
-        try:
-            camera = client.camera
-            shape = camera.image_height, camera.image_width
-        except AssertionError:  # it has not said anything yet
-            return False
-        same_view = np.isclose(camera.fov, self.page.viewpoint.field_of_view, rtol=1e-3)
-        return bool(shape == (round(canvas["height"]), round(canvas["width"])) and same_view)
+    def press(self, button: str) -> None:
+        self.tab.get_by_role("button", name=button, exact=True).click()
 
     def tick(self, label: str) -> None:
         """Click a box until it has changed: the panel that holds it may still be moving."""
@@ -136,15 +144,72 @@ class Seen:
                 box.click(force=True)
             playwright.expect(box).to_be_checked(checked=wanted, timeout=2000)
 
-        until(lambda: _succeeds(click), f"'{label}' is {'' if wanted else 'un'}ticked")
+        until(lambda: succeeds(click), f"'{label}' is {'' if wanted else 'un'}ticked")
+
+    def save(self, button: str, path: Path) -> Path:
+        """Press a button that has a file downloaded."""
+        with self.tab.expect_download() as download:
+            self.press(button)
+        download.value.save_as(path)
+        return path
+
+    def text(self, place: str) -> str:
+        return str(self.tab.locator(place).inner_text())
+
+    def number(self, place: str) -> int:
+        return int(self.text(place))
+
+    def until_number(self, place: str, number: int) -> None:
+        until(lambda: self.number(place) == number, f"{place} says {number}")
+
+    def until_text(self, place: str, words: str) -> None:
+        until(lambda: words in self.text(place), f"{place} says '{words}'")
+
+    def until_other(self, before: np.ndarray, difference: float = 0.2) -> None:
+        until(lambda: np.abs(self.picture() - before).max() > difference, "the picture changes")
+
+    def picture(self) -> np.ndarray:
+        """What the scene looks like on the page."""
+        return imread(io.BytesIO(self.tab.locator(SCENE).screenshot()))[..., :3]
+
+    def find(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+        """Row and column of points in the picture of the scene, and its shape."""
+        canvas = self.tab.locator(SCENE).bounding_box()
+        shape = round(canvas["height"]), round(canvas["width"])
+        row, column, _ = self.page.viewpoint.project(xyz, shape)
+        return row, column, shape
+
+    def place(self, row: float, column: float) -> tuple[float, float]:
+        """Where a pixel of the scene lies in the window, from the left and the top."""
+        canvas = self.tab.locator(SCENE).bounding_box()
+        return canvas["x"] + column, canvas["y"] + row
+
+    def is_framed(self) -> bool:
+        """Whether the browser looks from where it was sent, every point lies in the free part of the
+        window, and the cloud fills much of it.
+        """
+        clients, canvas = (
+            list(self.page.server.get_clients().values()),
+            self.tab.locator(SCENE).bounding_box(),
+        )
+        if not clients or canvas is None:
+            return False
+        row, column, shape = self.find(self.session.latest.cloud.xyz)
+        try:
+            camera = clients[0].camera
+            if (camera.image_height, camera.image_width) != shape:
+                return False
+        except AssertionError:  # it has not said anything yet
+            return False
+        same_view = np.isclose(camera.fov, self.page.viewpoint.field_of_view, rtol=1e-3)
+        inside = 0 < row.min() < row.max() < shape[0] and 0 < column.min() < column.max() < shape[1]
+        fills = max(np.ptp(row) / shape[0], np.ptp(column) / shape[1]) > 0.6
+        return bool(same_view and inside and fills)
 
     def open_filters(self) -> None:
         """Unfold the filters, unless another test has done so."""
         if not self.row("clip box").is_visible():
             self.tab.get_by_text("filters", exact=True).click()
-
-    def press(self, button: str) -> None:
-        self.tab.get_by_role("button", name=button, exact=True).click()
 
     def reset_filters(self) -> bool:
         """Whether all points are shown after the button. A browser reports a drag in pieces, of
@@ -154,74 +219,43 @@ class Seen:
         self.tab.wait_for_timeout(500)
         return self.number("#points") == 85
 
-    def number(self, place: str) -> int:
-        return int(self.tab.locator(place).inner_text())
-
-    def close(self) -> None:
-        self.tab.close()
-        self.page.close()
-        self._thread.join(10)
-
-
-def until(met: Callable[[], bool], what: str, patience_ms: float = PATIENCE_MS) -> None:
-    """Wait for something to become so."""
-    deadline = time.monotonic() + patience_ms / 1e3
-    while not met():
-        assert time.monotonic() < deadline, f"waited in vain until {what}"
-        time.sleep(0.05)
-
-
-def _succeeds(act: Callable[[], Any]) -> bool:
-    """Say whether something could be done; the page may just have drawn its place anew."""
-    try:
-        act()
-    except (playwright.Error, AssertionError):
-        return False
-    return True
-
 
 @pytest.fixture(scope="module")
 def seen(browser: Any) -> Iterator[Seen]:
-    opened = Seen(browser, Session(TransientSource("frames <b>.h5", frames())))
-    yield opened
-    opened.close()
-
-
-def picture(seen: Seen) -> np.ndarray:
-    """What the scene looks like on the page."""
-    return imread(io.BytesIO(seen.tab.locator(SCENE).screenshot()))[..., :3]
+    with serve(TransientSource("frames <b>.h5", frames())) as page:
+        opened = Seen(browser, page)
+        yield opened
+        opened.tab.close()
 
 
 def test_it_loads(seen: Seen) -> None:
-    until(lambda: seen.number("#points") == 85, "all points are shown")
+    seen.until_number("#points", 85)
     assert seen.number("#frame-number") == 95
-    assert seen.tab.locator("#label").inner_text() == "REPLAY"
-    assert "frames <b>.h5" in seen.tab.locator("body").inner_text()  # no file name becomes HTML
-    until(lambda: picture(seen).std() > 0.02, "the scene is drawn")
-    assert seen.tab.get_by_text("range (m)").is_visible()
+    assert seen.text("#label") == "REPLAY"
+    assert "frames <b>.h5" in seen.text("body")  # no file name becomes HTML
     assert seen.tab.title() == "tofclip · frames <b>.h5"
-    assert "where you look from is your own" in seen.tab.locator("#shared").inner_text()
-    assert seen.tab.get_by_text("10.5 ns").is_visible()  # the time line
-    instant = seen.page.session.source.times[95]
-    words = seen.tab.locator("#instant").inner_text()
-    assert words == f"{1e9 * instant:.2f} ns, range {299792458 * instant / 2:.3f} m"
-    whole = picture(seen)
+    assert "where you look from is your own" in seen.text("#shared")
+    for words in ("range (m)", "10.5 ns"):  # the scale and the time line
+        assert seen.tab.get_by_text(words).is_visible()
+    instant = seen.session.source.times[95]
+    expected = f"{1e9 * instant:.2f} ns, range {299792458 * instant / 2:.3f} m"
+    assert seen.text("#instant") == expected
+    whole = seen.picture()
     seen.tick("box")
-    until(lambda: bool(np.abs(picture(seen) - whole).max() > 0.2), "the box disappears")
+    seen.until_other(whole)
     seen.tick("box")
     until(lambda: seen.tab.locator("img").count() >= 3, "streak, intensity and depth are shown")
 
 
 @pytest.mark.parametrize("size", [(1024, 700), (1280, 800), (1920, 1080)])
 def test_the_cloud_fits_between_the_panels(seen: Seen, size: tuple[int, int]) -> None:
-    """Every point lies in the free part of the window, and the cloud fills much of it."""
     seen.tab.set_viewport_size({"width": size[0], "height": size[1]})
     until(seen.is_framed, "the page has framed the cloud for this window")
     canvas = seen.tab.locator(SCENE).bounding_box()
-    panel = seen.tab.locator("#label").bounding_box()
     assert canvas["x"] >= 200  # right of the pictures
-    assert canvas["x"] + canvas["width"] <= panel["x"]  # left of the controls
-    seen.tab.set_viewport_size({"width": 1024, "height": 700})
+    # left of the controls
+    assert canvas["x"] + canvas["width"] <= seen.tab.locator("#label").bounding_box()["x"]
+    seen.tab.set_viewport_size(WINDOW)
 
 
 @pytest.mark.parametrize("seconds", [2.0, pytest.param(10.0, marks=pytest.mark.nightly)])
@@ -244,85 +278,53 @@ def test_no_control_moves_while_frames_pass(seen: Seen, seconds: float) -> None:
     seen.press(">|")
 
 
-def test_a_page_that_waits_becomes_the_page_in_the_same_tab(browser: Any) -> None:
-    """A raw shot takes seconds: the browser has loaded by then, and says what it waits for."""
-    waiting = WaitingPage("shot.tif", "recovering <b>shot.tif")
-    tab = browser.new_page(viewport={"width": 1024, "height": 700})
-    tab.goto(waiting.address)
-    tab.locator("#waiting").wait_for(timeout=LOADING_MS)
-    assert tab.locator("#waiting").inner_text() == "recovering <b>shot.tif ..."
-    page = Page(Session(PlaneSource()), waiting=waiting)
-    thread = threading.Thread(target=page.run, daemon=True)
-    thread.start()
-    tab.locator("#frame-number").wait_for(timeout=LOADING_MS)
-    assert tab.locator("#waiting").count() == 0
-    (client,) = page.server.get_clients().values()
-    until(lambda: page.viewpoint.is_close_to(look(client)), "the cloud is framed", LOADING_MS)
-    tab.close()
-    page.close()
-    thread.join(10)
-
-
-def look(client: Any) -> Viewpoint:
-    """Where a browser looks from."""
-    return Viewpoint(client.camera.position, client.camera.look_at, client.camera.fov)
-
-
 def test_play_pause_and_step(seen: Seen) -> None:
     seen.press("play")
     until(lambda: 0 < seen.number("#frame-number") < 95, "the frame advances")
     seen.press("pause")
-    until(lambda: not seen.page.session.clock.playing, "it stands still")
-    seen.press("|<")
-    until(lambda: seen.number("#frame-number") == 0, "the first frame is shown")
-    seen.press("+10")
-    until(lambda: seen.number("#frame-number") == 10, "ten frames further on")
+    until(lambda: not seen.session.clock.playing, "it stands still")
+    for button, frame in (("|<", 0), ("+10", 10)):
+        seen.press(button)
+        seen.until_number("#frame-number", frame)
     seen.type("frame", "40")
-    until(lambda: seen.number("#frame-number") == 40, "the frame that was typed is shown")
+    seen.until_number("#frame-number", 40)
     assert seen.number("#points") == 36  # of the nearer square
     seen.tab.keyboard.press("End")
-    until(lambda: seen.number("#points") == 85, "all points are shown again")
+    seen.until_number("#points", 85)
 
 
 def test_recolour(seen: Seen) -> None:
-    before = picture(seen)
+    before = seen.picture()
     seen.choose("colour", "intensity")
-    until(
-        lambda: "intensity (counts)" in seen.tab.locator("#scale").inner_text(), "the scale says so"
-    )
+    seen.until_text("#scale", "intensity (counts)")
     seen.choose("palette", "inferno")
-    until(lambda: bool(np.abs(picture(seen) - before).max() > 0.2), "the colours are others")
+    seen.until_other(before)
     seen.choose("colour", "range")
-    until(lambda: "range (m)" in seen.tab.locator("#scale").inner_text(), "they come back")
+    seen.until_text("#scale", "range (m)")
 
 
 def test_filter(seen: Seen) -> None:
     seen.open_filters()
     seen.type("range", "1.6", field=1)  # the squares are at 1.59 m and 1.68 m
-    until(lambda: seen.number("#points") == 36, "the farther square is left out")
+    seen.until_number("#points", 36)
     until(seen.reset_filters, "it is back")
 
 
 def test_the_clip_box_is_dragged_by_its_corners(seen: Seen) -> None:
-    until(lambda: seen.number("#points") == 85, "all points are shown")
+    seen.until_number("#points", 85)
     seen.open_filters()
-    before = picture(seen)
+    before = seen.picture()
     seen.tick("clip box")
     scene = seen.page.server.scene
     until(lambda: scene.get_handle_by_name("/clip/low") is not None, "there are handles")
     handle: Any = scene.get_handle_by_name("/clip/low")
-    canvas = seen.tab.locator(SCENE).bounding_box()
     # along the arrow that points right, until a part of the nearer square is outside
-    arrow = handle.position + np.outer((0.5, 2.5), (handle.scale, 0, 0))
-    shape = round(canvas["height"]), round(canvas["width"])
-    row, column, _ = seen.page.viewpoint.project(arrow, shape)
-    there = np.s_[
-        round(row[0]) - 4 : round(row[0]) + 5, round(column[0]) - 4 : round(column[0]) + 5
-    ]
-    until(lambda: bool(np.ptp(picture(seen)[there] - before[there]) > 0.2), "its arrow is drawn")
-    seen.tab.mouse.move(canvas["x"] + column[0], canvas["y"] + row[0])
+    row, column, _ = seen.find(handle.position + np.outer((0.5, 2.5), (handle.scale, 0, 0)))
+    there = tuple(slice(round(middle) - 4, round(middle) + 5) for middle in (row[0], column[0]))
+    until(lambda: np.ptp(seen.picture()[there] - before[there]) > 0.2, "its arrow is drawn")
+    seen.tab.mouse.move(*seen.place(row[0], column[0]))
     seen.tab.mouse.down()
-    seen.tab.mouse.move(canvas["x"] + column[1], canvas["y"] + row[1], steps=8)
+    seen.tab.mouse.move(*seen.place(row[0], column[1]), steps=8)
     seen.tab.mouse.up()
     until(lambda: seen.number("#points") < 85, "what lies outside of the box is left out")
     until(seen.reset_filters, "it is back")
@@ -331,18 +333,16 @@ def test_the_clip_box_is_dragged_by_its_corners(seen: Seen) -> None:
 
 
 def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
-    shown, before = seen.page.session.latest, picture(seen)
+    shown, before = seen.session.latest, seen.picture()
     assert shown is not None
-    canvas = seen.tab.locator(SCENE).bounding_box()
-    assert canvas is not None
-    near = shown.cloud.xyz[shown.cloud.range < 1.63].mean(axis=0, keepdims=True)
-    row, column, _ = seen.page.viewpoint.project(
-        near, (round(canvas["height"]), round(canvas["width"]))
-    )
-    seen.tab.mouse.click(canvas["x"] + column[0], canvas["y"] + row[0])
-    words = seen.tab.locator("#picked")
-    until(lambda: "range 1.58" in words.inner_text(), "the point is described")
-    assert "pixel row 1" in words.inner_text()
+
+    def click(points: np.ndarray) -> None:
+        row, column, _ = seen.find(shown.cloud.xyz[points].mean(axis=0, keepdims=True))
+        seen.tab.mouse.click(*seen.place(row[0], column[0]))
+
+    click(shown.cloud.range < 1.63)
+    seen.until_text("#picked", "range 1.58")
+    assert "pixel row 1" in seen.text("#picked")
     plot = seen.tab.locator(".uplot canvas")
 
     def shows_the_return() -> bool:
@@ -352,118 +352,83 @@ def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
         if place is None or not 0 < place["height"] <= 700 - place["y"]:  # without scrolling
             return False
         taken: list[bytes] = []
-        if not _succeeds(lambda: taken.append(plot.screenshot())):
+        if not succeeds(lambda: taken.append(plot.screenshot())):
             return False
         drawn = imread(io.BytesIO(taken[0]))
         red = (drawn[..., 0] > 0.6) & (drawn[..., 1] < 0.5)
         return bool(0.002 < red.mean() < 0.2)
 
     until(shows_the_return, "its waveform is drawn, with the return")
-    far = shown.cloud.xyz[shown.cloud.range > 1.63].mean(axis=0, keepdims=True)
-    row, column, _ = seen.page.viewpoint.project(
-        far, (round(canvas["height"]), round(canvas["width"]))
-    )
-    seen.tab.mouse.click(canvas["x"] + column[0], canvas["y"] + row[0])
-    until(lambda: "distance 0." in words.inner_text(), "the distance of both is shown")
-    until(lambda: bool(np.abs(picture(seen) - before).max() > 0.3), "both are marked")
-    assert np.abs(picture(seen) - before).mean() < 0.05  # marks are small: two balls and a line
+    click(shown.cloud.range > 1.63)
+    seen.until_text("#picked", "distance 0.")
+    seen.until_other(before, 0.3)
+    # marks are small: two balls and a line
+    assert np.abs(seen.picture() - before).mean() < 0.05
 
 
 def test_refocus(seen: Seen) -> None:
     seen.choose("time gate", GATE_AROUND_FRAME)
     seen.type("frame", "30")
-    until(lambda: seen.number("#points") == 36, "the gate is shown")
-    before = seen.page.session.latest
+    seen.until_number("#points", 36)
+    before = seen.session.latest
     seen.type("refocus", "1")
-    until(lambda: "quick look (linear)" in seen.tab.inner_text("body"), "it says how")
-    until(
-        lambda: (
-            seen.page.session.source.refocus.value == 1.0 and seen.page.session.latest is not before
-        ),
-        "it is recovered anew",
-    )
-    after = seen.page.session.latest
-    assert before is not None
-    assert after is not None
+    seen.until_text("body", "quick look (linear)")  # it says how
+    assert seen.session.source.refocus.value == 1.0
+    after = seen.session.latest
+    assert before.pixels is not None
     assert after.pixels is not None
     assert after.pixels[:, 0].mean() > before.pixels[:, 0].mean() + 1
     seen.type("refocus", "0")
-    until(lambda: seen.page.session.source.refocus.value == 0, "it is as it was")
+    until(lambda: seen.session.source.refocus.value == 0, "it is as it was")
 
 
 def test_screenshot_export_and_bookmark(seen: Seen, tmp_path: Path) -> None:
-    with seen.tab.expect_download() as download:
-        seen.press("screenshot")
-    download.value.save_as(tmp_path / "shot.png")
-    drawn = imread(tmp_path / "shot.png")[..., :3]
+    drawn = imread(seen.save("screenshot", tmp_path / "shot.png"))[..., :3]
     assert min(drawn.shape[:2]) > 300
     legend = drawn[-70:]
     assert legend.mean() > 0.8  # on white
     assert np.ptp(legend[:, :, 0] - legend[:, :, 2]) > 0.5  # the colours of the ranges
     assert drawn.std() > 0.01
-    with seen.tab.expect_download() as download:
-        seen.press("export")
-    download.value.save_as(tmp_path / "shown.ply")
-    assert len(PointCloud.load(tmp_path / "shown.ply")) == seen.number("#points")
+    exported = PointCloud.load(seen.save("export", tmp_path / "shown.ply"))
+    assert len(exported) == seen.number("#points")
     seen.press("bookmark")
-    until(
-        lambda: seen.row("view from").locator("input").first.input_value() == "view 1",
-        "the view is remembered",
-    )
+    field = seen.row("view from").locator("input").first
+    until(lambda: field.input_value() == "view 1", "the view is remembered")
     for preset in ("front", "top", "side", "camera", "start"):
         seen.choose("view from", preset)
 
 
-def test_k_shows_the_keys(seen: Seen) -> None:
+def test_k_shows_the_keys_and_nothing_was_complained_about(seen: Seen) -> None:
     seen.tab.evaluate("document.activeElement.blur()")  # into a box, a K is typed
     seen.tab.keyboard.press("k")
     seen.tab.get_by_text("play or pause").first.wait_for()
     seen.press("close")
-
-
-def test_nothing_was_complained_about(seen: Seen) -> None:
     assert seen.complaints == []
 
 
-def test_a_lost_connection_is_said_in_words(browser: Any) -> None:
-    seen = Seen(browser, Session(PlaneSource()))
-    words = seen.tab.locator(".tofclip-lost")
-    assert not words.is_visible()
-    seen.page.close()
-    until(words.is_visible, "the page says that no answer came")
-    assert words.inner_text().startswith("Connection lost: tofclip view has ended")
-    seen.close()
+def test_a_page_that_waits_becomes_the_page_in_the_same_tab_until_it_ends(browser: Any) -> None:
+    """A raw shot takes seconds: the browser has loaded by then, and says what it waits for."""
+    waiting = serve_waiting("shot.tif", "recovering <b>shot.tif")
+    tab = browser.new_page(viewport=WINDOW)
+    tab.goto(waiting[1])
+    tab.locator("#waiting").wait_for(timeout=LOADING_MS)
+    assert tab.locator("#waiting").inner_text() == "recovering <b>shot.tif ..."
+    lost = tab.locator(".tofclip-lost")
+    with serve(PlaneSource(), waiting) as page:
+        tab.locator("#frame-number").wait_for(timeout=LOADING_MS)
+        assert tab.locator("#waiting").count() == 0
+        (client,) = page.server.get_clients().values()
 
+        def is_framed() -> bool:
+            camera = client.camera
+            there = Viewpoint(camera.position, camera.look_at, camera.fov)
+            return page.viewpoint.is_close_to(there)
 
-def test_the_pages_of_other_servers_see_nothing(browser: Any) -> None:
-    """Not even in the browser that has the cookie, which it sends along to every port."""
-    page, second = Page(Session(PlaneSource())), Page(Session(PlaneSource()))
-    other = http.server.HTTPServer(("127.0.0.1", 0), EmptyPage)
-    threading.Thread(target=other.serve_forever, daemon=True).start()
-    context = browser.new_context()
-    tab, elsewhere = context.new_page(), f"http://127.0.0.1:{other.server_port}/"
-    bare = page.address.partition("?")[0]
-    socket_address = bare.replace("http:", "ws:")
-    try:
-        assert tab.goto(bare, timeout=LOADING_MS).status == 403
-        assert tab.goto(f"{page.address}x", timeout=LOADING_MS).status == 403
-        for one in (page, second):
-            assert tab.goto(one.address, timeout=LOADING_MS).status == 200
-        assert tab.goto(bare, timeout=LOADING_MS).status == 200  # the second's cookie is another
-        until(lambda: len(page.server.get_clients()) == 1, "the page has its WebSocket", LOADING_MS)
-        assert tab.evaluate(OPEN_SOCKET, socket_address)
-        assert tab.evaluate("document.cookie") == ""
-        tab.goto(elsewhere, timeout=LOADING_MS)
-        assert len(context.cookies(elsewhere)) == 2
-        assert not tab.evaluate(OPEN_SOCKET, socket_address)
-        tab.set_content(f"<iframe src='{bare}'></iframe>")
-        until(lambda: tab.frames[1].url == "chrome-error://chromewebdata/", "no frame shows it")
-    finally:
-        context.close()
-        other.shutdown()
-        other.server_close()
-        page.close()
-        second.close()
+        until(is_framed, "the cloud is framed", LOADING_MS)
+        assert not lost.is_visible()
+    until(lost.is_visible, "the page says that no answer came")
+    assert lost.inner_text().startswith("Connection lost: tofclip view has ended")
+    tab.close()
 
 
 class EmptyPage(http.server.BaseHTTPRequestHandler):
@@ -477,23 +442,50 @@ class EmptyPage(http.server.BaseHTTPRequestHandler):
         """Say nothing."""
 
 
+def test_the_pages_of_other_servers_see_nothing(browser: Any) -> None:
+    """Not even in the browser that has the cookie, which it sends along to every port."""
+    with contextlib.ExitStack() as stack:
+        page, second = (Page(Session(PlaneSource())) for _ in range(2))
+        other = stack.enter_context(http.server.HTTPServer(("127.0.0.1", 0), EmptyPage))
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        context = browser.new_context()
+        for end in (other.shutdown, page.close, second.close, context.close):
+            stack.callback(end)
+        tab, elsewhere = context.new_page(), f"http://127.0.0.1:{other.server_port}/"
+        bare = page.address.partition("?")[0]
+        socket_address = bare.replace("http:", "ws:")
+        for address, status in (
+            (bare, 403),
+            (f"{page.address}x", 403),
+            (page.address, 200),
+            (second.address, 200),
+            (bare, 200),  # the second's cookie is another
+        ):
+            assert tab.goto(address, timeout=LOADING_MS).status == status
+        until(lambda: len(page.server.get_clients()) == 1, "the page has its WebSocket", LOADING_MS)
+        assert tab.evaluate(OPEN_SOCKET, socket_address)
+        assert tab.evaluate("document.cookie") == ""
+        tab.goto(elsewhere, timeout=LOADING_MS)
+        assert len(context.cookies(elsewhere)) == 2
+        assert not tab.evaluate(OPEN_SOCKET, socket_address)
+        tab.set_content(f"<iframe src='{bare}'></iframe>")
+        until(lambda: tab.frames[1].url == "chrome-error://chromewebdata/", "no frame shows it")
+
+
 def test_a_volume_as_a_surface(browser: Any) -> None:
-    seen = Seen(browser, Session(VolumeSource("ball", volume())))
-    try:
+    with serve(VolumeSource("ball", volume())) as page:
+        seen = Seen(browser, page)
         until(lambda: seen.number("#points") > 10, "the maximum projection is shown first")
-        assert seen.tab.locator("#what").inner_text() == "maximum projection"
-        assert seen.tab.locator("#depth").inner_text() == "of all 21 slices"
+        assert seen.text("#what") == "maximum projection"
+        assert seen.text("#depth") == "of all 21 slices"
         assert seen.tab.locator("#frame-number").count() == 0  # it is not of slice 0
         seen.choose("show as", SLICE_MODE)
         seen.type("slice", "10")
-        until(
-            lambda: seen.tab.locator("#what").inner_text() == "slice 10 of 21", "the slice is named"
-        )
-        until(lambda: seen.tab.locator("#depth").inner_text() == "z 0.500 m", "its depth is said")
+        seen.until_text("#what", "slice 10 of 21")
+        seen.until_text("#depth", "z 0.500 m")
         seen.choose("show as", SURFACE_MODE)
         seen.type("threshold", "0.6")
-        until(lambda: seen.page.session.source.threshold.value == 0.6, "the threshold is set")
-        until(lambda: picture(seen).std() > 0.02, "the surface is drawn")
+        until(lambda: page.session.source.threshold.value == 0.6, "the threshold is set")
+        until(lambda: seen.picture().std() > 0.02, "the surface is drawn")
         assert seen.complaints == []
-    finally:
-        seen.close()
+        seen.tab.close()
