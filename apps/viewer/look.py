@@ -86,6 +86,7 @@ class Scale:
     unit: str
     palette: str
     values: FloatArray  # (256,), value of each colour, rising
+    full_light: float = 0.0  # intensity from which on points are not shaded; 0 where none are
 
     @property
     def limits(self) -> Limits:
@@ -117,7 +118,11 @@ def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
         thinned = inside[:: max(1, inside.size // MAX_RANKED_POINTS)].astype(np.float64)
         scale = np.quantile(thinned, np.linspace(0, 1, PALETTE_SIZE))
         scale[0], scale[-1] = low, high
-    return Scale(colouring.quantity, unit, colouring.palette, scale)
+    full_light = 0.0
+    # Intensity is in the colour already.
+    if colouring.shaded and colouring.quantity != "intensity" and np.any(np.diff(cloud.intensity)):
+        full_light = float(np.percentile(cloud.intensity, FULL_LIGHT_PERCENTILE))
+    return Scale(colouring.quantity, unit, colouring.palette, scale, full_light)
 
 
 def _find_limits(values: NDArray[Any]) -> Limits:
@@ -130,23 +135,14 @@ def _find_limits(values: NDArray[Any]) -> Limits:
     return low - 0.5, low + 0.5  # all values alike, to rounding: any width will do but zero
 
 
-def colour_points(cloud: PointCloud, scale: Scale, brightest: float = 0.0) -> NDArray[np.uint8]:
-    """Return each point's red, green and blue, (n, 3), in full light from the intensity `brightest`
-    on; all alike where it is 0.
-    """
+def colour_points(cloud: PointCloud, scale: Scale) -> NDArray[np.uint8]:
+    """Return each point's red, green and blue, (n, 3)."""
     colours = scale.colours(QUANTITIES[scale.quantity][1](cloud))
-    if brightest <= 0 or scale.quantity == "intensity":  # which is in the colour already
+    if scale.full_light <= 0:
         return colours
-    light = np.clip(cloud.intensity / np.float32(brightest), 0, 1) ** np.float32(GAMMA)
+    light = np.clip(cloud.intensity / np.float32(scale.full_light), 0, 1) ** np.float32(GAMMA)
     shade = MIN_SHADE + (1 - MIN_SHADE) * light
     return np.asarray(colours * shade[:, np.newaxis], np.uint8)
-
-
-def find_full_light(cloud: PointCloud) -> float:
-    """Return the intensity that is drawn in full light; 0 where all points are alike."""
-    if len(cloud) == 0 or np.ptp(cloud.intensity) == 0:
-        return 0.0
-    return float(np.percentile(cloud.intensity, FULL_LIGHT_PERCENTILE))
 
 
 def format_length(length: float) -> str:

@@ -16,7 +16,6 @@ from apps.viewer.look import (
     Pick,
     Scale,
     colour_points,
-    find_full_light,
     find_point_on_ray,
     make_scale,
     project_front,
@@ -151,12 +150,11 @@ def render_frame(
     lit = view.cloud.intensity >= source.min_intensity
     usual = view.cloud if lit.all() or not lit.any() else view.cloud[lit]
     scale = make_scale(usual, colouring)
-    brightest = find_full_light(usual) if colouring.shaded else 0.0
     kept = filters.select(view.cloud) & Filters(time=view.times).select(view.cloud)
     shown = view if kept.all() else view.select(kept)
     number = f"{source.frame_name} {frame}" if len(source) > 1 else ""
     facts = {**vars(shown), "caption": view.caption or number}
-    colours = colour_points(shown.cloud, scale, brightest)
+    colours = colour_points(shown.cloud, scale)
     points = whole_points if is_thinned else len(shown.cloud)
     return DisplayedFrame(**facts, frame=frame, colours=colours, scale=scale, points=points)
 

@@ -532,11 +532,9 @@ class LiveShotSource(ShotSource):
         super().__init__(title, camera, first.times, method)
         self._cache: deque[tuple[Readings, View]] = deque(maxlen=MAX_CACHED_SHOTS)
         self._arrivals: deque[float] = deque(maxlen=RATE_WINDOW_SHOTS + 1)
-        self._count, self._failure_text = 0, ""
-        self._latency, self._lost = float("nan"), 0
+        self._count, self._inflow = 0, Inflow(is_live=True)
         self._pipeline = RangingPipeline(camera, first.times)
         self._lock, self._stopping = threading.Lock(), threading.Event()
-        self._ended = False
         rectifier = self._pipeline.rectifier
         measurements = rectifier.measure(first.counts, first.saturated).values
         self._append_entry(measurements, make_view(self._pipeline.find_returns(measurements)))
@@ -549,13 +547,11 @@ class LiveShotSource(ShotSource):
     @property
     def inflow(self) -> Inflow:
         with self._lock:
-            rate = 0.0
-            if len(self._arrivals) > 1 and not self._ended:
+            oldest, rate = self._count - len(self._cache), 0.0
+            if len(self._arrivals) > 1 and self._inflow.is_live:
                 span = self._arrivals[-1] - self._arrivals[0]
                 rate = (len(self._arrivals) - 1) / max(span, 1e-9)
-            oldest = self._count - len(self._cache)
-            state = (self._latency, self._lost, self._failure_text)
-            return Inflow(oldest, not self._ended, rate, *state)
+            return replace(self._inflow, oldest=oldest, data_rate=rate)
 
     def view_at(self, number: int, shear: float) -> View:
         return super().view_at(number, shear) if shear else self._find_entry(number)[1]
@@ -586,14 +582,15 @@ class LiveShotSource(ShotSource):
                         stamp = self._shots.get_stamp(made.shot + 1)  # the first one is shown
                         self._append_entry(made.measurements, make_view(made.returns, made.cloud))
                         age = stamp.compute_age()
-                        self._latency = made.latency if age is None else age
-                        self._lost = self._shots.count_dropped(stamp, self._count)
+                        latency = made.latency if age is None else age
+                        lost = self._shots.count_dropped(stamp, self._count)
+                        self._inflow = replace(self._inflow, latency=latency, lost=lost)
         except Exception as fault:
             # Whatever ends it is shown on the page: an exception on this thread would be lost.
-            self._failure_text = format_error_line(fault)
+            self._inflow = replace(self._inflow, failure_text=format_error_line(fault))
         finally:
-            self._lost = self._shots.count_shots(self._count).dropped
-            self._ended = True
+            lost = self._shots.count_shots(self._count).dropped
+            self._inflow = replace(self._inflow, is_live=False, lost=lost)
 
     def _append_entry(self, measurements: Readings, view: View) -> None:
         if not self.is_linear:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.figures.style import DOTS_PER_INCH, make_figure, save_figure
 from apps.mp4 import open_film
@@ -77,8 +76,26 @@ class RasterRenderer:
     def draw(
         self, shown: DisplayedFrame, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int
     ) -> Image:
-        """Return a picture, as `PyvistaRenderer.draw` does; surfaces appear as their points."""
-        return rasterise_points(shown.cloud.xyz, shown.colours, viewpoint, shape, point_px)
+        """Return a picture, as `PyvistaRenderer.draw` does; surfaces appear as their points, and
+        points as squares, near ones over far ones.
+        """
+        picture = np.full((*shape, 3), BACKGROUND, np.uint8)
+        row, column, depth = viewpoint.project(shown.cloud.xyz, shape)
+        middle = shape[0] / 2, shape[1] / 2
+        with np.errstate(invalid="ignore"):
+            seen = (np.abs(row - middle[0]) < shape[0]) & (np.abs(column - middle[1]) < shape[1])
+        order = np.flatnonzero(seen)
+        # of writes to one pixel the last one stays
+        order = order[np.argsort(-depth[order], kind="stable")]
+        corner = np.stack([row[order], column[order]]) - (point_px - 1) / 2
+        # All pixels of one point before those of the next, or far points would show at the edges of
+        # near ones.
+        offsets = np.indices((point_px, point_px)).reshape(2, 1, -1)
+        rows, columns = (np.rint(corner).astype(np.intp)[..., np.newaxis] + offsets).reshape(2, -1)
+        inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
+        colours = shown.colours[order].repeat(point_px**2, axis=0)
+        picture[rows[inside], columns[inside]] = colours[inside]
+        return picture
 
 
 Renderer = PyvistaRenderer | RasterRenderer
@@ -114,31 +131,6 @@ def add_to_plotter(plotter: Any, shown: DisplayedFrame, point_px: int) -> None:
         points["colour"] = shown.colours
         look = {"rgb": True, "point_size": point_px, "lighting": False, "name": "shown"}
         plotter.add_mesh(points, scalars="colour", **look)
-
-
-def rasterise_points(
-    xyz: NDArray[np.float32],
-    colours: NDArray[np.uint8],
-    viewpoint: Viewpoint,
-    shape: tuple[int, int],
-    size_px: int,
-) -> Image:
-    """Draw points (n, 3) as squares, near ones over far ones, into a picture (rows, columns, 3)."""
-    picture = np.full((*shape, 3), BACKGROUND, np.uint8)
-    row, column, depth = viewpoint.project(xyz, shape)
-    with np.errstate(invalid="ignore"):
-        seen = (np.abs(row - shape[0] / 2) < shape[0]) & (np.abs(column - shape[1] / 2) < shape[1])
-    order = np.flatnonzero(seen)
-    # of writes to one pixel the last one stays
-    order = order[np.argsort(-depth[order], kind="stable")]
-    corner = np.stack([row[order], column[order]]) - (size_px - 1) / 2
-    # All pixels of one point before those of the next, or far points would show at the edges of
-    # near ones.
-    offsets = np.indices((size_px, size_px)).reshape(2, 1, -1)
-    rows, columns = (np.rint(corner).astype(np.intp)[..., np.newaxis] + offsets).reshape(2, -1)
-    inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
-    picture[rows[inside], columns[inside]] = colours[order].repeat(size_px**2, axis=0)[inside]
-    return picture
 
 
 PICTURE_SHAPE_PX = (640, 960)

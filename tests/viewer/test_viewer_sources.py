@@ -47,7 +47,7 @@ from apps.viewer.sources import (
     render_depth,
 )
 from tofclip.camera import registration
-from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.errors import FileFormatError, InputError
 from tofclip.io.streaks import save_stack
 from tofclip.lidar import PointCloud
 from tofclip.sequences.ranger import RangingPipeline, SummedShot
@@ -426,22 +426,6 @@ def test_an_instruments_address() -> None:
     assert source.inflow.data_rate > 0
     source.close()
     assert not source.inflow.is_live
-
-
-def test_what_cannot_be_looked_at(tmp_path: Path, folder: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "text.txt").write_text("hello")
-    (tmp_path / "cut.h5").write_bytes((folder / "frames.h5").read_bytes()[:3000])
-    for name, fault in (
-        (tmp_path / "absent.h5", StorageError),
-        (tmp_path / "empty", InputError),
-        (tmp_path / "text.txt", FileFormatError),
-        (tmp_path / "cut.h5", FileFormatError),
-        (folder / "camera.h5", FileFormatError),
-        ("nothing://x", InputError),
-    ):
-        with pytest.raises(fault):
-            open_source(str(name))
 
 
 @pytest.mark.parametrize("brightest", [0, 1, 2])

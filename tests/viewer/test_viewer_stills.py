@@ -10,6 +10,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,6 @@ from apps.viewer.still import (
     SceneFigure,
     has_working_graphics,
     open_window,
-    rasterise_points,
     save_film,
 )
 from apps.viewer.viewpoint import Viewpoint, measure_point_spacing, place_viewpoint
@@ -41,7 +41,6 @@ from tofclip.errors import InputError, MissingDependencyError
 from tofclip.recovery import Shot
 
 ROOT = Path(tofclip.__file__).parents[1]
-PROGRAM = [sys.executable, "-m", "tofclip", "view"]
 
 
 @pytest.fixture(scope="module")
@@ -67,22 +66,23 @@ class CloudsSource(PlaneSource):
         return View(make_cloud(self._xyz, {"intensity": np.ones(len(self._xyz))}))
 
 
-def test_near_points_hide_far_ones() -> None:
+def test_near_points_hide_far_ones_however_many_there_are() -> None:
+    def draw(xyz: Any, colours: Any, *how: Any) -> Any:
+        shown: Any = SimpleNamespace(cloud=SimpleNamespace(xyz=xyz), colours=colours)
+        return RasterRenderer().draw(shown, *how)
+
     ahead = Viewpoint(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.deg2rad(90.0))
     xyz = np.array([[0.0, 0, 1], [0, 0, 2], [0.5, 0.5, 2]], np.float32)
     colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
     for order in ([0, 1, 2], [2, 1, 0]):
-        picture = rasterise_points(xyz[order], colours[order], ahead, (101, 101), 3)
+        picture = draw(xyz[order], colours[order], ahead, (101, 101), 3)
         assert picture[50, 50].tolist() == [255, 0, 0]
         assert picture[62:65, 62:65].reshape(-1, 3).tolist() == [[0, 0, 255]] * 9
         assert (picture == BACKGROUND).all(axis=-1).sum() == 101 * 101 - 18
-    assert (rasterise_points(xyz[:0], colours[:0], ahead, (11, 11), 3) == BACKGROUND).all()
-
-
-def test_a_million_points_are_drawn_at_once() -> None:
+    assert (draw(xyz[:0], colours[:0], ahead, (11, 11), 3) == BACKGROUND).all()
     xyz = plane(1_000_000).xyz
-    colours = np.full((len(xyz), 3), 200, np.uint8)
-    picture = rasterise_points(xyz, colours, place_viewpoint(xyz), PICTURE_SHAPE_PX, 2)
+    grey = np.full((len(xyz), 3), 200, np.uint8)
+    picture = draw(xyz, grey, place_viewpoint(xyz), PICTURE_SHAPE_PX, 2)
     assert (picture == 200).all(axis=-1).mean() > 0.3
 
 
@@ -199,23 +199,6 @@ def test_a_window_without_a_display_says_what_is_missing(
         open_window(Session(PlaneSource()))
 
 
-@pytest.mark.parametrize(
-    "words",
-    ["--png picture.jpg", "--png a.png --mp4 a.mp4", "--host example.org", "--png missing/a.png"],
-)
-def test_what_cannot_be_is_said_in_a_line(
-    words: str,
-    cloud: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["view", str(cloud), *words.split()]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_the_page_of_a_raw_shot_opens_before_it_is_recovered(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -262,16 +245,10 @@ def test_the_page_is_served_without_graphics_display_or_open3d(cloud: Path, tmp_
     """Libraries that cannot be imported stand for a machine that does not have them."""
     for name in ("open3d", "pyvista", "vtk"):
         (tmp_path / f"{name}.py").write_text("raise ImportError('not on this machine')\n")
-    there: Any = {
-        "cwd": ROOT,
-        "env": {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}", "DISPLAY": ""},
-        "text": True,
-    }
-    picture = [*PROGRAM, str(cloud), "--png", str(tmp_path / "cloud.png"), "--json"]
-    done = subprocess.run(picture, capture_output=True, timeout=60, check=False, **there)
-    assert (done.returncode, json.loads(done.stdout)["backend"]) == (0, "matplotlib")
-    words = [*PROGRAM, str(cloud), "--no-browser", "--json"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, **there) as page:
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}", "DISPLAY": ""}
+    words = [sys.executable, "-m", "tofclip", "view", str(cloud), "--no-browser", "--json"]
+    there: Any = {"cwd": ROOT, "env": environment, "text": True, "stdout": subprocess.PIPE}
+    with subprocess.Popen(words, **there) as page:
         try:
             assert page.stdout is not None
             address = json.loads(page.stdout.readline())["address"]
