@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +15,7 @@ from tofclip.errors import InputError, MissingDependencyError
 
 
 @pytest.fixture
-def frames() -> tofclip.Frames:
+def frames():
     camera = tofclip.Camera(np.array([8.0, 24.0]), np.zeros(2), (6, 5), 32, time_zero=-1e-9)
     times = 10e-9 + 1e-10 * np.arange(50)
     values = np.random.default_rng(0).random((50, 6, 5), dtype=np.float32)
@@ -26,7 +23,7 @@ def frames() -> tofclip.Frames:
 
 
 @pytest.fixture
-def cloud() -> tofclip.PointCloud:
+def cloud():
     xyz = np.random.default_rng(1).uniform(1, 2, (40, 3)).astype(np.float32)
     distance = np.linalg.norm(xyz, axis=1)
     one = np.ones(40)
@@ -37,7 +34,7 @@ GRID = nlos.Grid.box((0, 5), (0, 4), (1, 4), 1.0)
 VOLUME = nlos.Volume(np.ones((4, 5, 6), np.float32), GRID)
 
 
-def test_frames_are_sliced_and_selected(frames: tofclip.Frames) -> None:
+def test_frames_are_sliced_and_selected(frames):
     some = frames[10:20]
     assert len(some) == 10
     assert np.array_equal(np.asarray(some), frames.values[10:20])
@@ -52,10 +49,10 @@ def test_frames_are_sliced_and_selected(frames: tofclip.Frames) -> None:
         with pytest.raises(InputError):
             frames.sel(**wrong)
     with pytest.raises(InputError, match="slice"):
-        frames[3]  # type: ignore[index]
+        frames[3]
 
 
-def test_points_are_selected(cloud: tofclip.PointCloud) -> None:
+def test_points_are_selected(cloud):
     near = cloud[cloud.range < 2.5]
     assert 0 < len(near) < len(cloud)
     assert near.range.max() < 2.5
@@ -64,9 +61,7 @@ def test_points_are_selected(cloud: tofclip.PointCloud) -> None:
         cloud[np.ones(3, bool)]
 
 
-def test_a_line_and_a_page_say_what_is_held(
-    frames: tofclip.Frames, cloud: tofclip.PointCloud
-) -> None:
+def test_a_line_and_a_page_say_what_is_held(frames, cloud):
     assert repr(frames) == "Frames(50 frames of 6 x 5 pixels, range 1.5 to 2.23 m)"
     no_zero = replace(frames, camera=frames.camera.replace(time_zero=0.0))
     assert repr(no_zero).endswith("2.23 m up to a constant, no time zero given)")
@@ -88,24 +83,18 @@ def test_a_line_and_a_page_say_what_is_held(
     assert "range" in cloud._repr_html_()
 
 
-def test_objects_become_those_of_other_libraries(
-    frames: tofclip.Frames, cloud: tofclip.PointCloud
-) -> None:
+def test_objects_become_those_of_other_libraries(frames, cloud):
     streak = tofclip.Streak(np.ones((9, 7)))
     assert np.array_equal(np.asarray(frames), frames.values)
     assert np.array_equal(np.asarray(cloud), cloud.xyz)
     assert np.array_equal(np.asarray(VOLUME), VOLUME.values)
     assert np.array_equal(np.asarray(streak), streak.counts)
     pytest.importorskip("torch", reason="pip install torch")
-    for tensor, array in (
-        (frames.to_torch(), frames.values),
-        (cloud.to_torch(), cloud.xyz),
-        (VOLUME.to_torch(), VOLUME.values),
-    ):
-        assert np.array_equal(tensor.numpy(), array)
+    for one, array in ((frames, frames.values), (cloud, cloud.xyz), (VOLUME, VOLUME.values)):
+        assert np.array_equal(one.to_torch().numpy(), array)
 
 
-def test_labelled_arrays_carry_times_and_places(frames: tofclip.Frames) -> None:
+def test_labelled_arrays_carry_times_and_places(frames):
     pytest.importorskip("xarray", reason="pip install 'tofclip[notebook]'")
     labelled = frames.to_xarray()
     assert labelled.dims == ("time", "y", "x")
@@ -116,7 +105,7 @@ def test_labelled_arrays_carry_times_and_places(frames: tofclip.Frames) -> None:
     assert np.array_equal(VOLUME.to_xarray().z.values, VOLUME.grid.z)
 
 
-def test_points_become_a_table(cloud: tofclip.PointCloud) -> None:
+def test_points_become_a_table(cloud):
     pytest.importorskip("pandas", reason="pip install 'tofclip[notebook]'")
     table = cloud.to_pandas()
     assert list(table.columns[:4]) == ["x", "y", "z", "intensity"]
@@ -124,11 +113,11 @@ def test_points_become_a_table(cloud: tofclip.PointCloud) -> None:
 
 
 @pytest.mark.usefixtures("open3d")
-def test_points_become_open3ds(cloud: tofclip.PointCloud) -> None:
+def test_points_become_open3ds(cloud):
     assert np.allclose(np.asarray(cloud.to_open3d().points), cloud.xyz)
 
 
-def test_pictures_are_drawn_where_asked(frames: tofclip.Frames, cloud: tofclip.PointCloud) -> None:
+def test_pictures_are_drawn_where_asked(frames, cloud):
     figure = Figure()
     axes = figure.subplots(1, 3)
     for one, ax in zip((frames, cloud, VOLUME), axes, strict=True):
@@ -148,36 +137,27 @@ def test_pictures_are_drawn_where_asked(frames: tofclip.Frames, cloud: tofclip.P
         ("torch", lambda frames, cloud: frames.to_torch()),
     ],
 )
-def test_a_missing_library_is_named_in_a_line(
-    monkeypatch: pytest.MonkeyPatch,
-    frames: tofclip.Frames,
-    cloud: tofclip.PointCloud,
-    package: str,
-    export: Callable[[tofclip.Frames, tofclip.PointCloud], Any],
-) -> None:
+def test_a_missing_library_is_named_in_a_line(monkeypatch, frames, cloud, package, export):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(MissingDependencyError, match=f"pip install {package}") as fault:
         export(frames, cloud)
     assert "\n" not in str(fault.value)
 
 
-def test_wrong_types_and_names_are_refused_by_our_own_errors(
-    frames: tofclip.Frames, cloud: tofclip.PointCloud, tmp_path: Path
-) -> None:
+def test_wrong_types_and_names_are_refused_by_our_own_errors(frames, cloud, tmp_path):
     values, times, camera = frames.values, frames.times, frames.camera
-    calls: dict[Callable[[], Any], str] = {
+    calls = {
         lambda: frames.save(tmp_path / "frames.npz"): r"must end in \.h5 or \.hdf5",
         lambda: cloud.save(tmp_path / "cloud.xyz"): r"\.xyz",
-        lambda: tofclip.recover("shot.tif"): r"see tofclip\.read_streak, not a str",  # type: ignore[arg-type]
-        lambda: tofclip.depth(values): "not a ndarray",  # type: ignore[arg-type]
-        lambda: tofclip.point_cloud(frames): "not a Frames",  # type: ignore[arg-type]
+        lambda: tofclip.recover("shot.tif"): r"see tofclip\.read_streak, not a str",
+        lambda: tofclip.depth(values): "not a ndarray",
+        lambda: tofclip.point_cloud(frames): "not a Frames",
         lambda: tofclip.Frames([1.0], times, camera): "not a list",
-        lambda: tofclip.Frames(values, times, "camera.h5"): "not a str",  # type: ignore[arg-type]
-        lambda: tofclip.Frames("a", "b", "c"): "belong to a Camera",  # type: ignore[arg-type]
-        **{
-            lambda limits=limits: frames.sel(range=limits): "limits"
-            for limits in ("near", 2, (1, 2, 3))
-        },
+        lambda: tofclip.Frames(values, times, "camera.h5"): "not a str",
+        lambda: tofclip.Frames("a", "b", "c"): "belong to a Camera",
+        lambda: frames.sel(range="near"): "limits",
+        lambda: frames.sel(range=2): "limits",
+        lambda: frames.sel(range=(1, 2, 3)): "limits",
         lambda: cloud["near"]: "slice, a mask or numbers",
         lambda: cloud[3]: r"one point is cloud\[3:4\]",
         lambda: frames[60:70]: "no frame is selected of 50",
@@ -189,24 +169,24 @@ def test_wrong_types_and_names_are_refused_by_our_own_errors(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_number_is_not_taken_for_a_file_that_is_open(tmp_path: Path) -> None:
+def test_a_number_is_not_taken_for_a_file_that_is_open(tmp_path):
     """Python's `open` takes a number for one of the process's files, and closes it afterwards."""
     with open(tmp_path / "mine.txt", "w") as mine:
         for read in (tofclip.load, tofclip.read_streak, tofclip.Camera.load):
             with pytest.raises(InputError, match="a file is given by its name, not a int"):
-                read(mine.fileno())  # type: ignore[arg-type]
+                read(mine.fileno())
         mine.write("still open")
     assert (tmp_path / "mine.txt").read_text() == "still open"
 
 
-def test_wrong_types_are_refused_around_the_corner(frames: tofclip.Frames) -> None:
+def test_wrong_types_are_refused_around_the_corner(frames):
     hybrid = nlos.Hybrid(wavelength=0.05)
     grid = nlos.Grid.box((0, 5), (0, 4), (1, 4), 1.0)
-    calls: tuple[Callable[[], Any], ...] = (
-        lambda: nlos.Capture.from_frames(3),  # type: ignore[arg-type]
-        lambda: nlos.Grid.in_front_of(frames, voxel=0.01),  # type: ignore[arg-type]
-        lambda: nlos.Hybrid(wavelength="long"),  # type: ignore[arg-type]
-        lambda: hybrid.reconstruct(frames, grid),  # type: ignore[arg-type]
+    calls = (
+        lambda: nlos.Capture.from_frames(3),
+        lambda: nlos.Grid.in_front_of(frames, voxel=0.01),
+        lambda: nlos.Hybrid(wavelength="long"),
+        lambda: hybrid.reconstruct(frames, grid),
     )
     for call in calls:
         with pytest.raises(InputError, match="not a"):

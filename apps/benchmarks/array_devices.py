@@ -10,7 +10,6 @@ there.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -19,28 +18,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.benchmarks.harness import Prepare, PreparedCase
-from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
-from nlos.capture import TimeAxis
-from nlos.illumination import AliasingWarning
-from nlos.method import Method
-from nlos.simulate import PointScene, build_relay_wall
+from apps.benchmarks.nlos import RELIEF_M, make_scene
+from apps.benchmarks.shots import (
+    ANGLES_RAD,
+    CENTRES_PX,
+    ITERATIONS,
+    SLIT_WIDTH_PX,
+    make_operator,
+)
+from nlos import Backprojection, Capture, Hybrid, PlanarRSD
+from nlos.method import Method as Imaging
 from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy
 from tofclip.camera import Camera
 from tofclip.lidar import depth
 from tofclip.shots import Frames
-from tofclip.solvers import LinearInverse, Sparse, TotalVariation
+from tofclip.solvers import LinearInverse, Method, Sparse, TotalVariation
 
 DEVICE_VARIABLE = "TOFCLIP_BENCH_DEVICE"
-VIEWS, FRAMES, ITERATIONS = 7, 1016, 30
+FRAMES = 1016
 BIN_S, FIRST_BIN_S = 20e-12, 10e-9
 NOISE, PEAK = 3.0, 100.0
 CARDS = 8  # a side
-HIDDEN_POINTS_M = [[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4], [-0.6, -0.6, 1.1]]
-LASER_M = [0.1, 0.05, 0.02]
-WALL_WIDTH_M = 2.0
-AXIS = TimeAxis(512, 32e-12)
-JITTER_S = 60e-12
-WALL_POINTS_PER_WAVELENGTH = 4
 
 
 def find_device() -> ComputeDevice:
@@ -48,20 +46,17 @@ def find_device() -> ComputeDevice:
     return parse_device(os.environ.get(DEVICE_VARIABLE) or "torch:cpu")
 
 
-def make_shot(side: int) -> tuple[Camera, NDArray[np.float32]]:
-    """A camera, and what it measures of 8 x 8 cards at random ranges, (measurements, frames)."""
+def make_cards(side: int) -> NDArray[np.float32]:
+    """Pictures (side, side, frames) of 8 x 8 cards at random ranges."""
     random = np.random.default_rng(0)
-    spacing = 0.8 * side
-    angles = np.radians(np.linspace(-41, 41, VIEWS))
-    width = round((VIEWS - 1) * spacing + 1.6 * side)
-    centres = 0.8 * side + spacing * np.arange(VIEWS, dtype=np.float64)
-    camera = Camera(centres, angles, (side, side), width, pulse_fwhm=3 * BIN_S)
     delay = np.arange(FRAMES) - random.uniform(0, FRAMES, (CARDS, CARDS, 1))
     cards = PEAK * np.exp(-4 * np.log(2) * (delay / 3) ** 2).astype(np.float32)
-    truth = np.repeat(np.repeat(cards, side // CARDS, axis=0), side // CARDS, axis=1)
-    measurements = camera.operator()(np.ascontiguousarray(truth))
-    noise = NOISE * random.standard_normal(measurements.shape, np.float32)
-    return camera, measurements + noise
+    return np.repeat(np.repeat(cards, side // CARDS, axis=0), side // CARDS, axis=1)
+
+
+def add_noise(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values with readout noise."""
+    return values + NOISE * np.random.default_rng(1).standard_normal(values.shape, np.float32)
 
 
 def wait_for(result: Array) -> Array:
@@ -87,24 +82,21 @@ def compare_devices(
     )
 
 
-def prepare_recovery(method: str, side: int) -> PreparedCase:
-    """Frames from a shot's measurements by ``l1``, ``tv`` or ``linear``."""
-    camera, measurements = make_shot(side)
-    operator = camera.operator()
-    inverse = LinearInverse().prepare(operator)
-    recover: dict[str, Callable[[Array], Array]] = {
-        "l1": lambda given: Sparse(iterations=ITERATIONS).recover(operator, given).frames,
-        "tv": lambda given: TotalVariation(iterations=ITERATIONS).recover(operator, given).frames,
-        "linear": lambda given: inverse.recover(given).frames,
-    }
+def prepare_recovery(method: Method, side: int) -> PreparedCase:
+    """Frames from a shot's measurements; the linear inverse is prepared beforehand."""
+    operator = make_operator(side)
+    measurements = add_noise(operator(make_cards(side)))
+    recover: Callable[[Array], Any] = partial(method.recover, operator)
+    if isinstance(method, LinearInverse):
+        recover = method.prepare(operator).recover
     moved = find_device().put(measurements)
-    return compare_devices(recover[method], measurements, moved, FRAMES)
+    return compare_devices(lambda given: recover(given).frames, measurements, moved, FRAMES)
 
 
 def prepare_ranging(side: int) -> PreparedCase:
     """Ranges of all returns in frames."""
-    camera, measurements = make_shot(side)
-    values = LinearInverse().prepare(camera.operator()).recover(measurements).frames
+    camera = Camera(CENTRES_PX, ANGLES_RAD, (side, side), SLIT_WIDTH_PX, pulse_fwhm=3 * BIN_S)
+    values = add_noise(np.ascontiguousarray(np.moveaxis(make_cards(side), -1, 0)))
     times = FIRST_BIN_S + BIN_S * np.arange(FRAMES, dtype=np.float64)
 
     def find_ranges(given: Array) -> Array:
@@ -114,19 +106,12 @@ def prepare_ranging(side: int) -> PreparedCase:
 
 
 def prepare_imaging(
-    make_method: Callable[[float], Method], shape: str, confocal: bool, side: int
+    make_method: Callable[[float], Imaging], relief: float, confocal: bool, side: int
 ) -> PreparedCase:
-    """A hidden volume from a simulated capture of a wall of some shape; `make_method`: from a
+    """A hidden volume from a simulated capture of a wall with some relief, m; `make_method`: from a
     wavelength in m.
     """
-    warnings.simplefilter("ignore", AliasingWarning)
-    wavelength = WALL_POINTS_PER_WAVELENGTH * WALL_WIDTH_M / (side - 1)
-    wall = build_relay_wall(shape, side, WALL_WIDTH_M)
-    capture = PointScene(np.array(HIDDEN_POINTS_M)).simulate_capture(
-        wall, wall if confocal else LASER_M, AXIS, JITTER_S
-    )
-    across = np.linspace(-WALL_WIDTH_M / 2, WALL_WIDTH_M / 2, side)
-    grid = Grid(across, across, np.linspace(0.5, 2.0, side))
+    capture, grid, wavelength = make_scene(side, relief, confocal)
     method = make_method(wavelength)
 
     def image(given: Capture) -> Array:
@@ -136,12 +121,14 @@ def prepare_imaging(
 
 
 PREPARE: dict[str, Prepare] = {
-    **{f"device-{name}": partial(prepare_recovery, name) for name in ("l1", "tv", "linear")},
+    "device-l1": partial(prepare_recovery, Sparse(iterations=ITERATIONS)),
+    "device-tv": partial(prepare_recovery, TotalVariation(iterations=ITERATIONS)),
+    "device-linear": partial(prepare_recovery, LinearInverse()),
     "device-depth": prepare_ranging,
-    "device-rsd": partial(prepare_imaging, PlanarRSD, "planar", False),
-    "device-rsd-confocal": partial(prepare_imaging, lambda w: PlanarRSD(2 * w), "planar", True),
-    "device-hybrid": partial(prepare_imaging, Hybrid, "cylinder", False),
+    "device-rsd": partial(prepare_imaging, PlanarRSD, 0.0, False),
+    "device-rsd-confocal": partial(prepare_imaging, lambda w: PlanarRSD(2 * w), 0.0, True),
+    "device-hybrid": partial(prepare_imaging, Hybrid, RELIEF_M, False),
     "device-backprojection": partial(
-        prepare_imaging, lambda w: Backprojection(2 * w), "cylinder", False
+        prepare_imaging, lambda w: Backprojection(2 * w), RELIEF_M, False
     ),
 }

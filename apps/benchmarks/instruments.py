@@ -107,13 +107,6 @@ def make_decoding(size_mb: int) -> Action:
     return decode
 
 
-def prepare_driver(size_mb: int) -> PreparedCase:
-    """From the emulated instrument through pyusb's own code to records."""
-    return PreparedCase(
-        lambda: read_records(devices.open(ADDRESS), size_mb), make_decoding(size_mb), size_mb
-    )
-
-
 def make_recording(size_mb: int) -> Path:
     """A recording of so much, in a folder that goes when the process ends."""
     folder = tempfile.TemporaryDirectory()
@@ -140,14 +133,11 @@ def prepare_recorder(size_mb: int) -> PreparedCase:
     return PreparedCase(record, make_decoding(size_mb), size_mb)
 
 
-def prepare_replay(size_mb: int) -> PreparedCase:
-    """A recording to its records."""
-    path = make_recording(size_mb)
-    return PreparedCase(
-        lambda: read_records(devices.open(f"file://{path}"), size_mb),
-        make_decoding(size_mb),
-        size_mb,
-    )
+def prepare_reading(recorded: bool, size_mb: int) -> PreparedCase:
+    """From the emulated instrument through pyusb's own code, or from a recording, to records."""
+    address = f"file://{make_recording(size_mb)}" if recorded else ADDRESS
+    read = partial(read_records, size_mb=size_mb)
+    return PreparedCase(lambda: read(devices.open(address)), make_decoding(size_mb), size_mb)
 
 
 PREPARE: dict[str, Prepare] = {
@@ -155,7 +145,7 @@ PREPARE: dict[str, Prepare] = {
     "decode-timetag": prepare_tag_decoding,
     "decode-stamps": prepare_stamp_histogram,
     "decode-tags": prepare_tag_histogram,
-    "driver-timetag": prepare_driver,
+    "driver-timetag": partial(prepare_reading, False),
     "driver-record": prepare_recorder,
-    "driver-replay": prepare_replay,
+    "driver-replay": partial(prepare_reading, True),
 }

@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -59,14 +59,20 @@ def render_scene(side: int) -> LightField:
     """Letters at three depths in 8 x 8 views, of the paper's field of view."""
     coarseness = PAPER_SIDE_PX / side
     # Views wider apart: the scene's shears, pixels per view step, stay those of the paper's size.
-    array = CameraArray(
-        (side, side),
-        8,
-        PAPER_FOCAL_LENGTH_PX / coarseness,
-        PAPER_VIEW_STEP_M * coarseness,
-        samples=1,
-    )
+    focal_length_px, step = PAPER_FOCAL_LENGTH_PX / coarseness, PAPER_VIEW_STEP_M * coarseness
+    array = CameraArray((side, side), 8, focal_length_px, step, samples=1)
     return render_light_field(make_scene(SCENE, array), array).light_field
+
+
+def repeat_products(model: LinearOperator, number: int) -> Action:
+    """The floor of a recovery: so many products each way."""
+    picture = np.ones(model.shape_in, np.float32)
+
+    def products() -> None:
+        for _ in range(number):
+            model.adjoint(model(picture))
+
+    return products
 
 
 def prepare_recovery(encoder: str, weight: float | None, side: int) -> PreparedCase:
@@ -78,12 +84,7 @@ def prepare_recovery(encoder: str, weight: float | None, side: int) -> PreparedC
     method = ClipRecovery(weight=weight)
     found = method.recover(measurement, SHEAR)
     camera = measurement.camera()
-    model = camera.weighting() @ camera.model(SHEAR)
-    picture = np.ones(model.shape_in, np.float32)
-
-    def products() -> None:
-        for _ in range(found.iterations):
-            model.adjoint(model(picture))
+    products = repeat_products(camera.weighting() @ camera.model(SHEAR), found.iterations)
 
     def judge() -> dict[str, float]:
         error = nmse(found.picture, light_field.refocus(SHEAR), side // 10)
@@ -122,10 +123,6 @@ def prepare_lensless(side: int) -> PreparedCase:
             iterations=LENSLESS_ITERATIONS,
         )
 
-    def products() -> None:
-        for _ in range(LENSLESS_ITERATIONS):
-            model.adjoint(model(scene))
-
     def compare() -> dict[str, float]:
         errors = {"nmse": compute_scaled_nmse(method.recover(model, readings).frames[0], scene)}
         with contextlib.suppress(PeerUnavailableError):
@@ -136,7 +133,7 @@ def prepare_lensless(side: int) -> PreparedCase:
 
     return PreparedCase(
         lambda: method.recover(model, readings),
-        products,
+        repeat_products(model, LENSLESS_ITERATIONS),
         1,
         {"LenslessPiCam": lambda: ask()[0]},
         figures=compare,
@@ -176,11 +173,7 @@ def transform_picture(side: int) -> Action:
     return lambda: [scipy.fft.irfft2(scipy.fft.rfft2(picture), s=picture.shape) for _ in range(2)]
 
 
-FLOORS = {
-    "line": multiply_matrix,
-    "line-even": multiply_matrix,
-    "single-pixel": multiply_codes,
-}
+FLOORS = dict.fromkeys(("line", "line-even"), multiply_matrix) | {"single-pixel": multiply_codes}
 
 
 def prepare_camera(name: str, side: int) -> PreparedCase:
@@ -274,15 +267,10 @@ def prepare_quality(wanted: QualityCase, ratio_percent: int) -> PreparedCase:
 
     measured = measure_seed(0)
     camera = measured.camera()
-    model = camera.weighting() @ camera.model(wanted.shear)
     first = settings.recover(measured, wanted.shear)
-    solver = ClipRecovery(preset=wanted.preset, data_term=settings.data_term, weight=first.weight)
-    picture = np.ones(model.shape_in, np.float32)
-
-    def products() -> None:
-        for _ in range(first.iterations):
-            model.adjoint(model(picture))
-
+    solver = replace(settings, weight=first.weight)
+    model = camera.weighting() @ camera.model(wanted.shear)
+    products = repeat_products(model, first.iterations)
     return PreparedCase(lambda: solver.recover(measured, wanted.shear), products, 1, figures=judge)
 
 

@@ -32,16 +32,16 @@ COPY_BYTES = 1 << 25
 warnings.simplefilter("ignore", AliasingWarning)  # what is imaged does not matter here
 
 
-def make_scene(count: int, relief: float) -> tuple[Capture, Grid, float]:
+def make_scene(count: int, relief: float, confocal: bool = False) -> tuple[Capture, Grid, float]:
     """A capture of ``count ** 2`` points, a grid of ``count ** 3`` voxels, and a wavelength of four
     wall points, m. `relief`: depth of the wall's shape, m; 0: a plane.
     """
     axis = np.linspace(-1, 1, count)
     x, y = np.meshgrid(axis, axis)
     wall = np.stack([x, y, relief / 2 * (1 + np.sin(3 * x + 1) * np.cos(2 * y))], axis=-1)
-    capture = PointScene(HIDDEN_POINTS_M).simulate_capture(
-        wall, LASER_M * [1, 1, relief > 0], TimeAxis(BINS, BIN_WIDTH_S), 60e-12
-    )
+    laser = wall if confocal else LASER_M * [1, 1, relief > 0]
+    time_axis = TimeAxis(BINS, BIN_WIDTH_S)
+    capture = PointScene(HIDDEN_POINTS_M).simulate_capture(wall, laser, time_axis, 60e-12)
     return capture, Grid(axis, axis, np.linspace(0.6, 1.6, count)), 8 / count
 
 

@@ -5,7 +5,7 @@ of a recovered shot, a stream of shots to clouds, and ranges from counted photon
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
@@ -58,17 +58,19 @@ def measurements(frames: int) -> NDArray[np.float32]:
     )
 
 
-def run_products(projection: LineProjection, frames: int, iterations: int) -> None:
-    """Multiply `iterations` times each way on every frame, in blocks on all threads, nothing else."""
+def run_products(projection: LineProjection, data: NDArray[np.float32]) -> None:
+    """Multiply as often as a method iterates each way on every frame, in blocks on all threads,
+    nothing else.
+    """
 
     def work(piece: slice) -> None:
         block = np.ones((*projection.shape_in, LANES), np.float32)
-        for _ in range(iterations):
+        for _ in range(ITERATIONS):
             block = projection.adjoint(projection(block))
             # so that the values neither overflow nor become subnormal, which would be slow
             block *= np.float32(1e-3)
 
-    run_blocks(work, frames)
+    run_blocks(work, data.shape[1])
 
 
 def run_adjoints(projection: LineProjection, data: NDArray[np.float32]) -> None:
@@ -99,33 +101,15 @@ def run_dense_products(projection: LineProjection, data: NDArray[np.float32]) ->
     run_blocks(project, data.shape[1])
 
 
-def prepare_iterative(method: Method, frames: int) -> PreparedCase:
-    """A method that multiplies again and again."""
+def prepare_recovery(
+    method: Method, floor: Callable[[LineProjection, NDArray[np.float32]], None], frames: int
+) -> PreparedCase:
+    """A method beside the products that it needs; the linear inverse is prepared beforehand."""
     projection, data = make_operator(), measurements(frames)
-    return PreparedCase(
-        lambda: method.recover(projection, data),
-        lambda: run_products(projection, frames, ITERATIONS),
-        frames,
-    )
-
-
-def prepare_linear(frames: int) -> PreparedCase:
-    """The linear inverse, prepared."""
-    projection, data = make_operator(), measurements(frames)
-    inverse = LinearInverse().prepare(projection)
-    return PreparedCase(
-        lambda: inverse.recover(data), lambda: run_dense_products(projection, data), frames
-    )
-
-
-def prepare_adjoint(frames: int) -> PreparedCase:
-    """The adjoint, scaled."""
-    projection, data = make_operator(), measurements(frames)
-    return PreparedCase(
-        lambda: Backprojection().recover(projection, data),
-        lambda: run_adjoints(projection, data),
-        frames,
-    )
+    recover: Callable[[NDArray[np.float32]], object] = partial(method.recover, projection)
+    if isinstance(method, LinearInverse):
+        recover = method.prepare(projection).recover
+    return PreparedCase(lambda: recover(data), lambda: floor(projection, data), frames)
 
 
 def prepare_projection(side: int) -> PreparedCase:
@@ -246,10 +230,10 @@ def prepare_accuracy(photons: int) -> PreparedCase:
 
 
 PREPARE: dict[str, Prepare] = {
-    "recovery-l1": partial(prepare_iterative, Sparse(iterations=ITERATIONS)),
-    "recovery-tv": partial(prepare_iterative, TotalVariation(iterations=ITERATIONS)),
-    "recovery-linear": prepare_linear,
-    "recovery-adjoint": prepare_adjoint,
+    "recovery-l1": partial(prepare_recovery, Sparse(iterations=ITERATIONS), run_products),
+    "recovery-tv": partial(prepare_recovery, TotalVariation(iterations=ITERATIONS), run_products),
+    "recovery-linear": partial(prepare_recovery, LinearInverse(), run_dense_products),
+    "recovery-adjoint": partial(prepare_recovery, Backprojection(), run_adjoints),
     "recovery-projection": prepare_projection,
     "depth-returns": prepare_ranges,
     "streaming-cloud": partial(prepare_streaming, method=LinearInverse()),

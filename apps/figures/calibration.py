@@ -63,14 +63,9 @@ def _draw_picture(axes: Axes, found: FocusCalibration, picture: NDArray[Any], ti
         _draw_line(axes, found, view)
         row = found.dot_rows_px[view]
         axes.plot(found.centres_px[view], row, "+", color="white", markersize=9, markeredgewidth=1)
-        axes.annotate(
-            f"{angle:.1f}\N{DEGREE SIGN}",
-            (found.centres_px[view], first + 2),
-            color="white",
-            ha="center",
-            va="top",
-            fontsize=SMALL_FONT_PT,
-        )
+        look: Any = {"color": "white", "ha": "center", "va": "top", "fontsize": SMALL_FONT_PT}
+        above = (found.centres_px[view], first + 2)
+        axes.annotate(f"{angle:.1f}\N{DEGREE SIGN}", above, **look)
     label_axes(axes, title, "slit column (px)", "row (px)")
 
 
@@ -88,14 +83,8 @@ def _draw_line_zoom(axes: Axes, found: FocusCalibration, view: int) -> None:
     window, extent = _cut_window(found.signal, row, column)
     draw_image(axes, window, extent, aspect="equal")
     _draw_line(axes, found, view)
-    axes.plot(
-        found.centres_px[view],
-        found.dot_rows_px[view],
-        "+",
-        color="white",
-        markersize=12,
-        markeredgewidth=1,
-    )
+    cross: Any = {"color": "white", "markersize": 12, "markeredgewidth": 1}
+    axes.plot(found.centres_px[view], found.dot_rows_px[view], "+", **cross)
     axes.set_xlim(extent[:2])
     axes.set_ylim(extent[2:])
     label_axes(axes, f"view {view}", "", "")
@@ -119,12 +108,8 @@ def _cut_window(
     """Cut out the surroundings of a pixel, and say where their outer edges lie."""
     top, left = max(0, row - ZOOM_HALF_WIDTH_PX), max(0, column - ZOOM_HALF_WIDTH_PX)
     window = picture[top : row + ZOOM_HALF_WIDTH_PX + 1, left : column + ZOOM_HALF_WIDTH_PX + 1]
-    return window, (
-        left - 0.5,
-        left + window.shape[1] - 0.5,
-        top + window.shape[0] - 0.5,
-        top - 0.5,
-    )
+    height, width = window.shape
+    return window, (left - 0.5, left + width - 0.5, top + height - 0.5, top - 0.5)
 
 
 MAX_DRAWN_POINTS = 20_000

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-    from apps.verbs.nlos_imaging import MeasuredVolume
     from apps.verbs.nlos_scenes import DemoRun
     from nlos import Capture, Volume
     from nlos.known_scenes import HiddenTruth
@@ -40,7 +38,6 @@ OUTLINE_PIXELS = 400  # along the longer side of a view, for the outline of what
 POINT_RADIUS_M = 0.03  # m; the circle about a hidden point
 # by so much of a facet the stairs of slanting edges are smoothed, as a standard deviation
 CORNER_SMOOTHING = 0.5
-PlaneAxes = tuple[str, str]  # the axes to the right and downwards
 
 
 def make_comparison_figure(
@@ -63,28 +60,19 @@ def make_comparison_figure(
     )
     for column, (name, volume) in enumerate(volumes.items()):
         front, top = panels[:, column]
-        drawn = draw_view(front, volume, ("x", "y"), truth)
-        draw_view(top, volume, ("x", "z"), truth)
-        label_axes(
-            front,
-            f"{name}\n{_format_cost(figures[name])}",
-            "",
-            "y (m), down" if column == 0 else "",
-        )
-        label_axes(
-            top,
-            "",
-            f"x (m)\n\n{_format_merit(figures[name])}",
-            "z (m), away from the wall" if column == 0 else "",
-        )
+        drawn = draw_view(front, volume, "xy", truth)
+        draw_view(top, volume, "xz", truth)
+        down, away = ("y (m), down", "z (m), away from the wall") if column == 0 else ("", "")
+        label_axes(front, f"{name}\n{_format_cost(figures[name])}", "", down)
+        label_axes(top, "", f"x (m)\n\n{_format_merit(figures[name])}", away)
     add_colour_bar(panels[0, -1], drawn, "relative to each method's brightest")
     return figure
 
 
-def draw_view(axes: Axes, volume: Volume, plane: PlaneAxes, truth: HiddenTruth | None) -> AxesImage:
+def draw_view(axes: Axes, volume: Volume, plane: str, truth: HiddenTruth | None) -> AxesImage:
     """Draw the brightest voxel along the third axis, and the outline of what is hidden. `plane`:
-    names of the axes to the right and downwards. Returns brightness relative to the view's largest,
-    0 to 1.
+    names of the axes to the right and downwards, as ``xy``. Returns brightness relative to the
+    view's largest, 0 to 1.
     """
     along = "zyx".index(next(name for name in "zyx" if name not in plane))
     picture = volume.magnitude.max(axis=along)
@@ -98,36 +86,22 @@ def draw_view(axes: Axes, volume: Volume, plane: PlaneAxes, truth: HiddenTruth |
     return drawn
 
 
-def draw_outline(axes: Axes, truth: HiddenTruth, plane: PlaneAxes) -> None:
-    """Draw the border of everything hidden, seen along the third axis. `truth`: positions, m;
-    `plane`: names of the axes to the right and downwards.
-    """
+def draw_outline(axes: Axes, truth: HiddenTruth, plane: str) -> None:
+    """Draw the border of everything hidden, seen along the third axis."""
     places = truth.positions[:, ["xyz".index(name) for name in plane]]
     radius = truth.spacing / 2 if truth.spacing else POINT_RADIUS_M
     low, high = places.min(axis=0) - 3 * radius, places.max(axis=0) + 3 * radius
     step = float((high - low).max()) / OUTLINE_PIXELS
-    right, down = (
-        np.arange(first, last + step, step) for first, last in zip(low, high, strict=True)
-    )
-    inside = _rasterise_outline(places, right, down, radius, round_ones=not truth.spacing)
+    right, down = (np.arange(*ends, step) for ends in zip(low, high + step, strict=True))
+    pixels = np.stack(np.meshgrid(right, down), axis=-1)
+    # Squares about facets, circles about points. Squares that touch overlap by a hair, or gaps would
+    # be drawn between them.
+    norm = np.inf if truth.spacing else 2
+    distance, _ = cKDTree(places).query(pixels, p=norm, distance_upper_bound=radius * 1.05)
+    inside = np.asarray(np.isfinite(distance), np.float64)
     # corners of facets are rounded off, so that the contour is not a staircase
     smooth = gaussian_filter(inside, truth.spacing * CORNER_SMOOTHING / step)
     axes.contour(right, down, smooth, [0.5], colors=LINE_COLOUR, linewidths=1.0)
-
-
-def _rasterise_outline(
-    places: NDArray[np.float64],
-    right: NDArray[np.float64],
-    down: NDArray[np.float64],
-    radius: float,
-    round_ones: bool,
-) -> NDArray[np.float64]:
-    """Return 1 inside the squares about facets, or the circles about points, and 0 outside."""
-    pixels = np.stack(np.meshgrid(right, down), axis=-1)
-    norm = 2 if round_ones else np.inf
-    # Squares that touch overlap by a hair, or gaps would be drawn between them.
-    distance, _ = cKDTree(places).query(pixels, p=norm, distance_upper_bound=radius * 1.05)
-    return np.asarray(np.isfinite(distance), np.float64)
 
 
 def _format_cost(figures: Mapping[str, Any]) -> str:
@@ -164,21 +138,23 @@ def make_demo_figure(run: DemoRun) -> Figure:
     _draw_room(panels[0, 0], run)
     _draw_streak(panels[0, 1], run.capture)
     hybrid, slow, flat = (run.images[name] for name in ("hybrid", "backprojection", "flat"))
+    quick, long = (
+        f"{one.seconds:.1f} s" if one.seconds >= 1 else f"{one.seconds:.2f} s"
+        for one in (hybrid, slow)
+    )
     longer = f"{slow.seconds / hybrid.seconds:.2g} times as long"
-    _draw_image(
-        panels[0, 2], flat, run.truth, ("x", "y"), "3. hybrid, had the wall been taken for flat"
-    )
-    _draw_image(
-        panels[1, 0], hybrid, run.truth, ("x", "y"), f"4. hybrid: {_format_seconds(hybrid.seconds)}"
-    )
-    _draw_image(
-        panels[1, 1],
-        slow,
-        run.truth,
-        ("x", "y"),
-        f"5. back-projection: {_format_seconds(slow.seconds)}, {longer}",
-    )
-    _draw_image(panels[1, 2], hybrid, run.truth, ("x", "z"), "6. hybrid, seen from above")
+    for axes, image, plane, title in (
+        (panels[0, 2], flat, "xy", "3. hybrid, had the wall been taken for flat"),
+        (panels[1, 0], hybrid, "xy", f"4. hybrid: {quick}"),
+        (panels[1, 1], slow, "xy", f"5. back-projection: {long}, {longer}"),
+        (panels[1, 2], hybrid, "xz", "6. hybrid, seen from above"),
+    ):
+        draw_view(axes, image.volume, plane, run.truth)
+        down = "y, down (m)" if plane == "xy" else "z, away from the wall (m)"
+        label_axes(axes, title, "x (m)", down)
+        axes.plot([], [], color=LINE_COLOUR, label="truth")
+        look: Any = {"framealpha": 0.3, "labelcolor": "white", "facecolor": INK_COLOUR}
+        axes.legend(fontsize=SMALL_FONT_PT, loc="upper right", **look)
     return figure
 
 
@@ -189,24 +165,17 @@ def _draw_room(axes: Axes, run: DemoRun) -> None:
     behind = float(z.min()) - 0.14
     axes.fill_between(x, z, behind, color=WALL_COLOUR)
     axes.plot(x, z, color=INK_COLOUR, lw=2)
-    draw_outline(axes, run.truth, ("x", "z"))
+    draw_outline(axes, run.truth, "xz")
     seen = int(np.argmin(np.abs(x - WALL_POINT_X_M)))
-    spot, point = (
-        (float(run.capture.laser[0]), float(run.capture.laser[2])),
-        (float(x[seen]), float(z[seen])),
-    )
+    spot, point = run.capture.laser[[0, 2]].tolist(), [float(x[seen]), float(z[seen])]
     for start, end, colour, style in (
         (DEVICE_POSITION_M, spot, DEVICE_COLOUR, "--"),
         (spot, HIDDEN_POINT_M, OUTGOING_COLOUR, "-"),
         (HIDDEN_POINT_M, point, RETURN_COLOUR, "-"),
         (point, DEVICE_POSITION_M, DEVICE_COLOUR, "--"),
     ):
-        axes.annotate(
-            "",
-            end,
-            start,
-            arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.5, "ls": style},
-        )
+        arrow = {"arrowstyle": "-|>", "color": colour, "lw": 1.5, "ls": style}
+        axes.annotate("", end, start, arrowprops=arrow)
     axes.plot([SCREEN_X_M] * 2, SCREEN_Z_M, color=INK_COLOUR, lw=5, solid_capstyle="butt")
     axes.plot(*DEVICE_POSITION_M, "s", color=INK_COLOUR, ms=8)
     for place, text in (
@@ -232,29 +201,5 @@ def _draw_streak(axes: Axes, capture: Capture) -> None:
     axes.set_box_aspect(PANEL_ASPECT)
     for place, text in (((-0.78, 1.98), "3"), ((0.72, 2.4), "D")):
         axes.annotate(text, place, color="white", fontsize=SMALL_FONT_PT)
-    label_axes(
-        axes,
-        f"2. one row of the wall: up to {row.max():.0f} photons in a bin",
-        "x on the wall (m)",
-        "path spot - hidden - wall (m)",
-    )
-
-
-def _draw_image(
-    axes: Axes, image: MeasuredVolume, truth: HiddenTruth, plane: PlaneAxes, title: str
-) -> None:
-    draw_view(axes, image.volume, plane, truth)
-    downwards = "y, down (m)" if plane[1] == "y" else "z, away from the wall (m)"
-    label_axes(axes, title, "x (m)", downwards)
-    axes.plot([], [], color=LINE_COLOUR, label="truth")
-    axes.legend(
-        fontsize=SMALL_FONT_PT,
-        loc="upper right",
-        framealpha=0.3,
-        labelcolor="white",
-        facecolor=INK_COLOUR,
-    )
-
-
-def _format_seconds(seconds: float) -> str:
-    return f"{seconds:.1f} s" if seconds >= 1 else f"{seconds:.2f} s"
+    title = f"2. one row of the wall: up to {row.max():.0f} photons in a bin"
+    label_axes(axes, title, "x on the wall (m)", "path spot - hidden - wall (m)")

@@ -54,11 +54,9 @@ def draw_region(axes: Axes, region: InactiveRegion, least_reach: float = 0.0) ->
     at least so far behind the occluder, m.
     """
     places = np.linspace(-0.5, 0.5, VIEW_COUNT) * region.baseline
-    usual = (
-        DRAWN_LENGTH_FACTOR * region.length
-        if region.is_bounded
-        else ENDLESS_DEPTH_FACTOR * region.distance
-    )
+    usual = ENDLESS_DEPTH_FACTOR * region.distance
+    if region.is_bounded:
+        usual = DRAWN_LENGTH_FACTOR * region.length
     reach = max(usual, least_reach)
     half = 0.62 * max(region.baseline, region.width)
     x = np.linspace(-half, half, GRID_SHAPE[0])[:, np.newaxis, np.newaxis]
@@ -66,22 +64,17 @@ def draw_region(axes: Axes, region: InactiveRegion, least_reach: float = 0.0) ->
     share = region.sees(places, x, behind).mean(axis=-1)
     edges = np.array([region.distance, region.distance + reach, -half, half]) / MILLIMETRE
     left, right, low, high = edges.tolist()
-    mapped = draw_image(
-        axes, share[::-1], (left, right, low, high), cmap="bone", vmin=0, vmax=1, aspect="auto"
-    )
+    look = {"cmap": "bone", "vmin": 0, "vmax": 1, "aspect": "auto"}
+    mapped = draw_image(axes, share[::-1], (left, right, low, high), **look)
     add_colour_bar(axes, mapped, "share of the views that see the place")
     _draw_lines(axes, region, reach)
-    axes.plot(
-        np.zeros(len(places)), places / MILLIMETRE, "s", color=LINE_COLOUR, ms=7, clip_on=False
-    )
-    axes.plot(
-        [left, left], np.array([-0.5, 0.5]) * region.width / MILLIMETRE, color=OCCLUDER_COLOUR, lw=6
-    )
+    axes.plot(0 * places, places / MILLIMETRE, "s", color=LINE_COLOUR, ms=7, clip_on=False)
+    ends = np.array([-0.5, 0.5]) * region.width / MILLIMETRE
+    axes.plot([left, left], ends, color=OCCLUDER_COLOUR, lw=6)
     axes.set_xlim(-0.03 * right, right)
     axes.set_facecolor(EMPTY_COLOUR)
-    label_axes(
-        axes, _format_title(region), "z, away from the views (mm)", "x, along the baseline (mm)"
-    )
+    x_label, y_label = "z, away from the views (mm)", "x, along the baseline (mm)"
+    label_axes(axes, _format_title(region), x_label, y_label)
 
 
 def _draw_lines(axes: Axes, region: InactiveRegion, reach: float) -> None:
@@ -94,18 +87,11 @@ def _draw_lines(axes: Axes, region: InactiveRegion, reach: float) -> None:
         axes.plot(z / MILLIMETRE, x / MILLIMETRE, color=LINE_COLOUR, lw=1, ls="--")
     if region.is_bounded:
         start, stop = region.distance / MILLIMETRE, (region.distance + region.length) / MILLIMETRE
-        axes.annotate(
-            "", (stop, 0), (start, 0), arrowprops={"arrowstyle": "<->", "color": OCCLUDER_COLOUR}
-        )
+        arrow = {"arrowstyle": "<->", "color": OCCLUDER_COLOUR}
+        axes.annotate("", (stop, 0), (start, 0), arrowprops=arrow)
         said = f"l = {region.length / MILLIMETRE:.1f} mm, hidden"
-        axes.annotate(
-            said,
-            (start, 0),
-            (8, 7),
-            textcoords="offset points",
-            color=OCCLUDER_COLOUR,
-            bbox=TEXT_BOX,
-        )
+        note: dict[str, Any] = {"textcoords": "offset points", "bbox": TEXT_BOX}
+        axes.annotate(said, (start, 0), (8, 7), color=OCCLUDER_COLOUR, **note)
 
 
 def _format_title(region: InactiveRegion) -> str:
@@ -118,10 +104,8 @@ def _format_title(region: InactiveRegion) -> str:
 
 SEEN_COLOUR, UNSEEN_COLOUR = "#57c84d", "#ff5a5f"
 DRAWN_DEPTH_FACTOR = 1.15  # of the target's distance behind the occluder is drawn
-MIN_RELATIVE_LIGHT, CAPTION_LEVEL = (
-    1e-4,
-    12.0,
-)  # of the strongest instant: where the drawing begins, and where its captions stand
+# of the strongest instant: where the drawing begins, and where its captions stand
+MIN_RELATIVE_LIGHT, CAPTION_LEVEL = 1e-4, 12.0
 
 
 def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult]) -> Figure:
@@ -144,11 +128,8 @@ def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult])
         axes.set_title(title, fontsize=SMALL_FONT_PT + 1)
         if truth is not None and truth is not picture:
             found = correlation_coefficient(picture, truth)
-            axes.set_xlabel(
-                f"correlation {found:.2f}",
-                fontsize=SMALL_FONT_PT + 2,
-                color=SEEN_COLOUR if found >= 0.8 else UNSEEN_COLOUR,
-            )
+            colour = SEEN_COLOUR if found >= 0.8 else UNSEEN_COLOUR
+            axes.set_xlabel(f"correlation {found:.2f}", fontsize=SMALL_FONT_PT + 2, color=colour)
     return figure
 
 
@@ -211,32 +192,17 @@ def draw_history(axes: Axes, experiment: Experiment) -> None:
     history = np.maximum(measurements.history / measurements.history.max(), MIN_RELATIVE_LIGHT)
     axes.set_facecolor(EMPTY_COLOUR)
     axes.semilogy(times, history, color="white", lw=1.5, drawstyle="steps-mid")
-    for found, name, colour in zip(
-        measurements.find_returns(),
-        ("occluder", "target"),
-        (OCCLUDER_COLOUR, LINE_COLOUR),
-        strict=False,
-    ):
+    look: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": SMALL_FONT_PT}
+    named = (("occluder", OCCLUDER_COLOUR), ("target", LINE_COLOUR))
+    for found, (name, colour) in zip(measurements.find_returns(), named, strict=False):
         gate = times[found.bins]
         axes.axvspan(float(gate[0]), float(gate[-1]), color=colour, alpha=0.3)
-        peak = gate[np.argmax(history[found.bins])]
+        peak = float(gate[np.argmax(history[found.bins])])
         said = f"{name}\n{found.distance / MILLIMETRE:.1f} mm"
-        axes.text(
-            float(peak),
-            CAPTION_LEVEL,
-            said,
-            ha="center",
-            va="top",
-            fontsize=SMALL_FONT_PT,
-            color="white",
-        )
+        axes.text(peak, CAPTION_LEVEL, said, color="white", **look)
     axes.set_ylim(MIN_RELATIVE_LIGHT, 2 * CAPTION_LEVEL)
-    label_axes(
-        axes,
-        "sum of all measurements",
-        "time after the flash (ps)",
-        "relative to the brightest instant",
-    )
+    light = "relative to the brightest instant"
+    label_axes(axes, "sum of all measurements", "time after the flash (ps)", light)
 
 
 FRAME_MS, LAST_FRAME_MS = 120, 2500
@@ -355,34 +321,21 @@ def _make_flash_frames(experiment: Experiment) -> list[FlashFrame]:
     """Every instant that is not dark; at last the whole of the second return."""
     separated, returns = experiment.separated, experiment.measurements.find_returns()
     parts = [separated.occluder, separated.target][: len(returns)]
-    history, middle = (
-        experiment.measurements.history,
-        experiment.pictures[len(experiment.pictures) // 2],
-    )
+    history = experiment.measurements.history
+    middle = experiment.pictures[len(experiment.pictures) // 2]
     times, frames = experiment.time_axis.times / PICOSECOND, []
     for found, recovered in zip(returns, parts, strict=True):
         lit = history / history[found.bins].max()
-        scales = [
-            max(float(top), 1e-12)
-            for top in (middle[..., found.bins].max(), np.quantile(recovered, 0.999))
-        ]
-        for instant in np.arange(found.bins.start, found.bins.stop)[
-            lit[found.bins] > DARK_THRESHOLD
-        ]:
-            pictures = middle[..., instant] / scales[0], lit[instant] * recovered / scales[1]
-            frames.append(
-                FlashFrame(
-                    float(times[instant]), f"{times[instant]:.0f} ps after the flash", pictures
-                )
-            )
+        tops = (middle[..., found.bins].max(), np.quantile(recovered, 0.999))
+        seen, made = (max(float(top), 1e-12) for top in tops)
+        for instant in found.bins.start + np.flatnonzero(lit[found.bins] > DARK_THRESHOLD):
+            pictures = middle[..., instant] / seen, lit[instant] * recovered / made
+            title = f"{times[instant]:.0f} ps after the flash"
+            frames.append(FlashFrame(float(times[instant]), title, pictures))
     brightest = experiment.truth.max()
     behind, last = separated.plain, "nothing comes from behind the occluder"
     if separated.sees_target:
-        behind, last = (
-            middle[..., returns[1].bins].sum(axis=-1),
-            "all of the second return together",
-        )
-    return [
-        *frames,
-        FlashFrame(frames[-1].time, last, (behind / brightest, separated.target / brightest)),
-    ]
+        behind = middle[..., returns[1].bins].sum(axis=-1)
+        last = "all of the second return together"
+    whole = behind / brightest, separated.target / brightest
+    return [*frames, FlashFrame(frames[-1].time, last, whole)]

@@ -53,6 +53,7 @@ CROP_MARGIN_PX = 8
 LIT_THRESHOLD = 0.2  # pixels that are lighter decide about the scale of distances
 BRIGHT_AREA_PERCENTILE = 95.0  # percent: colours need light to be distinguishable
 GAMMA = 0.6  # far objects stay visible beside near ones
+SQUARED_RANGE = " \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}"
 
 
 @dataclass(frozen=True)
@@ -77,21 +78,14 @@ def make_preview_figure(streak: Streak, frames: Frames) -> Figure:
     brightness = frames.values * _compute_compensation(frames)[:, np.newaxis, np.newaxis]
     counts = np.maximum(streak.counts - estimate_dark_level(streak.counts), 0)
     draw_streak(left, tone_map(counts, gamma=GAMMA), streak.times, "streak image as measured")
-    squared = (
-        " \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}" if _has_known_range(frames) else ""
-    )
+    squared = SQUARED_RANGE if _has_known_range(frames) else ""
     summed = tone_map(brightness.sum(axis=0), gamma=GAMMA)
     draw_camera_picture(middle, summed, f"summed brightness{squared}")
     _draw_distance(right, brightness, frames)
     strip = (OVERVIEW_INCHES + STRIP_TITLE_INCHES, height)
-    figure.text(
-        0.5,
-        1 - OVERVIEW_INCHES / height,
-        "frames, each scaled to its own brightness; x and y in px",
-        fontsize=SMALL_FONT_PT + 2,
-        ha="center",
-        va="top",
-    )
+    title = "frames, each scaled to its own brightness; x and y in px"
+    look: Any = {"fontsize": SMALL_FONT_PT + 2, "ha": "center", "va": "top"}
+    figure.text(0.5, 1 - OVERVIEW_INCHES / height, title, **look)
     panels = add_panels(figure, lines, PANEL_COLUMNS, strip, STRIP_ROOM_INCHES)
     _draw_moments(panels, brightness, moments, frames)
     return figure
@@ -116,16 +110,11 @@ def _find_peak_moments(energy: NDArray[np.float64]) -> list[Moment]:
     from scipy.ndimage import gaussian_filter1d
     from scipy.signal import find_peaks
 
-    smooth = np.pad(
-        gaussian_filter1d(energy, 1.5), 1
-    )  # padded: the first and the last frame can be peaks
-    peaks, found = find_peaks(
-        smooth,
-        distance=MIN_PEAK_DISTANCE_BINS,
-        prominence=MIN_PEAK_PROMINENCE * smooth.max(),
-        width=0,
-        rel_height=0.5,
-    )
+    # padded: the first and the last frame can be peaks
+    smooth = np.pad(gaussian_filter1d(energy, 1.5), 1)
+    prominence = MIN_PEAK_PROMINENCE * smooth.max()
+    half_height = {"width": 0, "rel_height": 0.5}
+    peaks, found = find_peaks(smooth, None, None, MIN_PEAK_DISTANCE_BINS, prominence, **half_height)
     chosen = np.sort(np.argsort(found["prominences"])[::-1][:MAX_MOMENTS])
     edges = np.rint([found["left_ips"], found["right_ips"]]).astype(int).clip(1, energy.size) - 1
     return [Moment(int(peaks[i]) - 1, int(edges[0, i]), int(edges[1, i])) for i in chosen]
@@ -204,13 +193,12 @@ def _draw_moments(
 def _crop_to_bright(pictures: list[NDArray[Any]]) -> tuple[slice, slice]:
     """Rows and columns that hold everything bright in any picture, with a margin."""
     bright = np.any([picture >= CROP_THRESHOLD * picture.max() for picture in pictures], axis=0)
-    sides = []
-    for lit in (bright.any(axis=1), bright.any(axis=0)):
+
+    def surround(lit: NDArray[np.bool_]) -> slice:
         first, last = np.flatnonzero(lit)[[0, -1]].tolist()
-        sides.append(
-            slice(max(0, first - CROP_MARGIN_PX), min(lit.size, last + CROP_MARGIN_PX + 1))
-        )
-    return sides[0], sides[1]
+        return slice(max(0, first - CROP_MARGIN_PX), min(lit.size, last + CROP_MARGIN_PX + 1))
+
+    return surround(bright.any(axis=1)), surround(bright.any(axis=0))
 
 
 HISTOGRAM_BINS = 61
@@ -254,7 +242,7 @@ def make_demo_figure(
 def _draw_brightness(axes: Axes, frames: Frames, name: str) -> None:
     ranges = np.maximum(frames.times, 0) * SPEED_OF_LIGHT / 2
     picture = np.tensordot((ranges**2).astype(np.float32), frames.values, axes=1)
-    title = f"{name}: brightness \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}"
+    title = f"{name}: brightness{SQUARED_RANGE}"
     top = np.percentile(picture, WHITE_PERCENTILE)
     draw_camera_picture(axes, picture, title, "photons at 1 m", vmin=0, vmax=top)
 
@@ -267,13 +255,8 @@ def _draw_errors(axes: Axes, returns: Returns, truth: GroundTruth) -> None:
     axes.hist(np.clip(error, edges[0], edges[-1]), edges, color="#4c72b0")
     for edge in (-bin_mm, bin_mm):
         axes.axvline(edge, color="black", linewidth=0.8, linestyle=":")
-    median = float(np.median(np.abs(error)))
-    label_axes(
-        axes,
-        f"range error: median {median:.2f} mm, one bin = {bin_mm:.2f} mm",
-        "range error (mm), larger ones at the ends",
-        "target pixels",
-    )
+    title = f"range error: median {np.median(np.abs(error)):.2f} mm, one bin = {bin_mm:.2f} mm"
+    label_axes(axes, title, "range error (mm), larger ones at the ends", "target pixels")
 
 
 def make_range_figure(found: SurfaceImage) -> Figure:

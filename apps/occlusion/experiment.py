@@ -21,6 +21,7 @@ from tofclip.errors import InputError
 from tofclip.light_field import LightField
 from tofclip.light_field.measurement import CameraSetup
 from tofclip.occlusion import (
+    InactiveRegion,
     Rig,
     SeparatedImages,
     TimedMeasurements,
@@ -78,6 +79,27 @@ class ExperimentSettings:
             raise InputError(f"the number of photons must be positive, got {self.photons}")
 
 
+def make_rig(
+    region: InactiveRegion,
+    side_px: int,
+    focal_length_px: float,
+    focus: float,
+    samples: int,
+    setup: CameraSetup,
+) -> Rig:
+    """Return a row of views as long as the baseline, in focus at a distance, m, a lamp beside each."""
+    array = CameraArray(
+        (side_px, side_px),
+        VIEW_COUNT,
+        focal_length_px,
+        region.baseline / (VIEW_COUNT - 1),
+        focus=focus,
+        samples=samples,
+        view_rows=1,
+    )
+    return Rig(array, np.stack([array.position((v, u)) for v, u in array.views]), setup)
+
+
 @dataclass(frozen=True)
 class Experiment:
     """A scene, as it is measured."""
@@ -88,26 +110,13 @@ class Experiment:
     @cached_property
     def rig(self) -> Rig:
         """Views, lamps and measurements."""
-        near, far = self.scene.region.distance, self.scene.distance
-        side = self.settings.side_px
-        array = CameraArray(
-            (side, side),
-            VIEW_COUNT,
-            focal_length_px=side / FIELD_OF_VIEW_RAD,
-            view_step=self.scene.region.baseline / (VIEW_COUNT - 1),
-            focus=2 / (1 / near + 1 / far),
-            samples=self.settings.samples,
-            view_rows=1,
-        )
-        setup = CameraSetup(self.settings.encoder, self.settings.sampling_ratio, self.settings.seed)
-        return Rig(array, self._lamps(array), setup)
-
-    def _lamps(self, array: CameraArray) -> NDArray[np.float64]:
-        if self.settings.illumination == "oblique":
-            return np.array([OBLIQUE_LAMP_M])
-        if self.settings.illumination == "co-located":
-            return np.zeros((1, 3))
-        return np.stack([array.position((v, u)) for v, u in array.views])
+        region, known = self.scene.region, self.settings
+        setup = CameraSetup(known.encoder, known.sampling_ratio, known.seed)
+        focal_length_px = known.side_px / FIELD_OF_VIEW_RAD
+        focus = 2 / (1 / region.distance + 1 / self.scene.distance)
+        rig = make_rig(region, known.side_px, focal_length_px, focus, known.samples, setup)
+        lamps = {"oblique": np.array([OBLIQUE_LAMP_M]), "co-located": np.zeros((1, 3))}
+        return replace(rig, lamps=lamps.get(known.illumination, rig.lamps))
 
     @cached_property
     def time_axis(self) -> TimeAxis:

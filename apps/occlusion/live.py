@@ -32,6 +32,7 @@ MAX_KEPT_FRAMES = 32
 BRIGHT_FRACTION, WHITE_QUANTILE = 0.2, 0.99
 
 STOP_TIMEOUT_S = 20.0
+KEPT_OUT = "light from nearer than this is kept out of"
 
 ONE_CAMERA, ONE_CAMERA_GATED = "one camera", "one camera behind the gate"
 CLIP_GATED, TRUTH = "ToF-CLIP behind the gate", "truth, no occluder"
@@ -56,22 +57,11 @@ class WalkSource(Source):
 
     def __init__(self, scene: OcclusionScene, settings: ExperimentSettings) -> None:
         near, far = OCCLUDER_DISTANCE_M / MILLIMETRE, scene.distance / MILLIMETRE
-        self._width = Setting(
-            "occluder width (mm)",
-            1.0,
-            20.0,
-            0.5,
-            scene.region.width / MILLIMETRE,
-            f"of its solid part; the views are {BASELINE_M / MILLIMETRE:g} mm apart",
-        )
-        self._gate = Setting(
-            "gate opens (mm)",
-            near - 15,
-            far + 15,
-            1.0,
-            round((near + far) / 2),
-            "light from nearer than this is kept out of the picture",
-        )
+        width = scene.region.width / MILLIMETRE
+        hint = f"of its solid part; the views are {BASELINE_M / MILLIMETRE:g} mm apart"
+        self._width = Setting("occluder width (mm)", 1.0, 20.0, 0.5, width, hint)
+        middle, hint = round((near + far) / 2), f"{KEPT_OUT} the picture"
+        self._gate = Setting("gate opens (mm)", near - 15, far + 15, 1.0, middle, hint)
         super().__init__(
             f"{scene.title}, live", 2.0, frame_name="step", settings=(self._width, self._gate)
         )
@@ -224,14 +214,8 @@ class GatedSource(Source):
             (float(one) for one in np.percentile(ranges, (0, 100))) if len(ranges) else (0.0, 1.0)
         )
         low, high = np.floor(100 * low) / 100, np.ceil(100 * high) / 100
-        self._gate = Setting(
-            "gate opens (m)",
-            low,
-            high,
-            0.01,
-            low,
-            "light from nearer than this is kept out of cloud and picture",
-        )
+        hint = f"{KEPT_OUT} cloud and picture"
+        self._gate = Setting("gate opens (m)", low, high, 0.01, low, hint)
         super().__init__(
             f"{shots.title}, behind a gate",
             min(shots.rate, 10.0),

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.occlusion.experiment import VIEW_COUNT, make_rig
 from tofclip.light_field.measurement import CameraSetup
 from tofclip.metrics import correlation_coefficient
 from tofclip.occlusion import (
@@ -29,7 +30,6 @@ from tofclip.occlusion import (
 from tofclip.recovery.light_field import MAX_ITERATIONS, OBJECTIVE_TOLERANCE
 from tofclip.simulate.bodies import Body, Lambertian, Rectangle
 from tofclip.simulate.light_fields import (
-    CameraArray,
     PulsedScene,
     TimeAxis,
     render_flash,
@@ -44,7 +44,6 @@ DISTANCE_FACTORS = (0.8, 1.2, 2.0)  # behind the occluder, in lengths of the ina
 TARGET_WIDTH_FRACTION = 0.15  # of the occluder's; the umbra is 0.2 of it wide at 0.8 of its length
 MIN_CORRELATION = 0.8  # with the unoccluded truth: from there on a target counts as recovered
 
-VIEW_COUNT = 7
 PICTURE_PX = 48
 TARGET_PX = 20
 PULSE_FWHM_S = 10e-12  # the nearest target of all trials answers 25 ps after its occluder
@@ -95,7 +94,8 @@ def probe_target(
     distance = region.distance + factor * region.length
     width = TARGET_WIDTH_FRACTION * region.width
     focal_length_px = distance * TARGET_PX / width
-    rig = _make_rig(region, PICTURE_PX, focal_length_px, distance, 2, seed)
+    setup = CameraSetup("line", 1.0, seed)
+    rig = make_rig(region, PICTURE_PX, focal_length_px, distance, 2, setup)
     letter = Lambertian(cut_pattern(make_letter("L"), make_plain_pattern(0.9)))
     target = Body(Rectangle(width, width), letter, np.array([0.0, 0.0, distance]))
     # one bin about the target's return that opens halfway from the occluder's
@@ -130,8 +130,8 @@ def probe_with_fixed_camera(
     width = TARGET_WIDTH_FRACTION * region.width
     focal_length_px = FIXED_PICTURE_PX / FIXED_FIELD_OF_VIEW_RAD
     rigs = [
-        _make_rig(region, FIXED_PICTURE_PX, focal_length_px, FIXED_FOCUS_M, 1, seed)
-        for seed in range(seeds)
+        make_rig(region, FIXED_PICTURE_PX, focal_length_px, FIXED_FOCUS_M, 1, setup)
+        for setup in (CameraSetup("line", 1.0, seed) for seed in range(seeds))
     ]
     array, lamps = rigs[0].array, rigs[0].lamps
     sweep = TimeAxis.for_ranges(
@@ -168,28 +168,6 @@ def _make_board(cell_width: float, side: float, distance: float) -> Body:
         Lambertian(np.where(bright, 0.9, 0.1)),
         np.array([0.0, 0.0, distance]),
     )
-
-
-def _make_rig(
-    region: InactiveRegion,
-    side_px: int,
-    focal_length_px: float,
-    focus: float,
-    samples: int,
-    seed: int,
-) -> Rig:
-    """A row of views as long as the baseline, in focus at a distance, a lamp beside each."""
-    array = CameraArray(
-        (side_px, side_px),
-        VIEW_COUNT,
-        focal_length_px,
-        region.baseline / (VIEW_COUNT - 1),
-        focus=focus,
-        samples=samples,
-        view_rows=1,
-    )
-    lamps = np.stack([array.position((v, u)) for v, u in array.views])
-    return Rig(array, lamps, CameraSetup("line", 1.0, seed))
 
 
 def _recover_target(rig: Rig, light: Array, brightest: float, seed: int) -> tuple[Array, int]:

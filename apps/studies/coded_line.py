@@ -5,7 +5,6 @@ rotating the lines gains.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -105,26 +104,18 @@ def _tabulate_model(
     return SparseMatrix(matrix, shape, (matrix.shape[0],))
 
 
-@dataclass(frozen=True)
-class LineArm:
-    """One arm of the comparison: ten lines of one width, upright or rotated."""
-
-    name: str
-    width_px: int  # n_p
-    max_angle: float  # angles run evenly from minus this to this, rad
-
-
-def measure_arm(
-    light_field: LightField, shear: float, seeds: int, arm: LineArm
+def measure_lines(
+    light_field: LightField, shear: float, seeds: int, lines: tuple[int, float]
 ) -> tuple[tuple[float, ...], NDArray[Any]]:
-    """Recover a light field's picture through an arm's lines, a view for each line, once for each
-    seed of their codes: PSNR of each seed, dB, against shift-and-add, and the first seed's picture.
+    """Recover a light field's picture through ten lines, a view for each, once for each seed of
+    their codes: PSNR of each seed, dB, against shift-and-add, and the first seed's picture. `lines`:
+    their width, n_p, and the angle up to which they turn to either side, rad.
     """
     truth = light_field.refocus(shear)
     shape = (truth.shape[0], truth.shape[1])
     weight, pictures = None, []  # the weight chosen with the first seed is kept
     for seed in range(seeds):
-        sensors = make_coded_line_sensors(shape, LINES, arm.width_px, arm.max_angle, seed)
+        sensors = make_coded_line_sensors(shape, LINES, *lines, seed)
         picture, weight = recover_from_lines(light_field, shear, sensors, weight)
         pictures.append(picture)
     return tuple(compute_psnr_db(one, truth) for one in pictures), pictures[0]
@@ -158,16 +149,14 @@ def run_line_rotation(library: Library, seeds: int, advance: Advance) -> Outcome
     """Recover letters through ten coded lines of several widths, with and without rotation."""
     light_field = halve_pictures(select_views(library.light_field(SCENE), LINES))
     shear = SHEAR / 2  # a pixel is twice as wide
-    arms = [
-        LineArm(name, width, angle) for name, angle in MAX_ANGLES_RAD.items() for width in WIDTHS_PX
-    ]
+    arms = [(name, (width, angle)) for name, angle in MAX_ANGLES_RAD.items() for width in WIDTHS_PX]
     truth = light_field.refocus(shear)
     rows, panels = [], {name: [Panel(f"true; right: {name}", truth)] for name in MAX_ANGLES_RAD}
-    results = map_parallel(partial(measure_arm, light_field, shear, seeds), arms)
-    for arm, (psnr_db, picture) in zip(arms, results, strict=True):
-        rows.append(Row((arm.name, str(arm.width_px)), psnr_db))
-        title = f"{arm.width_px} px wide\n{psnr_db[0]:.1f} dB"
-        panels[arm.name].append(Panel(title, picture))
+    measure = partial(measure_lines, light_field, shear, seeds)
+    results = map_parallel(measure, [lines for _, lines in arms])
+    for (name, (width, _)), (psnr_db, picture) in zip(arms, results, strict=True):
+        rows.append(Row((name, str(width)), psnr_db))
+        panels[name].append(Panel(f"{width} px wide\n{psnr_db[0]:.1f} dB", picture))
         advance(seeds)
     return Outcome(("lines", "N_p, px"), "PSNR, dB", rows, list(panels.values()))
 

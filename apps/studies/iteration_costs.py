@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import astuple, dataclass
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -14,12 +15,12 @@ from apps.studies.cases import Advance, Library, Outcome, Panel, Row, study
 from tofclip.light_field import LightField
 from tofclip.operators import LinearOperator, Reshape, estimate_squared_norm
 from tofclip.operators.cameras import CAMERAS, COMPRESSIVE_CAMERAS, LightFieldCamera
-from tofclip.operators.shear import View
 from tofclip.solvers import Fista, LeastSquares, NonnegativeTotalVariation
 from tofclip.threads import limit_blas_threads
 
 TV_WEIGHT = 1e-2  # relative to the largest A'f; what an iteration costs does not depend on it
 NORM_ITERATIONS = 10
+WHOLE, PICTURE = "light field", "refocused picture"
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class IterationCost:
     """One row of Table 1, with what was measured."""
 
     method: str
-    recovers: str  # ``"light field"`` or ``"refocused picture"``
+    recovers: str  # `WHOLE` or `PICTURE`
     measurements: int
     unknowns: int
     # of one iteration as the paper has it: N pixels on a side, n_a views on a side, m measurements,
@@ -36,16 +37,6 @@ class IterationCost:
     # of one whole iteration: model, prior and bookkeeping; the median of the repeats
     seconds: float
     model_seconds: float  # of the model and its adjoint alone, the median of the repeats
-
-
-@dataclass(frozen=True)
-class _Method:
-    """A camera and what is recovered from its measurements."""
-
-    name: str
-    camera: LightFieldCamera
-    recovers: str
-    complexity: str
 
 
 def measure_iteration_costs(
@@ -62,14 +53,6 @@ def measure_iteration_costs(
     """
     views = [(v, u) for v, u in light_field.views.tolist()]
     shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])
-    methods = _list_methods(shape, views, exposures, sampling_ratio)
-    with limit_blas_threads():  # all methods on one core
-        return [_time_method(method, light_field, shear, repeats) for method in methods]
-
-
-def _list_methods(
-    shape: tuple[int, int], views: list[View], exposures: int, sampling_ratio: float
-) -> list[_Method]:
     line, pixel = (
         CAMERAS[name](shape, views, sampling_ratio, 0) for name in ("line", "single-pixel")
     )
@@ -77,43 +60,36 @@ def _list_methods(
         name: kind(shape, views, 1 if name == "marwah" else exposures, 0)
         for name, kind in COMPRESSIVE_CAMERAS.items()
     }
-    whole, picture = "light field", "refocused picture"
-    return [
-        _Method("Ashok", masks["ashok"], whole, "(2r + k) n_a^2 N^2"),
-        _Method("Babacan", masks["babacan"], whole, "(2r + k) n_a^2 N^2"),
-        _Method("Marwah", masks["marwah"], whole, "(2 + k) n_a^2 N^2"),
-        _Method(
-            "Cai, Antipa",
-            CAMERAS["diffuser"](shape, views, 1.0, 0),
-            whole,
-            "(4 log N + k n_a^2) N^2",
-        ),
-        _Method("CLIP-1D", line, whole, "(2m + k n_a^2) N^2"),
-        _Method("CLIP-0D", pixel, whole, "(2m + k n_a^2) N^2"),
-        _Method("CLIP-1D", line, picture, "(2m + 2n_a^2 + k) N^2"),
-        _Method("CLIP-0D", pixel, picture, "(2m + 2n_a^2 + k) N^2"),
+    diffuser = CAMERAS["diffuser"](shape, views, 1.0, 0)
+    methods: list[tuple[str, LightFieldCamera, str, str]] = [
+        ("Ashok", masks["ashok"], WHOLE, "(2r + k) n_a^2 N^2"),
+        ("Babacan", masks["babacan"], WHOLE, "(2r + k) n_a^2 N^2"),
+        ("Marwah", masks["marwah"], WHOLE, "(2 + k) n_a^2 N^2"),
+        ("Cai, Antipa", diffuser, WHOLE, "(4 log N + k n_a^2) N^2"),
+        ("CLIP-1D", line, WHOLE, "(2m + k n_a^2) N^2"),
+        ("CLIP-0D", pixel, WHOLE, "(2m + k n_a^2) N^2"),
+        ("CLIP-1D", line, PICTURE, "(2m + 2n_a^2 + k) N^2"),
+        ("CLIP-0D", pixel, PICTURE, "(2m + 2n_a^2 + k) N^2"),
     ]
+    costs = []
+    with limit_blas_threads():  # all methods on one core
+        for name, camera, recovers, complexity in methods:
+            seen = light_field.pictures[list(camera.used_views)]
+            measurements = camera.light_field_model()(seen)
+            model = camera.model(shear) if recovers == PICTURE else _build_tall_model(camera)
+            solver = _build_solver(model, measurements)
+            times = (
+                _measure_median_seconds(action, repeats)
+                for action in (solver.step, partial(_multiply, model, solver))
+            )
+            unknowns = int(np.prod(model.shape_in))
+            numbers = (measurements.size, unknowns)
+            costs.append(IterationCost(name, recovers, *numbers, complexity, *times))
+    return costs
 
 
-def _time_method(
-    method: _Method, light_field: LightField, shear: float, repeats: int
-) -> IterationCost:
-    camera = method.camera
-    pictures = light_field.pictures[list(camera.used_views)]
-    measurements = camera.light_field_model()(pictures)
-    model = (
-        camera.model(shear) if method.recovers == "refocused picture" else _build_tall_model(camera)
-    )
-    solver = _build_solver(model, measurements)
-    return IterationCost(
-        method.name,
-        method.recovers,
-        measurements.size,
-        int(np.prod(model.shape_in)),
-        method.complexity,
-        _measure_median_seconds(solver.step, repeats),
-        _measure_median_seconds(lambda: model.adjoint(model(solver.current)), repeats),
-    )
+def _multiply(model: LinearOperator, solver: Fista) -> None:
+    model.adjoint(model(solver.current))
 
 
 def _build_tall_model(camera: LightFieldCamera) -> LinearOperator:

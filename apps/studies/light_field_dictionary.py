@@ -29,7 +29,6 @@ TRAINING_PATCHES = 2000
 MAX_COMPONENTS = 256
 SPARSITY_WEIGHT = 0.2  # of unit patches
 EPOCHS = 2
-POWER_ITERATIONS = 15
 
 
 @dataclass(frozen=True)
@@ -129,11 +128,10 @@ def _compute_sparse_weights(
     """Shares of the atoms, (patches, atoms), for coded dictionaries (patches, pixels, atoms)."""
     transposed = coded.swapaxes(1, 2)
     correlation = (transposed @ measurements[..., np.newaxis])[..., 0]
-    # The power iteration approaches the eigenvalue from below, hence the margin.
-    step = 1 / (1.05 * _compute_largest_eigenvalues(coded))[:, np.newaxis]
-    threshold = (
-        step * weight * np.abs(correlation).max(axis=1, keepdims=True) * np.ones_like(correlation)
-    )
+    largest = np.linalg.eigvalsh(coded @ transposed)[:, -1:]  # of each dictionary's Gram matrix
+    step = 1 / np.maximum(1.05 * largest, np.finfo(np.float32).tiny)
+    threshold = step * weight * np.abs(correlation).max(axis=1, keepdims=True)
+    threshold = np.repeat(threshold, correlation.shape[1], axis=1)
     threshold[:, 0] = 0  # brightness
     shares = ahead = np.zeros_like(correlation)
     age = 1.0
@@ -146,18 +144,6 @@ def _compute_sparse_weights(
         ahead = following + np.float32((older - 1) / age) * (following - shares)
         shares = following
     return shares
-
-
-def _compute_largest_eigenvalues(coded: Array) -> Array:
-    """Of each coded dictionary's Gram matrix, by power iteration."""
-    vector = np.ones((coded.shape[0], coded.shape[2], 1), np.float32)
-    length = np.ones(coded.shape[0], np.float32)
-    for _ in range(POWER_ITERATIONS):
-        vector = coded.swapaxes(1, 2) @ (coded @ vector)
-        length = np.linalg.norm(vector[..., 0], axis=1)
-        vector /= np.maximum(length, np.finfo(np.float32).tiny)[:, np.newaxis, np.newaxis]
-    safe: Array = np.maximum(length, np.finfo(np.float32).tiny)
-    return safe
 
 
 def _draw_training_patches(

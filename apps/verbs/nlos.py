@@ -35,15 +35,16 @@ from apps.settings import (
     settings_to_dict,
 )
 from apps.verbs.nlos_imaging import (
+    CAPTURE,
     METHODS,
     PORTABLE_METHODS,
     ImagingSettings,
     PreparedImaging,
     add_provenance,
+    choose_methods,
     image_capture,
     is_capture_folder,
     list_captures,
-    parse_method_names,
     prepare_imaging,
     require_valid_settings,
     show_settings,
@@ -58,8 +59,6 @@ from tofclip.units import MILLIMETRE, PICOSECOND
 if TYPE_CHECKING:
     from nlos import Capture, Grid, Method, Volume
     from tofclip.sequences.jobs import Report
-
-CAPTURE = arg("CAPTURE", "Recovered frames of a relay wall, or a capture.", read=True)
 
 PHOTONS = "photons"
 REFINEMENTS = ("l1", "tv", PHOTONS)
@@ -84,9 +83,20 @@ app = make_group("Image the scene hidden around a corner.")
 
 
 @dataclass(frozen=True)
-class RefinementSettings(Settings):
-    """Whether and how an image is refined."""
+class ReconstructSettings(Settings):
+    """How a capture is imaged, refined and written."""
 
+    method: str | None = setting(
+        "NAME",
+        f"One of {', '.join(METHODS)}.",
+        shown="the quickest that suits the capture",
+        choices=METHODS,
+    )
+    point_fraction: float = setting(
+        "SHARE",
+        "Voxels with this share of the brightest become points of .ply, .pcd, .csv, and the surface.",
+        0.3,
+    )
     refine: str | None = setting(
         "NAME",
         "Iterate the image: photons by the statistics of counts; l1 for few bright things, tv for even surfaces.",
@@ -102,23 +112,6 @@ class RefinementSettings(Settings):
         "SHARE",
         "With --refine: weight of the prior, of that which leaves nothing; photons: of noise's standard deviation.",
         shown=f"{PRIOR_WEIGHTS['l1']}; photons: {PRIOR_WEIGHTS[PHOTONS]:g}",
-    )
-
-
-@dataclass(frozen=True)
-class ReconstructSettings(RefinementSettings):
-    """How a capture is imaged and written."""
-
-    method: str | None = setting(
-        "NAME",
-        f"One of {', '.join(METHODS)}.",
-        shown="the quickest that suits the capture",
-        choices=METHODS,
-    )
-    point_fraction: float = setting(
-        "SHARE",
-        "Voxels with this share of the brightest become points of .ply, .pcd, .csv, and the surface.",
-        0.3,
     )
 
 
@@ -252,11 +245,7 @@ def _check_reconstruction(wanted: ReconstructSettings) -> None:
     """Refuse settings that no capture could make sense of, before any is read."""
     if not 0 <= wanted.point_fraction <= 1:
         raise InputError(f"point_fraction is a share between 0 and 1, got {wanted.point_fraction}")
-    names = PORTABLE_METHODS if wanted.method is None else parse_method_names(wanted.method)
-    if wanted.method is not None and len(names) > 1:
-        raise InputError(
-            f"one method is asked for, got '{wanted.method}'; nlos compare takes several"
-        )
+    names = choose_methods(wanted.method, PORTABLE_METHODS)
     _check_refinement(wanted)
     require_valid_settings(wanted, names)
 

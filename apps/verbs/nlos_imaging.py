@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from apps.options import arg
 from apps.progress import show_activity, show_progress
 from apps.report import build_provenance
 from apps.settings import find_key
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 METHODS = tuple(METHOD_CLASSES)
 PORTABLE_METHODS = METHODS_BY_SPEED
 """They compute wherever the signal is; the others have compiled loops only."""
+
+CAPTURE = arg("CAPTURE", "Recovered frames of a relay wall, or a capture.", read=True)
 
 PULSE_SETTINGS = {"wavelength", "cycles"}
 CAPTURE_SUFFIXES = (".h5", ".hdf5", ".npz", ".mat")
@@ -85,6 +88,15 @@ def parse_method_names(text: str) -> tuple[str, ...]:
             raise InputError(f"unknown method '{name}'; choose from {', '.join(METHODS)}")
     if len(set(names)) < len(names):
         raise InputError(f"a method is named twice in '{text}'")
+    return names
+
+
+def choose_methods(method: str | None, usual: Sequence[str]) -> Sequence[str]:
+    """Return the methods that may image a capture: the one that is named, or the usual ones."""
+    names = usual if method is None else parse_method_names(method)
+    if method is not None and len(names) > 1:
+        one = f"one method images a stream or a capture, got '{method}'"
+        raise InputError(f"{one}; nlos compare takes several")
     return names
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from apps.options import JSON, SEED, SETTINGS, arg, opt
+from apps.options import JSON, SEED, SETTINGS, opt
 from apps.progress import show_activity
 from apps.report import (
     PICTURE_SUFFIXES,
@@ -29,6 +29,7 @@ from apps.settings import (
     settings_to_dict,
 )
 from apps.verbs.nlos_imaging import (
+    CAPTURE,
     METHODS,
     ImagingSettings,
     MeasuredVolume,
@@ -76,7 +77,7 @@ class CompareSettings(ImagingSettings):
 
 @add_setting_flags(CompareSettings)
 def compare(
-    source: Path = arg("CAPTURE", "Recovered frames of a relay wall, or a capture.", read=True),
+    source: Path = CAPTURE,
     out: Path = opt("PNG", "The picture to write.", ...),
     volumes: Path | None = opt("DIR", "Folder for the volumes, one file per method."),
     settings: Path | None = SETTINGS,

@@ -29,10 +29,12 @@ from apps.settings import (
     settings_to_dict,
 )
 from apps.verbs.nlos_imaging import (
+    CAPTURE,
     CAPTURE_SUFFIXES,
     GEOMETRY_FILE,
     METHODS,
     PORTABLE_METHODS,
+    choose_methods,
     is_capture_folder,
     list_captures,
     parse_method_names,
@@ -136,9 +138,7 @@ def stream(
 
 
 def _check_stream(wanted: StreamSettings, follow_s: float, captures: int | None) -> None:
-    names = METHODS if wanted.method is None else parse_method_names(wanted.method)
-    if wanted.method is not None and len(names) > 1:
-        raise InputError(f"one method images a stream, got '{wanted.method}'")
+    names = choose_methods(wanted.method, METHODS)
     require_valid_settings(wanted, names)
     if wanted.average < 1:
         raise InputError(f"--average must be 1 or more, got {wanted.average}")
@@ -369,7 +369,7 @@ class FilmSettings(Settings):
 
 @add_setting_flags(FilmSettings)
 def film(
-    source: Path = arg("CAPTURE", "Recovered frames of a relay wall, or a capture.", read=True),
+    source: Path = CAPTURE,
     out: Path = opt("FILE", "The film to write, .mp4 or .gif; or its numbers, .h5.", ...),
     settings: Path | None = SETTINGS,
     as_json: bool = JSON,

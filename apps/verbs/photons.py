@@ -260,16 +260,9 @@ def save_range_image(found: SurfaceImage, camera: Camera, path: Path, returns: i
     from tofclip.files import atomic_path
 
     known = camera.range_calibration
-    layers: list[dict[str, Any]] = [
-        {
-            "range_m": one.range,
-            "range_sigma_m": one.range_sigma,
-            "intensity": one.intensity,
-            "outlier_probability": one.outlier_probability,
-        }
-        for one in (found, *found.further)
-    ]
-    arrays = dict(layers[0])
+    names = {"range_m": "range", "range_sigma_m": "range_sigma"}
+    names |= {name: name for name in ("intensity", "outlier_probability")}
+    arrays: dict[str, Any] = {key: getattr(found, name) for key, name in names.items()}
     if found.hot_pixels is not None and found.hot_pixels.any():
         arrays["hot_pixels"] = found.hot_pixels
     if known is not None and np.isfinite(known.reflectance_scale):
@@ -277,7 +270,8 @@ def save_range_image(found: SurfaceImage, camera: Camera, path: Path, returns: i
             found.intensity * found.range**2, *np.indices(found.range.shape)
         )
     if returns > 1:
-        for name in layers[0]:
-            arrays[f"returns_{name}"] = np.stack([one[name] for one in layers], axis=-1)
+        for key, name in names.items():
+            layers = [getattr(one, name) for one in (found, *found.further)]
+            arrays[f"returns_{key}"] = np.stack(layers, axis=-1)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **arrays)

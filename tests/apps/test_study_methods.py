@@ -13,11 +13,10 @@ from scipy.ndimage import gaussian_filter
 from apps.studies.coded_line import (
     LINES,
     MAX_ANGLE_RAD,
-    LineArm,
     compute_column_ranks,
     compute_psnr_db,
     make_coded_line_sensors,
-    measure_arm,
+    measure_lines,
     recover_from_lines,
     select_views,
 )
@@ -76,8 +75,7 @@ class TestCodedLine:
         whole = read_light_field(shared_data / "lightfields" / "render_letters.npz")
         light_field = select_views(whole, LINES)
         upright, rotated = (
-            measure_arm(light_field, -0.3, 5, LineArm("", 1, angle))[0]
-            for angle in (0.0, MAX_ANGLE_RAD)
+            measure_lines(light_field, -0.3, 5, (1, angle))[0] for angle in (0.0, MAX_ANGLE_RAD)
         )
         gain_db = np.subtract(rotated, upright)
         assert gain_db.shape == (5,)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -34,30 +33,28 @@ LONG = 60.0  # compiling, on a slow machine
 SIMULATED = f"sim+timetag://?seed=3&records={RECORDS}&transfer_kib=1&reconnect_s=5"
 
 
-def emulated(folder: Path) -> str:
-    return SIMULATED
+EMULATED = {
+    "emulated": SIMULATED,
+    "emulated in short packets": f"{SIMULATED}&packet_bytes=510",
+    "emulated with faults": f"{SIMULATED}&faults=stall@2,unplug@5:1,corrupt@8:3,overflow@11,short@13:5,lost@15:20",
+    "simulated linospad2": "sim+linospad2://?seed=2&cycles=12",
+    "emulated spad array": "sim+spad512://?seed=2&width=16&pictures=20",
+    "emulated streak camera": "sim+remoteex://?seed=2&scene=small&frames=8&frame_rate=100",
+}
 
 
-def emulated_in_short_packets(folder: Path) -> str:
-    return f"{SIMULATED}&packet_bytes=510"
-
-
-def emulated_with_faults(folder: Path) -> str:
-    return f"{SIMULATED}&faults=stall@2,unplug@5:1,corrupt@8:3,overflow@11,short@13:5,lost@15:20"
-
-
-def recorded(folder: Path) -> str:
+def recorded(folder):
     path = folder / "run.h5"
     if not path.exists():
-        record_until_quiet(devices.open(emulated_with_faults(folder)), path)
+        record_until_quiet(devices.open(EMULATED["emulated with faults"]), path)
     return f"file://{path}"
 
 
-def record_until_quiet(source: Source, path: Path) -> None:
+def record_until_quiet(source: Source, path: Path):
     """Record all that a source has; a live one is stopped once it falls silent."""
     seen, asked = 0, 0
 
-    def stop_when_quiet(seconds: float) -> None:
+    def stop_when_quiet(seconds: float):
         nonlocal seen, asked
         stats = source.stats
         if stats.delivered + stats.malformed > seen:
@@ -68,27 +65,22 @@ def record_until_quiet(source: Source, path: Path) -> None:
     record_source(source, path, LONG, watch=stop_when_quiet if source.is_live else None)
 
 
-def recorded_and_paced(folder: Path) -> str:
+def recorded_and_paced(folder):
     return f"{recorded(folder)}?pace=realtime"
 
 
-def simulated_linospad2(folder: Path) -> str:
-    return "sim+linospad2://?seed=2&cycles=12"
-
-
-def recorded_linospad2(folder: Path) -> str:
+def recorded_linospad2(folder):
     path = folder / "linospad2.h5"
     if not path.exists():
-        record_source(devices.open(simulated_linospad2(folder)), path)
+        record_source(devices.open(EMULATED["simulated linospad2"]), path)
     return f"file://{path}"
 
 
-def words_of_linospad2(folder: Path) -> str:
+def words_of_linospad2(folder):
     path = folder / "words.dat"
     if not path.exists():
-        board = SimulatedBoard(
-            simulate_line_light(), draw_uneven_calibration(2), LinoSpad2Codec(), 100, 2
-        )
+        parts = simulate_line_light(), draw_uneven_calibration(2), LinoSpad2Codec()
+        board = SimulatedBoard(*parts, 100, 2)
         path.write_bytes(b"".join(board.encode_cycle(number) for number in range(45)))
         path.with_suffix(".toml").write_text(
             'firmware = "2212b"\ntimestamps_per_cycle = 512\nabsolute_counter = false\n'
@@ -96,43 +88,22 @@ def words_of_linospad2(folder: Path) -> str:
     return f"linospad2://{path}"
 
 
-def photons_of_a_ptu(folder: Path) -> str:
+def photons_of_a_ptu(folder):
     ptufile = pytest.importorskip("ptufile")
     path = folder / "photons.ptu"
     if not path.exists():
         counts = np.random.default_rng(1).poisson(900, (1, 1, 1, 2, 250)).astype(np.uint16)
-        ptufile.imwrite(
-            path, counts, global_resolution=25e-9, tcspc_resolution=32e-12, pixel_time=1e-2
-        )
+        clocks = {"global_resolution": 25e-9, "tcspc_resolution": 32e-12, "pixel_time": 1e-2}
+        ptufile.imwrite(path, counts, **clocks)
     return f"file://{path}"
 
 
-def emulated_spad_array(folder: Path) -> str:
-    return "sim+spad512://?seed=2&width=16&pictures=20"
-
-
-def emulated_streak_camera(folder: Path) -> str:
-    return "sim+remoteex://?seed=2&scene=small&frames=8&frame_rate=100"
-
-
-KINDS = [
-    emulated,
-    emulated_in_short_packets,
-    emulated_with_faults,
-    recorded,
-    recorded_and_paced,
-    simulated_linospad2,
-    recorded_linospad2,
-    words_of_linospad2,
-    photons_of_a_ptu,
-    emulated_spad_array,
-    emulated_streak_camera,
-]
-Open = Callable[[], Source]
+WRITTEN = [recorded, recorded_and_paced, recorded_linospad2, words_of_linospad2, photons_of_a_ptu]
+KINDS = EMULATED | {kind.__name__: kind for kind in WRITTEN}
 
 
 @pytest.fixture(autouse=True)
-def own_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def own_time(monkeypatch):
     """Let the time tagger's driver measure rates by its own work: the emulated instrument's time runs
     as fast as it is read, and does not while other programs have the processor.
     """
@@ -140,22 +111,23 @@ def own_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """What the kinds write, once."""
     return tmp_path_factory.mktemp("sources")
 
 
-@pytest.fixture(params=KINDS, ids=lambda kind: kind.__name__)
-def address(request: pytest.FixtureRequest, folder: Path) -> str:
-    return str(request.param(folder))
+@pytest.fixture(params=KINDS)
+def address(request, folder):
+    kind = KINDS[request.param]
+    return kind if isinstance(kind, str) else kind(folder)
 
 
 @pytest.fixture
-def opened(address: str) -> Open:
+def opened(address):
     return lambda: devices.open(address)
 
 
-def read_on(source: Source, batches: list[Batch]) -> None:
+def read_on(source: Source, batches: list[Batch]):
     """Read until nothing more comes: a live source is stopped once it falls silent, a paced replay
     is waited for.
     """
@@ -180,15 +152,15 @@ def joined(batches: list[Batch]) -> Records:
     return np.concatenate([batch.records for batch in batches])
 
 
-def test_it_says_what_it_is(opened: Open) -> None:
+def test_it_says_what_it_is(opened):
     with opened() as source:
         assert source.info.instrument
         assert json.loads(json.dumps(source.info.as_dict()))["instrument"] == source.info.instrument
         assert source.calibration is None or source.calibration.kind
 
 
-def test_batches_are_numbered_arrays_of_records(opened: Open) -> None:
-    batches: list[Batch] = []
+def test_batches_are_numbered_arrays_of_records(opened):
+    batches = []
     with opened() as source:
         read_on(source, batches)
     assert len(batches) > 5
@@ -201,7 +173,7 @@ def test_batches_are_numbered_arrays_of_records(opened: Open) -> None:
     assert position > len(batches) / 2
 
 
-def test_accounts_balance_at_every_moment(opened: Open) -> None:
+def test_accounts_balance_at_every_moment(opened):
     delivered = 0
     with opened() as source:
         assert source.stats.is_balanced
@@ -216,8 +188,8 @@ def test_accounts_balance_at_every_moment(opened: Open) -> None:
     assert source.stats.unread > 0
 
 
-def test_everything_read_is_everything_there_was(opened: Open, address: str) -> None:
-    batches: list[Batch] = []
+def test_everything_read_is_everything_there_was(opened, address):
+    batches = []
     with opened() as source:
         read_on(source, batches)
     stats = source.stats
@@ -229,29 +201,23 @@ def test_everything_read_is_everything_there_was(opened: Open, address: str) -> 
         assert stats.acquired == RECORDS
 
 
-def test_after_the_end_there_is_nothing(opened: Open) -> None:
+def test_after_the_end_or_after_closing_there_is_nothing(opened):
     with opened() as source:
         read_on(source, [])
         assert source.read(0.0) is None
         assert list(source) == []
-
-
-def test_after_closing_there_is_nothing(opened: Open) -> None:
     source = opened()
     source.read(LONG)
     source.close()
     source.close()
     assert source.read(0.0) is None
     assert source.stats.is_balanced
-
-
-def test_an_exception_closes_it(opened: Open) -> None:
     with pytest.raises(ZeroDivisionError), opened() as source:
         raise ZeroDivisionError
     assert source.read(0.0) is None
 
 
-def test_waiting_is_bounded(opened: Open) -> None:
+def test_waiting_is_bounded(opened):
     with opened() as source:
         if not source.is_live:
             return
@@ -268,18 +234,18 @@ def test_waiting_is_bounded(opened: Open) -> None:
         assert SILENCE <= time.monotonic() - begin < SILENCE + 5
 
 
-def test_seeking_is_exact_or_refused(opened: Open) -> None:
+def test_seeking_is_exact_or_refused(opened):
     with opened() as source:
         if not source.is_seekable:
             with pytest.raises(InputError, match="cannot seek"):
                 source.seek(0)
             return
-        first: list[Batch] = []
+        first = []
         read_on(source, first)
         whole = joined(first)
         for target in (len(whole) // 2, 0, 1, len(whole) // 3, len(whole) - 1):
             source.seek(target)
-            again: list[Batch] = []
+            again = []
             read_on(source, again)
             assert again[0].first == target
             np.testing.assert_array_equal(joined(again), whole[target:])
@@ -293,7 +259,7 @@ def test_seeking_is_exact_or_refused(opened: Open) -> None:
                 source.seek(absent)
 
 
-def test_the_same_again_is_the_same(opened: Open) -> None:
+def test_the_same_again_is_the_same(opened):
     runs: list[list[Batch]] = [[], []]
     for batches in runs:
         with opened() as source:
@@ -303,7 +269,7 @@ def test_the_same_again_is_the_same(opened: Open) -> None:
     assert gaps[0] == gaps[1]
 
 
-def test_its_bytes_are_tapped_before_they_are_decoded(opened: Open, tmp_path: Path) -> None:
+def test_its_bytes_are_tapped_before_they_are_decoded(opened, tmp_path):
     with opened() as source:
         if not isinstance(source, DecodedSource):
             return
@@ -315,7 +281,7 @@ def test_its_bytes_are_tapped_before_they_are_decoded(opened: Open, tmp_path: Pa
         np.testing.assert_array_equal(found.records, batch.records)
 
 
-def test_its_recording_replays_what_it_gave(opened: Open, tmp_path: Path) -> None:
+def test_its_recording_replays_what_it_gave(opened, tmp_path):
     path, recorded_from = tmp_path / "again.h5", opened()
     if not isinstance(recorded_from, DecodedSource):
         with recorded_from, pytest.raises(InputError, match="nothing to record"):
@@ -323,7 +289,7 @@ def test_its_recording_replays_what_it_gave(opened: Open, tmp_path: Path) -> Non
         return
     record_until_quiet(recorded_from, path)
     assert verify(path).is_sound
-    live: list[Batch] = []
+    live = []
     with opened() as source:
         read_on(source, live)
     with devices.open(f"file://{path}") as replay:
@@ -332,6 +298,6 @@ def test_its_recording_replays_what_it_gave(opened: Open, tmp_path: Path) -> Non
     assert replay.info == source.info
 
 
-def test_unknown_values_in_its_address_are_refused(address: str) -> None:
+def test_unknown_values_in_its_address_are_refused(address):
     with pytest.raises(InputError, match="'colour' is unknown"):
         devices.open(f"{address}{'&' if '?' in address else '?'}colour=red")
