@@ -21,31 +21,22 @@ from pathlib import Path
 from distributed import LocalCluster
 
 from apps.benchmarks.harness import Prepare, PreparedCase
-from apps.benchmarks.shots import bring_shots, make_instrument
+from apps.benchmarks.shots import bring_shots, make_instrument, simulate_shots
 from tofclip.sequences import RangingSettings, list_shots
 from tofclip.sequences.jobs import Summary, run_jobs
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
-from tofclip.shots import Streak
-from tofclip.simulate import make_default_scene, simulate_shot
 
 RATE_FRACTION = 0.75  # of the rate that a stream reaches: the pace at which latency is measured
 
-DISTINCT_SHOTS = 3
 ROWS, SMALL_ROWS, CLUSTER_ROWS = 1016, 576, 254
 SUFFIX = ".npz"
 BYTES_PER_MIB = 1 << 20
 
 
-def make_streaks(rows: int) -> list[Streak]:
-    """Shots that differ in their noise."""
-    instrument, scene = make_instrument(rows), make_default_scene()
-    return [simulate_shot(scene, instrument, seed).streak for seed in range(DISTINCT_SHOTS)]
-
-
 def prepare_stream(rows: int, shots: int) -> PreparedCase:
     """Shots as fast as they are taken, then at three quarters of that rate."""
-    streaks = make_streaks(rows)
+    streaks = simulate_shots(rows)
     pipeline = RangingPipeline.for_shot(streaks[0])
 
     def stream(period_s: float = 0.0, number: int = shots) -> list[float]:
@@ -86,16 +77,15 @@ def start_workers(number: int) -> Iterator[str]:
 
 def record_shots(folder: Path, number: int) -> Path:
     """Simulate some shots, and link to them under as many names as asked for."""
-    instrument, scene = make_instrument(CLUSTER_ROWS), make_default_scene()
-    shots = folder / "shots"
+    streaks, shots = simulate_shots(CLUSTER_ROWS), folder / "shots"
     shots.mkdir()
     for place in range(number):
         path = shots / f"shot{place:04d}.h5"
-        if place < DISTINCT_SHOTS:
-            simulate_shot(scene, instrument, place).streak.save(path)
+        if place < len(streaks):
+            streaks[place].save(path)
         else:
-            os.link(shots / f"shot{place % DISTINCT_SHOTS:04d}.h5", path)
-    instrument.camera.save(folder / "camera.h5")
+            os.link(shots / f"shot{place % len(streaks):04d}.h5", path)
+    make_instrument(CLUSTER_ROWS).camera.save(folder / "camera.h5")
     return shots
 
 

@@ -167,7 +167,8 @@ def _draw_room(axes: Axes, run: DemoRun) -> None:
     axes.plot(x, z, color=INK_COLOUR, lw=2)
     draw_outline(axes, run.truth, "xz")
     seen = int(np.argmin(np.abs(x - WALL_POINT_X_M)))
-    spot, point = run.capture.laser[[0, 2]].tolist(), [float(x[seen]), float(z[seen])]
+    laser_x, _, laser_z = run.capture.laser.tolist()
+    spot, point = (laser_x, laser_z), (float(x[seen]), float(z[seen]))
     for start, end, colour, style in (
         (DEVICE_POSITION_M, spot, DEVICE_COLOUR, "--"),
         (spot, HIDDEN_POINT_M, OUTGOING_COLOUR, "-"),

@@ -267,7 +267,7 @@ class TestReadme:
         assert script.rstrip().endswith(promised[-1])  # last, so that its summary is the last line
 
     @pytest.mark.skipif(
-        "PYTEST_XDIST_WORKER" not in os.environ, reason="no /workers in one process"
+        "PYTEST_XDIST_WORKER" not in os.environ, reason="one process has no workers"
     )
     def test_the_tests_of_a_file_stay_on_one_worker(self, request):
         # what the scheduler of pytest-xdist goes by: not added with pytest 9.2

@@ -129,7 +129,7 @@ def test_a_gated_arrays_address_becomes_ranges(shell):
 
 def test_a_recording_of_a_gated_array_becomes_ranges(shell):
     """SPAD512: one whole scan of a recording, by its address."""
-    line = f"record {GATED}&gate_steps=8&gate_step_ps=1920 --out run.h5 --seconds 0.5"
+    line = f"record {GATED}&gate_steps=8&gate_step_ps=1920 --out run.h5 --seconds 2"
     assert shell(line).status == 0
     found = shell.figures("info run.h5")
     assert found["kind"] == "recording"
