@@ -218,6 +218,8 @@ def test_adjoint_is_the_adjoint_at_the_scale_that_fits_best(operator):
     expected = np.moveaxis(operator.adjoint(measurements), -1, 0)
     frames = Backprojection().recover(operator, measurements).frames
     np.testing.assert_allclose(frames * expected.max() / frames.max(), expected, rtol=1e-12)
+    measurements = readings(9, 5)
+    frames = Backprojection().recover(operator, measurements).frames
     best, smaller, larger = (
         relative_residual(operator, factor * frames, measurements) for factor in (1, 0.99, 1.01)
     )
