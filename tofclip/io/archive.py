@@ -117,11 +117,11 @@ def list_mat_entries(path: Path) -> dict[str, ArchiveEntry]:
             start = file.tell()
             if start + length > size:
                 raise FileFormatError(path, DAMAGED_MAT)
-            read = partial(_read_element, path, order, kind, start, length)
+            where = path, order, kind, start, length
             # Only the beginning is unpacked: name and shape are wanted here, not the values.
-            matrix = read(PEEKED_BYTES)
+            matrix = _read_element(*where, PEEKED_BYTES)
             if matrix is not None and matrix.kind == MAT_STRUCT and math.prod(matrix.shape) == 1:
-                for name, part in read().fields():
+                for name, part in _read_element(*where).fields():
                     if part.is_readable:
                         entry = ArchiveEntry(part.shape, part.dtype, part.values)
                         entries[f"{matrix.name}.{name}"] = entry
@@ -130,7 +130,7 @@ def list_mat_entries(path: Path) -> dict[str, ArchiveEntry]:
                     # A number takes at least one byte in the file, whatever its class.
                     packed, number = kind == MAT_COMPRESSED, math.prod(matrix.shape)
                     require_bounded_size(path, matrix.name, number, length, packed)
-                load = partial(_MatMatrix.load, read)
+                load = partial(_read_values, *where)
                 entries[matrix.name] = ArchiveEntry(matrix.shape, matrix.dtype, load)
             file.seek(start + length)
     return entries
@@ -152,6 +152,11 @@ def _read_element(
                 require_bounded_size(path, "a variable", claimed, length, True)
             content = unpacker.decompress(unpacker.unconsumed_tail, most or claimed + 1)
         return _MatMatrix(path, order, content) if kind == MAT_MATRIX else None
+
+
+def _read_values(*where: Any) -> NDArray[Any]:
+    matrix: _MatMatrix = _read_element(*where)
+    return matrix.values()
 
 
 class _MatMatrix:
@@ -213,11 +218,6 @@ class _MatMatrix:
                 raise FileFormatError(self._path, DAMAGED_MAT)
             values = np.frombuffer(self._content, stored, number, start)
             return values.astype(self.dtype, copy=False).reshape(self.shape, order="F")
-
-    @staticmethod
-    def load(read: Callable[[], _MatMatrix]) -> NDArray[Any]:
-        """Return the values of a matrix that has to be read."""
-        return read().values()
 
     def fields(self) -> Iterator[tuple[str, _MatMatrix]]:
         """Yield names and contents of the fields of a struct."""
