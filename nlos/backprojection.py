@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from nlos.band import Band, VirtualPulse, Waveforms
 from nlos.capture import Capture
 from nlos.illumination import warn_of_aliasing
-from nlos.kernels import add_backprojection
+from nlos.kernels import MIN_DISTANCE_M, add_backprojection
 from nlos.method import (
     VOXEL_BYTES,
     Method,
@@ -27,9 +27,10 @@ from nlos.method import (
     require_imageable,
     require_numpy_signal,
 )
+from nlos.phasor.arrays import ArrayLibrary, BandTransform, get_traces
 from nlos.plane import axis_step, is_evenly_spaced
 from nlos.volume import Grid, Volume
-from tofclip.arrays import is_numpy
+from tofclip.arrays import Array, is_numpy
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, split_blocks
 
@@ -142,8 +143,6 @@ class BackprojectionPlan(PhasorPlan):
         history = {**capture.provenance, "imaging": self.settings}
         grid, band, weighting = self.grid, self.band, self.weighting
         if not is_numpy(capture.signal):
-            from nlos.backprojection_arrays import backproject_on_device
-
             values = backproject_on_device(capture, grid, band, weighting, progress)
             return Volume(values, grid, history)
 
@@ -194,6 +193,62 @@ def backproject_signals(
         waveforms = signals.values.view(np.float32), start, spacing, *spots
         run_blocks(partial(process_brick, waveforms), len(bricks), size=1)
     return total
+
+
+# Of other libraries' arrays: waveforms held at a time, and a pair of voxel and wall point, which takes
+# five times as much, in several arrays.
+DEVICE_TABLE_BYTES, BYTES_PER_PAIR = 64 << 20, 16
+
+
+def backproject_on_device(
+    capture: Capture, grid: Grid, band: Band, weighting: Weighting, progress: Progress
+) -> Array:
+    """Return the complex sum of `nlos.Backprojection` where the capture's signal lives. Memory: the
+    volume, 64 MiB of waveforms, and five chunks (`ArrayLibrary.chunk_bytes`) for the pairs of voxel
+    and wall point that are looked up at a time.
+    """
+    library = ArrayLibrary(capture.device)
+    xp = library.xp
+    z, y = (
+        library.put(axis.reshape(-1, 1, 1)) for axis in np.meshgrid(grid.z, grid.y, indexing="ij")
+    )
+    x, rows = library.put(grid.x[:, np.newaxis]), grid.z.size * grid.y.size
+    total = library.zeros((rows, grid.x.size))
+    transform = BandTransform(band, capture.axis.bins, library)
+    carriers, start, spacing = band.carriers
+    carriers, samples = library.put(carriers), band.sample_count
+    pairs = library.chunk_bytes // BYTES_PER_PAIR
+    size = min(DEVICE_TABLE_BYTES // (8 * samples), max(1, pairs // grid.x.size))
+    for points in split_blocks(len(capture.points), max(1, size)):
+        # Waveforms of some wall points, one after the other in one flat array; the first and the
+        # last two samples of each are 0.
+        waveforms = xp.reshape(transform.of(get_traces(capture, points)) @ carriers, (-1,))
+        count = points.stop - points.start
+        first, wall = library.put(samples * np.arange(count)), library.put(capture.points[points].T)
+        lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[points]
+        laser = library.put(lasers.T)
+        for some in split_blocks(rows, max(1, pairs // (grid.x.size * count))):
+            ahead, across = z[some, ...] - wall[2, :], y[some, ...] - wall[1, :]
+            squared = xp.clip(across**2 + ahead**2, MIN_DISTANCE_M**2, None)
+            distance = xp.sqrt(squared + (x - wall[0, :]) ** 2)
+            aside = (y[some, ...] - laser[1, :]) ** 2 + (z[some, ...] - laser[2, :]) ** 2
+            outward = xp.sqrt((x - laser[0, :]) ** 2 + aside)
+            # Samples that the path is late by, in the order in which single precision loses least.
+            position = (outward - start) * (1 / spacing) + distance * (1 / spacing)
+            position = xp.clip(position, 0.0, float(samples - 2))
+            before = xp.astype(position, xp.int64)
+            weight, index = position - xp.astype(before, position.dtype), before + first
+            here, there = (
+                xp.reshape(xp.take(waveforms, xp.reshape(one, (-1,))), weight.shape)
+                for one in (index, index + 1)
+            )
+            factor = 1 / distance if weighting.falloff == 1 else distance**-weighting.falloff
+            if weighting.obliquity != 0:
+                cosine = xp.clip(ahead, 0.0, None) / distance
+                factor = factor * cosine**weighting.obliquity
+            total[some, :] += xp.sum((here + weight * (there - here)) * factor, axis=-1)
+            progress((some.stop - some.start) * grid.x.size * count)
+    return xp.reshape(total, grid.shape)
 
 
 # Zeros before and after every signal, where look-ups outside the record end.

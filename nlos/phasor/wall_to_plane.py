@@ -444,12 +444,13 @@ class LatticeAnalysis:
         # In one piece, whatever its size: compiled loops are quicker then.
         spectra = self._spectra[: len(weights) * count].reshape(len(weights), count, -1)
         for spectrum, weight in zip(spectra, weights, strict=True):
-            weighted = values * weight
-            if self._place is not None:
-                placed = np.zeros(self._shape[0] * self._shape[1], np.complex64)
-                placed[self._place] = weighted
-                weighted = placed
-            self._points[:, : self._shape[1]] = weighted.reshape(self._shape)
+            if self._place is None:
+                pair = values.reshape(self._shape), weight.reshape(self._shape)
+                np.multiply(*pair, out=self._points[:, : self._shape[1]])
+            else:
+                flat = np.zeros(self._shape[0] * self._shape[1], np.complex64)
+                flat[self._place] = values * weight
+                self._points[:, : self._shape[1]] = flat.reshape(self._shape)
             self._along_x.execute()
             for number, end in enumerate(ends):
                 turned = middle[number * columns : (number + 1) * columns, :rows]

@@ -27,7 +27,7 @@ from scenes import (
     see_shaped,
 )
 
-import nlos.backprojection_arrays
+import nlos.backprojection
 import nlos.phasor.to_depths
 import nlos.phasor.wall_to_plane_arrays
 from nlos import (
@@ -44,8 +44,7 @@ from nlos import (
     Volume,
     propagate,
 )
-from nlos.backprojection import Weighting
-from nlos.backprojection_arrays import BYTES_PER_PAIR
+from nlos.backprojection import BYTES_PER_PAIR, Weighting
 from nlos.capture import remove_device_legs
 from nlos.compressed import CompressedCapture
 from nlos.phasor import wall_to_plane
@@ -302,7 +301,7 @@ def test_pieces_of_a_backprojection_make_up_the_whole_and_progress_counts_them(
     layer = Grid(UNEVEN.x, UNEVEN.y, UNEVEN.z[1:2])
     whole = to_numpy(BACKPROJECTION.phasor_field(capture, layer).values)
     for table, pairs in ((1 << 20, 40), (1, 1 << 20), (1 << 20, 1)):
-        monkeypatch.setattr(nlos.backprojection_arrays, "TABLE_BYTES", table)
+        monkeypatch.setattr(nlos.backprojection, "DEVICE_TABLE_BYTES", table)
         monkeypatch.setattr(ArrayLibrary, "chunk_bytes", pairs * BYTES_PER_PAIR)
         counted: list[int] = []
         found = BACKPROJECTION.phasor_field(capture, layer, counted.append).values
