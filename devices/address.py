@@ -93,9 +93,7 @@ def option(
     most: float = inf,
     choices: tuple[str, ...] = (),
 ) -> Any:
-    """Declare a field of `Options`: what makes it of a text (the default's type), and its bounds;
-    of `choices` the first is the default.
-    """
+    """Declare a field of `Options`: what makes it of a text, and what it may be."""
     bounds = {"least": least, "above": above, "most": most}
     return field(
         default=choices[0] if choices else default,

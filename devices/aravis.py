@@ -140,7 +140,11 @@ class AravisFeed(FrameFeed):
             held = min(max(HELD_BYTES // payload, HELD_FRAMES[0]), HELD_FRAMES[1])
             for _ in range(self._options.buffers or held):
                 self._offer_buffer(self._library.Buffer.new_allocate(payload))
-            self._packets_per_frame = self._count_packets(payload)
+            # Aravis counts packets of what finds no buffer.
+            self._packets_per_frame = 1
+            if self._camera.is_gv_device():
+                carried = int(self._camera.gv_get_packet_size()) - PACKET_HEADER_BYTES
+                self._packets_per_frame = -(-payload // carried) + 2
             self._camera.start_acquisition()
         self._running = True
         self._heard_at = monotonic()
@@ -191,14 +195,14 @@ class AravisFeed(FrameFeed):
         with self._translate_errors(InputError):
             camera.set_acquisition_mode(self._library.AcquisitionMode.CONTINUOUS)
             self._prepare(camera)
-            if options.pixel_format:
-                camera.set_pixel_format_from_string(options.pixel_format)
-            if options.frame_rate is not None:
-                camera.set_frame_rate(options.frame_rate)
-            if options.exposure_us is not None:
-                camera.set_exposure_time(options.exposure_us)
-            if options.gain is not None:
-                camera.set_gain(options.gain)
+            for change, value in (
+                (camera.set_pixel_format_from_string, options.pixel_format or None),
+                (camera.set_frame_rate, options.frame_rate),
+                (camera.set_exposure_time, options.exposure_us),
+                (camera.set_gain, options.gain),
+            ):
+                if value is not None:
+                    change(value)
         with self._translate_errors():
             self._stream = camera.create_stream(None, None)
             if camera.is_gv_device():
@@ -211,13 +215,6 @@ class AravisFeed(FrameFeed):
         """Let Aravis fill a buffer; it keeps the identifier that it has if the frame brings none."""
         buffer.set_frame_id(UNNUMBERED)
         self._stream.push_buffer(buffer)
-
-    def _count_packets(self, payload: int) -> int:
-        """Return the packets of a frame, as of which Aravis counts what finds no buffer."""
-        if not self._camera.is_gv_device():
-            return 1
-        carried = int(self._camera.gv_get_packet_size()) - PACKET_HEADER_BYTES
-        return -(-payload // carried) + 2
 
     def _take_frame(self, buffer: Any, arrived_at: float) -> Transfer | None:
         """Enter a frame into the accounts; None where packets of it are missing."""
@@ -244,9 +241,7 @@ class AravisFeed(FrameFeed):
         return self._hand_over(self._number - 1, pixels, self._clock.to_host(stamp))
 
     def _count_missing(self, frame_id: int) -> bool:
-        """Enter frames between the last identifier and this one; False for one that comes behind a
-        later one, which has been entered already, as lost or torn.
-        """
+        """Enter frames since the last identifier; False for a late one, entered before."""
         if self._last_id is None:
             missing = self._unnumbered
         else:
@@ -262,7 +257,9 @@ class AravisFeed(FrameFeed):
             return True
         torn = min(missing, self._unnumbered)
         self._unnumbered = 0
-        dropped = min(missing - torn, self._count_underruns() - self._dropped)
+        packets = int(self._stream.get_info_uint64_by_name("n_underruns"))
+        underruns = max(self._dropped, -(-packets // self._packets_per_frame))
+        dropped = min(missing - torn, underruns - self._dropped)
         self._dropped += dropped
         self.ledger.truncate(torn)
         self.ledger.receive(dropped)
@@ -271,11 +268,6 @@ class AravisFeed(FrameFeed):
         self._number += missing
         self._note_gap()
         return True
-
-    def _count_underruns(self) -> int:
-        """Return how many frames found no buffer so far; Aravis counts their packets."""
-        packets = int(self._stream.get_info_uint64_by_name("n_underruns"))
-        return max(self._dropped, -(-packets // self._packets_per_frame))
 
     def _count_unnumbered(self) -> None:
         """Enter frames without an identifier that no other frame comes after."""

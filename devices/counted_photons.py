@@ -88,9 +88,14 @@ def read_photons(address: str, bin_width: float | None = None) -> CountedPhotons
     counting = Accumulation.names() if uri.scheme in STAMP_SCHEMES else ()
     with open_source(strip_options(uri, ScanOptions.names() + counting)) as source:
         known = source.calibration
-        axis = _find_time_axis(known)
+        names = () if known is None else known.fields
+        axis = next((name for name in ("gate_times", "bin_times") if name in names), None)
         if known is not None and known.kind == BoardCalibration.RECORD_KIND:
-            return _count_stamps(source, known, gathering)
+            batches = read_batches(source, gathering.seconds)
+            streak = accumulate_streak(batches, known, gathering)
+            dark = np.float32(0) if streak.saturated is None else streak.saturated
+            counts = np.where(dark, np.float32(0), streak.counts)  # of hot pixels
+            return CountedPhotons(counts[:, np.newaxis, :], streak.times)
         if bin_width is not None:
             raise InputError(f"'{address}': an instrument knows its own bins")
         if known is None or axis is None:
@@ -107,21 +112,6 @@ def read_photons(address: str, bin_width: float | None = None) -> CountedPhotons
             pulse = _make_gate_response(known, times)
         source.drain()
     return CountedPhotons(counts, times, pulse)
-
-
-def _count_stamps(source: Source, known: Record, gathering: Accumulation) -> CountedPhotons:
-    """Count a line's photons, each of which has a time stamp, in bins; hot pixels are left dark."""
-    streak = accumulate_streak(read_batches(source, gathering.seconds), known, gathering)
-    counts = streak.counts
-    if streak.saturated is not None:
-        counts = np.where(streak.saturated, np.float32(0), counts)
-    return CountedPhotons(counts[:, np.newaxis, :], streak.times)
-
-
-def _find_time_axis(known: Record | None) -> str | None:
-    """Return which of a calibration's fields is the photons' time axis."""
-    names = () if known is None else known.fields
-    return next((name for name in ("gate_times", "bin_times") if name in names), None)
 
 
 def _add_histograms(source: Source, scans: int) -> NDArray[np.float32]:

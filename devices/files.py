@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,31 +56,20 @@ SWABIAN_TAG, SWABIAN_MISSED = 0, 4
 PICOSECOND_S = 1e-12
 
 
-class Reader(Protocol):
-    """A file as pieces of records."""
-
-    info: Info
-    lost: int  # Records that the electronics say they lost
-
-    @property
-    def calibration(self) -> Record | None:
-        """What turns records into seconds."""
-
-    @property
-    def sizes(self) -> list[int]:
-        """Records of each piece."""
-
-    def decode(self, piece: int) -> Records:
-        """Return the records of a piece."""
-
-
 class RecordFile(Source):
     """A file's records. Memory: one piece of it, decoded. The calibration of photons and histograms
     has ``resolution_s``, the width of a bin, and ``channels``; of photons also ``laser_period_s``,
     of images ``rows`` and ``columns``.
+
+    A reader knows ``info`` and ``calibration``, the ``sizes`` of its pieces in records, how many
+    records the electronics ``lost``, and can ``decode`` a piece.
     """
 
-    def __init__(self, path: str | Path, open_file: Callable[[Path], Reader]) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        open_file: Callable[[Path], WholeRecords | PtuPhotons | SwabianPhotons],
+    ) -> None:
         with guard(path, "is a damaged or unsupported file"):
             Path(path).stat()  # some libraries say of an absent file that it is damaged
             self._reader = open_file(Path(path))
@@ -136,7 +125,7 @@ class RecordFile(Source):
 
 @dataclass
 class WholeRecords:
-    """All records of a file as one piece; see `Reader`."""
+    """All records of a file as one piece."""
 
     records: Records
     info: Info
@@ -154,7 +143,7 @@ class WholeRecords:
 
 
 class PtuPhotons:
-    """Photons of a PTU file; see `Reader`. Opening reads the file once, to know its channels and
+    """Photons of a PTU file. Opening reads the file once, to know its channels and
     where each piece begins. Markers are passed over; pictures are read by `tofclip.lidar.photons`.
     `sync`: channel of the laser's pulses in T2 mode; by default the electronics' own input for
     them.
@@ -185,7 +174,7 @@ class PtuPhotons:
 
 
 class SwabianPhotons:
-    """Photons of Swabian Instruments' files; see `Reader`. Their library reads forwards only, so
+    """Photons of Swabian Instruments' files. Their library reads forwards only, so
     that stepping back begins anew. `sync`: channel of the laser's pulses, as the instrument numbers
     it: negative for falling edges. All others become channels from 0, in the order of their
     numbers.
@@ -245,9 +234,7 @@ class SwabianPhotons:
     def _read_next(
         self,
     ) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], int]:
-        """Return number of the pulse, time after it and channel of the next photons, and how many
-        tags the instrument lost among them.
-        """
+        """Return pulse, delay and channel of the next photons, and how many tags were lost."""
         tags = self._file.getData(SWABIAN_CHUNK_TAGS)
         kind, channel = np.asarray(tags.getEventTypes()), np.asarray(tags.getChannels(), np.int64)
         time = np.asarray(tags.getTimestamps(), np.int64)
@@ -261,9 +248,7 @@ class SwabianPhotons:
 
 
 def open_ptu(uri: Uri) -> RecordFile:
-    """Open ``file://run.ptu``; ``sync=N`` where a file in T2 mode has the laser's pulses on an input
-    for photons.
-    """
+    """Open ``file://run.ptu``; ``sync=N``: input of the laser's pulses in T2 mode."""
     uri.reject_unknown("sync")
     sync = uri.value("sync", int, 0) if "sync" in uri.values else None
     return RecordFile(uri.location, lambda path: PtuPhotons(path, sync))
@@ -345,6 +330,7 @@ def _require_moderate_size(path: Path) -> int:
 def _stack_histograms(
     curves: Any, resolution: float, instrument: str, path: Path, **shape: int
 ) -> WholeRecords:
+    """Return histograms, each a record; all must have as many bins."""
     lengths = {len(curve) for curve in curves}
     if len(lengths) != 1 or not 0 < max(lengths) <= MAX_BINS:
         raise FileFormatError(

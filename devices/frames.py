@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from devices.address import Uri, option
-from devices.source import ByteView, DecodeResult, Gap, Ledger, Records, as_bytes
-from devices.stream import InstrumentClock, LiveOptions, Transfer, retry_connect
+from devices.source import ByteView, Codec, DecodeResult, Gap, Ledger, Records
+from devices.stream import Feed, InstrumentClock, LiveOptions, Transfer, retry_connect
 from tofclip.errors import InputError
 from tofclip.storage import Field, Record, Scalar
 
@@ -83,7 +83,7 @@ _PIXEL_DTYPES = {1: "u1", 8: "u1", 16: "<u2", 32: "<u4"}
 
 
 @dataclass(frozen=True)
-class FrameCodec:
+class FrameCodec(Codec):
     """A picture's number (8 bytes, little-endian) and its pixels as the camera sent them, to
     records and back. A frame is malformed if its number is not above that of the one before.
     Decoding allocates what the pixels take, 8 bits for each of those that came as single bits.
@@ -119,12 +119,8 @@ class FrameCodec:
     @cached_property
     def dtype(self) -> np.dtype[Any]:
         """`number` and `counts` (rows, columns)."""
-        return np.dtype(
-            [
-                ("number", _NUMBER_DTYPE),
-                ("counts", _PIXEL_DTYPES[self.bits], (self.rows, self.columns)),
-            ]
-        )
+        counts = ("counts", _PIXEL_DTYPES[self.bits], (self.rows, self.columns))
+        return np.dtype([("number", _NUMBER_DTYPE), counts])
 
     @property
     def settings(self) -> Mapping[str, Scalar]:
@@ -138,26 +134,13 @@ class FrameCodec:
         return self.rows * self.columns * self.bits // 8
 
     @property
-    def frame_bytes(self) -> int:
+    def unit_bytes(self) -> int:
         """Bytes of a picture and its number."""
         return _NUMBER_DTYPE.itemsize + self.pixel_bytes
 
-    def count_complete_bytes(self, data: ByteView) -> int:
-        """Return how many bytes at the front of `data` form whole frames."""
-        return len(data) - len(data) % self.frame_bytes
-
-    def count_records(self, data: ByteView) -> int:
-        """Return the number of frames in `data`."""
-        return len(data) // self.frame_bytes
-
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
         """Decode whole frames; `state` is the last one's number."""
-        words = as_bytes(data)
-        if words.size % self.frame_bytes:
-            raise InputError(
-                f"{words.size} bytes are not a whole number of {self.frame_bytes}-byte frames"
-            )
-        frames = np.ascontiguousarray(words).reshape(-1, self.frame_bytes)
+        frames = self._view_units(data)
         numbers = frames[:, : _NUMBER_DTYPE.itemsize].copy().view(_NUMBER_DTYPE)[:, 0]
         # A number that does not exceed all earlier ones was damaged, or belongs to a frame that
         # came already.
@@ -165,46 +148,35 @@ class FrameCodec:
         valid = numbers > before[:-1]
         records = np.empty(int(valid.sum()), self.dtype)
         records["number"] = numbers[valid]
-        records["counts"] = self._unpack_pixels(frames[valid, _NUMBER_DTYPE.itemsize :])
+        pixels = frames[valid, _NUMBER_DTYPE.itemsize :]
+        if self.bits == 1:
+            pixels = np.unpackbits(pixels, axis=1)
+        else:
+            pixels = np.ascontiguousarray(pixels).view(_PIXEL_DTYPES[self.bits])
+        pictures = pixels.reshape(len(records), self.rows, self.columns)
+        records["counts"] = np.rot90(pictures, self.quarter_turns, axes=(1, 2))
         return DecodeResult(records, len(numbers) - len(records), int(before[-1]))
 
     def encode(self, records: Records) -> bytes:
         """Return numbers and pixels as the camera sends them."""
-        if records.dtype != self.dtype or records.ndim != 1:
-            raise InputError(f"frames must be a one-dimensional array of {self.dtype}")
-        if np.any(np.diff(records["number"], prepend=-1) <= 0):
+        self._require_records(records)
+        numbers, counts = np.ascontiguousarray(records["number"]), records["counts"]
+        if np.any(np.diff(numbers, prepend=-1) <= 0):
             raise InputError("frames must have rising numbers from 0")
-        if self.bits == 1 and records["counts"].max(initial=0) > 1:
+        if self.bits == 1 and counts.max(initial=0) > 1:
             raise InputError("a single bit is 0 or 1")
-        frames = np.empty((len(records), self.frame_bytes), np.uint8)
-        numbers = np.ascontiguousarray(records["number"])
-        frames[:, : _NUMBER_DTYPE.itemsize] = numbers.view(np.uint8).reshape(
-            -1, _NUMBER_DTYPE.itemsize
-        )
-        frames[:, _NUMBER_DTYPE.itemsize :] = self._pack_pixels(records["counts"])
-        return frames.tobytes()
+        as_sent = np.rot90(counts, -self.quarter_turns, axes=(1, 2))
+        flat = np.ascontiguousarray(as_sent).reshape(len(records), self.rows * self.columns)
+        pixels = np.packbits(flat, axis=1) if self.bits == 1 else flat.view(np.uint8)
+        stamps = numbers[:, np.newaxis].view(np.uint8)
+        return np.concatenate([stamps, pixels], axis=1).tobytes()
 
     def pack_frame(self, number: int, pixels: bytes) -> bytes:
         """Return a frame's bytes from those of its pixels."""
         return number.to_bytes(_NUMBER_DTYPE.itemsize, "little") + pixels
 
-    def _unpack_pixels(self, data: ByteView) -> Any:
-        shape = (len(data), self.rows, self.columns)
-        if self.bits == 1:
-            pixels = np.unpackbits(data, axis=1).reshape(shape)
-        else:
-            pixels = np.ascontiguousarray(data).view(_PIXEL_DTYPES[self.bits]).reshape(shape)
-        return np.rot90(pixels, self.quarter_turns, axes=(1, 2))
 
-    def _pack_pixels(self, counts: Any) -> Any:
-        as_sent = np.rot90(counts, -self.quarter_turns, axes=(1, 2))
-        flat = np.ascontiguousarray(as_sent).reshape(len(counts), self.rows * self.columns)
-        if self.bits == 1:
-            return np.packbits(flat, axis=1)
-        return flat.view(np.uint8)
-
-
-class FrameFeed:
+class FrameFeed(Feed):
     """What the drivers of cameras share: the number of the next picture, what is missing before it,
     and the accounts; see `devices.stream.Feed`.
     """

@@ -127,9 +127,7 @@ class Accumulator:
 
     @property
     def counts(self) -> NDArray[np.float64]:
-        """Photons in each bin of each pixel so far, (bins, pixels); right to a millionth of a
-        photon.
-        """
+        """Photons so far, (bins, pixels); right to a millionth of a photon."""
         total = np.zeros((self.pixels, self.axis.bins + 2))
         for part in self._parts:
             total += part
@@ -167,9 +165,7 @@ class Accumulator:
         return Streak(counts, self.axis.times, untrusted, camera=camera, source=source)
 
     def _add_in_parallel(self, add: Callable[[slice, NDArray[Any]], None], total: int) -> None:
-        """Call `add` on pieces of ``range(total)``, each with an array of steps that no other
-        thread uses.
-        """
+        """Call `add` on pieces of ``range(total)``, each with steps that no other thread uses."""
         size = max(_MIN_PIECE, -(-total // thread_count()))
         # a sum for each piece, so that threads never write to the same one
         while len(self._parts) * size < total:

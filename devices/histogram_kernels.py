@@ -28,9 +28,7 @@ inlined = njit(inline="always", error_model="numpy")
 
 @inlined
 def _add_step(row, position, height):
-    """Add a step at `position`; one before the first bin counts from there, one behind the last
-    makes no difference.
-    """
+    """Add a step; one before the first bin counts from there, one behind the last not at all."""
     # clamped: light before the axis steps up in its first bin, light after it in the two spare ones
     inside = min(max(position, 0.0), row.size - 2.0)
     place = int(inside)
@@ -56,11 +54,9 @@ def _add_photon(row, position, width, density, period, per_period):
 
 @compiled
 def add_stamps(stamps, clock_bins, codes, period, steps):
-    """Add LinoSPAD2's time stamps. `stamps` (n, columns): the last two columns are code and pixel;
-    `clock_bins`: period of the board's clock; `codes` (pixels, codes, 2): where a code begins
-    within the first period of the clock, offset and start of the axis included; its length;
-    `period`: time between two laser pulses, 0 for none; `steps` (pixels, bins + 2). Returns stamps
-    left out because there is no such pixel.
+    """Add LinoSPAD2's time stamps, whose last two columns are code and pixel; return how many are of
+    no pixel. `codes` (pixels, codes, 2): where a code begins within the first period of the clock,
+    offset and start of the axis included, and its length.
     """
     number = np.uint32(codes.shape[1])
     last = stamps.shape[1] - 1
@@ -83,11 +79,7 @@ def add_stamps(stamps, clock_bins, codes, period, steps):
 
 @compiled
 def add_times(pixels, times, scale, shift, width, period, steps):
-    """Add photons of which pixel and time are known; ``position = times * scale + shift``. `pixels`
-    (photons,); `times` (photons,); `scale, shift`: bins per unit of time, and bins; `width`: bins
-    over which a photon is spread; `period`: bins of the laser's period; `steps` (pixels, bins + 2):
-    added to, in place; the density's differences.
-    """
+    """Add photons at ``times * scale + shift``, each spread over `width` bins."""
     density, per_period = 1.0 / width, 1.0 / period
     for photon in range(times.size):
         _add_photon(
@@ -97,12 +89,8 @@ def add_times(pixels, times, scale, shift, width, period, steps):
 
 @compiled
 def find_last_sync(ticks, channels, flags, ignored, sync, before, known):
-    """Return the time of the last sync pulse before record `before`, `known` if there is none.
-
-    A record with one of the `ignored` flags reports levels, not edges.
-
-    `ticks, channels, flags` (records,); `ignored`: bits of flags; `sync`: bit of the laser's
-    channel; `before`: record; `known`: ticks. Returns ticks.
+    """Return the ticks of the last sync pulse before record `before`, `known` if there is none. A
+    record with one of the `ignored` flags reports levels, not edges.
     """
     for record in range(before - 1, -1, -1):
         if channels[record] & sync and not flags[record] & ignored:
@@ -112,12 +100,10 @@ def find_last_sync(ticks, channels, flags, ignored, sync, before, known):
 
 @compiled
 def add_tags(ticks, channels, flags, ignored, sync, known, pixel_of, scale, shift, period, steps):
-    """Add time tags, each by how long it came after the last sync pulse. `ticks, channels, flags`
-    (n,): one bit of `channels` for each channel that saw an edge; `ignored`: flags of records that
-    report no edges; `sync`: the sync's bit; `known`: ticks at the last sync before the first
-    record, -1 where there was none: photons before the first one are left out; `pixel_of`
-    (channels,): negative: not a pixel; `scale, shift`: ``position = ticks since sync * scale +
-    shift``; a tick is `scale` bins long; `steps` (pixels, bins + 2).
+    """Add time tags, each at ``ticks since the last sync pulse * scale + shift``. `channels`: one bit
+    for each that saw an edge; `ignored`: flags of records that report none; `known`: ticks at the
+    last sync before the first record, -1 where there was none: photons before the first one are
+    left out; `pixel_of` (channels,): negative: not a pixel.
     """
     density, per_period = 1.0 / scale, 1.0 / period
     for record in range(ticks.size):

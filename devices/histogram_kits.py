@@ -20,9 +20,9 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import monotonic
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,21 +59,6 @@ class KitFrame:
     stamp: float | None = None  # s of the kit's clock
 
 
-class Parser(Protocol):
-    """Puts frames together from lines."""
-
-    @property
-    def codec(self) -> FrameCodec:
-        """Histograms as pictures of one row for each bin, one column for each zone."""
-
-    @property
-    def scale(self) -> float:
-        """Photons, or whatever the kit counts, that one stored count stands for."""
-
-    def parse_line(self, line: bytes) -> KitFrame | None:
-        """Take the next line; return the frame that it completes, if it does."""
-
-
 @dataclass
 class Tmf8828Parser:
     """See the module's text. Zones are in the order in which they come: captures, then halves, then
@@ -81,23 +66,25 @@ class Tmf8828Parser:
     """
 
     zones: int = 64  # 64, or 9 for the 3 x 3 mode
-    scale: float = field(default=1.0, init=False)
+    scale: ClassVar[float] = 1.0  # what one stored count stands for
 
     def __post_init__(self) -> None:
         if self.zones not in TMF_ZONES:
             raise InputError(f"a TMF8828 has 64 zones or 9, not {self.zones}")
         self._captures = TMF_CAPTURES if self.zones == 64 else 1
         self._halves = 2 if self.zones == 64 else 1
-        self._last_number: int | None = None
+        self._last_frame: int | None = None
         self._counts = np.zeros((TMF_BINS, self.zones), np.uint32)
         self._complete = 0
         self._begin_capture()
 
     @property
     def codec(self) -> FrameCodec:
+        """Histograms as pictures of one row for each bin, one column for each zone."""
         return FrameCodec(TMF_BINS, self.zones, 32)
 
     def parse_line(self, line: bytes) -> KitFrame | None:
+        """Take the next line; return the frame that it completes, if it does."""
         if line.startswith(b"#Raw,"):
             self._add_lane(line)
             return None
@@ -137,15 +124,10 @@ class Tmf8828Parser:
         self._begin_capture()
         if place != self._captures - 1:
             return None
-        return self._end_frame(number // self._captures, tick)
-
-    def _end_frame(self, number: int, tick: int) -> KitFrame:
-        is_whole = self._complete == (1 << self._captures) - 1
-        self._complete = 0
-        missing = 0
-        if self._last_number is not None:
-            missing = (number - self._last_number - 1) % (TMF_NUMBERS // self._captures)
-        self._last_number = number
+        is_whole, self._complete = self._complete == (1 << self._captures) - 1, 0
+        frame, before = number // self._captures, self._last_frame
+        missing = 0 if before is None else (frame - before - 1) % (TMF_NUMBERS // self._captures)
+        self._last_frame = frame
         counts = self._counts.copy() if is_whole else None
         return KitFrame(counts, missing, tick * TMF_TICK_S if tick else None)
 
@@ -156,7 +138,7 @@ class Vl53l8Parser:
 
     zones: int = 16  # as the kit's program was set
     bins: int = 24  # as the kit's program was set
-    scale: float = field(default=1 / VL53_SCALE, init=False)
+    scale: ClassVar[float] = 1 / VL53_SCALE
 
     def __post_init__(self) -> None:
         if not (1 <= self.zones <= 64 and 1 <= self.bins <= 144):
@@ -168,14 +150,18 @@ class Vl53l8Parser:
 
     @property
     def codec(self) -> FrameCodec:
+        """As of a `Tmf8828Parser`."""
         return FrameCodec(self.bins, self.zones, 32)
 
     def parse_line(self, line: bytes) -> KitFrame | None:
+        """Take the next line; return the frame that it completes, if it does."""
         if not line.startswith(b"Aggregate "):
             return None
         head, _, tail = line.partition(b"Bins:")
         zone = _parse_integers([head.removeprefix(b"Aggregate ").split(b",")[0]])
-        values = _parse_floats([word for word in tail.split(b",") if word.strip()])
+        values = np.empty(0)
+        with contextlib.suppress(ValueError):
+            values = np.array([float(word) for word in tail.split(b",") if word.strip()])
         if zone is None:
             return None
         place = int(zone[0])
@@ -183,9 +169,8 @@ class Vl53l8Parser:
             self._next = 0
         # Behind every value stands a comma: without the last one it may have lost digits.
         is_ended = tail.rstrip().endswith(b",")
-        is_sound = is_ended and values is not None and len(values) == self.bins
-        is_sound = is_sound and place == self._next
-        if values is not None and is_sound:
+        is_whole = len(values) == self.bins and bool(np.all(np.isfinite(values)))
+        if is_ended and is_whole and place == self._next:
             # The sensor subtracts the ambient light itself, which may leave less than nothing.
             self._counts[:, place] = np.rint(np.clip(values, 0, 4e8) * VL53_SCALE)
             self._next += 1
@@ -193,22 +178,17 @@ class Vl53l8Parser:
             self._next = -1  # wait for the next beginning
         if place != self.zones - 1:
             return None
-        is_whole, self._next = self._next == self.zones, 0
-        return KitFrame(self._counts.copy() if is_whole else None)
+        is_complete, self._next = self._next == self.zones, 0
+        return KitFrame(self._counts.copy() if is_complete else None)
+
+
+Parser = Tmf8828Parser | Vl53l8Parser
 
 
 def _parse_integers(words: list[bytes]) -> NDArray[np.int64] | None:
     if not all(word.strip().isdigit() and len(word) < 12 for word in words):
         return None
     return np.array([int(word) for word in words], np.int64)
-
-
-def _parse_floats(words: list[bytes]) -> NDArray[np.float64] | None:
-    try:
-        found = np.array([float(word) for word in words], np.float64)
-    except ValueError:
-        return None
-    return found if np.all(np.isfinite(found)) else None
 
 
 READ_BYTES = 1 << 16
@@ -223,25 +203,7 @@ class KitOptions(LiveOptions):
     baud: int = option(460_800)
     start: str = option("")  # letters that begin measuring; none: the program does so by itself
     zones: int = option(16)
-
-    @property
-    def stop(self) -> bytes:
-        """What ends measuring."""
-        return b""
-
-    @property
-    def bin_width(self) -> float:
-        """Duration of a bin, s."""
-        raise NotImplementedError
-
-    @property
-    def first_bin(self) -> float:
-        """Middle of the first bin, s."""
-        return self.bin_width / 2
-
-    def make_parser(self) -> Parser:
-        """Return a parser of the kit's lines that has seen none of them."""
-        raise NotImplementedError
+    stop: ClassVar[bytes] = b""  # what ends measuring, where something began it
 
 
 @dataclass(frozen=True)
@@ -254,6 +216,7 @@ class Tmf8828Options(KitOptions):
     # Enable, dump histograms, measure: the state after the reset that opening the port brings.
     start: str = option("ezm")
     zones: int = option(64)
+    stop = b"s"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -261,14 +224,17 @@ class Tmf8828Options(KitOptions):
             raise InputError("add bin_ps=..., the duration of a bin as the kit was set")
 
     @property
-    def stop(self) -> bytes:
-        return b"s" if self.start else b""
-
-    @property
     def bin_width(self) -> float:
+        """Duration of a bin, s."""
         return self.bin_ps * PICOSECOND_S
 
+    @property
+    def first_bin(self) -> float:
+        """Middle of the first bin, s."""
+        return self.bin_width / 2
+
     def make_parser(self) -> Tmf8828Parser:
+        """Return a parser of the kit's lines that has seen none of them."""
         return Tmf8828Parser(self.zones)
 
 
@@ -283,13 +249,16 @@ class Vl53l8Options(KitOptions):
 
     @property
     def bin_width(self) -> float:
+        """Duration of a bin, s."""
         return self.sub_sample * VL53_NATIVE_BIN_S
 
     @property
     def first_bin(self) -> float:
+        """Middle of the first bin, s."""
         return self.start_bin * VL53_NATIVE_BIN_S + self.bin_width / 2
 
     def make_parser(self) -> Vl53l8Parser:
+        """Return a parser of the kit's lines that has seen none of them."""
         return Vl53l8Parser(self.zones, self.bins)
 
 
@@ -301,7 +270,7 @@ class KitFeed(FrameFeed):
     before is of use behind it.
     """
 
-    def __init__(self, port: str, options: KitOptions) -> None:
+    def __init__(self, port: str, options: Tmf8828Options | Vl53l8Options) -> None:
         super().__init__()
         self._name, self._options = port, options
         self._ready: deque[tuple[int, bytes, float]] = deque()
@@ -348,7 +317,7 @@ class KitFeed(FrameFeed):
     def stop(self) -> None:
         self._is_stopped = True
         with self._translate_errors():
-            self._port.write(self._options.stop)
+            self._port.write(self._options.stop if self._options.start else b"")
             self._port.flush()
 
     def close(self) -> None:
@@ -428,7 +397,7 @@ def open_vl53l8(uri: Uri) -> StreamSource:
     return _open_kit(uri, Vl53l8Options.from_uri(uri))
 
 
-def _open_kit(uri: Uri, options: KitOptions) -> StreamSource:
+def _open_kit(uri: Uri, options: Tmf8828Options | Vl53l8Options) -> StreamSource:
     if not uri.location:
         raise InputError(
             f"'{uri.text}': name the serial port, as in {uri.scheme}:///dev/ttyACM0?..."

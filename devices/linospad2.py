@@ -20,7 +20,6 @@ from __future__ import annotations
 import contextlib
 import os
 import tomllib
-from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
@@ -41,15 +40,14 @@ from devices.linospad2_kernels import (
     PIXEL_CONVERTERS,
 )
 from devices.source import (
-    READ_TIMEOUT_S,
-    Batch,
     ByteView,
-    DecodedSource,
+    Checkpoint,
+    Codec,
     DecodeResult,
     Info,
-    Ledger,
     Piece,
     Records,
+    SeekableSource,
     as_bytes,
 )
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
@@ -78,7 +76,7 @@ _ENCODE_ERRORS = {
 
 
 @dataclass(frozen=True)
-class LinoSpad2Codec:
+class LinoSpad2Codec(Codec):
     """Bytes of LinoSPAD2 to time stamps and back. A valid word of the converter that serves no
     pixels is malformed. Decoding allocates at most 5 bytes for each byte of the stream: rows for
     the valid words only.
@@ -124,7 +122,7 @@ class LinoSpad2Codec:
         return self.header + CONVERTERS * self.timestamps
 
     @property
-    def cycle_bytes(self) -> int:
+    def unit_bytes(self) -> int:
         """Bytes of a cycle."""
         return self.cycle_words * _WORD_DTYPE.itemsize
 
@@ -142,26 +140,20 @@ class LinoSpad2Codec:
         """Converter * 4 + address of each pixel, (256,)."""
         return np.argsort(self.pixel_of, axis=None).astype(np.uint32)
 
-    def count_complete_bytes(self, data: ByteView) -> int:
-        """Return how many bytes at the front of `data` form whole cycles."""
-        return len(data) - len(data) % self.cycle_bytes
-
     def count_records(self, data: ByteView) -> int:
         """Return how many words of `data` are valid."""
         return sum(self.count_stamps(data))
 
     def count_stamps(self, data: ByteView) -> tuple[int, int]:
         """Return how many records `decode` would make of `data`, and how many are malformed."""
-        kept, malformed = self._count_per_cycle(self._view_cycles(data))
+        kept, malformed = self._count_per_cycle(self._view_units(data, _WORD_DTYPE))
         return int(kept.sum()), malformed
 
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
-        """Decode whole cycles; `state` is how many came before. Cycles that were lost are not
-        counted.
-        """
+        """Decode whole cycles; `state` is how many came before, without those that were lost."""
         from devices.linospad2_kernels import decode_stamps
 
-        cycles = self._view_cycles(data)
+        cycles = self._view_units(data, _WORD_DTYPE)
         kept, malformed = self._count_per_cycle(cycles)
         # Counted first: each block then knows which rows of the result are its own, and threads
         # need no lock.
@@ -176,7 +168,7 @@ class LinoSpad2Codec:
             own = rows[first : int(ends[block.stop - 1])]
             decode_stamps(cycles[block], self.header, state + block.start, self.pixel_of, own)
 
-        run_blocks(work, len(cycles), max(1, _BLOCK_BYTES // self.cycle_bytes))
+        run_blocks(work, len(cycles), max(1, _BLOCK_BYTES // self.unit_bytes))
         return DecodeResult(records, malformed, state + len(cycles))
 
     def encode(self, records: Records) -> bytes:
@@ -194,19 +186,9 @@ class LinoSpad2Codec:
         return cycles.tobytes()
 
     def sort_stamps(self, records: Records) -> Records:
-        """Return time stamps in the order of the stream: by cycle, then converter, else as they
-        were.
-        """
+        """Return time stamps in the order of the stream: by cycle, then by converter."""
         converter = self.address_of[records["pixel"]] // ADDRESSES
         return records[np.lexsort([converter, records["cycle"]])]
-
-    def _view_cycles(self, data: ByteView) -> NDArray[np.uint32]:
-        words = as_bytes(data)
-        if words.size % self.cycle_bytes:
-            raise InputError(
-                f"{words.size} bytes are not a whole number of {self.cycle_bytes}-byte cycles"
-            )
-        return np.ascontiguousarray(words).view(_WORD_DTYPE).reshape(-1, self.cycle_words)
 
     def _count_per_cycle(self, cycles: NDArray[np.uint32]) -> tuple[NDArray[np.int64], int]:
         """Count the time stamps of each cycle, and all malformed words."""
@@ -218,16 +200,15 @@ class LinoSpad2Codec:
         def work(block: slice) -> None:
             strays.append(count_stamps(cycles[block], self.header, kept[block]))
 
-        run_blocks(work, len(cycles), max(1, _BLOCK_BYTES // self.cycle_bytes))
+        run_blocks(work, len(cycles), max(1, _BLOCK_BYTES // self.unit_bytes))
         return kept, sum(strays)
 
     def _require_valid(self, records: Records) -> None:
-        if records.dtype != self.dtype or records.ndim != 1:
-            raise InputError(f"time stamps must be a one-dimensional array of {self.dtype}")
+        self._require_records(records)
         if np.any(records["pixel"] >= PIXELS) or np.any(records["code"] > CODE_MASK):
             raise InputError(f"a time stamp has a pixel below {PIXELS} and a code below 2**28")
         cycles = int(records["cycle"].max(initial=0)) + 1
-        if cycles * self.cycle_bytes > _MAX_ENCODED_BYTES:
+        if cycles * self.unit_bytes > _MAX_ENCODED_BYTES:
             raise InputError(
                 f"{cycles} cycles take more than {_MAX_ENCODED_BYTES} bytes; encode them in pieces"
             )
@@ -353,9 +334,7 @@ def _guard_table(path: str | Path) -> Iterator[None]:
 def make_calibration_record(
     board: BoardCalibration, laser_period: float | None, camera: Record | None
 ) -> Record:
-    """Return what turns time stamps into a scene: the board's tables, the laser's period (s), the
-    camera.
-    """
+    """Return a board's tables, the laser's period (s) and the camera as one record."""
     record = board.to_record()
     attributes = {} if laser_period is None else {"laser_period_s": laser_period}
     children = {} if camera is None else {"camera": camera}
@@ -452,44 +431,47 @@ LIMITATION = "LinoSPAD2's USB commands are not public: its recordings are read, 
 PIECE_BYTES = 1 << 20  # Bytes that are read and decoded at once, or one cycle where that is longer
 
 
-class LinoSpad2File(DecodedSource):
-    """A recording, with the TOML file beside it that says how to read it
-    (`devices.linospad2`).
+class LinoSpad2File(SeekableSource):
+    """A recording, with the TOML file beside it that says how to read it.
 
     Opening counts the time stamps of the whole recording, which takes about a second for two
-    gigabytes. After `seek` the accounts are as if everything before had been read.
+    gigabytes: the file has no index. A last cycle that is incomplete counts as one record that
+    cannot be read.
 
-    Memory: one piece of 1 MiB, or one cycle, and what it decodes to; 16 bytes for each piece of the
-    recording.
+    Memory: one piece of 1 MiB, or one cycle, and what it decodes to; 100 bytes for each piece of
+    the recording.
     """
 
     codec: LinoSpad2Codec
 
     def __init__(self, path: str | Path) -> None:
-        self._path, self._sidecar = Path(path), read_sidecar(path)
+        self._sidecar = read_sidecar(path)
         codec = self._sidecar.codec
-        super().__init__(codec, Ledger())
         with translate_read_errors(path):
             self._file = open(path, "rb")  # noqa: SIM115 - closed by `close`
         size = os.fstat(self._file.fileno()).st_size
-        if size < codec.cycle_bytes:
+        if size < codec.unit_bytes:
             self._file.close()
-            raise FileFormatError(path, f"holds {size} bytes; one cycle takes {codec.cycle_bytes}")
-        self._is_cut_off = size % codec.cycle_bytes > 0
-        self._cycles = max(1, PIECE_BYTES // codec.cycle_bytes)
-        self._pieces = -(-(size // codec.cycle_bytes) // self._cycles)
-        # The file has no index: one pass at the start lets the accounts and seek know every number.
-        self._good, self._malformed = self._count_records()
-        self._next = self._skip = 0
-        self._seek_to(0)
+            raise FileFormatError(path, f"holds {size} bytes; one cycle takes {codec.unit_bytes}")
+        total, rest = divmod(size, codec.unit_bytes)
+        cycles = max(1, PIECE_BYTES // codec.unit_bytes)
+        self._piece_bytes, self._whole_bytes = cycles * codec.unit_bytes, size - rest
+        pieces, marks = -(-total // cycles), [Checkpoint(0, 0, 0)]
+        for number in range(pieces):
+            good, malformed = codec.count_stamps(as_bytes(self._read_bytes(number)))
+            before = marks[-1]
+            marks.append(
+                Checkpoint(
+                    (number + 1) * cycles, before.delivered + good, before.malformed + malformed
+                )
+            )
+        records = marks[-1].delivered + marks[-1].malformed
+        super().__init__(codec, Path(path), pieces, records, int(rest > 0), marks)
 
     @property
     def info(self) -> Info:
-        return Info(
-            "LinoSPAD2 recording",
-            self._sidecar.board,
-            {"limits": LIMITATION, **self.codec.settings},
-        )
+        details = {"limits": LIMITATION, **self.codec.settings}
+        return Info("LinoSPAD2 recording", self._sidecar.board, details)
 
     @property
     def calibration(self) -> Record:
@@ -498,57 +480,18 @@ class LinoSpad2File(DecodedSource):
             camera = Record.load(known.folder / known.camera, "camera")
         return make_calibration_record(known.calibration, known.laser_period, camera)
 
-    @property
-    def is_seekable(self) -> bool:
-        return True
-
-    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
-        """Return the next batch at once; `timeout` does not matter."""
-        if self._file.closed or self._next == self._pieces:
-            return None
-        data = self._read_piece(self._next)
-        batch = self._decode_piece(Piece(data, self.codec.count_records(as_bytes(data))))
-        self._next += 1
-        skipped, self._skip = self._skip, 0
-        return Batch(batch.records[skipped:], batch.first + skipped)
-
-    def seek(self, record: int) -> None:
-        if not 0 <= record <= self._good[-1]:
-            raise InputError(
-                f"{self._path} holds {self._good[-1]} records, there is no number {record}"
-            )
-        self._seek_to(min(bisect_right(self._good, record) - 1, self._pieces))
-        self._skip = record - self._good[self._next]
-
     def close(self) -> None:
+        super().close()
         self._file.close()
 
-    def _read_piece(self, number: int) -> bytes:
-        length = self._cycles * self.codec.cycle_bytes
-        self._file.seek(number * length)
-        data = self._file.read(length)
-        return data[: self.codec.count_complete_bytes(as_bytes(data))]
+    def _read_piece(self, number: int) -> Piece:
+        data = self._read_bytes(number)
+        return Piece(data, self.codec.count_records(as_bytes(data)))
 
-    def _count_records(self) -> tuple[list[int], list[int]]:
-        """Return how many good and malformed time stamps there are before each piece, and
-        altogether.
-        """
-        good, malformed = [0], [0]
-        for number in range(self._pieces):
-            kept, strays = self.codec.count_stamps(as_bytes(self._read_piece(number)))
-            good.append(good[-1] + kept)
-            malformed.append(malformed[-1] + strays)
-        return good, malformed
-
-    def _seek_to(self, number: int) -> None:
-        """Make the next piece the one with that number, as if all before it had been read."""
-        self._next, self._skip, self._state = number, 0, number * self._cycles
-        self._ledger = Ledger()
-        self._ledger.receive(self._good[-1] + self._malformed[-1])
-        self._ledger.deliver(self._good[number], self._malformed[number])
-        # The last cycle is incomplete; it counts as one record that cannot be read.
-        if self._is_cut_off:
-            self._ledger.truncate()
+    def _read_bytes(self, number: int) -> bytes:
+        begin = number * self._piece_bytes
+        self._file.seek(begin)
+        return self._file.read(min(self._piece_bytes, self._whole_bytes - begin))
 
 
 def open_recording(uri: Uri) -> LinoSpad2File:

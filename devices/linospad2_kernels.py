@@ -22,9 +22,8 @@ compiled = compile_and_keep(error_model="numpy")
 
 @compiled
 def count_stamps(cycles, header, kept_of_cycle):
-    """Count the valid words of each cycle. `cycles` (cycles, words); `header`: words before the
-    first converter's; `kept_of_cycle` (cycles,): gets the number of valid words of the converters
-    that have pixels. Returns valid words of the converter that has none.
+    """Count the valid words of the converters that have pixels, for each cycle (cycles, words) with
+    `header` words before the first converter's; return those of the converter that has none.
     """
     words = cycles.shape[1]
     # the last converter serves no pixels
@@ -47,11 +46,7 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
 
     Every word is written to the next free row, and only a valid one moves on to the row behind it:
     no branch that the processor could guess wrong. It ends with the last row, behind which there
-    are not valid words.
-
-    `cycles` (cycles, words); `header`: words before the first converter's; they are repeated at the
-    front of each row; `first_cycle`: number of the first cycle; `pixel_of` (converters, addresses);
-    `records` (rows, header + 3): one row for each valid word; gets header, cycle, code and pixel.
+    are not valid words. A row gets header, cycle, code and pixel.
     """
     depth = (cycles.shape[1] - header) // CONVERTERS
     row = 0
@@ -77,10 +72,8 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
 
 @compiled
 def encode_stamps(records, header, address_of, cycles):
-    """Put records into the words of empty cycles. `records` (rows, header + 3): as `decode_stamps`
-    writes them, in order of cycle and converter; `address_of` (pixels,): converter * 4 + address;
-    `cycles` (cycles, words): zeros; gets the words. Returns `ENCODED_OK`, or what keeps the records
-    from being encoded.
+    """Put rows, as `decode_stamps` writes them, into the words of empty cycles; return `ENCODED_OK`,
+    or what keeps them from being encoded.
     """
     depth = (cycles.shape[1] - header) // CONVERTERS
     previous, slot = np.int64(-1), 0

@@ -10,7 +10,7 @@ import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from devices.address import Uri
 from devices.source import Codec, Source
@@ -61,13 +61,6 @@ CODECS: dict[str, str] = {
 }
 
 
-class Opener(Protocol):
-    """What the tables name."""
-
-    def __call__(self, uri: Uri, /) -> Source:
-        """Open the source at a parsed address."""
-
-
 @dataclass(frozen=True)
 class DiscoveredInstrument:
     """An instrument that can be opened now.
@@ -116,13 +109,16 @@ def open(uri: str) -> Source:  # noqa: A001 - the name users type: devices.open
     True
     """
     parsed = Uri.parse(uri)
+    table, name = OPENERS, parsed.scheme
     if parsed.scheme == "file":
-        return _open_file(parsed)
-    if parsed.scheme not in OPENERS:
-        known = ", ".join(sorted([*OPENERS, "file"]))
-        raise InputError(f"'{uri}': no source is called '{parsed.scheme}'; known are {known}")
-    opener: Opener = import_entry(OPENERS[parsed.scheme])
-    return opener(parsed)
+        table, name = FILE_OPENERS, Path(parsed.location).suffix.lower()
+        if name not in table:
+            raise InputError(f"'{uri}': the name must end in {', '.join(sorted(table))}")
+    if name not in table:
+        known = ", ".join(sorted([*table, "file"]))
+        raise InputError(f"'{uri}': no source is called '{name}'; known are {known}")
+    source: Source = import_entry(table[name])(parsed)
+    return source
 
 
 def discover() -> list[DiscoveredInstrument]:
@@ -139,14 +135,6 @@ def build_codec(name: str, settings: Mapping[str, Scalar]) -> Codec:
     except TypeError as fault:
         raise InputError(f"codec '{name}' does not take {', '.join(settings)}") from fault
     return codec
-
-
-def _open_file(uri: Uri) -> Source:
-    ending = Path(uri.location).suffix.lower()
-    if ending not in FILE_OPENERS:
-        raise InputError(f"'{uri.text}': the name must end in {', '.join(sorted(FILE_OPENERS))}")
-    opener: Opener = import_entry(FILE_OPENERS[ending])
-    return opener(uri)
 
 
 def import_entry(entry: str) -> Any:

@@ -73,21 +73,16 @@ class AnswerCode(enum.IntEnum):
     OUT_OF_RANGE = 10
 
 
-REFUSAL_REASONS = {
-    AnswerCode.SYNTAX: "its syntax is wrong",
-    AnswerCode.UNKNOWN: "it, or one of its parameters, is unknown",
-    AnswerCode.NOT_NOW: "it is not possible now",
-    AnswerCode.MISSING: "a parameter is missing",
-    AnswerCode.IMPOSSIBLE: "it cannot be executed",
-    AnswerCode.FAILED: "it failed",
-    AnswerCode.NO_DATA_LINK: "its data cannot be sent",
-    AnswerCode.OUT_OF_RANGE: "a value is out of range",
-}
-_ERRORS: dict[AnswerCode, type[DeviceError]] = {
-    AnswerCode.NOT_NOW: DeviceBusyError,
-    AnswerCode.IMPOSSIBLE: DeviceError,
-    AnswerCode.FAILED: DeviceError,
-    AnswerCode.NO_DATA_LINK: DeviceError,
+# What is raised for a command that was refused, and why it was
+REFUSALS: dict[AnswerCode, tuple[type[DeviceError], str]] = {
+    AnswerCode.SYNTAX: (ProtocolError, "its syntax is wrong"),
+    AnswerCode.UNKNOWN: (ProtocolError, "it, or one of its parameters, is unknown"),
+    AnswerCode.NOT_NOW: (DeviceBusyError, "it is not possible now"),
+    AnswerCode.MISSING: (ProtocolError, "a parameter is missing"),
+    AnswerCode.IMPOSSIBLE: (DeviceError, "it cannot be executed"),
+    AnswerCode.FAILED: (DeviceError, "it failed"),
+    AnswerCode.NO_DATA_LINK: (DeviceError, "its data cannot be sent"),
+    AnswerCode.OUT_OF_RANGE: (ProtocolError, "a value is out of range"),
 }
 
 
@@ -152,10 +147,8 @@ class Answer:
         if self.code is AnswerCode.DONE:
             return self.arguments
         said = f" ({', '.join(self.arguments)[:120]})" if self.arguments else ""
-        error = _ERRORS.get(self.code, ProtocolError)
-        raise error(
-            f"RemoteEx refused {command}: {REFUSAL_REASONS.get(self.code, 'no reason given')}{said}"
-        )
+        error, reason = REFUSALS.get(self.code, (ProtocolError, "no reason given"))
+        raise error(f"RemoteEx refused {command}: {reason}{said}")
 
 
 def parse_integer(text: str, what: str) -> int:
@@ -221,20 +214,15 @@ class RemoteExClient:
 
     def ask(self, name: str, *arguments: str) -> tuple[str, ...]:
         """Send a command and return its answer's arguments."""
-        answer, command = self._exchange(name, arguments)
-        return answer.require_done(command)
+        return self._exchange(name, arguments).require_done(Command(name, arguments))
 
-    def is_done(self, name: str, *arguments: str) -> bool:
+    def is_done(self, name: str, *arguments: str, timeout: float | None = None) -> bool:
         """Send a command that may be refused; False where it was."""
-        return self._exchange(name, arguments)[0].code is AnswerCode.DONE
-
-    def start_application(self, timeout: float) -> bool:
-        """Start HPD-TA where it is not up, which takes a while; False where that is refused."""
-        return self._exchange("AppStart", ("1",), timeout)[0].code is AnswerCode.DONE
+        return self._exchange(name, arguments, timeout).code is AnswerCode.DONE
 
     def _exchange(
         self, name: str, arguments: tuple[str, ...], timeout: float | None = None
-    ) -> tuple[Answer, Command]:
+    ) -> Answer:
         # After a timeout the late answer would be taken for that of the next command.
         self._wait_for_owed()
         if name in _COMMANDS_WITH_DATA:
@@ -243,7 +231,7 @@ class RemoteExClient:
         answer = self._read_answer(timeout)
         if answer.name.casefold() != command.name.casefold():
             raise ProtocolError(f"RemoteEx answered {answer.name} when asked {command}")
-        return answer, command
+        return answer
 
     def send_command(self, name: str, *arguments: str) -> Command:
         """Send a command without waiting, neither for its answer nor for those that are owed."""
@@ -299,9 +287,7 @@ class RemoteExClient:
         )
 
     def read_scaling_table(self) -> NDArray[np.float32]:
-        """Return the vertical scaling of the current picture, one number for each row, in the time
-        range's unit.
-        """
+        """Return the picture's vertical scaling, a number per row, in the time range's unit."""
         shape = self.ask("ImgDataGet", "current", "ScalingTable", "Vertical")
         if not shape:
             raise ProtocolError("RemoteEx did not say how long its scaling table is")
@@ -338,9 +324,7 @@ class RemoteExClient:
             self._read_data(length, MAX_FRAME_BYTES)
 
     def _read_answer(self, timeout: float | None = None) -> Answer:
-        """Return the answer to the first command that is owed one; keep the messages that come
-        before.
-        """
+        """Return the answer to the first command that is owed one; messages before it are kept."""
         timeout = timeout or self._timeout
         deadline = monotonic() + timeout
         while True:
@@ -438,9 +422,7 @@ class RemoteExOptions(StreakOptions):
 
 
 class _Announcement(NamedTuple):
-    """A message that a picture was taken."""
-
-    number: int
+    number: int  # of a picture that was taken
     stamp: float | None  # its time by the camera's computer, s since live mode was started
     received_at: float  # s of `time.monotonic`
 
@@ -459,7 +441,11 @@ class RemoteExFeed(FrameFeed):
         try:
             first = self._first
             self.codec = FrameCodec(first.rows, first.columns, 8 * first.pixel_bytes)
-            self._parameters = self._read_parameters()
+            self._parameters: dict[str, Scalar] = {}
+            for name, parameter in _PARAMETERS.items():
+                with contextlib.suppress(ProtocolError):  # HiPic has no streak tube to ask
+                    said = self._link.ask("DevParamGet", STREAK_TUBE, parameter)
+                    self._parameters[name] = ",".join(said)
             self._row_times = self._read_row_times()
         except BaseException:
             # Also a signal to end: nothing else could turn the gain down now.
@@ -478,11 +464,6 @@ class RemoteExFeed(FrameFeed):
         if self._row_times is None:
             return None
         return Record("streak_calibration", {"row_times": Field(self._row_times, "s", ("row",))})
-
-    def start(self) -> None:
-        """Do nothing: the camera runs since the connection was made, which is how the pictures'
-        size is known.
-        """
 
     def pull(self, timeout: float) -> Transfer | None:
         while True:
@@ -540,7 +521,8 @@ class RemoteExFeed(FrameFeed):
             except (DeviceDisconnectedError, DeviceTimeoutError):
                 raise
             except DeviceError:
-                if not link.start_application(APPLICATION_START_S):
+                # HPD-TA may not be up.
+                if not link.is_done("AppStart", "1", timeout=APPLICATION_START_S):
                     raise
                 self._prepare_live(link)
             if not link.is_done("AcqStart", "Live"):
@@ -573,9 +555,7 @@ class RemoteExFeed(FrameFeed):
         link.ask("AcqLiveMonitor", "RingBuffer", str(options.buffers))
 
     def _join_or_restart(self, link: RemoteExClient) -> None:
-        """Join live mode that runs already, or wait until what else keeps the camera busy is over;
-        in the end, stop that.
-        """
+        """Join live mode that runs, or wait for what keeps the camera busy, then stop it."""
         with contextlib.suppress(ProtocolError):  # not every version knows the question
             state = [word.strip().casefold() for word in link.ask("AcqStatus")]
             if "live" in state:
@@ -606,8 +586,11 @@ class RemoteExFeed(FrameFeed):
             except (DeviceDisconnectedError, DeviceTimeoutError, ProtocolError):
                 raise
             except DeviceError:
-                # Refused, as no such picture is there: the numbers begin anew when live mode does.
-                if not self._have_numbers_restarted():
+                # Refused, as no such picture is there: the numbers begin anew when live mode does,
+                # which the next announcement says.
+                expected = self._next
+                self._note_announcement(self._wait_for_announcement(self._options.timeout_s))
+                if self._next == expected:
                     raise
         lost = picture.number - self._next
         if lost < 0:
@@ -636,9 +619,7 @@ class RemoteExFeed(FrameFeed):
             self._stamps[announced.number] = announced.stamp
 
     def _estimate_time(self, number: int) -> float:
-        """Return when a picture was taken, s of `time.monotonic`; 0 where its announcement has not
-        come, or had no time.
-        """
+        """Return when a picture was taken, s of `time.monotonic`; 0 where that is not known."""
         # A picture that was sent for one that is gone may be announced right before the answer.
         with contextlib.suppress(DeviceTimeoutError):
             while number not in self._stamps and self._announced < number:
@@ -646,12 +627,6 @@ class RemoteExFeed(FrameFeed):
         stamp = self._stamps.get(number)
         self._stamps = {later: at for later, at in self._stamps.items() if later > number}
         return 0.0 if stamp is None else self._clock.to_host(stamp)
-
-    def _have_numbers_restarted(self) -> bool:
-        """Wait for the next announcement, and say whether it goes back."""
-        expected = self._next
-        self._note_announcement(self._wait_for_announcement(self._options.timeout_s))
-        return self._next != expected
 
     def _wait_for_announcement(self, timeout: float) -> _Announcement:
         """Return the next message that announces a picture."""
@@ -669,13 +644,6 @@ class RemoteExFeed(FrameFeed):
         """Enter pictures that were announced and will not come."""
         self.ledger.lose(max(0, self._newest - self._next + 1))
         self._newest, self._unread_frame = self._next - 1, None
-
-    def _read_parameters(self) -> dict[str, Scalar]:
-        found: dict[str, Scalar] = {}
-        for name, parameter in _PARAMETERS.items():
-            with contextlib.suppress(ProtocolError):  # HiPic has no streak tube to ask
-                found[name] = ",".join(self._link.ask("DevParamGet", STREAK_TUBE, parameter))
-        return found
 
     def _read_row_times(self) -> NDArray[np.float64] | None:
         """Return the rows' times, s; the table is in the unit of the time range, as the files show."""

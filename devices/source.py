@@ -13,14 +13,15 @@ from __future__ import annotations
 import abc
 import enum
 import threading
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from types import TracebackType
-from typing import Any, ClassVar, Literal, Protocol, Self
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from tofclip.errors import BufferOverflowError, DeviceTimeoutError, InputError
 from tofclip.storage import Record, Scalar
@@ -54,7 +55,7 @@ class DecodeResult:
     state: Any
 
 
-class Codec(Protocol):
+class Codec(abc.ABC):
     """Bytes to records and back, both vectorised.
 
     ``decode(encode(x), start).records`` equals ``x`` for every array of valid records. A codec
@@ -62,50 +63,59 @@ class Codec(Protocol):
     stated multiple of the bytes that it was given.
     """
 
-    # Name in `devices.registry.CODECS`; a recording keeps it together with `settings`
-    name: ClassVar[str]
+    name: ClassVar[str]  # in `devices.registry.CODECS`; a recording keeps it with `settings`
+    start: ClassVar[Any]  # state before the first byte, and after the instrument began anew
 
     @property
+    @abc.abstractmethod
     def dtype(self) -> np.dtype[Any]:
         """Type of a record; `encode` takes and `decode` gives arrays of it."""
 
     @property
-    def settings(self) -> Mapping[str, Scalar]:
-        """Arguments that build this codec again."""
+    @abc.abstractmethod
+    def unit_bytes(self) -> int:
+        """Bytes of a record, or of as many as come together."""
 
     @property
-    def start(self) -> Any:
-        """State before the first byte, and after the instrument began anew."""
+    def settings(self) -> Mapping[str, Scalar]:
+        """Arguments that build this codec again."""
+        return {}
 
     def count_complete_bytes(self, data: ByteView) -> int:
         """Return how many bytes at the front of `data` form whole records."""
+        return len(data) - len(data) % self.unit_bytes
 
     def count_records(self, data: ByteView) -> int:
         """Return how many records, malformed ones included, are in `data`, of which
         `count_complete_bytes` is all.
         """
+        return len(data) // self.unit_bytes
 
+    @abc.abstractmethod
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
-        """Decode whole records; `after_loss` says that some are missing right before them.
+        """Decode whole records; `state` is what the decoder remembers, from the call before or
+        `start`; `after_loss` says that some are missing right before them.
 
-        ``len(decoded.records) + decoded.malformed == count(data)``.
-
-        Parameters
-        ----------
-        data : bytes-like
-            Whole records.
-        state : object
-            What the decoder remembers, from the call before or `start`.
-        after_loss : bool
-
-        Returns
-        -------
-        DecodeResult
-            Records, number of malformed ones, and the state for the next call.
+        ``len(decoded.records) + decoded.malformed == count_records(data)``.
         """
 
+    @abc.abstractmethod
     def encode(self, records: Records) -> bytes:
         """Return the bytes that the instrument would have sent."""
+
+    def _view_units(self, data: ByteView, dtype: DTypeLike = np.uint8) -> NDArray[Any]:
+        """Return whole units as rows of words, (units, words)."""
+        found = as_bytes(data)
+        if found.size % self.unit_bytes:
+            raise InputError(
+                f"{found.size} bytes are not a whole number of {self.unit_bytes}-byte records"
+            )
+        words = np.ascontiguousarray(found).view(dtype)
+        return words.reshape(-1, self.unit_bytes // words.itemsize)
+
+    def _require_records(self, records: Records) -> None:
+        if records.dtype != self.dtype or records.ndim != 1:
+            raise InputError(f"records must be a one-dimensional array of {self.dtype}")
 
 
 @dataclass(frozen=True)
@@ -143,14 +153,10 @@ class Stats:
     reconnects: int = 0
 
     @property
-    def total_records(self) -> int:
-        """Records whose fate is known."""
-        return self.delivered + self.unread + self.dropped_host + self.lost_device + self.malformed
-
-    @property
     def is_balanced(self) -> bool:
         """Whether acquired = delivered + unread + dropped_host + lost_device + malformed."""
-        return self.acquired == self.total_records
+        known = self.delivered + self.unread + self.dropped_host + self.lost_device
+        return self.acquired == known + self.malformed
 
     def as_dict(self) -> dict[str, int]:
         """Return the accounts by name."""
@@ -175,9 +181,7 @@ class Ledger:
         self._add(acquired=records, unread=records)
 
     def deliver(self, delivered: int, malformed: int) -> None:
-        """Move records that waited to those that were read. `delivered`: records that were sound;
-        `malformed`: records that were not.
-        """
+        """Move records that waited to those that were read, sound or malformed."""
         self._add(unread=-delivered - malformed, delivered=delivered, malformed=malformed)
 
     def drop(self, records: int) -> None:
@@ -251,9 +255,7 @@ class RingBuffer:
         self._lost_before_next = Gap.NONE
 
     def put(self, piece: Piece) -> None:
-        """Append a piece. With policy ``"block"`` this waits until there is room or the ring has
-        ended.
-        """
+        """Append a piece; with policy ``"block"``, once there is room or the ring has ended."""
         with self._changed:
             self._ledger.receive(piece.records)
             if self._policy == "block":
@@ -308,9 +310,7 @@ class RingBuffer:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """End the stream; what is in it can still be taken, and a writer that waits for room waits
-        no more.
-        """
+        """End the stream; what is in it can still be taken, and no writer waits any more."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
@@ -390,7 +390,21 @@ class Batch:
         return len(self.records)
 
 
-class Source(abc.ABC):
+class Closing(abc.ABC):
+    """What is closed where its context is left."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Let go of what is held; closing twice is fine."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Source(Closing):
     """A stream of records: a context manager and an iterator over batches.
 
     A subclass gives `read`, `close`, `info` and `stats`, and where they differ from the defaults
@@ -410,16 +424,12 @@ class Source(abc.ABC):
 
     @property
     def calibration(self) -> Record | None:
-        """Tables and constants that turn records into seconds and pixels, None where there are
-        none.
-        """
+        """Tables and constants that turn records into seconds and pixels, if there are any."""
         return None
 
     @property
     def is_live(self) -> bool:
-        """Whether the records come from an instrument, real or emulated, and go by if they are not read
-        them.
-        """
+        """Whether the records come from an instrument, real or emulated, and go by if not read."""
         return False
 
     @property
@@ -481,17 +491,6 @@ class Source(abc.ABC):
             raise StopIteration
         return batch
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
 
 class DecodedSource(Source):
     """What live and recorded streams have in common, so that both decode alike."""
@@ -509,9 +508,7 @@ class DecodedSource(Source):
 
     @property
     def is_complete(self) -> bool:
-        """Whether nothing is missing beyond what `stats` reports; False for a recording that was
-        cut or repaired.
-        """
+        """Whether nothing is missing beyond `stats`; False for a cut or repaired recording."""
         return True
 
     def _decode_piece(self, piece: Piece) -> Batch:
@@ -528,3 +525,91 @@ class DecodedSource(Source):
         first = self._ledger.stats.delivered
         self._ledger.deliver(len(found.records), found.malformed)
         return Batch(found.records, first, has_gap, piece.received_at, piece.taken_at)
+
+
+class Checkpoint(NamedTuple):
+    """What the decoder and the accounts were when a piece began."""
+
+    state: Any
+    delivered: int
+    malformed: int
+
+
+class SeekableSource(DecodedSource):
+    """A number of pieces that can be read again. The accounts are those of the reading; after
+    `seek` they are as if everything before had been read.
+
+    `records`: in all pieces; `truncated`: records besides of which only a part is there;
+    `checkpoints`: of every piece, and of the end, where they are known; otherwise they are noted
+    while reading.
+    """
+
+    def __init__(
+        self,
+        codec: Codec,
+        name: Path,
+        pieces: int,
+        records: int,
+        truncated: int = 0,
+        checkpoints: list[Checkpoint] | None = None,
+    ) -> None:
+        super().__init__(codec, Ledger())
+        self._name, self._pieces, self._records, self._truncated = name, pieces, records, truncated
+        self._checkpoints = checkpoints or [Checkpoint(codec.start, 0, 0)]
+        self._next = self._skip = 0
+        self._go_to(0)
+
+    @property
+    def is_seekable(self) -> bool:
+        return True
+
+    @abc.abstractmethod
+    def _read_piece(self, number: int) -> Piece:
+        """Return a piece, by its number from 0."""
+
+    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
+        """Return the next batch at once; `timeout` does not matter."""
+        if self._next >= self._pieces:
+            return None
+        batch = self._decode_next()
+        skipped, self._skip = self._skip, 0
+        return Batch(batch.records[skipped:], batch.first + skipped) if skipped else batch
+
+    def seek(self, record: int) -> None:
+        if record < 0:
+            raise InputError(f"records are numbered from 0, got {record}")
+        marks, tap = self._checkpoints, self.tap
+        self.tap = None  # what is stepped over is not read
+        try:
+            self._go_to(bisect_right(marks, record, key=lambda mark: mark.delivered) - 1)
+            while self._next < self._pieces and marks[self._next].delivered <= record:
+                self._decode_next()
+        finally:
+            self.tap = tap
+        reached = marks[self._next].delivered
+        if record > reached:
+            raise InputError(f"{self._name} has only {reached} records, no record {record}")
+        if record < reached:
+            self._go_to(self._next - 1)
+            self._skip = record - marks[self._next].delivered
+
+    def close(self) -> None:
+        self._next = self._pieces
+
+    def _decode_next(self) -> Batch:
+        """Decode the next piece and note how things are behind it."""
+        batch = self._decode_piece(self._read_piece(self._next))
+        self._next += 1
+        if self._next == len(self._checkpoints):
+            stats = self.stats
+            self._checkpoints.append(Checkpoint(self._state, stats.delivered, stats.malformed))
+        return batch
+
+    def _go_to(self, number: int) -> None:
+        """Make the next piece the one with that number, as if all before it had been read."""
+        self._next, self._skip = number, 0
+        self._state, delivered, malformed = self._checkpoints[number]
+        self._ledger = Ledger()
+        self._ledger.receive(self._records)
+        self._ledger.deliver(delivered, malformed)
+        self._ledger.truncate(self._truncated)

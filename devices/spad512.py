@@ -95,9 +95,7 @@ class ExposureRequest:
 
     @property
     def codec(self) -> FrameCodec:
-        """What the pictures look like: single bits are packed and turned, more than 8 bits take two
-        bytes.
-        """
+        """What the pictures look like: single bits are turned, more than 8 take two bytes."""
         if self.bits == 1:
             return FrameCodec(ROWS, self.width, 1, SINGLE_BIT_QUARTER_TURNS)
         return FrameCodec(ROWS, self.width, 16 if self.bits > 8 or self.pile_up else 8)
@@ -214,21 +212,18 @@ class Spad512Feed(FrameFeed):
 
     @property
     def calibration(self) -> Record | None:
-        """When the gate opens in each picture of a scan, s, and for how long; nothing where there is
-        no gate, and so no time axis.
-        """
+        """When the gate opens in each picture of a scan, s; None where there is no gate."""
         gate = self._exposure.gate
         return None if gate is None else gate.to_record()
-
-    def start(self) -> None:
-        """Do nothing: the first request starts the instrument."""
 
     def pull(self, timeout: float) -> Transfer | None:
         while True:
             if self._frames_due == 0:
                 if self._stopped:
                     return None
-                self._request_frames()
+                self._link.send(self._exposure.encode(), self._patience)
+                self._frames_due = self._exposure.frames
+                self._deadline = monotonic() + self._exposure.seconds + self._patience
             try:
                 return self._read_frame(timeout)
             except DeviceDisconnectedError:
@@ -255,9 +250,7 @@ class Spad512Feed(FrameFeed):
             raise
 
     def _ask_system(self) -> list[str]:
-        """Ask what the system is, as the vendor's clients do first; where the first question lets it
-        calibrate itself, wait for the end of that and ask again.
-        """
+        """Ask what the system is, as the vendor's clients do; it may calibrate itself first."""
         self._link.send(INFORMATION_COMMAND, self._patience)
         text = self._read_text(self._patience)
         if BREAKDOWN_BEGINS in text:
@@ -278,11 +271,6 @@ class Spad512Feed(FrameFeed):
                 text += self._link.read_available(MAX_TEXT_BYTES - len(text), _SILENCE_S)
         return text.removesuffix(DONE_MARK).decode("ascii", "replace").strip()
 
-    def _request_frames(self) -> None:
-        self._link.send(self._exposure.encode(), self._patience)
-        self._frames_due = self._exposure.frames
-        self._deadline = monotonic() + self._exposure.seconds + self._patience
-
     def _read_frame(self, timeout: float) -> Transfer:
         """Return the next picture; with the last one of a request comes the end of the answer."""
         is_last = self._frames_due == 1
@@ -302,33 +290,25 @@ class Spad512Feed(FrameFeed):
         return self._hand_over(self._number - 1, pixels)
 
     def _fill_buffer(self, length: int, timeout: float) -> None:
-        """Wait until `length` bytes came, a length that was computed, not reported; what came in
-        time is kept.
-        """
+        """Wait until `length` bytes came, a computed number; what came in time is kept."""
         deadline = monotonic() + timeout
         while len(self._received) < length:
             try:
                 self._received += self._link.read_available(
                     length - len(self._received), max(deadline - monotonic(), 0)
                 )
-            except DeviceTimeoutError:
-                self._raise_server_error()
+            except DeviceTimeoutError as fault:
+                said = find_error_text(self._received)
+                if said is not None:
+                    raise DeviceError(f"the SPAD array could not take pictures: {said}") from fault
+                if monotonic() > self._deadline:
+                    raise DeviceDisconnectedError(
+                        f"the SPAD array sent nothing for {self._patience:g} s beyond the exposure"
+                    ) from fault
                 raise
 
-    def _raise_server_error(self) -> None:
-        """Raise what the server says instead of a picture, or that it says nothing at all."""
-        said = find_error_text(self._received)
-        if said is not None:
-            raise DeviceError(f"the SPAD array could not take pictures: {said}")
-        if monotonic() > self._deadline:
-            raise DeviceDisconnectedError(
-                f"the SPAD array sent nothing for {self._patience:g} s beyond the exposure"
-            )
-
     def _count_truncated(self) -> None:
-        """Enter a picture of which only a part came; of those that never began it is not known whether
-        they were taken.
-        """
+        """Enter a picture of which a part came; whether the next ones were taken is not known."""
         if self._received:
             self.ledger.truncate()
             self._number += 1

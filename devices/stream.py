@@ -3,20 +3,19 @@
 ::
 
     instrument -> Feed -> [thread: whole records] -> Ring -> (tap) -> Codec -> Batch
-
-Here is also what such sources share: the way from an instrument's own clock to the computer's,
-values of their addresses, and trying again until an instrument that went away is back.
 """
 
 from __future__ import annotations
 
+import abc
 import atexit
 import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
 from time import monotonic, sleep
-from typing import Protocol, TypeVar
+from typing import TypeVar
 from weakref import WeakSet
 
 from devices.address import Options, option
@@ -62,26 +61,23 @@ class InstrumentClock:
 
     def reset(self) -> None:
         """Forget everything: the instrument began anew."""
-        self._last_stamp: float | None = None
-        self._window_began = float("-inf")
-        self._least = self._least_before = float("inf")
+        self._last_stamp = self._window_began = -inf
+        self._least = self._least_before = inf
 
     def observe(self, stamp: float, arrived_at: float) -> None:
-        """Note when a stamped message arrived. A stamp that goes back means that the instrument's
-        clock began anew.
-        """
-        if self._last_stamp is not None and stamp < self._last_stamp:
+        """Note when a stamped message arrived; a stamp that goes back means a clock begun anew."""
+        if stamp < self._last_stamp:
             self.reset()
         self._last_stamp = stamp
         if arrived_at - self._window_began > WINDOW_S:
             self._window_began = arrived_at
-            self._least, self._least_before = float("inf"), self._least
+            self._least, self._least_before = inf, self._least
         self._least = min(self._least, arrived_at - stamp)
 
     def to_host(self, stamp: float) -> float:
         """Return the time of a stamp, s of `time.monotonic`; 0 where nothing was observed yet."""
         offset = min(self._least, self._least_before)
-        return stamp + offset if offset < float("inf") else 0.0
+        return stamp + offset if offset < inf else 0.0
 
 
 # Seconds after which the thread looks whether it should stop, though nothing came
@@ -107,35 +103,34 @@ class Transfer:
     taken_at: float = 0.0
 
 
-class Feed(Protocol):
+class Feed(abc.ABC):
     """Where a stream's bytes come from. Every method is called from one thread, never two at once."""
 
-    ledger: Ledger  # Where the feed enters losses and reconnections
+    codec: Codec  # what reads its bytes
+    ledger: Ledger  # where the feed enters losses and reconnections
 
     @property
-    def codec(self) -> Codec:
-        """What reads its bytes."""
-
-    @property
+    @abc.abstractmethod
     def info(self) -> Info:
         """What is known about the instrument."""
 
     @property
     def calibration(self) -> Record | None:
         """What turns records into seconds and pixels."""
+        return None
 
-    def start(self) -> None:
+    def start(self) -> None:  # noqa: B027 - some instruments run since they were connected
         """Let the instrument send."""
 
+    @abc.abstractmethod
     def pull(self, timeout: float) -> Transfer | None:
-        """Return what came next, None at the end; `DeviceTimeoutError` if nothing came. Enters
-        reconnections itself.
-        """
+        """Return what came next, None at the end; DeviceTimeoutError if nothing came."""
 
+    @abc.abstractmethod
     def stop(self) -> None:
         """Let the instrument register nothing more; what it holds can still be pulled."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - some hold nothing
         """Enter what the instrument says that it lost, and let go of it."""
 
 
@@ -155,9 +150,7 @@ class LiveOptions(StreamOptions):
 
 
 class StreamSource(DecodedSource):
-    """A live source. Opening starts the instrument. Memory: the buffer's capacity, plus one
-    transfer and one decoded piece.
-    """
+    """A live source. Memory: the buffer's capacity, one transfer and one decoded piece."""
 
     def __init__(self, feed: Feed, options: StreamOptions | None = None) -> None:
         options = options or StreamOptions()
@@ -197,9 +190,7 @@ class StreamSource(DecodedSource):
         return self._decode_piece(piece)
 
     def keep_newest(self) -> None:
-        """From now on, give a late reader the newest piece; the others count as dropped by
-        the host.
-        """
+        """From now on, a late reader gets the newest piece; the others count as dropped."""
         self._ring.keep_newest()
 
     def stop(self) -> None:
@@ -258,18 +249,13 @@ class _FeedReader:
                 if arrival is None:
                     break
                 self._enqueue(arrival)
-            self._drain()
+            self._feed.stop()
+            deadline = monotonic() + DRAIN_TIMEOUT_S
+            with contextlib.suppress(DeviceTimeoutError):
+                while monotonic() < deadline and (rest := self._feed.pull(POLL_INTERVAL_S)):
+                    self._enqueue(rest)
         finally:
             self._count_truncated()
-
-    def _drain(self) -> None:
-        self._feed.stop()
-        deadline = monotonic() + DRAIN_TIMEOUT_S
-        with contextlib.suppress(DeviceTimeoutError):
-            while (
-                monotonic() < deadline and (arrival := self._feed.pull(POLL_INTERVAL_S)) is not None
-            ):
-                self._enqueue(arrival)
 
     def _enqueue(self, arrival: Transfer) -> None:
         # A record cut by a gap never gets its end.

@@ -8,9 +8,8 @@ import contextlib
 import socket
 from collections.abc import Iterator
 from time import monotonic
-from types import TracebackType
-from typing import Self
 
+from devices.source import Closing
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceError,
@@ -22,7 +21,7 @@ from tofclip.errors import (
 RECEIVE_BYTES = 1 << 18  # Most bytes taken from the system at once
 
 
-class TcpLink:
+class TcpLink(Closing):
     """A connection to a server. Not for two threads at once."""
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
@@ -54,9 +53,7 @@ class TcpLink:
         return self._take_bytes(min(limit, len(self._buffer)))
 
     def read_exactly(self, length: int, limit: int, timeout: float) -> bytes:
-        """Return `length` bytes, a length that came from the wire and is bounded before anything is
-        held for it.
-        """
+        """Return `length` bytes; that came from the wire, so it is bounded first."""
         if not 0 <= length <= limit:
             raise ProtocolError(
                 f"{self.name} announced {length} bytes; at most {limit} are possible"
@@ -83,9 +80,7 @@ class TcpLink:
         return message
 
     def discard_available(self) -> int:
-        """Throw away what has come unasked, without waiting, and return how many bytes
-        that were.
-        """
+        """Throw away what has come unasked, without waiting; return how many bytes."""
         thrown = len(self._buffer)
         self._buffer.clear()
         with contextlib.suppress(DeviceError), self._translate_errors():
@@ -95,19 +90,7 @@ class TcpLink:
         return thrown
 
     def close(self) -> None:
-        """Close the connection; closing twice is fine."""
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _take_bytes(self, length: int) -> bytes:
         taken = bytes(self._buffer[:length])

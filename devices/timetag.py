@@ -18,7 +18,7 @@ from typing import Any
 from devices.address import Uri, option
 from devices.registry import DiscoveredInstrument
 from devices.source import Gap, Info, Ledger
-from devices.stream import LiveOptions, StreamSource, Transfer
+from devices.stream import Feed, LiveOptions, StreamSource, Transfer
 from devices.timetag_codec import RECORD_BYTES, TimeTagCodec
 from devices.usb import UsbIdentity, UsbLink, find_devices, read_serial, system_backend
 from tofclip.errors import (
@@ -76,10 +76,7 @@ class TimeTagger:
 
     A reply is four bytes that do not say which request they answer. One that a killed program never
     fetched would shift all later answers by one. So every exchange is followed by a reading of the
-    version, which must be what it always is; where it is not, the replies are thrown away, and the
-    exchange is tried again.
-
-    Making one of these synchronises.
+    version, which must be what it always is, or the exchange is tried again.
     """
 
     def __init__(self, link: UsbLink) -> None:
@@ -124,9 +121,7 @@ class TimeTagger:
         self.write(Register.LOST, 0)
 
     def clear_memory(self) -> None:
-        """Throw away every record that waits in the memory and in the USB chip, which makes packets
-        of 512 bytes then. Nothing may be registered meanwhile.
-        """
+        """Throw away what waits in memory and USB chip, while nothing is registered."""
         self.write(Register.CLEAR, 1)
         self.set_send_window(PACKET_BYTES)
         # The chip still holds packets, and a last one that is not full. Once they have left, a
@@ -143,9 +138,8 @@ class TimeTagger:
     def run(
         self, channels: int, delta: int, capture: Capture = Capture.COUNT | Capture.REGISTER
     ) -> None:
-        """Start the counter, then the registration, so that the first zero of the counter is not
-        taken for a wrap. `channels, delta`: one bit for each channel whose edges are recorded as
-        strobes, or whose levels; `capture`: what to switch on in the end.
+        """Start the counter, then the registration, or the counter's first zero would be a wrap.
+        `channels, delta`: one bit for each channel whose edges, or whose levels, are recorded.
         """
         self.write(Register.STROBE, channels)
         self.write(Register.DELTA, delta)
@@ -153,16 +147,13 @@ class TimeTagger:
         self.write(Register.CAPTURE, capture)
 
     def set_send_window(self, size: int) -> bool:
-        """Set how many bytes make a packet, and let the chip send what it holds now, however
-        little. `size`: at most 512. Packets of 512 bytes do not end a transfer, smaller ones do.
-        Returns false where the firmware has no such request.
+        """Set how many bytes make a packet, and let the chip send what it holds now. Packets of 512
+        bytes do not end a transfer, smaller ones do. False where there is no such request.
         """
         return self._request(_SET_SEND_WINDOW, size)
 
     def flush(self) -> bool:
-        """Let the chip get rid of an unfinished packet: send it or, by other firmware, forget it.
-        Returns false where the firmware has no such request.
-        """
+        """Let the chip send or forget an unfinished packet; False where it has no such request."""
         return self._request(_FLUSH, 0)
 
     def _request(self, number: int, value: int) -> bool:
@@ -244,7 +235,7 @@ class TimeTagOptions(LiveOptions):
         return int(self.transfer_kib * 1024)
 
 
-class TimeTaggerFeed:
+class TimeTaggerFeed(Feed):
     """The time tagger's words, one transfer after the other; see `devices.stream.Feed`.
 
     What the instrument registered but never handed over is found by comparing its own counts with
@@ -275,14 +266,12 @@ class TimeTaggerFeed:
         self._bytes_since_gap = 0
         self._clock_hz = self._tagger.read(Register.CLOCK)
         # Ticks become seconds by this number, so that a wrong one is refused before any record.
-        if not self._clock_hz:
-            raise ProtocolError(
-                "the time tagger says that its clock has 0 Hz; is its gateware loaded?"
-            )
         if not MIN_CLOCK_HZ <= self._clock_hz <= MAX_CLOCK_HZ:
+            advice = (
+                "unplug it and plug it in again" if self._clock_hz else "is its gateware loaded?"
+            )
             raise ProtocolError(
-                f"the time tagger says that its clock has {self._clock_hz} Hz, which cannot be; "
-                "unplug it and plug it in again"
+                f"the time tagger says that its clock has {self._clock_hz} Hz, which cannot be; {advice}"
             )
 
     @property
@@ -308,7 +297,10 @@ class TimeTaggerFeed:
     def pull(self, timeout: float) -> Transfer | None:
         while True:
             try:
-                self._prepare_read(timeout)
+                if self._disconnected_at is not None:
+                    self._reconnect(timeout)
+                if self._must_clear:
+                    self._clear_memory()
                 begin = self._window.clock()
                 wait = min(timeout, self._window.read_timeout)
                 length = self._link.read(DATA_ENDPOINT, self._buffer, wait)
@@ -335,7 +327,13 @@ class TimeTaggerFeed:
     def close(self) -> None:
         try:
             self.stop()
-            self._count_losses()
+            self._end_segment()
+            # What it counted, in 32 bits, and this program never saw.
+            counted = self._tagger.read(Register.RECORDS)
+            missing = (counted - self._records_received) % _COUNTER_MODULUS
+            if missing >= _COUNTER_MODULUS // 2:
+                raise ProtocolError("the time tagger sent more records than it counted")
+            self.ledger.lose(missing + self._tagger.read(Register.LOST))
         finally:
             self._link.close()
 
@@ -360,13 +358,6 @@ class TimeTaggerFeed:
         with contextlib.suppress(DeviceDisconnectedError):  # the next transfer notices
             return self._tagger.set_send_window(size)
         return False
-
-    def _prepare_read(self, timeout: float) -> None:
-        """Do what has to be done before reading can go on."""
-        if self._disconnected_at is not None:
-            self._reconnect(timeout)
-        if self._must_clear:
-            self._clear_memory()
 
     def _clear_memory(self) -> None:
         """Empty the instrument's memory, so that the stream begins with a whole record again."""
@@ -411,20 +402,8 @@ class TimeTaggerFeed:
         begin = monotonic() if self._disconnected_at is None else self._disconnected_at
         return begin + self._options.reconnect_s - monotonic()
 
-    def _count_losses(self) -> None:
-        """Enter what the instrument counted and this program never saw."""
-        self._end_segment()
-        missing = (
-            self._tagger.read(Register.RECORDS) - self._records_received
-        ) % _COUNTER_MODULUS  # the counts have 32 bits
-        if missing >= _COUNTER_MODULUS // 2:
-            raise ProtocolError("the time tagger sent more records than it counted")
-        self.ledger.lose(missing + self._tagger.read(Register.LOST))
-
     def _end_segment(self) -> None:
-        """Count what arrived without a gap; a record of which only the beginning arrived counts as
-        well.
-        """
+        """Count what arrived without a gap, and a record of which only the beginning did."""
         self._records_received += -(-self._bytes_since_gap // RECORD_BYTES)
         self._bytes_since_gap = 0
 
@@ -442,16 +421,15 @@ class SendWindow:
     def __init__(self) -> None:
         self.size = PACKET_BYTES
         """Bytes of a packet."""
-        self._bytes = 0
-        self._transfers = 0
-        self._seconds = 0.0
         self._rate = 0.0
+        self._begin_count()
+
+    def _begin_count(self) -> None:
+        self._bytes, self._transfers, self._seconds = 0, 0, 0.0
 
     @property
     def read_timeout(self) -> float:
-        """Seconds that one transfer may take: long for a full stream, which is not cut then, and
-        for packets of single records, which end a transfer at once.
-        """
+        """Seconds of a transfer: long where the stream is full, or ends it with each record."""
         is_full = self._rate > FULL_STREAM_BYTES_PER_S
         return 10.0 if is_full or self.size == RECORD_BYTES else LATENCY_S
 
@@ -463,9 +441,7 @@ class SendWindow:
         if self._transfers < 8 and self._seconds < PACKET_INTERVAL_S:
             return self.size
         self._rate = self._bytes / max(self._seconds, 1e-6)
-        self._bytes = 0
-        self._transfers = 0
-        self._seconds = 0.0
+        self._begin_count()
         wanted = self._rate * PACKET_INTERVAL_S
         if wanted >= PACKET_BYTES:
             return PACKET_BYTES
@@ -503,13 +479,9 @@ def find_timetaggers() -> list[DiscoveredInstrument]:
     """Look for connected time taggers; an empty list where there is no USB to look at."""
     try:
         backend = system_backend()
-        return [
-            *(_describe(device) for device in find_devices(USB_IDENTITY, backend)),
-            *(
-                DiscoveredInstrument("timetag://", INSTRUMENT, WITHOUT_FIRMWARE)
-                for _ in find_devices(BARE_CHIP_IDENTITY, backend)
-            ),
-        ]
+        bare = DiscoveredInstrument("timetag://", INSTRUMENT, WITHOUT_FIRMWARE)
+        found = [_describe(device) for device in find_devices(USB_IDENTITY, backend)]
+        return found + [bare for _ in find_devices(BARE_CHIP_IDENTITY, backend)]
     except DeviceError:
         return []
 

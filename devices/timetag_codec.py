@@ -19,26 +19,12 @@ The compiled loops that read them are apart, so that their names do not load a c
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from devices.source import ByteView, DecodeResult, Records, as_bytes
+from devices.source import ByteView, Codec, DecodeResult, Records
 from tofclip.errors import InputError
-from tofclip.storage import Scalar
-
-__all__ = [
-    "COUNTER_RANGE",
-    "DELTA",
-    "LOST",
-    "RECORD_BYTES",
-    "RECORD_DTYPE",
-    "WRAP",
-    "TimeTagCodec",
-    "mark_wraps",
-]
-
 
 RECORD_BYTES = 6
 TIME_BITS = 36
@@ -63,7 +49,7 @@ class CounterState(NamedTuple):
     counter: int = 0
 
 
-class TimeTagCodec:
+class TimeTagCodec(Codec):
     """Bytes of the time tagger to records and back.
 
     A record is malformed if an unused bit is set, if it reports nothing (no channel, no wrap), or
@@ -74,33 +60,15 @@ class TimeTagCodec:
     """
 
     name: ClassVar[str] = "timetag"
+    start: ClassVar[CounterState] = CounterState()
     dtype = RECORD_DTYPE
-    start = CounterState()
-
-    @property
-    def settings(self) -> Mapping[str, Scalar]:
-        """Nothing about this format can be set."""
-        return {}
-
-    def count_complete_bytes(self, data: ByteView) -> int:
-        """Return how many bytes at the front of `data` form whole records."""
-        return len(data) - len(data) % RECORD_BYTES
-
-    def count_records(self, data: ByteView) -> int:
-        """Return the number of records in `data`."""
-        return len(data) // RECORD_BYTES
+    unit_bytes = RECORD_BYTES
 
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
-        """Decode whole records; `state` is a `CounterState`. `data`: whole records; `after_loss`:
-        records are missing right before these, so that the counter may have wrapped unseen.
-        """
+        """Decode whole records; after a loss the counter may have wrapped unseen."""
         from devices.timetag_kernels import decode_timetags
 
-        words = as_bytes(data)
-        if words.size % RECORD_BYTES:
-            raise InputError(
-                f"{words.size} bytes are not a whole number of {RECORD_BYTES}-byte records"
-            )
+        words = self._view_units(data).ravel()
         records = np.empty(words.size // RECORD_BYTES, RECORD_DTYPE)
         columns = (records[name] for name in ("time_ticks", "channels", "flags"))
         kept, *position = decode_timetags(words, *state, after_loss, *columns)
@@ -110,6 +78,7 @@ class TimeTagCodec:
         """Return the bytes that the instrument would have sent."""
         from devices.timetag_kernels import encode_timetags
 
+        self._require_records(records)
         _require_valid(records)
         data = np.empty(len(records) * RECORD_BYTES, np.uint8)
         encode_timetags(records["time_ticks"], records["channels"], records["flags"], data)
@@ -117,10 +86,8 @@ class TimeTagCodec:
 
 
 def mark_wraps(records: Records) -> Records:
-    """Add the records that the instrument sends each time its counter wraps. `records` (n,): times
-    must not go back. Returns (m,): with one record of flag WRAP at every multiple of
-    `COUNTER_RANGE` ticks up to the last time. A record that is already at such a time gets the flag
-    instead.
+    """Add the records that the instrument sends each time its counter wraps: one of flag WRAP at
+    every multiple of `COUNTER_RANGE` ticks; a record that is already there gets the flag instead.
     """
     ticks = records["time_ticks"]
     if len(ticks) == 0:
@@ -139,8 +106,6 @@ def mark_wraps(records: Records) -> Records:
 
 def _require_valid(records: Records) -> None:
     """Refuse records that would not come back from `TimeTagCodec.decode` as they are."""
-    if records.dtype != RECORD_DTYPE or records.ndim != 1:
-        raise InputError(f"time tags must be a one-dimensional array of {RECORD_DTYPE}")
     ticks, channels, flags = (records[name] for name in RECORD_DTYPE.names or ())
     if np.any(channels > CHANNEL_MASK) or np.any(flags > FLAG_MASK):
         raise InputError("a time tag has 4 channels and 3 flags")

@@ -27,10 +27,8 @@ _DOUBLE_STEP = 2.0**-53
 
 @compiled
 def decode_timetags(data, epoch, previous, after_loss, ticks, channels, flags):
-    """Decode the 6-byte words in `data` (bytes) into three arrays; see `TimeTagCodec.decode`.
-    `data` (bytes,); `epoch, previous`: state of the counter; `ticks` (words,): overwritten;
-    `channels, flags` (words,): overwritten. Returns `kept`: records written; all other words are
-    malformed; `epoch, previous`: how often the counter has wrapped, and its last value.
+    """Decode 6-byte words into three arrays. Returns how many records were written (all other words
+    are malformed), how often the counter has wrapped, and its last value.
     """
     kept = 0
     expects_loss = after_loss
@@ -83,9 +81,7 @@ def encode_timetags(ticks, channels, flags, data):
 
 @compiled
 def _next_random(state):
-    """One step of splitmix64 (Steele, Lea, Flood, OOPSLA 2014); returns the new state and 64 random
-    bits.
-    """
+    """One step of splitmix64 (Steele, Lea, Flood, OOPSLA 2014): new state, 64 random bits."""
     state = state + np.uint64(0x9E3779B97F4A7C15)
     mixed = state
     mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -95,12 +91,10 @@ def _next_random(state):
 
 @compiled
 def fill_poisson_words(state, now, scale, weights, last, words):
-    """Write the words of photons that arrive at random on four channels, one at most per tick.
-    `state` (1,): of the random numbers; changed in place; `now` (1,): tick of the last record;
-    changed in place; `scale`: of the exponential distribution of which the whole part is the number
-    of ticks between two photons; `weights` (4,): of all photons, the fraction of each channel,
-    added up; `last`: no record is later than this tick; `words`: filled with as many records as
-    fit. Returns records written.
+    """Write the words of photons that arrive at random on four channels, one at most per tick, none
+    later than tick `last`; return how many. `state` of the random numbers and `now`, tick of the
+    last record, change in place; `scale`: of the exponential distribution of which the whole part
+    is the number of ticks between two photons; `weights` (4,): fractions of the channels, added up.
     """
     written = 0
     while written < words.size // RECORD_BYTES:

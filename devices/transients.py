@@ -12,12 +12,8 @@ Besides what a source itself takes, its address may say how to gather (`Accumula
 * ``sync``, ``pixels``: channel of the laser's pulses and channels of the line's pixels of a time
   tagger, ``0`` and ``1,2,3`` by default.
 
-Read shot after shot, a source gives streak images as they come, with what became of every other
-one::
-
-    Source -> TransientStream (one image of several pictures or photons) -> TrackedShots
-           -> stages that make clouds -> consumer, which asks TrackedShots for the age of each and
-                                         for the accounts of all
+Read shot after shot, a source gives streak images as they come (`TransientStream`); behind stages
+that make clouds of them, `TrackedShots` knows the age of each and what became of all others.
 """
 
 from __future__ import annotations
@@ -54,7 +50,7 @@ PICOSECOND_S = 1e-12
 
 @dataclass(frozen=True)
 class Accumulation(Options):
-    """How records become a streak image; see the module's text."""
+    """How records become a streak image."""
 
     seconds: float = option(10.0, above=0)
     frames: int = option(1, above=0)
@@ -121,12 +117,9 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
     with open_source(strip_options(uri)) as source:
         known = source.calibration
         streak = accumulate_streak(read_batches(source, gathering.seconds), known, gathering)
-        past = {
-            **collect_provenance({"address": address, "bin_width_s": bin_width}),
-            "source": source.info.as_dict(),
-        }
+        past = collect_provenance({"address": address, "bin_width_s": bin_width})
         source.drain()
-    past["stats"] = source.stats.as_dict()
+    past |= {"source": source.info.as_dict(), "stats": source.stats.as_dict()}
     return replace(streak, camera=read_camera(known), source=address, provenance=past)
 
 
@@ -189,9 +182,7 @@ def _make_histogram(
 def _stack_histograms(batches: list[Batch], calibration: Record, gathering: Accumulation) -> Streak:
     """Return histograms that the instrument has made itself, a channel in each column."""
     counts = np.concatenate([batch.records["histogram"] for batch in batches]).T
-    times: NDArray[np.float64] = np.float64(calibration.number("resolution_s")) * (
-        np.arange(len(counts)) + 0.5
-    )
+    times = calibration.number("resolution_s") * (np.arange(len(counts), dtype=np.float64) + 0.5)
     streak = Streak(counts.astype(np.float32), times)
     return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
 
@@ -253,9 +244,7 @@ class ShotStamp:
     received_at: float = 0.0
 
     def compute_age(self) -> float | None:
-        """Return the seconds since it was taken, or since it came where the instrument does not say
-        when it was taken; None for a file.
-        """
+        """Return the seconds since it was taken, or came; None for a file."""
         began = self.taken_at or self.received_at
         return monotonic() - began if began else None
 
@@ -357,9 +346,7 @@ class TransientStream(Iterator[Streak]):
                 yield replace(streak, camera=camera, source=f"{self._uri.text} shot {number}")
 
     def _note_times(self, batches: Iterator[Batch], tick: object) -> Iterator[Batch]:
-        """Note when each batch was taken and came; photons carry the instrument's clock in their
-        time tags, of which `tick` is the unit in s.
-        """
+        """Note when each batch was taken and came; time tags carry a clock of `tick` s."""
         for batch in batches:
             self._taken_at, self._received_at = batch.taken_at, batch.received_at
             names = batch.records.dtype.names or ()
@@ -389,9 +376,7 @@ class TrackedShots(Iterator[Streak | TofclipError]):
         return self._stream is not None and self._stream.is_live
 
     def peek(self) -> Streak | None:
-        """Return the next shot that can be read; it and those before it are still to come. None at
-        the end.
-        """
+        """Return the next shot that can be read, which is still to come; None at the end."""
         while not self._peeked or isinstance(self._peeked[-1], TofclipError):
             try:
                 self._peeked.append(self._take())
@@ -404,8 +389,7 @@ class TrackedShots(Iterator[Streak | TofclipError]):
 
     def _take(self) -> Streak | TofclipError:
         shot = next(self._shots)
-        stamp = None if self._stream is None else self._stream.stamp
-        stamp = stamp or ShotStamp(self._count)
+        stamp = (self._stream and self._stream.stamp) or ShotStamp(self._count)
         self._stamps[self._count] = stamp
         if self._count == 0:
             self._first_number = stamp.number
@@ -414,9 +398,7 @@ class TrackedShots(Iterator[Streak | TofclipError]):
         return shot
 
     def get_stamp(self, place: int) -> ShotStamp:
-        """Return the stamp of the shot that came as number `place` out of this iterator, from 0.
-        Asked once for each shot, and not for one before.
-        """
+        """Return the stamp of shot number `place` from 0; asked once for each, in order."""
         for earlier in [known for known in list(self._stamps) if known < place]:
             del self._stamps[earlier]  # they were dropped
         return self._stamps.pop(place, ShotStamp(place))
@@ -432,9 +414,7 @@ class TrackedShots(Iterator[Streak | TofclipError]):
         return missing
 
     def count_shots(self, delivered: int, failed: int = 0) -> ShotAccounts:
-        """Return what became of every shot, given how many were delivered and how many failed;
-        final once the stream has been closed.
-        """
+        """Return what became of every shot; final once the stream has been closed."""
         acquired, lost = self._count, 0
         if self._stream is not None and self._stream.is_live:
             # The instrument knows of shots that never reached this program.
@@ -445,9 +425,7 @@ class TrackedShots(Iterator[Streak | TofclipError]):
 
     def close(self) -> None:
         """Close the source; not while another thread waits for a shot."""
-        close = getattr(self._shots, "close", None)
-        if close is not None:
-            close()
+        getattr(self._shots, "close", lambda: None)()
 
 
 def _split_shots(batches: Iterator[Batch], gathering: Accumulation) -> Iterator[tuple[int, Batch]]:

@@ -105,7 +105,11 @@ def translate_errors(identity: UsbIdentity) -> Iterator[None]:
     except usb.core.NoBackendError as fault:  # a ValueError, so it has to come first
         raise UsbBackendError("no USB library was found; install libusb-package") from fault
     except usb.core.USBError as fault:
-        raise _convert_error(fault, identity) from fault
+        number = errno.ETIMEDOUT if isinstance(fault, usb.core.USBTimeoutError) else fault.errno
+        if number == errno.EACCES:
+            raise _make_permission_error(identity) from fault
+        kind, said = _FAULTS.get(number, (DeviceError, f": {' '.join(str(fault).split())}"))
+        raise kind(f"USB device {identity} {said}".replace(" :", ":")) from fault
     except ValueError as fault:
         if "langid" not in str(fault):
             raise
@@ -117,16 +121,6 @@ def translate_errors(identity: UsbIdentity) -> Iterator[None]:
         ) from fault
 
 
-def _convert_error(fault: usb.core.USBError, identity: UsbIdentity) -> DeviceError:
-    import usb.core
-
-    number = errno.ETIMEDOUT if isinstance(fault, usb.core.USBTimeoutError) else fault.errno
-    if number == errno.EACCES:
-        return _make_permission_error(identity)
-    kind, said = _FAULTS.get(number, (DeviceError, f": {' '.join(str(fault).split())}"))
-    return kind(f"USB device {identity} {said}".replace(" :", ":"))
-
-
 def _make_permission_error(identity: UsbIdentity) -> DevicePermissionError:
     return DevicePermissionError(
         f"USB device {identity} may not be opened by this user; put this line into "
@@ -135,12 +129,8 @@ def _make_permission_error(identity: UsbIdentity) -> DevicePermissionError:
 
 
 class UsbLink:
-    """One claimed USB instrument, known by its serial number.
-
-    Not for two threads at once. Reading and writing clear a stalled endpoint and try once more.
-
-    `serial`: empty: the only one that is connected; `backend`: pyusb's backend; `system_backend`,
-    or an emulator's.
+    """One claimed USB instrument, known by its serial number (empty: the only one). Not for two
+    threads at once. Reading and writing clear a stalled endpoint and try once more.
     """
 
     def __init__(self, identity: UsbIdentity, serial: str, backend: Any) -> None:
@@ -149,9 +139,7 @@ class UsbLink:
         self._claim()
 
     def read(self, endpoint: int, buffer: array.array[int], timeout: float) -> int:
-        """Fill `buffer` from a bulk endpoint and return how many bytes came; fewer than fit are no
-        fault.
-        """
+        """Fill `buffer` from a bulk endpoint and return how many bytes came; fewer than fit are no fault."""
         return self._retry_after_halt(
             endpoint, lambda: int(self._device.read(endpoint, buffer, _to_milliseconds(timeout)))
         )
@@ -205,10 +193,9 @@ class UsbLink:
         fitting = [(device, number) for device, number in known if serial in ("", number)]
         if not fitting:
             others = ", ".join(number or "one without serial number" for _, number in known)
-            others = others or "none"
             wanted = f" with serial number {serial}" if serial else ""
             raise DeviceNotFoundError(
-                f"no USB device {self.identity}{wanted} is connected (connected: {others})"
+                f"no USB device {self.identity}{wanted} is connected (connected: {others or 'none'})"
             )
         if len(fitting) > 1:
             numbers = ", ".join(number for _, number in fitting if number)

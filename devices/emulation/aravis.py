@@ -76,9 +76,7 @@ class ShownLight:
         library.arv_fake_camera_set_fill_pattern(camera, self._pattern, None)
 
     def close(self) -> None:
-        """Have the library draw its own stripes again: a camera that ends waits for its thread,
-        which must not wait for Python then.
-        """
+        """Draw stripes again: the camera's thread must not wait for Python at the end."""
         self._library.arv_fake_camera_set_fill_pattern(self._camera, FillPattern(), None)
 
 

@@ -12,28 +12,18 @@ import socketserver
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
-from devices.source import Codec, Info, Ledger
-from devices.stream import Feed
+from devices.source import Info
+from devices.stream import Feed, Transfer
 from tofclip.errors import InputError
 from tofclip.storage import Record
 
-FaultKind = Literal[
-    "timeout",
-    "stall",
-    "unplug",
-    "powerloss",
-    "short",
-    "overflow",
-    "corrupt",
-    "lost",
-    "reply_late",
-    "reply_lost",
-    "reply_stall",
-]
-FAULT_KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
-REPLY_FAULTS = ("reply_late", "reply_lost", "reply_stall")
+LinkFault = Literal["timeout", "stall", "unplug", "powerloss", "short", "overflow"]
+ReplyFault = Literal["reply_late", "reply_lost", "reply_stall"]
+FaultKind = LinkFault | Literal["corrupt", "lost"] | ReplyFault
+REPLY_FAULTS: tuple[FaultKind, ...] = get_args(ReplyFault)
+FAULT_KINDS: tuple[FaultKind, ...] = (*get_args(LinkFault), "corrupt", "lost", *REPLY_FAULTS)
 
 
 @dataclass(frozen=True)
@@ -162,14 +152,7 @@ class LoopbackServer(socketserver.ThreadingTCPServer):
         self.close()
 
 
-class Instrument(Protocol):
-    """What can be switched off."""
-
-    def close(self) -> None:
-        """Switch it off."""
-
-
-class EmulatedFeed:
+class EmulatedFeed(Feed):
     """A driver's feed whose instrument is software, which is switched off with it; see
     `devices.stream.Feed`. `describe`: from the calibration that the driver knows to that of the
     scene.
@@ -177,7 +160,7 @@ class EmulatedFeed:
 
     def __init__(
         self,
-        instrument: Instrument,
+        instrument: Any,
         connect: Callable[[], Feed],
         describe: Callable[[Record | None], Record | None] = lambda known: known,
     ) -> None:
@@ -187,9 +170,7 @@ class EmulatedFeed:
         except BaseException:
             instrument.close()
             raise
-        self.codec: Codec = self._feed.codec
-        self.ledger: Ledger = self._feed.ledger
-        self.start, self.stop, self.pull = self._feed.start, self._feed.stop, self._feed.pull
+        self.codec, self.ledger = self._feed.codec, self._feed.ledger
 
     @property
     def info(self) -> Info:
@@ -199,6 +180,15 @@ class EmulatedFeed:
     @property
     def calibration(self) -> Record | None:
         return self._describe(self._feed.calibration)
+
+    def start(self) -> None:
+        self._feed.start()
+
+    def pull(self, timeout: float) -> Transfer | None:
+        return self._feed.pull(timeout)
+
+    def stop(self) -> None:
+        self._feed.stop()
 
     def close(self) -> None:
         try:

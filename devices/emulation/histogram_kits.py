@@ -60,9 +60,7 @@ def format_tmf8828(counts: NDArray[Any], number: int, tick: int) -> list[bytes]:
 
 
 def format_vl53l8(counts: NDArray[Any], number: int = 0, tick: int = 0) -> list[bytes]:
-    """Return the lines that a VL53L8CH's program sends for a frame of counts (bins, zones), which
-    say neither its number nor its time.
-    """
+    """Return the lines that a VL53L8CH's program sends for counts (bins, zones)."""
     lines = [b"Ranging Results:\r\n"]
     for zone, column in enumerate(counts.T):
         words = "".join(f"{value / VL53_SCALE:.1f}, " for value in column.tolist())

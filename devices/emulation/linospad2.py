@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from devices.address import Uri, option
-from devices.emulation.scenes import LineLight, simulate_line_light
+from devices.emulation.scenes import LineLight, draw_cells, simulate_line_light
 from devices.linospad2 import (
     CLOCK_PERIOD_S,
     CODES_PER_PERIOD,
@@ -27,7 +27,7 @@ from devices.linospad2 import (
 )
 from devices.linospad2_kernels import ADDRESSES
 from devices.source import Info, Ledger, Records
-from devices.stream import StreamOptions, StreamSource, Transfer
+from devices.stream import Feed, StreamOptions, StreamSource, Transfer
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Record
 
@@ -72,9 +72,7 @@ class SimulatedBoard:
         return (self.calibration.code_ends + self._table_offsets[:, np.newaxis]).ravel()
 
     def encode_cycle(self, number: int) -> bytes:
-        """Return the words of one cycle; the same number gives the same words. Photons that find
-        their converter's memory full are not stamped.
-        """
+        """Return a cycle's words; photons that find their converter's memory full are left out."""
         random = np.random.default_rng([self.seed, number])
         pixel, time = self._draw_photons(random)
         records = np.zeros(len(pixel), self.codec.dtype)
@@ -82,22 +80,14 @@ class SimulatedBoard:
         if self.codec.counter:
             records["counter"] = round(number * CYCLE_TIME_S / COUNTER_TICK_S)
         cycle = self.codec.encode(self._drop_overflow(records))
-        return cycle or bytes(self.codec.cycle_bytes)
+        return cycle or bytes(self.codec.unit_bytes)
 
     def _draw_photons(
         self, random: np.random.Generator
     ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Draw pixel and time since the cycle began of each photon of a cycle."""
-        columns = self.light.photons.shape[1]
         total = random.poisson(self.photons_per_cycle)
-        row, pixel = np.divmod(
-            np.searchsorted(
-                self._cumulative_photons,
-                random.uniform(0, self._cumulative_photons[-1], total),
-                side="right",
-            ),
-            columns,
-        )
+        row, pixel = draw_cells(random, self._cumulative_photons, total, PIXELS)
         # The last pulses of a cycle are left out, so that the board's offsets cannot carry a photon
         # beyond it.
         pulse = random.integers(1, round(CYCLE_TIME_S / LASER_PERIOD_S) - 1, total) * LASER_PERIOD_S
@@ -109,14 +99,9 @@ class SimulatedBoard:
     ) -> NDArray[np.int64]:
         """Return the code in which each time lies, for its own pixel's converter."""
         periods, phase = np.divmod(time - self.calibration.offsets[pixel], CLOCK_PERIOD_S)
-        code = (
-            np.searchsorted(self._code_ends, phase + self._table_offsets[pixel], side="right")
-            - pixel * CODES_PER_PERIOD
-        )
-        codes: NDArray[np.int64] = periods.astype(np.int64) * CODES_PER_PERIOD + np.clip(
-            code, 0, CODES_PER_PERIOD - 1
-        )
-        return codes
+        place = np.searchsorted(self._code_ends, phase + self._table_offsets[pixel], side="right")
+        code = np.clip(place - pixel * CODES_PER_PERIOD, 0, CODES_PER_PERIOD - 1)
+        return np.asarray(periods.astype(np.int64) * CODES_PER_PERIOD + code)
 
     def _drop_overflow(self, records: Records) -> Records:
         # A converter keeps its first photons in time; later ones find its memory full.
@@ -128,9 +113,7 @@ class SimulatedBoard:
 
 
 def draw_uneven_calibration(seed: int) -> BoardCalibration:
-    """Return a board as uneven as real ones: codes from a tenth to twice their width, pixels out of
-    step by 10 ns.
-    """
+    """Return a board of uneven codes, 0.1 to 2 widths, and pixels out of step by 10 ns."""
     random = np.random.default_rng([seed, 1])
     ends = np.cumsum(random.uniform(0.1, 1.9, (PIXELS, CODES_PER_PERIOD)), axis=1)
     return BoardCalibration(
@@ -138,7 +121,7 @@ def draw_uneven_calibration(seed: int) -> BoardCalibration:
     )
 
 
-class SimulatedFeed:
+class SimulatedFeed(Feed):
     """A board's cycles, one after the other; see `devices.stream.Feed`. `cycles`: until the stream
     ends; `cycle_time`: seconds that a cycle takes at least; 0: as fast as they are read.
     """
@@ -174,9 +157,6 @@ class SimulatedFeed:
 
     def stop(self) -> None:
         self._left = 0
-
-    def close(self) -> None:
-        """Do nothing: nothing is held."""
 
 
 @dataclass(frozen=True)

@@ -179,9 +179,7 @@ class EmulatedStreakCamera:
     def _execute(  # noqa: C901 - a table
         self, command: Command, connection: Connection
     ) -> tuple[str, ...] | None:
-        """Do what the handbook says, and return what is answered; None where that has been sent.
-        Names of commands are not case-sensitive.
-        """
+        """Do what the handbook says; return what is answered, None where that has been sent."""
         tube, sensor, run = self._tube, self._sensor, self._run
         match (command.name.casefold(), *command.arguments):
             case (name, *_) if not self.is_application_up and name not in ("appstart", "appinfo"):

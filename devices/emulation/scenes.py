@@ -69,9 +69,7 @@ class EmulatedLight:
 
 
 def make_line_instrument() -> Instrument:
-    """Return seven lenslets before a line of 256 pixels, as long as LinoSPAD2; nothing sweeps,
-    nothing is skewed.
-    """
+    """Return seven lenslets before a line of 256 pixels; nothing sweeps, nothing is skewed."""
     half = IMAGE_SIZE_PX / 2
     centres = np.linspace(half, SENSOR_PIXELS - half, LENSLET_COUNT)
     still = SkewSweep(centres, np.zeros(LENSLET_COUNT), np.zeros(LENSLET_COUNT))
@@ -92,9 +90,7 @@ def make_line_instrument() -> Instrument:
 
 
 def make_line_scene() -> Scene:
-    """Return a letter and four plates between 1.7 and 3.2 m, as coarse as pictures of 32 pixels
-    need.
-    """
+    """Return a letter and four plates between 1.7 and 3.2 m, coarse enough for 32 pixels."""
     return Scene(
         (
             _make_plate(
@@ -116,9 +112,7 @@ def simulate_line_light() -> LineLight:
 
 @lru_cache(maxsize=1)
 def simulate_demonstration_light() -> LineLight:
-    """Return, always the same object, the demonstration's light; its camera is known as focus
-    pictures would tell: without sweep and gains.
-    """
+    """Return, always the same, the demonstration's light; its camera lacks sweep and gains."""
     light = _simulate_light(make_default_scene(), make_default_instrument())
     return replace(
         light, camera=replace(light.camera, sweep=None, gains=np.ones(light.camera.views))
@@ -131,10 +125,17 @@ def render_array_light() -> NDArray[np.float64]:
 
 
 def render_array_delays() -> NDArray[np.float64]:
-    """Return when the light of each pixel of `render_array_light` comes back, s; NaN where none
-    does.
-    """
+    """Return when light comes back to the array's pixels, s; NaN where none does."""
     return _enlarge(_render_truth().range) * 2 / SPEED_OF_LIGHT
+
+
+def draw_cells(
+    random: np.random.Generator, cumulative: NDArray[np.float64], total: int, columns: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Draw row and column of so many photons from light added up in raster order."""
+    return np.divmod(
+        np.searchsorted(cumulative, random.uniform(0, cumulative[-1], total), "right"), columns
+    )
 
 
 def draw_exposure(light: LineLight, seed: int) -> Streak:
@@ -172,9 +173,7 @@ def _make_plate(
     yaw: float = 0.0,
     pitch: float = 0.0,
 ) -> Body:
-    """Square plate; `middle` (x, y) from the optical axis and `side` are in 128ths of the picture's
-    side.
-    """
+    """Square plate; `middle` from the optical axis and `side` in 128ths of the picture's side."""
     unit = depth / make_default_instrument().camera.focal_length_px
     return make_plate(
         (middle[0] * unit, middle[1] * unit, depth), (side * unit, side * unit), pattern, yaw, pitch

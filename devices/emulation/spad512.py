@@ -92,9 +92,7 @@ class EmulatedSpadArray:
         return self._server.port
 
     def draw_frame(self, request: int, number: int, exposure: ExposureRequest) -> NDArray[np.uint8]:
-        """Return the bytes of picture `number` of a request; the same numbers give the same
-        picture.
-        """
+        """Return picture `number` of a request; the same numbers give the same bytes."""
         light = self._photons[:, : exposure.width] * exposure.seconds
         if exposure.gate is not None:
             light = self._gate_light(light, exposure.gate, number)
@@ -159,9 +157,8 @@ class EmulatedSpadArray:
         if fault is not None and kind == "stall":
             if fault.amount == 3:
                 connection.send(b"\x81" * 1000)
-            is_framed = fault.amount == 2
             framed = ERROR_MARK + b": the FIFO is full.\n" + DONE_MARK
-            connection.send(framed if is_framed else b"The FIFO is full.\n" + ERROR_MARK)
+            connection.send(framed if fault.amount == 2 else b"The FIFO is full.\n" + ERROR_MARK)
             return
         time.sleep(pause if kind == "timeout" else 0)
         for number in range(exposure.frames):
@@ -207,9 +204,7 @@ class EmulationOptions(SpadOptions):
 
 
 def open_emulated(uri: Uri) -> StreamSource:
-    """Open ``sim+spad512://?seed=1&rate=20000&pictures=N&faults=...``: an emulated array that sees
-    the demonstration.
-    """
+    """Open ``sim+spad512://?seed=1&rate=20000&pictures=N&faults=...``, before the demonstration."""
     options = EmulationOptions.from_uri(uri)
     server = EmulatedSpadArray(
         render_array_light() * options.rate,

@@ -21,7 +21,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic, sleep
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ from usb.core import USBError
 
 from devices.address import Uri, option
 from devices.emulation.harness import FOREVER, REPLY_FAULTS, Fault
-from devices.emulation.scenes import LineLight, simulate_line_light
+from devices.emulation.scenes import LineLight, draw_cells, simulate_line_light
 from devices.emulation.usb import PACKET_BYTES, VirtualDevice, VirtualUsb, make_usb_error
 from devices.source import ByteView, Records
 from devices.stream import StreamSource
@@ -50,19 +49,9 @@ from tofclip.errors import InputError
 MAX_TICK = (1 << 62) - 1  # A tick that never comes
 
 
-class TagStream(Protocol):
-    """What falls on a time tagger, as the words that it makes of it."""
-
-    def next_words(self, limit: int, last: int) -> ByteView:
-        """Return the next words: `limit` at most, none of them later than tick `last`; fewer is for
-        good. Wraps of the counter are among them. How a stream is cut into calls does not change it.
-        """
-
-
 class PoissonStream:
-    """Photons at random, at a constant rate. `rate`: photons per second on all channels together;
-    `clock_hz`: ticks per second. There is one record at most per tick; `weights`: how the photons
-    are shared among the channels; any positive scale.
+    """Photons at random, at a constant rate per second, on all channels together, shared among
+    these by `weights`; one record at most for each tick of the clock.
     """
 
     def __init__(
@@ -84,7 +73,9 @@ class PoissonStream:
         self._now = np.zeros(1, np.int64)
 
     def next_words(self, limit: int, last: int) -> ByteView:
-        """Return the next words; see `TagStream`."""
+        """Return the next words: `limit` at most, none of them later than tick `last`; fewer is for
+        good. Wraps of the counter are among them. How a stream is cut into calls does not change it.
+        """
         from devices.timetag_kernels import fill_poisson_words
 
         words = np.empty(limit * RECORD_BYTES, np.uint8)
@@ -108,7 +99,7 @@ BLOCK_TICKS = (
 
 
 class PulsedSceneStream:
-    """Photons of a line of pixels after each pulse of a laser; see `TagStream`.
+    """Photons of a line of pixels after each pulse of a laser.
 
     Three detectors stand at a sixth, a half and five sixths of the line. Photons that one of them
     sees within a tick count as one; what several channels see within a tick is one record. Memory:
@@ -138,7 +129,7 @@ class PulsedSceneStream:
         self._words: ByteView = np.empty(0, np.uint8)
 
     def next_words(self, limit: int, last: int) -> ByteView:
-        """Return the next words; see `TagStream`."""
+        """Return the next words, as a `PoissonStream` does."""
         taken, left = [], limit
         while left:
             if not len(self._ticks):
@@ -169,25 +160,16 @@ class PulsedSceneStream:
     def _draw_records(self, random: np.random.Generator) -> Records:
         """Draw a block's pulses and photons, in ticks since the block began."""
         total = random.poisson(self._photons_per_block)
-        row, pixel = np.divmod(
-            np.searchsorted(
-                self._cumulative_photons,
-                random.uniform(0, self._cumulative_photons[-1], total),
-                "right",
-            ),
-            3,
-        )
+        row, pixel = draw_cells(random, self._cumulative_photons, total, 3)
         delay = self._delays[row] + random.uniform(0, self._row_ticks, total)
         # The half of the first row that lies before its pulse belongs to the pulse before, in
         # blocks as in the counter.
-        ticks = (
-            random.integers(0, PULSES_PER_BLOCK, total) * PERIOD_TICKS + np.floor(delay).astype(int)
-        ) % BLOCK_TICKS
+        ticks = random.integers(0, PULSES_PER_BLOCK, total) * PERIOD_TICKS
+        ticks = (ticks + np.floor(delay).astype(int)) % BLOCK_TICKS
         pulses = np.arange(PULSES_PER_BLOCK) * PERIOD_TICKS
         all_ticks = np.concatenate([pulses, ticks])
-        channels = np.concatenate(
-            [np.full(PULSES_PER_BLOCK, SYNC_MASK, np.uint32), PIXEL_MASKS[pixel]]
-        )
+        sync = np.full(PULSES_PER_BLOCK, SYNC_MASK, np.uint32)
+        channels = np.concatenate([sync, PIXEL_MASKS[pixel]])
         order = np.argsort(all_ticks, kind="stable")
         distinct, begins = np.unique(all_ticks[order], return_index=True)
         records = np.zeros(len(distinct), RECORD_DTYPE)
@@ -257,19 +239,11 @@ class EmulationOptions(TimeTagOptions):
 
 class EmulatedTimeTagger(VirtualDevice):
     """The instrument. What firmware and killed programs differ in is the class's: subclasses have
-    other habits.
+    other habits. Memory: the larger of its own memory and one transfer.
 
-    Memory: the larger of its own memory and one transfer.
-
-    `light`: makes the light that falls on it from a moment at which its counter is reset; takes how
-    often it was before.
+    `light`: makes the light that falls on it after its counter was reset so often.
     """
 
-    # register CLEAR holds the memory empty until it is set to 0 again; otherwise any write clears
-    # once
-    clear_is_level = True
-    # the USB chip sends a packet when it is full, or when asked to; otherwise whenever asked
-    holds_packets = True
     flush_discards = True  # the request to flush throws an unfinished packet away, or sends it
     # what a killed program left: replies that it never fetched, records in the USB chip and the
     # memory, and bytes of a command that was cut short
@@ -278,7 +252,10 @@ class EmulatedTimeTagger(VirtualDevice):
     jammed_bytes = 3
 
     def __init__(
-        self, light: Callable[[int], TagStream], options: EmulationOptions, serial: str = ""
+        self,
+        light: Callable[[int], PoissonStream | PulsedSceneStream],
+        options: EmulationOptions,
+        serial: str = "",
     ) -> None:
         super().__init__(
             USB_IDENTITY,
@@ -290,8 +267,10 @@ class EmulatedTimeTagger(VirtualDevice):
         self._is_paced = options.pace == "realtime"
         self._make_light, self._light = light, light(0)
         self._resets = self._registered_before_reset = 0
-        self._faults = {at.transfer: at for at in options.faults if at.kind not in REPLY_FAULTS}
-        self._reply_faults = {at.transfer: at for at in options.faults if at.kind in REPLY_FAULTS}
+        self._faults, self._reply_faults = (
+            {at.transfer: at for at in options.faults if (at.kind in REPLY_FAULTS) is of_replies}
+            for of_replies in (False, True)
+        )
         self._has_started = False
         self._transfers = self._replies_asked = self._reply_delay = 0
         self._stalls = self._records_to_corrupt = 0
@@ -312,9 +291,7 @@ class EmulatedTimeTagger(VirtualDevice):
         return open_on_backend(self.options, self.strings[2], VirtualUsb(self))
 
     def receive(self, endpoint: int, data: bytes) -> None:
-        """Take a command of the host, byte by byte as the gateware does, and queue its reply; what is
-        not a command is passed over.
-        """
+        """Take a command, byte by byte as the gateware does, and queue its reply."""
         if endpoint != COMMAND_ENDPOINT:
             raise make_usb_error(errno.EPIPE)
         # Replies that are not fetched block the register manager.
@@ -346,15 +323,13 @@ class EmulatedTimeTagger(VirtualDevice):
             self._window = min(max(value, 1), PACKET_BYTES)
 
     def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
-        """Write a reply or time tags into `buffer`, with the faults that were ordered for this
-        transfer.
-        """
+        """Write a reply or time tags into `buffer`, with the faults ordered for this transfer."""
         if endpoint == REPLY_ENDPOINT:
             return self._send_reply(buffer)
-        if not self._has_started or self._is_held_empty:
-            return self._send_data(buffer, timeout)  # what comes is thrown away
-        fault = self._faults.get(self._transfers)
-        self._transfers += 1
+        fault = None
+        if self._has_started and not self._is_held_empty:  # otherwise what comes is thrown away
+            fault = self._faults.get(self._transfers)
+            self._transfers += 1
         if fault is not None:
             return self._apply_fault(fault, buffer, timeout)
         return self._send_data(buffer, timeout)
@@ -402,12 +377,11 @@ class EmulatedTimeTagger(VirtualDevice):
         # Read-only.
         if register in (Register.VERSION, Register.CLOCK):
             return
-        is_level = register is Register.CLEAR and self.clear_is_level
-        if register in (Register.RECORDS, Register.LOST, Register.CLEAR) and not is_level:
+        if register in (Register.RECORDS, Register.LOST):
             value = 0
         if register is Register.RECORDS:
             self._reported = self._segment_bytes = 0
-        if register is Register.CLEAR and (value & 1 or not is_level):
+        if register is Register.CLEAR and value & 1:
             self._clear_memory()
         if register is Register.CAPTURE:
             self._switch_capture(Capture(value & 7))
@@ -417,7 +391,9 @@ class EmulatedTimeTagger(VirtualDevice):
         if Capture.REGISTER not in to:
             self._register_until_now()
         elif not self._has_started and self._capture is Capture.OFF and Capture.COUNT in to:
-            self._store_zero()
+            # Registration that begins together with the counter sees its zero as a wrap.
+            self.truth.registered += 1
+            self._store(np.array([WRAP << 5, 0, 0, 0, 0, 0], np.uint8))
         if Capture.RESET in to and self.truth.registered > self._registered_before_reset:
             self._registered_before_reset = self.truth.registered
             self._resets += 1
@@ -430,37 +406,23 @@ class EmulatedTimeTagger(VirtualDevice):
     def _capture(self) -> Capture:
         return Capture(self._registers[Register.CAPTURE] & 7)
 
-    def _store_zero(self) -> None:
-        """Registration that begins together with the counter sees the counter's zero as a wrap."""
-        self.truth.registered += 1
-        words = np.zeros(RECORD_BYTES, np.uint8)
-        words[0] = WRAP << 5
-        self._store(words)
-
     def _clear_memory(self) -> None:
-        """Forget the memory. The USB chip keeps what it has, and the rest of a record of which it
-        has the beginning follows.
-        """
+        """Forget the memory; the USB chip keeps what it has, to the end of a record."""
         self._reported += -(-self._segment_bytes // RECORD_BYTES)
         self._segment_bytes = 0
-        chip = 0
-        if self.holds_packets:
-            chip = min(len(self._stream), CHIP_PACKETS * self._window)
+        chip = min(len(self._stream), CHIP_PACKETS * self._window)
         del self._stream[chip + (len(self._stream) - chip) % RECORD_BYTES :]
         if not self._stream:
             self._unfinished.clear()
 
     def _register_until_now(self, in_flight: int = 0) -> None:
-        """Register what fell on the instrument up to now, where that depends on the time.
-        `in_flight`: bytes that a transfer under way takes besides what the instrument holds.
-        """
+        """Register what fell on it; a transfer under way takes `in_flight` bytes more."""
         if not self._is_paced or Capture.REGISTER not in self._capture:
             return
         tick = int((monotonic() - self._started) * CLOCK_HZ)
         # Photons beyond memory, chip and the transfer under way have nowhere to go.
-        capacity = (
-            int(self.options.memory_mib * (1 << 20)) + CHIP_PACKETS * self._window + in_flight
-        )
+        memory = int(self.options.memory_mib * (1 << 20))
+        capacity = memory + CHIP_PACKETS * self._window + in_flight
         found = MAX_BATCH_RECORDS
         while found == MAX_BATCH_RECORDS:
             words = self._register_photons(MAX_BATCH_RECORDS, tick)
@@ -471,9 +433,8 @@ class EmulatedTimeTagger(VirtualDevice):
 
     def _register_photons(self, limit: int, last: int = MAX_TICK) -> ByteView:
         """Return the words of the next photons, at most `limit`."""
-        words = self._light.next_words(
-            max(0, min(limit, self.options.records - self.truth.registered)), last
-        )
+        left = max(0, self.options.records - self.truth.registered)
+        words = self._light.next_words(min(limit, left), last)
         self.truth.registered += len(words) // RECORD_BYTES
         return words
 
@@ -500,12 +461,10 @@ class EmulatedTimeTagger(VirtualDevice):
 
     @property
     def _is_held_empty(self) -> bool:
-        return self.clear_is_level and bool(self._registers[Register.CLEAR] & 1)
+        return bool(self._registers[Register.CLEAR] & 1)
 
     def _send_data(self, buffer: memoryview, timeout: float) -> int:
-        """Send packets until the host's buffer is full, a short one ends the transfer, or
-        `timeout` seconds have passed.
-        """
+        """Send packets until the buffer is full, a short one ends the transfer, or time is up."""
         deadline = monotonic() + timeout
         self._register_until_now()  # until now no transfer was under way
         length = 0
@@ -515,8 +474,6 @@ class EmulatedTimeTagger(VirtualDevice):
             if is_over or length == len(buffer):
                 break
             if not self._wait_for_photons(len(buffer) - length, deadline):
-                if not self.holds_packets:
-                    length += self._take(buffer[length:])
                 if not length:
                     raise make_usb_error(errno.ETIMEDOUT)
                 break
@@ -525,9 +482,7 @@ class EmulatedTimeTagger(VirtualDevice):
         return length
 
     def _take_packets(self, buffer: memoryview) -> tuple[int, bool]:
-        """Move packets into the host's buffer; return their bytes, and whether the last was short
-        and ended the transfer.
-        """
+        """Move packets into the buffer; return their bytes, and whether a short one came."""
         taken = 0
         while self._unfinished:
             size = self._unfinished[0]
@@ -647,16 +602,17 @@ def open_timetag(uri: Uri) -> StreamSource:
     ``memory_mib=0.01172``.
     """
     options = EmulationOptions.from_uri(uri)
-    make_light = choose_light(options)
+    is_scene = options.light == "scene"
+    rate = options.rate
+    if rate is None:
+        rate = SCENE_RATE_HZ if is_scene else POISSON_RATE_HZ
+    scene = simulate_line_light() if is_scene else None
+
+    def make_light(resets: int) -> PoissonStream | PulsedSceneStream:
+        seed = options.seed + resets
+        if scene is None:
+            return PoissonStream(rate, CLOCK_HZ, seed)
+        return PulsedSceneStream(scene, rate, CLOCK_HZ, seed)
+
     # The real ones have no serial number.
     return EmulatedTimeTagger(make_light, options, uri.location).open_driver()
-
-
-def choose_light(options: EmulationOptions) -> Callable[[int], TagStream]:
-    """Return what makes the light of an address, from how often the counter was reset."""
-    seed = options.seed
-    if options.light == "poisson":
-        even = POISSON_RATE_HZ if options.rate is None else options.rate
-        return lambda resets: PoissonStream(even, CLOCK_HZ, seed + resets)
-    scene, rate = simulate_line_light(), SCENE_RATE_HZ if options.rate is None else options.rate
-    return lambda resets: PulsedSceneStream(scene, rate, CLOCK_HZ, seed + resets)

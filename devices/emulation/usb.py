@@ -65,9 +65,7 @@ class VirtualDevice(abc.ABC):
 
     @abc.abstractmethod
     def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
-        """Write what the host asks for into `buffer` and return how many bytes; raise
-        `make_usb_error` for faults.
-        """
+        """Write what is asked for into `buffer`, return how many bytes; raise `make_usb_error`."""
 
 
 class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no types

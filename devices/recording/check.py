@@ -38,9 +38,7 @@ class Findings:
 
     @property
     def is_sound(self) -> bool:
-        """Whether everything in the file is what was written, and the accounts agree with the
-        records.
-        """
+        """Whether all blocks are what was written, and the accounts agree with the records."""
         damaged_blocks = self.damaged_blocks - (1 if self.cut_bytes else 0)
         if damaged_blocks or not self.stats:
             return not damaged_blocks

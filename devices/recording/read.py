@@ -23,18 +23,17 @@ import os
 import struct
 import tempfile
 import zlib
-from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import h5py
 
 from devices.address import Uri
 from devices.registry import build_codec
-from devices.source import READ_TIMEOUT_S, Batch, Codec, DecodedSource, Gap, Info, Ledger, Piece
+from devices.source import READ_TIMEOUT_S, Batch, Closing, Codec, Gap, Info, Piece, SeekableSource
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
 from tofclip.files import guard, translate_read_errors
 from tofclip.storage import HDF5_SIGNATURE, Record
@@ -161,8 +160,7 @@ class Block:
 
 class BlockReader:
     """Blocks in anything that holds bytes; damage between them is stepped over and reported. The
-    first sound header decides which recording, and which version of the format, this is; blocks of
-    any other are not looked at. Memory: one block.
+    first sound header decides which recording, and of which version, this is. Memory: one block.
     """
 
     def __init__(self, path: Path, fetch: Callable[[int, int], bytes], length: int) -> None:
@@ -177,9 +175,7 @@ class BlockReader:
         self._begin = begin if self._first is not None and self._first.is_legacy else 0
 
     def __iter__(self) -> Iterator[Block | Damage]:
-        """Yield every block with a sound header, and the damage between them; payloads are not
-        looked at.
-        """
+        """Yield every block with a sound header, and the damage between; payloads are not read."""
         position = self._begin
         while position < self.length:
             header = self._read_header(position) if self._first else None
@@ -204,10 +200,6 @@ class BlockReader:
             )
         return data
 
-    def read_piece(self, block: Block) -> Piece:
-        """Return the piece of the stream that a block holds; raises as `read_payload`."""
-        return Piece(self.read_payload(block), block.header.records, block.header.gap)
-
     def find_head(self) -> Block | None:
         """Return the first undamaged description of the instrument, None if there is none."""
         for entry in self:
@@ -218,9 +210,7 @@ class BlockReader:
         return None
 
     def _read_header(self, position: int) -> BlockHeader | None:
-        """Read a header of this recording, or None if there is none or its payload would not lie
-        within the file.
-        """
+        """Read a header of this recording; None if its payload would not lie within the file."""
         header = BlockHeader.unpack(self._fetch(position, HEADER_BYTES))
         if header is None or position + header.header_bytes + header.length > self.length:
             return None
@@ -276,10 +266,8 @@ class Ending:
             return cls(stats, str(known["fault"]), bool(known.get("complete", True)))
 
 
-class Recording:
-    """A recording, open for reading; also one that is still being written, or whose program was
-    killed.
-    """
+class Recording(Closing):
+    """A recording, open for reading; it may still be written, or its program have been killed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -311,14 +299,7 @@ class Recording:
             return Info(known.pop("instrument"), known.pop("serial"), known)
 
     def close(self) -> None:
-        """Close the file; closing twice is fine."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _read_head(self) -> Record:
         head = self.blocks.find_head()
@@ -349,9 +330,7 @@ class Recording:
 
 
 def read_head_if_recording(path: Path) -> Record | None:
-    """Return what a recording says about its instrument, None for any other file; its pieces are
-    not read.
-    """
+    """Return what a recording says about its instrument, None for any other file."""
     with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(len(HDF5_SIGNATURE))
     if start == HDF5_SIGNATURE:
@@ -373,20 +352,9 @@ NS_PER_S = 1_000_000_000
 MAX_PAUSE_S = 10.0
 
 
-class _Checkpoint(NamedTuple):
-    """What the decoder and the accounts were when a block began."""
-
-    state: Any
-    delivered: int
-    malformed: int
-
-
-class ReplaySource(DecodedSource):
+class ReplaySource(SeekableSource):
     """A recording played back. It never drops anything: the reader sets the pace, unless the
     recording does.
-
-    The accounts are those of the playback. After `seek` they are as if everything before had been
-    read.
 
     Memory: one piece and its records; 100 bytes for each piece of the recording.
 
@@ -395,17 +363,13 @@ class ReplaySource(DecodedSource):
     """
 
     def __init__(self, path: Path, is_paced: bool = False) -> None:
-        self._recording = Recording(path)
-        super().__init__(self._recording.codec, Ledger())
-        self._info = self._recording.info
-        self._is_paced = is_paced
+        self._recording = recording = Recording(path)
+        codec, self._info, self._is_paced = recording.codec, recording.info, is_paced
         self._is_complete = False
         self._blocks = list(self._list_blocks())
-        self._next = self._skip = 0
         self._last_due: tuple[float, int] | None = None
-        # of every block up to the furthest that was read
-        self._checkpoints = [_Checkpoint(self.codec.start, 0, 0)]
-        self._seek_to(0)
+        records = sum(block.header.records for block in self._blocks)
+        super().__init__(codec, path, len(self._blocks), records)
 
     @property
     def info(self) -> Info:
@@ -419,96 +383,50 @@ class ReplaySource(DecodedSource):
     def is_complete(self) -> bool:
         return self._is_complete
 
-    @property
-    def is_seekable(self) -> bool:
-        return True
-
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
-        if self._next >= len(self._blocks):
-            return None
-        block = self._blocks[self._next]
-        if self._is_paced:
-            self._wait_until_due(block, timeout)
-        batch = self._decode_next()
-        if not self._skip:
-            return batch
-        skipped, self._skip = self._skip, 0
-        return Batch(batch.records[skipped:], batch.first + skipped)
-
-    def seek(self, record: int) -> None:
-        if record < 0:
-            raise InputError(f"records are numbered from 0, got {record}")
-        tap = self.tap
-        self.tap = None  # what is stepped over is not read
-        try:
-            nearest = bisect_right(self._checkpoints, record, key=lambda mark: mark.delivered) - 1
-            self._seek_to(nearest)
-            while (
-                self._next < len(self._blocks) and self._checkpoints[self._next].delivered <= record
-            ):
-                self._decode_next()
-        finally:
-            self.tap = tap
-        reached = self._checkpoints[self._next].delivered
-        if record > reached:
-            raise InputError(
-                f"{self._recording.path} has only {reached} records, no record {record}"
-            )
-        if record < reached:
-            self._seek_to(self._next - 1)
-            self._skip = record - self._checkpoints[self._next].delivered
+        if self._is_paced and self._next < self._pieces:
+            self._wait_until_due(self._blocks[self._next], timeout)
+        return super().read(timeout)
 
     def close(self) -> None:
-        self._next = len(self._blocks)
+        super().close()
         self._recording.close()
 
-    def _decode_next(self) -> Batch:
-        """Decode the next block and note how things are behind it."""
-        batch = self._decode_piece(self._recording.blocks.read_piece(self._blocks[self._next]))
-        self._next += 1
-        if self._next == len(self._checkpoints):
-            self._checkpoints.append(
-                _Checkpoint(self._state, self.stats.delivered, self.stats.malformed)
-            )
-        return batch
+    def _read_piece(self, number: int) -> Piece:
+        block = self._blocks[number]
+        data = self._recording.blocks.read_payload(block)
+        return Piece(data, block.header.records, block.header.gap)
 
-    def _seek_to(self, number: int) -> None:
-        """Make the next block the one with that number, as if all before it had been read."""
-        self._next, self._skip = number, 0
-        self._state, delivered, malformed = self._checkpoints[number]
-        self._ledger = Ledger()
-        self._ledger.receive(sum(block.header.records for block in self._blocks))
-        self._ledger.deliver(delivered, malformed)
+    def _go_to(self, number: int) -> None:
+        super()._go_to(number)
         self._last_due = None
 
     def _list_blocks(self) -> Iterator[Block]:
-        for entry in self._recording.blocks:
+        path, blocks = self._recording.path, self._recording.blocks
+        for entry in blocks:
             if isinstance(entry, Damage):
                 if entry.is_cut:
                     return  # the program that recorded was killed; all before it is whole
                 raise FileFormatError(
-                    self._recording.path,
+                    path,
                     f"is damaged at byte {entry.position}; tofclip devices repair makes a sound copy",
                 )
             if entry.header.kind is BlockKind.PIECE:
                 yield entry
             elif entry.header.kind is BlockKind.END:
-                payload = self._recording.blocks.read_payload(entry)
-                self._is_complete = Ending.from_json(payload, self._recording.path).is_complete
+                ending = Ending.from_json(blocks.read_payload(entry), path)
+                self._is_complete = ending.is_complete
 
     def _wait_until_due(self, block: Block, timeout: float) -> None:
-        """Wait until a block is due, `timeout` seconds at most; DeviceTimeoutError if it is not
-        then.
-        """
-        now = monotonic()
-        due = now
+        """Wait until a block is due; DeviceTimeoutError where that is later than `timeout`."""
+        due = now = monotonic()
         if self._last_due is not None:
             pause = (block.header.time_ns - self._last_due[1]) / NS_PER_S
             due = self._last_due[0] + min(max(pause, 0.0), MAX_PAUSE_S)
         sleep(max(0.0, min(due - now, timeout)))
         if due - now > timeout:
             raise DeviceTimeoutError(
-                f"the next piece of {self._recording.path} is due in {due - now - timeout:.3g} s"
+                f"the next piece of {self._name} is due in {due - now - timeout:.3g} s"
             )
         self._last_due = due, block.header.time_ns
 

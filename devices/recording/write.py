@@ -26,6 +26,7 @@ except ImportError:  # Windows: there, nothing keeps a second recorder away
 HEAD_INTERVAL_BYTES = 64 << 20  # Payload after which the head is written once more
 SECTOR_BYTES = 4096
 
+_EXISTS = "exists already; choose another name, or replace it (`overwrite=True`)"
 CHECK_INTERVAL_S = 0.25  # Seconds after which the writer looks whether its file is still there
 
 
@@ -171,12 +172,6 @@ def _explain_refusal(path: Path) -> Iterator[None]:
         raise StorageError(f"{path}: cannot be written: {said}") from fault
 
 
-def _refuse_existing(path: Path) -> InputError:
-    return InputError(
-        f"{path}: exists already; choose another name, or replace it (`overwrite=True`)"
-    )
-
-
 def _create_file(path: Path, overwrite: bool, stack: contextlib.ExitStack) -> tuple[int, Path]:
     """Create and lock a file beside `path`, which gets its name when the head is in it. The lock on
     a file that exists already is held as long, so that of two recorders one is refused.
@@ -186,7 +181,7 @@ def _create_file(path: Path, overwrite: bool, stack: contextlib.ExitStack) -> tu
         if old is not None:
             stack.callback(os.close, old)
             if not overwrite:
-                raise _refuse_existing(path)
+                raise InputError(f"{path}: {_EXISTS}")
         temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
         # 0o666, less what the user's umask takes away.
         file = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
@@ -233,7 +228,7 @@ def _publish(temporary: Path, path: Path, overwrite: bool) -> None:
             if not overwrite:
                 os.link(temporary, path)
         except FileExistsError:
-            raise _refuse_existing(path) from None
+            raise InputError(f"{path}: {_EXISTS}") from None
         except OSError:  # a file system without links
             overwrite = True
         if overwrite:

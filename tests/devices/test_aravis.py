@@ -230,7 +230,8 @@ def test_packets_without_a_buffer_are_counted_as_frames(stand_in: Any) -> None:
     assert (stats.dropped_host, stats.lost_device) == (4, 2)
 
 
-def test_a_streak_picture_becomes_a_cloud(stand_in: Any) -> None:
+def test_a_streak_picture_has_its_rows_in_time(stand_in: Any) -> None:
+    """The address says how long they take; when the first one is swept, the time zero does."""
     light = simulate_line_light()
     shot = draw_exposure(light, 1)
     stand_in(shot.counts.astype(np.uint16)[np.newaxis], list(range(1, 4)))
@@ -238,14 +239,6 @@ def test_a_streak_picture_becomes_a_cloud(stand_in: Any) -> None:
     streak = read_transient(f"aravis://?row_ps={row_ps}")
     np.testing.assert_array_equal(streak.counts, shot.counts)
     np.testing.assert_allclose(np.diff(streak.times), np.diff(shot.times), rtol=1e-9)
-    # The address gives rows their duration; when the first one is swept, the camera's time zero does.
-    shift = float(streak.times[0] - shot.times[0])
-    pipeline = RangingPipeline.for_shot(
-        streak, light.camera, FixedFocus(0.0), light.camera.time_zero + shift
-    )
-    cloud = next(stream_clouds([streak], pipeline)).cloud
-    assert len(cloud) > 100
-    assert 1.6 < np.median(cloud.range) < 3.3  # where the simulated scene stands
 
 
 def test_each_streak_picture_of_the_emulated_camera_becomes_a_cloud(aravis: Any) -> None:

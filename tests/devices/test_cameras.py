@@ -31,7 +31,7 @@ from devices.emulation.scenes import (
 from devices.emulation.spad512 import EmulatedSpadArray
 from devices.frames import GateScan
 from devices.remoteex import (
-    REFUSAL_REASONS,
+    REFUSALS,
     TERMINATOR,
     Answer,
     AnswerCode,
@@ -185,7 +185,7 @@ def test_no_thread_is_left_behind(either: Make) -> None:
     deadline = time.monotonic() + 5
     while threading.active_count() > before and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert threading.active_count() == before
+    assert threading.active_count() <= before
 
 
 def test_servers_are_for_this_computer_only() -> None:
@@ -241,7 +241,7 @@ def test_answers_that_are_none(message: bytes) -> None:
         Answer.decode(message)
 
 
-@pytest.mark.parametrize("code", REFUSAL_REASONS)
+@pytest.mark.parametrize("code", REFUSALS)
 def test_every_refusal_is_explained(code: AnswerCode) -> None:
     with pytest.raises(DeviceError, match=r"refused AcqStart\(Live\): .*\(why\)") as caught:
         Answer(code, "AcqStart", ("why",)).require_done(Command("AcqStart", ("Live",)))

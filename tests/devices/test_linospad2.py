@@ -185,7 +185,7 @@ def test_a_table_whose_header_lies(recording: Path, shape: bytes) -> None:
 @pytest.fixture
 def stamps(tmp_path: Path, light: LineLight, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Twenty cycles, read five at a time, with a sidecar that names laser and camera."""
-    monkeypatch.setattr(linospad2, "PIECE_BYTES", 5 * CODEC.cycle_bytes)
+    monkeypatch.setattr(linospad2, "PIECE_BYTES", 5 * CODEC.unit_bytes)
     board = SimulatedBoard(light, draw_uneven_calibration(3), CODEC, 300, 3)
     path = tmp_path / "run.dat"
     path.write_bytes(b"".join(board.encode_cycle(number) for number in range(20)))
@@ -292,7 +292,7 @@ def test_a_cycle_that_is_full_keeps_the_first_stamps(light: LineLight) -> None:
     data = np.frombuffer(SimulatedBoard(light, board, codec, 256, 1).encode_cycle(0), np.uint8)
     assert 100 < codec.count_records(data) < 256
     nearly_dark = SimulatedBoard(light, board, CODEC, 1e-9, 1)
-    assert nearly_dark.encode_cycle(0) == bytes(CODEC.cycle_bytes)
+    assert nearly_dark.encode_cycle(0) == bytes(CODEC.unit_bytes)
     narrow = replace(light, photons=np.ones((5, 3)))
     with pytest.raises(ShapeError):
         SimulatedBoard(narrow, board, CODEC, 5, 0)

@@ -343,7 +343,7 @@ def test_a_minute_of_linospad2_at_half_rate_drops_nothing() -> None:
     words = random.integers(0, 1 << 31, (80, codec.cycle_words), dtype=np.uint32)
     words |= (random.random(words.shape) < 0.6).astype(np.uint32) << 31
     words[:, 64 * codec.timestamps :] = 0
-    size, data = 8 * codec.cycle_bytes, memoryview(words.astype("<u4").tobytes())
+    size, data = 8 * codec.unit_bytes, memoryview(words.astype("<u4").tobytes())
     interval = codec.count_records(as_bytes(data)) / 10 / rate
     codec.decode(as_bytes(data), codec.start)  # loops are compiled before the clock runs
     make: Callable[[int], Any] = lambda number: data[number % 10 * size :][:size]  # noqa: E731
