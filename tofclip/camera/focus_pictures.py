@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera.model import Camera
 from tofclip.errors import CalibrationError, InputError, ShapeError
-
-FloatArray = NDArray[np.float64]
 
 DOT_HALF_WIDTH_PX = 14  # the core of a dot; aberrated tails beyond it would pull the centre
 SLIT_HALF_HEIGHT_PX = 6

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera.range_calibration import RangeCalibration, empty_array
-from tofclip.camera.sweep import FloatArray, Sweep, sweep_from_record
+from tofclip.camera.sweep import Sweep, sweep_from_record
 from tofclip.errors import CalibrationError
 from tofclip.notebook import render_html
 from tofclip.operators import LineProjection

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera.model import Camera
 from tofclip.camera.rectifier import Measurement
 from tofclip.errors import CalibrationError, InputError, ShapeError
 from tofclip.solvers import Progress, Sparse, ignore_progress, relative_residual
-
-FloatArray = NDArray[np.float64]
 
 # How a gate is recovered to see whether its views agree.
 GATE_METHOD = Sparse(weight=5e-3, iterations=30)

@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import CalibrationError
 from tofclip.storage import Storable, stored_array, stored_value
 from tofclip.units import SPEED_OF_LIGHT
-
-FloatArray = NDArray[np.float64]
 
 
 def empty_array(units: str, *axes: str, **options: Any) -> Any:

@@ -17,14 +17,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera.model import Camera
 from tofclip.camera.rectifier import Measurement, estimate_dark_level, measure, require_width
 from tofclip.camera.sweep import SkewSweep
 from tofclip.errors import CalibrationError
 from tofclip.solvers import Progress, Sparse, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
-
-FloatArray = NDArray[np.float64]
 
 MAX_OFFSET_FRACTION = 0.08  # of the rows; beyond it a picture's start or end would be lost anyway
 # Slower changes than this are the scene's fall-off with range, not structure to match.

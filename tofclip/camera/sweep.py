@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import CalibrationError, FileFormatError, ShapeError
 from tofclip.storage import Record, Storable, stored_array
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

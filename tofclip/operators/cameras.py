@@ -17,6 +17,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.operators.base import (
     BlockDiagonal,
@@ -107,7 +108,7 @@ class LightFieldCamera(ABC):
 # SR 1 and 0.5: 1.6 and 3.0 % NMSE with angles assigned evenly, against 4.0 and 4.0 % from whole lines).
 CORRELATION_LENGTH_PX = 12
 
-AngleAssignment = tuple[tuple[int, ...], list[NDArray[np.float64]]]
+AngleAssignment = tuple[tuple[int, ...], list[FloatArray]]
 """Numbers of the views that get any directions, and each one's own."""
 
 
@@ -122,7 +123,7 @@ def count_lines(image_shape: tuple[int, int], detector_px: int, sampling_ratio: 
 
 
 def assign_randomly(
-    directions: NDArray[np.float64], views: int, random: np.random.Generator
+    directions: FloatArray, views: int, random: np.random.Generator
 ) -> AngleAssignment:
     """Permute the directions and deal them one by one to the views in random order (supplement Note
     6); of few directions some views get none.
@@ -132,7 +133,7 @@ def assign_randomly(
 
 
 def assign_evenly(
-    directions: NDArray[np.float64], views: Sequence[View], cycle: int, random: np.random.Generator
+    directions: FloatArray, views: Sequence[View], cycle: int, random: np.random.Generator
 ) -> AngleAssignment:
     """Deal so that neighbouring directions look from places spread evenly over the aperture.
 
@@ -171,7 +172,7 @@ def assign_evenly(
     return _group_by_view(directions, owners)
 
 
-def _group_by_view(directions: NDArray[np.float64], owners: NDArray[np.intp]) -> AngleAssignment:
+def _group_by_view(directions: FloatArray, owners: NDArray[np.intp]) -> AngleAssignment:
     used = tuple(int(view) for view in np.unique(owners))
     return used, [directions[owners == view] for view in used]
 
@@ -193,7 +194,7 @@ class LineCamera(LightFieldCamera):
         used, self.angles = self._assign_angles(np.arange(count) * np.pi / count)
         return used
 
-    def _assign_angles(self, angles: NDArray[np.float64]) -> AngleAssignment:
+    def _assign_angles(self, angles: FloatArray) -> AngleAssignment:
         return assign_randomly(angles, len(self.views), np.random.default_rng(self.seed))
 
     @cached_property
@@ -227,7 +228,7 @@ class EvenAngleLineCamera(LineCamera):
 
     name: ClassVar[str] = "line-even"
 
-    def _assign_angles(self, angles: NDArray[np.float64]) -> AngleAssignment:
+    def _assign_angles(self, angles: FloatArray) -> AngleAssignment:
         """Deal evenly; directions that differ by 6 px at the picture's border stand for the
         aperture together.
         """
@@ -303,7 +304,7 @@ class ApertureMaskCamera(CompressiveCamera):
     """A mask in the aperture, another one for each exposure (Eq. 17)."""
 
     @abstractmethod
-    def weights(self) -> NDArray[np.float64]:
+    def weights(self) -> FloatArray:
         """Return the fraction of each view's light that each mask lets pass, (exposures, views)."""
 
     @cached_property
@@ -334,14 +335,14 @@ class AshokCamera(ApertureMaskCamera):
             )
         return used
 
-    def weights(self) -> NDArray[np.float64]:
+    def weights(self) -> FloatArray:
         """Return the masks."""
         from scipy.linalg import hadamard
 
         others = 1 + np.random.default_rng(self.seed).permutation(self._order - 1)
         # row 0 of the Hadamard matrix opens all cells; +-1 become open and closed
         rows = np.append(0, others[: self.exposures - 1])
-        open_cells: NDArray[np.float64] = (1 + hadamard(self._order)[rows, : len(self.views)]) / 2
+        open_cells: FloatArray = (1 + hadamard(self._order)[rows, : len(self.views)]) / 2
         return open_cells
 
 
@@ -352,7 +353,7 @@ class BabacanCamera(ApertureMaskCamera):
 
     name: ClassVar[str] = "babacan"
 
-    def weights(self) -> NDArray[np.float64]:
+    def weights(self) -> FloatArray:
         """Return the masks, their transmissions evenly from 0 to 1."""
         return np.random.default_rng(self.seed).random((self.exposures, len(self.views)))
 
@@ -373,7 +374,7 @@ class MarwahCamera(CompressiveCamera):
             )
         return used
 
-    def codes(self) -> NDArray[np.float64]:
+    def codes(self) -> FloatArray:
         """Return the mask as each view sees it, (views, rows, columns)."""
         random = np.random.default_rng(self.seed)
         return make_sheared_mask(self.image_shape, self.views, MASK_SHEAR_PX, random)

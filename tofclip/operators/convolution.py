@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from tofclip.arrays import Array
+from tofclip.arrays import Array, FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators.base import LinearOperator
 
@@ -97,9 +97,7 @@ class PointSpreadConvolution(LinearOperator):
         return np.ascontiguousarray(filtered[:, : shape[1]])
 
 
-def validate_point_spread(
-    point_spread: ArrayLike, image_shape: tuple[int, int]
-) -> NDArray[np.float64]:
+def validate_point_spread(point_spread: ArrayLike, image_shape: tuple[int, int]) -> FloatArray:
     """Return a PSF as float64 once it is known to fit pictures of `image_shape`."""
     spread = np.asarray(point_spread, dtype=np.float64)
     if spread.ndim != 2 or 0 in spread.shape:
@@ -118,7 +116,7 @@ def validate_point_spread(
     return spread
 
 
-def _crop_to_support(spread: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[int]]:
+def _crop_to_support(spread: FloatArray) -> tuple[FloatArray, list[int]]:
     """Cut a PSF down to where it is not zero; return it and where its origin lies then."""
     lit = [np.flatnonzero(spread.any(axis=other)) for other in (1, 0)]
     cut = spread[lit[0][0] : lit[0][-1] + 1, lit[1][0] : lit[1][-1] + 1]
@@ -215,7 +213,7 @@ class SliceConvolution(LinearOperator):
 
 def make_coded_line(
     shape: tuple[int, int], width_px: int, angle: float, random: np.random.Generator
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Make a line PSF of sum 1 times a random 0/1 code of `width_px` (n_p) cells in each row (supplement
     Note 4). Each row's cells are moved by ``row * tan(angle)`` columns, `angle` being that of the line
     from the vertical, and shared between two columns where that is not a whole number.

@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators.shear import LinearShear, View
 
 if TYPE_CHECKING:
     from scipy.interpolate import RectBivariateSpline
 
-Coordinates = NDArray[np.float64]
+Coordinates = FloatArray
 
 # Along each side of a view's patch of the aperture: 0.15 million for 8 x 8 views.
 RAYS_PER_SIDE = 48
@@ -119,7 +120,7 @@ def trace_view_point_spreads(
     views: Sequence[View],
     shape: tuple[int, int],
     rays: int = RAYS_PER_SIDE,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Trace each view's PSF ``r(x, -u_k)``, (views, rows, columns): the light that passes its patch of
     the aperture, one view step wide, from a point at infinity. The patches fill the aperture; all PSFs
     together have the sum 1 for an element that lets all light pass onto `shape`. There are `rays` along
@@ -145,7 +146,7 @@ def trace_view_point_spreads(
 
 def shear_point_spreads(
     spreads: NDArray[Any], views: Sequence[View], shear: float, reference: View = (0.0, 0.0)
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Move each view's PSF, (views, rows, columns), by ``s (u - u_ref)``: convolving with it is shearing
     the picture and convolving then. Their sum is the camera's ``g(x, s)`` (supplement Eq. 4).
     """
@@ -180,7 +181,7 @@ class MeasuredPointSpreads:
         # the same light at every depth, whatever the exposures were
         self.stack = (spreads / light[:, np.newaxis, np.newaxis])[order]
 
-    def interpolate(self, shear: float) -> NDArray[np.float64]:
+    def interpolate(self, shear: float) -> FloatArray:
         """Return the PSF at one depth, (rows, columns), linearly between the two nearest that were
         measured.
         """
@@ -196,7 +197,7 @@ class MeasuredPointSpreads:
 
 def _accumulate_rays(
     light: Coordinates, down: Coordinates, right: Coordinates, shape: tuple[int, int]
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Gather rays on pixels; each is shared between the four nearest."""
     total = np.zeros(shape[0] * shape[1])
     # A ray that lands between pixels is shared out by its distance to each, which keeps the light.

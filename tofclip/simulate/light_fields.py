@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import LightField
 from tofclip.operators.shear import View
@@ -82,18 +83,18 @@ class CameraArray:
         return (self.view_count if self.view_rows is None else self.view_rows), self.view_count
 
     @property
-    def views(self) -> NDArray[np.float64]:
+    def views(self) -> FloatArray:
         """(v, u) of each camera in raster order, (views, 2)."""
         numbers = (np.arange(float(count)) - count // 2 for count in self._view_counts)
         return np.stack(np.meshgrid(*numbers, indexing="ij"), axis=-1).reshape(-1, 2)
 
-    def position(self, view: View) -> NDArray[np.float64]:
+    def position(self, view: View) -> FloatArray:
         """Where the camera at (v, u) stands, (x, y, z) in metres; fractions are places between the
         array's.
         """
         return np.array([view[1] * self.view_step, view[0] * self.view_step, 0.0])
 
-    def shear(self, depth: ArrayLike) -> NDArray[np.float64]:
+    def shear(self, depth: ArrayLike) -> FloatArray:
         """Shear s in pixels per view step of points at `depth` metres along z (supplement Note 1, s
         = 0 at focus).
         """
@@ -109,14 +110,14 @@ class CameraArray:
             )
         return 1 / inverse
 
-    def point(self, x: float, y: float, shear: float) -> NDArray[np.float64]:
+    def point(self, x: float, y: float, shear: float) -> FloatArray:
         """The point (x, y, z), m, that the reference view sees `x` pixels right and `y` down of its
         centre at a shear, in pixels per view step.
         """
         depth = self.depth(shear)
         return np.array([x / self.focal_length_px * depth, y / self.focal_length_px * depth, depth])
 
-    def rays(self, view: View, samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def rays(self, view: View, samples: int) -> tuple[FloatArray, FloatArray]:
         """Rays of one camera at (v, u), `samples` on a side of each pixel: the origin (3,), m, and
         directions (rows * samples * columns * samples, 3), as long as the way to the plane in focus.
         """
@@ -246,7 +247,7 @@ class PulsedScene:
     """
 
     bodies: tuple[Body, ...]
-    lamps: NDArray[np.float64]
+    lamps: FloatArray
 
     def __post_init__(self) -> None:
         if not self.bodies:
@@ -286,7 +287,7 @@ class TimeAxis:
             raise InputError("bins, their width and the pulse must be positive, the start finite")
 
     @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Middle of each bin, s."""
         return np.linspace(self.start, self.start + (self.bins - 1) * self.bin_width, self.bins)
 

@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Returns
@@ -33,8 +34,6 @@ from tofclip.simulate.rays import (
 )
 from tofclip.storage import collect_provenance
 from tofclip.units import SPEED_OF_LIGHT
-
-FloatArray = NDArray[np.float64]
 
 
 def make_plate(
@@ -185,12 +184,12 @@ class StreakDetector:
             )
 
     @property
-    def row_times(self) -> NDArray[np.float64]:
+    def row_times(self) -> FloatArray:
         """Instant of each row's middle on the streak's own time axis, s; the first is 0."""
         return np.arange(self.rows, dtype=np.float64) * self.bin_width
 
     def expose(
-        self, signal: NDArray[np.float64], noise: np.random.Generator
+        self, signal: FloatArray, noise: np.random.Generator
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Draw one shot of an expected signal, (rows, columns): measurements in photons, none above
         full scale, and which of them saturated.
@@ -223,11 +222,11 @@ class Instrument:
         if not self.rays_per_pixel_side >= 1:
             raise InputError(f"the number of rays must be positive, got {self.rays_per_pixel_side}")
 
-    def viewpoint(self, position: float) -> NDArray[np.float64]:
+    def viewpoint(self, position: float) -> FloatArray:
         """Where the view at `position` view steps stands, m."""
         return np.array([self.camera.lenslet_pitch * position, 0.0, 0.0])
 
-    def pixel_grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def pixel_grid(self) -> tuple[FloatArray, FloatArray]:
         """Rays of a picture: X and Y from the optical axis in pixels, flat, sub-pixel by sub-pixel
         in raster order.
         """
@@ -244,9 +243,7 @@ class Instrument:
         """Return what all rays of the view at `position` view steps see, in `pixel_grid`'s order."""
         return scene.trace(self.viewpoint(position), self.directions(*self.pixel_grid(), position))
 
-    def directions(
-        self, x: NDArray[np.float64], y: NDArray[np.float64], position: float = 0.0
-    ) -> NDArray[np.float64]:
+    def directions(self, x: FloatArray, y: FloatArray, position: float = 0.0) -> FloatArray:
         """Directions (n, 3), with z = 1, in which the view at `position` view steps sees its picture
         points (x, y), in pixels from the optical axis.
 
