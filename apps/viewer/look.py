@@ -120,7 +120,8 @@ def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
         scale[0], scale[-1] = low, high
     full_light = 0.0
     # Intensity is in the colour already.
-    if colouring.shaded and colouring.quantity != "intensity" and np.any(np.diff(cloud.intensity)):
+    is_plain = not colouring.shaded or colouring.quantity == "intensity" or len(cloud) == 0
+    if not is_plain and np.ptp(cloud.intensity) > 0:
         full_light = float(np.percentile(cloud.intensity, FULL_LIGHT_PERCENTILE))
     return Scale(colouring.quantity, unit, colouring.palette, scale, full_light)
 

@@ -150,7 +150,9 @@ def render_frame(
     lit = view.cloud.intensity >= source.min_intensity
     usual = view.cloud if lit.all() or not lit.any() else view.cloud[lit]
     scale = make_scale(usual, colouring)
-    kept = filters.select(view.cloud) & Filters(time=view.times).select(view.cloud)
+    kept = filters.select(view.cloud)
+    if view.times != NO_LIMITS:
+        kept &= Filters(time=view.times).select(view.cloud)
     shown = view if kept.all() else view.select(kept)
     number = f"{source.frame_name} {frame}" if len(source) > 1 else ""
     facts = {**vars(shown), "caption": view.caption or number}

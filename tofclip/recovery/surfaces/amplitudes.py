@@ -15,6 +15,8 @@ from tofclip.threads import run_blocks
 PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
 NORM_ITERATIONS, FURTHER_NORM_ITERATIONS = 10, 2
 NORM_MARGIN = 1.1
+EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
+NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
 TINY = float(np.finfo(np.float32).tiny)
 
 
@@ -46,6 +48,31 @@ class AmplitudeSolver:
         if earlier is not None:
             self._dual, self._direction = earlier._dual.copy(), earlier._direction
             self._fresh, self.variance = False, earlier.variance
+
+    def cover(self, masks: NDArray[np.bool_]) -> AmplitudeSolver:
+        """Return the same for surfaces that lie only, or also, where their masks are."""
+        left = masks.any(axis=(1, 2))
+        pictures, directions = np.zeros((2, *masks.shape), np.float32)
+        pictures[self.model.masks], directions[self.model.masks] = self.amplitude, self._direction
+        other = AmplitudeSolver(self.model.cover(masks), pictures[masks], self.weight, self)
+        other._dual, other._direction = self._dual[left], directions[masks]
+        return other
+
+    def measure_significance(self) -> Image:
+        """By how many standard deviations each point's amplitude is above nothing, (points,). A pixel
+        alone is hardly above the photons' noise: its neighbours on the surface, which the prior ties
+        to it, count as well.
+        """
+        information = self.model.gather(self.model.weights, squared=True)
+        found = np.zeros_like(information)
+        for mask, box, part in zip(self.model.masks, self._boxes, self.model.parts, strict=True):
+            lit, pictures = mask[box], np.zeros((2, *mask[box].shape), np.float32)
+            if part.stop == part.start:
+                continue
+            pictures[:, lit] = information[part], self.amplitude[part]
+            found[part] = pool_information(*pictures)[lit]
+        # running sums may leave a rounding error below nothing
+        return np.asarray(self.amplitude * np.sqrt(np.maximum(found, 0) / self.variance))
 
     def run(self, iterations: int, progress: Progress, frames: int) -> None:
         """Take some steps; `progress` hears of `frames` after each."""
@@ -108,6 +135,28 @@ class AmplitudeSolver:
 
         run_blocks(work, len(masks), 1)
         return found
+
+
+def pool_information(information: Image, picture: Image) -> Image:
+    """Return the information about each pixel's amplitude, (rows, columns), one over its variance,
+    with that of pixels tied to it. These are the nearest ones, and those further off that the prior
+    has made as bright: where little is known of each pixel it leaves large even pieces, whose
+    amplitude all their pixels determine.
+    """
+
+    def add_up(values: Image, side: int) -> Image:
+        mean: Image = scipy.ndimage.uniform_filter(values, side, mode="constant")
+        return side**2 * mean
+
+    pooled = add_up(information, NEIGHBOURHOOD_PX)
+    lit, level = picture > 0, np.zeros(picture.shape, np.intp)
+    level[lit] = np.floor(np.log(picture[lit]) / np.log(EVEN_RATIO)).astype(np.intp)
+    for one in np.unique(level[lit]):
+        even = lit & (np.abs(level - one) <= 1)
+        own = lit & (level == one)
+        wide = add_up(np.where(even, information, 0), EVEN_PX)
+        pooled[own] = np.maximum(pooled[own], wide[own])
+    return pooled
 
 
 def estimate_excess_variance(model: SurfaceModel, amplitude: Image) -> float:

@@ -25,7 +25,9 @@ from tofclip.recovery.surfaces.model import (
     find_rows,
 )
 from tofclip.recovery.surfaces.patches import (
+    COEFFICIENTS,
     MARGIN_PX,
+    MIN_PATCH_PX,
     FloatArray,
     find_dimmer_patches,
     find_patches,
@@ -63,11 +65,13 @@ MAX_TAIL_SHARE = 0.3
 STEEP_BINS, MAX_STEEP_SHARE = 10.0, 0.3
 SLOPE_WINDOW_PX = 7
 
+LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
+
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
 MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
-EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
-NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
+# Of what certainly is a surface, and beyond: points that are fainter are looked at no further.
+LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 5.0, 0.05, 3
 
 
 @dataclass(frozen=True)
@@ -135,12 +139,13 @@ def fit_surfaces(
     solver = AmplitudeSolver(model, pictures[masks], weight)
     solver.run(START_ITERATIONS, progress, count)
     require_explained(solver, frames, streak)
-    model.find_behind(solver.amplitude)
+    solver = keep_lit(solver)
+    solver.model.find_behind(solver.amplitude)
 
     # 5. Ranges, after splines that are not needed: these take longer to be right, and late views give
     # way to them.
-    solver = straighten_surfaces(solver)
-    refinement, remainder = _refine(solver, progress, count)
+    solver, begun = straighten_surfaces(solver)
+    refinement, remainder = _refine(solver, begun, progress, count)
     solver.run(iterations, progress, count)
     reference = solver.model.unexplained(solver.amplitude)
     return SurfaceFit(solver.model, solver, refinement, remainder, reference)
@@ -222,38 +227,76 @@ def require_explained(solver: AmplitudeSolver, frames: Frames, streak: Streak) -
         )
 
 
-def straighten_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
-    """Replace splines by quadratics that explain the shot at least as well, after a step each;
-    return the same solver where all are needed. Splines follow the returns of frames, also where
-    these are displaced, as behind gauze; the shot itself says whether the surface is bent.
+def straighten_surfaces(
+    solver: AmplitudeSolver,
+) -> tuple[AmplitudeSolver, Refinement | None]:
+    """Replace splines by quadratics where these explain the shot as well, after a step; return what
+    that step knew as well, if there was one. Splines follow the returns of frames, also where these
+    are displaced, as behind gauze; the shot itself says whether the surface is bent.
     """
-    bent = [surface for surface, basis in enumerate(solver.model.bases) if not basis.is_quadratic]
+    model = solver.model
+    bent = [
+        surface
+        for surface, basis in enumerate(model.bases)
+        if not basis.is_quadratic and (solver.amplitude[model.parts[surface]] > 0).any()
+    ]
     if not bent:
-        return solver
-    ahead = copy.copy(solver.model)
-    least = refine_state(ahead, solver.amplitude).objective
+        return solver, None
+    ahead, trial = copy.copy(model), model.straighten(bent, solver.amplitude)
+    before, after = (refine_state(one, solver.amplitude) for one in (ahead, trial))
+    # whose light it is says to which surface a change of the misfit belongs
+    light = np.maximum(model.render(solver.amplitude), np.float32(LEAST_COUNT))
+    change = ((after.rest**2 - before.rest**2) / light).astype(np.float32)
+    excess = solver.amplitude * model.gather(model.weights * change)
+    straight = []
     for surface in bent:
-        if not (solver.amplitude[solver.model.parts[surface]] > 0).any():
-            continue
-        trial = solver.model.straighten(surface, solver.amplitude)
-        moved = refine_state(trial, solver.amplitude)
-        if moved.objective <= least:
-            solver = AmplitudeSolver(trial, moved.amplitude, solver.weight, solver)
-            least = moved.objective
-    return solver
+        basis, coefficients = ahead.bases[surface], ahead.state.coefficients[surface]
+        freedom = 2 * solver.variance * (coefficients.size - COEFFICIENTS)
+        needed = freedom + coefficients @ basis.bending @ coefficients
+        if excess[model.parts[surface]].sum() <= needed:
+            straight.append(surface)
+    if straight == bent:
+        return AmplitudeSolver(trial, after.amplitude, solver.weight, solver), after
+    if not straight:
+        return solver, replace(before, free=None)
+    straightened = model.straighten(straight, solver.amplitude)
+    kept = AmplitudeSolver(straightened, solver.amplitude, solver.weight, solver)
+    return kept, replace(after, free=None)
+
+
+def keep_lit(solver: AmplitudeSolver) -> AmplitudeSolver:
+    """Leave out the points of surfaces that are dark and far from any that is not, and surfaces too few
+    of whose points are sure, as what frames spread about bright ones.
+    """
+    model, significance = solver.model, solver.measure_significance()
+    lit = significance[significance > LIT_SIGMAS]
+    # In little light no point is that far out of the noise, but some are further than others.
+    upper = float(np.quantile(lit, UPPER_QUANTILE)) if lit.size else np.inf
+    sure = significance > min(SURE_SIGMAS, max(LIT_SIGMAS, upper / 2))
+    kept = np.zeros_like(model.masks)
+    near = np.ones((2 * LIT_MARGIN_PX + 1,) * 2)
+    for surface, (part, mask) in enumerate(zip(model.parts, model.masks, strict=True)):
+        amplitude = solver.amplitude[part]
+        if sure[part].sum() >= MIN_PATCH_PX:
+            usual = float(np.median(amplitude[sure[part]]))
+            kept[surface][mask] = (significance[part] > LIT_SIGMAS) & (
+                amplitude > LIT_FRACTION * usual
+            )
+            kept[surface] = mask & scipy.ndimage.binary_dilation(kept[surface], near)
+    return solver.cover(kept) if kept.any() else solver
 
 
 def _refine(
-    solver: AmplitudeSolver, progress: Progress, count: int
+    solver: AmplitudeSolver, found: Refinement | None, progress: Progress, count: int
 ) -> tuple[Refinement, FloatArray]:
     """Steps on ranges and instrument until they hardly move; the last one, and what more would
     change of each surface.
     """
-    model, found, lengths = solver.model, None, []
+    model, lengths = solver.model, []
     for number in range(MAX_REFINEMENTS):
         before = model.distance
         model.find_behind(solver.amplitude)
-        found = refine_state(model, solver.amplitude, found)
+        found = refine_state(model, solver.amplitude, found, number + 1 >= MIN_REFINEMENTS)
         solver.amplitude = found.amplitude
         solver.run(REFINEMENT_ITERATIONS, progress, count)
         moved = model.distance - before
@@ -283,7 +326,7 @@ def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFi
     solver = AmplitudeSolver(model, fit.solver.amplitude, weight, fit.solver)
     solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
     # what explains the last shot best without the prior has that shot's noise
-    refinement = refine_state(model, solver.amplitude, replace(fit.refinement, free=None))
+    refinement = refine_state(model, solver.amplitude, replace(fit.refinement, free=None), True)
     solver.amplitude = refinement.amplitude
     solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
     unexplained = model.unexplained(solver.amplitude)
@@ -301,14 +344,8 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
     model, solver = fit.model, fit.solver
     camera = model.camera.replace(gains=model.state.gains)
     distance, amplitude = model.distance, solver.amplitude
-    # 6. Points. A pixel alone is hardly above the photons' noise: its neighbours on the surface,
-    # which the prior ties to it, count as well.
-    pictures, information = np.zeros((2, *model.masks.shape), np.float32)
-    information[model.masks] = model.gather(model.weights, squared=True)
-    pictures[model.masks] = amplitude
-    pooled = np.stack([pool_information(*one) for one in zip(information, pictures, strict=True)])
-    # running sums may leave a rounding error below nothing
-    significance = amplitude * np.sqrt(np.maximum(pooled, 0)[model.masks] / solver.variance)
+    # 6. Points.
+    significance = solver.measure_significance()
     limit, surface = detection.signal_to_noise, model.surface
     usual = [find_usual_brightness(amplitude[p], significance[p], limit) for p in model.parts]
     least = MIN_BRIGHTNESS_FRACTION * np.array(usual)[surface]
@@ -351,28 +388,6 @@ def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
     in_turns = (-1.0) ** np.arange(camera.views)
     looks = np.stack([np.ones(camera.views), -np.tan(camera.angles)], axis=1)
     return np.asarray(np.abs(np.linalg.pinv(looks) @ in_turns) * centre_error_px)
-
-
-def pool_information(information: Image, picture: Image) -> Image:
-    """Return the information about each pixel's amplitude, (rows, columns), one over its variance,
-    with that of pixels tied to it. These are the nearest ones, and those further off that the prior
-    has made as bright: where little is known of each pixel it leaves large even pieces, whose
-    amplitude all their pixels determine.
-    """
-
-    def add_up(values: Image, side: int) -> Image:
-        mean: Image = scipy.ndimage.uniform_filter(values, side, mode="constant")
-        return side**2 * mean
-
-    pooled = add_up(information, NEIGHBOURHOOD_PX)
-    lit, level = picture > 0, np.zeros(picture.shape, np.intp)
-    level[lit] = np.floor(np.log(picture[lit]) / np.log(EVEN_RATIO)).astype(np.intp)
-    for one in np.unique(level[lit]):
-        even = lit & (np.abs(level - one) <= 1)
-        own = lit & (level == one)
-        wide = add_up(np.where(even, information, 0), EVEN_PX)
-        pooled[own] = np.maximum(pooled[own], wide[own])
-    return pooled
 
 
 def find_usual_brightness(amplitude: Image, significance: Image, limit: float) -> float:

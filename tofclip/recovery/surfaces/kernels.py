@@ -93,32 +93,35 @@ def gather_light(image, gain, row, row_shares, column, slit_shares, amplitude):
 
 
 @fast_loop
-def smooth_rows(image, kernel, rows, margin, result):
-    """Convolve an image with a kernel along its rows, for some of the result's rows, of which row 0 is
-    row `margin` of the image; what lies outside the image counts as dark.
+def smooth_rows(image, kernel, lags, rows, margin, result):
+    """Add up the rows of an image that lie `lags` before each row, weighted by a kernel, for some of the
+    result's rows, of which row 0 is row `margin` of the image; what lies outside the image counts as
+    dark. Lags increase or decrease.
     """
-    half = kernel.size // 2
+    taps, height = kernel.size, image.shape[0]
     for number in range(rows.size):
         target = rows[number]
-        top = target + margin + half  # the source row of the first tap
-        line = result[target]
+        line, source = result[target], target + margin
         for i in range(line.size):
             line[i] = 0
-        tap = top - image.shape[0] + 1 if top >= image.shape[0] else 0
-        end = kernel.size if kernel.size <= top else top + 1
+        tap, end = 0, taps
+        while tap < end and not 0 <= source - lags[tap] < height:
+            tap += 1
+        while end > tap and not 0 <= source - lags[end - 1] < height:
+            end -= 1
         # Four rows at a time, as whole lines: the sums stay in registers, and an index into two
         # dimensions would be checked for every pixel.
         while tap + 4 <= end:
             a, b, c, d = kernel[tap], kernel[tap + 1], kernel[tap + 2], kernel[tap + 3]
-            line_a, line_b = image[top - tap], image[top - tap - 1]
-            line_c, line_d = image[top - tap - 2], image[top - tap - 3]
+            line_a, line_b = image[source - lags[tap]], image[source - lags[tap + 1]]
+            line_c, line_d = image[source - lags[tap + 2]], image[source - lags[tap + 3]]
             for i in range(line.size):
                 line[i] += a * line_a[i] + b * line_b[i] + c * line_c[i] + d * line_d[i]
             tap += 4
         while tap < end:
-            weight, source = kernel[tap], image[top - tap]
+            weight, other = kernel[tap], image[source - lags[tap]]
             for i in range(line.size):
-                line[i] += weight * source[i]
+                line[i] += weight * other[i]
             tap += 1
 
 

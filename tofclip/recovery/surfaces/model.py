@@ -139,7 +139,7 @@ def find_rows(times: FloatArray, time: FloatArray) -> FloatArray:
 
 class Footprint(NamedTuple):
     """The rows and columns of a view on which points have light, and in which fractions. Rows count
-    from the streak image's first, columns from `first_column`.
+    from the first whose afterglow reaches the streak image, columns from `first_column`.
     """
 
     row: NDArray[np.int32]  # (points,), first of those that a point reaches
@@ -152,6 +152,20 @@ class Footprint(NamedTuple):
     reached_rows: NDArray[np.int64]  # (n,), before it is smoothed; from `margin` above the first on
     between: BetweenCentres
     rows_per_instant: float  # raw rows in the time of one, on average
+
+
+class Window(NamedTuple):
+    """A part of the streak image."""
+
+    row: int  # of its corner
+    column: int
+    image: Image
+
+    @property
+    def area(self) -> tuple[slice, slice]:
+        """Where it lies."""
+        rows, columns = self.image.shape
+        return slice(self.row, self.row + rows), slice(self.column, self.column + columns)
 
 
 class SurfaceModel:
@@ -172,22 +186,37 @@ class SurfaceModel:
         state: SurfaceState,
         pulse: ShotPulse | None = None,
     ) -> None:
-        self.camera, self.masks, self.bases = camera, masks, list(bases)
+        self.camera = camera
         self.times, self.bin_width = streak.times, float(np.mean(np.diff(streak.times)))
         self.reference = int(np.argmin(np.abs(camera.view_positions)))
         self.pulse = pulse or ShotPulse(camera.pulse_fwhm / FWHM_PER_SIGMA / self.bin_width)
         self.image, self.weights = weigh_measurements(streak, camera)
+        self._cover(masks, bases)
+        self.place(state)
+
+    def _cover(self, masks: NDArray[np.bool_], bases: Sequence[SmoothBasis]) -> None:
+        """Have points where surfaces may be."""
+        self.masks, self.bases = masks, list(bases)
         self.surface, y, x = np.nonzero(masks)
         self.pixel = y * masks.shape[2] + x
         ends = np.searchsorted(self.surface, np.arange(len(masks) + 1))
         self.parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
         self.monomials = self._evaluate(self.pixel)
-        self._directions = compute_ray_directions(camera, y, x)
-        axis_row, axis_column = camera.optical_axis_px
+        self._directions = compute_ray_directions(self.camera, y, x)
+        axis_row, axis_column = self.camera.optical_axis_px
         self._x, self._y = x - axis_column, y - axis_row
         self.ray_length = 1 / self._directions[:, 2]
         self.behind = np.zeros(self.surface.size, bool)
-        self.place(state)
+
+    def cover(self, masks: NDArray[np.bool_]) -> SurfaceModel:
+        """Return the same surfaces, each where its mask is; those without any are left out."""
+        other, left = copy.copy(self), np.flatnonzero(masks.any(axis=(1, 2)))
+        other._cover(masks[left], [self.bases[surface] for surface in left])
+        state = self.state.copy()
+        state.coefficients = [state.coefficients[surface] for surface in left]
+        state.shading = state.shading[left]
+        other.place(state)
+        return other
 
     def _evaluate(self, pixel: NDArray[np.intp]) -> list[FloatArray]:
         """The functions of each surface's basis, at one pixel for each point."""
@@ -198,9 +227,11 @@ class SurfaceModel:
         """Move the surfaces to where `state` has them."""
         self.state = state
         self.distance = self._find_ranges(self.monomials, self.ray_length)
-        self._core_half = int(np.ceil(EXTENT_SIGMAS * MAX_LENGTHENING * self.pulse.sigma)) + 1
-        self.half = self._core_half + self.pulse.reach
+        self.half = int(np.ceil(EXTENT_SIGMAS * MAX_LENGTHENING * self.pulse.sigma)) + 1
         self._margin = self.half + 3
+        # rows before and behind the streak image whose light reaches it later or earlier
+        self.before = int(max(self.pulse.lags.max(), 0))
+        self._rows = self.before + self.image.shape[0] + int(max(-self.pulse.lags.min(), 0))
         self.footprints = self._map_views(self._spread_view)
         self.kernels = [self.make_kernel(view) for view in range(self.camera.views)]
 
@@ -216,8 +247,10 @@ class SurfaceModel:
         """
         from tofclip.recovery.surfaces import kernels
 
-        (rows, columns), margin, samples = self.image.shape, self._margin, kernels.SPLINE_SAMPLES
+        rows, margin, samples = self._rows, self._margin, kernels.SPLINE_SAMPLES
         row, column, between, pace = self._locate(view)
+        row += self.before
+        columns = self.image.shape[1]
         away, last = margin + samples, rows + margin - samples
         first, shares = kernels.split_between_rows(np.clip(row, -away, rows + away))
         shares[(first < -margin) | (first > last)] = 0
@@ -228,8 +261,8 @@ class SurfaceModel:
         tangent = float(np.tan(self.camera.angles[view]))
         kernels.split_over_slit(along, tangent, SUBROWS, slit_first, slit)
         slit[along != column] = 0
-        left = int(slit_first.min(initial=0))
-        wide = int(slit_first.max(initial=0)) + SLIT_PIXELS - left
+        left = int(slit_first.min(initial=columns))
+        wide = max(int(slit_first.max(initial=-SLIT_PIXELS)) + SLIT_PIXELS - left, 0)
         hit = np.bincount(first + margin, minlength=rows + 2 * margin)
         reached = np.convolve(hit, np.ones(samples))[: hit.size] > 0
         lit = np.convolve(reached, np.ones(2 * self.half + 1), "same")[margin:-margin] > 0
@@ -271,12 +304,12 @@ class SurfaceModel:
     def make_kernel(
         self, view: int, relative_width: float = 1.0, variance: float = SPLINE_LEFT_VARIANCE
     ) -> Image:
-        """Return the pulse with which light between rows is smoothed, of so many widths of the view's
-        own and less the variance, rows^2, that is there already.
+        """Return the pulse's core with which light between rows is smoothed, of so many widths of the
+        view's own and less the variance, rows^2, that is there already.
         """
         rows_per_instant = self.footprints[view].rows_per_instant
         sigma = self.pulse.sigma * rows_per_instant * self.state.widths[view] * relative_width
-        return self.pulse.extend(make_pulse(sigma, self._core_half, variance))
+        return make_pulse(sigma, self.half, variance)
 
     def find_behind(self, amplitude: Image) -> None:
         """Find the points that lie behind another surface and are seen through it."""
@@ -301,19 +334,20 @@ class SurfaceModel:
         """What is left of the signal, as a fraction."""
         return compare_smoothed(self.render(amplitude), self.image, self.weights > 0)
 
-    def straighten(self, surface: int, amplitude: Image) -> SurfaceModel:
-        """Return the same surfaces, one of splines replaced by the quadratic that is nearest to it
-        where it is lit.
+    def straighten(self, surfaces: Sequence[int], amplitude: Image) -> SurfaceModel:
+        """Return the same surfaces, some of splines replaced by the quadratics that are nearest to them
+        where they are lit.
         """
-        other, part = copy.copy(self), self.parts[surface]
-        basis = SmoothBasis(self.bases[surface].image_shape)
-        design, lit = basis.evaluate(self.pixel[part]), amplitude[part] > 0
-        inverse = self.ray_length[part] / self.distance[part]
-        state = self.state.copy()
-        nearest, *_ = np.linalg.lstsq(design[lit], inverse[lit])
-        state.coefficients[surface] = nearest.astype(np.float64)
+        other, state = copy.copy(self), self.state.copy()
         other.bases, other.monomials = list(self.bases), list(self.monomials)
-        other.bases[surface], other.monomials[surface] = basis, design
+        for surface in surfaces:
+            part = self.parts[surface]
+            basis = SmoothBasis(self.bases[surface].image_shape)
+            design, lit = basis.evaluate(self.pixel[part]), amplitude[part] > 0
+            inverse = self.ray_length[part] / self.distance[part]
+            nearest, *_ = np.linalg.lstsq(design[lit], inverse[lit])
+            state.coefficients[surface] = nearest.astype(np.float64)
+            other.bases[surface], other.monomials[surface] = basis, design
         other.place(state)
         return other
 
@@ -345,69 +379,106 @@ class SurfaceModel:
         found = map_parallel(lambda share: [work(v) for v in range(views)[share]], shares)
         return [one for part in found for one in part]
 
-    def project(
-        self,
-        view: int,
-        amplitude: Image,
-        kernel: Image,
-        part: slice = slice(None),
-        rows: tuple[int, int] | None = None,
-    ) -> Image:
-        """Return what a view of gain 1 receives from some points, (rows, its columns). `amplitude`:
-        of the points in `part`; `kernel` (taps,): of the pulse; `rows`: first and the one after the
-        last; all by default.
+    def receive(
+        self, view: int, amplitude: Image, kernel: Image, part: slice = slice(None)
+    ) -> Window:
+        """Return what the streak image receives of some points by a view of gain 1. `amplitude`: of
+        the points in `part`; `kernel` (taps,): of the pulse's core.
+        """
+        top, image = self._project(view, amplitude, kernel, part)
+        own, slit = self._cut_to_slit(view, part, image.shape[1])
+        light, first = image[:, own], max(top - self.before + int(self.pulse.lags.min()), 0)
+        last = top + len(light) - self.before + int(self.pulse.lags.max())
+        last = max(min(last, self.image.shape[0]), first)
+        return Window(
+            first, slit.start, self._trail(light, first + self.before - top, last - first)
+        )
+
+    def _project(
+        self, view: int, amplitude: Image, kernel: Image, part: slice
+    ) -> tuple[int, Image]:
+        """What a view of gain 1 sees of some points without their afterglow: the first row, as rows of
+        `Footprint` count, and (rows, columns) there.
         """
         from tofclip.recovery.surfaces.kernels import add_light, smooth_rows
 
-        place, margin = self.footprints[view], self._margin
+        place, margin, samples = self.footprints[view], self._margin, 3
         amplitude = self.shade(view, amplitude, part)
-        first, last = (0, self.image.shape[0]) if rows is None else rows
-        light = np.zeros((last - first + 2 * margin, place.columns), np.float32)
-        down = place.row[part] + np.int32(margin - first), place.row_shares[part]
-        add_light(amplitude, *down, place.column[part], place.slit_shares[part], light)
-        image = np.zeros((last - first, place.columns), np.float32)
-        wanted = place.lit_rows if rows is None else np.arange(last - first)
-        smooth_rows(light, kernel, wanted, margin, image)
+        row, column = place.row[part], place.column[part]
+        if not row.size:
+            return 0, np.zeros((0, 0), np.float32)
+        first = max(int(row.min()) - self.half, 0)
+        last = max(min(int(row.max()) + samples + self.half, self._rows), first)
+        left = int(column.min())
+        light = np.zeros(
+            (last - first + 2 * margin, int(column.max()) + SLIT_PIXELS - left), np.float32
+        )
+        down = row + np.int32(margin - first), place.row_shares[part]
+        add_light(amplitude, *down, column - np.int32(left), place.slit_shares[part], light)
+        image = np.zeros((last - first, light.shape[1]), np.float32)
+        lit = np.arange(last - first) if row.size < self.surface.size else place.lit_rows - first
+        smooth_rows(light, kernel, np.arange(-self.half, self.half + 1), lit, margin, image)
+        return first, image
+
+    def _cut_to_slit(self, view: int, part: slice, width: int) -> tuple[slice, slice]:
+        """The part of some points' columns that lies on the slit, and where."""
+        place = self.footprints[view]
+        first = place.first_column + int(place.column[part].min(initial=place.columns))
+        left = min(max(first, 0), self.image.shape[1])
+        right = max(left, min(first + width, self.image.shape[1]))
+        return slice(left - first, right - first), slice(left, right)
+
+    def _trail(self, light: Image, first: int, rows: int) -> Image:
+        """Some rows of light with its afterglow, from row `first` of `light` on."""
+        from tofclip.recovery.surfaces.kernels import smooth_rows
+
+        if not self.pulse.reach:
+            return light[first : first + rows]
+        light, image = np.ascontiguousarray(light), np.empty((rows, light.shape[1]), np.float32)
+        shares = self.pulse.shares.astype(np.float32)
+        smooth_rows(light, shares, self.pulse.lags, np.arange(rows), first, image)
         return image
 
-    def render(
-        self, amplitude: Image, part: slice = slice(None), rows: tuple[int, int] | None = None
-    ) -> Image:
-        """Return A a, (rows, columns); or of some points, on the rows that hold all their light."""
-        first, last = (0, self.image.shape[0]) if rows is None else rows
-        total = np.zeros((last - first, self.image.shape[1]), np.float32)
+    def render(self, amplitude: Image) -> Image:
+        """Return A a, (rows, columns)."""
+        total = np.zeros((self._rows, self.image.shape[1]), np.float32)
         kernels = [
             kernel * np.float32(gain)
             for kernel, gain in zip(self.kernels, self.state.gains, strict=True)
         ]
-        images = self._map_views(lambda v: self.project(v, amplitude, kernels[v], part, rows))
-        for view, image in enumerate(images):
-            own, slit = self.overlap(view)
-            total[:, slit] += image[:, own]
-        return total
-
-    def overlap(self, view: int) -> tuple[slice, slice]:
-        """Return the part of a view's columns that lies on the slit, and where."""
-        place, width = self.footprints[view], self.image.shape[1]
-        left = max(place.first_column, 0)
-        right = max(left, min(place.first_column + place.columns, width))
-        return slice(left - place.first_column, right - place.first_column), slice(left, right)
+        everywhere = slice(None)
+        for view, (top, light) in enumerate(
+            self._map_views(lambda v: self._project(v, amplitude, kernels[v], everywhere))
+        ):
+            own, slit = self._cut_to_slit(view, everywhere, light.shape[1])
+            total[top : top + len(light), slit] += light[:, own]
+        return self._trail(total, self.before, self.image.shape[0])
 
     def gather(self, image: Image, squared: bool = False) -> Image:
         """Return A' of an image, (points,); squared: with the squares of all entries."""
         from tofclip.recovery.surfaces.kernels import gather_light, smooth_rows
 
+        lags = np.arange(-self.half, self.half + 1)
+        seen = np.zeros((self._rows, image.shape[1]), np.float32)
+        if squared or not self.pulse.reach:
+            seen[self.before : self.before + len(image)] = image
+            reach = self.half + self.pulse.reach
+            lags = np.arange(-reach, reach + 1)
+        else:
+            shares = self.pulse.shares.astype(np.float32)
+            smooth_rows(image, shares, -self.pulse.lags, np.arange(self._rows), -self.before, seen)
+
         def work(view: int) -> Image:
             place, kernel = self.footprints[view], self.kernels[view]
             gain, slit_shares = self.state.gains[view], place.slit_shares
             if squared:  # a pulse is smooth: the square of its samples between rows is theirs
-                whole = self.make_kernel(view, variance=0.0)
+                whole = self.pulse.extend(self.make_kernel(view, variance=0.0))
                 kernel, gain, slit_shares = whole**2, gain**2, slit_shares**2
-            own, slit = self.overlap(view)
-            part = np.zeros((image.shape[0], place.columns), np.float32)
-            part[:, own] = image[:, slit]
-            smooth = np.empty((image.shape[0] + 2 * self._margin, place.columns), np.float32)
-            smooth_rows(part, kernel[::-1].copy(), place.reached_rows, -self._margin, smooth)
+            own, slit = self._cut_to_slit(view, slice(None), place.columns)
+            part = np.zeros((self._rows, place.columns), np.float32)
+            part[:, own] = seen[:, slit]
+            smooth = np.empty((self._rows + 2 * self._margin, place.columns), np.float32)
+            smooth_rows(part, kernel, -lags, place.reached_rows, -self._margin, smooth)
             found = np.zeros(self.surface.size, np.float32)
             row = place.row + np.int32(self._margin)
             gather_light(smooth, gain, row, place.row_shares, place.column, slit_shares, found)
@@ -421,8 +492,8 @@ class SurfaceModel:
 
     def shade(self, view: int, amplitude: Image, part: slice = slice(None)) -> Image:
         """Return amplitudes, of the points in `part`, as a view sees them."""
-        behind = self.behind[part]
-        if not behind.any():
+        if not self.state.shading[:, view].any():
             return amplitude
+        behind = self.behind[part]
         brightness = np.exp(self.state.shading[self.surface[part], view])
         return np.where(behind, amplitude * brightness, amplitude).astype(np.float32)

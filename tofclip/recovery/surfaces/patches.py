@@ -40,6 +40,7 @@ FIT_ITERATIONS = 10
 RIDGE = 1e-9  # per return: those along a line say nothing about what is across it
 CURVATURE_PENALTY = 1e-3  # keeps small patches from bending
 KNOT_SPACING_PX, MAX_PIECES = 12, 8
+RETURNS_PER_UNKNOWN = 15.0  # of splines: they share their errors
 BEND_BINS = 0.3  # misfit of a quadratic from which on splines are tried
 BENT_FRACTION = 0.6  # of a quadratic's misfit: splines are worth their freedom below
 EVIDENCE_ROUNDS = 2
@@ -240,7 +241,13 @@ def _bend_where_needed(patch: Patch, bin_m: float) -> Patch:
         return patch
     corners = np.stack(np.divmod(patch.pixels, patch.ray_length.shape[1]))
     start, end = corners.min(axis=1) - MARGIN_PX, corners.max(axis=1) + 1 + MARGIN_PX
-    down, across = np.clip(np.rint((end - start) / KNOT_SPACING_PX), 1, MAX_PIECES).astype(int)
+    free = int(patch.pixels.size / RETURNS_PER_UNKNOWN)
+    spacing = float(KNOT_SPACING_PX)
+    while True:
+        down, across = np.clip(np.rint((end - start) / spacing), 1, MAX_PIECES).astype(int)
+        if (down + SPLINE_DEGREE) * (across + SPLINE_DEGREE) <= free or down == across == 1:
+            break
+        spacing *= 1.1
     box = (int(start[0]), int(start[1]), int(end[0]), int(end[1]))
     basis = replace(patch.basis, box=box, pieces=(int(down), int(across)))
     design = basis.evaluate(patch.pixels)

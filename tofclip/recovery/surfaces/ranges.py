@@ -8,15 +8,17 @@ the entry. W are the weights of the measurements, A is the model (`SurfaceModel`
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.recovery.surfaces.amplitudes import TINY, explain_by_amplitude, scale_amplitude
-from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState
+from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, Window
 from tofclip.recovery.surfaces.patches import COEFFICIENTS, FloatArray
 from tofclip.recovery.surfaces.pulse import Image, differentiate_pulse
 from tofclip.threads import map_parallel
@@ -39,117 +41,220 @@ ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 12, 4
 # What the prior takes from amplitudes is as fine as they are. After 6 the ranges of a wall behind
 # wires were 0.009 mm too near, without noise and with the model exact; after 15, 0.0005 mm.
 FREE_ITERATIONS, FURTHER_FREE_ITERATIONS, MOVED_FREE_ITERATIONS = 15, 6, 3
+Unknown = tuple[str, int, int]
 RIDGE = 1e-6  # of each unknown's own information: for what the shot says nothing about
 
 
 class Derivatives(NamedTuple):
-    """Derivatives of the streak image by some unknowns, on the part of it that they change."""
+    """Derivatives of the streak image by some unknowns on a part of it: whole clusters, which no
+    other part with the same unknowns shares.
+    """
 
-    names: list[tuple[str, int, int]]
+    names: list[Unknown]
     row: int  # of the part's corner
     column: int  # of the part's corner
     images: Image  # (unknowns, rows, columns)
 
+    @property
+    def area(self) -> tuple[slice, slice]:
+        """Where the part lies."""
+        _, rows, columns = self.images.shape
+        return slice(self.row, self.row + rows), slice(self.column, self.column + columns)
+
 
 def iterate_derivatives(model: SurfaceModel, amplitude: Image) -> Iterator[Derivatives]:
-    """Yield the image's derivatives by the unknowns of the state, each view's and surface's. The
-    reference view keeps its delay and stretch: time zero is its own. Derivatives by gains and
-    widths are by their logarithms.
+    """Yield the image's derivatives by the unknowns of the state, each view's and surface's, part by
+    part. The reference view keeps its delay and stretch: time zero is its own. Derivatives by gains
+    and widths are by their logarithms.
     """
     views = range(model.camera.views)
     others = [view for view in views if view != model.reference]
     surfaces = range(len(model.masks))
-    yield from map_parallel(lambda view: _differentiate_view(model, view, amplitude), views)
-    yield from map_parallel(lambda view: _differentiate_sweep(model, view, amplitude), others)
-    yield from map_parallel(lambda k: _differentiate_surface(model, k, amplitude), surfaces)
+    for work, numbers in (
+        (_differentiate_view, views),
+        (_differentiate_sweep, others),
+        (_differentiate_surface, surfaces),
+    ):
+        parts = map_parallel(partial(work, model, amplitude), numbers)
+        yield from itertools.chain.from_iterable(parts)
 
 
-def _differentiate_view(model: SurfaceModel, view: int, amplitude: Image) -> Derivatives:
-    kernel, (own, slit) = model.kernels[view], model.overlap(view)
+def _join_windows(
+    model: SurfaceModel, names: list[Unknown], windows: Sequence[Sequence[Window]]
+) -> Iterator[Derivatives]:
+    """Yield derivatives by some unknowns as windows show them, (places, unknowns), those of one place
+    of one size: on whole clusters, and windows that share one as one part.
+    """
+    rows, columns = model.image.shape
+    boxes: list[tuple[int, int, int, int, list[Sequence[Window]]]] = []
+    for place in windows:
+        if not place[0].image.size:
+            continue
+        (top, bottom), (left, right) = (
+            (area.start // side * side, min(-(-area.stop // side) * side, size))
+            for area, side, size in zip(
+                place[0].area, (CLUSTER_ROWS, CLUSTER_COLUMNS), (rows, columns), strict=True
+            )
+        )
+        held, apart = [place], []
+        # a box that grows may meet others that were apart
+        while True:
+            for box in boxes:
+                if box[0] < bottom and top < box[1] and box[2] < right and left < box[3]:
+                    top, bottom = min(top, box[0]), max(bottom, box[1])
+                    left, right = min(left, box[2]), max(right, box[3])
+                    held += box[4]
+                else:
+                    apart.append(box)
+            if len(apart) == len(boxes):
+                break
+            boxes, apart = apart, []
+        boxes = [*apart, (top, bottom, left, right, held)]
+    if not boxes:  # nothing of it falls on the slit
+        yield Derivatives(names, 0, 0, np.zeros((len(names), 0, 0), np.float32))
+    for top, bottom, left, right, held in boxes:
+        images = np.zeros((len(names), bottom - top, right - left), np.float32)
+        for place in held:
+            for image, window in zip(images, place, strict=True):
+                height, width = window.image.shape
+                row, column = window.row - top, window.column - left
+                image[row : row + height, column : column + width] += window.image
+        yield Derivatives(names, top, left, images)
+
+
+def _differentiate_view(model: SurfaceModel, amplitude: Image, view: int) -> list[Derivatives]:
+    kernel, gain = model.kernels[view], np.float32(model.state.gains[view])
     wider = (model.make_kernel(view, 1 + WIDTH_STEP) - kernel) / np.float32(WIDTH_STEP)
-    unknowns = [("gains", 0, view), ("widths", 0, view)]
-    projected = [model.project(view, amplitude, one) for one in (kernel, wider)]
+    windows = [model.receive(view, amplitude, gain * one) for one in (kernel, wider)]
+    found = [*_join_windows(model, [("gains", 0, view), ("widths", 0, view)], [windows])]
     for surface in np.unique(model.surface[model.behind]):
-        chosen = model.behind & (model.surface == surface)
-        unknowns.append(("shading", int(surface), view))
-        projected.append(model.project(view, amplitude * chosen, kernel))
-    stacked = np.stack(projected)[:, :, own] * np.float32(model.state.gains[view])
-    return Derivatives(unknowns, 0, slit.start, stacked)
+        part = model.parts[surface]
+        hidden = model.receive(view, amplitude[part] * model.behind[part], gain * kernel, part)
+        found += _join_windows(model, [("shading", int(surface), view)], [[hidden]])
+    return found
 
 
-def _differentiate_sweep(model: SurfaceModel, view: int, amplitude: Image) -> Derivatives:
+def _differentiate_sweep(model: SurfaceModel, amplitude: Image, view: int) -> list[Derivatives]:
     """By delay and stretch at a view's centre, which the views beside it feel as well."""
-    total = np.zeros((2, *model.image.shape), np.float32)
-    first, last = total.shape[2], 1
+    windows = []
     for other, place in enumerate(model.footprints):
         weight = place.between.weigh_centre(view)
         if not weight.any():
             continue
         slope = differentiate_pulse(model.kernels[other]) * np.float32(model.state.gains[other])
         light = amplitude * weight
-        own, slit = model.overlap(other)
-        for image, one in zip(total, (light, light * model.measure_height(place.row)), strict=True):
-            image[:, slit] += model.project(other, one.astype(np.float32), slope)[:, own]
-        first, last = min(first, slit.start), max(last, slit.stop)
-    first = min(first, last - 1)
-    unknowns = [("delays", 0, view), ("stretches", 0, view)]
-    return Derivatives(unknowns, 0, first, total[:, :, first:last])
+        height = model.measure_height(place.row - model.before)
+        windows.append(
+            [model.receive(other, one.astype(np.float32), slope) for one in (light, light * height)]
+        )
+    return [*_join_windows(model, [("delays", 0, view), ("stretches", 0, view)], windows)]
 
 
-def _differentiate_surface(model: SurfaceModel, surface: int, amplitude: Image) -> Derivatives:
+def _differentiate_surface(
+    model: SurfaceModel, amplitude: Image, surface: int
+) -> list[Derivatives]:
     part, monomials = model.parts[surface], model.monomials[surface]
-    first = min(int(one.row[part].min(initial=0)) for one in model.footprints) - model.half
-    last = max(int(one.row[part].max(initial=0)) for one in model.footprints) + model.half + 3
-    first = min(max(first, 0), model.image.shape[0] - 1)
-    last = max(min(last, model.image.shape[0]), first + 1)
     there = 2 * model.distance[part] / SPEED_OF_LIGHT + model.camera.time_zero
     rows_per_metre = 2 / SPEED_OF_LIGHT / np.interp(there, model.times, np.gradient(model.times))
     # range = length / inverse depth
     by_inverse = -(model.distance[part] ** 2) / model.ray_length[part] * rows_per_metre
     in_range = (amplitude[part] * by_inverse)[:, np.newaxis] * monomials
     lights = np.ascontiguousarray(in_range.T, np.float32)
-    images = np.zeros((len(lights), last - first, model.image.shape[1]), np.float32)
+    windows = []
     for view, place in enumerate(model.footprints):
         slope = differentiate_pulse(model.kernels[view])
         slope *= np.float32(model.state.gains[view] * place.rows_per_instant)
-        own, slit = model.overlap(view)
-        for image, light in zip(images, lights, strict=True):
-            image[:, slit] += model.project(view, light, slope, part, (first, last))[:, own]
+        windows.append([model.receive(view, light, slope, part) for light in lights])
     names = [("coefficients", surface, number) for number in range(len(lights))]
-    return Derivatives(names, first, 0, images)
+    return [*_join_windows(model, names, windows)]
 
 
-class ClusterProducts(NamedTuple):
-    """What a part of the image says of the unknowns that change it."""
+@dataclass(frozen=True)
+class NormalEquations:
+    """What a Gauss-Newton step is made of: products of all derivatives with each other and with the
+    misfit that a step is to explain. Cluster by cluster: what is on one stays in cache, and most
+    derivatives are on few.
+    """
 
-    own: NDArray[np.intp]  # (n,), numbers of these unknowns
-    normal: Image  # (n, n), J'WJ of the part
-    score: Image  # (n,), J'W of its misfit
-
-
-class NormalEquations(NamedTuple):
-    """What a Gauss-Newton step is made of."""
-
+    names: list[Unknown]
     normal: FloatArray  # (unknowns, unknowns), J'WJ
     slope: FloatArray  # (unknowns,), J'W of what is to be explained
-    clusters: list[ClusterProducts]  # what each part of the image adds to them
+    # of each cluster the unknowns' numbers, and their derivatives (n, pixels)
+    clusters: dict[tuple[int, int], list[tuple[NDArray[np.intp], Image]]]
+    weights: Image
 
-    def sum_squared_scores(self, inverse: FloatArray) -> FloatArray:
-        """Return the sum of squares of the clusters' scores, (unknowns, unknowns), as they were before
-        the step; `inverse`: of the normal matrix.
+    @classmethod
+    def multiply(cls, groups: list[Derivatives], weights: Image, rest: Image) -> NormalEquations:
+        """Multiply derivatives with each other and with what is to be explained."""
+        names = list(dict.fromkeys(name for group in groups for name in group.names))
+        number = {name: place for place, name in enumerate(names)}
+        clusters: dict[tuple[int, int], list[tuple[NDArray[np.intp], Image]]] = {}
+        for group in groups:
+            own = np.array([number[name] for name in group.names])
+            for down in range(0, group.images.shape[1], CLUSTER_ROWS):
+                for right in range(0, group.images.shape[2], CLUSTER_COLUMNS):
+                    part = group.images[
+                        :, down : down + CLUSTER_ROWS, right : right + CLUSTER_COLUMNS
+                    ]
+                    if part.any():
+                        place = group.row + down, group.column + right
+                        clusters.setdefault(place, []).append((own, part))
+        normal, slope = np.zeros((len(names), len(names))), np.zeros(len(names))
+        equations = cls(names, normal, slope, clusters, weights)
+        for place in clusters:
+            numbers, images, weighted = equations.list_cluster(place)
+            normal[np.ix_(numbers, numbers)] += weighted @ images.T
+            slope[numbers] += weighted @ rest[_find_cluster(place)].ravel()
+        return equations
+
+    def list_cluster(self, place: tuple[int, int]) -> tuple[NDArray[np.intp], Image, Image]:
+        """Return the numbers of a cluster's unknowns, and their derivatives, (n, pixels), plain and
+        weighted.
+        """
+        own, parts = zip(*self.clusters[place], strict=True)
+        images = np.concatenate([part.reshape(len(part), -1) for part in parts])
+        return np.concatenate(own), images, images * self.weights[_find_cluster(place)].ravel()
+
+    def estimate_covariances(
+        self, inverse: FloatArray, known: FloatArray, error: Image
+    ) -> FloatArray:
+        """Return the covariance ``H^-1 S H^-1``, (unknowns, unknowns), right within the blocks of each
+        surface's coefficients. S is the sum of squares of the clusters' scores, with the misfit `error`
+        as it was before the step, and of what was known before; `inverse`: of the normal matrix.
 
         A step explains a part of each cluster's misfit, the more the fewer clusters there are, and what
         is left is too little. With the leverage h of a cluster, ``1 - h`` of its variance is left
-        (R. Bell and D. McCaffrey, Surv. Methodol. 28, 169, 2002).
+        (R. Bell and D. McCaffrey, Surv. Methodol. 28, 169, 2002), here in each direction of what the
+        cluster says of a surface.
         """
+        surfaces = np.array([n if name == "coefficients" else -1 for name, n, _ in self.names])
         scores = np.zeros((len(self.clusters), self.slope.size))
-        for score, (own, normal, pull) in zip(scores, self.clusters, strict=True):
-            factor, inverse_factor = _take_root(inverse[np.ix_(own, own)])
-            leverage, directions = np.linalg.eigh(factor.T @ normal @ factor)
-            left = np.sqrt(1 - np.clip(leverage, 0, MAX_LEVERAGE))
-            along = directions.T @ (factor.T @ pull)
-            score[own] = inverse_factor.T @ (directions @ (along / left))
-        return scores.T @ scores
+        for score, place in zip(scores, self.clusters, strict=True):
+            own, images, weighted = self.list_cluster(place)
+            score[own] = weighted @ error[_find_cluster(place)].ravel()
+        influence = scores @ inverse
+        covariance = inverse @ known @ inverse
+        parts = [np.flatnonzero(surfaces == one) for one in np.unique(surfaces[surfaces >= 0])]
+        roots = {part[0]: _take_root(inverse[np.ix_(part, part)]) for part in parts}
+        for score, place in zip(influence, self.clusters, strict=True):
+            for own, images in self.clusters[place]:
+                if own[0] in roots:
+                    factor, inverse_factor = roots[own[0]]
+                    along = factor.T @ images.reshape(own.size, -1)
+                    scaled = along * self.weights[_find_cluster(place)].ravel()
+                    leverage, axes = np.linalg.eigh(scaled @ along.T)
+                    left = np.sqrt(1 - np.clip(leverage, 0, MAX_LEVERAGE))
+                    score[own] = factor @ (axes @ (axes.T @ (inverse_factor @ score[own]) / left))
+        for part in parts:
+            covariance[np.ix_(part, part)] += influence[:, part].T @ influence[:, part]
+        return covariance
+
+
+def _find_cluster(place: tuple[int, int]) -> tuple[slice, slice]:
+    return (
+        slice(place[0], place[0] + CLUSTER_ROWS),
+        slice(place[1], place[1] + CLUSTER_COLUMNS),
+    )
 
 
 def _take_root(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -163,51 +268,6 @@ def _take_root(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     return unit[:, np.newaxis] * axes * deviations, (axes / deviations).T / unit
 
 
-def multiply_derivatives(
-    groups: list[Derivatives], weights: Image, rest: Image, error: Image
-) -> NormalEquations:
-    """Return the products of all derivatives with each other, with the misfit that a step is to
-    explain and with the one of the clusters' scores. Cluster by cluster: what is on one stays in
-    cache, and most derivatives are on few.
-    """
-    ends = np.cumsum([0] + [len(group.names) for group in groups])
-    normal, slope = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
-    clusters = []
-    for top in range(0, weights.shape[0], CLUSTER_ROWS):
-        for left in range(0, weights.shape[1], CLUSTER_COLUMNS):
-            area = np.s_[top : top + CLUSTER_ROWS, left : left + CLUSTER_COLUMNS]
-            own, parts = [], []
-            for group, first, last in zip(groups, ends[:-1], ends[1:], strict=True):
-                part = _cut_out(group, top, left, weights[area].shape)
-                if part is not None:
-                    own.append(np.arange(first, last))
-                    parts.append(part)
-            if not own:
-                continue
-            numbers, images = np.concatenate(own), np.concatenate(parts)
-            weighted: Image = images * weights[area].ravel()
-            product: Image = weighted @ images.T
-            score: Image = weighted @ error[area].ravel()
-            normal[np.ix_(numbers, numbers)] += product
-            slope[numbers] += weighted @ rest[area].ravel()
-            clusters.append(ClusterProducts(numbers, product, score))
-    return NormalEquations(normal, slope, clusters)
-
-
-def _cut_out(group: Derivatives, top: int, left: int, shape: tuple[int, ...]) -> Image | None:
-    """Derivatives on a part of the image, (n, pixels); None where they change nothing."""
-    row, column = group.row - top, group.column - left
-    here = group.images[
-        :, max(-row, 0) : max(shape[0] - row, 0), max(-column, 0) : max(shape[1] - column, 0)
-    ]
-    if not here.any():
-        return None
-    row, column = max(row, 0), max(column, 0)
-    part = np.zeros((here.shape[0], *shape), np.float32)
-    part[:, row : row + here.shape[1], column : column + here.shape[2]] = here
-    return part.reshape(here.shape[0], -1)
-
-
 @dataclass(frozen=True)
 class Refinement:
     """What a Gauss-Newton step knows."""
@@ -218,15 +278,17 @@ class Refinement:
     # (6, points), changes of amplitude that look like a change of each coefficient of a quadratic
     explained: Image
     steps: int  # taken, with this one
-    # after the step: half the weighted squared misfit that amplitudes cannot explain, and what is
-    # known of surfaces and sweep beforehand
-    objective: float
+    # after the step: the misfit that amplitudes cannot explain, (rows, columns)
+    rest: Image
     # amplitudes that explain this shot best without the prior, if it is this shot's step
     free: Image | None
 
 
 def refine_state(
-    model: SurfaceModel, amplitude: Image, earlier: Refinement | None = None
+    model: SurfaceModel,
+    amplitude: Image,
+    earlier: Refinement | None = None,
+    robust: bool = False,
 ) -> Refinement:
     """Take a Gauss-Newton step on ranges, gains, pulse widths and, from the second step on, delays
     and stretches, if it lowers the misfit that amplitudes cannot explain. The model is moved in
@@ -258,39 +320,39 @@ def refine_state(
     # 3. The covariance is ``H^-1 S H^-1`` with the information H of the data and the sum S of squares
     # of the score over clusters of measurements (H. White, Econometrica 50, 1, 1982): it holds the
     # noise that the misfit has, also where misfits of neighbouring measurements depend on each other.
-    names = [name for group in groups for name in group.names]
-    equations = multiply_derivatives(groups, model.weights, rest, error)
+    equations = NormalEquations.multiply(groups, model.weights, rest)
+    names = equations.names
     second, first = _differentiate_priors(model, names)
     unit = np.sqrt(np.diag(equations.normal)) + TINY
     whole = (equations.normal + second) / np.outer(unit, unit) + RIDGE * np.eye(unit.size)
     inverse = np.linalg.inv(whole) / np.outer(unit, unit)
-    robust = inverse @ (equations.sum_squared_scores(inverse) + second) @ inverse
     change = inverse @ (equations.slope - first)
+    covariance = inverse
+    if robust:
+        covariance = equations.estimate_covariances(inverse, second, error)
 
     # 4. With as many iterations before the step as after it, so that these alone do not make it good.
     # A step that is far too long may overflow: it is refused like others that lower nothing.
     state, step = model.state, 1.0
     settled, left = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
-    before = objective = _compute_objective(model, left)
-    moved, free = amplitude, amplitude + settled
+    before = compute_objective(model, left)
+    moved, free, rest = amplitude, amplitude + settled, left
     with np.errstate(over="ignore", invalid="ignore"):
         while step >= SMALLEST_STEP:
             ahead = _move(model, state, amplitude, names, step * change, changes)
             error = model.image - model.render(ahead)
             settled, left = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
-            objective = _compute_objective(model, left)
-            if objective < before:
-                moved, free = ahead, ahead + settled
+            if compute_objective(model, left) < before:
+                moved, free, rest = ahead, ahead + settled, left
                 break
             step /= 2
         else:
             model.place(state)
-            objective = before
     numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
     own = [np.ix_(numbers == surface, numbers == surface) for surface in range(len(model.masks))]
-    covariances = [robust[block] for block in own]
+    covariances = [covariance[block] for block in own]
     steps = 1 if earlier is None else earlier.steps + 1
-    return Refinement(covariances, moved, changes, steps, objective, free)
+    return Refinement(covariances, moved, changes, steps, rest, free)
 
 
 def _explain_rest(
@@ -312,29 +374,21 @@ def _leave_out_even_shading(
     # what each view would make of them alone; views hardly share measurements
     information, shading = np.zeros(model.state.shading.shape), model.state.shading.copy()
     known = shading.any(axis=1)
+    pulls = np.zeros(shading.shape)
     for group in groups:
-        height, width = group.images.shape[1:]
-        area = np.s_[group.row : group.row + height, group.column : group.column + width]
-        for (name, surface, view), image in zip(group.names, group.images, strict=True):
-            if name == "shading":
-                weighted = model.weights[area] * image
-                information[surface, view] = np.sum(weighted * image, dtype=np.float64)
-                pull = float(np.sum(weighted * rest[area], dtype=np.float64))
-                shading[surface, view] += pull / max(information[surface, view], TINY)
+        name, surface, view = group.names[0]
+        if name == "shading":
+            weighted = model.weights[group.area] * group.images[0]
+            information[surface, view] += np.vdot(weighted, group.images[0])
+            pulls[surface, view] += np.vdot(weighted, rest[group.area])
+    shading += pulls / np.maximum(information, TINY)
     shading -= shading.mean(axis=1, keepdims=True)
     variance = float(np.average(rest**2 * model.weights, weights=model.weights > 0))
     gain = np.mean(information * shading**2, axis=1)
     shaded = (np.std(shading, axis=1) > MIN_SHADING) & (gain > SHADING_SIGMAS**2 * variance)
     shaded |= known
     model.behind = model.behind & shaded[model.surface]
-    left = []
-    for group in groups:
-        own = [
-            n for n, (name, one, _) in enumerate(group.names) if name != "shading" or shaded[one]
-        ]
-        names = [group.names[number] for number in own]
-        left.append(group._replace(names=names, images=group.images[own]))
-    return left
+    return [one for one in groups if one.names[0][0] != "shading" or shaded[one.names[0][1]]]
 
 
 def _eliminate_amplitude(
@@ -353,8 +407,7 @@ def _eliminate_amplitude(
     would make steps too short and ranges surer than they are.
     """
     own = [group for group in groups if group.names[0][0] == "coefficients"]
-    surfaces = [group.names[0][1] for group in own]
-    shares = [model.bases[surface].split_quadratic() for surface in surfaces]
+    shares = [basis.split_quadratic() for basis in model.bases]
     changes = np.zeros((COEFFICIENTS, model.surface.size), np.float32)
     iterations = ELIMINATION_ITERATIONS
     if start is not None:
@@ -362,22 +415,40 @@ def _eliminate_amplitude(
         iterations = FURTHER_ELIMINATION_ITERATIONS
     for number, change in enumerate(changes):
         image = np.zeros_like(model.image)
-        for group, (functions, _) in zip(own, shares, strict=True):
-            derivative = np.tensordot(functions[:, number].astype(np.float32), group.images, 1)
-            image[group.row : group.row + group.images.shape[1]] += derivative
+        for group in own:
+            functions, _ = shares[group.names[0][1]]
+            image[group.area] += np.tensordot(
+                functions[:, number].astype(np.float32), group.images, 1
+            )
         if start is not None:
             image -= model.render(change)
         change += explain_by_amplitude(model, image, scale, iterations)
+
+    def explain(surface: int) -> list[Derivatives]:
+        part = model.parts[surface]
+        windows = [
+            [model.receive(view, change[part], gain * kernel, part) for change in changes]
+            for view, (kernel, gain) in enumerate(
+                zip(model.kernels, model.state.gains.astype(np.float32), strict=True)
+            )
+        ]
+        names = [("explained", surface, number) for number in range(COEFFICIENTS)]
+        return [*_join_windows(model, names, windows)]
+
     patterns = []
-    for group, surface, (_, quadratic) in zip(own, surfaces, shares, strict=True):
-        part, rows = model.parts[surface], (group.row, group.row + group.images.shape[1])
-        explained = np.stack([model.render(change[part], part, rows) for change in changes])
-        group.images[...] -= np.tensordot(quadratic.T.astype(np.float32), explained, 1)
-        patterns.append(Derivatives([("patterns", surface, 0)], group.row, 0, explained[:1]))
+    explained = map_parallel(explain, range(len(model.masks)))
+    # the same points, and so the same parts of the image
+    for group, seen in zip(own, itertools.chain.from_iterable(explained), strict=True):
+        surface = group.names[0][1]
+        _, quadratic = shares[surface]
+        group.images[...] -= np.tensordot(quadratic.T.astype(np.float32), seen.images, 1)
+        patterns.append(
+            seen._replace(names=[("patterns", surface, 0)], images=seen.images[:1].copy())
+        )
     return changes, patterns
 
 
-def _compute_objective(model: SurfaceModel, rest: Image) -> float:
+def compute_objective(model: SurfaceModel, rest: Image) -> float:
     """Half the squared misfit that is left, and what is known of surfaces and sweep beforehand."""
     state = model.state
     bases = zip(model.bases, state.coefficients, strict=True)
