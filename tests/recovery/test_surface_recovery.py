@@ -46,7 +46,7 @@ def test_frames_are_the_rendering_of_the_returns_and_keep_them(found, tmp_path: 
     assert found.figures["method"] == "surfaces"
     assert found.figures["surfaces"] == 3
     # all steps on ranges are taken only where they go on moving
-    assert 105 <= found.figures["iterations"] <= SurfaceRecovery().steps == 125
+    assert 105 <= found.figures["iterations"] <= SurfaceRecovery().steps == 150
     assert found.figures["relative_residual"] < 0.1
     again = depth(found)
     strongest, rendered = (one.image("range") for one in (found.returns, again))

@@ -29,8 +29,10 @@ from tofclip.recovery.surfaces.patches import (
     MARGIN_PX,
     MIN_PATCH_PX,
     FloatArray,
+    Pixels,
     find_dimmer_patches,
     find_patches,
+    leave_out_rough,
     rank_within_pixels,
     reach_further,
 )
@@ -67,11 +69,17 @@ SLOPE_WINDOW_PX = 7
 
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 
+# Bins in range, and pixels, within which frames' returns and surfaces are the same; and by how many
+# standard deviations the shot must show light of others.
+NEAR_BINS, NEAR_PX, OTHER_SIGMAS = 7.0, 1.5, 10.0
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
 MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
 # Of what certainly is a surface, and beyond: points that are fainter are looked at no further.
 LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 5.0, 0.05, 3
+
+
+NO_SHARES = Detection(min_scene_fraction=0.0, min_time_bin_fraction=0.0, min_pixel_fraction=0.0)
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,9 @@ class SurfaceFit:
     remainder: FloatArray  # (surfaces,), what further steps would still change of ranges, m
     # what the surfaces left unexplained when they were found, as a fraction of the signal
     reference: float
+    # of the frames, where the shot shows light that no surface explains; ranges as measured
+    others: Returns
+    whole: AmplitudeSolver  # with the light of these
 
 
 @limit_blas_threads()  # products of a few dozen columns are too small to share
@@ -117,6 +128,7 @@ def fit_surfaces(
     share = _measure_light(found, on_surface)
     if share < MIN_SURFACE_SHARE:
         raise _refuse(f"only {100 * share:.0f} % of the returns' light lies on smooth surfaces")
+    patches = leave_out_rough(patches, bin_m)
     patches += find_dimmer_patches(patches, found, ray_length, bin_m)
     seen = np.concatenate([patch.pixels for patch in patches])
     pulse = measure_pulse(frames, seen, strongest[seen])
@@ -148,7 +160,47 @@ def fit_surfaces(
     refinement, remainder = _refine(solver, begun, progress, count)
     solver.run(iterations, progress, count)
     reference = solver.model.unexplained(solver.amplitude)
-    return SurfaceFit(solver.model, solver, refinement, remainder, reference)
+    others, whole = find_others(solver, found, bin_m, progress, count)
+    return SurfaceFit(solver.model, solver, refinement, remainder, reference, others, whole)
+
+
+def find_others(
+    solver: AmplitudeSolver, found: Returns, bin_m: float, progress: Progress, count: int
+) -> tuple[Returns, AmplitudeSolver]:
+    """Return those of the frames' returns that no surface is near and that the whole shot shows, with
+    surfaces and all other returns free to take over their light; and the light of all.
+    """
+    model = solver.model
+    chosen = choose_points(solver)
+    y, x = np.divmod(model.pixel[chosen], model.camera.image_shape[1])
+    # a return in a neighbouring pixel may be a bin further off for each that it is aside
+    reach = NEAR_BINS * bin_m
+    aside = reach / NEAR_PX
+    tree = scipy.spatial.cKDTree(np.stack([aside * y, aside * x, model.distance[chosen]], axis=1))
+    places = np.stack([aside * found.y, aside * found.x, found.range], axis=1)
+    apart, _ = tree.query(places, p=np.inf, distance_upper_bound=reach)
+    others = found[np.isinf(apart)]
+    if not len(others):
+        return others, solver
+    pixel = others.y.astype(np.intp) * model.camera.image_shape[1] + others.x
+    order, rank = rank_within_pixels(pixel, others.range)
+    others, pixel = others[order], pixel[order]
+    masks = np.zeros((int(rank.max()) + 1, *model.camera.image_shape), bool)
+    inverse = np.ones(masks.shape)
+    masks.reshape(len(masks), -1)[rank, pixel] = True
+    depths = compute_ray_directions(model.camera, others.y, others.x)[:, 2] * others.range
+    inverse.reshape(len(masks), -1)[rank, pixel] = 1 / depths
+    whole = model.add(masks, inverse)
+    begin = np.concatenate([solver.amplitude, np.zeros(pixel.size, np.float32)])
+    together = AmplitudeSolver(whole, begin, solver.weight)
+    together.run(START_ITERATIONS, progress, count)
+    significance = together.measure_significance()
+    shown = significance > OTHER_SIGMAS
+    shown[: model.surface.size] = True
+    together.amplitude = np.where(shown, together.amplitude, np.float32(0))
+    kept = np.zeros(masks.shape, bool)
+    kept[masks] = shown[model.surface.size :]
+    return others[kept.reshape(len(masks), -1)[rank, pixel]], together
 
 
 def _measure_light(found: Returns, where: NDArray[np.bool_]) -> float:
@@ -332,24 +384,31 @@ def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFi
     unexplained = model.unexplained(solver.amplitude)
     if unexplained > CHANGED_RATIO * fit.reference + CHANGED_EXCESS:
         return None
-    return SurfaceFit(model, solver, refinement, fit.remainder, fit.reference)
+    none = fit.others[np.zeros(0, np.intp)]
+    return SurfaceFit(model, solver, refinement, fit.remainder, fit.reference, none, solver)
+
+
+def choose_points(solver: AmplitudeSolver, limit: float = Detection.signal_to_noise) -> Pixels:
+    """Numbers of the points that stand out of the noise and of their surface's fringe."""
+    model, amplitude = solver.model, solver.amplitude
+    significance = solver.measure_significance()
+    usual = [find_usual_brightness(amplitude[p], significance[p], limit) for p in model.parts]
+    least = MIN_BRIGHTNESS_FRACTION * np.array(usual)[model.surface]
+    return np.flatnonzero((significance > limit) & (amplitude > least))
 
 
 @limit_blas_threads()
 def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float = 0.0) -> Returns:
-    """List the points that stand out of the noise and of their neighbourhood, pixel by pixel.
+    """List the points of surfaces that stand out of the noise, and beside them the frames' returns where
+    no surface is, pixel by pixel.
 
     `centre_error_px`: how far off the calibration had each slit centre, see `tofclip.recovery.Shot`.
     """
-    model, solver = fit.model, fit.solver
+    model, amplitude = fit.model, fit.solver.amplitude
     camera = model.camera.replace(gains=model.state.gains)
-    distance, amplitude = model.distance, solver.amplitude
+    distance, others = model.distance, fit.others
     # 6. Points.
-    significance = solver.measure_significance()
-    limit, surface = detection.signal_to_noise, model.surface
-    usual = [find_usual_brightness(amplitude[p], significance[p], limit) for p in model.parts]
-    least = MIN_BRIGHTNESS_FRACTION * np.array(usual)[surface]
-    bright = np.flatnonzero((significance > limit) & (amplitude > least))
+    bright = choose_points(fit.solver, detection.signal_to_noise)
     # brightness is told as the reference view sees it
     intensity = model.shade(model.reference, amplitude) * distance**2
     time = 2 * distance / SPEED_OF_LIGHT
@@ -357,25 +416,38 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
         model.pixel[bright], time[bright], intensity[bright], camera.pulse_fwhm
     )
     chosen = bright[strong]
-    order, rank = rank_within_pixels(model.pixel[chosen], distance[chosen])
-    chosen = chosen[order]
 
     fitted = model.estimate_deviation(fit.refinement.covariances)
     moved = estimate_displacement(camera, centre_error_px)[:, np.newaxis] * model.compute_slopes()
-    deviation = np.hypot(np.hypot(fitted, fit.remainder[surface]), np.hypot(*moved))
+    deviation = np.hypot(np.hypot(fitted, fit.remainder[model.surface]), np.hypot(*moved))
     y, x = np.divmod(model.pixel[chosen], camera.image_shape[1])
-    measured = Returns(
-        y=y.astype(np.int32),
-        x=x.astype(np.int32),
-        range=distance[chosen],
-        intensity=intensity[chosen].astype(np.float32),
-        confidence=deviation[chosen].astype(np.float32),
-        return_number=(rank + 1).astype(np.uint8),
-        time=time[chosen],
-        camera=camera,
-        shear=np.asarray(camera.shear_at(distance[chosen])),
+    measured: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {
+        "y": (y, others.y),
+        "x": (x, others.x),
+        "range": (distance[chosen], others.range),
+        "intensity": (intensity[chosen], others.intensity),
+        "confidence": (deviation[chosen], others.confidence),
+        "time": (time[chosen], others.time),
+    }
+    columns: dict[str, NDArray[Any]] = {
+        name: np.concatenate(parts) for name, parts in measured.items()
+    }
+    pixel = columns["y"] * camera.image_shape[1] + columns["x"]
+    order, rank = rank_within_pixels(pixel.astype(np.intp), columns["range"])
+    columns = {name: column[order] for name, column in columns.items()}
+    return correct_returns(
+        Returns(
+            y=columns["y"].astype(np.int32),
+            x=columns["x"].astype(np.int32),
+            range=columns["range"],
+            intensity=columns["intensity"].astype(np.float32),
+            confidence=columns["confidence"].astype(np.float32),
+            return_number=(rank + 1).astype(np.uint8),
+            time=columns["time"],
+            camera=camera,
+            shear=np.asarray(camera.shear_at(columns["range"])),
+        )
     )
-    return correct_returns(measured)
 
 
 def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
@@ -427,7 +499,7 @@ class SurfaceRecovery:
     weight: float = 2.0
     iterations: int = 60
     start: Method = field(default_factory=lambda: Sparse(iterations=40))
-    detection: Detection = field(default_factory=Detection)
+    detection: Detection = field(default_factory=lambda: NO_SHARES)
     name = "surfaces"
 
     def __post_init__(self) -> None:
@@ -437,7 +509,7 @@ class SurfaceRecovery:
     @property
     def steps(self) -> int:
         """Iterations of FISTA at most."""
-        return START_ITERATIONS + MAX_REFINEMENTS * REFINEMENT_ITERATIONS + self.iterations
+        return 2 * START_ITERATIONS + MAX_REFINEMENTS * REFINEMENT_ITERATIONS + self.iterations
 
     def work(self, frames: int) -> int:
         """Frame iterations that are reported at most: the start's, and one per frame and iteration."""
@@ -477,7 +549,7 @@ class SurfaceRecovery:
         return self._make_frames(frames, fit, returns)
 
     def _make_frames(self, start: Frames, fit: SurfaceFit, returns: Returns) -> Frames:
-        model, amplitude, camera = fit.model, fit.solver.amplitude, returns.camera
+        model, amplitude, camera = fit.whole.model, fit.whole.amplitude, returns.camera
         # Rectified like every other method's: its residual is of measurements, not of raw pixels.
         rendered = model.render(amplitude)
         predicted, measured = (
@@ -495,7 +567,7 @@ class SurfaceRecovery:
             + self.iterations,
             "stopped_because": "iteration limit",
             "relative_residual": residual,
-            "surfaces": len(model.masks),
+            "surfaces": len(fit.model.masks),
         }
         return replace(
             start,

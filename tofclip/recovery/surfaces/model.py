@@ -27,7 +27,12 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera, estimate_dark_level
 from tofclip.lidar import compute_ray_directions
-from tofclip.recovery.surfaces.patches import MIN_BEHIND_FRACTION, FloatArray, SmoothBasis
+from tofclip.recovery.surfaces.patches import (
+    MIN_BEHIND_FRACTION,
+    FloatArray,
+    KnownBasis,
+    SmoothBasis,
+)
 from tofclip.recovery.surfaces.pulse import (
     EXTENT_SIGMAS,
     FWHM_PER_SIGMA,
@@ -215,6 +220,19 @@ class SurfaceModel:
         state = self.state.copy()
         state.coefficients = [state.coefficients[surface] for surface in left]
         state.shading = state.shading[left]
+        other.place(state)
+        return other
+
+    def add(self, masks: NDArray[np.bool_], inverse: FloatArray) -> SurfaceModel:
+        """Return the same surfaces, and behind them others whose inverse depths are known, 1/m; both
+        (surfaces, rows, columns).
+        """
+        other, state, hidden = copy.copy(self), self.state.copy(), self.behind
+        known = [KnownBasis(self.camera.image_shape, inverse=one) for one in inverse]
+        other._cover(np.concatenate([self.masks, masks]), [*self.bases, *known])
+        other.behind[: hidden.size] = hidden
+        state.coefficients += [np.ones(1)] * len(known)
+        state.shading = np.pad(state.shading, ((0, len(known)), (0, 0)))
         other.place(state)
         return other
 

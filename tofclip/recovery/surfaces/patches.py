@@ -40,7 +40,10 @@ FIT_ITERATIONS = 10
 RIDGE = 1e-9  # per return: those along a line say nothing about what is across it
 CURVATURE_PENALTY = 1e-3  # keeps small patches from bending
 KNOT_SPACING_PX, MAX_PIECES = 12, 8
-RETURNS_PER_UNKNOWN = 15.0  # of splines: they share their errors
+RETURNS_PER_UNKNOWN = 8.0  # of splines: they share their errors
+# Misfit of a patch, also over what is usual in the shot: of more it is no one surface, or one that is
+# turned so far that its returns are anywhere.
+ROUGH_BINS, ROUGH_RATIO = 1.5, 2.0
 BEND_BINS = 0.3  # misfit of a quadratic from which on splines are tried
 BENT_FRACTION = 0.6  # of a quadratic's misfit: splines are worth their freedom below
 EVIDENCE_ROUNDS = 2
@@ -107,6 +110,18 @@ def evaluate_monomials(pixels: Pixels, image_shape: tuple[int, int]) -> FloatArr
 
 
 @dataclass(frozen=True)
+class KnownBasis(SmoothBasis):
+    """One function: inverse depths that are known point by point, 1/m, (rows, columns)."""
+
+    inverse: FloatArray = field(default_factory=lambda: np.ones((0, 0)))
+    bending: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+
+    def evaluate(self, pixels: Pixels) -> FloatArray:
+        """Return the inverse depths at some pixels, (pixels, 1)."""
+        return self.inverse.ravel()[pixels, np.newaxis]
+
+
+@dataclass(frozen=True)
 class Patch:
     """Returns that lie on one smooth surface."""
 
@@ -150,6 +165,14 @@ def find_patches(
             first += 1
     patches.sort(key=lambda patch: -patch.pixels.size)
     return [_bend_where_needed(patch, bin_m) for patch in patches]
+
+
+def leave_out_rough(patches: list[Patch], bin_m: float) -> list[Patch]:
+    """Leave out patches whose returns scatter far about their surface."""
+    misfits = np.array([patch.compute_error() for patch in patches])
+    usual = np.repeat(misfits, [patch.pixels.size for patch in patches])
+    limit = max(ROUGH_BINS * bin_m, ROUGH_RATIO * float(np.median(usual)) if usual.size else 0.0)
+    return [patch for patch, misfit in zip(patches, misfits, strict=True) if misfit < limit]
 
 
 def _connect_neighbours(

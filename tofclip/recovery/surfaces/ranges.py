@@ -30,9 +30,9 @@ LEAST_VARIANCE = 1e-12  # of the largest one
 MAX_LEVERAGE = 0.9  # of a cluster: what it alone determines, its misfit says nothing about
 SMALLEST_STEP = 1 / 16  # of a Gauss-Newton step, halved until it lowers the misfit
 # Rows by which each view's part of a sweep that was found from the shot is off: root mean squares of
-# the demonstration. Later views and farther surfaces look alike, so that the mean over the views is
-# what all ranges have in common.
-SWEEP_SIGMAS = {"delays": 0.015, "stretches": 0.05}
+# scenes by a forward model of their own (0.015 and 0.05 in the demonstration). Later views and farther
+# surfaces look alike, so that the mean over the views is what all ranges have in common.
+SWEEP_SIGMAS = {"delays": 0.1, "stretches": 0.3}
 # Of the brightness behind another surface, between the views: less does not matter, or is noise.
 MIN_SHADING, SHADING_SIGMAS = 0.1, 3.0
 # Of conjugate gradients. Smooth changes of amplitude, which matter for a derivative, converge first,
