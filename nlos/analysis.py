@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.band import BAND_EDGE_LEVEL, VirtualPulse
+from nlos.band import VirtualPulse
 from nlos.capture import Capture
 from nlos.illumination import is_confocal
 from tofclip.arrays import to_numpy
@@ -331,7 +331,7 @@ def find_sampling_step(capture: Capture) -> float:
 def _band_reach(cycles: float) -> float:
     """Highest wavenumber of a virtual pulse's band, relative to its carrier."""
     pulse = VirtualPulse(1.0, cycles)
-    return 1 + math.sqrt(-2 * math.log(BAND_EDGE_LEVEL)) / (pulse.sigma * pulse.wavenumber)
+    return 1 + pulse.half_band / pulse.wavenumber
 
 
 def _sampling_limit(capture: Capture, sine: float = 1.0) -> float:

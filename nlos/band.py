@@ -18,12 +18,15 @@ from nlos.capture import TimeAxis
 from tofclip.errors import InputError, require_type
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 
-# The pulse's cycles fill its Gaussian envelope from -3 to +3 standard deviations.
+# The pulse's cycles fill its envelope from -3 to +3 standard deviations.
 ENVELOPE_SIGMAS = 3.0
-# Frequencies at which the pulse's spectrum is weaker than this, relative to its peak, are left out.
-BAND_EDGE_LEVEL = 0.01
-# Room for the pulse before and after the record, in standard deviations of its envelope.
-TAIL_SIGMAS = 4.0
+# Where the pulse's spectrum ends, in detunings times the envelope's standard deviation.
+BAND_EDGE = 3.15
+# Room for the pulse before and after the record, in standard deviations of its envelope: an edge of
+# the record leaves 1e-4 of itself beyond.
+TAIL_SIGMAS = 4.5
+# Of Kaiser's spectrum: near to the Gaussian, and its echoes weak enough for tolerances of 1e-3.
+KAISER = 9.46
 # Bins that are reduced to the few shapes of waves in the band before the Fourier transform.
 BLOCK_BINS = 64
 # Wall points that a thread filters at once.
@@ -39,10 +42,11 @@ SAMPLES_PER_WAVELENGTH = 64
 
 @dataclass(frozen=True)
 class VirtualPulse:
-    """A carrier of a given wavelength under a Gaussian envelope.
+    """A carrier of a given wavelength under an envelope that is Gaussian within 2 %.
 
-    The envelope over path length L is ``exp(-L^2 / (2 * sigma^2))`` with ``6 * sigma = cycles *
-    wavelength``: 99.7 % of it lie within the cycles.
+    The envelope over path length L is about ``exp(-L^2 / (2 * sigma^2))`` with ``6 * sigma = cycles
+    * wavelength``: 99.7 % of it lie within the cycles. Its spectrum is Kaiser's: a Gaussian that is
+    cut off as early rings ten times as strongly, which shows as echoes of a record's end.
 
     Parameters
     ----------
@@ -76,10 +80,35 @@ class VirtualPulse:
         """Standard deviation of the envelope, m of path."""
         return self.cycles * self.wavelength / (2 * ENVELOPE_SIGMAS)
 
+    @property
+    def half_band(self) -> float:
+        """Wavenumbers on either side of the carrier's that the pulse holds, rad/m."""
+        return BAND_EDGE / self.sigma
+
     def spectrum(self, wavenumbers: Any) -> NDArray[np.float64]:
-        """Strength of the pulse at wavenumbers in rad/m, 1 at the carrier."""
-        detuning = (np.asarray(wavenumbers, dtype=np.float64) - self.wavenumber) * self.sigma
-        return np.exp(-(detuning**2) / 2)
+        """Strength of the pulse at wavenumbers in rad/m, 1 at the carrier, 0 from the band's edges on.
+
+        J. F. Kaiser, R. W. Schafer, IEEE Trans. Acoust. Speech Signal Process. 28, 105 (1980).
+        """
+        from scipy.special import i0
+
+        inside, root = self._find_in_band(wavenumbers)
+        return np.where(inside, (i0(KAISER * root) - 1) / (i0(KAISER) - 1), 0.0)
+
+    def slope(self, wavenumbers: Any) -> NDArray[np.float64]:
+        """Change of the logarithm of `spectrum` with the wavenumber inside the band, m."""
+        from scipy.special import i0, i1
+
+        _, root = self._find_in_band(wavenumbers)
+        argument = KAISER * np.maximum(root, 1e-3)
+        detuning = np.asarray(wavenumbers, dtype=np.float64) - self.wavenumber
+        change: NDArray[np.float64] = i1(argument) / (argument * (i0(argument) - 1))
+        return -((KAISER / self.half_band) ** 2) * detuning * change
+
+    def _find_in_band(self, wavenumbers: Any) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Which wavenumbers are in the band, and ``sqrt(1 - u^2)`` of their places -1 < u < 1."""
+        place = (np.asarray(wavenumbers, dtype=np.float64) - self.wavenumber) / self.half_band
+        return np.abs(place) <= 1, np.sqrt(np.maximum(1 - place**2, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +171,7 @@ class Band:
         frequency, which have no phase.
         """
         indices = np.arange(1, (self.period_bins + 1) // 2)
-        return indices[
-            self.pulse.spectrum(indices * self._fundamental_wavenumber) >= BAND_EDGE_LEVEL
-        ]
+        return indices[self.pulse.spectrum(indices * self._fundamental_wavenumber) > 0]
 
     @property
     def _fundamental_wavenumber(self) -> float:

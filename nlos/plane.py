@@ -154,6 +154,14 @@ def _fade_out(axis: FloatArray, width: float) -> FloatArray:
     return faded
 
 
+# Least distance from wall to plane by which Fresnel zones are measured, in wavelengths: before a wall
+# that is closer, waves of noise and even backgrounds run along it. Measured with both.
+MIN_ZONE_GAP = 1.5
+# From so many zones on, that is, for tolerances below 3e-3, points of the plane are closer than half
+# the shortest wavelength: waves that fade before the nearest voxel would show as others.
+FINE_ZONES, FINE_SPACING = 3.0, 0.9
+
+
 def choose_virtual_plane(
     points: FloatArray,
     grid: Grid,
@@ -184,9 +192,10 @@ def choose_virtual_plane(
     behind = grid.z[grid.z > z]
     depth = gap + float(behind[0]) - z if behind.size else gap
     axes, fades = [], []
-    spacings = (shortest / 2, shortest / 2)
+    widest = shortest / 2 * (FINE_SPACING if zones > FINE_ZONES else 1.0)
+    spacings = (widest, widest)
     if wall is not None:
-        spacings = _fit_spacing(shortest / 2, wall.x), _fit_spacing(shortest / 2, wall.y)
+        spacings = _fit_spacing(widest, wall.x), _fit_spacing(widest, wall.y)
     for first, last, voxels, spacing in zip(
         low[:2], high[:2], (grid.x, grid.y), spacings, strict=True
     ):
@@ -194,7 +203,7 @@ def choose_virtual_plane(
         # Along a slanted way to voxels beside the wall, a zone's cut is longer: it grows with the
         # root of the way and is seen aslant.
         slant = 1 + (max(before, beyond) / depth) ** 2
-        room = zones * np.sqrt(middle * gap) * slant**0.75
+        room = zones * np.sqrt(middle * max(gap, MIN_ZONE_GAP * middle)) * slant**0.75
         start, stop = first - before * gap / depth - room, last + beyond * gap / depth + room
         count = max(1, int(np.ceil((stop - start) / spacing)))
         if wall is not None:
@@ -211,11 +220,11 @@ def _fit_spacing(widest: float, axis: FloatArray) -> float:
     return step * int(widest / step) if step <= widest else step / int(np.ceil(step / widest))
 
 
-# Of the longest path, what a window about wall points holds at least, and how much more for each
-# digit of the tolerance: where the plane stands close to the wall, crossings are wide beside their
-# distance. Measured with noise, which comes by all paths alike; errors of 1e-2 and 1e-3 ask for 0.7
-# and 0.9.
-MIN_WALL_FRACTION, WALL_FRACTION_PER_DIGIT = 0.3, 0.2
+# Of the longest path, what a window about wall points holds at least, for each digit of the tolerance:
+# where the plane stands close to the wall, crossings are wide beside their distance. Measured with
+# noise and even backgrounds, which come by all paths alike; errors of 1e-2 and 1e-3 ask for 0.7 and
+# 1.0.
+WALL_FRACTION_PER_DIGIT = 0.35
 # Of the fade towards the plane's rim, how wide a rim carries too little to be told from an image of
 # it a period away: at most, and how much less for each digit of the tolerance. Measured with noise;
 # none where the error is 1e-3.
@@ -255,7 +264,7 @@ class StraightPaths:
         # farthest voxels from the foremost points soonest.
         before = (plane.z - low[2]) / (first - low[2])
         behind = (last - plane.z) / (last - high[2])
-        room = MIN_WALL_FRACTION + WALL_FRACTION_PER_DIGIT * np.log10(1 / tolerance)
+        room = WALL_FRACTION_PER_DIGIT * np.log10(1 / tolerance)
         rim = RIM_FRACTION + RIM_FRACTION_PER_DIGIT * np.log10(tolerance)
         rim = np.clip(rim, 0, MAX_RIM_FRACTION)
         fade_y, fade_x = plane.fade

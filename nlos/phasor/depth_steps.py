@@ -114,7 +114,7 @@ IntArray = NDArray[np.int64]
 
 # Of the error allowed, what weak plane waves that are left out may hold. Half of it or less is an
 # error of voxels: the rest lies on the window's edge, beyond most of them.
-WAVES_ERROR_FRACTION = 0.8
+WAVES_ERROR_FRACTION = 0.5
 # Lateral wavenumbers nearer to each other are one, rad/m.
 LATERAL_ROUNDING = 1e-9
 

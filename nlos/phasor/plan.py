@@ -211,8 +211,7 @@ class ReciprocalPlan(PhasorPlan):
         longer = replace(plain, signal=plain.signal * device.put(paths.astype(np.float32)))
         band = self.swapped.band
         # i dG/dk / G of the pulse's weights G_k, whose phasors of L * H are not those of L * s
-        detuning = band.wavenumbers - band.pulse.wavenumber
-        slopes = device.put((-1j * band.pulse.sigma**2 * detuning).astype(np.complex64))
+        slopes = device.put((1j * band.pulse.slope(band.wavenumbers)).astype(np.complex64))
         total, without = self.swapped.zeros(), self.swapped.zeros()
         for number, one in enumerate(self.swapped.groups):
             plane_field = self.swapped.propagate_to_plane(number, plain, progress)
@@ -338,10 +337,10 @@ class PlanarRSD(WaveMethod):
     the band. For a confocal scan the wavenumber is doubled and the laser's wave drops out; several
     laser spots add up.
 
-    Errs by less than `tolerance` at depths of a wavelength and more where the record holds every
-    path by way of the voxels, in noise as well; nearer to the wall, waves that fade within a
-    wavelength are missing. Light or background that the record's end cuts off adds an error that no
-    tolerance makes smaller: 0.3 % for points on a background, 1.2 % for an even background alone.
+    Errs by less than `tolerance` at depths of a wavelength and more, of photons on any background
+    as well, whether or not the record holds every path; nearer to the wall, waves that fade within
+    a wavelength are missing. Below 1e-3 what the ends of a record cut off of a bright background is
+    not kept: its echoes are up to 3e-4 of it.
     Holds the wall's spectrum, 8 bytes per plane wave and frequency (60 MB for 128 x 128 points and
     120 frequencies), the volume, and per thread the waves of all terms of two depths (30 MB). A
     capture of another library's arrays is imaged in that library.
@@ -396,9 +395,9 @@ class PlanarRSD(WaveMethod):
 
 
 # Relative error of the image where one Fresnel zone has room on the virtual plane beside the
-# straight paths; that of n zones is n^3 times less. Measured, for fields that fade as
-# `VirtualPlane`'s.
-RIM_ERROR = 0.016
+# straight paths; that of n zones is n^2.1 times less. Measured with noise and even backgrounds, which a
+# wall's rim cuts off, for fields that fade as `VirtualPlane`'s.
+RIM_ERROR, RIM_POWER = 0.01, 0.47
 # Of the error allowed, what the virtual plane's rim, and the way from the wall to it, may take.
 RIM_ERROR_FRACTION, WALL_TO_PLANE_ERROR_FRACTION = 0.3, 0.6
 # Of all time, what the way from the wall to the plane takes, roughly.
@@ -415,12 +414,8 @@ class Hybrid(WaveMethod):
     `PlanarRSD` does. The image is that of `Backprojection`. Several laser spots add up; confocal
     scans run at doubled wavenumbers.
 
-    Errs by less than `tolerance` at voxels a wavelength and more from the wall where the record
-    holds every path by way of them, in noise as well unless the wall is planar; nearer to the wall,
-    waves that fade within a wavelength are missing. Of noise or an even background alone the error
-    before a planar wall is 3 to 4 times the tolerance (`PlanarRSD` keeps it). Light or background
-    that the record's end cuts off adds an error that no tolerance makes smaller: 0.1 to 0.6 % for
-    points on a background, 1.1 to 1.6 % for an even background alone.
+    Errs by less than `tolerance` at voxels a wavelength and more from the wall, of photons on any
+    background as well; see `PlanarRSD`.
 
     Voxels between wall and virtual plane are reached backwards, without the waves that left the
     plane's rim. A capture of another library's arrays is imaged in that library.
@@ -467,7 +462,7 @@ class Hybrid(WaveMethod):
         if self.plane_z is not None:
             require_in_front(self.plane_z, points)
         waves = build_waves(group, band, continued=True)
-        zones = (RIM_ERROR / (RIM_ERROR_FRACTION * self.tolerance)) ** (1 / 3)
+        zones = (RIM_ERROR / (RIM_ERROR_FRACTION * self.tolerance)) ** RIM_POWER
         lattice = WallLattice.find(points)
         plane = choose_virtual_plane(points, grid, waves, zones, self.plane_z, lattice)
         paths = StraightPaths.find(points, plane, grid, self.tolerance)

@@ -62,7 +62,7 @@ PREPARATION_S, TERM_S, LATTICE_POINT_S, DIRECT_TERM_S = 0.02, 2e-5, 3e-9, 2e-10
 POINT_S, WAVE_S = 2.5e-8, 9e-9
 # Of the error allowed, what weak plane waves that are left out may hold: most of it passes beside
 # all voxels, or is on the edge of the window. Measured with noise.
-WAVES_ERROR_FRACTION = 2.0
+WAVES_ERROR_FRACTION = 1.5
 
 
 @dataclass(frozen=True, eq=False)

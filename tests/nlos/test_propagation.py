@@ -335,7 +335,7 @@ def test_the_field_fades_towards_the_rim_beside_the_straight_paths_only() -> Non
     np.testing.assert_allclose(inside, 1, rtol=1e-6)
     assert weights[0].max() < 0.05  # half a step from where nothing is left
     # Voxels beside the wall along x ask for more room there than along y.
-    assert plane.fade[1] > plane.fade[0] == pytest.approx(0.75 * 2 * 0.07)
+    assert plane.fade[1] > plane.fade[0] == pytest.approx(0.75 * 2 * 0.07 * np.sqrt(1.5))
 
 
 NEAR = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.8, 9), [0.6, 0.7, 0.9])

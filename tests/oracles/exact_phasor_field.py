@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse
-from nlos.capture import Capture
+from nlos.capture import Capture, TimeAxis
 from nlos.method import require_imageable
 from nlos.volume import Grid, Volume
 
@@ -20,7 +20,7 @@ def compute_exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse
     """Sum ``P_k(r_p) * exp(1j * k * (|r_L - r| + |r - r_p|)) / |r - r_p|`` over the band and the
     wall.
 
-    Costs one complex exponential per voxel, wall point and frequency, plus one each.
+    The record is followed by silence. Costs one complex exponential per voxel, wall point and frequency, plus one each.
 
     Parameters
     ----------
@@ -38,8 +38,8 @@ def compute_exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse
     InputError
         An empty band, a single wall point, a grid behind the wall, or one that is too large.
     """
-    band = Band(pulse, capture.axis)
     require_imageable(capture, grid)
+    band = Band(pulse, follow_by_silence(capture, grid))
     phasors = band.compute_phasors(capture.traces().astype(np.float64))
     z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
     voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
@@ -49,6 +49,17 @@ def compute_exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse
         some = slice(first, first + count)
         field[some] = _sum_over_wall(capture, voxels[some], band.wavenumbers, phasors)
     return Volume(field.reshape(grid.shape), grid, capture.provenance)
+
+
+def follow_by_silence(capture: Capture, grid: Grid) -> TimeAxis:
+    """The record's axis and twice as much again, beyond every path: evenly spaced frequencies repeat a
+    record with their period, and what was not recorded is dark.
+    """
+    corners = np.array([(axis[0], axis[-1]) for axis in (grid.x, grid.y, grid.z)])
+    ends = np.concatenate([capture.points, capture.lasers, corners.T])
+    longest = 2 * float(np.linalg.norm(np.ptp(ends, axis=0)))
+    bins = max(capture.axis.bins, int(longest / capture.axis.spacing))
+    return TimeAxis(2 * bins, capture.axis.bin_width, capture.axis.start)
 
 
 def _sum_over_wall(
