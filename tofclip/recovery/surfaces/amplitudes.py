@@ -17,6 +17,7 @@ NORM_ITERATIONS, FURTHER_NORM_ITERATIONS = 10, 2
 NORM_MARGIN = 1.1
 EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
+MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
 TINY = float(np.finfo(np.float32).tiny)
 
 
@@ -58,12 +59,25 @@ class AmplitudeSolver:
         other._dual, other._direction = self._dual[left], directions[masks]
         return other
 
-    def measure_significance(self) -> Image:
+    def estimate_local_variance(self) -> Image:
+        """What is left of the measurements about each, (rows, columns), in units of what the weights
+        expect, at least what is left of the shot: noise, and beside bright light what the model does
+        not explain of it.
+        """
+        model = self.model
+        rest = model.weights * (model.image - model.render(self.amplitude)) ** 2
+        valid = (model.weights > 0).astype(np.float32)
+        around, seen = (scipy.ndimage.gaussian_filter(one, MISFIT_PX) for one in (rest, valid))
+        return np.asarray(np.maximum(around / np.maximum(seen, TINY), np.float32(self.variance)))
+
+    def measure_significance(self, variance: Image | None = None) -> Image:
         """By how many standard deviations each point's amplitude is above nothing, (points,). A pixel
         alone is hardly above the photons' noise: its neighbours on the surface, which the prior ties
-        to it, count as well.
+        to it, count as well. `variance`: of `estimate_local_variance`, by default the own one.
         """
-        information = self.model.gather(self.model.weights, squared=True)
+        if variance is None:
+            variance = self.estimate_local_variance()
+        information = self.model.gather(self.model.weights / variance, squared=True)
         found = np.zeros_like(information)
         for mask, box, part in zip(self.model.masks, self._boxes, self.model.parts, strict=True):
             lit, pictures = mask[box], np.zeros((2, *mask[box].shape), np.float32)
@@ -72,7 +86,7 @@ class AmplitudeSolver:
             pictures[:, lit] = information[part], self.amplitude[part]
             found[part] = pool_information(*pictures)[lit]
         # running sums may leave a rounding error below nothing
-        return np.asarray(self.amplitude * np.sqrt(np.maximum(found, 0) / self.variance))
+        return np.asarray(self.amplitude * np.sqrt(np.maximum(found, 0)))
 
     def run(self, iterations: int, progress: Progress, frames: int) -> None:
         """Take some steps; `progress` hears of `frames` after each."""

@@ -14,11 +14,13 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera, measure
+from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar import Detection, compute_ray_directions, depth
 from tofclip.lidar.range_calibration import correct_returns
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.model import (
+    SMOOTHING_PX,
     SurfaceModel,
     SurfaceState,
     compare_smoothed,
@@ -69,9 +71,8 @@ SLOPE_WINDOW_PX = 7
 
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 
-# Bins in range, and pixels, within which frames' returns and surfaces are the same; and by how many
-# standard deviations the shot must show light of others.
-NEAR_BINS, NEAR_PX, OTHER_SIGMAS = 7.0, 1.5, 10.0
+# Bins in range, and pixels, within which frames' returns and surfaces are the same.
+NEAR_BINS, NEAR_PX = 7.0, 1.5
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
 MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
@@ -194,8 +195,10 @@ def find_others(
     begin = np.concatenate([solver.amplitude, np.zeros(pixel.size, np.float32)])
     together = AmplitudeSolver(whole, begin, solver.weight)
     together.run(START_ITERATIONS, progress, count)
-    significance = together.measure_significance()
-    shown = significance > OTHER_SIGMAS
+    # what no surface explains is judged by what they leave, not by what takes it up
+    variance = solver.estimate_local_variance()
+    sure = find_sure_level(solver.measure_significance(variance))
+    shown = together.measure_significance(variance) > sure
     shown[: model.surface.size] = True
     together.amplitude = np.where(shown, together.amplitude, np.float32(0))
     kept = np.zeros(masks.shape, bool)
@@ -260,10 +263,17 @@ def measure_slopes(distance: Image) -> tuple[FloatArray, FloatArray]:
 
 def require_explained(solver: AmplitudeSolver, frames: Frames, streak: Streak) -> None:
     """Refuse a shot that surfaces explain neither well nor as well as its frames do."""
-    unexplained = solver.model.unexplained(solver.amplitude)
-    if unexplained <= MAX_UNEXPLAINED:
+    model = solver.model
+    unexplained = model.unexplained(solver.amplitude)
+    noise = MeasurementNoise.from_figures(frames.figures)
+    dark = 0.0
+    if noise is not None:
+        variance = float(np.sum(noise.compute_variance(np.maximum(model.image, 0))))
+        signal = np.linalg.norm(scipy.ndimage.gaussian_filter(model.image, SMOOTHING_PX))
+        # what is left of the variance of neighbours' mean
+        dark = float(np.sqrt(variance / (4 * np.pi)) / SMOOTHING_PX / max(signal, LEAST_COUNT))
+    if unexplained**2 <= MAX_UNEXPLAINED**2 + dark**2:
         return
-    # In little light noise is left over however right the surfaces are, and by frames as well.
     camera = frames.camera
     seen = measure(streak.counts, streak.saturated, camera)
     predicted = np.zeros_like(seen.values)
@@ -272,6 +282,11 @@ def require_explained(solver: AmplitudeSolver, frames: Frames, streak: Streak) -
         pictures = np.ascontiguousarray(np.moveaxis(frames.values[own], 0, -1))
         predicted[:, own] = camera.operator(float(shear))(pictures)
     by_frames = compare_smoothed(predicted, seen.values, seen.valid)
+    if unexplained > by_frames and dark > MAX_UNEXPLAINED:
+        raise InputError(
+            f"noise is {100 * dark:.0f} % of this shot's signal: it is too dark for surfaces; "
+            'choose `method="tv"`, or average shots'
+        )
     if unexplained > by_frames:
         raise _refuse(
             f"surfaces leave {100 * unexplained:.0f} % of the signal unexplained, and frames "
@@ -316,15 +331,20 @@ def straighten_surfaces(
     return kept, replace(after, free=None)
 
 
+def find_sure_level(significance: Image) -> float:
+    """Standard deviations from which on a point is certain in a shot."""
+    lit = significance[significance > LIT_SIGMAS]
+    # In little light no point is that far out of the noise, but some are further than others.
+    upper = float(np.quantile(lit, UPPER_QUANTILE)) if lit.size else np.inf
+    return min(SURE_SIGMAS, max(LIT_SIGMAS, upper / 2))
+
+
 def keep_lit(solver: AmplitudeSolver) -> AmplitudeSolver:
     """Leave out the points of surfaces that are dark and far from any that is not, and surfaces too few
     of whose points are sure, as what frames spread about bright ones.
     """
     model, significance = solver.model, solver.measure_significance()
-    lit = significance[significance > LIT_SIGMAS]
-    # In little light no point is that far out of the noise, but some are further than others.
-    upper = float(np.quantile(lit, UPPER_QUANTILE)) if lit.size else np.inf
-    sure = significance > min(SURE_SIGMAS, max(LIT_SIGMAS, upper / 2))
+    sure = significance > find_sure_level(significance)
     kept = np.zeros_like(model.masks)
     near = np.ones((2 * LIT_MARGIN_PX + 1,) * 2)
     for surface, (part, mask) in enumerate(zip(model.parts, model.masks, strict=True)):
@@ -420,6 +440,7 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
     fitted = model.estimate_deviation(fit.refinement.covariances)
     moved = estimate_displacement(camera, centre_error_px)[:, np.newaxis] * model.compute_slopes()
     deviation = np.hypot(np.hypot(fitted, fit.remainder[model.surface]), np.hypot(*moved))
+    deviation = np.hypot(deviation, model.estimate_sweep_error())
     y, x = np.divmod(model.pixel[chosen], camera.image_shape[1])
     measured: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {
         "y": (y, others.y),

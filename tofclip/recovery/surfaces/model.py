@@ -52,6 +52,9 @@ SMOOTHING_PX = 2.0
 SLIT_PIXELS, SUBROWS = 4, 3
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
+SWEEP_LEFT_FRACTION = (
+    0.6  # of the corrections to a sweep, which are lines: what is left of its shape
+)
 MIN_BEHIND_PX = 100  # of a surface, seen through another; fewer are a rim, of which each has a part
 FRONT_FRACTION = 0.5  # of a surface's usual brightness: it ends where its rim is darker
 
@@ -375,6 +378,15 @@ class SurfaceModel:
         variance = np.concatenate([np.einsum("pi,ij,pj->p", m, c, m) for m, c in known])
         # range = length / inverse depth
         return np.asarray(self.distance**2 / self.ray_length * np.sqrt(variance))
+
+    def estimate_sweep_error(self) -> float:
+        """Return by how much all ranges may be off, m, because the sweep is of another shape than is
+        solved for: a part of what the fit had to correct of it.
+        """
+        # a height is even between -1/2 and 1/2
+        corrected = np.mean(self.state.delays**2 + self.state.stretches**2 / 12)
+        rows = SWEEP_LEFT_FRACTION * float(np.sqrt(corrected))
+        return rows * self.bin_width * SPEED_OF_LIGHT / 2
 
     def compute_slopes(self) -> FloatArray:
         """Return how steeply the ranges change along columns and rows, (2, points), m per pixel."""
