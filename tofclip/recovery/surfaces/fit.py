@@ -198,7 +198,7 @@ def find_others(
     # what no surface explains is judged by what they leave, not by what takes it up
     variance = solver.estimate_local_variance()
     sure = find_sure_level(solver.measure_significance(variance))
-    shown = together.measure_significance(variance) > sure
+    shown = together.measure_significance(variance) > sure / 2
     shown[: model.surface.size] = True
     together.amplitude = np.where(shown, together.amplitude, np.float32(0))
     kept = np.zeros(masks.shape, bool)
