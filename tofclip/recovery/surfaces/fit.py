@@ -449,6 +449,8 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
         "intensity": (intensity[chosen], others.intensity),
         "confidence": (deviation[chosen], others.confidence),
         "time": (time[chosen], others.time),
+        # a surface's points are not judged one by one
+        "false_alarm": (np.full(chosen.size, np.nan), others.false_alarm),
     }
     columns: dict[str, NDArray[Any]] = {
         name: np.concatenate(parts) for name, parts in measured.items()
@@ -467,6 +469,7 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
             time=columns["time"],
             camera=camera,
             shear=np.asarray(camera.shear_at(columns["range"])),
+            false_alarm=columns["false_alarm"],
         )
     )
 
