@@ -184,7 +184,9 @@ def measure_face(folder: Path) -> dict[str, float]:
     found = estimate_surface(PhotonImage.from_events(pixel, times, cells.shape, 8e-12))
     error = found.range[head] - truth[head] * SPEED_OF_LIGHT / 2 * 8e-12
     error -= np.median(error)
-    ratio = error / found.range_sigma[head]
+    # The exposure's own errors: two halves of these photons, pooled over 8 x 8 pixels, both lie so
+    # far off it, and 0.2 mm off the surface that is found.
+    ratio = error / np.hypot(found.range_sigma[head], 3.2e-3)
     return {
         "share_within_12_mm": float(np.mean(np.abs(error) < 12e-3)),
         "rms_error_m": float(np.sqrt(np.mean(error**2))),

@@ -159,9 +159,11 @@ def test_a_recorded_face_is_as_its_long_exposure_shows(shared_data) -> None:
     )
     error = found.range[head] - truth[head] * SPEED_OF_LIGHT / 2 * 8e-12
     error -= np.median(error)
-    assert np.mean(np.abs(error) < 12e-3) >= 0.965
+    assert np.mean(np.abs(error) < 12e-3) >= 0.97
     assert np.sqrt(np.mean(error**2)) <= 37e-3
-    assert 0.9 <= compute_robust_z(error, found.range_sigma[head]) <= 1.15
+    # The long exposure has errors of its own: two halves of these photons, pooled over 8 x 8 pixels,
+    # both lie 3.2 mm off it, and 0.2 mm off the surface that is found.
+    assert 0.8 <= compute_robust_z(error, np.hypot(found.range_sigma[head], 3.2e-3)) <= 1.15
 
 
 def test_two_layers_are_both_found_and_none_twice() -> None:
@@ -211,9 +213,9 @@ def test_times_in_steps_of_the_counter_are_no_pulse() -> None:
     error = found.range / (SPEED_OF_LIGHT / 2 * 1e-12) - surface
     near = np.abs(error) < 400
     assert near.mean() > 0.99
-    # a learnt response is known to an eighth of its width
     assert np.sqrt(np.mean(error[near] ** 2)) < 400 / 8
-    assert np.median(found.range_sigma) > SPEED_OF_LIGHT / 2 * 1e-12 * 400 / 10
+    sigma = found.range_sigma / (SPEED_OF_LIGHT / 2 * 1e-12)
+    assert 0.7 < compute_robust_z(error[near], sigma[near]) < 1.3
     assert error.std() < 2000
 
 

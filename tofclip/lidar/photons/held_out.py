@@ -17,11 +17,11 @@ from tofclip.lidar.photons.matching import PLANE_ROUNDS, TRIAL_ROUNDS, fit_surfa
 from tofclip.lidar.photons.scene import BinnedResponse, Scene, learn_response
 
 REACHES_PX = (1, 2, 3, 4, 6, 8)
-RESPONSE_ROUNDS, RESPONSE_REACH_PX = 3, 3
+RESPONSE_ROUNDS, RESPONSE_REACH_PX = 4, 3
 # Log-likelihood, and its standard deviations, by which a learnt response has to beat a given one;
 # its free shape alone gains some hundred.
 MIN_LEARNT_GAIN, MIN_LEARNT_SIGNIFICANCE = 500.0, 5.0
-SIGNAL_POOL_PX = 5
+SIGNAL_POOL_PX, MIN_SIGNAL_SHARE = 5, 0.002
 WIDER_POOLS_PX = (SIGNAL_POOL_PX, 9, 17, 33, 65)
 # Log odds in a unit of a label's margin, and how far (in its logarithm) scenes differ in it: eight
 # paths count what they share several times. In 16 simulated scenes of 0.7 to 20 signal and 2 to 200
@@ -58,8 +58,9 @@ def weigh_evidence(
     )
     # Background within the response's length, as dense as outside of it.
     outside = np.maximum(total - pooled, 0) * length / max(train.bins - length, 1)
-    # Neither certainty is ever claimed: one photon against it would decide for the pixel.
-    signal = np.clip((pooled - outside) / np.maximum(total, 1e-9), 0.02, 0.98)
+    # That all is signal is never claimed: one photon against it would decide for the pixel. More
+    # than there is would count against every surface in a hundred times as much background.
+    signal = np.clip((pooled - outside) / np.maximum(total, 1e-9), MIN_SIGNAL_SHARE, 0.98)
     evidence = np.empty(flat.size)
     sampled = response.density * train.bins, response.start, response.step, signal.ravel()
     kernels.sum_evidence(test.offsets, test.bin, test.count, flat, *sampled, evidence)

@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
@@ -224,13 +225,48 @@ TOTAL_RATIO = 2.0
 USUAL_QUANTILE = 0.9  # of the pixels: up to a tenth of them may be hot
 SAMPLED_PIXELS = 4096
 NEIGHBOUR_BINS = 2  # by which the same surface may lie earlier or later in the next pixel
+# Stretches of the time axis, of which the fullest quarter may hold returns; how far beyond that of its
+# neighbours a pixel's light in the others, or below that of its neighbours all its light, has to be,
+# beside six standard deviations; and which neighbours, as up to two of them may be hot, or dead.
+STRETCHES, FAULT_RATIO, FAULT_SIGMAS, NEIGHBOUR_RANK = 16, 3.0, 6.0, 2
 
 
 def find_hot_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
-    """Say which pixels, (rows, columns), have one bin far beyond what the others count. Pairs of
-    photons grow with the square of their number: one such pixel would say more about the pulse than
-    all others together. They are found before anything is learnt.
+    """Say which pixels, (rows, columns), count what no light makes: far more than their neighbours
+    at all times, or in one bin. Pairs of photons grow with the square of their number: one such pixel
+    would say more about the pulse than all others together. They are found before anything is learnt.
     """
+    return _find_peaked_pixels(photons) | _find_pixels_hot_throughout(photons)
+
+
+def find_dim_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
+    """Say which pixels, (rows, columns), count far less than their neighbours, dead ones among them."""
+    light = photons.photons_per_pixel
+    around = _rank_neighbours(light, NEIGHBOUR_RANK)
+    return np.asarray(FAULT_RATIO * light + FAULT_SIGMAS * np.sqrt(light + 4) < around)
+
+
+def _find_pixels_hot_throughout(photons: PhotonImage) -> NDArray[np.bool_]:
+    number = min(STRETCHES, photons.bins)
+    stretch = np.clip(photons.bin * (number / photons.bins), 0, number - 1).astype(np.int64)
+    pixels = photons.offsets.size - 1
+    light = np.bincount(photons.pixel * number + stretch, photons.count, pixels * number)
+    quiet = np.sort(light.reshape(pixels, number), axis=1)[:, : number - number // 4].sum(axis=1)
+    quiet = quiet.reshape(photons.image_shape)
+    around = _rank_neighbours(quiet, -1 - NEIGHBOUR_RANK)
+    return np.asarray(quiet > FAULT_RATIO * around + FAULT_SIGMAS * np.sqrt(around + 4))
+
+
+def _rank_neighbours(values: FloatArray, rank: int) -> FloatArray:
+    """Value of that rank among each pixel's eight neighbours, of a line the eight along it."""
+    footprint = np.ones(
+        (3, 3) if min(values.shape) > 1 else np.where(np.array(values.shape) > 1, 9, 1)
+    )
+    footprint[footprint.shape[0] // 2, footprint.shape[1] // 2] = 0
+    return np.asarray(scipy.ndimage.rank_filter(values, rank, footprint=footprint, mode="mirror"))
+
+
+def _find_peaked_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
     rows, columns = photons.image_shape
     hot, table = np.zeros((rows, columns), np.bool_), photons.table
     total = photons.photons_per_pixel.ravel()

@@ -175,7 +175,7 @@ def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int, width: flo
     apart = (fitted[..., 0] - nested[..., 0]) ** 2
     wide, narrow = fitted[..., 1] ** 2, nested[..., 1] ** 2
     # A border that moved is not a bend.
-    known = (np.maximum(wide, narrow) < width**2) & (apart < 25 * narrow)
+    known = (np.maximum(wide, narrow) < width**2) & (apart < 16 * narrow)
     excess = np.zeros(apart.shape)
     excess[known] = (apart - narrow)[known] + wide[known]
     number, total = (

@@ -41,7 +41,7 @@ from tofclip.units import PICOSECOND
 MAX_LAG_FRACTION = 0.25  # of the time axis: photons further apart than this are not of one pulse
 MIN_LAG_SIGNIFICANCE = 8.0  # standard deviations of pairs beyond those that meet by chance
 SAMPLES_PER_WIDTH = 24
-SMOOTHING_WIDTHS = 1 / 12
+SMOOTHING_WIDTHS = 1 / 6
 # Full widths before and after the surface in which the response is learnt (tails are long), and
 # where only background is expected.
 EXTENT_WIDTHS, BACKGROUND_WIDTHS = (-3.0, 9.0), (-8.0, -4.0)
@@ -50,6 +50,7 @@ MIN_PULSE_S = 1e-12  # superconducting counters, the quickest there are, spread 
 # such bins with how many photons each say that the bins between them stay empty for a reason.
 STEP_QUANTILE, MIN_STEP_BINS, MIN_PHOTONS_PER_STEP = 0.05, 64, 4.0
 DENSITY_FLOOR = 1e-4  # of the peak: no instant is impossible, so that no single photon decides
+SLOPE_FLOOR = 0.03  # of the peak: how bright the response has to be for its slope to be known
 MIN_SIGNAL_PHOTONS = 0.05
 BACKGROUND_QUANTILE, BACKGROUND_GROUPS = 0.2, 64
 MIN_BACKGROUND_PHOTONS = 1.0  # of the whole picture: no background is exactly zero
@@ -85,8 +86,11 @@ class BinnedResponse:
 
     @cached_property
     def log_slope(self) -> FloatArray:
-        """Minus the slope of the density's logarithm at each sample, per bin."""
-        return np.asarray(-np.gradient(np.log(self.density), self.step))
+        """Minus the slope of the density's logarithm at each sample, per bin; where the response is
+        faint, chance in what was learnt is not taken for a slope.
+        """
+        faint = SLOPE_FLOOR * self.density.max()
+        return np.asarray(-np.gradient(self.density, self.step) / (self.density + faint))
 
     def coarse_shares(self, coarse: int) -> tuple[FloatArray, int]:
         """Share of the photons in each of the coarse bins, of so many bins, around the one that holds
@@ -220,18 +224,27 @@ def learn_response(
     photons = np.bincount(number[known] - early[0], count[known], last - early[0] + 1)
     # Before the pulse there is only background; behind it its own tail would count as one.
     level = float(np.mean(photons[: early[1] - early[0]]))
-    shape = scipy.ndimage.gaussian_filter1d(photons, SMOOTHING_WIDTHS * SAMPLES_PER_WIDTH)[
-        first - early[0] :
-    ]
-    # A density is not negative, whatever noise does to the tail.
-    shape = np.maximum(shape - level, 0.0)
-    if not shape.any():
-        raise InputError("there is no light around the surface to learn the pulse from")
-    peak = int(np.argmax(shape))
-    before, here, after = np.pad(shape, 1, "edge")[peak : peak + 3]
-    # Vertex of the parabola through the highest sample and its neighbours.
-    bend = 2 * here - before - after
-    part = float((after - before) / (2 * bend)) if bend > 0 else 0.0
+    start, width_seen = first - early[0], float(SAMPLES_PER_WIDTH) / 2
+    # As smooth as its own width allows, which is not known before it has been smoothed once.
+    for _ in range(2):
+        shape = scipy.ndimage.gaussian_filter1d(photons, SMOOTHING_WIDTHS * width_seen)[start:]
+        # A density is not negative, whatever noise does to the tail.
+        shape = np.maximum(shape - level, 0.0)
+        if not shape.any():
+            raise InputError("there is no light around the surface to learn the pulse from")
+        peak = int(np.argmax(shape))
+        low = np.flatnonzero(np.pad(2 * shape <= shape[peak], 1, constant_values=True)) - 1
+        after = int(np.searchsorted(low, peak))
+        near = np.arange(low[after - 1] + 1, low[after])
+        width_seen = float(near.size)
+    # Vertex of the parabola through the logarithm of all that is above half of the peak, each sample
+    # weighing as its photons: the highest sample alone moves by an eighth of the width with chance.
+    part = 0.0
+    if near.size > 2:
+        weight = np.sqrt(shape[near])
+        bend, slope, _ = np.polyfit(near - peak, np.log(shape[near]), 2, w=weight)
+        vertex = -slope / (2 * bend) if bend < 0 else 0.0
+        part = float(np.clip(vertex, near[0] - peak, near[-1] - peak))
     return Pulse(shape, step * bin_width, peak + part), (first + peak + part) * step
 
 

@@ -27,7 +27,7 @@ from tofclip.lidar.photons.held_out import (
     learn_scene,
     weigh_evidence,
 )
-from tofclip.lidar.photons.image import FloatArray, PhotonImage, SurfaceImage
+from tofclip.lidar.photons.image import FloatArray, PhotonImage, SurfaceImage, find_dim_pixels
 from tofclip.lidar.photons.matching import (
     LabelAxis,
     choose_label_axis,
@@ -41,12 +41,12 @@ from tofclip.lidar.pulse import Pulse
 from tofclip.units import SPEED_OF_LIGHT
 
 HELD_OUT_FRACTION = 0.25
-SLOPE_COSTS = (1.5, 4.0, 10.0)  # log-likelihood that a change by one label has to bring
-JUMP_COST_RATIO = 7.0  # any larger change costs this many times as much
+SLOPE_COSTS = (0.5, 2.0, 10.0)  # log-likelihood that a change by one label has to bring
+JUMP_COST_RATIO = 9.0  # any larger change costs this many times as much
 
-# Standard deviation of where the surface lies in a response that was learnt from the scene: its shape
-# varies from surface to surface with tilt, material and brightness. One that is given is exact.
-LEARNT_RESPONSE_SIGMA_WIDTHS = 1 / 8
+# How well it is known where in a response that was learnt from the scene its surface lies: one offset
+# for the whole picture, which `settings` state and no pixel's deviation holds.
+LEARNT_RESPONSE_SIGMA_WIDTHS = 1 / 30
 MIN_EXPLAINED_DENSITY = 0.003  # of the response's peak: where it is brighter photons are explained
 # That the background alone shows as many photons at a further surface, in the pixel and in the nine
 # pixels around it.
@@ -94,6 +94,7 @@ def estimate_surface(
     Memory: at most 2 GiB beside the photons.
     """
     report = (lambda _: None) if progress is None else progress
+    dim = find_dim_pixels(photons)
     photons, start, hot = prepare_photons(photons, pulse)
     scene = Scene.start(photons, start)
     axis = choose_label_axis(photons, scene)
@@ -129,8 +130,8 @@ def estimate_surface(
     to_probability = calibrate_outliers(test, train, training, surface, margin)
     report(0.8)
 
-    systematic = LEARNT_RESPONSE_SIGMA_WIDTHS * scene.response.width if learnt is not None else 0.0
-    plan = SurfacePlan(axis, costs, reach, systematic, to_probability)
+    common = LEARNT_RESPONSE_SIGMA_WIDTHS * scene.response.width if learnt is not None else 0.0
+    plan = SurfacePlan(axis, costs, reach, to_probability)
     layers = [plan.locate(photons, scene)]
     rest = photons
     # A surface goes on where another one stops: behind an edge the second of a pixel may be found
@@ -154,8 +155,9 @@ def estimate_surface(
         "slope_cost": slope_cost,
         "jump_cost": costs[1],
         "reach_px": reach,
-        "response_sigma_m": systematic * bin_m,
+        "response_sigma_m": common * bin_m,
         "hot_pixels": int(hot.sum()),
+        "dim_pixels": int(dim.sum()),
     }
     stack = stack * [bin_m, bin_m, 1, 1]
     return SurfaceImage.from_layers(stack, scene.response.pulse, settings, hot)
@@ -168,7 +170,6 @@ class SurfacePlan:
     axis: LabelAxis
     costs: tuple[float, float]  # of a slope and of a jump, see `match_labels`
     reach: int  # see `fit_surface`
-    systematic: float  # standard deviation that no photons reduce, in bins
     to_probability: Callable[[NDArray[np.float32]], FloatArray]  # see `calibrate_outliers`
 
     def locate(self, photons: PhotonImage, scene: Scene) -> FloatArray:
@@ -183,7 +184,7 @@ class SurfacePlan:
         # Where no photon is near, the label is all there is.
         counted = np.minimum(fitted[..., 1], scene.response.width)
         bias = estimate_bias(fitted, nested, self.reach, scene.response.width)
-        sigma = np.sqrt(counted**2 + bias + self.systematic**2)
+        sigma = np.sqrt(counted**2 + bias)
         return np.stack([fitted[..., 0], sigma, fitted[..., 2], self.to_probability(margin)], -1)
 
 

@@ -1,0 +1,128 @@
+"""Counts of a photon-counting camera from the physics, apart from the program's own code: rates of
+bins, then chance, cycle by cycle where the detector goes blind.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import ndtr
+from scipy.stats import exponnorm
+
+from tofclip.units import SPEED_OF_LIGHT
+
+BIN = 100e-12
+FWHM = 300e-12
+BIN_M = SPEED_OF_LIGHT / 2 * BIN
+
+
+def make_surface(shape: tuple[int, int] = (80, 80), bins: int = 512) -> np.ndarray:
+    """Slanted wall, ball, box and poles; arrival in bins."""
+    rows, columns = shape
+    y, x = np.mgrid[:rows, :columns] / np.maximum(shape, 2).reshape(2, 1, 1)
+    surface = bins * (0.62 + 0.06 * x + 0.03 * y)
+    near = np.hypot(y - 0.35, x - 0.32) / 0.24
+    ball = bins * (0.42 - 0.05 * np.sqrt(np.maximum(1 - near**2, 0)))
+    surface = np.where(near < 1, ball, surface)
+    box = (np.abs(x - 0.75) < 0.13) & (np.abs(y - 0.6) < 0.2)
+    surface = np.where(box, bins * (0.3 + 0.08 * y), surface)
+    for place in (0.1, 0.55, 0.93):
+        surface = np.where(
+            (np.abs(x - place) < 0.02) & (y > 0.2), bins * (0.2 + 0.1 * place), surface
+        )
+    return surface
+
+
+def make_art(shape: tuple[int, int] = (120, 140), bins: int = 512, seed: int = 7) -> np.ndarray:
+    """Many things before each other, with steep edges: discs, bars and slats at depths of their own."""
+    noise = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    surface = bins * (0.8 + 0.05 * x / shape[1])
+    for level in np.linspace(0.72, 0.2, 26):
+        cy, cx = noise.uniform(0, shape[0]), noise.uniform(0, shape[1])
+        size, turn = noise.uniform(3, 18), noise.uniform(0, np.pi)
+        u = (x - cx) * np.cos(turn) + (y - cy) * np.sin(turn)
+        v = (y - cy) * np.cos(turn) - (x - cx) * np.sin(turn)
+        kind = noise.integers(3)
+        inside = (
+            np.hypot(u, v) < size,
+            (np.abs(u) < size) & (np.abs(v) < 0.5 * size),
+            (np.abs(u) < 2.5 * size) & (np.abs(v) < 2.5),
+        )[kind]
+        surface = np.where(inside, bins * (level + noise.uniform(-0.001, 0.001) * u), surface)
+    return surface
+
+
+def find_edges(surface: np.ndarray, step: float = 6.0) -> np.ndarray:
+    """Pixels of which a neighbour lies further off than `step` bins."""
+    padded = np.pad(surface, 1, mode="edge")
+    rows, columns = surface.shape
+    beside = [padded[v : v + rows, u : u + columns] for v in range(3) for u in range(3)]
+    return np.max(np.abs(np.array(beside) - surface), axis=0) > step
+
+
+def make_rates(
+    surface: np.ndarray,
+    signal: np.ndarray | float,
+    background: np.ndarray | float,
+    bins: int = 512,
+    fwhm: float = FWHM / BIN,
+    tail: tuple[float, float] = (0.0, 0.0),
+) -> np.ndarray:
+    """Expected photons, (rows, columns, bins): signal of each pixel, background of each bin; a share
+    of the light in an exponential tail of so many bins.
+    """
+    edges = np.arange(bins + 1) - 0.5 - surface[..., np.newaxis]
+    sigma = fwhm / np.sqrt(8 * np.log(2))
+    passed = ndtr(edges / sigma)
+    share, length = tail
+    if share:
+        passed = (1 - share) * passed + share * exponnorm.cdf(edges, length / sigma, scale=sigma)
+    return np.asarray(signal)[..., np.newaxis] * np.diff(passed, axis=-1) + background
+
+
+def count_first_photons(rates: np.ndarray, cycles: int, seed: int) -> np.ndarray:
+    """Histograms of a detector that counts the first photon of a cycle; `rates` of all cycles."""
+    missed = np.exp(-np.cumsum(rates, axis=-1) / cycles)
+    before = np.concatenate([np.ones_like(missed[..., :1]), missed[..., :-1]], axis=-1)
+    share = np.concatenate([before - missed, missed[..., -1:]], axis=-1)
+    return np.random.default_rng(seed).multinomial(cycles, share)[..., :-1]
+
+
+def count_with_dead_time(rates: np.ndarray, cycles: int, dead: int, seed: int) -> np.ndarray:
+    """Histograms of a detector that is blind for some bins after each count; ready in every cycle."""
+    noise, flat = np.random.default_rng(seed), rates.reshape(-1, rates.shape[-1])
+    chance, counts = -np.expm1(-flat / cycles), np.zeros(flat.shape, np.int64)
+    for _ in range(cycles):
+        ready = np.zeros(len(flat), np.int64)
+        arrived = noise.random(flat.shape) < chance
+        for number in np.flatnonzero(arrived.any(axis=0)):
+            seen = arrived[:, number] & (ready <= number)
+            ready[seen] = number + 1 + dead
+            counts[seen, number] += 1
+    return counts.reshape(rates.shape)
+
+
+def spoil_pixels(
+    rates: np.ndarray, level: float, seed: int, share: float = 0.02
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rates with hot pixels (so many photons a bin more: even, in a few bins only, or rising) and
+    dead ones, and both masks.
+    """
+    noise, (rows, columns, bins) = np.random.default_rng(seed), rates.shape
+    number = round(share * rows * columns)
+    chosen = noise.choice(rows * columns, 2 * number, replace=False)
+    hot, dead = (np.isin(np.arange(rows * columns), part) for part in np.split(chosen, 2))
+    spoilt = rates.reshape(-1, bins).copy()
+    for row in np.flatnonzero(hot):
+        spectrum = (
+            np.ones(bins),
+            np.linspace(0, 2, bins),
+            np.exp(-np.arange(bins) / (0.2 * bins)) * 5,
+        )[noise.integers(3)]
+        spoilt[row] += level * spectrum
+    spoilt[dead] = 0
+    return (
+        spoilt.reshape(rates.shape),
+        hot.reshape(rows, columns),
+        dead.reshape(rows, columns),
+    )
