@@ -208,7 +208,8 @@ class Returns(Storable):
     shear : (n,) float64 array, optional
         Shear at which the picture of that instant was recovered; 0 by default.
     false_alarm : (n,) float64 array, optional
-        Probability that the return is noise; NaN, the default, where it is not known.
+        Probability that the return is false, noise or spread by the recovery; NaN, the default, where
+        it is not known.
     """
 
     RECORD_KIND = "returns"
@@ -339,6 +340,9 @@ class Frames(Storable):
         Shear at which each frame was recovered, pixels per view step; 0 everywhere by default.
     returns : Returns, optional
         Where the recovery found them itself: the surfaces of which the frames are a rendering.
+    measured : (columns, time) array, optional
+        The rectified measurements that the frames explain, NaN where one was not used: by them returns
+        are judged. Without elements where they are not known.
     """
 
     RECORD_KIND = "frames"
@@ -354,6 +358,12 @@ class Frames(Storable):
     )
     returns: Returns | None = field(
         default=None, metadata=stored_child(Returns.from_record, "returns", optional=True)
+    )
+    measured: NDArray[np.float32] = field(
+        default_factory=lambda: np.empty((0, 0), np.float32),
+        metadata=stored_array(
+            "count", "column", "time", dtype=np.float32, optional=True, skip_empty=True
+        ),
     )
 
     def __post_init__(self) -> None:
@@ -373,6 +383,9 @@ class Frames(Storable):
         object.__setattr__(self, "shears", shears if shears.size else np.zeros(times.size))
         if self.shears.shape != times.shape or not np.all(np.isfinite(self.shears)):
             raise ShapeError("the frames' shears", f"{times.shape}, finite", self.shears.shape)
+        slit = self.camera.slit_width_px, times.size
+        if self.measured.size and self.measured.shape != slit:
+            raise ShapeError("the frames' measurements", slit, self.measured.shape)
         xp = namespace(self.values)
         if not xp.all(xp.isfinite(self.values)):
             raise InputError("frames must not hold NaN or infinity")
@@ -398,6 +411,7 @@ class Frames(Storable):
             taken = np.arange(len(self))[frames]
             returns = returns[(taken[0] <= nearest) & (nearest <= taken[-1])]
         own = {name: getattr(self, name)[frames] for name in ("values", "times", "shears")}
+        own["measured"] = self.measured[:, frames]
         return replace(self, **own, returns=returns)
 
     def sel(

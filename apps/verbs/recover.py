@@ -189,7 +189,10 @@ def cloud(
         "pixel's returns the strongest, unless --returns says which.",
     ),
     false_alarm: float | None = opt(
-        "P", "Drop points that are noise with a higher probability.", shown="0.5"
+        "P", "Drop points that are false with a higher probability.", shown="0.1"
+    ),
+    all_points: bool = flag(
+        "--all-points", "Drop none: false_alarm says how probably each one is false."
     ),
     voxel: float | None = opt(
         "MM", "One point for each cube of this side.", name="--voxel-mm", shown="all points"
@@ -202,7 +205,7 @@ def cloud(
     """Find each pixel's returns and place them in space: x right, y down, z forward, in metres.
 
     Columns of a point: intensity, range with its standard deviation (range_sigma), number within the
-    pixel, time of flight; where known the probability that it is noise (false_alarm) and the
+    pixel, time of flight; where known the probability that it is false (false_alarm) and the
     surface's reflectance in percent (see calibrate range).
 
     Of a sequence, clouds that are in the folder already are kept; frames of which none can be made
@@ -221,6 +224,9 @@ def cloud(
 
     if organised and returns == "all":
         returns = "strongest"  # a pixel has one place in an organised cloud
+    if all_points and false_alarm is not None:
+        raise InputError("--all-points drops no point, so that --false-alarm has no effect")
+    false_alarm = 1.0 if all_points else false_alarm
     settings = CloudSettings(drop_outliers, voxel, device, returns, organised, false_alarm)
     used = resolve_device(device, cluster)
     if is_sequence(frames):

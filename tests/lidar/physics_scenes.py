@@ -141,7 +141,6 @@ def make_room(r) -> list[Surface]:
         plate("steep plate", (-0.35, lift, 2.6), (0.7, 0.5), 0.7, yaw=turn),
         sphere("ball", (0.33, 0.25 + lift, 2.7), r.uniform(0.15, 0.2), 0.6),
         sphere("small ball", (0.25, -0.3, 2.2), r.uniform(0.08, 0.11), 0.8),
-        plate("floor", (0, 0.6, 3.2), (3, 1.8), 0.4, pitch=1.25),
     ]
 
 
@@ -174,7 +173,9 @@ def make_gauze(r) -> list[Surface]:
 def make_table(r) -> list[Surface]:
     shift = r.uniform(-0.05, 0.05)
     return [
-        plate("table top", (0, 0.3, 2.9), (2.4, 1.6), 0.5, pitch=1.2),
+        plate(
+            "table top", (0, 0.35, 2.8), (2.4, 1.4), 0.5, r.uniform(-0.3, 0.3), r.uniform(0.6, 0.8)
+        ),
         cylinder("cup", (-0.3, 0.1, 2.6), (-0.3, 0.4, 2.6), r.uniform(0.08, 0.11), 0.7),
         sphere("apple", (0.12 + shift, 0.3, 2.5), 0.09, 0.5),
         sphere("melon", (0.38, 0.14 + shift, 2.9), 0.16, 0.6),
@@ -356,11 +357,14 @@ def make_shot(
     frame: int = 0,
     background: float = 2.0,
     afterglow: float = 0.0,
+    haze: float = 0.0,
+    pulse: float = PULSE_S,
     rays_per_side: int = 4,
 ) -> Shot:
     """Simulate a shot whose brightest streak pixel expects `photons`. `scene`: one of `SCENES`, "moving",
     of which `frame` is the number of the shot, or surfaces; `background`: photons a pixel; `afterglow`:
-    fraction of the light that comes late, by 400 ps in the mean.
+    fraction of the light that comes late, by 400 ps in the mean; `haze`: fraction that is scattered
+    along the slit, 10 columns far in the mean; `pulse`: the response, s, for which the camera takes 60 ps.
     """
     random = np.random.default_rng([seed, frame])
     if isinstance(scene, str):
@@ -399,14 +403,18 @@ def make_shot(
             brought = (GAINS[view] * light * weight)[there]
             gathered += np.bincount(flat, brought, gathered.size).reshape(gathered.shape)
     late = (np.arange(-24 * FINE, 200 * FINE)) * ROW_S / FINE
-    pulse = np.exp(-4 * np.log(2) * (late / PULSE_S) ** 2)
-    pulse /= pulse.sum()
+    shape = np.exp(-4 * np.log(2) * (late / pulse) ** 2)
+    shape /= shape.sum()
     if afterglow:
         tail = np.where(late >= 0, np.exp(-late / 400e-12), 0)
-        tail = np.convolve(pulse, tail / tail.sum())[24 * FINE :][: late.size]
-        pulse = (1 - afterglow) * pulse + afterglow * tail
+        tail = np.convolve(shape, tail / tail.sum())[24 * FINE :][: late.size]
+        shape = (1 - afterglow) * shape + afterglow * tail
+    if haze:
+        away = np.exp(-np.abs(np.arange(-60, 61)) / 10)
+        hazy = [np.convolve(row, away / away.sum(), "same") for row in gathered]
+        gathered = (1 - haze) * gathered + haze * np.array(hazy)
     length = ROWS * FINE + late.size
-    spectrum = np.fft.rfft(gathered, length, axis=0) * np.fft.rfft(pulse, length)[:, None]
+    spectrum = np.fft.rfft(gathered, length, axis=0) * np.fft.rfft(shape, length)[:, None]
     spread = np.fft.irfft(spectrum, length, axis=0)[24 * FINE :][: ROWS * FINE]
     expected = np.maximum(spread.reshape(ROWS, FINE, width).sum(axis=1), 0)
     expected *= photons / expected.max()

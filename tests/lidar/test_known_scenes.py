@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from physics_scenes import Shot, make_shot, plate
@@ -9,9 +11,16 @@ from physics_scenes import Shot, make_shot, plate
 import tofclip
 
 
+def recover(shot: Shot) -> tofclip.Frames:
+    return tofclip.recover(tofclip.Streak(shot.counts, shot.row_times), shot.true_camera)
+
+
 def find_points(shot: Shot) -> tofclip.PointCloud:
-    streak = tofclip.Streak(shot.counts, shot.row_times)
-    return tofclip.point_cloud(tofclip.depth(tofclip.recover(streak, shot.true_camera)))
+    return tofclip.point_cloud(tofclip.depth(recover(shot)))
+
+
+def score(shot: Shot, cloud: tofclip.PointCloud) -> dict[str, Any]:
+    return shot.score(*shot.locate(cloud.xyz), cloud.range, cloud.range_sigma, cloud.false_alarm)
 
 
 def test_small_plates_lie_where_they_are() -> None:
@@ -39,7 +48,25 @@ def test_small_plates_lie_where_they_are() -> None:
 def test_a_plane_is_found_with_a_millimetre_s_error() -> None:
     shot = make_shot([plate("wall", (0, 0, 3.0), (4, 4), 0.6, yaw=0.1)], size=64)
     cloud = find_points(shot)
-    found = shot.score(*shot.locate(cloud.xyz), cloud.range, cloud.range_sigma, cloud.false_alarm)
+    found = score(shot, cloud)
     assert found["median_mm"] < 1
     assert found["false"] < 0.01
     assert found["miss"] < 0.05
+
+
+@pytest.mark.parametrize(("scene", "missed", "false"), [("room", 0.1, 0.02), ("wires", 0.06, 0.09)])
+def test_rays_are_left_out_and_marked_where_all_points_are_asked_for(scene, missed, false) -> None:
+    """All points have hardly a return missing; hardly any is false of those that are said to be sure, and
+    most of those that are said to be false.
+    """
+    shot = make_shot(scene, seed=5, size=64)
+    frames = recover(shot)
+    found = score(shot, tofclip.point_cloud(tofclip.depth(frames)))
+    assert found["miss"] < missed
+    assert found["false"] < false
+    everything = score(shot, tofclip.point_cloud(tofclip.depth(frames, false_alarm=1.0)))
+    assert everything["miss"] < 0.01
+    assert everything["false"] > 0.15
+    true_fractions = [fraction for *_, fraction, number in everything["calibration"] if number > 50]
+    assert true_fractions[0] < 0.03
+    assert true_fractions[-1] > max(0.5, 2 * true_fractions[-3])

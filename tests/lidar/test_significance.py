@@ -8,7 +8,7 @@ import pytest
 import tofclip
 from tofclip.camera.noise import MeasurementNoise
 from tofclip.lidar import Pulse
-from tofclip.lidar.significance import find_most_significant, weigh_candidates
+from tofclip.lidar.significance import weigh_candidates
 
 SIZE = 32
 SURFACE, RAY = (slice(6, 26), 30, 2000.0), (slice(14, 18), 70, 100.0)
@@ -33,22 +33,15 @@ def test_what_is_bright_is_not_dropped_for_what_is_dim_and_sure() -> None:
         "noise_dazzle_count": 1e6,
         "noise_misfit_fraction": 0.3,
     }
-    returns = tofclip.depth(tofclip.Frames(cube, times, camera, figures=figures))
+    measured = camera.operator()(np.moveaxis(cube, 0, -1))
+    frames = tofclip.Frames(cube, times, camera, figures=figures, measured=measured)
+    returns = tofclip.depth(frames)
     place, frame, _ = SURFACE
     found = np.zeros((SIZE, SIZE), bool)
     near = np.abs(returns.time - times[frame]) < camera.pulse_fwhm / 4
     found[returns.y[near].astype(int), returns.x[near].astype(int)] = True
     assert found[RAY[0], RAY[0]].all()
     assert found[place, place].mean() > 0.95  # corners have few neighbours
-
-
-def test_the_most_significant_of_each_pixel() -> None:
-    pixel = np.array([2, 2, 5, 7, 7, 7])
-    pooled = np.array([1.0, 3.0, 2.0, 9.0, 8.0, 7.0])
-    signal = np.array([10.0, 11.0, 12.0, 13.0, 14.0, 15.0])
-    best, brightness = find_most_significant(pixel, pooled, signal)
-    np.testing.assert_array_equal(best, [3, 3, 2, 9, 9, 9])
-    np.testing.assert_array_equal(brightness, [11, 11, 12, 13, 13, 13])
 
 
 def test_the_significance_of_a_candidate_is_its_height_over_its_deviation() -> None:
@@ -59,11 +52,20 @@ def test_the_significance_of_a_candidate_is_its_height_over_its_deviation() -> N
     times, floor = np.arange(60) * 10e-12, 3.0
     pixel, pulse = np.array([40, 77]), Pulse.gaussian(camera.pulse_fwhm)
     arrival, signal = np.array([200e-12, 333e-12]), np.array([50.0, 80.0])
-    frames = tofclip.Frames(np.zeros((60, 12, 12), np.float32), times, camera)
-    found = weigh_candidates(frames, MeasurementNoise(floor, 0.0), pulse, pixel, arrival, signal)
+    measured = np.ones((121, 60), np.float32)
+    measured[5] = np.nan  # not used
+    frames = tofclip.Frames(np.zeros((60, 12, 12), np.float32), times, camera, measured=measured)
+    noise = MeasurementNoise(floor, 0.0)
+    found = weigh_candidates(frames, noise, pulse, pixel, arrival, signal)
     matrix = camera.operator().matrix.toarray()
-    for place, late, counts, stated in zip(pixel, arrival, signal, found, strict=True):
+    matrix[5] = 0
+    for place, late, counts, stated, exceeds, explained in zip(
+        pixel, arrival, signal, *found, strict=True
+    ):
         course = pulse(times - late)
         seen = np.outer(matrix[:, place], course)  # of a height of one
         expected = counts / course.sum() * np.sqrt(np.sum(seen**2)) / floor
         assert stated == pytest.approx(expected, rel=0.01)  # the pulse's far ends are left out
+        # every used measurement has a count that the dark frames do not explain
+        assert exceeds == pytest.approx(counts / course.sum() * seen.sum() / floor**2, rel=0.01)
+        assert explained == 0

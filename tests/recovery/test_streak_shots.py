@@ -69,7 +69,7 @@ EXPECTED = {
     "hot pixels": (0.12, 0.03),
     "tracks": (0.12, 0.03),
     "dead stripe": (0.12, 0.03),
-    "clipped": (0.12, 0.03),
+    "clipped": (0.05, 0.04),
 }
 SLOW = pytest.mark.nightly
 
@@ -107,8 +107,8 @@ def check_returns(kind: str, method: str, scene: oracle.Scene, counts: np.ndarra
     missed, false = oracle.score(returns.y, returns.x, returns.range, scene)
     assert missed <= EXPECTED[kind][0]
     assert false <= EXPECTED[kind][1]
-    assert 0.8 < compute_range_z(returns, scene) < (1.5 if kind in ("clean", "dark") else 2)
-    assert np.all(returns.false_alarm <= 0.5)
+    assert 0.6 < compute_range_z(returns, scene) < (1.5 if kind in ("clean", "dark") else 2)
+    assert np.all(returns.false_alarm <= 0.1)
 
 
 FAST = {("clean", "l1"), ("clean", "tv"), ("dark", "l1"), ("tracks", "l1")}
@@ -177,13 +177,13 @@ def test_a_bright_shot_is_iterated_until_the_rim_of_thin_bars_is_gone() -> None:
 
 
 def test_the_probability_of_a_false_alarm_is_kept(room, light) -> None:
-    """In the dark, where noise is all there is; a third of the points said to be wrong with probability 1/3 are."""
+    """In the dark, with 20 photons at the brightest, up to three times as many are false as are said to be."""
     frames = recover_frames(oracle.count_photons(light, 20.0), "l1")
-    strict, lenient = depth(frames, false_alarm=0.1), depth(frames)
+    strict, lenient = depth(frames, false_alarm=0.05), depth(frames, false_alarm=0.5)
     assert len(strict) < len(lenient)
-    assert strict.false_alarm.max() <= 0.1
-    near = np.abs(lenient.range[:, None] - room.nearby_ranges[lenient.y, lenient.x]) < 0.009
-    assert 1 - near.any(axis=1).mean() <= lenient.false_alarm.mean()
+    assert strict.false_alarm.max() <= 0.05
+    near = np.abs(lenient.range[:, None] - room.nearby_ranges[lenient.y, lenient.x]) < 0.03
+    assert 1 - near.any(axis=1).mean() <= 3 * lenient.false_alarm.mean()
     with pytest.raises(InputError, match="between 0 and 1"):
         depth(frames, false_alarm=0.0)
     with pytest.raises(InputError, match="recover them again"):

@@ -82,7 +82,8 @@ class PointCloud(Storable):
     provenance : mapping
         How it came about; kept in HDF5 files only.
     false_alarm : (n,) float32 array, optional
-        Probability that the point is noise; NaN, the default, where it is not known.
+        Probability that the point is false, noise or spread by the recovery; NaN, the default, where
+        it is not known.
     reflectance : (n,) float32 array, optional
         Of the surface as if it faced the camera, percent; NaN, the default, where the camera has
         not seen a target of known reflectance.

@@ -45,7 +45,7 @@ from tofclip.lidar.significance import (
     CANDIDATES,
     DEFAULT_FALSE_ALARM,
     Detection,
-    SignificanceJudge,
+    EvidenceJudge,
 )
 from tofclip.shots import Frames, Returns
 from tofclip.threads import run_blocks, split_blocks
@@ -87,7 +87,7 @@ class ReturnSearch:
         self,
         traces: Traces,
         provenance: Mapping[str, Any] | None = None,
-        judge: SignificanceJudge | None = None,
+        judge: EvidenceJudge | None = None,
     ) -> Returns:
         """Find the returns in the traces of all pixels. `judge` decides which candidates count; by
         default the fractions of `Detection`. Takes 256 KiB of traces a thread, and 100 bytes a
@@ -103,8 +103,8 @@ class ReturnSearch:
             kept = self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
             kept &= time > 0
         else:
-            kept, doubt = judge.judge(pixel, time, signal)
-            kept &= time > 0
+            doubt = judge.judge(pixel, time, signal)
+            kept = (time > 0) & (doubt <= judge.max_false_alarm)
             false_alarm = doubt[kept]
         chosen = np.flatnonzero(kept)
         pixel, time = pixel.take(chosen), time.take(chosen)
@@ -212,9 +212,9 @@ def depth(
 ) -> Returns:
     """Find each pixel's returns in a transient cube.
 
-    Frames of a recovery know how noisy their measurements were: their returns are judged by that
-    (`tofclip.lidar.significance`). Those of other frames, or where `detection` is given, are judged
-    by its fractions.
+    Frames of a recovery with a prior know their measurements and how noisy these were: their returns
+    are judged by that (`tofclip.lidar.significance`). Those of other frames, or where `detection` is
+    given, are judged by its fractions.
 
     Parameters
     ----------
@@ -226,7 +226,8 @@ def depth(
     detection, pulse
         As for `ReturnSearch`.
     false_alarm : float, optional
-        Probability of being noise up to which a candidate counts as a return; 0.5 by default.
+        Probability of being false, noise or spread by the recovery, up to which a candidate counts as a
+        return; 0.1 by default. 1 keeps them all.
 
     Returns
     -------
@@ -257,11 +258,12 @@ def depth(
         raise ShapeError(
             "frames", f"(time, y, x) with (y, x) = {camera.image_shape}", frames.values.shape
         )
-    noise = MeasurementNoise.from_figures(frames.figures) if detection is None else None
+    judged = detection is None and frames.measured.size > 0
+    noise = MeasurementNoise.from_figures(frames.figures) if judged else None
     if noise is None and false_alarm is not None:
         raise InputError(
-            "these frames do not say how noisy their measurements were, as a probability of false "
-            "alarms needs it: recover them again"
+            "these frames do not hold their measurements and how noisy they were, as a probability of "
+            "false alarms needs it: recover them again, by a method with a prior"
         )
     search = ReturnSearch(
         camera, frames.times, detection if noise is None else CANDIDATES, pulse, frames.shears
@@ -269,7 +271,7 @@ def depth(
     judge = None
     if noise is not None:
         limit = DEFAULT_FALSE_ALARM if false_alarm is None else false_alarm
-        judge = SignificanceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
+        judge = EvidenceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
     return search.find_returns(FrameTraces(frames), frames.provenance, judge)
 
 

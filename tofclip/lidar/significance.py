@@ -1,34 +1,29 @@
 """Which candidates count as returns: by fractions of what is brightest (`Detection`), or judged by the
-noise of the recovery that showed them (`SignificanceJudge`).
+evidence of the shot that shows them (`EvidenceJudge`).
 
-A recovered frame shows light where there is none: photons' noise, and what the recovery spreads.
-How bright that is depends on what else the views saw at that instant, so no fraction of the scene's
-brightest return tells it from a dim wall beside a retroreflector. Three things do:
+A recovered frame shows light where there is none: photons' noise, and what the recovery spreads from
+few views. Of each candidate the probability is stated that it is false, of which both kinds are part:
+a return is true if it is neither noise nor spread.
 
-* **Own significance** (`weigh_candidates`). A return of brightness h puts ``h a_m`` on measurement m
-  of variance ``floor^2 + gain * (F h)_m``. With all other pixels known its brightness would be
-  known to ``1 / sqrt(sum a_m^2 / variance_m)``: the diagonal of the linear inverse's covariance at
-  the solution. A pixel of which some view saw little else is known well; one that bright objects
-  cross in every view is hardly known.
-* **Neighbours** (`CandidatePool`). Surfaces go on in the pixels around, at the same range; noise
-  does not.
-* **Decoys** (`estimate_false_alarms`). The same sums at ranges displaced by chance are what noise
-  makes of this very shot. Where true and displaced sums are equally frequent, a candidate is noise;
-  the ratio of their densities is the probability that it is (local false-discovery rate: B. Efron,
-  J. Am. Stat. Assoc. 96, 1151 (2001); the decoys are those of proteomics).
+* **Noise.** A return of brightness h puts ``h a_m`` on measurement m of variance ``floor^2 + gain *
+  (F h)_m``. With all other pixels known its brightness would be known to ``1 / sqrt(sum a_m^2 /
+  variance_m)``. Surfaces go on in the pixels around, at the same range, and noise does not: what counts
+  is the sum of significances of a candidate with its neighbours, and how many these are
+  (`CandidatePool`).
+* **Spread.** What is spread around a bright object is weaker than it at the same instant, weak in its
+  scene, and in its pixel weaker than the surface that is there; and the shot contradicts it: the
+  measurements that should see it hold less light than the frames explain, because only some views have
+  light there and the others are dark. Without the candidate and those around it they would be
+  explained better.
 
-What is spread around true returns goes on in neighbouring pixels as well, so decoys do not know it.
-It is less significant, and weaker, than the surface of its own pixel (`MIN_PIXEL_SHARE`), and it is
-less significant than most of what is at its range (`MIN_INSTANT_SHARE`), and far weaker
-(`MIN_INSTANT_BRIGHTNESS`). The shares were found on two scenes by different forward models, in
-bright, dark and dazzled shots.
+Both are logistic functions of these numbers, whose few weights (`NOISE`, `SPREAD`) were found on scenes
+of known returns by a forward model of their own (docs/recovery_algorithm.md has the table).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import scipy
@@ -42,6 +37,7 @@ from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
 SLOTS_PER_WIDTH = 4
+TINY = float(np.finfo(np.float64).tiny)
 # of the scene's brightness: that of its brightest pixels, but not of a single glint
 SCENE_BRIGHTNESS_QUANTILE = 0.999
 
@@ -174,7 +170,7 @@ def find_quantile_value(values: NDArray[np.floating], fraction: float) -> float:
     return value + (place - before) * (above - value) if place > before else value
 
 
-DEFAULT_FALSE_ALARM = 0.5  # probability of being noise above which a candidate is dropped
+DEFAULT_FALSE_ALARM = 0.1  # probability of being false above which a candidate is dropped
 
 CANDIDATES = Detection(
     signal_to_noise=3.0,
@@ -185,33 +181,34 @@ CANDIDATES = Detection(
 )
 """What is looked at: nearly everything that a trace shows."""
 
-CORE_RADIUS_PX, POOL_RADIUS_PX = 1.5, 2.9
-GATE_PULSES_PER_PX = 0.45  # the wider pool then reaches 1.3 pulse lengths in range
+AT_INSTANT = Detection(min_scene_fraction=0, min_time_bin_fraction=1, min_pixel_fraction=0)
+POOL_RADIUS_PX = 2.9
+GATE_PULSES_PER_PX = 0.45  # the pool then reaches 1.3 pulse lengths in range
+EXCESS_LIMITS = -0.8, 0.3  # of light, beyond which it says no more
+# Of the light at an instant or in the scene, the part that is brighter than what others are compared with:
+# a retroreflector is bright, but has little of the light.
+BRIGHTER_PART = 0.5
+HALF_MISFIT = (
+    0.02  # at which half of the scene's brightness counts; of its light the instrument spreads some
+)
+# pooled significance of the brightest at an instant, at which half of what it spreads is seen beside noise
+HALF_SEEN = 30.0
 
-MIN_PIXEL_SHARE = 0.3
-"""Of the pixel's most significant candidate, pooled over either radius. What is brighter than that
-one is not what it spreads, however little is known of it at an instant full of light."""
-
-MIN_INSTANT_SHARE, INSTANT_QUANTILE = 0.42, 0.8
-"""Of what the upper candidates at the same range have. Streaks that a recovery from few views
-draws across a dark background go on from pixel to pixel, as surfaces do, at the range of what they
-come from. The quantile does not know how bright the brightest are."""
-
-MIN_INSTANT_BRIGHTNESS = 0.06
-"""Of the same quantile of the signals at the same range: what the model does not explain beside the
-light of a bright shot is weak, however sure it is."""
-
-DECOY_ROUNDS, DECOY_SEED = 3, 20220614
-MIN_DISPLACEMENT_GATES = 6.0  # displaced candidates must not meet the surface they come from
-MIN_RANGE_GATES = 4 * MIN_DISPLACEMENT_GATES
+# Weights, and last what is added to the sum.
+# of the log of the pooled significance, and of how many candidates it is pooled over
+NOISE = np.array([0.93, 0.41, -3.118])
+# of the logs of the brightness, over that of the light at its instant, over that of the scene's light, and
+# over the most in the pixel, and of the relative excess of light
+SPREAD = np.array([0.567, 1.3, 0.981, 3.915, 3.582])
 FRAMES_PER_BLOCK = 32
+CLIPPED_KEY = "clipped_readings"  # of the figures of frames, see `tofclip.recovery.defects`
 
 
 @dataclass(frozen=True)
-class SignificanceJudge:
-    """Decides which candidates of a transient cube are returns."""
+class EvidenceJudge:
+    """Says how probable it is that each candidate of a transient cube is false."""
 
-    frames: Frames  # recovered, with what was known of the measurements' noise
+    frames: Frames  # recovered, with the measurements that they explain
     noise: MeasurementNoise
     pulse: Pulse
     max_false_alarm: float = DEFAULT_FALSE_ALARM
@@ -222,29 +219,75 @@ class SignificanceJudge:
                 f"the probability of a false alarm lies between 0 and 1, got {self.max_false_alarm}"
             )
 
-    def judge(
-        self, pixel: NDArray[np.int64], time: FloatArray, signal: FloatArray
-    ) -> tuple[NDArray[np.bool_], FloatArray]:
-        """Say which candidates are returns, and how probable it is that each is noise. `pixel` (n,)
-        does not decrease; `signal` (n,): counts, summed over the bins.
+    def judge(self, pixel: NDArray[np.int64], time: FloatArray, signal: FloatArray) -> FloatArray:
+        """Return the probability that each candidate is false. `pixel` (n,) does not decrease; `signal`
+        (n,): counts, summed over the bins.
         """
-        length = SPEED_OF_LIGHT / 2 * self.pulse.fwhm
-        own = weigh_candidates(self.frames, self.noise, self.pulse, pixel, time, signal)
-        distance = SPEED_OF_LIGHT / 2 * time
-        shape = self.frames.camera.image_shape
-        pool = CandidatePool(pixel, distance, own, shape, GATE_PULSES_PER_PX * length)
-        core, whole = pool.sum_around(CORE_RADIUS_PX), pool.sum_around(POOL_RADIUS_PX)
-        probability = estimate_false_alarms(pool, whole)
-        kept = probability <= self.max_false_alarm
-        if kept.any():
-            at_range = find_usual_at_range(distance, np.where(kept, whole, 0), length)
-            kept &= whole >= MIN_INSTANT_SHARE * at_range
-            bright = find_usual_at_range(distance, np.where(kept, signal, 0), length)
-            kept &= signal >= MIN_INSTANT_BRIGHTNESS * bright
-        for pooled in (core, whole):
-            best, brightness = find_most_significant(pixel, pooled, signal)
-            kept &= (pooled >= MIN_PIXEL_SHARE * best) | (signal >= brightness)
-        return kept, probability
+        if pixel.size == 0:
+            return np.empty(0)
+        against_noise, against_spread, seen = self.describe(pixel, time, signal)
+        no_noise = scipy.special.expit(NOISE[:-1] @ against_noise + NOISE[-1])
+        spread = scipy.special.expit(-SPREAD[:-1] @ against_spread - SPREAD[-1])
+        return np.asarray(1 - no_noise * (1 - seen * spread))
+
+    def describe(
+        self, pixel: NDArray[np.int64], time: FloatArray, signal: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what speaks against noise, and against spread, of each candidate: the numbers of which
+        `NOISE` and `SPREAD` are the weights, a line each; and how much of what is spread is seen.
+        """
+        width, distance = self.pulse.fwhm, SPEED_OF_LIGHT / 2 * time
+        gate = GATE_PULSES_PER_PX * SPEED_OF_LIGHT / 2 * width
+        pool = CandidatePool(pixel, distance, self.frames.camera.image_shape, gate)
+        # what the model does not explain is known by its brightness
+        noise = replace(self.noise, misfit=0.0, dazzle=np.inf)
+        own, missing, light = weigh_candidates(self.frames, noise, self.pulse, pixel, time, signal)
+        pooled, neighbours = pool.sum_around(own), pool.sum_around(np.ones(own.size))
+        most = AT_INSTANT.compute_least_intensity(pixel, time, pooled, width, time)
+        excess = pool.sum_around(missing) / np.maximum(pool.sum_around(light), TINY)
+        # of what is hardly seen, noise makes as much
+        excess = np.clip(excess, *EXCESS_LIMITS) * pooled**2 / (pooled**2 + 4 * neighbours)
+        intensity = signal * distance**2
+        around = pool.sum_around(intensity)
+        strongest = np.zeros(int(pixel.max()) + 1)
+        np.maximum.at(strongest, pixel, intensity)
+        ratios = [
+            around / find_brightness_at_instant(time, around, width),
+            intensity / find_brightness(intensity),
+            intensity / strongest[pixel],
+        ]
+        brightness = np.log(np.clip(ratios, TINY, 1))
+        # what is cut off does not fit either, but is not spread
+        misfit = 0.0 if self.frames.figures.get(CLIPPED_KEY) else self.noise.misfit
+        brightness[1] *= misfit / (misfit + HALF_MISFIT)
+        # what has no significance does not gain any by being many
+        many = np.minimum(neighbours, 3 * pooled)
+        no_noise = np.array([np.log(np.maximum(pooled, TINY)), many])
+        return no_noise, np.array([*brightness, excess]), most**2 / (most**2 + HALF_SEEN**2)
+
+
+def find_brightness(values: FloatArray) -> float:
+    """Return the brightness above which there is half of the light."""
+    downwards = np.sort(values)[::-1]
+    light = np.cumsum(downwards)
+    return float(downwards[min(np.searchsorted(light, BRIGHTER_PART * light[-1]), light.size - 1)])
+
+
+def find_brightness_at_instant(time: FloatArray, values: FloatArray, width: float) -> FloatArray:
+    """Return the brightness above which there is half of the light within about a pulse's `width`, s, of
+    each candidate's time.
+    """
+    slot = np.floor((time - time.min()) / width).astype(np.int64)
+    order = np.argsort(slot, kind="stable")
+    edges = np.searchsorted(slot[order], np.arange(int(slot.max()) + 2))
+    usual = np.ones(edges.size - 1)
+    for number in range(usual.size):
+        # With the slots before and behind: a surface at a slot's edge is in two of them.
+        first, last = edges[max(number - 1, 0)], edges[min(number + 2, edges.size - 1)]
+        if first < last:
+            usual[number] = find_brightness(values[order[first:last]])
+    at_each: FloatArray = usual[slot]
+    return at_each
 
 
 def weigh_candidates(
@@ -254,12 +297,15 @@ def weigh_candidates(
     pixel: NDArray[np.int64],
     time: FloatArray,
     signal: FloatArray,
-) -> FloatArray:
-    """Return by how many of its own standard deviations each candidate is brighter than nothing."""
-    values = to_numpy(frames.values)
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return by how many of its own standard deviations each candidate is brighter than nothing; by how
+    much the measurements that see it exceed what the frames explain, and what these explain of them,
+    both weighted by its light and the measurements' precision.
+    """
+    values, measured = to_numpy(frames.values), frames.measured
     order = np.argsort(time)
     at, first, last = time[order], *pulse.support
-    information, total = np.zeros((2, time.size))
+    information, missing, light, total = np.zeros((4, time.size))
     # blocks of one shear
     number = frames.times.size
     changes = np.flatnonzero(np.diff(frames.shears)) + 1
@@ -267,32 +313,29 @@ def weigh_candidates(
     for start, stop in pairwise(edges.tolist()):
         operator = frames.camera.operator(float(frames.shears[start])).matrix
         pictures = values[start:stop].reshape(stop - start, -1).T.astype(np.float32)
-        variance = noise.compute_variance(np.maximum(operator @ pictures, 0))
+        explained = operator @ pictures
+        variance = noise.compute_variance(np.maximum(explained, 0))
+        used = np.isfinite(measured[:, start:stop])
+        precision = used / np.maximum(variance, np.finfo(np.float32).tiny)
+        rest = np.where(used, measured[:, start:stop] - explained, 0)
         squares = operator.copy()
         squares.data = squares.data**2
-        known = squares.T @ (1 / np.maximum(variance, np.finfo(np.float32).tiny))
+        known = squares.T @ precision
+        exceeds, explains = (operator.T @ (part * precision) for part in (rest, explained))
         for place in range(start, stop):
             instant = frames.times[place]
             # candidates whose pulse reaches this frame
             here = slice(*np.searchsorted(at, [instant - last, instant - first]))
             shape = np.maximum(pulse(instant - at[here]), 0)
             reached = order[here]
-            information[reached] += shape**2 * known[pixel[reached], place - start]
+            seen = pixel[reached], place - start
+            information[reached] += shape**2 * known[seen]
+            missing[reached] += shape * exceeds[seen]
+            light[reached] += shape * explains[seen]
             total[reached] += shape
     # The pulse's samples are a shape; a candidate's counts are its sum over the bins.
-    height = signal / np.maximum(total, np.finfo(np.float64).tiny)
-    return np.asarray(height * np.sqrt(information))
-
-
-def find_most_significant(
-    pixel: NDArray[np.int64], pooled: FloatArray, signal: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return significance and signal of the most significant candidate in each one's pixel; `pixel`
-    does not decrease.
-    """
-    order = np.lexsort((pooled, pixel))
-    last = order[np.searchsorted(pixel, pixel, side="right") - 1]
-    return pooled[last], signal[last]
+    height = signal / np.maximum(total, TINY)
+    return height * np.sqrt(information), height * missing, height * light
 
 
 @dataclass(frozen=True)
@@ -301,82 +344,19 @@ class CandidatePool:
 
     pixel: NDArray[np.int64]  # (n,), not decreasing
     distance: FloatArray  # (n,), m
-    own: FloatArray  # (n,), significance of each
     image_shape: tuple[int, int]
     # what ranges may differ by for each pixel of the pool's radius, m: it reaches less far in range
     # the further a neighbour is, like a ball
     gate: float
 
-    def sum_around(self, radius: float, displaced: FloatArray | None = None) -> FloatArray:
-        """Return each candidate's significance with those within `radius` pixels at the same range, m,
-        or around the ranges `displaced`.
-        """
+    def sum_around(self, own: FloatArray) -> FloatArray:
+        """Return the sum of `own` (n,) over each candidate and those around it at the same range."""
         # the compiler takes as long to import as all else
         from tofclip.lidar.peak_kernels import pool_significance
 
         rows, columns = self.image_shape
         starts = np.searchsorted(self.pixel, np.arange(rows * columns + 1))
-        at = self.distance if displaced is None else displaced
-        pooled = np.empty(self.own.size)
-        pool_significance(
-            self.pixel,
-            at,
-            self.distance,
-            self.own,
-            starts,
-            self.image_shape,
-            (radius, self.gate),
-            pooled,
-        )
+        pooled = np.empty(own.size)
+        settings = self.image_shape, (POOL_RADIUS_PX, self.gate)
+        pool_significance(self.pixel, self.distance, self.distance, own, starts, *settings, pooled)
         return pooled
-
-
-def find_usual_at_range(distance: FloatArray, pooled: FloatArray, length: float) -> FloatArray:
-    """Return what the upper candidates within a pulse's `length`, m, of each one's range have; those
-    of 0 do not count.
-    """
-    slot = np.floor((distance - distance.min()) / length).astype(np.int64)
-    order = np.argsort(slot, kind="stable")
-    edges = np.searchsorted(slot[order], np.arange(int(slot.max()) + 2))
-    usual = np.zeros(edges.size - 1)
-    for number in range(usual.size):
-        # With the slots before and behind: a surface at a slot's edge is in two of them.
-        first, last = edges[max(number - 1, 0)], edges[min(number + 2, edges.size - 1)]
-        around = pooled[order[first:last]]
-        around = around[around > 0]
-        if around.size:
-            usual[number] = np.quantile(around, INSTANT_QUANTILE)
-    at_each: FloatArray = usual[slot]
-    return at_each
-
-
-def estimate_false_alarms(pool: CandidatePool, pooled: FloatArray) -> FloatArray:
-    """Return the probability that each candidate is noise, by decoys at displaced ranges. `pooled`:
-    of `POOL_RADIUS_PX`. 0 where all candidates lie so close together that no decoy can be had.
-    """
-    span = float(np.ptp(pool.distance)) if pooled.size else 0.0
-    if span < MIN_RANGE_GATES * pool.gate:
-        return np.zeros(pooled.size)
-    noise, nearest = np.random.default_rng(DECOY_SEED), float(pool.distance.min())
-    least = MIN_DISPLACEMENT_GATES * pool.gate
-    decoys = []
-    # By pixel and order in it: one candidate more or less changes no other's displacement.
-    place = np.arange(pooled.size) - np.searchsorted(pool.pixel, pool.pixel)
-    slots = (*pool.image_shape, CANDIDATES.max_returns)
-    for _ in range(DECOY_ROUNDS):
-        displacement = noise.uniform(least, span - least, slots).reshape(-1, slots[-1])
-        further = pool.distance - nearest + displacement[pool.pixel, place]
-        decoys.append(pool.sum_around(POOL_RADIUS_PX, nearest + further % span))
-    everything = np.concatenate([pooled, *decoys])
-    weights = np.full(everything.size, 1 / DECOY_ROUNDS)
-    weights[: pooled.size] = 1.0
-    is_decoy = np.arange(everything.size) >= pooled.size
-    order = np.argsort(everything)
-    # The stronger, the less probable a decoy is.
-    fitted: Any = scipy.optimize.isotonic_regression(
-        is_decoy[order].astype(np.float64), weights=weights[order], increasing=False
-    )
-    share = np.empty(everything.size)
-    share[order] = fitted.x
-    odds = share[: pooled.size] / np.maximum(1 - share[: pooled.size], 1e-9)
-    return np.minimum(odds, 1.0)

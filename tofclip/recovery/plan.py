@@ -199,6 +199,7 @@ class RecoveryPlan:
             figures=figures,
             attachments=streak.attachments,
             provenance={**streak.provenance, "objective": result.objective.tolist()},
+            measured=np.where(used, measurement.values, np.float32(np.nan)),
         )
 
     def _recover_surfaces(
