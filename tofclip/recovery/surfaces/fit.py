@@ -45,6 +45,7 @@ from tofclip.solvers import Method, Progress, Sparse, ignore_progress
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
+MAX_FALSE_ALARM = 0.04  # of a return that makes a surface: what it misses the surface still reaches
 START_ITERATIONS = 25
 MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 4, 10
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
@@ -113,7 +114,7 @@ def fit_surfaces(
     camera, count = frames.camera, frames.times.size
     # 1. Frames by a fast method, whose returns are a picture of ranges. The model explains what was
     # measured: corrections come when its own returns are listed.
-    found = depth(frames, camera.replace(range_calibration=None))
+    found = depth(frames, camera.replace(range_calibration=None), false_alarm=MAX_FALSE_ALARM)
     bin_m = SPEED_OF_LIGHT * frames.bin_width / 2
     directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
     ray_length = (1 / directions[:, 2]).reshape(camera.image_shape)
