@@ -68,7 +68,7 @@ DEFAULTS: dict[str, dict[Any, dict[str, Any]]] = {
             "weight": 2.0,
             "iterations": 60,
             "start": Sparse(),
-            "detection": Detection(),
+            "detection": Detection(5.0, 0.0, 0.0, 0.0),
         }
     },
     SHEARS: {DepthLockedFocus: {"tolerance_px": 0.25}, FixedFocus: {"shear": 0.0}},
