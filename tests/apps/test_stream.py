@@ -76,7 +76,7 @@ def test_a_point_cloud_from_a_source(shell, light, address):
 
 def test_a_streaming_camera_becomes_clouds(shell):
     figures = shell.figures(f"stream {STREAK_CAMERA} --shots 3 --out clouds")
-    assert (figures["clouds"], figures["method"]) == (3, "linear")
+    assert (figures["clouds"], figures["method"]) == (3, "l1")
     assert set(figures["stages_s"]) == {"read", "wait", "rectify", "recover", "range", "place"}
     assert figures["latency_s"]["median"] > 0
     assert figures["clouds_per_second"] > 0

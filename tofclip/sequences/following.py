@@ -7,6 +7,7 @@ pictures need a few steps where those that begin in darkness need forty.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
@@ -23,29 +24,32 @@ from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfa
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import ProximalMethod
 
-WARM_ITERATIONS = 4  # of each shot but the first, which has the method's own number
+# Of each shot but the first, which has the method's own number. Of a moving scene's points, with 300
+# photons in the brightest pixel, 17 % are false after 4, 9 % after 8, 5 % after 12 (the linear
+# inverse: 27 %), and 3 % after 16, in half as much time again.
+WARM_ITERATIONS = 12
 
 
 class WarmStartedRecovery:
     """Recovers the rows of a shot that hold light, beginning at the same rows of the shot before.
 
     Shots are taken one after the other, each with all cores: what comes out of a shot depends on
-    those before it, and only on them. The method's iterations are the first shot's; slit columns
-    that are not `alive` are never trusted.
+    those before it, and only on them. The method's iterations are the first shot's. `places`: rows,
+    and the operator of their shear; slit columns that are not `alive` are never trusted.
     """
 
     def __init__(
         self,
         method: ProximalMethod,
-        operator: LinearOperator,
+        places: Sequence[tuple[slice, LinearOperator]],
         alive: NDArray[np.bool_],
         iterations: int = WARM_ITERATIONS,
     ) -> None:
-        self.method, self.operator, self._alive = method, operator, alive
+        self.method, self._places, self._alive = method, places, alive
         # so few iterations end before the gap is looked at
         self._warm = replace(method, iterations=iterations, gap=0.0)
         self._rows = np.zeros(0, np.int64)
-        self._pictures = np.zeros((0, *operator.shape_in), np.float32)
+        self._pictures = np.zeros((0, *places[0][1].shape_in), np.float32)
 
     def recover(self, measurements: NDArray[np.float32], bins: TraceBins) -> PictureTraces:
         """Recover some rows of a shot from their rectified measurements (columns, bins); those of
@@ -54,22 +58,33 @@ class WarmStartedRecovery:
         lit = bins.bin_weights == 1
         rows = bins.numbers[lit]
         seen = np.ascontiguousarray(measurements[:, lit])
-        valid = None if self._alive.all() else np.repeat(self._alive[:, np.newaxis], rows.size, 1)
+        found = np.zeros((rows.size, *self._pictures.shape[1:]), np.float32)
         shared, here, before = np.intersect1d(rows, self._rows, True, return_indices=True)
-        pictures = np.zeros((bins.numbers.size, *self.operator.shape_in), np.float32)
-        if rows.size == 0:
-            return PictureTraces(pictures, bins)
-        if shared.size == 0:
-            found = self.method.recover(self.operator, seen, valid).frames
-        else:
-            start = self._pictures
-            if not np.array_equal(rows, self._rows):
-                start = np.zeros((rows.size, *self.operator.shape_in), np.float32)
-                start[here] = self._pictures[before]
-            found = self._warm.recover(self.operator, seen, valid, start=start).frames
+        found[here] = self._pictures[before]
+        for place, operator in self._places:
+            own = slice(*np.searchsorted(rows, [place.start, place.stop]))
+            if own.start < own.stop:
+                known = bool(np.isin(rows[own], shared).any())
+                found[own] = self._recover_place(operator, seen[:, own], found[own], known)
         self._rows, self._pictures = rows, found
+        pictures = np.zeros((bins.numbers.size, *found.shape[1:]), np.float32)
         pictures[lit] = found
         return PictureTraces(pictures, bins)
+
+    def _recover_place(
+        self,
+        operator: LinearOperator,
+        seen: NDArray[np.float32],
+        start: NDArray[np.float32],
+        known: bool,
+    ) -> NDArray[np.float32]:
+        """Recover rows of one shear, beginning at `start` where some of them are `known`."""
+        valid = None if self._alive.all() else np.repeat(self._alive[:, None], seen.shape[1], 1)
+        if known:
+            frames = self._warm.recover(operator, seen, valid, start=start).frames
+        else:
+            frames = self.method.recover(operator, seen, valid).frames
+        return np.asarray(frames, np.float32)
 
 
 class SurfacePipeline:

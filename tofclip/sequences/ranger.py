@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera, Measurement, Rectifier
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError
 from tofclip.lidar import Detection, PointCloud, point_cloud
 from tofclip.lidar.pulse_tables import TraceBins, Traces
 from tofclip.lidar.search import ReturnSearch
@@ -58,9 +58,9 @@ class SummedShot(NamedTuple):
 class RangingPipeline:
     """Makes clouds of shots of one camera, by the linear inverse or by a method with a prior.
 
-    The linear inverse needs no iterations and knows nothing of the shots before; it draws streaks
-    ("rays") around bright objects. A prior (l1) leaves these out. It begins at the pictures of the
-    shot before and takes its shots in order (`tofclip.sequences.following`).
+    A prior (l1) begins at the pictures of the shot before and takes its shots in order
+    (`tofclip.sequences.following`). The linear inverse needs no iterations and knows nothing of the
+    shots before; it draws streaks ("rays") around bright objects.
 
     Sweep, operators, inverted Gram matrices and filters are worked out once. No transient cube is
     made: pixels are recovered a few at a time, and their returns are sought at once
@@ -104,10 +104,9 @@ class RangingPipeline:
         ]
         self._warm_start: WarmStartedRecovery | None = None
         if isinstance(self.method, ProximalMethod):
-            if len(pieces) > 1:
-                name = self.method.name
-                raise InputError(f"{name} of a stream has one shear for all shots: use fixed:S")
-            self._warm_start = WarmStartedRecovery(self.method, operators[0], alive)
+            rows = [piece.frames for piece in pieces]
+            places = list(zip(rows, operators, strict=True))
+            self._warm_start = WarmStartedRecovery(self.method, places, alive)
         shears = np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces])
         self._search = ReturnSearch(camera, self.times, detection, shears=shears)
         # mean duration of a row: the sweep is nearly even

@@ -27,6 +27,7 @@ from tofclip.errors import InputError, TofclipError
 from tofclip.lidar import PointCloud, point_cloud
 from tofclip.sequences.ranger import CloudPipeline, RangingPipeline
 from tofclip.shots import Returns, Streak
+from tofclip.solvers import Sparse
 from tofclip.threads import open_worker_pool, thread_count
 
 Policy = Literal["block", "drop_oldest"]
@@ -260,7 +261,10 @@ def stream_clouds(
             return
         if isinstance(first, TofclipError):
             raise first
-        pipeline, coming = RangingPipeline.for_shot(first), _prepend_shot(first, coming)
+        # shots on workers of one's own cannot begin at the last one's pictures
+        method = Sparse() if executor is None else None
+        pipeline = RangingPipeline.for_shot(first, method=method)
+        coming = _prepend_shot(first, coming)
     pool: AbstractContextManager[Executor]
     if executor is not None:
         pool = nullcontext(executor)
