@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -95,8 +96,8 @@ def photons(
     ),
     cycles: int | None = opt(
         "N",
-        "With --single-pixel: laser cycles of each pixel, of a detector that counts the first photon of a cycle only; "
-        "pile-up is corrected.",
+        "Laser cycles of each pixel, of a detector that counts the first photon of a cycle only: pile-up is corrected, "
+        "best with --pulse-ps.",
         shown="no pile-up",
     ),
     returns: int = opt(
@@ -123,8 +124,8 @@ def photons(
 
     started = time.perf_counter()
     suffix = out.suffix.lower()
-    if not single_pixel and (background is not None or cycles is not None):
-        raise InputError("--background and --cycles go with --single-pixel")
+    if not single_pixel and background is not None:
+        raise InputError("--background goes with --single-pixel")
     suffixes = (*CLOUD_SUFFIXES, DEPTH_SUFFIX, *PICTURE_SUFFIXES)
     require_writable(out, *suffixes, inputs=(file, pulse, background, camera))
     if pulse is not None and pulse_fwhm is not None:
@@ -144,7 +145,9 @@ def photons(
         found = estimate_pixels(image, shape, background=shades, cycles=cycles, max_returns=returns)
     else:
         with show_share("finding surfaces", 1.0) as show:
-            found = estimate_surface(image, shape, pulse is None, returns, progress=show)
+            found = estimate_surface(
+                image, shape, pulse is None, returns, progress=show, cycles=cycles
+            )
     seen_by = choose_camera(
         known, image.image_shape, focal_length_px, field_of_view_deg, found.pulse.fwhm
     )
@@ -185,6 +188,13 @@ def photons(
         "seconds": time.perf_counter() - started,
         "settings": settings,
     }
+    missed = found.settings.get("pile_up", 0.0)
+    if missed:
+        print(
+            f"tofclip: warning: {missed:.0%} of the background is missing behind surfaces: the detector is blind after "
+            "a photon, and ranges are too short (pile-up); give --cycles N and --pulse-ps W",
+            file=sys.stderr,
+        )
     report(figures, as_json, [out])
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import photon_scenes as scenes
 import pytest
 
+from tofclip.lidar import Pulse
 from tofclip.lidar.photons import PhotonImage, SurfaceImage, estimate_surface
 
 BINS = 512
@@ -41,6 +42,7 @@ def test_deviations_and_outliers_are_as_stated(signal, background, least):
     said = float(found.outlier_probability.mean())
     # a share of a hundredth, which either may be off, is as good as none
     assert (wrong.mean() - 0.005) / 2 < said < 2 * wrong.mean() + 0.005
+    assert found.settings["pile_up"] == 0
     # the offset that all pixels have in common
     offset = np.median(found.range - surface * scenes.BIN_M)
     assert abs(offset) < 2 * float(found.settings["response_sigma_m"])
@@ -77,3 +79,18 @@ def test_pixels_that_are_hot_at_all_times_and_dead_ones_are_found(level):
     # in the darkest columns chance leaves no photon either
     assert 0.9 * dead.sum() <= found.settings["dim_pixels"] <= dead.sum() + 5
     assert np.mean(np.abs(found.range / scenes.BIN_M - surface) <= 3) >= 0.98
+
+
+@pytest.mark.parametrize(("photons", "unaware"), [(1, -4e-3), (3, -10e-3)])
+def test_first_photons_of_a_cycle_are_not_taken_for_all(photons, unaware):
+    """Ranges without the cycles are short by 5 and 14 mm, which deviations do not say."""
+    cycles, surface = 300, scenes.make_surface()
+    light = 0.9 * photons * cycles * TILES + 0 * surface
+    rates = scenes.make_rates(surface, light, 0.1 * photons * cycles / BINS)
+    image = PhotonImage.from_cube(scenes.count_first_photons(rates, cycles, 0), scenes.BIN)
+    pulse = Pulse.gaussian(scenes.FWHM)
+    missed, found = (estimate_surface(image, pulse, cycles=told) for told in (None, cycles))
+    assert np.median(missed.range - surface * scenes.BIN_M) < unaware
+    assert abs(np.median(found.range - surface * scenes.BIN_M)) < 1e-3
+    assert missed.settings["pile_up"] > 0.3
+    assert found.settings["pile_up"] == 0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 from tofclip.lidar.photons.image import FloatArray, PhotonImage
 from tofclip.lidar.photons.matching import PLANE_ROUNDS, TRIAL_ROUNDS, fit_surface
-from tofclip.lidar.photons.scene import BinnedResponse, Scene, learn_response
+from tofclip.lidar.photons.scene import LEARNT_SLOPE_FLOOR, BinnedResponse, Scene, learn_response
 
 REACHES_PX = (1, 2, 3, 4, 6, 8)
 RESPONSE_ROUNDS, RESPONSE_REACH_PX = 4, 3
@@ -77,12 +77,18 @@ def learn_scene(
     before = weigh_evidence(test, train, scene, fitted)
     for _ in range(RESPONSE_ROUNDS):
         residual = test.bin - fitted.ravel()[test.pixel]
-        pulse, later = learn_response(residual, test.count, scene.response.width, train.bin_width)
-        scene = Scene(BinnedResponse(pulse, train.bin_width), scene.background)
+        pulse, later = learn_response(
+            residual, _count_arrived(test), scene.response.width, train.bin_width
+        )
+        scene = Scene(BinnedResponse(pulse, train.bin_width, LEARNT_SLOPE_FLOOR), scene.background)
         fitted = fit_surface(train, scene, fitted + later, RESPONSE_REACH_PX, TRIAL_ROUNDS)[..., 0]
     gain = weigh_evidence(test, train, scene, fitted) - before
     clear = MIN_LEARNT_SIGNIFICANCE * np.sqrt(gain.size) * gain.std() + MIN_LEARNT_GAIN
     return scene.response if required or gain.sum() > clear else None
+
+
+def _count_arrived(photons: PhotonImage) -> NDArray[np.float32]:
+    return photons.count if photons.arrived is None else photons.count * photons.arrived
 
 
 def choose_reach(
@@ -152,7 +158,9 @@ def _learn_anew(
     residual = teacher.bin - surface.ravel()[teacher.pixel]
     width = scene.response.width
     try:
-        pulse, later = learn_response(residual, teacher.count, width, teacher.bin_width)
+        pulse, later = learn_response(residual, _count_arrived(teacher), width, teacher.bin_width)
     except InputError:
         return scene, surface
-    return Scene(BinnedResponse(pulse, teacher.bin_width), scene.background), surface + later
+    return Scene(
+        BinnedResponse(pulse, teacher.bin_width, LEARNT_SLOPE_FLOOR), scene.background
+    ), surface + later

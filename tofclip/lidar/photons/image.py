@@ -24,6 +24,9 @@ from tofclip.units import SPEED_OF_LIGHT, require_credible_bin_width
 
 FloatArray = NDArray[np.float64]
 
+# Of the cycles that no photon has ended yet: what fewer show is not worth its noise, and of more
+# photons their number is not known.
+MIN_READY_SHARE, MAX_BLIND_SHARE = 0.02, 0.9
 MIN_BIN_WIDTH_S = 1e-13  # half of the finest channel of time-correlated counters (0.2 ps)
 
 
@@ -48,6 +51,11 @@ class PhotonImage:
     axes : str
         Order of the axes of the cube that they were read from and how surely it was recognised;
         empty where it was known.
+    cycles : float
+        Laser cycles of each pixel, of a detector that counts the first photon of a cycle only; by
+        default so many that none is missed; see `correct_pile_up`.
+    arrived : (events,) float32 array, optional
+        Photons that arrived for each one that was counted; 1 by default.
 
     Raises
     ------
@@ -62,6 +70,8 @@ class PhotonImage:
     bins: int
     bin_width: float
     axes: str = ""
+    cycles: float = np.inf
+    arrived: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         pixels = self.image_shape[0] * self.image_shape[1]
@@ -74,6 +84,8 @@ class PhotonImage:
         require_credible_bin_width(self.bin_width, shortest=MIN_BIN_WIDTH_S)
         if not self.bin.size:
             raise InputError("no pixel counted a photon")
+        if not self.cycles > 0:
+            raise InputError(f"pile-up needs a cycle or more, got {self.cycles}")
 
     @classmethod
     def from_cube(cls, counts: ArrayLike, bin_width: float) -> PhotonImage:
@@ -186,7 +198,9 @@ class PhotonImage:
         """Return the events with other counts, (events,); those with none are left out."""
         kept = count > 0
         offsets = np.concatenate([[0], np.cumsum(kept)])[self.offsets]
-        return replace(self, offsets=offsets, bin=self.bin[kept], count=count[kept], axes="")
+        arrived = None if self.arrived is None else self.arrived[kept]
+        own = self.bin[kept], count[kept]
+        return replace(self, offsets=offsets, bin=own[0], count=own[1], axes="", arrived=arrived)
 
     def join_bins(self, number: int) -> PhotonImage:
         """Return the same events, at the same instants, on a time axis of bins that are as many
@@ -210,7 +224,30 @@ class PhotonImage:
                 f"{self.photons:g} photons are too few to find a surface and to hold some back "
                 "that judge it; each pixel may be judged alone (`single_pixel`)"
             )
-        return self.select(self.count - second), self.select(second)
+        # each part sees as much of the dead time as all photons do
+        first, other = self.select(self.count - second), self.select(second)
+        return (
+            replace(first, cycles=self.cycles * (1 - fraction)),
+            replace(other, cycles=self.cycles * fraction),
+        )
+
+    def correct_pile_up(self, cycles: int) -> PhotonImage:
+        """Return the same events, of a detector that counts the first photon of each of so many
+        cycles, with what it was blind to (Coates 1968).
+        """
+        if self.photons_per_pixel.max() > cycles:
+            raise InputError(
+                f"more photons than {cycles} cycles allow, of which each counts its first"
+            )
+        order = np.lexsort((self.bin, self.pixel))
+        ordered = self.count[order].astype(np.float64)
+        until = np.concatenate([[0.0], np.cumsum(ordered)])
+        live = cycles - (until[:-1] - until[self.offsets[:-1]][self.pixel])
+        share = ordered / np.maximum(live, MIN_READY_SHARE * cycles)
+        arrived = np.empty_like(self.count)
+        share = np.clip(share, 1e-9, MAX_BLIND_SHARE)
+        arrived[order] = -np.log1p(-share) * cycles / ordered
+        return replace(self, cycles=float(cycles), arrived=arrived)
 
     def histograms(self, pixels: slice) -> FloatArray:
         """Return the histograms of some pixels in raster order, (n, bins)."""

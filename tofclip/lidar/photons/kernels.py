@@ -27,6 +27,7 @@ vectorised = compile_and_keep(error_model="numpy", fastmath=True)
 per_histogram = compile_and_keep()
 
 MAX_ITERATIONS = 16  # the weights change with the estimate: some rounds more than the plain fit
+MIN_READY_SHARE = 0.02  # of the cycles: what fewer show is not worth its noise
 MIN_PHOTONS = 0.5  # lets an empty histogram have a background
 MIN_PLANE_PIXELS = 6  # a plane through fewer pixels is taken as level
 MIN_DETERMINED_FRACTION = 1e-2  # of the information that must be left for the middle after slopes
@@ -325,17 +326,23 @@ def find_best_labels(score, total, extra_paths, apart, label, margin):
 
 
 @compiled
-def measure_events(offsets, bin_time, count, surface, table, start, step, brightness, sums):
+def measure_events(offsets, bin_time, count, surface, table, start, step, brightness, dead, sums):
     """What the photons of each pixel say about moving its surface, `sums` (pixels, 3): slope of the
-    log-likelihood, its Fisher information, photons of the signal. `table` (n, 2): of the response,
-    sampled from `start` by `step`: minus the slope of its logarithm, and its density over that of
-    the background for one photon of signal, of which `brightness` (pixels,) are expected.
+    log-likelihood, its Fisher information, photons of the signal. `table` (n, 4): of the response,
+    sampled from `start` by `step`: minus the slope of its logarithm, its density over that of the
+    background for one photon of signal, of which `brightness` (pixels,) are expected, then the
+    share of it that is later than the photon's bin, and how much it pushes. `dead`:
+    background of a bin, and one photon, over the cycles: where a cycle ends with its first photon,
+    each takes a share of the later signal away (0, 0: it does not). Coates 1968, Eq. 4.
     """
     for pixel in range(surface.size):
         slope = information = photons = 0.0
+        ready = 1.0
         for event in range(offsets[pixel], offsets[pixel + 1]):
             position = (bin_time[event] - surface[pixel] - start) / step
             if not 0 <= position < table.shape[0] - 1:
+                if position < 0:
+                    ready -= count[event] * dead[1]
                 continue
             left = int(position)
             part = position - left
@@ -344,10 +351,19 @@ def measure_events(offsets, bin_time, count, surface, table, start, step, bright
             # Probability that the photon is of the signal. The derivative of log(background +
             # signal) is the signal's own, weighted by it.
             belongs = odds / (1 + odds)
-            slope += count[event] * belongs * push
+            ready -= (
+                count[event] * dead[1] * (table[left, 2] * (1 - part) + table[left + 1, 2] * part)
+            )
+            missed = brightness[pixel] * (table[left, 3] * (1 - part) + table[left + 1, 3] * part)
+            # of several photons in one bin and cycle one is counted
+            rate = odds * dead[0]
+            belongs *= 1 + rate * (0.5 + rate / 12)
+            # what would have come later pushes no more: as much is added
+            slope += count[event] * (belongs * push + missed * dead[0])
             information += count[event] * (belongs * push) ** 2
             photons += count[event] * belongs
-        sums[pixel, 0], sums[pixel, 1], sums[pixel, 2] = slope, information, photons
+        sums[pixel, 0], sums[pixel, 1] = slope, information
+        sums[pixel, 2] = photons / max(ready, MIN_READY_SHARE)
 
 
 @compiled

@@ -143,21 +143,31 @@ def fit_surface(
     from tofclip.lidar.photons import kernels
 
     response, now = scene.response, np.array(surface, dtype=np.float64)
-    table = np.stack([response.log_slope, response.density / scene.background], axis=1)
+    odds = response.density / scene.background
+    # at the end of the bin in whose middle a photon is said to lie
+    half = 0.5 / response.step + np.arange(odds.size)
+    passed = (np.cumsum(response.density) - response.density / 2) * response.step
+    later = 1 - np.interp(half, np.arange(odds.size), passed)
+    pushes = response.log_slope * odds * response.step
+    pushed = pushes.sum() - np.cumsum(pushes) + pushes / 2
+    missed = np.interp(half, np.arange(odds.size), pushed)
+    table = np.stack([response.log_slope, odds, later, missed], axis=1)
+    dead = scene.background / photons.cycles, 1 / photons.cycles
     brightness = np.full(now.size, scene.count_signal(photons))
     slopes, gate = np.zeros((*now.shape, 2)), GATE_WIDTHS * response.width
     sums, fitted = np.empty((now.size, 3)), np.empty((*now.shape, 3))
 
     def measure(piece: slice) -> None:
         offsets, flat = photons.offsets[piece.start : piece.stop + 1], now.reshape(-1)[piece]
-        sampled = table, response.start, response.step, brightness[piece]
+        sampled = table, response.start, response.step, brightness[piece], dead
         kernels.measure_events(offsets, photons.bin, photons.count, flat, *sampled, sums[piece])
 
     def fit(piece: slice) -> None:
         around = sums.reshape(fitted.shape)
         kernels.fit_planes(now, around, reach, gate, slopes, (piece.start, piece.stop), fitted)
 
-    for _ in range(rounds):
+    # signal and instant say something of each other where cycles end with the first photon
+    for _ in range(rounds if np.isinf(photons.cycles) else 4 * rounds):
         run_blocks(measure, now.size, PIXELS_PER_BLOCK)
         run_blocks(fit, now.shape[0], ROWS_PER_BLOCK)
         now = fitted[..., 0].copy()

@@ -50,7 +50,7 @@ MIN_PULSE_S = 1e-12  # superconducting counters, the quickest there are, spread 
 # such bins with how many photons each say that the bins between them stay empty for a reason.
 STEP_QUANTILE, MIN_STEP_BINS, MIN_PHOTONS_PER_STEP = 0.05, 64, 4.0
 DENSITY_FLOOR = 1e-4  # of the peak: no instant is impossible, so that no single photon decides
-SLOPE_FLOOR = 0.03  # of the peak: how bright the response has to be for its slope to be known
+LEARNT_SLOPE_FLOOR = 0.03
 MIN_SIGNAL_PHOTONS = 0.05
 BACKGROUND_QUANTILE, BACKGROUND_GROUPS = 0.2, 64
 MIN_BACKGROUND_PHOTONS = 1.0  # of the whole picture: no background is exactly zero
@@ -62,6 +62,7 @@ class BinnedResponse:
 
     pulse: Pulse  # shape of a return, bins included
     bin_width: float  # s
+    slope_floor: float = 0.0  # of the peak: how bright it has to be for its slope to be known
 
     @property
     def step(self) -> float:
@@ -89,8 +90,8 @@ class BinnedResponse:
         """Minus the slope of the density's logarithm at each sample, per bin; where the response is
         faint, chance in what was learnt is not taken for a slope.
         """
-        faint = SLOPE_FLOOR * self.density.max()
-        return np.asarray(-np.gradient(self.density, self.step) / (self.density + faint))
+        faint = self.slope_floor * self.density.max()
+        return np.asarray(-np.gradient(np.log(self.density + faint), self.step))
 
     def coarse_shares(self, coarse: int) -> tuple[FloatArray, int]:
         """Share of the photons in each of the coarse bins, of so many bins, around the one that holds

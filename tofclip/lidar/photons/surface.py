@@ -48,6 +48,10 @@ JUMP_COST_RATIO = 9.0  # any larger change costs this many times as much
 # for the whole picture, which `settings` state and no pixel's deviation holds.
 LEARNT_RESPONSE_SIGMA_WIDTHS = 1 / 30
 MIN_EXPLAINED_DENSITY = 0.003  # of the response's peak: where it is brighter photons are explained
+# Of the time axis, and pixels that have to show a stretch before their surfaces; photons expected behind
+# surfaces, and the share of them that has to be missing before a detector is said to be blind there.
+BLIND_STRETCHES, MIN_WITNESSES = 64, 20
+MIN_BLIND_PHOTONS, MIN_MISSED_SHARE = 400.0, 0.2
 # That the background alone shows as many photons at a further surface, in the pixel and in the nine
 # pixels around it.
 MAX_OWN_CHANCE, MAX_POOLED_CHANCE = 0.02, 1e-4
@@ -60,6 +64,7 @@ def estimate_surface(
     max_returns: int = 1,
     seed: int = 0,
     progress: Callable[[float], object] | None = None,
+    cycles: int | None = None,
 ) -> SurfaceImage:
     """Find one surface for every pixel, with the help of its neighbours.
 
@@ -77,6 +82,10 @@ def estimate_surface(
         Of the choice of the photons that are held back.
     progress : callable, optional
         Called with the fraction of the work that is done.
+    cycles : int, optional
+        Laser cycles of each pixel, of a detector that counts the first photon of a cycle only. Then
+        a `pulse` that is given is kept; ranges by one that is learnt are up to 0.3 bins late where
+        most cycles have a photon.
 
     Returns
     -------
@@ -96,6 +105,8 @@ def estimate_surface(
     report = (lambda _: None) if progress is None else progress
     dim = find_dim_pixels(photons)
     photons, start, hot = prepare_photons(photons, pulse)
+    if cycles is not None:
+        photons = photons.correct_pile_up(cycles)
     scene = Scene.start(photons, start)
     axis = choose_label_axis(photons, scene)
     train, test = photons.split(HELD_OUT_FRACTION, seed)
@@ -114,7 +125,8 @@ def estimate_surface(
     costs = slope_cost, slope_cost * JUMP_COST_RATIO
 
     learnt = None
-    if learn or pulse is None:
+    # what is learnt behind many first photons is too late
+    if pulse is None or (learn and cycles is None):
         learnt = learn_scene(train, test, training, surface, required=pulse is None)
     if learnt is not None:
         scene = Scene(learnt, scene.background)
@@ -148,6 +160,7 @@ def estimate_surface(
     strongest = np.argsort(-np.nan_to_num(stack[..., 2], nan=-1.0), axis=0, kind="stable")
     stack = np.take_along_axis(stack, strongest[..., np.newaxis], axis=0)[:max_returns]
     bin_m = SPEED_OF_LIGHT / 2 * photons.bin_width
+    missed = 0.0 if cycles is not None else find_missed_share(photons, scene, layers[0][..., 0])
     settings: dict[str, float | str] = {
         "response": "given" if learnt is None else "learnt",
         "pulse_fwhm_ps": scene.response.pulse.fwhm * 1e12,
@@ -158,6 +171,7 @@ def estimate_surface(
         "response_sigma_m": common * bin_m,
         "hot_pixels": int(hot.sum()),
         "dim_pixels": int(dim.sum()),
+        "pile_up": missed,
     }
     stack = stack * [bin_m, bin_m, 1, 1]
     return SurfaceImage.from_layers(stack, scene.response.pulse, settings, hot)
@@ -197,6 +211,27 @@ def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> Phot
     bright = times[response.density >= MIN_EXPLAINED_DENSITY * response.density.max()]
     late = photons.bin - layer[..., 0].ravel()[photons.pixel]
     return photons.select(photons.count * ~((late >= bright[0]) & (late <= bright[-1])))
+
+
+def find_missed_share(photons: PhotonImage, scene: Scene, surface: FloatArray) -> float:
+    """Share of the background that is missing behind surfaces, as of a detector that their photons
+    blind; 0 where nothing says so. What is expected there is a pixel's own background before its
+    surface, with the course over time that pixels show whose surfaces come later.
+    """
+    number, pixels = min(BLIND_STRETCHES, photons.bins), surface.size
+    stretch = np.clip(photons.bin * (number / photons.bins), 0, number - 1).astype(np.int64)
+    seen = np.bincount(photons.pixel * number + stretch, photons.count, pixels * number)
+    seen, length = seen.reshape(pixels, number), photons.bins / number
+    late = (np.arange(number) + 0.5) * length - surface.reshape(-1, 1)
+    before = late < -2 * scene.response.width - length
+    known = (late > 12 * scene.response.width + length) & (before.sum(axis=0) >= MIN_WITNESSES)
+    own, course = np.ones((pixels, 1)), np.ones(number)
+    for _ in range(5):
+        own = (seen * before).sum(1, keepdims=True) / np.maximum(before @ course, 1e-9)[:, None]
+        course = (seen * before).sum(axis=0) / np.maximum((before * own).sum(axis=0), 1e-9)
+    expected = float((known * own * course).sum())
+    share = 1 - float((seen * known).sum()) / max(expected, 1e-9)
+    return share if expected > MIN_BLIND_PHOTONS and share > MIN_MISSED_SHARE else 0.0
 
 
 def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> FloatArray:
