@@ -28,6 +28,7 @@ from nlos.illumination import choose_roles
 from nlos.preparation import fade_record_end, join_near_lasers
 from nlos.settings import Limits, Settings, Wanted
 from nlos.volume import Grid, Volume
+from tofclip.arrays import namespace, to_numpy
 from tofclip.errors import InputError
 
 VOXELS_PER_WAVELENGTH = 8
@@ -51,6 +52,10 @@ SCOUT_WAVELENGTHS, QUICK_SCOUT_VOXELS = 2.0, 1 << 13
 GATE_DEPTH_FRACTION = 0.4
 # They see no finer than the wall's lattice and the time bins, whatever the wavelength.
 TRANSFORM_METHODS = ("lct", "fk")
+# A picture is judged by what this fraction of its voxels exceeds, against that of so many decoys.
+BRIGHT_QUANTILE, DECOYS = 0.999, 2
+# With less evidence than this, a picture may be of noise, a glow, or of wrong units.
+MIN_EVIDENCE = 2.0
 # A voxel nearer to a wall point than this is on the wall.
 BRIGHTEST_ON_WALL_WAVELENGTHS = 0.5
 
@@ -151,6 +156,31 @@ def find_bright_box(settings: Wanted, scouted: Volume) -> Wanted:
     """
     x, y, (near, far) = _find_ends(Grid.around(scouted, settings.voxel_size))
     return replace(settings, x=x, y=y, near=near, far=far, everywhere=True)
+
+
+def measure_evidence(capture: Capture, settings: Settings) -> float:
+    """How much brighter the brightest of a coarse picture is than that of decoys: of the capture
+    itself, its signals shuffled among the wall points. About 1 says that there is nothing to see.
+
+    Each depth's brightness is taken relative to the decoys': noise and the wall's glow fade with it.
+    `capture`, `settings`: as they are imaged.
+    """
+    coarse = find_scout(capture, replace(settings, everywhere=False))
+    scout, grid = coarse or (settings, settings.grid())
+    _, plan = scout.plan_quickest(capture, grid)
+    xp, places = namespace(capture.signal), np.flatnonzero(capture.valid)
+    flat, energies = xp.reshape(capture.signal, (capture.axis.bins, -1)), []
+    for seed in range(DECOYS + 1):
+        order = np.arange(capture.valid.size)
+        if seed:
+            order[places] = np.random.default_rng(seed).permutation(places)
+        signal = xp.take(flat, capture.device.put(order), axis=1)
+        shuffled = replace(capture, signal=xp.reshape(signal, capture.signal.shape))
+        energies.append(to_numpy(plan.image(shuffled).values).astype(np.float64) ** 2)
+    level = np.mean(energies[1:], axis=(0, 2, 3))[:, np.newaxis, np.newaxis]
+    level = np.maximum(level, np.finfo(np.float32).tiny)
+    own, *decoys = (float(np.quantile(energy / level, BRIGHT_QUANTILE)) for energy in energies)
+    return own / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
 
 
 def is_brightest_on_wall(volume: Volume, capture: Capture, wavelength: float) -> bool:

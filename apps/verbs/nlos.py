@@ -282,7 +282,7 @@ def reconstruct_single(
     source: Path, results: ResultFiles, wanted: ReconstructSettings, device: str
 ) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
-    from nlos.completion import is_brightest_on_wall
+    from nlos.completion import MIN_EVIDENCE, is_brightest_on_wall, measure_evidence
     from nlos.io import read_capture
     from nlos.normals import find_imaged_surface
     from tofclip.arrays import ComputeDevice, parse_device
@@ -303,6 +303,13 @@ def reconstruct_single(
         print(
             f"tofclip: warning: {source}: the brightest voxel lies on the wall, whose own light the picture shows; "
             "blank more of it by --gate-m, or begin farther away by --near-m",
+            file=sys.stderr,
+        )
+    evidence = measure_evidence(prepared.capture, prepared.settings)
+    if not evidence >= MIN_EVIDENCE:
+        print(
+            f"tofclip: warning: {source}: the picture's brightest is {evidence:.2g} times that of shuffled copies "
+            "of the capture: noise or a glow; see that the bin width and the wall's size are right",
             file=sys.stderr,
         )
     # Files are written from the host's memory.
@@ -337,6 +344,7 @@ def reconstruct_single(
         "wavelength_reason": found.reasons.get("wavelength", "given"),
         "bins_together": found.bins_together,
         "brightest_on_wall": on_wall,
+        "evidence": evidence,
         "voxel_mm": shown["voxel_mm"],
         "voxels": volume.grid.shape,
         "wall_points": len(capture.points),

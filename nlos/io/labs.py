@@ -261,7 +261,6 @@ def match_lasers_to_sensors(
 
 # Path per bin, m.
 SURFACE_OPTIMISATION_BIN_M = 1.2e-3
-PAIR_BIN_WIDTH_S = 32e-12
 
 # About z: from x to the left and y up to x to the right and y down.
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
@@ -351,8 +350,8 @@ def read_general_data(fields: NamedArrays) -> Capture:
     """Read ``data`` (rows, columns, t) of irregular pairs, with ``laserpoints`` and
     ``detectpoints`` (rows, columns, 3), m, in ``setup.mat`` beside the file.
 
-    Bins are 32 ps, or ``timeRes`` s where that number stands in either file: the authors keep it in
-    a file of settings instead, and it is another one for the data sets of others. Seen from the
+    The bin width, ``timeRes`` s, has to stand in either file: the authors keep it in a file of
+    settings, and it is 8.33, 16 or 32 ps there. Seen from the
     wall x runs to the left and y up: their script reverses both before it shows a volume, and only
     so the letter and the number of "tuan" read as in the photograph of them.
 
@@ -372,7 +371,13 @@ def read_general_data(fields: NamedArrays) -> Capture:
         beside.finite_array(name, *counts.shape[:2], 3) for name in ("laserpoints", "detectpoints")
     )
     stated = next((one for one in (fields, beside) if "timeRes" in one), None)
-    bin_width = PAIR_BIN_WIDTH_S if stated is None else stated.number("timeRes")
+    if stated is None:
+        raise FileFormatError(
+            fields.path,
+            "states no bin width; add it in seconds as timeRes to this file or to setup.mat, such as "
+            "timeRes = 32e-12; see docs/own_wall.md",
+        )
+    bin_width = stated.number("timeRes")
     return Capture(np.moveaxis(counts, 2, 0), wall @ HALF_TURN, laser @ HALF_TURN, bin_width)
 
 

@@ -12,7 +12,12 @@ from nlos import Capture, Grid, Settings, Volume, settings_for
 from nlos.analysis import choose_wavelength, find_brightest_path, find_first_bounce
 from nlos.band import VirtualPulse
 from nlos.capture import TimeAxis
-from nlos.completion import complete_settings, is_brightest_on_wall
+from nlos.completion import (
+    MIN_EVIDENCE,
+    complete_settings,
+    is_brightest_on_wall,
+    measure_evidence,
+)
 from nlos.simulate import add_poisson_noise
 from tofclip.errors import InputError
 
@@ -152,6 +157,25 @@ def test_a_bright_wall_is_noticed() -> None:
         values = np.zeros(grid.shape)
         values[index, 0, 0] = 1
         assert is_brightest_on_wall(Volume(values, grid), clean(), 0.1) == on_wall
+
+
+@pytest.mark.parametrize("confocal", [True, False])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_evidence_separates_a_scene_from_noise_and_from_a_shuffled_record(
+    confocal: bool, seed: int
+) -> None:
+    counts = add_poisson_noise(clean(confocal), 300, 0.5, seed)
+    random, signal = np.random.default_rng(seed), counts.signal
+    shuffled = random.permutation(signal.reshape(400, -1), axis=1).reshape(signal.shape)
+    noise = random.poisson(0.5, signal.shape)
+
+    def judge(capture: Capture) -> float:
+        settings = complete_settings(capture, Settings())
+        return measure_evidence(settings.prepare(capture), settings)
+
+    assert judge(counts) > 2 * MIN_EVIDENCE
+    assert judge(replace(counts, signal=shuffled)) < MIN_EVIDENCE
+    assert judge(replace(counts, signal=noise)) < MIN_EVIDENCE
 
 
 def test_the_box_before_a_wall_with_relief_begins_by_its_middle() -> None:

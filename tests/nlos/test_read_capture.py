@@ -337,6 +337,8 @@ def test_general_pairs(tmp_path: Path) -> None:
     # Theirs run to the left and up.
     turned = {"laserpoints": lasers * [-1, -1, 1], "detectpoints": WALL * [-1, -1, 1]}
     write_matlab(tmp_path / "setup.mat", "5", **turned)
+    refused(tmp_path / "data_one.mat", "states no bin width; add it in seconds as timeRes")
+    write_matlab(tmp_path / "setup.mat", "5", **turned, timeRes=32e-12)
     same(read_capture(tmp_path / "data_one.mat"), expected)
     write_matlab(tmp_path / "setup.mat", "5", **turned, timeRes=8.33e-12)
     assert read_capture(tmp_path / "data_one.mat").bin_width == pytest.approx(8.33e-12)
