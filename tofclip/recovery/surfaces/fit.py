@@ -45,7 +45,9 @@ from tofclip.solvers import Method, Progress, Sparse, ignore_progress
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
-MAX_FALSE_ALARM = 0.04  # of a return that makes a surface: what it misses the surface still reaches
+# Of a return that makes a surface: what is left out the surface still reaches. Where so few returns do
+# not explain a shot, as one of many small and dim things, those of the cloud are taken.
+SURE_FALSE_ALARM = 0.04
 START_ITERATIONS = 25
 MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 4, 10
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
@@ -112,10 +114,26 @@ def fit_surfaces(
     camera to use; `weight, iterations`: see `SurfaceRecovery`; `progress`: called with the number
     of frame iterations just done.
     """
-    camera, count = frames.camera, frames.times.size
     # 1. Frames by a fast method, whose returns are a picture of ranges. The model explains what was
     # measured: corrections come when its own returns are listed.
-    found = depth(frames, camera.replace(range_calibration=None), false_alarm=MAX_FALSE_ALARM)
+    plain = frames.camera.replace(range_calibration=None)
+    try:
+        sure = depth(frames, plain, false_alarm=SURE_FALSE_ALARM)
+        return _fit_returns(sure, streak, frames, weight, iterations, progress)
+    except InputError:
+        return _fit_returns(depth(frames, plain), streak, frames, weight, iterations, progress)
+
+
+def _fit_returns(
+    found: Returns,
+    streak: Streak,
+    frames: Frames,
+    weight: float,
+    iterations: int,
+    progress: Progress,
+) -> SurfaceFit:
+    """Fit the surfaces that some returns show."""
+    camera, count = frames.camera, frames.times.size
     bin_m = SPEED_OF_LIGHT * frames.bin_width / 2
     directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
     ray_length = (1 / directions[:, 2]).reshape(camera.image_shape)
