@@ -168,7 +168,9 @@ def test_a_slow_consumer_gets_the_newest_shot_and_the_truth_about_the_others(
 
 
 def test_photons_become_shots_of_so_many(shell):
-    figures = shell.figures("stream 'sim+linospad2://?seed=1&cycles=40&records=80000'")
+    figures = shell.figures(
+        "stream 'sim+linospad2://?seed=1&cycles=40&records=80000' --method linear"
+    )
     # 40 cycles of about 6000 photons
     assert (figures["clouds"], figures["dropped"]) == (3, 0)
     assert figures["points"] > 500

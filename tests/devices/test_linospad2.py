@@ -87,10 +87,10 @@ def test_recorded_boards(shared_data: Path, light: LineLight, board: str, hot: i
             histogram.add(codec.decode(words, codec.start).records)
         figures = score_returns(depth(recover(histogram.to_streak(light.camera))), light.truth)
         errors.append(figures["median_depth_error_m"])
-    # 0.8 mm with the tables and 315 mm without them, where the pixels' offsets are 11 ns or 1.6 m
+    # 0.8 mm with the tables and 90 to 315 mm without them, where the pixels' offsets are 11 ns or 1.6 m
     # apart.
     assert errors[0] < 1.5e-3
-    assert errors[1] > 0.1
+    assert errors[1] > 0.05
 
 
 def test_a_calibration_survives_storage(uneven: BoardCalibration, tmp_path: Path) -> None:

@@ -42,6 +42,7 @@ MAX_LAG_FRACTION = 0.25  # of the time axis: photons further apart than this are
 MIN_LAG_SIGNIFICANCE = 8.0  # standard deviations of pairs beyond those that meet by chance
 SAMPLES_PER_WIDTH = 24
 SMOOTHING_WIDTHS = 1 / 6
+MIN_SHAPE_BINS = 2.5  # of a response at half of its height: fewer show no shape
 # Full widths before and after the surface in which the response is learnt (tails are long), and
 # where only background is expected.
 EXTENT_WIDTHS, BACKGROUND_WIDTHS = (-3.0, 9.0), (-8.0, -4.0)
@@ -239,9 +240,10 @@ def learn_response(
         near = np.arange(low[after - 1] + 1, low[after])
         width_seen = float(near.size)
     # Vertex of the parabola through the logarithm of all that is above half of the peak, each sample
-    # weighing as its photons: the highest sample alone moves by an eighth of the width with chance.
+    # weighing as its photons: the highest sample alone moves by an eighth of the width with chance. Of
+    # a response as short as a few bins, as a gate's in coarse steps, no shape is seen.
     part = 0.0
-    if near.size > 2:
+    if near.size * step > MIN_SHAPE_BINS:
         weight = np.sqrt(shape[near])
         bend, slope, _ = np.polyfit(near - peak, np.log(shape[near]), 2, w=weight)
         vertex = -slope / (2 * bend) if bend < 0 else 0.0
