@@ -43,7 +43,7 @@ from tofclip.errors import (
 from tofclip.io.hamamatsu import TIME_UNITS
 from tofclip.storage import Field, Record, Scalar
 
-COMMAND_PORT, DATA_PORT = 1001, 1002
+COMMAND_PORT = 1001
 TERMINATOR = b"\r"
 ENCODING = "latin-1"  # Of all text: HPD-TA writes "µ" as one byte
 GREETING, DATA_GREETING = "RemoteEx Ready", "RemoteEx Data Ready"

@@ -143,8 +143,7 @@ class Detection:
         at: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
         """Largest intensity of each pixel, 0 where there is no candidate, and `compute_least_intensity`."""
-        strongest = np.zeros(int(pixel.max()) + 1)
-        np.maximum.at(strongest, pixel, intensity)
+        strongest = find_strongest(pixel, intensity)
         start, end = min(time.min(), at.min()), max(time.max(), at.max())
 
         def find_slot(instants: FloatArray) -> NDArray[np.int64]:
@@ -158,6 +157,13 @@ class Detection:
         needed = np.maximum(self.min_scene_fraction * scene, self.min_time_bin_fraction * around)
         least: FloatArray = needed[find_slot(at)]
         return strongest, least
+
+
+def find_strongest(pixel: NDArray[np.int64], intensity: FloatArray) -> FloatArray:
+    """Return the largest intensity of each pixel, 0 where there is no candidate."""
+    strongest = np.zeros(int(pixel.max()) + 1)
+    np.maximum.at(strongest, pixel, intensity)
+    return strongest
 
 
 def find_quantile_value(values: NDArray[np.floating], fraction: float) -> float:
@@ -188,9 +194,8 @@ EXCESS_LIMITS = -0.8, 0.3  # of light, beyond which it says no more
 # Of the light at an instant or in the scene, the part that is brighter than what others are compared with:
 # a retroreflector is bright, but has little of the light.
 BRIGHTER_PART = 0.5
-HALF_MISFIT = (
-    0.02  # at which half of the scene's brightness counts; of its light the instrument spreads some
-)
+# Misfit at which half of the scene's brightness counts: of its light the instrument spreads some.
+HALF_MISFIT = 0.02
 # pooled significance of the brightest at an instant, at which half of what it spreads is seen beside noise
 HALF_SEEN = 30.0
 
@@ -249,12 +254,10 @@ class EvidenceJudge:
         excess = np.clip(excess, *EXCESS_LIMITS) * pooled**2 / (pooled**2 + 4 * neighbours)
         intensity = signal * distance**2
         around = pool.sum_around(intensity)
-        strongest = np.zeros(int(pixel.max()) + 1)
-        np.maximum.at(strongest, pixel, intensity)
         ratios = [
             around / find_brightness_at_instant(time, around, width),
             intensity / find_brightness(intensity),
-            intensity / strongest[pixel],
+            intensity / find_strongest(pixel, intensity)[pixel],
         ]
         brightness = np.log(np.clip(ratios, TINY, 1))
         # what is cut off does not fit either, but is not spread

@@ -61,8 +61,7 @@ CHANGED_RATIO, CHANGED_EXCESS = 1.25, 0.02
 MIN_SURFACE_SHARE = 0.7
 # Of the measurements, both smoothed so that photons' noise hardly counts: above, much of the light is
 # not where the surfaces are. Surfaces leave 0.02 to 0.22, 0.3 where frames see things beside them, and
-# recorded relay walls 0.2 to 0.5. Smoke's
-# first light looks like one surface, but only the first.
+# recorded relay walls 0.2 to 0.5. Smoke's first light looks like one surface, but only the first.
 MAX_UNEXPLAINED = 0.4
 # Of a pulse's light, that long after its peak: more is not an instrument's afterglow (0.18), but light
 # that comes from many depths to each pixel.
