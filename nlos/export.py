@@ -76,8 +76,6 @@ def extract_surface(volume: Volume, fraction: float) -> Mesh:
     """Draw the surface on which the magnitude is `fraction` (0..1) of the largest, by marching
     cubes. Returns vertices in m, float32, and faces, int32.
     """
-    import pyvista
-
     magnitude = volume.magnitude
     if not 0 < fraction < 1:
         raise InputError(
@@ -85,9 +83,7 @@ def extract_surface(volume: Volume, fraction: float) -> Mesh:
         )
     if min(magnitude.shape) < 2 or not magnitude.any():
         raise InputError("a surface needs at least 2 voxels along every axis, and light")
-    grid = pyvista.RectilinearGrid(volume.grid.x, volume.grid.y, volume.grid.z)
-    # VTK lists points with x fastest, as a (z, y, x) array lies in memory.
-    found = grid.contour([fraction * float(magnitude.max())], scalars=magnitude.ravel())
+    found = volume.to_pyvista().contour([fraction * float(magnitude.max())])
     faces = np.asarray(found.regular_faces, np.int32).reshape(-1, 3)
     return Mesh(np.asarray(found.points, np.float32), faces)
 

@@ -278,6 +278,13 @@ class Volume:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(to_numpy(self.values), dtype=dtype)
 
+    def __getitem__(self, voxels: Any) -> Any:
+        """Pick from the values (z, y, x) as NumPy does: ``volume[10]`` is the slice at ``grid.z[10]``."""
+        try:
+            return self.values[voxels]
+        except (IndexError, TypeError) as fault:
+            raise InputError(f"a volume is (z, y, x) = {self.grid.shape}: {fault}") from fault
+
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.grid.shape))
         return f"Volume({shape} voxels (z, y, x), {self.values.dtype})"
@@ -397,6 +404,20 @@ class Volume:
         """
         axes = {name: (getattr(self.grid, name), "m") for name in AXES}
         return make_data_array(to_numpy(self.values), axes, "brightness", "")
+
+    def to_pyvista(self) -> Any:
+        """Return a `pyvista.RectilinearGrid`, places in m, with the magnitude as ``brightness``.
+
+        Raises
+        ------
+        MissingDependencyError
+            PyVista is not installed.
+        """
+        axes = self.grid.x, self.grid.y, self.grid.z
+        shown = require_package("pyvista").RectilinearGrid(*axes)
+        # VTK lists points with x fastest, as a (z, y, x) array lies in memory.
+        shown["brightness"] = self.magnitude.ravel()
+        return shown
 
     def to_torch(self) -> Any:
         """Return the values as a PyTorch tensor (z, y, x), which shares NumPy's memory.

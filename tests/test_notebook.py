@@ -48,8 +48,13 @@ def test_frames_are_sliced_and_selected(frames):
     for wrong in ({}, {"range": (5, 6)}, {"range": (1, 2), "time": (0, 1)}):
         with pytest.raises(InputError):
             frames.sel(**wrong)
-    with pytest.raises(InputError, match="slice"):
-        frames[3]
+    assert frames.shape == frames.values.shape
+    assert np.array_equal(frames.ranges, 299792458 * frames.times / 2)
+    assert np.array_equal(frames.max(axis=0), np.max(frames.values, axis=0))
+    assert np.max(frames) == frames.values.max()
+    for place in (3, (slice(None), slice(1, 4)), (..., 2, 1), frames.times > 12e-9):
+        assert np.array_equal(frames[place], frames.values[place])
+    assert np.array_equal(VOLUME[2], VOLUME.values[2])
 
 
 def test_points_are_selected(cloud):
@@ -76,6 +81,9 @@ def test_a_line_and_a_page_say_what_is_held(frames, cloud):
     assert repr(capture) == "Capture(2 x 3 wall points, one laser spot, 50 bins of 8 ps)"
     assert "0.200 x 0.100 x 0.000 m" in capture._repr_html_()
     assert "line angles" in frames.camera._repr_html_()
+    assert repr(tofclip.depth(frames)[:0]) == "Returns(none)"
+    noise = np.random.default_rng(0).poisson(9, (1016, 1344))
+    assert len(tofclip.Streak(noise)._repr_html_()) < 60_000  # of each cell of a notebook
     for one in (frames, VOLUME, cloud, streak, capture):
         assert "<img" in one._repr_html_()
     assert "<img" not in cloud[:0]._repr_html_()
@@ -100,6 +108,11 @@ def test_labelled_arrays_carry_times_and_places(frames):
     assert labelled.dims == ("time", "y", "x")
     assert labelled.attrs["units"] == "counts"
     assert labelled.time.attrs["units"] == "s"
+    assert labelled.range.attrs["units"] == "m"
+    assert np.array_equal(labelled.range, frames.ranges)
+    streak = tofclip.Streak(np.ones((9, 7)), np.arange(9) * 1e-9)
+    assert streak.to_xarray().dims == ("time", "column")
+    assert tofclip.Streak(np.ones((9, 7))).to_xarray().dims == ("row", "column")
     near = labelled.sel(time=slice(11e-9, 12e-9))
     assert np.array_equal(near.values, frames.sel(time=(11e-9, 12e-9)).values)
     assert np.array_equal(VOLUME.to_xarray().z.values, VOLUME.grid.z)
@@ -112,9 +125,29 @@ def test_points_become_a_table(cloud):
     assert np.array_equal(table[["x", "y", "z"]].to_numpy(), cloud.xyz)
 
 
-@pytest.mark.usefixtures("open3d")
-def test_points_become_open3ds(cloud):
-    assert np.allclose(np.asarray(cloud.to_open3d().points), cloud.xyz)
+def test_points_become_open3ds_and_come_back(cloud, open3d):
+    known = replace(cloud, false_alarm=np.linspace(0, 1, len(cloud), dtype=np.float32))
+    back = tofclip.PointCloud.from_open3d(known.to_open3d_tensor())
+    for column, again in zip(known.columns, back.columns, strict=True):
+        assert np.array_equal(column.values, again.values)
+    legacy = known.to_open3d()
+    assert legacy.has_colors()
+    back = tofclip.PointCloud.from_open3d(legacy)
+    assert np.allclose(back.xyz, cloud.xyz)
+    assert np.allclose(back.range, cloud.range)
+    assert np.isnan(back.range_sigma).all()
+    assert len(tofclip.PointCloud.from_open3d(open3d.geometry.PointCloud())) == 0
+    with pytest.raises(InputError, match="not a Volume"):
+        tofclip.PointCloud.from_open3d(VOLUME)
+
+
+def test_a_volume_becomes_pyvistas():
+    pytest.importorskip("pyvista", reason="pip install pyvista")
+    bright = np.zeros(GRID.shape, np.float32)
+    bright[1, 2, 3] = 5
+    shown = nlos.Volume(bright, GRID).to_pyvista()
+    place = shown.points[np.argmax(shown["brightness"])]
+    assert np.allclose(place, (GRID.x[3], GRID.y[2], GRID.z[1]))
 
 
 def test_pictures_are_drawn_where_asked(frames, cloud):
@@ -159,6 +192,8 @@ def test_wrong_types_and_names_are_refused_by_our_own_errors(frames, cloud, tmp_
         lambda: frames.sel(range=2): "limits",
         lambda: frames.sel(range=(1, 2, 3)): "limits",
         lambda: cloud["near"]: "slice, a mask or numbers",
+        lambda: frames[60]: r"frames are \(time, y, x\) = \(50, 6, 5\)",
+        lambda: VOLUME["near"]: r"a volume is \(z, y, x\) = \(4, 5, 6\)",
         lambda: cloud[3]: r"one point is cloud\[3:4\]",
         lambda: frames[60:70]: "no frame is selected of 50",
         lambda: frames[::-1]: "step cannot be negative",

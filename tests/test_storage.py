@@ -205,6 +205,8 @@ class TestDamage:
         assert_refused(path, "is empty")
         path.write_text("not HDF5")
         assert_refused(path, "is not an HDF5 file")
+        with pytest.raises(FileFormatError, match=r"expected frames \(run tofclip recover first\)"):
+            Record.load(path, "frames")
         with h5py.File(path, "w") as file:
             file["data"] = [1.0]
         assert_refused(path, "not one of tofclip's")

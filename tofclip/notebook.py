@@ -84,22 +84,41 @@ def plot_points(
 
 
 def make_data_array(
-    values: NDArray[Any], axes: Mapping[str, tuple[NDArray[Any], str]], name: str, unit: str
+    values: NDArray[Any],
+    axes: Mapping[str, tuple[NDArray[Any], str]],
+    name: str,
+    unit: str,
+    ranges: NDArray[np.float64] | None = None,
 ) -> Any:
     """Return an `xarray.DataArray` whose coordinates carry their units; `axes` are coordinates and
-    unit of each axis, in order.
+    unit of each axis, in order, `ranges` those of the times, m.
     """
     xarray = require_package("xarray")
     places = {axis: (axis, place, {"units": units}) for axis, (place, units) in axes.items()}
+    if ranges is not None:
+        places["range"] = ("time", ranges, {"units": "m"})
     return xarray.DataArray(
         values, dims=tuple(axes), coords=places, name=name, attrs={"units": unit}
     )
 
 
-def _encode_picture(picture: NDArray[np.floating]) -> str:
-    from matplotlib.image import imsave  # slow to load, and only notebooks need it
+def paint(picture: NDArray[np.floating], name: str = PICTURE_COLOURMAP) -> NDArray[np.uint8]:
+    """Return red, green and blue of brightness 0 to 1, in a further axis; NaN is as dark as 0."""
+    from matplotlib import colormaps  # slow to load
 
-    file = io.BytesIO()
-    imsave(file, np.nan_to_num(picture), cmap=PICTURE_COLOURMAP, format="png")
+    painted: NDArray[np.uint8] = colormaps[name](np.nan_to_num(picture), bytes=True)[..., :3]
+    return painted
+
+
+def _encode_picture(picture: NDArray[np.floating]) -> str:
+    """A page keeps a picture of each cell: as few pixels as it shows, a byte each."""
+    from PIL import Image
+
+    shown = Image.fromarray(np.nan_to_num(picture).astype(np.float32))
+    small = np.asarray(shown.reduce(-(-shown.width // PICTURE_WIDTH_PX)))
+    grey = 255 * (small - small.min()) / (np.ptp(small) or 1.0)
+    drawn, file = Image.fromarray(grey.astype(np.uint8)), io.BytesIO()
+    drawn.putpalette(paint(np.linspace(0, 1, 256)).tobytes())
+    drawn.save(file, format="PNG", optimize=True)
     data = base64.b64encode(file.getvalue()).decode()
     return f"<img width={PICTURE_WIDTH_PX} src='data:image/png;base64,{data}'>"

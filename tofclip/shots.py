@@ -143,6 +143,16 @@ class Streak(Storable):
         ax.set(xlabel="slit column (px)", ylabel="time (rows)")
         return ax
 
+    def to_xarray(self) -> Any:
+        """Return an `xarray.DataArray` (time, column), or (row, column) where no times are known;
+        `MissingDependencyError` where xarray is not installed.
+        """
+        rows, columns = map(np.arange, self.counts.shape)
+        down = ("row", (rows, "px")) if self.row_times is None else ("time", (self.times, "s"))
+        return make_data_array(
+            self.counts, dict([down, ("column", (columns, "px"))]), "counts", "counts"
+        )
+
     @property
     def times(self) -> NDArray[np.float64]:
         """Instant of each row, s; raises `MissingTimeAxisError` where none is known."""
@@ -247,6 +257,12 @@ class Returns(Storable):
 
     def __len__(self) -> int:
         return self.y.size
+
+    def __repr__(self) -> str:
+        if len(self) == 0:
+            return "Returns(none)"
+        near, far = self.range.min(), self.range.max()
+        return f"Returns({len(self)} returns, range {near:.3g} to {far:.3g} m)"
 
     @property
     def line_of_sight_px(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -396,10 +412,16 @@ class Frames(Storable):
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(to_numpy(self.values), dtype=dtype)
 
-    def __getitem__(self, frames: slice) -> Frames:
-        """Return some of the frames, such as ``frames[100:200]``, with the returns of their time."""
+    def __getitem__(self, frames: Any) -> Any:
+        """Return `Frames` by a slice, such as ``frames[100:200]``, with the returns of their time;
+        what else NumPy understands picks from the values: ``frames[5]`` is a picture, and
+        ``frames[:, 20, 30]`` a pixel's waveform.
+        """
         if not isinstance(frames, slice):
-            raise InputError("frames are selected by a slice, such as frames[100:101] for one")
+            try:
+                return self.values[frames]
+            except (IndexError, TypeError) as fault:
+                raise InputError(f"frames are (time, y, x) = {self.shape}: {fault}") from fault
         if self.times[frames].size == 0:
             raise InputError(f"no frame is selected of {len(self)}")
         if (frames.step or 1) < 0:
@@ -442,11 +464,27 @@ class Frames(Storable):
             raise InputError(f"limits are two numbers: {fault}") from fault
         if limits.shape != (2,):
             raise ShapeError("the limits of sel", "(lower, upper)", limits.shape)
-        at = self.times if range is None else SPEED_OF_LIGHT * self.times / 2
+        at = self.times if range is None else self.ranges
         first, stop = np.searchsorted(at, limits[0]), np.searchsorted(at, limits[1], side="right")
         if first >= stop:
             raise InputError(f"no frame lies between {limits[0]:g} and {limits[1]:g}")
-        return self[int(first) : int(stop)]
+        chosen: Frames = self[int(first) : int(stop)]
+        return chosen
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows and columns."""
+        frames, rows, columns = self.values.shape
+        return frames, rows, columns
+
+    @property
+    def ranges(self) -> NDArray[np.float64]:
+        """Range of each frame (time,), m; see `time_zero_note`."""
+        return SPEED_OF_LIGHT * self.times / 2
+
+    def max(self, axis: int | tuple[int, ...] | None = None, **options: Any) -> Any:
+        """Return the largest value, or the largest along some of the axes (time, y, x), counts."""
+        return np.asarray(self).max(axis, **options)
 
     @property
     def time_zero_note(self) -> str:
@@ -455,11 +493,11 @@ class Frames(Storable):
 
     @property
     def _range_text(self) -> str:
-        near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
+        near, far = self.ranges[[0, -1]]
         return f"{near:.3g} to {far:.3g} m{self.time_zero_note}"
 
     def __repr__(self) -> str:
-        frames, rows, columns = self.values.shape
+        frames, rows, columns = self.shape
         return f"Frames({frames} frames of {rows} x {columns} pixels, range {self._range_text})"
 
     def _repr_html_(self) -> str:
@@ -479,12 +517,12 @@ class Frames(Storable):
         return plot_picture(np.asarray(self).sum(axis=0), title, ax)
 
     def to_xarray(self) -> Any:
-        """Return an `xarray.DataArray` (time, y, x), times in s and pixels as coordinates;
-        `MissingDependencyError` where xarray is not installed.
+        """Return an `xarray.DataArray` (time, y, x) with times in s, ranges in m and pixels as
+        coordinates; `MissingDependencyError` where xarray is not installed.
         """
-        y, x = map(np.arange, self.values.shape[1:])
+        y, x = map(np.arange, self.shape[1:])
         axes = {"time": (self.times, "s"), "y": (y, "px"), "x": (x, "px")}
-        return make_data_array(np.asarray(self), axes, "brightness", "counts")
+        return make_data_array(np.asarray(self), axes, "brightness", "counts", self.ranges)
 
     def to_torch(self) -> Any:
         """Return the values as a PyTorch tensor (time, y, x), which shares NumPy's memory;

@@ -176,10 +176,11 @@ class Record:
     def load(cls, path: str | Path, *kinds: str) -> Record:
         """Read a record, refusing any other kind than those named (none named: any kind)."""
         require_path(path)
-        record = _read_file(path)
+        wanted = f", expected {' or '.join(kinds)}" if kinds else ""
+        wanted += " (run tofclip recover first)" if "frames" in kinds else ""
+        record = _read_file(path, wanted=wanted)
         if kinds and record.kind not in kinds:
-            wanted = " or ".join(kinds)
-            raise FileFormatError(path, f"holds a {record.kind} record, expected {wanted}")
+            raise FileFormatError(path, f"holds a {record.kind} record{wanted}")
         return record
 
 
@@ -248,13 +249,13 @@ def _storage_options(values: NDArray[Any], compressed: bool) -> dict[str, Any]:
     return options
 
 
-def _read_file(path: str | Path, values: bool = True) -> Record:
+def _read_file(path: str | Path, values: bool = True, wanted: str = "") -> Record:
     import h5py
 
     with translate_read_errors(path), open(path, "rb") as raw:
         start = raw.read(len(HDF5_SIGNATURE))
     if start != HDF5_SIGNATURE:
-        raise FileFormatError(path, "is not an HDF5 file" if start else "is empty")
+        raise FileFormatError(path, f"is not an HDF5 file{wanted}" if start else "is empty")
     with guard(path, "is damaged or incomplete"), h5py.File(path, "r") as file:
         if _read_text(file, "format") != FORMAT_NAME:
             raise FileFormatError(path, "is an HDF5 file, but not one of tofclip's")

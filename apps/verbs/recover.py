@@ -34,6 +34,10 @@ from tofclip.files import require_apart
 
 CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57", ".h5")
 DEPTH_SUFFIX = ".exr"
+ALL_POINTS = flag(
+    "--all-points",
+    "Drop no point of the cloud: false_alarm says how probably each one is false.",
+)
 METHODS = ("tv", "l1", "linear", "adjoint", "surfaces")
 
 
@@ -64,6 +68,7 @@ def recover(
         "fixed:0",
     ),
     cloud: Path | None = opt("PLY", "A point cloud to write as well.", shown="none"),
+    all_points: bool = ALL_POINTS,
     preview: Path | None = PREVIEW,
     sweep: list[str] | None = opt(
         "NAME=V,V",
@@ -127,6 +132,8 @@ def recover(
         raise InputError(
             f"{streak}: {option} is for a sequence: a folder, a quoted pattern or an HDF5 stack of shots"
         )
+    if all_points and cloud is None:
+        raise InputError("--all-points is for the points of --cloud")
     preview = choose_preview(out, preview, (streak, camera))
     if cloud is not None:
         require_writable(cloud, *CLOUD_SUFFIXES, inputs=(streak, camera))
@@ -148,7 +155,8 @@ def recover(
     seconds = time.perf_counter() - started
     save_figure(make_preview_figure(shot.streak, frames), preview)
     if cloud is not None:
-        points, _ = CloudSettings(device=device).make_cloud(frames, "the recovered frames")
+        clouds = CloudSettings(device=device, false_alarm=1.0 if all_points else None)
+        points, _ = clouds.make_cloud(frames, "the recovered frames")
         points.save(cloud)
     known = frames.figures
     names = ("method", "iterations", "relative_residual", "seconds", "frames_per_second")
@@ -191,9 +199,7 @@ def cloud(
     false_alarm: float | None = opt(
         "P", "Drop points that are false with a higher probability.", shown="0.1"
     ),
-    all_points: bool = flag(
-        "--all-points", "Drop none: false_alarm says how probably each one is false."
-    ),
+    all_points: bool = ALL_POINTS,
     voxel: float | None = opt(
         "MM", "One point for each cube of this side.", name="--voxel-mm", shown="all points"
     ),

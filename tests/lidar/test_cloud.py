@@ -55,7 +55,7 @@ def make_cloud(points: int, seed: int, known: bool = False) -> PointCloud:
         *column[:3],
         random.integers(1, 5, points).astype(np.uint8),
         1e-8 * column[3],
-        {"seed": seed},
+        {"seed": seed, "said": 40 * " in long  comments, π\n"},
         **optional,
     )
 
@@ -166,7 +166,8 @@ def test_every_format_brings_every_bit_back(tmp_path_factory, suffix, points, se
     for name in (*PROPERTIES, *OPTIONAL):
         np.testing.assert_array_equal(getattr(back, name), getattr(cloud, name))
         assert getattr(back, name).dtype == getattr(cloud, name).dtype
-    assert back.provenance == (cloud.provenance if suffix == ".h5" else {})
+    kept = suffix in (".h5", ".ply", ".pcd")
+    assert back.provenance == (cloud.provenance if kept else {})
     listed = set(PointCloud.read_outline(path).fields)
     assert (set(OPTIONAL) <= listed) if known and points else not set(OPTIONAL) & listed
 
@@ -277,8 +278,14 @@ def test_open3d_reads_the_same_points(open3d, tmp_path, suffix) -> None:
     np.testing.assert_array_equal(seen.positions.numpy(), cloud.xyz)
     for name in ("intensity", "range_sigma", *OPTIONAL):
         np.testing.assert_array_equal(seen[name].numpy().ravel(), getattr(cloud, name))
-    plain = np.asarray(open3d.io.read_point_cloud(path).points)
-    np.testing.assert_allclose(plain, cloud.xyz, rtol=1e-7)
+    plain, ours = open3d.io.read_point_cloud(path), cloud.to_open3d()
+    np.testing.assert_allclose(np.asarray(plain.points), cloud.xyz, rtol=1e-7)
+    assert plain.has_colors()
+    np.testing.assert_allclose(np.asarray(plain.colors), np.asarray(ours.colors))
+    # brighter points are never darker to the eye
+    seen = np.asarray(plain.colors)[np.argsort(cloud.intensity)] @ (0.2126, 0.7152, 0.0722)
+    assert np.all(np.diff(seen) >= -0.01)
+    assert np.ptp(seen) > 0.5
 
 
 def test_pye57_reads_e57_and_failed_files_are_closed(cloud, tmp_path) -> None:
@@ -307,7 +314,7 @@ def test_las_holds_micrometres_and_all_columns(cloud, tmp_path) -> None:
     layout, size = struct.unpack_from("<BH", content, 104)
     scale, offset = np.array(struct.unpack_from("<6d", content, 131)).reshape(2, 3)
     (number,) = struct.unpack_from("<Q", content, 247)
-    assert layout == 6
+    assert layout == 7  # with colours, 6 bytes
     at, names = struct.unpack_from("<H", content, 94)[0], []
     for _ in range(records):
         user, kind, length = struct.unpack_from("<16sHH", content, at + 2)
@@ -319,10 +326,10 @@ def test_las_holds_micrometres_and_all_columns(cloud, tmp_path) -> None:
     xyz = np.ascontiguousarray(rows[:, :12]).view("<i4") * scale + offset
     np.testing.assert_allclose(xyz, cloud.xyz, atol=0.51e-6)
     assert names == [f"tofclip_{name}".encode() for name in PROPERTIES]
-    floats = np.ascontiguousarray(rows[:, 30:42]).view("<f4")
+    floats = np.ascontiguousarray(rows[:, 36:48]).view("<f4")
     np.testing.assert_array_equal(floats[:, 0], cloud.intensity)
     np.testing.assert_array_equal(floats[:, 2], cloud.range)
-    np.testing.assert_array_equal(rows[:, 42], cloud.return_number)
+    np.testing.assert_array_equal(rows[:, 48], cloud.return_number)
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])

@@ -32,6 +32,7 @@ from tofclip.storage import (
     stored_array,
     stored_provenance,
 )
+from tofclip.units import SPEED_OF_LIGHT
 
 COLUMN_UNITS = {
     "x": "m",
@@ -50,6 +51,7 @@ COLUMN_UNITS = {
 PROPERTY_COLUMNS = tuple(name for name in COLUMN_UNITS if name not in "xyz")
 OPTIONAL_COLUMNS = ("false_alarm", "reflectance")  # in files only where they are known of a point
 FRONT_PIXELS = 64  # rows and columns of a cloud's picture in a notebook
+COMMENTED_SUFFIXES = (".ply", ".pcd")  # whose comments hold the provenance
 ORGANISED_SUFFIXES = (".pcd", ".ply", ".npz", ".csv")
 """Formats that can say what is missing; PCD says rows and columns as well."""
 
@@ -80,7 +82,7 @@ class PointCloud(Storable):
     time : (n,) float32 array
         Time of flight there and back, s.
     provenance : mapping
-        How it came about; kept in HDF5 files only.
+        How it came about; kept in HDF5, PLY and PCD files.
     false_alarm : (n,) float32 array, optional
         Probability that the point is false, noise or spread by the recovery; NaN, the default, where
         it is not known.
@@ -196,17 +198,66 @@ class PointCloud(Storable):
         return require_package("pandas").DataFrame(columns)
 
     def to_open3d(self) -> Any:
-        """Return an `open3d.geometry.PointCloud` of the positions.
+        """Return an `open3d.geometry.PointCloud`: the positions, and the intensity as colours; see
+        `to_open3d_tensor` for one with all columns.
 
         Raises
         ------
         MissingDependencyError
             Open3D is not installed, or does not load here.
         """
+        return self.to_open3d_tensor().to_legacy()
+
+    def to_open3d_tensor(self) -> Any:
+        """Return an `open3d.t.geometry.PointCloud`: positions, the intensity as colours, and every
+        other column as an attribute (points, 1), such as ``.point["range_sigma"]``.
+
+        Raises
+        ------
+        MissingDependencyError
+            Open3D is not installed, or does not load here.
+        """
+        tensors = import_open3d()
+        shown = tensors.t.geometry.PointCloud(tensors.core.Tensor(self.xyz))
+        shown.point["colors"] = tensors.core.Tensor(export.paint_brightness(self.intensity))
+        for column in self.columns:
+            if column.name not in "xyz":
+                shown.point[column.name] = tensors.core.Tensor(column.values[:, np.newaxis])
+        return shown
+
+    @classmethod
+    def from_open3d(cls, cloud: Any) -> PointCloud:
+        """Make a point cloud of one of Open3D's, legacy or tensor.
+
+        Parameters
+        ----------
+        cloud : open3d.geometry.PointCloud or open3d.t.geometry.PointCloud
+            Positions in m, x right, y down, z forward. Attributes named as in `COLUMN_UNITS` are
+            taken over. What is missing is made up where it follows from the positions (range and
+            time, first returns), is otherwise NaN; intensity is then the mean of the colours.
+
+        Raises
+        ------
+        InputError
+            It is not a point cloud of Open3D.
+        """
         open3d = import_open3d()
-        return open3d.geometry.PointCloud(
-            open3d.utility.Vector3dVector(self.xyz.astype(np.float64))
-        )
+        if isinstance(cloud, open3d.geometry.PointCloud):
+            cloud = open3d.t.geometry.PointCloud.from_legacy(cloud)
+        require_type(cloud, open3d.t.geometry.PointCloud, "from_open3d takes Open3D's point cloud")
+        known = {name: values.cpu().numpy() for name, values in cloud.point.items()}
+        xyz = known.get("positions", np.empty((0, 3))).astype(np.float64)
+        unknown = np.full(len(xyz), np.nan)
+        distance = np.linalg.norm(xyz, axis=1)
+        columns = {
+            "intensity": known["colors"].mean(axis=1) if "colors" in known else unknown,
+            "range_sigma": unknown,
+            "range": distance,
+            "return_number": np.ones(len(xyz)),
+            "time": 2 * distance / SPEED_OF_LIGHT,
+        }
+        columns |= {name: known[name].ravel() for name in PROPERTY_COLUMNS if name in known}
+        return cls(xyz, **columns)
 
     def to_torch(self) -> Any:
         """Return the positions as a PyTorch tensor (points, 3), m, which shares NumPy's memory.
@@ -224,8 +275,9 @@ class PointCloud(Storable):
         Parameters
         ----------
         path : path-like
-            ``.ply`` and ``.pcd`` (binary, little endian), ``.csv``, ``.npz``, ``.las``, ``.laz``
-            (both need laspy), ``.e57`` (needs pye57), or ``.h5`` (with provenance).
+            ``.ply`` and ``.pcd`` (binary, little endian, with colours by intensity and, up to 32
+            kB, provenance), ``.csv``, ``.npz``, ``.las``, ``.laz`` (both need laspy, and hold
+            colours too), ``.e57`` (needs pye57), or ``.h5`` (with provenance).
 
         Raises
         ------
@@ -238,7 +290,7 @@ class PointCloud(Storable):
         if Path(path).suffix.lower() == ".h5":
             super().save(path)
         else:
-            export.write_table(path, self.columns)
+            export.write_table(path, self.columns, provenance=self.provenance)
 
     @classmethod
     def load(cls, path: str | Path) -> PointCloud:
@@ -260,6 +312,8 @@ class PointCloud(Storable):
         there = np.isfinite(positions).all(axis=1)
         positions = positions[there]
         properties: dict[str, Any] = {name: column[there] for name, column in values.items()}
+        if Path(path).suffix.lower() in COMMENTED_SUFFIXES:
+            properties["provenance"] = export.read_provenance(path)
         return cls(xyz=positions, **properties)
 
     @staticmethod
@@ -351,11 +405,11 @@ def save_organised(returns: Returns, path: str | Path) -> int:
     pixel = returns.y.astype(np.int64) * shape[1] + returns.x
     if np.unique(pixel).size < pixel.size:
         raise InputError("an organised cloud has one point for a pixel: first, strongest or last")
-    columns = []
-    for column in point_cloud(returns).columns:
+    columns, cloud = [], point_cloud(returns)
+    for column in cloud.columns:
         whole = column.values.dtype.kind == "u"
         values = np.full(shape[0] * shape[1], 0 if whole else np.nan, column.values.dtype)
         values[pixel] = column.values
         columns.append(Column(column.name, column.unit, values))
-    export.write_table(path, columns, shape)
+    export.write_table(path, columns, shape, cloud.provenance)
     return len(returns)

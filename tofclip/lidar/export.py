@@ -2,7 +2,8 @@
 
 Every file says the units of its columns: PLY and PCD in a comment, CSV and NPZ in the columns'
 names (``x_m``), LAS in the description of its dimensions. PLY and PCD are written and read here and
-not by Open3D, which does not load on every machine.
+not by Open3D, which does not load on every machine; their comments hold the provenance as well.
+PLY, PCD and LAS hold colours by brightness, for viewers alone: they are not read back.
 
 LAS and its compressed form LAZ, through laspy: positions are whole multiples of a micrometre; all
 other columns are extra dimensions in full precision, named ``tofclip_NAME``. The standard intensity
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import struct
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,12 +40,17 @@ from tofclip.files import (
 )
 from tofclip.io.archive import Archive, ArchiveEntry
 from tofclip.lidar.geometry import compute_ray_directions
+from tofclip.notebook import paint
 from tofclip.shots import Returns
 
+BRIGHTNESS_COLUMNS = ("intensity", "brightness")
+BRIGHTNESS_PALETTE, WHITE_QUANTILE = "viridis", 0.99  # its dark end is seen on black and on white
 MAX_HEADER_BYTES = 1 << 16
+MAX_COMMENT_BYTES = 500  # readers of PLY and PCD take lines of at most 1023
+PROVENANCE = "provenance: "
 PLY_WORDS = 3  # in a line of a header: what it is, type, name or number
 PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
-PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8", ("U", "1"): "u1"}
+PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8", ("U", "1"): "u1", ("U", "4"): "<u4"}
 
 COORDINATE_STEP_M = 1e-6  # of LAS; 32 bits then reach 2.1 km
 LAS_HEADER_BYTES, LAS_RECORD_BYTES = 375, 54  # of version 1.4; of a record's own header
@@ -81,14 +88,20 @@ Columns = Sequence[Column]
 Entries = dict[str, ArchiveEntry]
 
 
-def write_table(path: str | Path, columns: Columns, shape: tuple[int, int] | None = None) -> None:
+def write_table(
+    path: str | Path,
+    columns: Columns,
+    shape: tuple[int, int] | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
     """Write columns to the format that the suffix of `path` names, whole or not at all. `shape`:
     rows and columns of a picture whose pixels the values are, in raster order; PCD and NPZ say so.
+    `provenance`: kept in PLY and PCD, unless it is longer than their headers may be.
     """
     require_suffix(path, *FORMATS)
     writer = FORMATS[Path(path).suffix.lower()][0]
     with atomic_path(path) as temporary:
-        writer(temporary, columns, shape)
+        writer(temporary, columns, shape, provenance or {})
 
 
 def list_columns(path: str | Path) -> Entries:
@@ -124,26 +137,62 @@ def _defer(points: int, types: Mapping[str, DTypeLike], read: Callable[[], Any])
     }
 
 
-def _format_units(columns: Columns) -> str:
-    return ", ".join(f"{column.name} {column.unit}" for column in columns if column.unit)
+def paint_brightness(brightness: NDArray[Any]) -> NDArray[np.uint8]:
+    """Colours (n, 3) of points; the root, or all but the brightest would be of one colour."""
+    light = np.nan_to_num(np.maximum(brightness, 0))
+    white = np.quantile(light, WHITE_QUANTILE) if light.size else 1.0
+    return paint(np.sqrt(np.minimum(light / (white or 1.0), 1)), BRIGHTNESS_PALETTE)
 
 
-def _write_ply(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
+def _list_colours(columns: Columns) -> list[Column]:
+    """Red, green and blue by the brightness; none where that is not among the columns."""
+    light = [column.values for column in columns if column.name in BRIGHTNESS_COLUMNS]
+    shades = paint_brightness(light[0]).T if light else ()
+    return [Column(*one) for one in zip(("red", "green", "blue"), ("",) * 3, shades, strict=False)]
+
+
+def _list_comments(columns: Columns, provenance: Mapping[str, Any]) -> list[str]:
+    """Lines that say the units and, in pieces of JSON, how the points came about."""
+    units = ", ".join(f"{column.name} {column.unit}" for column in columns if column.unit)
+    text = json.dumps(provenance, default=str) if provenance else ""
+    text = text if 2 * len(text) < MAX_HEADER_BYTES else ""
+    pieces = range(0, len(text), MAX_COMMENT_BYTES)
+    notes = [PROVENANCE + text[start : start + MAX_COMMENT_BYTES] for start in pieces]
+    return [f"units: {units}", *notes]
+
+
+def read_provenance(path: str | Path) -> dict[str, Any]:
+    """Return what the comments of a PLY or PCD file say of how its points came about."""
+    with open(path, "rb") as file:
+        lines = file.read(MAX_HEADER_BYTES).decode("ascii", errors="replace").splitlines()
+    marks = tuple(f"{mark} {PROVENANCE}" for mark in ("comment", "#"))
+    text = "".join(line.partition(PROVENANCE)[2] for line in lines if line.startswith(marks))
+    with guard(path, "has a provenance that is not JSON"):
+        return dict(json.loads(text or "{}"))
+
+
+def _write_ply(path: Path, columns: Columns, shape: Any, provenance: Mapping[str, Any]) -> None:
     names = {np.dtype(code): name for name, code in PLY_TYPES.items()}
-    lines = ["ply", "format binary_little_endian 1.0", f"comment units: {_format_units(columns)}"]
+    comments = [f"comment {one}" for one in _list_comments(columns, provenance)]
+    lines = ["ply", "format binary_little_endian 1.0", *comments]
     lines += [f"element vertex {columns[0].values.size}"]
+    columns = [*columns, *_list_colours(columns)]
     lines += [f"property {names[column.values.dtype]} {column.name}" for column in columns]
     _write_binary(path, [*lines, "end_header"], columns)
 
 
-def _write_pcd(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
+def _write_pcd(path: Path, columns: Columns, shape: Any, provenance: Mapping[str, Any]) -> None:
+    comments = [f"# {one}" for one in _list_comments(columns, provenance)]
+    if colours := _list_colours(columns):
+        red, green, blue = (colour.values.astype(np.uint32) for colour in colours)
+        columns = [*columns, Column("rgb", "", red << 16 | green << 8 | blue)]
     points = columns[0].values.size
     height, width = (1, points) if shape is None else shape
     kinds = {np.dtype(code): kind for kind, code in PCD_TYPES.items()}
     types, sizes = zip(*(kinds[column.values.dtype] for column in columns), strict=True)
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
-        f"# units: {_format_units(columns)}",
+        *comments,
         "VERSION 0.7",
         "FIELDS " + " ".join(column.name for column in columns),
         "SIZE " + " ".join(sizes),
@@ -231,7 +280,7 @@ def _list_binary(
     return _defer(int(points), types, functools.partial(np.fromfile, path, layout, offset=start))
 
 
-def _write_csv(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
+def _write_csv(path: Path, columns: Columns, *_: Any) -> None:
     table = np.stack([column.values for column in columns], axis=-1)
     header = ",".join(column.label for column in columns)
     # Nine significant digits bring every float32 back exactly.
@@ -255,7 +304,7 @@ def _list_csv(path: Path) -> Entries:
     return _defer(points, dict.fromkeys(labels, np.float64), read)
 
 
-def _write_npz(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
+def _write_npz(path: Path, columns: Columns, shape: tuple[int, int] | None, _: Any) -> None:
     arrays: dict[str, Any] = {
         column.label: column.values.reshape(-1 if shape is None else shape) for column in columns
     }
@@ -267,13 +316,13 @@ def _list_npz(path: Path) -> Entries:
     return {label: archive.describe(label) for label in sorted(archive.names)}
 
 
-def _write_las(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
+def _write_las(path: Path, columns: Columns, *_: Any) -> None:
     laspy = import_file_reader("laspy", "tofclip[las]")
     values = {column.name: column.values for column in columns}
     reach = COORDINATE_STEP_M * 2**31
     if any(np.abs(values[axis]).max(initial=0) >= reach for axis in "xyz"):
         raise InputError(f"{path}: LAS reaches {reach:.0f} m at a micrometre; use another format")
-    header = laspy.LasHeader(version="1.4", point_format=6)
+    header = laspy.LasHeader(version="1.4", point_format=7)
     header.scales, header.offsets = np.full(3, COORDINATE_STEP_M), np.zeros(3)
     extra = [column for column in columns if column.name not in "xyz"]
     for column in extra:
@@ -283,7 +332,9 @@ def _write_las(path: Path, columns: Columns, shape: tuple[int, int] | None) -> N
     table.x, table.y, table.z = (values[axis].astype(np.float64) for axis in "xyz")
     for column in extra:
         table[DIMENSION_PREFIX + column.name] = column.values
-    brightness = np.maximum(values["intensity"], 0).astype(np.float64)
+    for colour in _list_colours(columns):
+        table[colour.name] = colour.values * np.uint16(257)  # 255 becomes 65535
+    brightness = np.nan_to_num(np.maximum(values["intensity"], 0).astype(np.float64))
     scaled = np.rint(brightness * (65535 / (brightness.max(initial=0) or 1)))
     table.intensity = scaled.astype(np.uint16)
     table.return_number = np.minimum(values["return_number"], 15)
@@ -332,7 +383,7 @@ def _open_las(path: Path) -> Iterator[Any]:
             yield reader
 
 
-def _write_e57(path: Path, columns: Columns, shape: tuple[int, int] | None) -> None:
+def _write_e57(path: Path, columns: Columns, *_: Any) -> None:
     pye57 = import_file_reader("pye57", "tofclip[exchange]")
     path.unlink(missing_ok=True)  # the library makes its files itself
     file = pye57.E57(str(path), mode="w")
