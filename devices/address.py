@@ -154,6 +154,14 @@ def parse_integers(text: str) -> tuple[int, ...]:
     return tuple(int(word) for word in text.split(","))
 
 
+def parse_shape(text: str) -> tuple[int, int]:
+    """Read rows and columns, such as ``8x8``."""
+    rows, columns = (int(side) for side in text.split("x"))
+    if min(rows, columns) < 1:
+        raise ValueError(text)
+    return rows, columns
+
+
 def parse_numbers(text: str) -> tuple[float, ...]:
     """Read numbers that are joined by commas."""
     return tuple(float(word) for word in text.split(","))

@@ -21,6 +21,7 @@ import contextlib
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import isqrt
 from time import monotonic
 from typing import ClassVar
 
@@ -50,6 +51,19 @@ VL53_NATIVE_BIN_S = 2 * 37.5348e-3 / 299_792_458  # s; of the 37.5348 mm that ST
 VL53_SCALE = 10  # Counts are sent with one digit after the point
 
 
+def find_tmf_zones(zones: int) -> NDArray[np.int64]:
+    """Return the pixel, in raster order, at which each zone looks, in the order in which zones come:
+    captures, then halves, then channels. Of 64 zones the maker's own programs put them so; 9 come row
+    by row.
+    """
+    if zones != 64:
+        return np.arange(zones)
+    capture, half, channel = np.indices((TMF_CAPTURES, 2, 8))
+    row = 4 * (1 - channel // 4) + 2 * (1 - channel % 4 // 2) + 1 - capture // 2
+    column = 4 * (channel % 2) + 2 * (capture % 2) + half
+    return np.asarray(8 * row + column).ravel()
+
+
 @dataclass(frozen=True)
 class KitFrame:
     """What was sent for one frame."""
@@ -61,9 +75,7 @@ class KitFrame:
 
 @dataclass
 class Tmf8828Parser:
-    """See the module's text. Zones are in the order in which they come: captures, then halves, then
-    channels; where each of them looks is the optics' matter.
-    """
+    """See the module's text."""
 
     zones: int = 64  # 64, or 9 for the 3 x 3 mode
     scale: ClassVar[float] = 1.0  # what one stored count stands for
@@ -119,7 +131,8 @@ class Tmf8828Parser:
             # Channel 0 is the reference that looks at the emitter, not at the scene.
             looking = channels[:, 1 : 1 + self.zones // (self._captures * self._halves)]
             width = self.zones // self._captures
-            self._counts[:, place * width : (place + 1) * width] = looking.reshape(width, -1).T
+            own = find_tmf_zones(self.zones)[place * width : (place + 1) * width]
+            self._counts[:, own] = looking.reshape(width, -1).T
             self._complete |= 1 << place
         self._begin_capture()
         if place != self._captures - 1:
@@ -287,12 +300,19 @@ class KitFeed(FrameFeed):
 
     @property
     def calibration(self) -> Record | None:
-        """Middle of each bin, s, and what a stored count stands for."""
+        """Middle of each bin, s, what a stored count stands for, and the square that the zones make, row
+        by row as they come; of other numbers, and where `shape` of an address says so, a picture of
+        its own.
+        """
         options = self._options
         times = Field(
             options.first_bin + options.bin_width * np.arange(self.codec.rows), "s", ("bin",)
         )
-        return Record("histograms", {"bin_times": times}, {"count_scale": self._parser.scale})
+        side = isqrt(self.codec.columns)
+        rows = side if side**2 == self.codec.columns else 1
+        shape = Field(np.array([rows, self.codec.columns // rows]), "px", ("yx",))
+        known = {"bin_times": times, "image_shape": shape}
+        return Record("histograms", known, {"count_scale": self._parser.scale})
 
     def start(self) -> None:
         with self._translate_errors():

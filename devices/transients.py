@@ -1,51 +1,67 @@
-"""From a source's address to the streak image that recovery takes: photons histogrammed, frames
-added up.
+"""From a source's address to shots that ranges are found in: photons histogrammed, frames added up.
 
 Besides what a source itself takes, its address may say how to gather (`Accumulation`), e.g.
 ``file://run.h5?seconds=2&bins=576``:
 
 * ``seconds``: of reading, at most; a live source that never ends needs it, 10 by default;
-* ``frames``: of a camera, to add up; 1 by default;
+* ``frames``: of a camera, or histograms that the instrument made, to add up; 1 by default;
+* ``scans``: the same of a gate that moves from picture to picture, whose scans are added up whole, and
+  ``binning``, pixels along each side of a square that count as one; 1 by default;
+* ``shape``: rows and columns of the picture that the pixels make, such as ``8x8``, where the source does
+  not know it;
 * ``bins``, ``start_ps``, ``period_ps``: number of histogram bins, middle of the first one after the
   laser's pulse, and the laser's period, where the source does not know it;
 * ``records``: photons of a shot, where a source is read shot after shot; 100 000 by default;
 * ``sync``, ``pixels``: channel of the laser's pulses and channels of the line's pixels of a time
   tagger, ``0`` and ``1,2,3`` by default.
 
-Read shot after shot, a source gives streak images as they come (`TransientStream`); behind stages
-that make clouds of them, `TrackedShots` knows the age of each and what became of all others.
+A source of which the calibration says, besides ``bin_times`` (s, of each bin) and ``count_scale``, the
+``image_shape`` of a picture whose pixels look at the scene themselves gives `PhotonCube`s, as do a
+gate's scans; ``axes`` there is the order of what comes, ``tyx`` by default. A ``camera`` beside it says
+where the pixels look. Any other source gives streak images.
+
+Read shot after shot, a source gives shots as they come (`TransientStream`); behind stages
+that make clouds of them, `devices.tracking.TrackedShots` knows the age of each and what became of all others.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections import deque
-from collections.abc import Collection, Generator, Iterator
+import math
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from math import inf
 from operator import itemgetter
 from pathlib import Path
 from sys import maxsize
 from time import monotonic
+from typing import Any
 from urllib.parse import quote, urlencode
 
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.address import Options, Uri, option, parse_integers
+from devices.address import Options, Uri, option, parse_integers, parse_shape
 from devices.files import compute_photon_times
 from devices.histogram import BinAxis, StampHistogram, TagHistogram, TimeHistogram
 from devices.linospad2 import BoardCalibration
 from devices.registry import open as open_source
 from devices.source import READ_TIMEOUT_S, Batch, Source, Stats
 from devices.stream import InstrumentClock, StreamSource
+from devices.tracking import ShotStamp
 from tofclip.camera import Camera
-from tofclip.errors import DeviceTimeoutError, InputError, TofclipError
+from tofclip.errors import DeviceTimeoutError, InputError
+from tofclip.lidar import Pulse
+from tofclip.lidar.photons import PhotonCube
 from tofclip.shots import Streak
 from tofclip.storage import Record, collect_provenance
 
 BIN_WIDTH_S = 20e-12  # Width of a histogram's bins where no other is given, s
 PICOSECOND_S = 1e-12
+MAX_CUBE_BYTES = 1 << 32
+# Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s
+EDGE_S = 1e-10
+LiveShot = Streak | PhotonCube
 
 
 @dataclass(frozen=True)
@@ -54,6 +70,9 @@ class Accumulation(Options):
 
     seconds: float = option(10.0, above=0)
     frames: int = option(1, above=0)
+    scans: int = option(1, above=0)
+    binning: int = option(1, above=0)
+    shape: tuple[int, ...] = option((), parse_shape)
     bins: int | None = option(None, int)  # None: as many as fit into the laser's period
     start_ps: float = option(0.0)
     period_ps: float | None = option(None, float)  # None: as the source says
@@ -62,6 +81,13 @@ class Accumulation(Options):
     pixels: tuple[int, ...] = option((1, 2, 3), parse_integers)
     # s. None: `BIN_WIDTH_S` for photons, and the camera's own time axis for frames
     bin_width: float | None = None
+    # whether the pixels of a line that counts photons are a picture of one row
+    line: bool = False
+
+    @property
+    def pictures(self) -> int:
+        """Pictures, scans or histograms of a shot."""
+        return self.frames * self.scans
 
     @classmethod
     def of(cls, uri: Uri, bin_width: float | None) -> Accumulation:
@@ -86,10 +112,10 @@ class Accumulation(Options):
         return BinAxis(width, int(period / width * (1 + 1e-9)), start, period)
 
 
-def read_transient(address: str, bin_width: float | None = None) -> Streak:
-    """Read a source until it ends, or as long as its address says, and return a streak image.
+def read_transient(address: str, bin_width: float | None = None) -> LiveShot:
+    """Read a source until it ends, or as long as its address says, and return a shot.
 
-    Memory: one batch of the source, and the streak image.
+    Memory: one batch of the source, and the shot.
 
     Parameters
     ----------
@@ -101,7 +127,7 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
 
     Returns
     -------
-    Streak
+    Streak or PhotonCube
         With the camera that the source knows, if it knows one; hot pixels, and pixels that reached
         a camera's limit, are marked in ``Streak.saturated``.
 
@@ -112,30 +138,40 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
     DeviceError
         The instrument failed before there was anything to gather.
     """
-    uri = Uri.parse(address)
-    gathering = Accumulation.of(uri, bin_width)
+    return read_shot(Uri.parse(address), bin_width)
+
+
+def read_shot(uri: Uri, bin_width: float | None = None, line: bool = False) -> LiveShot:
+    """As `read_transient`; `line`: whether a line that counts photons is a picture of one row."""
+    gathering = replace(Accumulation.of(uri, bin_width), line=line)
     with open_source(strip_options(uri)) as source:
         known = source.calibration
-        streak = accumulate_streak(read_batches(source, gathering.seconds), known, gathering)
-        past = collect_provenance({"address": address, "bin_width_s": bin_width})
+        batches = read_batches(source, gathering.seconds)
+        if find_gate_steps(known):
+            batches = read_batches(source, inf)  # a scan lasts as long as it does
+            shot: LiveShot = next(_read_scans(batches, known, gathering))[1]
+        else:
+            shot = accumulate_shot(batches, known, gathering)
+        past = collect_provenance({"address": uri.text, "bin_width_s": bin_width})
         source.drain()
     past |= {"source": source.info.as_dict(), "stats": source.stats.as_dict()}
-    return replace(streak, camera=read_camera(known), source=address, provenance=past)
+    return replace(shot, camera=read_camera(known), source=uri.text, provenance=past)
 
 
-def accumulate_streak(
+def accumulate_shot(
     batches: Iterator[Batch], calibration: Record | None, gathering: Accumulation
-) -> Streak:
-    """Make one streak image of everything that comes."""
+) -> LiveShot:
+    """Make one shot of everything that comes."""
     first = next(batches, None)
     if first is None:
         raise InputError("the source ended before it gave anything")
     known = calibration or Record("none")
     names = first.records.dtype.names or ()
     if "counts" in names:
-        return _sum_frames(first, batches, calibration, gathering)
+        return _sum_frames(first, batches, known, gathering)
     if "histogram" in names:
-        return _stack_histograms([first, *batches], known, gathering)
+        streak = _stack_histograms([first, *batches], known, gathering)
+        return _make_picture(streak, gathering)
     histogram = _make_histogram(names, known, gathering)
     for batch in itertools.chain([first], batches):
         records = batch.records
@@ -145,7 +181,25 @@ def accumulate_streak(
             histogram.add(records["channel"], compute_photon_times(records, known))
         else:
             histogram.add(records)
-    return histogram.to_streak()
+    return _make_picture(histogram.to_streak(), gathering)
+
+
+def _make_picture(streak: Streak, gathering: Accumulation) -> LiveShot:
+    """Make histograms of a picture of a line's, where the address gives a shape; hot pixels count
+    nothing.
+    """
+    shape = gathering.shape or (gathering.line and (1, streak.counts.shape[1]))
+    if not shape:
+        return streak
+    dark = np.float32(0) if streak.saturated is None else streak.saturated
+    counts = np.where(dark, np.float32(0), streak.counts)
+    return PhotonCube(_reshape(counts, (len(counts), *shape)), streak.times)
+
+
+def _reshape(counts: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    if counts.size != math.prod(shape):
+        raise InputError(f"{counts.size} numbers are no picture of {' x '.join(map(str, shape))}")
+    return counts.reshape(shape)
 
 
 def read_batches(source: Source, seconds: float) -> Iterator[Batch]:
@@ -188,16 +242,17 @@ def _stack_histograms(batches: list[Batch], calibration: Record, gathering: Accu
 
 
 def _sum_frames(
-    first: Batch,
-    batches: Iterator[Batch],
-    calibration: Record | None,
-    gathering: Accumulation,
-) -> Streak:
+    first: Batch, batches: Iterator[Batch], known: Record, gathering: Accumulation
+) -> LiveShot:
     """Add up a camera's frames; a pixel that reached its limit in one of them is not to be trusted."""
+    if gathering.line and "bin_times" not in known.fields:
+        raise InputError(
+            "it counts no photons in time for each pixel; a SPAD array does with mode=gated"
+        )
     kind = first.records.dtype["counts"].base
     limit = np.iinfo(kind).max if kind.kind in "ui" else np.inf
     total: NDArray[np.float64] = np.zeros(first.records.dtype["counts"].shape)
-    saturated, left = np.zeros(total.shape, bool), gathering.frames
+    saturated, left = np.zeros(total.shape, bool), gathering.pictures
     for batch in itertools.chain([first], batches):
         pictures = batch.records["counts"][:left]
         total += pictures.sum(axis=0, dtype=np.float64)
@@ -205,12 +260,103 @@ def _sum_frames(
         left -= len(pictures)
         if not left:
             break
+    is_picture = gathering.shape or gathering.line or "image_shape" in known.fields
+    if "bin_times" in known.fields and is_picture:
+        return _arrange_histograms(total, known, gathering)
     times = None
     for name in ("row_times", "bin_times"):  # of a sweep, or of histograms of zones
-        if calibration is not None and name in calibration.fields:
-            times = calibration.array(name, np.float64, 1, "s")
+        if name in known.fields:
+            times = known.array(name, np.float64, 1, "s")
     streak = Streak(total.astype(np.float32), times, saturated)
     return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
+
+
+def _arrange_histograms(
+    counts: NDArray[np.float64], known: Record, gathering: Accumulation
+) -> PhotonCube:
+    """Put histograms that an instrument has made where its calibration says they look."""
+    _require_own_bins(gathering)
+    times = known.array("bin_times", np.float64, 1, "s")
+    shape = gathering.shape or (1, counts.size // times.size)
+    if not gathering.shape and "image_shape" in known.fields:
+        shape = tuple(known.array("image_shape", np.int64, 1, "px").tolist())
+    sides = dict(zip("tyx", (times.size, *shape), strict=True))
+    order = str(known.attributes.get("axes", "tyx"))
+    if sorted(order) != sorted(sides):
+        raise InputError(f"the axes of histograms are t, y and x in some order, not '{order}'")
+    cube = _reshape(counts, tuple(sides[axis] for axis in order))
+    scale = float(known.attributes.get("count_scale", 1.0))
+    cube = np.transpose(cube, [order.index(axis) for axis in "tyx"]) * np.float32(scale)
+    return PhotonCube(cube, times)
+
+
+def _require_own_bins(gathering: Accumulation) -> None:
+    if gathering.bin_width is not None:
+        raise InputError("an instrument that counts photons in bins knows their width")
+
+
+def find_gate_steps(known: Record | None) -> int:
+    """Return the pictures of a gate's scan; 0 where no gate moves."""
+    return known.fields["gate_times"].values.size if known and "gate_times" in known.fields else 0
+
+
+def _read_scans(
+    batches: Iterator[Batch], known: Record | None, gathering: Accumulation
+) -> Iterator[tuple[int, PhotonCube]]:
+    """Yield sums of whole scans of a gate, each with its number; one that was cut is left out."""
+    assert known is not None
+    _require_own_bins(gathering)
+    times, binning = known.array("gate_times", np.float64, 1, "s"), gathering.binning
+    pulse, steps = _make_gate_response(known, times), times.size
+    total: NDArray[np.float32] | None = None
+    present: NDArray[np.float32] | None = None
+    done = step = begun = 0  # `begun`: number of the scan's first picture
+    for batch in batches:
+        for record in batch.records:
+            counts = record["counts"]
+            rows, columns = (size // binning for size in counts.shape)
+            if total is None or present is None:
+                if steps * rows * columns * 4 > MAX_CUBE_BYTES:
+                    raise InputError(
+                        "that number of photons does not fit into 4 GiB: choose binning=2 or 4"
+                    )
+                total = np.zeros((steps, rows, columns), np.float32)
+                present = np.zeros_like(total)
+            number = int(record["number"])
+            if number != begun + step:  # cut: wait for the next beginning
+                step = 0
+                if number % steps:
+                    continue
+                begun = number
+            whole = counts[: rows * binning, : columns * binning]
+            present[step] = whole.reshape(rows, binning, columns, binning).sum(axis=(1, 3))
+            step += 1
+            if step == steps:
+                total += present
+                step, done, begun = 0, done + 1, begun + steps
+                if done % gathering.pictures == 0:
+                    yield (
+                        begun // steps // gathering.pictures - 1,
+                        PhotonCube(total, times, pulse=pulse),
+                    )
+                    total = None
+    if done < gathering.pictures:
+        raise InputError(f"the source ended after {done} of {gathering.pictures} whole scans")
+
+
+def _make_gate_response(known: Record, times: NDArray[np.float64]) -> Pulse:
+    """Return how one instant shows while a gate moves over it: it is seen from when the gate still
+    closes behind it until it opens after it, which is the instant itself.
+    """
+    from scipy.special import ndtr
+
+    width = known.number("gate_width_s")
+    step = float(times[1] - times[0])
+    spacing = min(step, EDGE_S) / 4
+    margin = 5 * EDGE_S
+    offset = np.arange(-width - margin, margin + spacing, spacing)
+    seen = ndtr(-offset / EDGE_S) - ndtr((-offset - width) / EDGE_S)
+    return Pulse(seen, spacing, (width + margin) / spacing)
 
 
 def read_camera(calibration: Record | None) -> Camera | None:
@@ -219,66 +365,29 @@ def read_camera(calibration: Record | None) -> Camera | None:
     return None if known is None else Camera.from_record(known)
 
 
-def strip_options(uri: Uri, names: Collection[str] = Accumulation.names()) -> str:
+def strip_options(uri: Uri) -> str:
     """Return the address without what says how to gather."""
-    # Files of photon counters need the channel of the laser's pulses themselves.
+    # Files of photon counters need the channel of the laser's pulses themselves, and a kit is told its
+    # bins.
     own = {"sync"} if Path(uri.location).suffix.lower() in (".ptu", ".ttbin") else set()
-    values = {k: v for k, v in uri.values.items() if k not in names or k in own}
+    own |= {"bins"} if uri.scheme.endswith("vl53l8") else set()
+    values = {k: v for k, v in uri.values.items() if k not in Accumulation.names() or k in own}
     place = quote(uri.location, safe="/:@[]~ ")
     return f"{uri.scheme}://{place}" + (f"?{urlencode(values)}" if values else "")
 
 
-MAX_STAMPS = 10_000  # Shots on their way whose stamps are kept
-
-
-@dataclass(frozen=True)
-class ShotStamp:
-    """As which shot, and when, a streak image was taken."""
-
-    # its number at the instrument, from 0: those that were lost on the way have been counted
-    number: int
-    # when the instrument took the last of it by its own clock, s of `time.monotonic`; 0 where it
-    # does not say
-    taken_at: float = 0.0
-    # when the last of it came, s of `time.monotonic`; 0 where it comes from a file
-    received_at: float = 0.0
-
-    def compute_age(self) -> float | None:
-        """Return the seconds since it was taken, or came; None for a file."""
-        began = self.taken_at or self.received_at
-        return monotonic() - began if began else None
-
-
-@dataclass(frozen=True)
-class ShotAccounts:
-    """What became of every shot."""
-
-    acquired: int  # shots that the instrument took, or that were read from a file
-    delivered: int
-    dropped_device: int  # lost by the instrument or on the wire, or damaged when they came
-    # came and were dropped for newer ones, by the driver's buffer or between the stages, or waited
-    # still when the stream was ended
-    dropped_host: int
-    failed: int = 0  # could not be read, or no cloud could be made of them
-
-    @property
-    def dropped(self) -> int:
-        """All that were taken and lost or left out, without those that failed."""
-        return self.dropped_device + self.dropped_host
-
-
 def read_transients(address: str, bin_width: float | None = None) -> TransientStream:
-    """Read a source until it ends, and yield one streak image after the other.
+    """Read a source until it ends, and yield one shot after the other.
 
-    One is made of each ``frames`` pictures of a camera or ``records`` photons, as the address says;
-    the last one may have fewer. The source is opened with the first image, and closed with the
-    stream. Memory: a batch of the source, and a streak image.
+    One is made of each ``frames`` pictures of a camera, ``scans`` of a gate or ``records`` photons, as
+    the address says; the last one may have fewer. The source is opened with the first shot, and
+    closed with the stream. Memory: a batch of the source, and a shot.
     """
     return TransientStream(address, bin_width)
 
 
-class TransientStream(Iterator[Streak]):
-    """Streak images as they come, and where every other one went; see `read_transients`.
+class TransientStream(Iterator[LiveShot]):
+    """Shots as they come, and where every other one went; see `read_transients`.
 
     A live camera whose pictures are taken one by one is read newest first, unless the address
     chooses a ``policy``: what is shown or ranged late would be of no use. What is dropped for that
@@ -318,14 +427,14 @@ class TransientStream(Iterator[Streak]):
         """Of these, images for which the instrument or the wire lost or damaged the data."""
         return (self.stats.lost_device + self.stats.malformed) // self._records_per_shot
 
-    def __next__(self) -> Streak:
+    def __next__(self) -> LiveShot:
         return next(self._shots)
 
     def close(self) -> None:
         """Close the source."""
         self._shots.close()
 
-    def _read(self) -> Generator[Streak]:
+    def _read(self) -> Generator[LiveShot]:
         gathering = self._gathering
         with open_source(strip_options(self._uri)) as source:
             self._source = source
@@ -333,17 +442,18 @@ class TransientStream(Iterator[Streak]):
             camera = read_camera(known)
             tick = None if known is None else known.attributes.get("tick_s")
             self._records_per_shot = gathering.records
+            steps = find_gate_steps(known)
             if isinstance(source, StreamSource) and source.codec.name == "frames":
-                self._records_per_shot = gathering.frames
+                self._records_per_shot = (steps or 1) * gathering.pictures
                 self.is_numbered = True
-                if gathering.frames == 1 and "policy" not in self._uri.values:
+                if self._records_per_shot == 1 and "policy" not in self._uri.values:
                     source.keep_newest()
             seconds = gathering.seconds if "seconds" in self._uri.values else inf
             batches = self._note_times(read_batches(source, seconds), tick)
-            for number, parts in itertools.groupby(_split_shots(batches, gathering), itemgetter(0)):
-                streak = accumulate_streak((part for _, part in parts), known, gathering)
+            shots = _read_scans if steps else _accumulate_shots
+            for number, shot in shots(batches, known, gathering):
                 self.stamp = ShotStamp(number, self._taken_at, self._received_at)
-                yield replace(streak, camera=camera, source=f"{self._uri.text} shot {number}")
+                yield replace(shot, camera=camera, source=f"{self._uri.text} shot {number}")
 
     def _note_times(self, batches: Iterator[Batch], tick: object) -> Iterator[Batch]:
         """Note when each batch was taken and came; time tags carry a clock of `tick` s."""
@@ -357,75 +467,12 @@ class TransientStream(Iterator[Streak]):
             yield batch
 
 
-class TrackedShots(Iterator[Streak | TofclipError]):
-    """Shots on their way into stages, each with its stamp, so that the consumer behind the stages
-    can say how old a shot is and where the others went. `shots`: A `TransientStream`, or shots from
-    files: in the place of one that cannot be read its error.
-    """
-
-    def __init__(self, shots: Iterator[Streak] | Iterator[Streak | TofclipError]) -> None:
-        self._shots = shots
-        self._stream = shots if isinstance(shots, TransientStream) else None
-        self._stamps: dict[int, ShotStamp] = {}
-        self._count = self._first_number = 0
-        self._peeked: deque[Streak | TofclipError] = deque()
-
-    @property
-    def is_live(self) -> bool:
-        """Whether an instrument is read, so that what comes too late is dropped."""
-        return self._stream is not None and self._stream.is_live
-
-    def peek(self) -> Streak | None:
-        """Return the next shot that can be read, which is still to come; None at the end."""
-        while not self._peeked or isinstance(self._peeked[-1], TofclipError):
-            try:
-                self._peeked.append(self._take())
-            except StopIteration:
-                return None
-        return self._peeked[-1]
-
-    def __next__(self) -> Streak | TofclipError:
-        return self._peeked.popleft() if self._peeked else self._take()
-
-    def _take(self) -> Streak | TofclipError:
-        shot = next(self._shots)
-        stamp = (self._stream and self._stream.stamp) or ShotStamp(self._count)
-        self._stamps[self._count] = stamp
-        if self._count == 0:
-            self._first_number = stamp.number
-        self._stamps.pop(self._count - MAX_STAMPS, None)
-        self._count += 1
-        return shot
-
-    def get_stamp(self, place: int) -> ShotStamp:
-        """Return the stamp of shot number `place` from 0; asked once for each, in order."""
-        for earlier in [known for known in list(self._stamps) if known < place]:
-            del self._stamps[earlier]  # they were dropped
-        return self._stamps.pop(place, ShotStamp(place))
-
-    def count_dropped(self, stamp: ShotStamp, delivered: int) -> int:
-        """Return how many shots up to a delivered one were lost, wherever that was. Those behind it
-        are not known yet. `stamp`: the newest delivered one's; `delivered`: shots delivered so far,
-        this one included.
-        """
-        missing = stamp.number - self._first_number + 1 - delivered
-        if self._stream is not None and not self._stream.is_numbered:
-            missing += self._stream.shots_lost
-        return missing
-
-    def count_shots(self, delivered: int, failed: int = 0) -> ShotAccounts:
-        """Return what became of every shot; final once the stream has been closed."""
-        acquired, lost = self._count, 0
-        if self._stream is not None and self._stream.is_live:
-            # The instrument knows of shots that never reached this program.
-            acquired = max(self._stream.shots_acquired, self._count)
-            lost = self._stream.shots_lost
-        dropped = acquired - lost - delivered - failed
-        return ShotAccounts(acquired, delivered, lost, dropped, failed)
-
-    def close(self) -> None:
-        """Close the source; not while another thread waits for a shot."""
-        getattr(self._shots, "close", lambda: None)()
+def _accumulate_shots(
+    batches: Iterator[Batch], known: Record | None, gathering: Accumulation
+) -> Iterator[tuple[int, LiveShot]]:
+    """Yield shots of as many records as they have, each with its number."""
+    for number, parts in itertools.groupby(_split_shots(batches, gathering), itemgetter(0)):
+        yield number, accumulate_shot((part for _, part in parts), known, gathering)
 
 
 def _split_shots(batches: Iterator[Batch], gathering: Accumulation) -> Iterator[tuple[int, Batch]]:
@@ -437,7 +484,9 @@ def _split_shots(batches: Iterator[Batch], gathering: Accumulation) -> Iterator[
     last = -1
     for batch in batches:
         names = batch.records.dtype.names or ()
-        size = {"counts": gathering.frames, "histogram": maxsize}.get(names[-1], gathering.records)
+        size = {"counts": gathering.pictures, "histogram": maxsize}.get(
+            names[-1], gathering.records
+        )
         own = batch.records["number"] if "number" in names else None
         if own is not None and len(own):
             base += last + 1 if own[0] <= last else 0

@@ -233,9 +233,10 @@ def _load_bins(path: Path, what: str) -> np.ndarray[Any, Any]:
 
 
 def require_view(focal_length_px: float | None, field_of_view_deg: float) -> None:
-    """Refuse a focal length or a field of view that no camera has."""
-    if not 0 < field_of_view_deg < 180 or (focal_length_px is not None and not focal_length_px > 0):
-        raise InputError("the focal length must be positive, the field of view within 0..180")
+    """Refuse a focal length or a field of view that no camera has, before anything is read."""
+    from tofclip.camera import Camera
+
+    Camera.pinhole((1, 1), focal_length_px, field_of_view_deg=field_of_view_deg)
 
 
 def choose_camera(
@@ -248,15 +249,11 @@ def choose_camera(
     """Return a known camera, with another focal length if one is given, or a pinhole whose returns
     are `pulse_fwhm` s wide.
     """
-    import math
-
-    from tofclip.lidar.photons import make_pinhole
+    from tofclip.camera import Camera
 
     if known is not None:
         return known if focal_length_px is None else known.replace(focal_length_px=focal_length_px)
-    # Half the width over the tangent of half the field of view.
-    usual = image_shape[1] / 2 / math.tan(math.radians(field_of_view_deg) / 2)
-    return make_pinhole(image_shape, focal_length_px or usual, pulse_fwhm)
+    return Camera.pinhole(image_shape, focal_length_px, pulse_fwhm, field_of_view_deg)
 
 
 def save_range_image(found: SurfaceImage, camera: Camera, path: Path, returns: int = 1) -> None:

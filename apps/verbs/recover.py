@@ -142,8 +142,15 @@ def recover(
     # Outputs and settings have been checked by now: an instrument is not started for nothing.
     if "://" in streak:
         from devices.transients import read_transient
+        from tofclip.shots import Streak
 
-        shot = open_shot(read_transient(streak, bin_width), camera, time_zero)
+        taken = read_transient(streak, bin_width)
+        if not isinstance(taken, Streak):
+            raise InputError(
+                f"{streak}: its pixels look at the scene themselves, so that nothing is to be recovered; "
+                "tofclip stream and tofclip lidar photons make clouds"
+            )
+        shot = open_shot(taken, camera, time_zero)
     else:
         shot = open_shot(streak, camera, time_zero, bin_width)
     plan = plan_recovery(shot, solver, chosen_focus, device)

@@ -19,10 +19,9 @@ from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
 
 if TYPE_CHECKING:
-    from devices.transients import TrackedShots
-    from tofclip.sequences.ranger import CloudPipeline
+    from devices.tracking import TrackedShots
+    from tofclip.sequences.pipelines import LiveShot
     from tofclip.sequences.streaming import StreamedCloud
-    from tofclip.shots import Streak
 
 MAX_LATENCY_SAMPLES = 10_000  # over which medians are taken: a stream may run for days
 
@@ -68,7 +67,9 @@ def stream(
     from dataclasses import asdict
     from itertools import islice
 
-    from devices.transients import TrackedShots
+    from devices.tracking import TrackedShots
+    from tofclip.recovery import parse_focus
+    from tofclip.sequences import make_pipeline
     from tofclip.sequences.streaming import stream_clouds
 
     require_format(suffix)
@@ -84,7 +85,7 @@ def stream(
         if isinstance(fault, TofclipError):
             raise fault
         raise InputError(f"{source}: the source ended before it gave a shot")
-    pipeline = _make_pipeline(first, camera, time_zero, focus, method)
+    pipeline = make_pipeline(first, camera, time_zero, parse_focus(focus), method)
     if out is not None:  # only now: what cannot be streamed leaves no empty folder
         make_folder(out)
     failed = 0
@@ -106,7 +107,7 @@ def stream(
         figures = _take_clouds(islice(made, shots), out, suffix, coming)
     # Counted last: only when the instrument has been stopped are its accounts final.
     accounts = coming.count_shots(figures["clouds"], failed)
-    figures |= {"method": method, "dropped": accounts.dropped, **asdict(accounts)}
+    figures |= {"method": pipeline.method_name, "dropped": accounts.dropped, **asdict(accounts)}
     report(figures, as_json, [] if out is None else [out])
     if failed:
         raise typer.Exit(EXIT_SOME_FAILED)
@@ -114,43 +115,25 @@ def stream(
 
 def _read_shots(
     source: str, bin_width: float | None
-) -> Iterator[Streak] | Iterator[Streak | TofclipError]:
+) -> Iterator[LiveShot] | Iterator[LiveShot | TofclipError]:
     """Shots of an instrument, a folder or a stack; in the place of one that cannot be read its
     error, which lets those behind it go on.
     """
+    from devices.counted_photons import find_address
     from devices.transients import read_transients
     from tofclip.sequences import list_shots
 
-    if "://" in source:
-        return read_transients(source, bin_width)
+    address = source if "://" in source else Path(source).is_file() and find_address(source)
+    if address:
+        return read_transients(address, bin_width)
     return map(_read_or_fail, list_shots(source, bin_width).values())
 
 
-def _read_or_fail(shot: Callable[[], Streak]) -> Streak | TofclipError:
+def _read_or_fail(shot: Callable[[], LiveShot]) -> LiveShot | TofclipError:
     try:
         return shot()
     except TofclipError as fault:
         return fault
-
-
-def _make_pipeline(
-    first: Streak, camera: Path | None, time_zero: float | None, focus: str, method: str
-) -> CloudPipeline:
-    from tofclip.recovery import SharpestFocus, SurfaceRecovery, parse_focus
-    from tofclip.sequences.following import SurfacePipeline
-    from tofclip.sequences.ranger import RangingPipeline
-    from tofclip.solvers import LinearInverse, Sparse, TotalVariation
-
-    chosen = parse_focus(focus)
-    if isinstance(chosen, SharpestFocus):
-        raise InputError("a stream has one focus for all shots: depth-locked or fixed:S")
-    if method == SurfaceRecovery.name:  # each surface is recovered at the shear of its range
-        return SurfacePipeline.for_shot(first, camera, time_zero)
-    methods: dict[str, Any] = {"linear": LinearInverse, "l1": Sparse, "tv": TotalVariation}
-    if method not in methods:
-        names = ", ".join((*methods, SurfaceRecovery.name))
-        raise InputError(f"a stream's method is one of {names}, not '{method}'")
-    return RangingPipeline.for_shot(first, camera, chosen, time_zero, methods[method]())
 
 
 def _take_clouds(

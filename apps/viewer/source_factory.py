@@ -8,22 +8,26 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from apps.viewer.shots import LiveShots, StoredShots
 from apps.viewer.sources import (
     CloudSource,
-    LiveShotSource,
-    StoredShotSource,
+    PhotonSource,
+    StreakSource,
     TransientSource,
     VolumeSource,
 )
-from devices.transients import TrackedShots, read_transient, read_transients
+from devices.tracking import TrackedShots
+from devices.transients import read_transient, read_transients
 from tofclip.camera import Camera, measure
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import read_streak
 from tofclip.io.streaks import StreakStack
+from tofclip.lidar.photons import PhotonCube
 from tofclip.loading import CLOUD_SUFFIXES, load, outline
 from tofclip.recovery import make_method, open_shot, plan_recovery
+from tofclip.sequences import make_pipeline
 from tofclip.shots import Streak
-from tofclip.solvers import Method
+from tofclip.solvers import LinearInverse, Method, ProximalMethod
 
 if TYPE_CHECKING:
     from apps.viewer.source import Source
@@ -138,7 +142,8 @@ def _open_shots(
     first = shots[0]()
     if len(shots) > 1:
         camera = _find_camera(title, first, options, announce)
-        return StoredShotSource(title, shots, camera, make_look_method(options.method))
+        method = make_look_method(options.method)
+        return StreakSource(title, StoredShots(shots), camera, first.times, method)
     if options.method == SURFACES:
         opened = open_shot(first, options.camera, options.time_zero)
         announce(f"recovering the surfaces of {title}")
@@ -148,7 +153,7 @@ def _open_shots(
         return TransientSource(title, frames, measured, make_look_method(FIRST_LOOK_METHOD))
     camera = _find_camera(title, first, options, announce)
     method = make_look_method(options.method or FIRST_LOOK_METHOD)
-    shot = StoredShotSource(title, [lambda: first], camera, method)
+    shot = StreakSource(title, StoredShots([lambda: first]), camera, first.times, method)
     source = TransientSource(title, shot.recover_frames(0), shot.measurements(0), method)
     if options.method is None:
         source.notes = (FIRST_LOOK_NOTE, *source.notes)
@@ -156,16 +161,26 @@ def _open_shots(
 
 
 def _open_instrument(address: str, options: ShotOptions, announce: Announce) -> Source:
-    """An instrument that goes on, or a recording, which is gathered once."""
-    if address.lower().startswith("file://"):
-        reader = partial(read_transient, address, options.bin_width)
-        return _open_shots(address, [reader], options, announce)
+    """An instrument that goes on, or a recording, of which streak images are gathered once."""
     shots = TrackedShots(read_transients(address, options.bin_width))
     first = shots.peek()
     if first is None:
         raise InputError(f"{address}: the source ended before it gave anything")
+    if isinstance(first, PhotonCube):
+        announce(f"finding the ranges of {address}")
+        pipeline = make_pipeline(first, options.camera, options.time_zero)
+        return PhotonSource(address, LiveShots(address, shots, pipeline), pipeline.camera)
+    if not shots.is_live:
+        shots.close()
+        whole = read_transient(address, options.bin_width)
+        assert isinstance(whole, Streak)
+        return _open_shots(address, [lambda: whole], options, announce)
+    method = make_look_method(options.method or LinearInverse.name)
     camera = _find_camera(address, first, options, announce)
-    return LiveShotSource(address, shots, camera, make_look_method(options.method))
+    # by a method that makes no clouds while shots come, they are made when one looks
+    by = method if isinstance(method, LinearInverse | ProximalMethod) else LinearInverse.name
+    pipeline = make_pipeline(first, camera, options.time_zero, method=by)
+    return StreakSource(address, LiveShots(address, shots, pipeline), camera, first.times, method)
 
 
 def _find_camera(title: str, shot: Streak, options: ShotOptions, announce: Announce) -> Camera:

@@ -6,22 +6,17 @@ from __future__ import annotations
 
 import abc
 import functools
-import threading
-import time
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.verbs.photons import DEFAULT_FIELD_OF_VIEW_DEG
+from apps.viewer.shots import LiveShots, Shots, make_view
 from apps.viewer.source import (
     NO_LIMITS,
     Choice,
@@ -33,19 +28,15 @@ from apps.viewer.source import (
     View,
     make_cloud,
 )
-from devices.transients import TrackedShots
 from tofclip.camera import Camera, Rectifier
-from tofclip.errors import FileFormatError, InputError, TofclipError
-from tofclip.files import format_error_line
-from tofclip.lidar import Detection, PointCloud, Returns, depth, point_cloud
+from tofclip.errors import FileFormatError
+from tofclip.lidar import Detection, PointCloud, depth
 from tofclip.lidar.export import read_table
 from tofclip.lidar.geometry import compute_ray_directions
-from tofclip.lidar.photons import make_pinhole
+from tofclip.lidar.photons import PhotonCube
 from tofclip.lidar.significance import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.loading import CLOUD_SUFFIXES, load
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
-from tofclip.sequences.ranger import RangingPipeline
-from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import LinearInverse, Method
 from tofclip.storage import Record
@@ -56,7 +47,7 @@ if TYPE_CHECKING:
     from nlos import Volume
 
 CLOUD_RATE_HZ = SHOT_RATE_HZ = 10.0
-MAX_CACHED_CLOUDS, MAX_CACHED_VIEWS, MAX_CACHED_SHOTS = 32, 16, 32
+MAX_CACHED_CLOUDS, MAX_CACHED_VIEWS = 32, 16
 MIN_PIXEL_FRACTION = 0.3  # of a pixel's strongest return, which weaker ones before it would hide
 
 
@@ -132,9 +123,7 @@ def read_cloud(path: Path) -> PointCloud:
     # The picture does not say its camera: a pinhole of the field of view that `tofclip lidar photons`
     # takes where none is given sees ranges as they are, widths maybe not.
     rows, columns = np.nonzero(np.isfinite(distance) & (distance > 0))
-    focal_length_px = distance.shape[1] / 2 / np.tan(np.deg2rad(DEFAULT_FIELD_OF_VIEW_DEG) / 2)
-    camera = make_pinhole(distance.shape, float(focal_length_px), 1e-10)
-    rays = compute_ray_directions(camera, rows, columns)
+    rays = compute_ray_directions(Camera.pinhole(distance.shape), rows, columns)
     rays /= 1 if "range_m" in fields else rays[:, 2:]
     brightness = fields.get("intensity", fields.get("Y", np.ones_like(distance)))
     xyz = distance[rows, columns, np.newaxis] * rays
@@ -304,12 +293,6 @@ class RecoveredSource(Source):
         return np.stack([frames.times, frames.values[:, row, column]])
 
 
-def make_view(returns: Returns, cloud: PointCloud | None = None) -> View:
-    """Return the points of returns and which pixel saw them; `cloud`: of these, where it is known."""
-    points = point_cloud(returns) if cloud is None else cloud
-    return View(points, np.stack([returns.y, returns.x], axis=-1))
-
-
 def render_depth(view: View, shape: tuple[int, int]) -> Picture:
     """Return the range of each pixel's most intense return, m; NaN where nothing came back."""
     picture = np.full(shape, np.nan, np.float32)
@@ -438,28 +421,57 @@ class TransientSource(RecoveredSource):
         return measurements
 
 
-class ShotSource(RecoveredSource):
-    """Shots of one camera, wherever they come from; frame `n` is the cloud of shot `n`. `row_times`
-    (rows,): instant of each row, s.
+class StreakSource(RecoveredSource):
+    """Streak images of one camera, wherever they come from; frame `n` is the cloud of shot `n`.
+
+    `row_times` (rows,): instant of each row, s. `method`: the linear inverse by default.
     """
 
     def __init__(
-        self, title: str, camera: Camera, row_times: FloatArray, method: Method | None = None
+        self,
+        title: str,
+        shots: Shots,
+        camera: Camera,
+        row_times: FloatArray,
+        method: Method | None = None,
     ) -> None:
         super().__init__(title, SHOT_RATE_HZ, camera, row_times - camera.time_zero, method)
         self.frame_name = "shot"
         if self.is_linear:
             self.notes = (LINEAR_NOTE, *self.notes)
+        self._shots, self._rectifier = shots, Rectifier(camera, row_times.size)
+        self._measured = functools.lru_cache(2)(self._rectify)
         self._recover_view = functools.lru_cache(MAX_CACHED_VIEWS)(
             lambda number, shear: self.recover_view(self.measurements(number), shear)
         )
+
+    def __len__(self) -> int:
+        return len(self._shots)
+
+    @property
+    def inflow(self) -> Inflow:
+        return self._shots.inflow
+
+    def close(self) -> None:
+        self._shots.close()
 
     def view(self, number: int) -> View:
         return self.view_at(number, self.refocus.value)
 
     def view_at(self, number: int, shear: float) -> View:
         """Return the points of shot `number`, recovered at a shear."""
-        return self._recover_view(number, shear)
+        made = self._shots.get(number).view
+        if made is None or shear or self._shots.method_name != self.method.name:
+            return self._recover_view(number, shear)
+        return made
+
+    def measurements(self, number: int) -> Readings:
+        return self._measured(number)
+
+    def _rectify(self, number: int) -> Readings:
+        shot = self._shots.get(number).shot
+        assert isinstance(shot, Streak)
+        return self._rectifier.measure(shot.counts, shot.saturated).values
 
     def pictures(self, number: int) -> Mapping[str, Picture]:
         measurements = self.measurements(number)
@@ -473,130 +485,35 @@ class ShotSource(RecoveredSource):
         }
 
 
-class StoredShotSource(ShotSource):
-    """Shots in files, each read when it is looked at; the measurements of the last one are kept."""
+class PhotonSource(Source):
+    """Histograms of a picture as they come; frame `n` is the cloud of shot `n`."""
 
-    def __init__(
-        self,
-        title: str,
-        shots: Sequence[Callable[[], Streak]],
-        camera: Camera,
-        method: Method | None = None,
-    ) -> None:
-        row_times = shots[0]().times
-        super().__init__(title, camera, row_times, method)
-        self._shots, self._rectifier = shots, Rectifier(camera, row_times.size)
-        self._measured = functools.lru_cache(1)(self._rectify)
+    def __init__(self, title: str, shots: LiveShots, camera: Camera) -> None:
+        super().__init__(title, SHOT_RATE_HZ, frame_name="shot")
+        self._shots, self.camera = shots, camera
+        self.notes = (NO_TIME_ZERO_NOTE,) if camera.time_zero == 0 else ()
 
     def __len__(self) -> int:
         return len(self._shots)
 
-    def measurements(self, number: int) -> Readings:
-        return self._measured(number)
-
-    def _rectify(self, number: int) -> Readings:
-        shot = self._shots[number]()
-        return self._rectifier.measure(shot.counts, shot.saturated).values
-
-
-STOP_TIMEOUT_S = 10.0  # for the shot under way and for letting go of the instrument
-RATE_WINDOW_SHOTS = 8  # arrivals over which the data rate is averaged
-
-
-class LiveShotSource(ShotSource):
-    """Shots that an iterator delivers, made into clouds as they come; the last 32 can be looked at
-    again.
-
-    Clouds are those of `tofclip.sequences.streaming.stream_clouds`, one shot at a time on all cores,
-    so that each is seen soon. Of the shots that come meanwhile only the newest waits, so that what
-    one sees is never late; `lost` counts the others wherever it happened, in the instrument, its
-    driver or here.
-
-    The end of `shots`, or a fault of an instrument, ends the source; what came can still be looked
-    at. `method`: the linear inverse by default: others take seconds for a shot.
-    """
-
-    def __init__(
-        self,
-        title: str,
-        shots: Iterator[Streak] | TrackedShots,
-        camera: Camera,
-        method: Method | None = None,
-    ) -> None:
-        self._shots = shots if isinstance(shots, TrackedShots) else TrackedShots(shots)
-        first = next(self._shots, None)
-        if first is None:
-            raise InputError(f"{title}: the source ended before it gave anything")
-        if isinstance(first, TofclipError):
-            raise first
-        super().__init__(title, camera, first.times, method)
-        self._cache: deque[tuple[Readings, View]] = deque(maxlen=MAX_CACHED_SHOTS)
-        self._arrivals: deque[float] = deque(maxlen=RATE_WINDOW_SHOTS + 1)
-        self._count, self._inflow = 0, Inflow(is_live=True)
-        self._pipeline = RangingPipeline(camera, first.times)
-        self._lock, self._stopping = threading.Lock(), threading.Event()
-        rectifier = self._pipeline.rectifier
-        measurements = rectifier.measure(first.counts, first.saturated).values
-        self._append_entry(measurements, make_view(self._pipeline.find_returns(measurements)))
-        self._thread = threading.Thread(target=self._run, name="live shots", daemon=True)
-        self._thread.start()
-
-    def __len__(self) -> int:
-        return self._count
-
     @property
     def inflow(self) -> Inflow:
-        with self._lock:
-            oldest, rate = self._count - len(self._cache), 0.0
-            if len(self._arrivals) > 1 and self._inflow.is_live:
-                span = self._arrivals[-1] - self._arrivals[0]
-                rate = (len(self._arrivals) - 1) / max(span, 1e-9)
-            return replace(self._inflow, oldest=oldest, data_rate=rate)
-
-    def view_at(self, number: int, shear: float) -> View:
-        return super().view_at(number, shear) if shear else self._find_entry(number)[1]
-
-    def measurements(self, number: int) -> Readings:
-        return self._find_entry(number)[0]
+        return self._shots.inflow
 
     def close(self) -> None:
-        self._stopping.set()
-        self._thread.join(STOP_TIMEOUT_S)
+        self._shots.close()
 
-    def _find_entry(self, number: int) -> tuple[Readings, View]:
-        """Return what is kept of a shot, or of the nearest that is."""
-        with self._lock:
-            place = number - (self._count - len(self._cache))
-            return self._cache[min(max(place, 0), len(self._cache) - 1)]
+    def view(self, number: int) -> View:
+        made = self._shots.get(number).view
+        assert made is not None
+        return made
 
-    def _run(self) -> None:
-        try:
-            with ThreadPoolExecutor(1) as worker:
-                how: Any = {"policy": "drop_oldest", "executor": worker, "at_once": 1}
-                stream = stream_clouds(self._shots, self._pipeline, **how)
-                # closing the generator stops its threads and the instrument
-                with closing(stream) as clouds:
-                    for made in clouds:
-                        if self._stopping.is_set():
-                            break
-                        stamp = self._shots.get_stamp(made.shot + 1)  # the first one is shown
-                        self._append_entry(made.measurements, make_view(made.returns, made.cloud))
-                        age = stamp.compute_age()
-                        latency = made.latency if age is None else age
-                        lost = self._shots.count_dropped(stamp, self._count)
-                        self._inflow = replace(self._inflow, latency=latency, lost=lost)
-        except Exception as fault:
-            # Whatever ends it is shown on the page: an exception on this thread would be lost.
-            self._inflow = replace(self._inflow, failure_text=format_error_line(fault))
-        finally:
-            lost = self._shots.count_shots(self._count).dropped
-            self._inflow = replace(self._inflow, is_live=False, lost=lost)
+    def pictures(self, number: int) -> Mapping[str, Picture]:
+        light = self._shots.get(number).shot.counts.sum(axis=0, dtype=np.float32)
+        depth_picture = render_depth(self.view(number), self.camera.image_shape)
+        return {"intensity": light, "depth": depth_picture}
 
-    def _append_entry(self, measurements: Readings, view: View) -> None:
-        if not self.is_linear:
-            # seconds of work, meanwhile the newest shot waits and older ones are dropped
-            view = self.recover_view(measurements)
-        with self._lock:
-            self._cache.append((measurements, view))
-            self._count += 1
-            self._arrivals.append(time.monotonic())
+    def waveform(self, number: int, pixel: tuple[int, int]) -> FloatArray:
+        shot = self._shots.get(number).shot
+        assert isinstance(shot, PhotonCube)
+        return np.stack([shot.times - self.camera.time_zero, shot.counts[:, pixel[0], pixel[1]]])

@@ -28,19 +28,21 @@ from devices.histogram_kits import (
     KitFeed,
     Tmf8828Options,
     Vl53l8Options,
+    find_tmf_zones,
 )
 from devices.stream import StreamSource
 from tofclip.units import SPEED_OF_LIGHT
 
 LineFormatter = Callable[[NDArray[np.uint32], int, int], list[bytes]]
 PEAK_COUNTS, BACKGROUND_COUNTS = 400.0, 4.0
-PULSE_BINS = 1.5  # Standard deviation of the emulated pulse
+PULSE_S = 0.375e-9  # Standard deviation of the emulated pulse
 
 
 def format_tmf8828(counts: NDArray[Any], number: int, tick: int) -> list[bytes]:
     """Return the lines that a TMF8828's program sends for a frame; the inverse of `Tmf8828Parser`.
     `counts` (128, zones); `number`: of the frame; `tick`: 0.2 us. Returns with their ends.
     """
+    counts = counts[:, find_tmf_zones(counts.shape[1])]
     captures, halves = (TMF_CAPTURES, 2) if counts.shape[1] == 64 else (1, 1)
     width = counts.shape[1] // captures
     lines = []
@@ -121,7 +123,7 @@ class EmulatedKit:
         """Return frame `number`'s counts (bins, zones); the same number gives the same frame."""
         times = self._options.first_bin + self._options.bin_width * np.arange(self._bins)
         delays = 2 * compute_zone_ranges(self._zones) / SPEED_OF_LIGHT
-        off = (times[:, np.newaxis] - delays) / (PULSE_BINS * self._options.bin_width)
+        off = (times[:, np.newaxis] - delays) / PULSE_S
         light = BACKGROUND_COUNTS + PEAK_COUNTS * np.exp(-(off**2) / 2)
         return np.random.default_rng([self._options.seed, number]).poisson(light).astype(np.uint32)
 

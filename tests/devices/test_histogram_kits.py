@@ -26,7 +26,6 @@ from devices.histogram_kits import (
     Tmf8828Parser,
     Vl53l8Parser,
 )
-from devices.transients import read_transient
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceNotFoundError,
@@ -109,26 +108,24 @@ def test_compact_histograms_of_each_zone() -> None:
 
 
 @pytest.mark.parametrize(
-    ("address", "bins", "zones"),
+    ("address", "shape"),
     [
-        ("sim+tmf8828://?seed=1&rate=100", 128, 64),
-        ("sim+tmf8828://?seed=1&rate=100&zones=9&start=", 128, 9),
-        ("sim+vl53l8://?seed=1&rate=100&zones=64&sub_sample=1&bins=60", 60, 64),
+        ("sim+tmf8828://?seed=1&rate=100", (128, 8, 8)),
+        ("sim+tmf8828://?seed=1&rate=100&zones=9&start=", (128, 3, 3)),
+        ("sim+vl53l8://?seed=1&rate=100&zones=64&sub_sample=1&bins=60", (60, 8, 8)),
+        ("sim+vl53l8://?seed=1&rate=100&shape=2x8", (24, 2, 8)),
     ],
 )
-def test_the_peak_of_each_zone_is_where_the_wall_is(address: str, bins: int, zones: int) -> None:
+def test_the_peak_of_each_zone_is_where_the_wall_is(
+    address: str, shape: tuple[int, int, int]
+) -> None:
     counted = read_photons(f"{address}&scans=3")
-    assert counted.counts.shape == (bins, 1, zones)
-    ranges = counted.times[counted.counts[:, 0].argmax(axis=0)] * SPEED_OF_LIGHT / 2
+    assert counted.counts.shape == shape
+    zones = shape[1] * shape[2]
+    ranges = counted.times[counted.counts.argmax(axis=0)] * SPEED_OF_LIGHT / 2
     bin_m = counted.bin_width * SPEED_OF_LIGHT / 2
-    assert np.abs(ranges - compute_zone_ranges(zones)).max() < bin_m
+    assert np.abs(ranges.ravel() - compute_zone_ranges(zones)).max() < bin_m
     assert counted.to_image().photons > 100 * zones
-
-
-def test_zones_are_columns_of_a_transient() -> None:
-    streak = read_transient("sim+vl53l8://?rate=100&frames=2")
-    assert streak.counts.shape == (24, 16)
-    np.testing.assert_allclose(np.diff(streak.times), 4 * 250.4e-12, rtol=1e-4)
 
 
 def test_every_frame_is_accounted_for() -> None:

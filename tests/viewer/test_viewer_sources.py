@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from viewer_scenes import (
 
 from apps.viewer.panels import render_status_html
 from apps.viewer.session import DIM_NOTE, Filters, Session
+from apps.viewer.shots import LiveShots
 from apps.viewer.source import Source, View, make_cloud
 from apps.viewer.source_factory import FIRST_LOOK_NOTE, ShotOptions, open_source
 from apps.viewer.sources import (
@@ -40,7 +40,7 @@ from apps.viewer.sources import (
     SLICE_MODE,
     SURFACE_MODE,
     VOXEL_MODE,
-    LiveShotSource,
+    StreakSource,
     TransientSource,
     VolumeSource,
     leave_out_rays,
@@ -50,6 +50,7 @@ from tofclip.camera import registration
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io.streaks import save_stack
 from tofclip.lidar import PointCloud
+from tofclip.sequences import make_pipeline
 from tofclip.sequences.ranger import RangingPipeline, SummedShot
 from tofclip.shots import Streak
 
@@ -361,14 +362,24 @@ def test_what_is_shown_is_called_what_it_is(transient: TransientSource) -> None:
     assert PROJECTION_MODE in of_volume.source.mode.options
 
 
+def follow(shots: Iterator[Streak]) -> LiveShots:
+    return LiveShots("test", shots, make_pipeline(streak(0), method="linear"))
+
+
 def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
+    opened = threading.Event()
+
     def shots() -> Iterator[Streak]:
+        yield streak(0)
+        opened.wait(20)
         yield streak(1)
-        wait_until(lambda: len(source) >= 2)  # or it may be dropped for the next
+        wait_until(lambda: len(live) >= 2)  # or it may be dropped for the next
         yield streak(2)
         raise ZeroDivisionError("nothing came")  # of no kind that is foreseen
 
-    source = LiveShotSource("test", chain([streak(0)], shots()), camera())
+    live = follow(shots())
+    opened.set()
+    source = StreakSource("test", live, camera(), streak(0).times)
     session = Session(source)
     wait_until(lambda: not source.inflow.is_live)
     assert (len(source), source.inflow.oldest, source.inflow.failure_text) == (3, 0, "nothing came")
@@ -382,11 +393,13 @@ def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
 
 
 def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    busy, came, go_on = threading.Event(), threading.Event(), threading.Event()
+    opened, busy, came, go_on = (threading.Event() for _ in range(4))
     handed_over = 0.0
 
     def shots() -> Iterator[Streak]:
         nonlocal handed_over
+        yield streak(0)
+        opened.wait(20)
         for seed in range(12):
             handed_over = time.monotonic()
             yield streak(seed)
@@ -394,14 +407,15 @@ def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPat
         came.set()
 
     def slowly(self: RangingPipeline, shot: Streak) -> SummedShot:
-        if threading.current_thread() is not threading.main_thread():
+        if opened.is_set():
             busy.set()
             go_on.wait(20)
         return rectify(self, shot)
 
     rectify = RangingPipeline.rectify
     monkeypatch.setattr(RangingPipeline, "rectify", slowly)
-    source = LiveShotSource("test", chain([streak(0)], shots()), camera())
+    source = follow(shots())
+    opened.set()
     assert came.wait(20)
     taken = time.monotonic()
     time.sleep(0.1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -21,6 +21,7 @@ from tofclip.storage import Record, Storable, stored_array, stored_child, stored
 # Mean over three set-ups of the same family of instruments (244, 271 and 282 px), fitted to the measured
 # positions of the wall points that their pixels see. A camera with other lenslets needs its own.
 DEFAULT_FOCAL_LENGTH_PX = 265.0
+PINHOLE_FIELD_OF_VIEW_DEG = 30.0  # width of the picture of a pinhole of which nothing is known
 
 
 @dataclass(frozen=True)
@@ -192,6 +193,45 @@ class Camera(Storable):
             "time zero": f"{1e9 * self.time_zero:.3f} ns" if self.time_zero else "not given",
         }
         return render_html("Camera", described, None)
+
+    @classmethod
+    def pinhole(
+        cls,
+        image_shape: tuple[int, int],
+        focal_length_px: float | None = None,
+        pulse_fwhm: float = 60e-12,
+        field_of_view_deg: float = PINHOLE_FIELD_OF_VIEW_DEG,
+    ) -> Self:
+        """Return a camera of one view that only says where its pixels look: that of a direct sensor,
+        as a SPAD array or a kit of histograms, or of frames of one's own.
+
+        Parameters
+        ----------
+        image_shape : (int, int)
+            Rows and columns.
+        focal_length_px : float, optional
+            Distance of the pinhole from the picture, in pixels; the optical axis meets pixel
+            ``(rows // 2, columns // 2)``. By default from the field of view.
+        pulse_fwhm : float
+            Full width at half maximum of a return, s.
+        field_of_view_deg : float
+            Width of the whole picture, degrees, where no focal length is given.
+
+        Raises
+        ------
+        CalibrationError
+            A focal length or a field of view that no pinhole has.
+        """
+        rows, columns = (int(side) for side in image_shape)
+        if not 0 < field_of_view_deg < 180:
+            raise CalibrationError(
+                f"a field of view lies between 0 and 180 degrees, got {field_of_view_deg}"
+            )
+        if focal_length_px is None:
+            focal_length_px = columns / 2 / float(np.tan(np.deg2rad(field_of_view_deg) / 2))
+        centre = np.array([min(columns / 2, columns - 1)])
+        optics: Any = {"pulse_fwhm": pulse_fwhm, "focal_length_px": focal_length_px}
+        return cls(centre, np.zeros(1), (rows, columns), columns, **optics)
 
     @property
     def views(self) -> int:

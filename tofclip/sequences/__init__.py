@@ -7,10 +7,12 @@ take the same way.
 
 from tofclip.sequences.clouds import CloudSettings
 from tofclip.sequences.inputs import FileShot, Shot, StackShot, is_sequence, list_files, list_shots
+from tofclip.sequences.pipelines import CloudPipeline, make_pipeline
 from tofclip.sequences.ranging import RangingPlan, RangingSettings
 from tofclip.sequences.recovering import RecoverySettings, expand_sweep
 
 __all__ = [
+    "CloudPipeline",
     "CloudSettings",
     "FileShot",
     "RangingPlan",
@@ -22,4 +24,5 @@ __all__ = [
     "is_sequence",
     "list_files",
     "list_shots",
+    "make_pipeline",
 ]

@@ -15,7 +15,7 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.camera import Camera, Rectifier
+from tofclip.camera import Camera
 from tofclip.lidar.pulse_tables import PictureTraces, TraceBins
 from tofclip.operators import LinearOperator
 from tofclip.recovery import DepthLockedFocus, Shot, SurfaceRecovery, open_shot, plan_recovery
@@ -98,12 +98,11 @@ class SurfacePipeline:
     Memory: as `SurfaceRecovery`; nothing is kept of the shots before but the last fit.
     """
 
-    in_order = True
+    in_order, method_name = True, SurfaceRecovery.name
 
     def __init__(self, shot: Shot, method: SurfaceRecovery | None = None) -> None:
         self.method = SurfaceRecovery() if method is None else method
         self.camera, self._centre_error_px = shot.camera, shot.centre_error_px
-        self.rectifier = Rectifier(shot.camera, shot.times.size)
         self.searches = 0
         self._fit: SurfaceFit | None = None
         self._lock = Lock()

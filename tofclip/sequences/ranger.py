@@ -5,7 +5,7 @@ once.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,27 +25,6 @@ from tofclip.solvers import LinearInverse, ProximalMethod
 from tofclip.solvers.direct import InverseTraces, order_by_patch
 
 FloatArray = NDArray[np.float64]
-
-
-class CloudPipeline(Protocol):
-    """What makes clouds of shots of one camera: `RangingPipeline`, or
-    `tofclip.sequences.following.SurfacePipeline`.
-    """
-
-    rectifier: Rectifier
-
-    @property
-    def in_order(self) -> bool:
-        """Whether what comes out of a shot depends on those before it."""
-
-    def rectify(self, shot: Streak) -> Any:
-        """Do what can be done before anything is recovered; what comes out is for `recover_shot`."""
-
-    def recover_shot(self, shot: Streak, rectified: Any) -> Any:
-        """Do what a shot needs as a whole; what comes out is for `search`."""
-
-    def search(self, found: Any) -> Returns:
-        """Find the returns in what `recover_shot` returned."""
 
 
 class SummedShot(NamedTuple):
@@ -85,6 +64,7 @@ class RangingPipeline:
     ) -> None:
         focus.check_camera(camera)
         self.method = LinearInverse() if method is None else method
+        self.method_name = self.method.name
         # Rows with light are told by the filter matched to the operator, whatever recovers them.
         inverse = self.method if isinstance(self.method, LinearInverse) else LinearInverse()
         self.camera = camera

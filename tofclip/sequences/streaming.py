@@ -13,21 +13,16 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from itertools import pairwise
 from threading import Condition, Thread
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from tofclip.camera import Rectifier
 from tofclip.errors import InputError, TofclipError
 from tofclip.lidar import PointCloud, point_cloud
-from tofclip.sequences.ranger import CloudPipeline, RangingPipeline
-from tofclip.shots import Returns, Streak
-from tofclip.solvers import Sparse
+from tofclip.sequences.pipelines import CloudPipeline, LiveShot, make_pipeline
+from tofclip.shots import Returns
 from tofclip.threads import open_worker_pool, thread_count
 
 Policy = Literal["block", "drop_oldest"]
@@ -221,24 +216,16 @@ class StreamedCloud:
 
     cloud: PointCloud
     returns: Returns  # those that the cloud's points are, in the same order
-    streak: Streak  # the shot
-    rectifier: Rectifier  # of its camera
+    taken: LiveShot  # the shot
     shot: int  # number of its shot in the source, from 0; what was dropped has been counted
     # what each step took: ``"read"`` (the source, which is not latency), ``"wait"`` (until its turn
     # came), ``"rectify"``, ``"recover"``, ``"range"`` and ``"place"``
     seconds: Mapping[str, float]
     latency: float  # time from when the shot was there until its cloud was handed out, s
 
-    @cached_property
-    def measurements(self) -> NDArray[np.float32]:
-        """The shot, rectified, (columns, rows). Worked out when it is asked for: memory that every
-        shot takes anew takes longer to get than to fill.
-        """
-        return self.rectifier.rectify(self.streak.counts)
-
 
 def stream_clouds(
-    shots: Iterable[Streak | TofclipError],
+    shots: Iterable[LiveShot | TofclipError],
     pipeline: CloudPipeline | None = None,
     queue_size: int = 1,
     policy: Policy = "block",
@@ -246,8 +233,8 @@ def stream_clouds(
     at_once: int | None = None,
     on_failure: OnFailure | None = None,
 ) -> Generator[StreamedCloud, None, None]:
-    """Yield the cloud of every shot as soon as it is made, see `run_in_order`; by a `RangingPipeline`
-    for the camera that the first shot carries if no other is given.
+    """Yield the cloud of every shot as soon as it is made, see `run_in_order`; by that of
+    `make_pipeline` for the first shot if no other is given.
 
     By default a shot has a core: shared out among all, it would be done sooner, but cores would wait
     for each other. Where a shot begins at what the last one showed, all cores work on it. Memory:
@@ -262,8 +249,7 @@ def stream_clouds(
         if isinstance(first, TofclipError):
             raise first
         # shots on workers of one's own cannot begin at the last one's pictures
-        method = Sparse() if executor is None else None
-        pipeline = RangingPipeline.for_shot(first, method=method)
+        pipeline = make_pipeline(first, method="l1" if executor is None else "linear")
         coming = _prepend_shot(first, coming)
     pool: AbstractContextManager[Executor]
     if executor is not None:
@@ -282,17 +268,15 @@ def stream_clouds(
         ) as items,
     ):
         for item in items:
-            streak, returns, cloud, seconds = item.value
+            taken, returns, cloud, seconds = item.value
             waited = item.latency - sum(seconds.values())
             steps = {"read": item.read_seconds, "wait": waited, **seconds}
-            yield StreamedCloud(
-                cloud, returns, streak, pipeline.rectifier, item.number, steps, item.latency
-            )
+            yield StreamedCloud(cloud, returns, taken, item.number, steps, item.latency)
 
 
 def _make_cloud(
-    pipeline: CloudPipeline, shot: Streak
-) -> tuple[Streak, Returns, PointCloud, dict[str, float]]:
+    pipeline: CloudPipeline, shot: LiveShot
+) -> tuple[LiveShot, Returns, PointCloud, dict[str, float]]:
     """Return a shot with its returns and cloud, and what each step took, s."""
     ends = [perf_counter()]
     rectified = pipeline.rectify(shot)
@@ -308,8 +292,8 @@ def _make_cloud(
 
 
 def _prepend_shot(
-    first: Streak, others: Iterator[Streak | TofclipError]
-) -> Iterator[Streak | TofclipError]:
+    first: LiveShot, others: Iterator[LiveShot | TofclipError]
+) -> Iterator[LiveShot | TofclipError]:
     """Put a shot back before the others; closing this closes them."""
     yield first
     yield from others

@@ -8,6 +8,7 @@ are found by the same compiled steps. `PhotonDetector` takes every pixel alone, 
 lets neighbours lend each other their photons.
 """
 
+from tofclip.lidar.photons.cube import PhotonCube
 from tofclip.lidar.photons.detector import (
     Arrivals,
     PhotonDetector,
@@ -26,6 +27,7 @@ from tofclip.lidar.photons.surface import (
 __all__ = [
     "Accuracy",
     "Arrivals",
+    "PhotonCube",
     "PhotonDetector",
     "PhotonImage",
     "Smoothness",

@@ -4,6 +4,7 @@ alone; and what a detector that goes blind after each photon would have counted 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -303,6 +304,33 @@ class PhotonDetector:
         learnt = learn_background(histograms, self.shape.fwhm / self.bin_width)
         return self if learnt is None else replace(self, background=learnt)
 
+    def learn(self, photons: PhotonImage) -> PhotonDetector:
+        """Return a detector for the background that the pixels of a picture have in common, which is
+        not asked for again; this one where its background is given already.
+        """
+        if self.background is not None:
+            return self
+        pixels = photons.offsets.size - 1  # all over the picture
+        some = photons.histograms(slice(0, pixels, -(-pixels // SAMPLED_PIXELS)))
+        return replace(self, background=self.adapt(some).relative_background)
+
+    def locate_pixels(
+        self, read: Callable[[slice], NDArray[np.floating]], pixels: int, cycles: int | None = None
+    ) -> FloatArray:
+        """Find the returns of all pixels of a picture whose histograms are read piece by piece: range
+        and its deviation, m, photons, and the probability of a false alarm, (most returns, pixels, 4);
+        NaN where there is none.
+        """
+        found = np.full((self.max_returns, pixels, 4), np.nan)
+        for piece in split_blocks(pixels, DETECTED_PIXELS_PER_BLOCK):
+            arrivals = self.locate(read(piece), piece.start, cycles)
+            located = np.stack([arrivals.range, arrivals.confidence, arrivals.photons], axis=-1)
+            found[:, piece, :3] = located.swapaxes(0, 1)
+        for layer in found:
+            seen = np.isfinite(layer[:, 0])
+            layer[seen, 3] = min(self.false_alarm_rate * pixels / max(int(seen.sum()), 1), 1.0)
+        return found
+
     def locate(
         self,
         histograms: ArrayLike,
@@ -462,20 +490,8 @@ def estimate_pixels(
     # a background that is given has the photons' own bins
     photons, shape, hot = prepare_photons(photons, pulse, join=background is None)
     settings = shape, photons.bin_width, photons.bins, false_alarm_rate, max_returns
-    detector = PhotonDetector(*settings, background=background)
-    pixels = photons.offsets.size - 1
-    if background is None:
-        # once for the whole picture, from pixels all over it
-        some = photons.histograms(slice(0, pixels, -(-pixels // SAMPLED_PIXELS)))
-        detector = replace(detector, background=detector.adapt(some).relative_background)
-    found = np.full((max_returns, pixels, 4), np.nan)
-    for piece in split_blocks(pixels, DETECTED_PIXELS_PER_BLOCK):
-        arrivals = detector.locate(photons.histograms(piece), piece.start, cycles)
-        located = np.stack([arrivals.range, arrivals.confidence, arrivals.photons], axis=-1)
-        found[:, piece, :3] = located.swapaxes(0, 1)
-    for layer in found:
-        seen = np.isfinite(layer[:, 0])
-        layer[seen, 3] = min(false_alarm_rate * pixels / max(int(seen.sum()), 1), 1.0)
+    detector = PhotonDetector(*settings, background=background).learn(photons)
+    found = detector.locate_pixels(photons.histograms, photons.offsets.size - 1, cycles)
     learnt = "learnt" if np.ptp(detector.relative_background) else "even"
     chosen: dict[str, float | str] = {
         "response": "learnt" if pulse is None else "given",

@@ -432,7 +432,7 @@ class SurfaceImage:
         Parameters
         ----------
         camera : Camera
-            Says where the pixels look, see `make_pinhole`.
+            Says where the pixels look, see `Camera.pinhole`.
         provenance : mapping, optional
             How they came about.
 
@@ -463,25 +463,4 @@ class SurfaceImage:
         )
 
 
-def make_pinhole(image_shape: tuple[int, int], focal_length_px: float, pulse_fwhm: float) -> Camera:
-    """Return a camera that only says where its pixels look.
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns.
-    focal_length_px : float
-        Distance of the pinhole from the picture, in pixels; the optical axis meets pixel
-        ``(rows // 2, columns // 2)``.
-    pulse_fwhm : float
-        Full width at half maximum of a return, s.
-
-    Returns
-    -------
-    Camera
-        Of one view.
-    """
-    columns = image_shape[1]
-    centre = np.array([min(columns / 2, columns - 1)])
-    optics: Any = {"pulse_fwhm": pulse_fwhm, "focal_length_px": focal_length_px}
-    return Camera(centre, np.zeros(1), image_shape, columns, **optics)
+make_pinhole = Camera.pinhole  # its name until version 0.2
