@@ -102,6 +102,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   record            an instrument's bytes, to be replayed exactly
   convert           any readable streak image to this program's own HDF5
   warm-up           compile everything now, so that no later run waits for it
+  plugins           methods, denoisers, readers, instruments, and whose they are
   info              what a file holds
 
   tofclip VERB --help explains a verb. Exit status: 0 done, 1 some failed,
@@ -125,6 +126,7 @@ VERBS = {
     "record": "Record an instrument: its bytes as they come, with clock, accounts and calibration.",
     "convert": "Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall inside.",
     "warm-up": "Run everything that is compiled on first use once, on small data.",
+    "plugins": "List methods, denoisers, readers and instruments, by whom they are, and what does not load.",
     "info": "Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.",
 }
 """The verbs, and groups of them, with their lines in the list of commands."""

@@ -19,12 +19,9 @@ UNITS = {"mm": MILLIMETRE, "ns": NANOSECOND, "ps": PICOSECOND}
 
 def make_completer(names: Iterable[str]) -> Callable[[str], list[str]] | None:
     """Return what completes a value in the shell: the names that begin as it does so far."""
-    known = list(names)
-    return (
-        (lambda incomplete: [name for name in known if name.startswith(incomplete)])
-        if known
-        else None
-    )
+    if names == ():
+        return None
+    return lambda incomplete: [name for name in names if name.startswith(incomplete)]
 
 
 def opt(

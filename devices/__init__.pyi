@@ -3,6 +3,7 @@
 from .registry import DiscoveredInstrument as DiscoveredInstrument
 from .registry import discover as discover
 from .registry import open as open  # noqa: A004 - the name users type
+from .registry import register_source as register_source
 from .source import Batch as Batch
 from .source import Codec as Codec
 from .source import DecodeResult as DecodeResult

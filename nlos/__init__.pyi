@@ -13,6 +13,7 @@ from .phasor.plan import PlanarRSD as PlanarRSD
 from .phasor.propagate import propagate as propagate
 from .refinement.l1 import Refinement as Refinement
 from .settings import Settings as Settings
+from .settings import register_method as register_method
 from .video import TransientImaging as TransientImaging
 from .video import TransientVideo as TransientVideo
 from .volume import Grid as Grid

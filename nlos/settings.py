@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from tofclip.errors import InputError
+from tofclip.plugins import Parts, list_settings
 
 if TYPE_CHECKING:
     from nlos.capture import Capture
@@ -22,15 +23,19 @@ if TYPE_CHECKING:
 Limits = tuple[float, float]
 Wanted = TypeVar("Wanted", bound="Settings")
 
-# Class in `nlos` by the method's name, and the settings that it takes.
-METHOD_CLASSES = {
-    "rsd": ("PlanarRSD", ("wavelength", "cycles", "tolerance")),
-    "hybrid": ("Hybrid", ("wavelength", "cycles", "tolerance")),
-    "backprojection": ("Backprojection", ("wavelength", "cycles")),
-    "filtered-backprojection": ("FilteredBackprojection", ("sigma",)),
-    "lct": ("LightCone", ("signal_to_noise", "falloff")),
-    "fk": ("FKMigration", ("falloff",)),
-}
+METHODS = Parts(
+    "nlos.methods",
+    "method",
+    {
+        "rsd": "nlos.phasor.plan:PlanarRSD",
+        "hybrid": "nlos.phasor.plan:Hybrid",
+        "backprojection": "nlos.backprojection:Backprojection",
+        "filtered-backprojection": "nlos.backprojection:FilteredBackprojection",
+        "lct": "nlos.confocal:LightCone",
+        "fk": "nlos.confocal:FKMigration",
+    },
+)
+register_method = METHODS.register
 # They give the same picture; the later one takes more walls and lasers, and more time.
 METHODS_BY_SPEED = ("rsd", "hybrid", "backprojection")
 # An image by waves takes as long as to back-project this many pairs of spots; measured. One is
@@ -53,7 +58,7 @@ class Settings:
 
     What is done to the capture first: `flip`, `gate`, `gate_ramp`, `fade`, `bins_together`; the
     virtual pulse: `wavelength`, `cycles`; the voxels: `voxel`, and their box, `x`, `y`, `near`,
-    `far`, `everywhere`; the `method`, one of `METHOD_CLASSES`, and its own settings, of which None
+    `far`, `everywhere`; the `method`, a name of `METHODS`, and its own settings, of which None
     is left to it: `tolerance`, `sigma`, `falloff`, `signal_to_noise`. The metadata of each field
     hold its ``unit``, its meaning (``help``), in words the default (``shown``), and the unit that it
     is ``written`` with on the command line where that is another. `gate_found`
@@ -200,11 +205,11 @@ class Settings:
 
     def make_method(self, name: str | None = None) -> Method:
         """Build a method by its name, the settings' own by default; what is None is left to it."""
-        import nlos
-
-        class_name, taken = METHOD_CLASSES[name or self.method or METHODS_BY_SPEED[0]]
-        arguments = {key: getattr(self, key) for key in taken if getattr(self, key) is not None}
-        made: Method = getattr(nlos, class_name)(**arguments)
+        chosen = name or self.method or METHODS_BY_SPEED[0]
+        given = {key: getattr(self, key) for key in list_taken(chosen)}
+        made: Method = METHODS.make(
+            chosen, {key: one for key, one in given.items() if one is not None}
+        )
         return made
 
     def plan_quickest(self, capture: Capture, grid: Grid) -> tuple[str, Plan]:
@@ -249,3 +254,9 @@ class Settings:
     def to_dict(self) -> dict[str, Any]:
         """Name every setting that has a value."""
         return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+def list_taken(method: str) -> list[str]:
+    """Return the fields of `Settings` that a method takes, by its name."""
+    known = {one.name for one in dataclasses.fields(Settings)}
+    return [name for name in list_settings(METHODS[method]) if name in known]

@@ -82,7 +82,13 @@ DEFAULTS: dict[str, dict[Any, dict[str, Any]]] = {
         }
     },
     "its docstring": {
-        PlugAndPlay: {"denoiser": WIENER, "calls": 8, "strength": 0.12, "coupling": 0.1}
+        PlugAndPlay: {
+            "start": TotalVariation(),
+            "denoiser": WIENER,
+            "calls": 8,
+            "strength": 0.12,
+            "coupling": 0.1,
+        }
     },
     HIDDEN: {
         nlos.Backprojection: {"cycles": 3.0, "weighting": Weighting(1.0, 0.0)},
@@ -110,6 +116,7 @@ DEFAULTS: dict[str, dict[Any, dict[str, Any]]] = {
     CHOSEN: {
         Wavelets: {"weight": 2e-3, "iterations": 60, **PROXIMAL},
         RegularisationByDenoising: {
+            "start": TotalVariation(),
             "denoiser": WIENER,
             "calls": 8,
             "strength": 0.08,

@@ -8,6 +8,9 @@ from .lidar import depth as depth
 from .lidar import point_cloud as point_cloud
 from .loading import load as load
 from .metrics import nmse as nmse
+from .plugins import register_denoiser as register_denoiser
+from .plugins import register_method as register_method
+from .plugins import register_reader as register_reader
 from .recovery import recover as recover
 from .shots import Frames as Frames
 from .shots import Streak as Streak

@@ -35,9 +35,9 @@ def list_(as_json: bool = JSON) -> None:
 
     found = [asdict(one) for one in discover()]
     # Files have no opener of their own: the name's ending chooses one.
-    kinds = sorted({*registry.OPENERS, "file"})
+    kinds = registry.list_schemes()
     if as_json:
-        file_types = sorted(registry.FILE_OPENERS)
+        file_types = registry.list_endings()
         report({"devices": found, "kinds": kinds, "file_types": file_types}, as_json)
         return
     for one in found:

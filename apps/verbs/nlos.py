@@ -36,7 +36,6 @@ from apps.settings import (
 )
 from apps.verbs.nlos_imaging import (
     CAPTURE,
-    METHODS,
     PORTABLE_METHODS,
     ImagingSettings,
     PreparedImaging,
@@ -51,7 +50,7 @@ from apps.verbs.nlos_imaging import (
 )
 from apps.verbs.nlos_scenes import compare, demo, simulate
 from apps.verbs.nlos_stream import film, stream
-from nlos.settings import Settings
+from nlos.settings import METHODS, Settings
 from tofclip.errors import InputError
 from tofclip.files import identify_file, require_apart
 from tofclip.units import MILLIMETRE, PICOSECOND
@@ -88,7 +87,7 @@ class ReconstructSettings(Settings):
 
     method: str | None = setting(
         "NAME",
-        f"One of {', '.join(METHODS)}.",
+        f"One of {', '.join(METHODS.own)}.",
         shown="the quickest that suits the capture",
         choices=METHODS,
     )
@@ -314,7 +313,7 @@ def reconstruct_single(
         )
     # Files are written from the host's memory.
     volume = volume.on(ComputeDevice())
-    seconds, imaging = time.perf_counter() - started, volume.provenance["imaging"]
+    seconds, imaging = time.perf_counter() - started, volume.provenance.get("imaging", {})
     shown = settings_to_dict(found)
     past = {"verb": "nlos reconstruct", "device": str(used), **shown}
     volume = add_provenance(volume, source, past)

@@ -8,7 +8,7 @@ import contextlib
 import ctypes
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -17,14 +17,13 @@ from apps.options import arg
 from apps.progress import show_activity, show_progress
 from apps.report import build_provenance
 from apps.settings import find_key
-from nlos.settings import METHOD_CLASSES, METHODS_BY_SPEED, Settings
+from nlos.settings import METHODS, METHODS_BY_SPEED, Settings, list_taken
 from tofclip.errors import InputError
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid, Method, Plan, Volume
     from tofclip.arrays import ComputeDevice
 
-METHODS = tuple(METHOD_CLASSES)
 PORTABLE_METHODS = METHODS_BY_SPEED
 """They compute wherever the signal is; the others have compiled loops only."""
 
@@ -104,9 +103,9 @@ def require_valid_settings(settings: Settings, methods: Sequence[str]) -> None:
     """Refuse settings that no capture could make sense of, and those that none of the methods takes,
     before any capture is read.
     """
-    for name in sorted(_list_own_settings(METHODS) - _list_own_settings(methods)):
+    for name in sorted(_list_own_settings(METHODS.own) - _list_own_settings(methods)):
         if getattr(settings, name) is not None:
-            by = ", ".join(one for one in METHODS if name in METHOD_CLASSES[one][1])
+            by = ", ".join(one for one in METHODS.own if name in list_taken(one))
             raise InputError(
                 f"{find_key(type(settings), name)} is a setting of {by} and changes nothing for "
                 f"{', '.join(methods)}; leave it out"
@@ -119,8 +118,8 @@ def require_valid_settings(settings: Settings, methods: Sequence[str]) -> None:
         settings.make_method(name)
 
 
-def _list_own_settings(methods: Sequence[str]) -> set[str]:
-    return {name for one in methods for name in METHOD_CLASSES[one][1]} - PULSE_SETTINGS
+def _list_own_settings(methods: Iterable[str]) -> set[str]:
+    return {name for one in methods for name in list_taken(one)} - PULSE_SETTINGS
 
 
 def show_settings(found: Imaging, methods: Sequence[str]) -> Imaging:
@@ -128,11 +127,11 @@ def show_settings(found: Imaging, methods: Sequence[str]) -> Imaging:
     nothing is given is named, and what none of the methods takes is left out.
     """
     made: dict[str, Any] = {
-        name: getattr(found.make_method(one), name)
+        name: getattr(found.make_method(one), name, getattr(found, name))
         for one in methods
         for name in _list_own_settings([one])
     }
-    shown: dict[str, Any] = dict.fromkeys(_list_own_settings(METHODS))
+    shown: dict[str, Any] = dict.fromkeys(_list_own_settings(METHODS.own))
     return replace(found, **shown | made)
 
 
@@ -175,7 +174,7 @@ def _warn_of_given_wavelength(capture: Capture, found: Settings) -> None:
     from nlos.band import Band, VirtualPulse
     from nlos.illumination import describe_aliasing
 
-    wavelength, (_, taken) = found.wavelength, METHOD_CLASSES[found.method or METHODS[0]]
+    wavelength, taken = found.wavelength, list_taken(found.method or METHODS_BY_SPEED[0])
     if wavelength is None or "wavelength" in found.reasons or "wavelength" not in taken:
         return
     band = Band(VirtualPulse(wavelength, found.cycles), capture.axis)

@@ -30,7 +30,6 @@ from apps.settings import (
 )
 from apps.verbs.nlos_imaging import (
     CAPTURE,
-    METHODS,
     ImagingSettings,
     MeasuredVolume,
     PreparedImaging,
@@ -42,6 +41,7 @@ from apps.verbs.nlos_imaging import (
     show_settings,
 )
 from nlos.known_scenes import SceneSettings
+from nlos.settings import METHODS
 from tofclip.errors import InputError
 from tofclip.files import require_apart
 
@@ -69,7 +69,7 @@ class CompareSettings(ImagingSettings):
 
     methods: str | None = setting(
         "A,B,...",
-        f"Of {', '.join(METHODS)}; the first is the reference.",
+        f"Of {', '.join(METHODS.own)}; the first is the reference.",
         shown="all that suit the capture",
         choices=METHODS,
     )
@@ -108,7 +108,7 @@ def compare(
     require_writable(out, *PICTURE_SUFFIXES, inputs=(source, settings))
     require_writable(written[1], inputs=(source, settings))
     # Everything that can be refused is refused before the capture is read.
-    names = METHODS if wanted.methods is None else parse_method_names(wanted.methods)
+    names = tuple(METHODS.own) if wanted.methods is None else parse_method_names(wanted.methods)
     require_valid_settings(wanted, names)
     if volumes is not None:
         require_apart([volumes, *(volumes / f"{name}.h5" for name in METHODS)], [source, settings])

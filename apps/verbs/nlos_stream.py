@@ -32,7 +32,6 @@ from apps.verbs.nlos_imaging import (
     CAPTURE,
     CAPTURE_SUFFIXES,
     GEOMETRY_FILE,
-    METHODS,
     PORTABLE_METHODS,
     choose_methods,
     is_capture_folder,
@@ -43,7 +42,7 @@ from apps.verbs.nlos_imaging import (
     show_settings,
 )
 from apps.verbs.stream import MAX_LATENCY_SAMPLES, compute_quantiles
-from nlos.settings import Settings
+from nlos.settings import METHODS, Settings
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
@@ -72,7 +71,7 @@ class StreamSettings(Settings):
 
     method: str | None = setting(
         "NAME",
-        f"One of {', '.join(METHODS)}.",
+        f"One of {', '.join(METHODS.own)}.",
         shown="the quickest that suits the first capture",
         choices=METHODS,
     )
@@ -138,7 +137,7 @@ def stream(
 
 
 def _check_stream(wanted: StreamSettings, follow_s: float, captures: int | None) -> None:
-    names = choose_methods(wanted.method, METHODS)
+    names = choose_methods(wanted.method, tuple(METHODS.own))
     require_valid_settings(wanted, names)
     if wanted.average < 1:
         raise InputError(f"--average must be 1 or more, got {wanted.average}")

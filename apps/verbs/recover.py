@@ -31,6 +31,7 @@ from apps.report import (
 )
 from tofclip.errors import InputError
 from tofclip.files import require_apart
+from tofclip.plugins import DENOISERS, METHODS, split_assignments
 
 CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57", ".h5")
 DEPTH_SUFFIX = ".exr"
@@ -38,7 +39,6 @@ ALL_POINTS = flag(
     "--all-points",
     "Drop no point of the cloud: false_alarm says how probably each one is false.",
 )
-METHODS = ("tv", "l1", "linear", "adjoint", "surfaces")
 
 
 def recover(
@@ -54,12 +54,30 @@ def recover(
     time_zero: float | None = TIME_ZERO,
     method: str = opt(
         "NAME",
-        "tv, l1, linear, adjoint, or surfaces: range and brightness of each pixel from the whole shot.",
+        f"{', '.join(METHODS.own)}, or another of tofclip plugins. surfaces: range and brightness of each pixel from "
+        "the whole shot; pnp, red: a denoiser plugged in.",
         "tv",
         choices=METHODS,
     ),
     iterations: int | None = opt(
-        "N", "Maximum number of iterations of tv, l1 and surfaces.", shown="the method's"
+        "N", "Maximum number, of methods that have iterations.", shown="the method's"
+    ),
+    weight: float | None = opt(
+        "SHARE",
+        "Of the prior: how much it counts, of what would leave nothing (surfaces: in deviations of the noise).",
+        shown="the method's",
+    ),
+    denoiser: str | None = opt(
+        "NAME",
+        f"For pnp and red: {', '.join(DENOISERS.own)}, or another of tofclip plugins.",
+        shown="collaborative",
+        choices=DENOISERS,
+    ),
+    settings: list[str] | None = opt(
+        "NAME=VALUE",
+        "One of the method's or the denoiser's own settings, which tofclip plugins NAME lists; may be given again.",
+        name="--set",
+        shown="theirs",
     ),
     focus: str = opt(
         "SHEAR",
@@ -111,18 +129,22 @@ def recover(
         list_shots,
     )
 
+    own = {"denoiser": denoiser} if denoiser else {}
+    own |= split_assignments(settings or ())
     if is_sequence(streak):
         # Options without effect are refused rather than ignored.
         if cloud is not None:
             raise InputError("--cloud is for one shot; give the folder of frames to tofclip cloud")
         if preview is not None:
             raise InputError("--preview is for one shot")
-        settings = RecoverySettings(method, iterations, None, focus, camera, time_zero, device)
+        recovery = RecoverySettings(
+            method, iterations, weight, focus, camera, time_zero, device, own
+        )
         used = resolve_device(device, cluster)
         require_apart([out], [streak, camera])
         shots = list_shots(streak, bin_width)
         tried = (text.partition("=") for text in sweep or [])
-        swept = expand_sweep(settings, {name: values.split(",") for name, _, values in tried})
+        swept = expand_sweep(recovery, {name: values.split(",") for name, _, values in tried})
         jobs = [job for label, one in swept.items() for job in one.jobs(shots, out / label)]
         summary = run_with_progress("recovering", jobs, cluster)
         report_summary(summary, len(jobs), as_json, out, {"device": used})
@@ -137,7 +159,8 @@ def recover(
     preview = choose_preview(out, preview, (streak, camera))
     if cloud is not None:
         require_writable(cloud, *CLOUD_SUFFIXES, inputs=(streak, camera))
-    solver, chosen_focus = make_method(method, iterations=iterations), parse_focus(focus)
+    solver = make_method(method, **{"iterations": iterations, "weight": weight, **own})
+    chosen_focus = parse_focus(focus)
     started = time.perf_counter()
     # Outputs and settings have been checked by now: an instrument is not started for nothing.
     if "://" in streak:

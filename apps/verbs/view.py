@@ -14,12 +14,11 @@ from apps.options import JSON, NO_BROWSER, PORT, TIME_ZERO, arg, flag, opt
 from apps.progress import show_activity, show_progress
 from apps.report import report, require_writable
 from tofclip.errors import InputError
+from tofclip.plugins import METHODS
 
 if TYPE_CHECKING:
     from apps.viewer.page import Served
     from apps.viewer.session import Session
-
-METHODS = ("tv", "l1", "linear", "adjoint", "surfaces")
 
 
 def view(
@@ -37,7 +36,8 @@ def view(
     time_zero: float | None = TIME_ZERO,
     method: str | None = opt(
         "NAME",
-        "For raw shots: tv, l1, linear or adjoint, with few iterations; surfaces for one shot.",
+        f"For raw shots: {', '.join(METHODS.own)}, those with iterations with few, or another of tofclip plugins; "
+        "surfaces for one shot.",
         shown="l1 for one shot, linear for many",
         choices=METHODS,
     ),

@@ -24,6 +24,7 @@ from tofclip.io import read_streak
 from tofclip.io.streaks import StreakStack
 from tofclip.lidar.photons import PhotonCube
 from tofclip.loading import CLOUD_SUFFIXES, load, outline
+from tofclip.plugins import METHODS, list_settings
 from tofclip.recovery import make_method, open_shot, plan_recovery
 from tofclip.sequences import make_pipeline
 from tofclip.shots import Streak
@@ -32,8 +33,6 @@ from tofclip.solvers import LinearInverse, Method, ProximalMethod
 if TYPE_CHECKING:
     from apps.viewer.source import Source
 
-# quick enough for shots that come one after the other, and to refocus by
-LOOK_METHODS = ("tv", "l1", "linear", "adjoint")
 SURFACES = "surfaces"  # takes some ten seconds, for which a single shot has the time
 # enough to read what is written on a surface; `tofclip recover` takes 40
 FIRST_LOOK_METHOD, FIRST_LOOK_ITERATIONS = "l1", 25
@@ -55,12 +54,10 @@ def make_look_method(name: str | None) -> Method | None:
     if name == SURFACES:
         raise InputError(
             "surfaces take too long for shots one after the other, and need a shot; choose one of "
-            f"{', '.join(LOOK_METHODS)}, or make frames by tofclip recover"
+            f"{', '.join(one for one in METHODS if one != SURFACES)}, or make frames by tofclip recover"
         )
-    if name not in LOOK_METHODS:
-        known = ", ".join((*LOOK_METHODS, SURFACES))
-        raise InputError(f"unknown method '{name}'; choose one of {known}")
-    iterations = FIRST_LOOK_ITERATIONS if name in ("tv", "l1") else None
+    takes = list_settings(METHODS[name])
+    iterations = FIRST_LOOK_ITERATIONS if {"iterations", "start"} & takes.keys() else None
     return cast(Method, make_method(name, iterations=iterations))
 
 
@@ -73,7 +70,7 @@ class ShotOptions:
     bin_width: float | None = None  # duration of a row, s; by default the shot's own time axis
     # reading of the time axis at which light of range 0 would arrive, s; by default the camera's
     time_zero: float | None = None
-    # one of `LOOK_METHODS`, ``"surfaces"`` for a single shot. By default a single one by some
+    # of `tofclip.plugins.METHODS`, ``"surfaces"`` for a single shot only. By default a single one by some
     # iterations of ``"l1"``, and one after the other by ``"linear"``
     method: str | None = None
 

@@ -2,6 +2,8 @@
 `nlos.Capture`.
 """
 
-from nlos.io.format_detection import read_capture
+from nlos.io.format_detection import READERS, read_capture
 
-__all__ = ["read_capture"]
+register_reader = READERS.register
+
+__all__ = ["read_capture", "register_reader"]

@@ -30,8 +30,9 @@ from nlos.capture import Capture
 from nlos.io import labs
 from nlos.io.arrays import NamedArrays, read_hdf5, read_matlab
 from tofclip.errors import FileFormatError
-from tofclip.files import format_error_line, translate_read_errors
+from tofclip.files import format_error_line
 from tofclip.io.light_fields import read_exr_parts
+from tofclip.plugins import Parts, Reader, read_by_signature
 from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance
 from tofclip.units import PICOSECOND
 
@@ -57,22 +58,18 @@ def read_native(path: str | Path) -> Capture | None:
     return Capture.from_frames(Frames.from_record(record))
 
 
-ZIP_SIGNATURE = b"PK\x03\x04"
-# Of .mat files from version 5 to 7.3.
-MATLAB_SIGNATURE = b"MATLAB"
-
-Reader = Callable[[NamedArrays], Capture]
+FieldReader = Callable[[NamedArrays], Capture]
 
 # A file is known by the names of its fields; the first format whose fields are all there is taken.
-ARCHIVE_FORMATS: Mapping[tuple[str, ...], Reader] = {
+ARCHIVE_FORMATS: Mapping[tuple[str, ...], FieldReader] = {
     ("H", "wall_xyz", "laser_xyz", time): labs.read_numpy_archive
     for time in ("delta_t_s", "t_s", "t_m", "delta_t_m")
 }
-HDF5_FORMATS: Mapping[tuple[str, ...], Reader] = {
+HDF5_FORMATS: Mapping[tuple[str, ...], FieldReader] = {
     ("H", "H_format", "sensor_grid_xyz", "laser_grid_xyz"): labs.read_tal,
     ("data", "cameraGridPositions", "laserGridPositions", "deltaT"): labs.read_zaragoza,
 }
-MATLAB_FORMATS: Mapping[tuple[str, ...], Reader] = {
+MATLAB_FORMATS: Mapping[tuple[str, ...], FieldReader] = {
     ("rect_data", "ts", "sampling_spacing"): labs.read_rectified_data,
     ("rect_data", "width"): labs.read_light_cone_data,
     ("dataset.data", "dataset.laserPos", "dataset.cameraPos"): labs.read_phasor_field_data,
@@ -95,7 +92,8 @@ def read_capture(path: str | Path) -> Capture:
     * HDF5 of y-tal, and of the Zaragoza NLOS data set;
     * .mat files, of any version, of O'Toole 2018, Lindell 2019, Tsai 2019, Liu 2019, Liu 2020 and
       Liu 2023;
-    * a folder with one EXR streak image per wall row, and a ``geometry.toml``.
+    * a folder with one EXR streak image per wall row, and a ``geometry.toml``;
+    * what a package offers a reader of, see `tofclip.plugins`.
 
     Captures come back with the ways to and from the device taken off. The light that the wall
     returns at once is left in; see `nlos.preparation.remove_first_bounce`. All of a file is read
@@ -126,25 +124,41 @@ def read_capture(path: str | Path) -> Capture:
 
 
 def _read_file(path: str | Path) -> Capture:
-    with translate_read_errors(path), open(path, "rb") as file:
-        start = file.read(len(HDF5_SIGNATURE))
-    if not start:
-        raise FileFormatError(path, "is empty")
-    if start.startswith(ZIP_SIGNATURE):
-        archive = NamedArrays(path)
-        if "streak_raw" in archive:
-            return labs.read_lift_archive(path)
-        return _read_fields(archive, ARCHIVE_FORMATS)
-    if start.startswith(MATLAB_SIGNATURE):
-        return _read_fields(read_matlab(path), MATLAB_FORMATS)
-    if start == HDF5_SIGNATURE:
-        return read_native(path) or _read_fields(read_hdf5(path), HDF5_FORMATS)
-    raise FileFormatError(
-        path, "is not a capture of a known format (HDF5, .npz, .mat, or a folder of EXR files)"
+    capture: Capture = read_by_signature(
+        READERS,
+        path,
+        lambda reader: reader.read(Path(path)),
+        "a capture of a known format (HDF5, .npz, .mat, or a folder of EXR files)",
     )
+    return capture
 
 
-def _read_fields(fields: NamedArrays, formats: Mapping[tuple[str, ...], Reader]) -> Capture:
+def _read_archive(path: Path) -> Capture:
+    archive = NamedArrays(path)
+    if "streak_raw" in archive:
+        return labs.read_lift_archive(path)
+    return _read_fields(archive, ARCHIVE_FORMATS)
+
+
+def _read_hdf5(path: Path) -> Capture:
+    return read_native(path) or _read_fields(read_hdf5(path), HDF5_FORMATS)
+
+
+def _read_matlab(path: Path) -> Capture:
+    return _read_fields(read_matlab(path), MATLAB_FORMATS)
+
+
+NPZ = Reader((b"PK\x03\x04",), _read_archive)
+MATLAB = Reader((b"MATLAB",), _read_matlab)  # .mat files from version 5 to 7.3
+HDF5 = Reader((HDF5_SIGNATURE,), _read_hdf5)
+READERS = Parts(
+    "nlos.readers",
+    "reader",
+    {name: f"{__name__}:{name.upper()}" for name in ("npz", "matlab", "hdf5")},
+)
+
+
+def _read_fields(fields: NamedArrays, formats: Mapping[tuple[str, ...], FieldReader]) -> Capture:
     for names, read in formats.items():
         if fields.names.issuperset(names):
             return read(fields)

@@ -130,6 +130,7 @@ calibrate range --target-m 0.5 cube.npy --out late.h5 --bin-width-ps 80 --pulse-
 info cube.npy
 lidar accuracy --trials 10
 devices list
+plugins
 devices info '{TAGGER}'
 devices test '{TAGGER}' --seconds 0.1
 record '{TAGGER}' --out run.h5 --seconds 0.1

@@ -21,7 +21,7 @@ from verb_pages import collect_verbs
 import tofclip
 from apps import cli
 from apps.verbs import warm_up
-from apps.verbs.nlos_imaging import METHODS
+from nlos.settings import METHODS
 from tofclip.files import describe_missing_package
 
 PROGRAM = [sys.executable, "-m", "tofclip"]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 
 from devices.frames import FrameCodec
 from devices.linospad2 import FIRMWARES, MAX_TIMESTAMPS, LinoSpad2Codec
-from devices.registry import CODECS, build_codec, import_entry
+from devices.registry import CODECS, build_codec
 from devices.source import Codec, Records, as_bytes
 from devices.timetag_codec import (
     COUNTER_RANGE,
@@ -155,7 +155,7 @@ def test_records_that_no_instrument_sends(codec: Codec, rows: list[Any], said: s
 )
 def test_impossible_settings_are_refused(name: str, settings: tuple[Any, ...], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        import_entry(CODECS[name])(*settings)
+        CODECS[name](*settings)
 
 
 # The time tagger's

@@ -12,6 +12,7 @@ from devices import registry
 from devices.address import Uri
 from devices.source import Batch, Info, Source, Stats
 from tofclip.errors import InputError
+from tofclip.plugins import load_target
 
 TABLE = (Path(__file__).parent / "refusals.txt").read_text(encoding="utf-8").splitlines()
 
@@ -54,17 +55,16 @@ def test_public_names_are_importable() -> None:
 
 
 def test_everything_in_the_tables_exists() -> None:
-    openers = (*registry.OPENERS.values(), *registry.FILE_OPENERS.values(), *registry.FINDERS)
-    assert all(callable(registry.import_entry(entry)) for entry in openers)
-    for name, entry in registry.CODECS.items():
-        assert registry.import_entry(entry).name == name
-    with pytest.raises(InputError, match="no codec is called 'absent'"):
+    assert all(callable(part) for part in registry.SOURCES.values())
+    assert all(callable(load_target(finder)) for finder in registry.FINDERS)
+    assert all(codec.name == name for name, codec in registry.CODECS.items())
+    with pytest.raises(InputError, match="unknown codec 'absent'"):
         registry.build_codec("absent", {})
 
 
 def test_a_scheme_opens_its_source(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its letters may be capital ones; what a source does not say itself is so by default."""
-    monkeypatch.setitem(registry.OPENERS, "nothing", f"{__name__}:open_nothing")
+    monkeypatch.setitem(registry.SOURCES.registered, "nothing", open_nothing)
     with devices.open("NOTHING://?seed=1") as source:
         assert isinstance(source, Nothing)
         assert list(source) == []

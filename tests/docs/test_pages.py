@@ -22,7 +22,7 @@ import tofclip
 from devices.aravis import CameraOptions
 from devices.emulation.linospad2 import SimulationOptions
 from devices.histogram_kits import Tmf8828Options, Vl53l8Options
-from devices.registry import FILE_OPENERS, OPENERS
+from devices.registry import list_endings, list_schemes
 from devices.remoteex import RemoteExOptions
 from devices.spad512 import SpadOptions
 from devices.timetag import TimeTagOptions
@@ -77,9 +77,10 @@ def test_every_address_is_on_a_page():
     pages = {path.stem: path.read_text() for path in (DOCS / "instruments").glob("*.md")}
     text = "\n".join(pages.values())
     assert set(pages) == {*INSTRUMENTS, "files"}
-    assert [scheme for scheme in OPENERS if f"{scheme}://" not in text] == []
-    endings = [ending for ending in FILE_OPENERS if ending.startswith(".")]
-    assert [one for one in endings if one not in (".tiff", ".hdf5") and one not in text] == []
+    assert [scheme for scheme in list_schemes() if f"{scheme}://" not in text] == []
+    assert [
+        one for one in list_endings() if one not in (".tiff", ".hdf5") and one not in text
+    ] == []
 
 
 NOTEBOOKS = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -19,6 +18,7 @@ from tofclip.files import atomic_path, guard, require_bounded_dataset, translate
 from tofclip.io.hamamatsu import SIGNATURE as ITEX_SIGNATURE
 from tofclip.io.hamamatsu import StreakFile, open_itex, open_tiff
 from tofclip.io.lift import open_lift
+from tofclip.plugins import READERS, Reader, read_by_signature
 from tofclip.shots import Streak
 from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance, read_outline
 
@@ -28,14 +28,27 @@ def _open_own(path: str | Path) -> Iterator[StreakFile]:
     yield partial(read_outline, path), partial(Streak.load, path)
 
 
-# A file is known by its first bytes: suffixes get lost and lie.
-READERS: dict[bytes, Callable[[str | Path], AbstractContextManager[StreakFile]]] = {
-    b"II*\0": open_tiff,
-    b"MM\0*": open_tiff,
-    b"PK\x03\x04": open_lift,
-    HDF5_SIGNATURE: _open_own,
-    ITEX_SIGNATURE: open_itex,
-}
+def _make_reader(
+    open_file: Callable[[str | Path], AbstractContextManager[StreakFile]], *signatures: bytes
+) -> Reader:
+    def read(path: Path) -> Streak:
+        with open_file(path) as (_, read_opened):
+            return read_opened()
+
+    def describe(path: Path) -> Record:
+        with open_file(path) as (outline, _):
+            return outline()
+
+    return Reader(signatures, read, describe)
+
+
+TIFF = _make_reader(open_tiff, b"II*\0", b"MM\0*")
+LIFT = _make_reader(open_lift, b"PK\x03\x04")
+OWN = _make_reader(_open_own, HDF5_SIGNATURE)
+ITEX = _make_reader(open_itex, ITEX_SIGNATURE)
+KNOWN_FILES = (
+    "a TIFF, ITEX (.img), LIFT archive (.npz) or HDF5 streak image, or what a plug-in reads"
+)
 
 
 def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
@@ -43,7 +56,8 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
 
     The format is recognised by content: a TIFF of Hamamatsu's HPD-TA with its text and time axis,
     the same program's ITEX (``.img``), any other grey TIFF (no time axis), a LIFT archive
-    (``.npz``) with its camera, or a streak image of our own (HDF5).
+    (``.npz``) with its camera, a streak image of our own (HDF5), or what a package offers a reader
+    of (`tofclip.plugins`).
 
     Parameters
     ----------
@@ -68,8 +82,9 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
         Its pixels hold NaN, are all zero, all saturated, or negative where counts cannot be.
     """
     require_path(path)
-    with _open_streak(path) as (_, read):
-        streak = read()
+    streak: Streak = read_by_signature(
+        READERS, path, lambda reader: reader.read(Path(path)), KNOWN_FILES
+    )
     if bin_width is not None:
         streak = streak.with_bin_width(bin_width)
     history = collect_provenance({"bin_width_s": bin_width}, path)
@@ -81,26 +96,16 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
 
 def outline_streak_file(path: str | Path) -> Record:
     """Describe the streak image in a file without reading its pixels, as `read_outline` does."""
-    with _open_streak(path) as (describe, _):
-        outline = describe()
+    outline = read_by_signature(
+        READERS, path, lambda reader: _outline(reader, Path(path)), KNOWN_FILES
+    )
     if outline.provenance:
         return outline
     return replace(outline, provenance=collect_provenance({"bin_width_s": None}, path))
 
 
-def _open_streak(path: str | Path) -> AbstractContextManager[StreakFile]:
-    with translate_read_errors(path), open(path, "rb") as file:
-        start = file.read(8)
-    if not start:
-        raise FileFormatError(path, "is empty")
-    for signature, open_file in READERS.items():
-        if start.startswith(signature):
-            return open_file(path)
-    size = os.path.getsize(path)
-    raise FileFormatError(
-        path,
-        f"is not a TIFF, ITEX (.img), LIFT archive (.npz) or HDF5 streak image ({size} bytes of something else)",
-    )
+def _outline(reader: Reader, path: Path) -> Record:
+    return reader.read(path).to_record() if reader.describe is None else reader.describe(path)
 
 
 class StreakStack:

@@ -4,7 +4,6 @@ can type.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
@@ -18,6 +17,7 @@ from tofclip.light_field import LightField
 from tofclip.light_field.measurement import ClipMeasurement
 from tofclip.operators import Diagonal, Identity, LinearOperator, ViewSelection
 from tofclip.operators.cameras import LightFieldCamera
+from tofclip.plugins import DENOISERS, METHODS
 from tofclip.solvers import (
     DataTermMaker,
     Huber,
@@ -26,9 +26,6 @@ from tofclip.solvers import (
     Poisson,
     Progress,
     ProximalMethod,
-    Sparse,
-    TotalVariation,
-    Wavelets,
     ignore_progress,
 )
 from tofclip.solvers.cross_validation import (
@@ -38,17 +35,9 @@ from tofclip.solvers.cross_validation import (
     choose_weight,
 )
 from tofclip.solvers.data_terms import estimate_robust_deviation
-from tofclip.solvers.denoising import BlockMatching, CollaborativeWiener, Denoiser, NonlocalMeans
 from tofclip.solvers.fista import LightFieldVariation
 
-VARIATIONAL_PRIORS: dict[str, type[ProximalMethod]] = {
-    kind.name: kind for kind in (TotalVariation, Wavelets, Sparse)
-}
-DENOISERS: dict[str, Callable[[], Denoiser]] = {
-    "collaborative": CollaborativeWiener,
-    "bm3d": BlockMatching,
-    "nlm": NonlocalMeans,
-}
+VARIATIONAL_PRIORS = ("tv", "wavelet", "l1")  # methods of `tofclip.plugins`
 PRESETS = {"fast": 2, "quality": 10}  # calls of the denoiser
 DATA_TERMS = ("squares", "huber", "poisson")
 MAX_ITERATIONS = 400
@@ -94,8 +83,8 @@ class ClipResult:
 class ClipRecovery:
     """How to recover; every choice has a name."""
 
-    # ``tv``, ``wavelet`` or ``l1``: minimised with the data term. ``collaborative``, ``bm3d`` or
-    # ``nlm``: a denoiser, plugged into the recovery after total variation
+    # ``tv``, ``wavelet``, ``l1`` or another method with a prior: minimised with the data term.
+    # ``collaborative``, ``bm3d``, ``nlm`` or another denoiser: plugged in after total variation
     prior: str = "tv"
     # ``fast`` stops where the prior's own problem has converged (denoisers: 2 calls). ``quality``
     # goes on with ten calls of the denoiser, the collaborative one if the prior is none
@@ -108,7 +97,8 @@ class ClipRecovery:
     data_term: str = "squares"
 
     def __post_init__(self) -> None:
-        _require_known("prior", self.prior, [*VARIATIONAL_PRIORS, *DENOISERS])
+        if not (_is_variational(self.prior) or self.prior in DENOISERS):
+            _require_known("prior", self.prior, [*VARIATIONAL_PRIORS, *DENOISERS])
         _require_known("preset", self.preset, list(PRESETS))
         _require_known("data term", self.data_term, list(DATA_TERMS))
         if self.weight is not None and not (np.isfinite(self.weight) and self.weight > 0):
@@ -180,7 +170,7 @@ class ClipRecovery:
     ) -> ProximalMethod:
         """Return the prior's method with its data term and weight."""
         first = search.first if self.weight is None else self.weight
-        method = VARIATIONAL_PRIORS.get(self.prior, TotalVariation)(
+        method: ProximalMethod = METHODS[self.prior if _is_variational(self.prior) else "tv"](
             first, MAX_ITERATIONS, OBJECTIVE_TOLERANCE, problem.data_term
         )
         if self.data_term == "huber":
@@ -202,9 +192,10 @@ class ClipRecovery:
         )
 
     def _add_denoiser(self, method: ProximalMethod) -> ProximalMethod | PlugAndPlay:
-        if self.preset == "fast" and self.prior in VARIATIONAL_PRIORS:
+        variational = _is_variational(self.prior)
+        if self.preset == "fast" and variational:
             return method
-        denoiser = DENOISERS.get(self.prior, CollaborativeWiener)()
+        denoiser = DENOISERS.make("collaborative" if variational else self.prior, {})
         return PlugAndPlay(method, denoiser, PRESETS[self.preset])
 
 
@@ -260,6 +251,14 @@ def _make_robust(method: ProximalMethod, problem: _InverseProblem) -> ProximalMe
     return replace(
         method, data_term=partial(Huber, threshold=FINAL_THRESHOLD_DEVIATIONS * deviation)
     )
+
+
+def _is_variational(prior: str) -> bool:
+    """Whether a prior is minimised with the data term, and no denoiser."""
+    if prior in VARIATIONAL_PRIORS:
+        return True
+    own = prior not in DENOISERS and prior in METHODS
+    return own and ProximalMethod in getattr(METHODS[prior], "__mro__", ())
 
 
 def _require_known(what: str, name: str, known: list[str]) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,8 @@ from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_num
 from tofclip.camera import Camera, Measurement, measure
 from tofclip.camera.noise import find_dazzled, find_glints
 from tofclip.camera.registration import count_registration_iterations
-from tofclip.errors import InputError, require_type
+from tofclip.errors import require_type
+from tofclip.plugins import DENOISERS, METHODS, list_settings
 from tofclip.recovery.defects import (
     clip_from_below,
     count_defects,
@@ -35,13 +36,9 @@ from tofclip.recovery.shot import Shot, open_shot
 from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import (
-    Backprojection,
-    LinearInverse,
     Method,
     Progress,
     Result,
-    Sparse,
-    TotalVariation,
     ignore_progress,
     relative_residual,
 )
@@ -57,14 +54,6 @@ AnyMethod = Method | SurfaceRecovery
 # missed, after 40 33 and 41 %. Noise alone falls as slowly from the 19th iteration on.
 SPARSE_SETTINGS = {"further": 40, "noise_fall": 2e-3}
 
-METHODS: dict[str, Callable[..., AnyMethod]] = {
-    "tv": TotalVariation,
-    "l1": Sparse,
-    "linear": LinearInverse,
-    "adjoint": Backprojection,
-    "surfaces": SurfaceRecovery,
-}
-
 
 def make_method(name: str, **settings: Any) -> AnyMethod:
     """Make a recovery method by its short name, with settings of its own where given.
@@ -72,10 +61,13 @@ def make_method(name: str, **settings: Any) -> AnyMethod:
     Parameters
     ----------
     name : str
-        ``"tv"``, ``"l1"``, ``"linear"``, ``"adjoint"`` or ``"surfaces"``.
+        ``"tv"``, ``"l1"``, ``"wavelet"``, ``"linear"``, ``"adjoint"``, ``"surfaces"``, ``"pnp"``,
+        ``"red"``, or one of another package (`tofclip.plugins.METHODS`).
     **settings
-        Passed on, such as ``iterations`` and ``weight`` of the iterative methods; None stands for
-        the method's own.
+        Passed on, such as ``iterations`` and ``weight`` of the iterative methods, or ``denoiser``, by
+        name too, together with its own; None stands for the method's own, and texts are read.
+        Methods with a denoiser pass iterations and weight on to the total variation that they
+        begin at.
 
     Raises
     ------
@@ -86,15 +78,22 @@ def make_method(name: str, **settings: Any) -> AnyMethod:
     --------
     >>> make_method("tv", iterations=100, weight=None).iterations
     100
+    >>> make_method("pnp", denoiser="nlm", patch_px=7, iterations=20).denoiser.patch_px
+    7
     """
-    if name not in METHODS:
-        raise InputError(f"unknown method '{name}'; choose one of {', '.join(METHODS)}")
+    known = list_settings(METHODS[name])
     given = {setting: value for setting, value in settings.items() if value is not None}
-    usual = SPARSE_SETTINGS if name == "l1" and "iterations" not in given else {}
-    try:
-        return METHODS[name](**{**usual, **given})
-    except TypeError as fault:
-        raise InputError(f"method '{name}' does not take {', '.join(given)}") from fault
+    if name == "l1" and "iterations" not in given:
+        given = {**SPARSE_SETTINGS, **given}
+    further = {one: given.pop(one) for one in [*given] if one not in known}
+    denoiser = given.get("denoiser")
+    if isinstance(denoiser, str):
+        own = [one for one in list_settings(DENOISERS[denoiser]) if one in further]
+        given["denoiser"] = DENOISERS.make(denoiser, {one: further.pop(one) for one in own})
+    if "start" in known and further and further.keys() <= {"iterations", "weight"}:
+        given["start"], further = METHODS.make("tv", further), {}
+    made: AnyMethod = METHODS.make(name, given | further)
+    return made
 
 
 @dataclass(frozen=True)
@@ -292,7 +291,7 @@ def recover(
     camera : Camera, optional
         Defaults to the one that the streak image carries.
     method : str or Method
-        ``"tv"`` (default), ``"l1"``, ``"linear"``, ``"adjoint"``, ``"surfaces"``, or a configured
+        ``"tv"`` (default) or another name that `tofclip.recovery.make_method` knows, or a configured
         method of `tofclip.solvers`, or a `SurfaceRecovery`.
     progress : callable
         Called with the number of frame iterations just done.

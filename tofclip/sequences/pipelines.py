@@ -8,16 +8,16 @@ from typing import Any, Protocol
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.lidar.photons import PhotonCube
+from tofclip.plugins import METHODS
 from tofclip.recovery import Focus, SharpestFocus, SurfaceRecovery
 from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.sequences.counting import PhotonPipeline
 from tofclip.sequences.following import SurfacePipeline
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.shots import Returns, Streak
-from tofclip.solvers import LinearInverse, ProximalMethod, Sparse, TotalVariation
+from tofclip.solvers import LinearInverse, ProximalMethod
 
 LiveShot = Streak | PhotonCube
-METHODS: dict[str, Any] = {"linear": LinearInverse, "l1": Sparse, "tv": TotalVariation}
 
 
 class CloudPipeline(Protocol):
@@ -63,7 +63,8 @@ def make_pipeline(
     focus : Focus
         One that needs no look at the shot: ``FixedFocus`` or ``DepthLockedFocus``.
     method : str, LinearInverse or ProximalMethod
-        ``"l1"``, ``"tv"``, ``"linear"`` or ``"surfaces"``.
+        ``"l1"``, ``"tv"``, ``"linear"``, ``"surfaces"``, or another name of
+        `tofclip.plugins.METHODS` that stands for one with a prior.
 
     Raises
     ------
@@ -72,12 +73,14 @@ def make_pipeline(
     """
     if isinstance(focus, SharpestFocus):
         raise InputError("a stream has one focus for all shots: depth-locked or fixed:S")
-    if isinstance(method, str) and method not in (*METHODS, SurfaceRecovery.name):
-        names = ", ".join((*METHODS, SurfaceRecovery.name))
-        raise InputError(f"a stream's method is one of {names}, not '{method}'")
+    chosen = METHODS.make(method, {}) if isinstance(method, str) else method
+    if not isinstance(chosen, LinearInverse | ProximalMethod | SurfaceRecovery):
+        raise InputError(
+            "a stream's method is linear, surfaces or one with a prior such as l1 or tv, "
+            f"not '{method}'"
+        )
     if isinstance(shot, PhotonCube):
         return PhotonPipeline.for_shot(shot, camera, time_zero)
-    if method == SurfaceRecovery.name:  # each surface is recovered at the shear of its range
+    if isinstance(chosen, SurfaceRecovery):  # each surface is recovered at the shear of its range
         return SurfacePipeline.for_shot(shot, camera, time_zero)
-    chosen = METHODS[method]() if isinstance(method, str) else method
     return RangingPipeline.for_shot(shot, camera, focus, time_zero, chosen)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -48,6 +48,8 @@ class RecoverySettings:
     device : str
         Where, by a name that `tofclip.arrays.parse_device` knows; each worker of a cluster looks
         for it anew.
+    own : mapping of str to str
+        Further settings of the method, as `tofclip.recovery.make_method` takes them.
 
     Raises
     ------
@@ -62,6 +64,7 @@ class RecoverySettings:
     camera: Path | None = None
     time_zero: float | None = None
     device: str = "cpu"
+    own: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         # Made once and thrown away, so that a wrong setting is reported before any shot is read.
@@ -70,7 +73,8 @@ class RecoverySettings:
 
     def build_solver(self) -> Method | SurfaceRecovery:
         """Return the method with its settings."""
-        return make_method(self.method, iterations=self.iterations, weight=self.weight)
+        known = {"iterations": self.iterations, "weight": self.weight, **self.own}
+        return make_method(self.method, **known)
 
     def plan(self, streak: Streak) -> RecoveryPlan:
         """Check a shot against the camera, before any work is done."""
@@ -99,7 +103,8 @@ class RecoverySettings:
         # The content counts, not the name: a camera calibrated anew gives other frames.
         camera = None if self.camera is None else compute_sha256(self.camera)
         device = normalise_device(self.device)
-        return {"verb": "recover", **asdict(self), "camera": camera, "device": device}
+        known = {**asdict(self), **self.own, "own": None, "camera": camera, "device": device}
+        return {"verb": "recover", **known}
 
 
 def normalise_device(device: str) -> str | None:

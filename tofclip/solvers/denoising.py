@@ -17,7 +17,7 @@ from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm, DataTermMaker, Mask
-from tofclip.solvers.fista import ProximalMethod
+from tofclip.solvers.fista import ProximalMethod, TotalVariation
 from tofclip.solvers.methods import Method, Progress, Result, ignore_progress
 from tofclip.threads import limit_blas_threads
 
@@ -68,7 +68,7 @@ class BlockMatching:
         except ImportError as fault:
             raise MissingDependencyError(
                 "BM3D needs the package bm3d (free for non-commercial use only): pip install 'tofclip[bm3d]'; "
-                "without it take the prior 'collaborative'"
+                "without it take the denoiser 'collaborative'"
             ) from fault
         clean: Picture = np.asarray(bm3d(noisy, deviation), noisy.dtype)
         return clean
@@ -125,7 +125,7 @@ class PlugAndPlay(Method):
     Parameters
     ----------
     start : ProximalMethod
-        Gives the first picture, and with it the data term.
+        Gives the first picture, and with it the data term; total variation by default.
     denoiser : Denoiser
     calls : int
         Of the denoiser.
@@ -135,7 +135,7 @@ class PlugAndPlay(Method):
         Relative to the largest eigenvalue of A'A.
     """
 
-    start: ProximalMethod
+    start: ProximalMethod = field(default_factory=TotalVariation)
     denoiser: Denoiser = field(default_factory=CollaborativeWiener)
     calls: int = 8
     strength: float = 0.12

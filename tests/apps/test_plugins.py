@@ -1,0 +1,170 @@
+"""The registry: names of ours that stay, parts of others that are found, used, or told what is wrong
+with, and settings that are given as texts.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import tofclip
+from apps.cli import main
+from devices.registry import CODECS, SOURCES
+from nlos.io.format_detection import READERS as CAPTURE_READERS
+from nlos.settings import METHODS as HIDDEN_SCENE_METHODS
+from nlos.settings import Settings
+from tofclip.errors import FileFormatError, InputError
+from tofclip.loading import outline
+from tofclip.plugins import DENOISERS, METHODS, READERS, Parts, Reader, list_settings
+from tofclip.recovery import make_method
+from tofclip.solvers import PlugAndPlay, RegularisationByDenoising, TotalVariation
+
+KEPT = {
+    "tofclip.methods": "tv l1 linear adjoint surfaces wavelet pnp red",
+    "tofclip.denoisers": "collaborative bm3d nlm",
+    "tofclip.readers": "tiff lift hdf5 itex",
+    "tofclip.codecs": "frames linospad2 timetag",
+    "nlos.methods": "rsd hybrid backprojection filtered-backprojection lct fk",
+    "nlos.readers": "npz matlab hdf5",
+    "tofclip.sources": "aravis linospad2 remoteex spad512 timetag tmf8828 vl53l8 sim+aravis"
+    " sim+linospad2 sim+remoteex sim+spad512 sim+timetag sim+tmf8828 sim+vl53l8"
+    " .dat .img .tif .tiff .phu .ptu .sdt .ttbin .h5 .hdf5",
+}
+EVERY = (METHODS, DENOISERS, READERS, CODECS, SOURCES, HIDDEN_SCENE_METHODS, CAPTURE_READERS)
+PACKAGE = """
+from tofclip.plugins import Reader
+from tofclip.solvers.denoising import NonlocalMeans
+from tofclip import Streak
+import numpy as np
+
+class Half:
+    def __init__(self, share: float = 0.5, twice: bool = False): self.share = share
+    def __call__(self, noisy, pilot, deviation): return noisy * self.share
+
+def read(path):
+    return Streak(np.full((4, 5), float(path.read_text().split()[1]), np.float32))
+
+TEXTS = Reader((b"MINE",), read)
+"""
+ENTRIES = """
+[tofclip.denoisers]
+half = mine:Half
+nlm = mine:Half
+broken = mine.absent:Half
+[tofclip.readers]
+texts = mine:TEXTS
+broken = mine:ABSENT
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A package that offers parts, installed for one test."""
+    place = tmp_path / "installed"
+    (place / "mine-1.0.dist-info").mkdir(parents=True)
+    (place / "mine.py").write_text(PACKAGE)
+    (place / "mine-1.0.dist-info" / "METADATA").write_text("Name: mine\nVersion: 1.0\n")
+    (place / "mine-1.0.dist-info" / "entry_points.txt").write_text(ENTRIES)
+    monkeypatch.syspath_prepend(place)
+    forget()
+    yield place
+    monkeypatch.undo()
+    sys.modules.pop("mine", None)
+    forget()
+
+
+def forget() -> None:
+    for parts in EVERY:
+        for name in ("_points", "offered"):
+            vars(parts).pop(name, None)
+
+
+@pytest.mark.parametrize("parts", EVERY, ids=lambda parts: parts.group)
+def test_a_name_stays_and_what_it_names_is_there(parts: Parts) -> None:
+    named = KEPT[parts.group].split()
+    for name in named:
+        assert name in parts.own, (
+            f"the {parts.kind} '{name}' is gone from {parts.group}: commands, files and other "
+            "packages name it; keep the name, or say in the changelog what takes its place"
+        )
+    assert {*parts.own} == {*named}, "a new name is noted in KEPT: from now on it stays"
+    for name in parts.own:
+        assert callable(parts[name]) or isinstance(parts[name], Reader)
+
+
+def test_nothing_is_looked_for_before_it_is_needed() -> None:
+    code = "import sys, tofclip.plugins as p, apps.cli; p.METHODS['tv']; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "importlib.metadata" not in done.stdout.split()
+
+
+def test_parts_of_a_package_are_used(package: Path, tmp_path: Path) -> None:
+    made = make_method("pnp", denoiser="half", share="0.25", strength="0.2", iterations=7)
+    assert (made.denoiser.share, made.strength, made.start.iterations) == (0.25, 0.2, 7)
+    (tmp_path / "shot.txt").write_text("MINE 3")
+    assert tofclip.read_streak(tmp_path / "shot.txt").counts[0, 0] == 3
+    assert outline(tmp_path / "shot.txt").fields["counts"].values.shape == (4, 5)
+    (tmp_path / "other.txt").write_text("OTHER")
+    with pytest.raises(
+        FileFormatError, match=r"is not a TIFF.*; reader 'broken' of mine 1\.0 does"
+    ):
+        tofclip.read_streak(tmp_path / "other.txt")
+
+
+def test_what_is_wrong_with_a_package_is_a_line(package: Path, shell: Any) -> None:
+    listed = shell.figures("plugins")["parts"]
+    own = {(one["name"], one["fault"]) for one in listed if one["origin"] == "mine 1.0"}
+    names, faults = [name for name, _ in own], [fault for _, fault in own if fault]
+    assert sorted(names) == ["broken", "broken", "half", "nlm", "texts"]
+    assert sorted(fault.partition(":")[0] for fault in faults) == [
+        "denoiser 'broken' of mine 1.0 does not load",
+        "not used",
+        "reader 'broken' of mine 1.0 does not load",
+    ]
+    with pytest.raises(InputError, match="does not load: ModuleNotFoundError"):
+        make_method("pnp", denoiser="broken")
+    assert "--set share=0.5" in shell("plugins half").out
+    assert main(["plugins", "absent"]) == 2
+
+
+def test_a_notebook_registers_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(METHODS, "registered", {})
+    tofclip.register_method("mine", lambda weight=1.0: TotalVariation(weight))
+    assert make_method("mine", weight="0.5") == TotalVariation(0.5)
+    assert METHODS.get_origin("mine") == "registered"
+    with pytest.raises(InputError, match="'tv' is tofclip's own"):
+        tofclip.register_method("tv", TotalVariation)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"denoiser": "absent"}, "unknown denoiser 'absent'; choose one of collaborative"),
+        ({"gamma": "2"}, "'pnp' does not take gamma; its settings are start, denoiser, calls"),
+        ({"calls": "2.5"}, "calls must be a whole number, got '2.5'"),
+        ({"strength": "x"}, "strength must be a number, got 'x'"),
+        ({"start": "tv"}, "start can be given in Python only"),
+        ({"denoiser": "nlm", "patch_px": "a"}, "'nlm': patch_px must be a whole number"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused(settings: dict[str, str], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        make_method("pnp", **settings)
+
+
+def test_methods_with_a_denoiser_are_named() -> None:
+    assert make_method("pnp", weight=2e-3) == PlugAndPlay(TotalVariation(2e-3))
+    assert make_method("red", coupling="0.2") == RegularisationByDenoising(coupling=0.2)
+
+
+def test_a_hidden_scene_method_takes_what_it_names() -> None:
+    for name in HIDDEN_SCENE_METHODS.own:
+        assert {*list_settings(HIDDEN_SCENE_METHODS[name])} & {"wavelength", "sigma", "falloff"}
+    made: Any = Settings(wavelength=0.1, sigma=0.3).make_method("filtered-backprojection")
+    assert np.isclose(made.sigma, 0.3)
