@@ -4,8 +4,12 @@ with, and settings that are given as texts.
 
 from __future__ import annotations
 
+import configparser
+import os
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -37,6 +41,7 @@ KEPT = {
     " .dat .img .tif .tiff .phu .ptu .sdt .ttbin .h5 .hdf5",
 }
 EVERY = (METHODS, DENOISERS, READERS, CODECS, SOURCES, HIDDEN_SCENE_METHODS, CAPTURE_READERS)
+PAGE = Path(tofclip.__file__).parents[1] / "docs" / "extending.md"
 PACKAGE = """
 from tofclip.plugins import Reader
 from tofclip.solvers.denoising import NonlocalMeans
@@ -96,6 +101,52 @@ def test_a_name_stays_and_what_it_names_is_there(parts: Parts) -> None:
     assert {*parts.own} == {*named}, "a new name is noted in KEPT: from now on it stays"
     for name in parts.own:
         assert callable(parts[name]) or isinstance(parts[name], Reader)
+
+
+def install(guide: Path, place: Path) -> None:
+    """Write the files that a page shows, each named by its first line, as pip would install them."""
+    blocks = re.findall(r"^```(?:python|toml)\n# (\S+)\n(.*?)^```", guide.read_text(), re.M | re.S)
+    for name, text in blocks:
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_text(text)
+    project = tomllib.loads((place / "pyproject.toml").read_text())["project"]
+    known = place / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    known.mkdir()
+    (known / "METADATA").write_text(f"Name: {project['name']}\nVersion: {project['version']}\n")
+    tables = configparser.ConfigParser()
+    tables.read_dict(project["entry-points"])
+    with open(known / "entry_points.txt", "w") as file:
+        tables.write(file)
+
+
+# Lines, blank ones and all, that a part may take.
+LENGTHS = {"denoiser": 25, "prior": 40, "method": 50, "hidden": 50, "reader": 40, "instrument": 120}
+
+
+def test_the_page_makes_a_package_whose_parts_are_used(tmp_path: Path) -> None:
+    install(PAGE, tmp_path / "installed")
+    found = {one.stem: len(one.read_text().splitlines()) for one in tmp_path.rglob("my_parts/*.py")}
+    assert found.keys() == LENGTHS.keys()
+    assert all(found[name] <= most for name, most in LENGTHS.items()), found
+    code = (
+        "from pathlib import Path; from guides import run_guide\n"
+        f"for step, status in run_guide(Path({str(PAGE)!r})): assert status == 0, step"
+    )
+    paths = (tmp_path / "installed", PAGE.parents[1], PAGE.parent)
+    there = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=tmp_path, env=there, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "my-parts 0.1" in done.stdout
+    # of two plates 15 cm apart the light comes 8 and 9 ns after the pulse of 0.2 ns, in bins of 0.1 ns
+    for name in ("denoised", "elastic", "likely"):
+        frames = tofclip.load(tmp_path / f"{name}.h5")
+        light = frames.values.sum(axis=(1, 2))
+        lit = frames.times[light > 0.2 * light.max()]
+        assert (lit.min(), lit.max()) == pytest.approx((8.0e-9, 9.0e-9), abs=0.3e-9), name
+    # within two voxels of 15 mm
+    found_at = tofclip.load(tmp_path / "hidden.h5").find_brightest()
+    assert found_at == pytest.approx((0.1, -0.05, 0.6), abs=0.03)
 
 
 def test_nothing_is_looked_for_before_it_is_needed() -> None:
