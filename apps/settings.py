@@ -38,6 +38,7 @@ METAVARS = {
     "points": "'X,Y,Z; ...'",
     "mesh": "FILE",
     "flip": "AXIS",
+    "set": "NAME=VALUE",
     "tolerance": "SHARE",
     "falloff": "POWER",
     "signal_to_noise": "RATIO",
@@ -140,7 +141,7 @@ def add_setting_flags(kind: type[DataclassInstance]) -> Callable[[Verb], Verb]:
 def load_settings(kind: type[Settings], file: Path | None, flags: Mapping[str, Any]) -> Settings:
     """Return the settings of a TOML file and of flags, which win and are None where not given."""
     given = {} if file is None else _read_file(kind, file)
-    given |= {key: value for key, value in flags.items() if value is not None}
+    given |= {key: value for key, value in flags.items() if value not in (None, [])}
     known = _list_settings(kind)
     return kind(**{known[key].field.name: known[key].read(given[key]) for key in given})
 
@@ -187,6 +188,10 @@ def _convert_value(value: Any, hint: Any, where: str) -> Any:
         if isinstance(value, list) and len(value) == count and all(map(_is_number, value)):
             return tuple(map(float, value))
         raise InputError(f"{where} must be a list of {count} finite numbers, got {value!r}")
+    if get_origin(wanted) is list:
+        if isinstance(value, list) and all(isinstance(one, str) for one in value):
+            return value
+        raise InputError(f"{where} must be a list of texts, got {value!r}")
     if wanted is float and _is_number(value):
         return float(value)
     if type(value) is wanted and wanted is not float:

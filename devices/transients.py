@@ -41,11 +41,11 @@ from urllib.parse import quote, urlencode
 import numpy as np
 from numpy.typing import NDArray
 
+from devices import registry
 from devices.address import Options, Uri, option, parse_integers, parse_shape
 from devices.files import compute_photon_times
 from devices.histogram import BinAxis, StampHistogram, TagHistogram, TimeHistogram
 from devices.linospad2 import BoardCalibration
-from devices.registry import open as open_source
 from devices.source import READ_TIMEOUT_S, Batch, Source, Stats
 from devices.stream import InstrumentClock, StreamSource
 from devices.tracking import ShotStamp
@@ -144,7 +144,7 @@ def read_transient(address: str, bin_width: float | None = None) -> LiveShot:
 def read_shot(uri: Uri, bin_width: float | None = None, line: bool = False) -> LiveShot:
     """As `read_transient`; `line`: whether a line that counts photons is a picture of one row."""
     gathering = replace(Accumulation.of(uri, bin_width), line=line)
-    with open_source(strip_options(uri)) as source:
+    with registry.open(strip_options(uri)) as source:
         known = source.calibration
         batches = read_batches(source, gathering.seconds)
         if find_gate_steps(known):
@@ -436,7 +436,7 @@ class TransientStream(Iterator[LiveShot]):
 
     def _read(self) -> Generator[LiveShot]:
         gathering = self._gathering
-        with open_source(strip_options(self._uri)) as source:
+        with registry.open(strip_options(self._uri)) as source:
             self._source = source
             known = source.calibration
             camera = read_camera(known)

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from tofclip.errors import InputError
-from tofclip.plugins import Parts, list_settings
+from tofclip.plugins import Parts, list_settings, split_assignments
 
 if TYPE_CHECKING:
     from nlos.capture import Capture
@@ -59,7 +59,8 @@ class Settings:
     What is done to the capture first: `flip`, `gate`, `gate_ramp`, `fade`, `bins_together`; the
     virtual pulse: `wavelength`, `cycles`; the voxels: `voxel`, and their box, `x`, `y`, `near`,
     `far`, `everywhere`; the `method`, a name of `METHODS`, and its own settings, of which None
-    is left to it: `tolerance`, `sigma`, `falloff`, `signal_to_noise`. The metadata of each field
+    is left to it: `tolerance`, `sigma`, `falloff`, `signal_to_noise`, and in `set` what only it knows, as
+    ``"name=value"``. The metadata of each field
     hold its ``unit``, its meaning (``help``), in words the default (``shown``), and the unit that it
     is ``written`` with on the command line where that is another. `gate_found`
     tells whether the gate was found from the capture, and `reasons`, by the names of settings, why
@@ -136,8 +137,17 @@ class Settings:
     method: str | None = declare_setting(
         "", "How the hidden scene is imaged.", shown="the quickest"
     )
+    set: list[str] | None = declare_setting(  # noqa: RUF009 - declares a field
+        "",
+        "A further setting of the method, which tofclip plugins NAME lists; may be given again.",
+        shown="its own",
+    )
     gate_found: bool = False
     reasons: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.set and self.method is None:
+            raise InputError("settings of one method are given (`set`): name it (`method`)")
 
     @property
     def box(self) -> tuple[Limits, Limits, Limits]:
@@ -207,8 +217,9 @@ class Settings:
         """Build a method by its name, the settings' own by default; what is None is left to it."""
         chosen = name or self.method or METHODS_BY_SPEED[0]
         given = {key: getattr(self, key) for key in list_taken(chosen)}
+        own = split_assignments(self.set or ()) if chosen == self.method else {}
         made: Method = METHODS.make(
-            chosen, {key: one for key, one in given.items() if one is not None}
+            chosen, {key: one for key, one in given.items() if one is not None} | own
         )
         return made
 

@@ -277,6 +277,11 @@ class Returns(Storable):
         return self.y - known * rows * missing, self.x - known * columns * missing
 
     @property
+    def range_sigma(self) -> NDArray[np.float32]:
+        """`confidence` by the name that clouds have for it: one standard deviation, m."""
+        return self.confidence
+
+    @property
     def reflectance(self) -> NDArray[np.float32]:
         """Reflectance of the surfaces as if they faced the camera, percent; NaN where the camera has
         not seen a target of known reflectance.

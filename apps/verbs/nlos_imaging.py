@@ -42,6 +42,7 @@ class ImagingSettings(Settings):
     """Settings of imaging where the verb does not let a method be named."""
 
     method: str | None = None
+    set: list[str] | None = None
 
 
 Imaging = TypeVar("Imaging", bound=Settings)

@@ -219,3 +219,9 @@ def test_a_hidden_scene_method_takes_what_it_names() -> None:
         assert {*list_settings(HIDDEN_SCENE_METHODS[name])} & {"wavelength", "sigma", "falloff"}
     made: Any = Settings(wavelength=0.1, sigma=0.3).make_method("filtered-backprojection")
     assert np.isclose(made.sigma, 0.3)
+    wanted = Settings(wavelength=0.1, method="hybrid", set=["plane_z=0.4"])
+    assert (wanted.make_method().plane_z, wanted.make_method("rsd").cycles) == (0.4, 3.0)
+    with pytest.raises(InputError, match="name it"):
+        Settings(set=["plane_z=0.4"])
+    with pytest.raises(InputError, match="'fk' does not take plane_z; its settings are falloff"):
+        Settings(method="fk", set=["plane_z=0.4"]).make_method()
