@@ -92,7 +92,8 @@ TIME_ZERO = opt(
 )
 CAMERA = opt("H5", "Made by calibrate.", shown="the one inside the shot")
 FOCUS = opt("SHEAR", "depth-locked or fixed:S.", "fixed:0")
-PREVIEW = opt("PNG", "Where the picture goes.", shown="beside --out, .png")
+PICTURE_FORMATS = ".png, .pdf or .svg"
+PREVIEW = opt("PNG", f"Where the picture goes: {PICTURE_FORMATS}.", shown="beside --out, .png")
 SUFFIX = opt(".EXT", "Format of the clouds.", ".ply")
 PORT = opt("N", "Of the page.", shown="a free one", min=1, max=65535)
 NO_BROWSER = flag("--no-browser", "Print the page's address; open nothing.")

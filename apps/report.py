@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tofclip.errors import StorageError
-from tofclip.files import require_apart, require_suffix
+from tofclip.files import PICTURE_SUFFIXES, require_apart, require_suffix
 
 if TYPE_CHECKING:
     from tofclip.shots import Frames
 
 RECORD_SUFFIXES = (".h5", ".hdf5")
-PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 MAX_LISTED_VALUES = 12  # of a list that are printed one by one
 MAX_TABLE_WIDTH = 100  # columns of a terminal for several things side by side
 UNITS = {"m", "mm", "s", "ns", "ps", "px"}

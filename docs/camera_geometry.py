@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from apps.figures.style import make_figure, save_figure
+from apps.figures.style import make_figure
+from tofclip.notebook import save_figure
 from tofclip.simulate import make_default_camera
 
 if TYPE_CHECKING:

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from apps.figures.style import make_figure, save_figure
+from apps.figures.style import make_figure
 from nlos.capture import TimeAxis
 from nlos.simulate import HiddenScene, Surface, build_relay_wall
+from tofclip.notebook import save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

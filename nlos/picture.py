@@ -4,7 +4,7 @@ view at every instant, both with axes in metres.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from nlos.video import TransientVideo
 from nlos.volume import Volume
-from tofclip.files import atomic_path, require_suffix
+from tofclip.files import PICTURE_SUFFIXES, atomic_path, require_suffix
+from tofclip.notebook import letter_panels, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 
-PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 # The depth map shows columns whose brightest voxel has at least this fraction of the volume's
 # brightest.
 DEPTH_THRESHOLD = 0.4
@@ -29,7 +29,7 @@ COLOUR_MAP = "inferno"
 DEPTH_COLOUR_MAP = "viridis"
 # Of the colours' scale: a flat thing whose depths are one voxel apart would look like steps.
 MIN_DEPTH_SPAN_VOXELS = 8
-WIDTH_INCHES = 13.0
+WIDTH_INCHES, HEADER_INCHES, FONT_PT = 11.0, 1.0, 8
 DOTS_PER_INCH = 110
 # Bounds of a panel's side relative to the scene's width, so that flat and deep boxes stay legible.
 MIN_PANEL_RATIO, MAX_PANEL_RATIO = 0.3, 2.0
@@ -39,52 +39,65 @@ def save_picture(volume: Volume, path: str | Path) -> None:
     """Draw front, side and top view (brightest voxel along the line of sight) and a depth map into
     a file.
 
-    The front view looks along +z from the wall into the scene, x to the right and y down. Beside
-    it, the side view shares y and has the wall at its left edge; below it, the top view shares x
-    and has the wall at its upper edge.
+    The front view looks along +z from the wall into the scene, x to the right and y down; the side
+    view has the wall at its left edge, the top view at its upper edge.
     """
-    target = Path(path)
-    require_suffix(target, *PICTURE_SUFFIXES)
-    figure = _draw_figure(volume)
-    with atomic_path(target) as temporary:
-        figure.savefig(temporary, format=target.suffix[1:].lower())
+    require_suffix(path, *PICTURE_SUFFIXES)  # before the drawing
+    save_figure(_draw_figure(volume), path)
 
 
 def _draw_figure(volume: Volume) -> Figure:
     # A bare figure draws with Agg and leaves the caller's pyplot alone.
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
     edges = [_find_edges(axis) for axis in (volume.grid.x, volume.grid.y, volume.grid.z)]
     lengths = np.array([last - first for first, last in edges])
     width, height, depth = np.clip(lengths / lengths[0], MIN_PANEL_RATIO, MAX_PANEL_RATIO)
-    columns, rows = [width, depth, width], [height, depth]
-    size = (WIDTH_INCHES, WIDTH_INCHES * sum(rows) / sum(columns) + 0.5)
-    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
-    panels = figure.add_gridspec(2, 3, width_ratios=columns, height_ratios=rows)
-    front, side, top = (figure.add_subplot(panels[place]) for place in ((0, 0), (0, 1), (1, 0)))
-    drawn = _draw_views(volume, front, side, top)
-    figure.colorbar(drawn, ax=top, label="relative brightness", location="bottom", shrink=0.8)
-    depth_map = figure.add_subplot(panels[0, 2])
-    drawn = _draw_depth(volume, depth_map)
-    figure.colorbar(
-        drawn, ax=depth_map, label="z (m)", location="bottom", shrink=0.8, ticks=MaxNLocator(4)
-    )
-    # Places are found here and stay: saving would draw all twice, once only to find them.
-    layout = figure.get_layout_engine()
-    if layout is not None:
-        layout.execute(figure)
-    figure.set_layout_engine(None)
+    # Of a flat box all views stand in a row; of a deep one the top view stands below the front.
+    columns = [width, depth, width, width] if depth < width else [width, depth]
+    rows = [height] if depth < width else [height, depth]
+    size = (WIDTH_INCHES, WIDTH_INCHES * sum(rows) / sum(columns) + HEADER_INCHES)
+    with rc_context({"font.size": FONT_PT}):
+        figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
+        panels = figure.subplots(
+            len(rows), len(columns), squeeze=False, width_ratios=columns, height_ratios=rows
+        )
+        front, side, top, depth_map = panels.ravel()
+        bar: dict[str, Any] = {"location": "bottom", "shrink": 0.8}
+        views = [front, side, top] if len(rows) == 1 else [front, top]
+        drawn = _draw_views(volume, front, side, top)
+        figure.colorbar(drawn, ax=views, label="relative brightness", aspect=30, **bar)
+        drawn = _draw_depth(volume, depth_map)
+        others = [depth_map] if len(rows) == 1 else [side, depth_map]
+        figure.colorbar(drawn, ax=others, label="z (m)", ticks=MaxNLocator(4), **bar)
+        figure.suptitle(_describe_imaging(volume))
+        letter_panels((front, side, top, depth_map))
     return figure
+
+
+def _describe_imaging(volume: Volume) -> str:
+    """Method, wavelength and size of the voxels, as far as they are known."""
+    past = volume.provenance
+    while "imaging" not in past and isinstance(past.get("earlier"), Mapping):
+        past = past["earlier"]
+    past = past.get("imaging", {})
+    said = [str(past["method"])] if "method" in past else []
+    if past.get("wavelength_m"):
+        said.append(f"wavelength {1e3 * past['wavelength_m']:.3g} mm")
+    if volume.grid.x.size > 1:
+        said.append(f"voxels of {1e3 * np.diff(volume.grid.x).mean():.3g} mm")
+    return ", ".join(said)
 
 
 def _draw_views(volume: Volume, front: Axes, side: Axes, top: Axes) -> AxesImage:
     x, y, z = volume.grid.x, volume.grid.y, volume.grid.z
     magnitude = volume.magnitude
     magnitude = magnitude / (magnitude.max() or 1.0)
-    front.set_title("front: from the wall, along +z")
-    side.set_title("side: wall at the left")
-    top.set_title("top: wall at the upper edge")
+    front.set_title("front: from the wall")
+    side.set_title("side: wall left")
+    top.set_title("top: wall above")
     _draw_picture(side, magnitude.max(axis=2).T, (z, y), ("z (m)", "y (m), down"))
     _draw_picture(top, magnitude.max(axis=1), (x, z), ("x (m)", "z (m)"))
     return _draw_picture(front, magnitude.max(axis=0), (x, y), ("x (m)", "y (m), down"))
@@ -94,7 +107,7 @@ def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
     projection = volume.maximum_projection()
     weak = projection.brightness < DEPTH_THRESHOLD * projection.brightness.max()
     depth = np.where(weak, np.nan, projection.depth)
-    axes.set_title(f"depth (above {DEPTH_THRESHOLD:.0%} brightness)")
+    axes.set_title(f"depth above {DEPTH_THRESHOLD:.0%} brightness")
     drawn = _draw_picture(
         axes, depth, (volume.grid.x, volume.grid.y), ("x (m)", "y (m), down"), None
     )

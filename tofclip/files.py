@@ -204,6 +204,9 @@ def require_bounded_dataset(
         raise FileFormatError(origin, f"is damaged: {problem}")
 
 
+PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
+
+
 def require_suffix(path: str | Path, *suffixes: str) -> None:
     """Refuse to write to a name that says another format than the file will have."""
     if Path(path).suffix.lower() not in suffixes:

@@ -1,5 +1,5 @@
 """How objects show themselves in a notebook, and how they become those of other libraries: a table of
-what they hold, a picture, labelled arrays and tables.
+what they hold, a picture, labelled arrays and tables. How figures are lettered and written.
 """
 
 from __future__ import annotations
@@ -7,22 +7,26 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import import_module
+from pathlib import Path
+from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import MissingDependencyError
-from tofclip.files import describe_missing_package
+from tofclip.files import PICTURE_SUFFIXES, atomic_path, describe_missing_package, require_suffix
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 PICTURE_COLOURMAP, RANGE_COLOURMAP = "inferno", "turbo"
 PICTURE_WIDTH_PX = 240
 MAX_PLOTTED_POINTS = 20_000
+PRINT_DOTS_PER_INCH = 300
 
 
 def require_package(name: str) -> Any:
@@ -81,6 +85,28 @@ def plot_points(
     if not ax.yaxis_inverted():
         ax.invert_yaxis()
     return ax
+
+
+def letter_panels(panels: Iterable[Axes]) -> None:
+    """Put (a), (b) and so on before the titles of a figure's panels."""
+    for letter, axes in zip(ascii_lowercase, panels, strict=False):
+        axes.title.set_text(f"({letter}) {axes.get_title()}".rstrip())
+
+
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure for print, PNG, PDF or SVG by the name's suffix, whole or not at all."""
+    require_suffix(path, *PICTURE_SUFFIXES)
+    engine, panels = figure.get_layout_engine(), figure.get_axes()
+    if engine is not None and panels:
+        # Saving would draw all twice, the first time only to find the places of the axes.
+        for axes in panels:
+            for spine in axes.spines.values():
+                spine.set_in_layout(False)  # ticks and labels reach further
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+    with atomic_path(path) as temporary:
+        kind = Path(path).suffix[1:].lower()
+        figure.savefig(temporary, format=kind, dpi=PRINT_DOTS_PER_INCH)
 
 
 def make_data_array(

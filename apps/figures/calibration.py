@@ -18,9 +18,12 @@ from apps.figures.style import (
     label_axes,
     make_figure,
 )
-from tofclip.units import MILLIMETRE
+from tofclip.notebook import letter_panels
+from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -30,7 +33,7 @@ if TYPE_CHECKING:
 
 ZOOM_HALF_WIDTH_PX = 20
 MARGIN_ROWS = 25
-HEIGHT_INCHES, WHOLE_INCHES = 8.5, 5.1
+WIDTH_INCHES, HEIGHT_INCHES, WHOLE_INCHES = 11, 8, 4.8
 ZOOM_ROOM_INCHES = (0.5, 0.1, 0.4, 0.3)
 WHITE_PERCENTILE = 99.8  # percent: a glint does not darken the rest
 
@@ -38,7 +41,7 @@ WHITE_PERCENTILE = 99.8  # percent: a glint does not darken the rest
 def make_calibration_figure(found: FocusCalibration) -> Figure:
     """Draw both pictures whole with the fits, and a zoom into every view's slit centre."""
     views = found.centres_px.size
-    figure = make_figure(12, HEIGHT_INCHES)
+    figure = make_figure(WIDTH_INCHES, HEIGHT_INCHES)
     upper, lower = add_panels(figure, 2, 1, (0, WHOLE_INCHES))[:, 0]
     lower.sharex(upper)
     _draw_picture(upper, found, found.signal, "slit open: the lines and their fitted angles")
@@ -49,6 +52,7 @@ def make_calibration_figure(found: FocusCalibration) -> Figure:
         _draw_dot_profile(panels[1, view], found, view)
     panels[0, 0].set_ylabel("row (px)", fontsize=SMALL_FONT_PT)
     panels[1, 0].set_ylabel("1000 counts", fontsize=SMALL_FONT_PT)
+    letter_panels([upper, lower])
     return figure
 
 
@@ -99,7 +103,7 @@ def _draw_dot_profile(axes: Axes, found: FocusCalibration, view: int) -> None:
     axes.plot(columns, thousands, color="#444444", linewidth=1, drawstyle="steps-mid")
     axes.axvspan(centre - error, centre + error, color=LINE_COLOUR, alpha=0.4, linewidth=0)
     axes.axvline(centre, color=LINE_COLOUR, linewidth=1)
-    label_axes(axes, f"{centre:.2f} \N{PLUS-MINUS SIGN} {error:.2f} px", "column (px)", "")
+    label_axes(axes, f"{centre:.2f} \N{PLUS-MINUS SIGN} {error:.2f}", "column (px)", "")
 
 
 def _cut_window(
@@ -113,18 +117,20 @@ def _cut_window(
 
 
 MAX_DRAWN_POINTS = 20_000
+MIN_SPAN_SIGMA = 6  # of the colours of offsets, or noise would look like a pattern
 
 
-def make_range_calibration_figure(found: RangeFit) -> Figure:
+def make_range_calibration_figure(found: RangeFit, distances: Sequence[float]) -> Figure:
     """Draw the fitted walk over what was measured, and the pictures of the pixels' own numbers."""
     known = found.calibration
-    pictures = [
-        (known.offsets / MILLIMETRE, "offset (mm)"),
-        (known.offset_sigma / MILLIMETRE, "its standard deviation (mm)"),
-        (known.response, "response"),
+    noise = float(np.nanmedian(known.offset_sigma)) / MILLIMETRE if known.offset_sigma.size else 0.0
+    pictures: list[tuple[NDArray[Any], str, str, dict[str, Any]]] = [
+        (known.offsets / MILLIMETRE, "offset", "mm", {"least_span": MIN_SPAN_SIGMA * noise}),
+        (known.offset_sigma / MILLIMETRE, "its standard deviation", "mm", {"vmin": 0}),
+        (known.response, "response", "relative to the mean", {"vmin": 0}),
     ]
-    drawn = [(picture, title) for picture, title in pictures if picture.size]
-    figure = make_figure(4 * (1 + len(drawn)), 3.6)
+    drawn = [one for one in pictures if one[0].size]
+    figure = make_figure(max(4.4, 3.4 * (1 + len(drawn))), 3.2)
     panels = np.atleast_1d(figure.subplots(1, 1 + len(drawn)))
     walk = panels[0]
     some = slice(None, None, -(-found.signal.size // MAX_DRAWN_POINTS))
@@ -137,7 +143,19 @@ def make_range_calibration_figure(found: RangeFit) -> Figure:
     walk.fill_between(signal, fitted - sigma, fitted + sigma, color=LINE_COLOUR, alpha=0.3)
     walk.plot(signal, fitted, color=LINE_COLOUR)
     walk.set_xscale("log")
-    label_axes(walk, "range walk", "counts of a return", "measured too long (mm)")
-    for panel, (picture, title) in zip(panels[1:], drawn, strict=True):
-        draw_spread_picture(panel, picture, title)
+    walk.minorticks_off()
+    if strongest < 10 * weakest:  # no two powers of ten to number
+        ticks = np.geomspace(weakest, strongest, 4)
+        walk.set_xticks(ticks, [f"{tick:.3g}" for tick in ticks])
+    zero, spread = found.camera.time_zero / NANOSECOND, known.time_zero_sigma / PICOSECOND
+    targets = ", ".join(f"{distance:g}" for distance in distances)
+    figure.suptitle(
+        f"target at {targets} m: time zero {zero:.3f} ns \N{PLUS-MINUS SIGN} {spread:.2g} ps",
+        fontsize=SMALL_FONT_PT + 2,
+    )
+    title = "residuals" if found.walk_note else "range walk"
+    label_axes(walk, title, "counts of a return", "measured too long (mm)")
+    for panel, (picture, title, meaning, look) in zip(panels[1:], drawn, strict=True):
+        draw_spread_picture(panel, picture, title, meaning, **look)
+    letter_panels(panels if drawn else ())
     return figure

@@ -20,6 +20,7 @@ from apps.figures.style import (
     make_figure,
     outer_edges,
 )
+from tofclip.notebook import letter_panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,6 +67,7 @@ def make_comparison_figure(
         label_axes(front, f"{name}\n{_format_cost(figures[name])}", "", down)
         label_axes(top, "", f"x (m)\n\n{_format_merit(figures[name])}", away)
     add_colour_bar(panels[0, -1], drawn, "relative to each method's brightest")
+    letter_panels(panels[0])
     return figure
 
 
@@ -133,28 +135,27 @@ def make_demo_figure(run: DemoRun) -> Figure:
     """Draw the room from above, one row's streak, and the images: flat, hybrid, back-projection,
     hybrid from above.
     """
-    figure = make_figure(13, 6.6)
+    figure = make_figure(11, 5.6)
     panels = figure.subplots(2, 3)
     _draw_room(panels[0, 0], run)
     _draw_streak(panels[0, 1], run.capture)
     hybrid, slow, flat = (run.images[name] for name in ("hybrid", "backprojection", "flat"))
-    quick, long = (
-        f"{one.seconds:.1f} s" if one.seconds >= 1 else f"{one.seconds:.2f} s"
-        for one in (hybrid, slow)
-    )
-    longer = f"{slow.seconds / hybrid.seconds:.2g} times as long"
+    wavelength = f"{1e3 * run.wavelength:.0f} mm"
     for axes, image, plane, title in (
-        (panels[0, 2], flat, "xy", "3. hybrid, had the wall been taken for flat"),
-        (panels[1, 0], hybrid, "xy", f"4. hybrid: {quick}"),
-        (panels[1, 1], slow, "xy", f"5. back-projection: {long}, {longer}"),
-        (panels[1, 2], hybrid, "xz", "6. hybrid, seen from above"),
+        (panels[0, 2], flat, "xy", "hybrid, had the wall been taken for flat"),
+        (panels[1, 0], hybrid, "xy", f"hybrid, wavelength {wavelength}"),
+        (panels[1, 1], slow, "xy", f"back-projection, wavelength {wavelength}"),
+        (panels[1, 2], hybrid, "xz", "hybrid, seen from above"),
     ):
-        draw_view(axes, image.volume, plane, run.truth)
+        drawn = draw_view(axes, image.volume, plane, run.truth)
         down = "y, down (m)" if plane == "xy" else "z, away from the wall (m)"
         label_axes(axes, title, "x (m)", down)
         axes.plot([], [], color=LINE_COLOUR, label="truth")
         look: Any = {"framealpha": 0.3, "labelcolor": "white", "facecolor": INK_COLOUR}
         axes.legend(fontsize=SMALL_FONT_PT, loc="upper right", **look)
+    for axes in panels[:, 2]:
+        add_colour_bar(axes, drawn, "relative brightness")
+    letter_panels(panels.ravel())
     return figure
 
 
@@ -188,7 +189,7 @@ def _draw_room(axes: Axes, run: DemoRun) -> None:
     ):
         axes.annotate(text, place, fontsize=SMALL_FONT_PT)
     axes.set(xlim=(-1.1, 2.0), ylim=(1.6, behind), aspect="equal", anchor="C")
-    label_axes(axes, "1. the room from above: a curved wall", "x (m)", "z, away from the wall (m)")
+    label_axes(axes, "the room from above: a curved wall", "x (m)", "z, away from the wall (m)")
 
 
 def _draw_streak(axes: Axes, capture: Capture) -> None:
@@ -198,9 +199,10 @@ def _draw_streak(axes: Axes, capture: Capture) -> None:
     paths = capture.axis.paths[lit[0] : lit[-1] + 1]
     left, right = outer_edges(capture.wall[0, :, 0])
     first, last = outer_edges(paths)
-    draw_image(axes, row[lit[0] : lit[-1] + 1], (left, right, last, first), aspect="auto")
+    shown = row[lit[0] : lit[-1] + 1]
+    drawn = draw_image(axes, shown, (left, right, last, first), aspect="auto", vmin=0)
+    add_colour_bar(axes, drawn, "photons")
     axes.set_box_aspect(PANEL_ASPECT)
     for place, text in (((-0.78, 1.98), "3"), ((0.72, 2.4), "D")):
         axes.annotate(text, place, color="white", fontsize=SMALL_FONT_PT)
-    title = f"2. one row of the wall: up to {row.max():.0f} photons in a bin"
-    label_axes(axes, title, "x on the wall (m)", "path spot - hidden - wall (m)")
+    label_axes(axes, "one row of the wall", "x on the wall (m)", "path spot - hidden - wall (m)")

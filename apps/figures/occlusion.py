@@ -22,6 +22,7 @@ from apps.figures.style import (
 )
 from tofclip.files import atomic_path
 from tofclip.metrics import correlation_coefficient
+from tofclip.notebook import letter_panels
 from tofclip.units import MILLIMETRE, PICOSECOND
 
 if TYPE_CHECKING:
@@ -119,9 +120,8 @@ def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult])
     plan, time = upper.subplots(1, 2, width_ratios=[1.8, 1])
     _draw_plan(plan, experiment, probes)
     draw_history(time, experiment)
-    for axes, (title, picture, truth) in zip(
-        lower.subplots(1, 6), _select_pictures(experiment), strict=True
-    ):
+    panels = lower.subplots(1, 6)
+    for axes, (title, picture, truth) in zip(panels, _select_pictures(experiment), strict=True):
         brightest = picture.max() if truth is None else truth.max()
         draw_image(axes, picture, vmin=0, vmax=max(float(brightest), 1e-12))
         axes.set(xticks=[], yticks=[])
@@ -130,6 +130,7 @@ def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult])
             found = correlation_coefficient(picture, truth)
             colour = SEEN_COLOUR if found >= 0.8 else UNSEEN_COLOUR
             axes.set_xlabel(f"correlation {found:.2f}", fontsize=SMALL_FONT_PT + 2, color=colour)
+    letter_panels([plan, time, *panels])
     return figure
 
 

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from apps.figures.style import (
     DEPTH_COLOURMAP,
     SMALL_FONT_PT,
-    WHITE_PERCENTILE,
-    add_colour_bar,
     add_panels,
     draw_camera_picture,
     draw_image,
@@ -24,10 +22,12 @@ from apps.figures.style import (
     draw_streak,
     label_axes,
     make_figure,
+    scale_brightness,
     scatter_points,
     tone_map,
 )
 from tofclip.camera import estimate_dark_level
+from tofclip.notebook import letter_panels
 from tofclip.units import MILLIMETRE, NANOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
@@ -42,16 +42,15 @@ if TYPE_CHECKING:
 
 PANEL_COLUMNS = 4
 MAX_MOMENTS = 3 * PANEL_COLUMNS
-OVERVIEW_INCHES, ROW_INCHES = 4.2, 2.45
-OVERVIEW_WIDTHS = (1, 1, 1.2)  # the last picture has a colour scale beside it
+WIDTH_INCHES, OVERVIEW_INCHES, ROW_INCHES = 10.0, 2.9, 2.0
+OVERVIEW_ROOM_INCHES = (0.6, 0.95, 0.45, 0.3)  # with a colour scale at the right
 STRIP_TITLE_INCHES = 0.25
-STRIP_ROOM_INCHES = (0.45, 0.1, 0.25, 0.25)  # its panels have ticks and a title, no labels
+STRIP_ROOM_INCHES = (0.35, 0.05, 0.2, 0.25)  # its panels have ticks and a title, no labels
 MIN_PEAK_DISTANCE_BINS = 12
 MIN_PEAK_PROMINENCE = 0.01  # of the highest
 CROP_THRESHOLD = 0.35  # of a frame's brightest pixel: what is dimmer is mostly artefacts
 CROP_MARGIN_PX = 8
-LIT_THRESHOLD = 0.2  # pixels that are lighter decide about the scale of distances
-BRIGHT_AREA_PERCENTILE = 95.0  # percent: colours need light to be distinguishable
+LIT_THRESHOLD = 0.1  # of the brightest: a pixel's range is shown from there on
 GAMMA = 0.6  # far objects stay visible beside near ones
 SQUARED_RANGE = " \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}"
 
@@ -72,22 +71,25 @@ def make_preview_figure(streak: Streak, frames: Frames) -> Figure:
     moments = choose_moments(frames)
     lines = math.ceil(len(moments) / PANEL_COLUMNS)
     height = OVERVIEW_INCHES + ROW_INCHES * lines
-    figure = make_figure(12, height)
-    (overview,) = add_panels(figure, 1, 3, (0, OVERVIEW_INCHES), widths=OVERVIEW_WIDTHS)
+    figure = make_figure(WIDTH_INCHES, height)
+    (overview,) = add_panels(figure, 1, 3, (0, OVERVIEW_INCHES), OVERVIEW_ROOM_INCHES)
     left, middle, right = overview
     brightness = frames.values * _compute_compensation(frames)[:, np.newaxis, np.newaxis]
     counts = np.maximum(streak.counts - estimate_dark_level(streak.counts), 0)
-    draw_streak(left, tone_map(counts, gamma=GAMMA), streak.times, "streak image as measured")
-    squared = SQUARED_RANGE if _has_known_range(frames) else ""
-    summed = tone_map(brightness.sum(axis=0), gamma=GAMMA)
-    draw_camera_picture(middle, summed, f"summed brightness{squared}")
+    look = scale_brightness(counts, GAMMA)
+    draw_streak(left, counts, streak.times, "streak image as measured", "counts", **look)
+    unit = f"counts{SQUARED_RANGE} (m\N{SUPERSCRIPT TWO})" if _has_known_range(frames) else "counts"
+    summed, method = brightness.sum(axis=0), frames.figures.get("method", "method unknown")
+    look = scale_brightness(summed, GAMMA)
+    draw_camera_picture(middle, summed, f"sum of all frames, {method}", unit, **look)
     _draw_distance(right, brightness, frames)
     strip = (OVERVIEW_INCHES + STRIP_TITLE_INCHES, height)
-    title = "frames, each scaled to its own brightness; x and y in px"
-    look: Any = {"fontsize": SMALL_FONT_PT + 2, "ha": "center", "va": "top"}
-    figure.text(0.5, 1 - OVERVIEW_INCHES / height, title, **look)
+    title = f"frames from 0 to their peak, in {unit}; x and y in px"
+    place: Any = {"fontsize": SMALL_FONT_PT + 2, "ha": "center", "va": "top"}
+    figure.text(0.5, 1 - OVERVIEW_INCHES / height, title, **place)
     panels = add_panels(figure, lines, PANEL_COLUMNS, strip, STRIP_ROOM_INCHES)
     _draw_moments(panels, brightness, moments, frames)
+    letter_panels([*overview, *panels.ravel()[: len(moments)]])
     return figure
 
 
@@ -129,10 +131,6 @@ def _split_evenly(energy: NDArray[np.float64]) -> list[Moment]:
     ]
 
 
-def _compute_ranges(frames: Frames) -> NDArray[np.float64]:
-    return frames.times * SPEED_OF_LIGHT / 2
-
-
 def _has_known_range(frames: Frames) -> bool:
     """Whether time is range: not without a time zero, and not for a relay wall, whose light took
     three bounces.
@@ -143,26 +141,19 @@ def _has_known_range(frames: Frames) -> bool:
 def _compute_compensation(frames: Frames) -> NDArray[np.float32]:
     """Factor of each frame that undoes the fall-off with range; 1 where it does not apply."""
     if _has_known_range(frames):
-        return np.maximum(_compute_ranges(frames), 0).astype(np.float32) ** 2
+        return np.maximum(frames.ranges, 0).astype(np.float32) ** 2
     return np.ones(frames.times.size, np.float32)
 
 
 def _draw_distance(axes: Axes, brightness: NDArray[Any], frames: Frames) -> None:
-    """Colour says when each pixel was brightest, lightness how bright it was."""
-    from matplotlib import colormaps
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    light = tone_map(brightness.max(axis=0), BRIGHT_AREA_PERCENTILE, GAMMA)
+    """When each pixel was brightest; dim ones have no say."""
     scale, meaning = (frames.times / NANOSECOND, "time (ns)")
     if _has_known_range(frames):
-        scale, meaning = _compute_ranges(frames), "range (m)"
-    distance = scale[brightness.argmax(axis=0)]
-    lit = distance[light > LIT_THRESHOLD] if np.any(light > LIT_THRESHOLD) else distance
-    mapped = ScalarMappable(Normalize(*np.percentile(lit, (1, 99))), colormaps[DEPTH_COLOURMAP])
-    picture = mapped.to_rgba(distance)[..., :3] * light[..., np.newaxis]
-    draw_camera_picture(axes, picture, "when each pixel was brightest")
-    add_colour_bar(axes, mapped, meaning)
+        scale, meaning = frames.ranges, "range (m)"
+    dim = tone_map(brightness.max(axis=0)) < LIT_THRESHOLD
+    distance = np.where(dim, np.nan, scale[brightness.argmax(axis=0)])
+    title = f"{meaning.partition(' ')[0]} of each pixel's peak"
+    draw_spread_picture(axes, distance, title, meaning, cmap=DEPTH_COLOURMAP)
 
 
 def _draw_moments(
@@ -176,18 +167,20 @@ def _draw_moments(
         draw_image(axes, picture[rows, columns], extent, vmin=0)
         where = f"{frames.times[moment.frame] / NANOSECOND:.2f} ns"
         if _has_known_range(frames):
-            where = f"{_compute_ranges(frames)[moment.frame]:.2f} m"
+            where = f"{frames.ranges[moment.frame]:.2f} m"
         which = f"frames {moment.first} to {moment.last}"
         if moment.first == moment.last:
             which = f"frame {moment.frame}"
-        label_axes(axes, f"{where}  ({which})", "", "")
+        label_axes(axes, f"{where}, {which}", "", "")
+        peak: Any = {"color": "white", "fontsize": SMALL_FONT_PT, "transform": axes.transAxes}
+        axes.text(0.03, 0.04, f"peak {float(f'{picture.max():.3g}'):g}", **peak)
     for axes in panels.ravel()[len(moments) :]:
         axes.set_axis_off()
     # Ticks at the left and below are those of the whole column and row.
     for axes in panels[:, 1:].ravel():
-        axes.tick_params(labelleft=False)
+        axes.tick_params(left=False, labelleft=False)
     for axes in panels[:-1].ravel():
-        axes.tick_params(labelbottom=False)
+        axes.tick_params(bottom=False, labelbottom=False)
 
 
 def _crop_to_bright(pictures: list[NDArray[Any]]) -> tuple[slice, slice]:
@@ -202,6 +195,7 @@ def _crop_to_bright(pictures: list[NDArray[Any]]) -> tuple[slice, slice]:
 
 
 HISTOGRAM_BINS = 61
+MIN_SPAN_SIGMA = 20  # of the colours of ranges
 
 
 def make_demo_figure(
@@ -215,12 +209,10 @@ def make_demo_figure(
     """Draw streak image, brightness and range as seen by the camera; top and side view in metres;
     range errors. `compared`: of the same shot, each frame recovered alone.
     """
-    figure = make_figure(15.5, 7.6)
+    figure = make_figure(12, 6)
     panels = figure.subplots(2, 4)
-    top = np.percentile(streak.counts, WHITE_PERCENTILE)
-    title = "streak image: one shot, seven views"
-    drawn = draw_streak(panels[0, 0], streak.counts, streak.times, title, vmin=0, vmax=top)
-    add_colour_bar(panels[0, 0], drawn, "photons")
+    title, look = "one shot, seven views", scale_brightness(streak.counts)
+    draw_streak(panels[0, 0], streak.counts, streak.times, title, "photons", **look)
     _draw_brightness(panels[0, 1], frames, "surfaces")
     _draw_brightness(panels[0, 2], compared, "tv")
     distance = returns.image("range")
@@ -236,15 +228,15 @@ def make_demo_figure(
     panels[1, 1].invert_yaxis()
     label_axes(panels[1, 1], "side view of the cloud", "z, away from the camera (m)", "y, down (m)")
     _draw_errors(panels[1, 2], returns, truth)
+    letter_panels(panels.ravel())
     return figure
 
 
 def _draw_brightness(axes: Axes, frames: Frames, name: str) -> None:
-    ranges = np.maximum(frames.times, 0) * SPEED_OF_LIGHT / 2
-    picture = np.tensordot((ranges**2).astype(np.float32), frames.values, axes=1)
+    squared = np.maximum(frames.ranges, 0).astype(np.float32) ** 2
+    picture = np.tensordot(squared, frames.values, axes=1)
     title = f"{name}: brightness{SQUARED_RANGE}"
-    top = np.percentile(picture, WHITE_PERCENTILE)
-    draw_camera_picture(axes, picture, title, "photons at 1 m", vmin=0, vmax=top)
+    draw_camera_picture(axes, picture, title, "photons at 1 m", **scale_brightness(picture))
 
 
 def _draw_errors(axes: Axes, returns: Returns, truth: GroundTruth) -> None:
@@ -255,20 +247,33 @@ def _draw_errors(axes: Axes, returns: Returns, truth: GroundTruth) -> None:
     axes.hist(np.clip(error, edges[0], edges[-1]), edges, color="#4c72b0")
     for edge in (-bin_mm, bin_mm):
         axes.axvline(edge, color="black", linewidth=0.8, linestyle=":")
-    title = f"range error: median {np.median(np.abs(error)):.2f} mm, one bin = {bin_mm:.2f} mm"
-    label_axes(axes, title, "range error (mm), larger ones at the ends", "target pixels")
+    title = f"range error, median {np.median(np.abs(error)):.2f} mm"
+    meaning = f"range error (mm), cut at 2 bins of {bin_mm:.2f} mm"
+    label_axes(axes, title, meaning, "target pixels")
 
 
 def make_range_figure(found: SurfaceImage) -> Figure:
     """Draw a range image with what it is worth."""
-    figure = make_figure(12, 9)
+    figure = make_figure(10, 7.5)
     axes = figure.subplots(2, 2)
-    panels: tuple[tuple[Any, str, dict[str, Any]], ...] = (
-        (found.range, "range (m)", {"cmap": DEPTH_COLOURMAP}),
-        (found.range_sigma * 1e3, "one standard deviation (mm)", {}),
-        (found.intensity, "photons", {}),
-        (found.outlier_probability, "probability of an outlier", {"vmin": 0, "vmax": 1}),
+    seen = np.isfinite(found.range)
+    sigma, photons = (
+        float(np.median(one[seen])) if seen.any() else np.nan
+        for one in (found.range_sigma, found.intensity)
     )
-    for panel, (picture, title, look) in zip(axes.flat, panels, strict=True):
-        draw_spread_picture(panel, picture, title, **look)
+    figure.suptitle(
+        f"medians: {photons:.3g} signal photons a pixel, deviation {sigma / MILLIMETRE:.3g} mm",
+        fontsize=SMALL_FONT_PT + 2,
+    )
+    # Ranges that differ by less than noise does are no scene.
+    span = MIN_SPAN_SIGMA * sigma if seen.any() else 0.0
+    panels: tuple[tuple[Any, str, str, dict[str, Any]], ...] = (
+        (found.range, "range", "m", {"cmap": DEPTH_COLOURMAP, "least_span": span}),
+        (found.range_sigma / MILLIMETRE, "one standard deviation", "mm", {"vmin": 0}),
+        (found.intensity, "signal", "photons", {"vmin": 0}),
+        (found.outlier_probability, "outliers", "probability", {"vmin": 0, "vmax": 1}),
+    )
+    for panel, (picture, title, meaning, look) in zip(axes.flat, panels, strict=True):
+        draw_spread_picture(panel, picture, title, meaning, **look)
+    letter_panels(axes.flat)
     return figure

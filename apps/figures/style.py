@@ -27,7 +27,8 @@ LINE_COLOUR = "#3dd6c8"  # drawn over a brightness map
 SMALL_FONT_PT = 8
 WHITE_PERCENTILE = 99.5  # percent: a glint does not darken the rest
 SHOWN_PERCENTILES = (1.0, 99.0)  # percent of the pixels that span the colours
-DOTS_PER_INCH = 100
+DOTS_PER_INCH = 100  # on a screen
+PAGE_WIDTH_PX = 1300
 # Colours of pictures with more bytes; 0: all, without transparency. 256 make a quarter of the
 # bytes, off by less than 16 of 255 anywhere; 64 are enough for the greys of many small pictures.
 FEWER_COLOURS = {150_000: 0, 290_000: 256, 600_000: 64}
@@ -80,29 +81,24 @@ def add_panels(
     return panels
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure in the format that the name's ending says, whole or not at all."""
-    engine, panels = figure.get_layout_engine(), figure.get_axes()
-    if engine is not None and panels:
-        # Saving would draw all twice, the first time only to find the places of the axes.
-        for axes in panels:
-            for spine in axes.spines.values():
-                spine.set_in_layout(False)  # ticks and labels reach further
-        engine.execute(figure)
-        figure.set_layout_engine(None)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary)
-
-
 def store_picture(picture: Path, place: Path) -> None:
-    """Store a picture at a place, which may be its own; a large PNG in `FEWER_COLOURS`."""
+    """Store a picture at a place, which may be its own, for a page: a PNG of a page's width, a large
+    one in `FEWER_COLOURS`.
+    """
     from PIL import Image
 
     drawn = picture.read_bytes()
+    if picture.suffix.lower() == ".png":
+        with Image.open(picture) as opened:
+            if opened.width > PAGE_WIDTH_PX:
+                whole, file = opened.convert("RGB"), io.BytesIO()
+                whole.thumbnail((PAGE_WIDTH_PX, PAGE_WIDTH_PX**2), Image.Resampling.LANCZOS)
+                whole.save(file, format="PNG", optimize=True)
+                drawn = file.getvalue()
     for most, colours in FEWER_COLOURS.items():
         if len(drawn) <= most or picture.suffix.lower() != ".png":
             break
-        with Image.open(picture) as opened:
+        with Image.open(io.BytesIO(drawn)) as opened:
             whole = opened.convert("RGB")
         if colours:
             whole = whole.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
@@ -138,8 +134,9 @@ def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
 
 
 def add_colour_bar(axes: Axes, mapped: Any, meaning: str) -> None:
-    """Put a colour scale beside a picture, labelled with its meaning and unit."""
-    bar = axes.figure.colorbar(mapped, ax=axes, shrink=0.9)
+    """Put a colour scale beside a picture, as high as it, labelled with its meaning and unit."""
+    place = axes.inset_axes((1.03, 0.0, 0.04, 1.0))
+    bar = axes.figure.colorbar(mapped, cax=place)
     bar.set_label(meaning, fontsize=SMALL_FONT_PT)
     bar.ax.tick_params(labelsize=SMALL_FONT_PT)
 
@@ -162,25 +159,50 @@ def draw_camera_picture(
         add_colour_bar(axes, drawn, meaning)
 
 
-def draw_spread_picture(axes: Axes, picture: NDArray[Any], title: str, **look: Any) -> None:
-    """Draw a pixel's own numbers; all but the outermost of them span the colours."""
+def draw_spread_picture(
+    axes: Axes,
+    picture: NDArray[Any],
+    title: str,
+    meaning: str,
+    least_span: float = 0.0,
+    **look: Any,
+) -> None:
+    """Draw a pixel's own numbers; all but the outermost of them span the colours, from `vmin` where it
+    is given, and at least `least_span`, or noise would look like a scene.
+    """
     finite = picture[np.isfinite(picture)]
-    if finite.size and "vmin" not in look:
+    if finite.size:
         low, high = np.percentile(finite, SHOWN_PERCENTILES)
-        look |= {"vmin": low, "vmax": high}
-    axes.figure.colorbar(draw_image(axes, picture, **look), ax=axes)
+        widen = max(0.0, least_span - (high - low)) / 2
+        look = {"vmin": low - widen, "vmax": high + widen, **look}
+    add_colour_bar(axes, draw_image(axes, picture, **look), meaning)
     label_axes(axes, title, "x (px)", "y (px), down")
 
 
 def draw_streak(
-    axes: Axes, picture: NDArray[Any], times: NDArray[np.float64], title: str, **look: Any
-) -> AxesImage:
+    axes: Axes,
+    picture: NDArray[Any],
+    times: NDArray[np.float64],
+    title: str,
+    meaning: str,
+    **look: Any,
+) -> None:
     """Draw a streak image over the slit's columns and its time axis."""
     first, last = outer_edges(times / NANOSECOND)
     extent = (-0.5, picture.shape[1] - 0.5, last, first)
     drawn = draw_image(axes, picture, extent, aspect="auto", **look)
     label_axes(axes, title, "slit column (px)", "time axis (ns)")
-    return drawn
+    add_colour_bar(axes, drawn, meaning)
+
+
+def scale_brightness(picture: NDArray[Any], gamma: float = 1.0) -> dict[str, Any]:
+    """How a picture is shown whose few brightest pixels do not darken the rest; with a `gamma` below
+    1 far things stay visible beside near ones, and the colour scale says so.
+    """
+    from matplotlib.colors import PowerNorm
+
+    top = float(np.percentile(picture, WHITE_PERCENTILE)) if picture.size else 0.0
+    return {"norm": PowerNorm(gamma, 0, top if top > 0 else float(picture.max(initial=0)) or 1.0)}
 
 
 def scatter_points(

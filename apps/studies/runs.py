@@ -11,7 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from apps.figures.style import save_figure, store_picture
+from apps.figures.style import store_picture
 from apps.jobs import run_with_progress
 from apps.progress import show_progress
 from apps.studies.best import SEED, SHEAR_RANGE, BestFigure, list_best_cases, solve_best
@@ -28,6 +28,7 @@ from apps.studies.report import (
 )
 from tofclip import __version__
 from tofclip.files import atomic_path
+from tofclip.notebook import save_figure
 from tofclip.sequences.jobs import Job, Summary
 
 

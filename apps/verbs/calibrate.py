@@ -63,9 +63,9 @@ def calibrate(
     import numpy as np
 
     from apps.figures.calibration import make_calibration_figure
-    from apps.figures.style import save_figure
     from tofclip.camera.focus_pictures import calibrate_views
     from tofclip.io import read_streak
+    from tofclip.notebook import save_figure
 
     pictures = (line, line_background, dot, dot_background)
     # Both outputs are checked before any picture is read, and neither may replace an input.
@@ -161,10 +161,10 @@ def calibrate_range(
     import math
 
     from apps.figures.calibration import make_range_calibration_figure
-    from apps.figures.style import save_figure
     from tofclip.camera import Camera
     from tofclip.lidar import Pulse
     from tofclip.lidar.range_calibration import fit_range_calibration
+    from tofclip.notebook import save_figure
 
     preview = choose_preview(out, preview, (*shots, camera))
     require_view(focal_length_px, field_of_view_deg)
@@ -189,7 +189,7 @@ def calibrate_range(
             advance(1)
     found = fit_range_calibration(seen, walk=walk)
     found.camera.save(out)
-    save_figure(make_range_calibration_figure(found), preview)
+    save_figure(make_range_calibration_figure(found, distances), preview)
     report(_list_figures(found, len(shots)), as_json, [out, preview])
 
 

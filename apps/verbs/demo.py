@@ -28,9 +28,9 @@ def demo(
     Example: tofclip demo --out demo-output
     """
     from apps.figures.shot import make_demo_figure
-    from apps.figures.style import save_figure
     from tofclip.lidar import depth, point_cloud
     from tofclip.metrics import nmse
+    from tofclip.notebook import save_figure
     from tofclip.recovery import open_shot, plan_recovery
     from tofclip.simulate import (
         make_default_instrument,

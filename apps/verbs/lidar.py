@@ -10,10 +10,21 @@ from typing import TYPE_CHECKING
 
 from apps.help import make_group
 from apps.jobs import report_summary, run_with_progress
-from apps.options import BIN_WIDTH, CAMERA, CLUSTER, FOCUS, JSON, SUFFIX, TIME_ZERO, arg, flag, opt
+from apps.options import (
+    BIN_WIDTH,
+    CAMERA,
+    CLUSTER,
+    FOCUS,
+    JSON,
+    PICTURE_FORMATS,
+    SUFFIX,
+    TIME_ZERO,
+    arg,
+    flag,
+    opt,
+)
 from apps.progress import show_progress
 from apps.report import (
-    PICTURE_SUFFIXES,
     RECORD_SUFFIXES,
     describe_ranges,
     report,
@@ -22,6 +33,7 @@ from apps.report import (
 from apps.verbs.photons import photons
 from apps.verbs.recover import CLOUD_SUFFIXES, require_format
 from tofclip.errors import InputError
+from tofclip.files import PICTURE_SUFFIXES
 
 if TYPE_CHECKING:
     from tofclip.lidar.ros import StampedCloud
@@ -159,7 +171,7 @@ def parallax(
 @app.command()
 def scene(
     frames: Path = arg("FRAMES", "Recovered frames (HDF5).", read=True),
-    out: Path = opt("PNG", "The picture to write.", ...),
+    out: Path = opt("PNG", f"The picture to write: {PICTURE_FORMATS}.", ...),
     reach: float = opt("MM", "Points this close belong together.", 40.0, name="--reach-mm"),
     fewest_points: int = opt("N", "Smaller groups are not objects.", 40),
     as_json: bool = JSON,
@@ -174,10 +186,10 @@ def scene(
     import numpy as np
 
     from apps.figures.scene import make_scene_figure
-    from apps.figures.style import save_figure
     from tofclip.lidar import Detection, depth, point_cloud
     from tofclip.lidar.processing import find_objects
     from tofclip.lidar.significance import SCENE_BRIGHTNESS_QUANTILE
+    from tofclip.notebook import save_figure
     from tofclip.shots import Frames
 
     require_writable(out, *PICTURE_SUFFIXES, inputs=(frames,))

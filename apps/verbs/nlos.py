@@ -18,9 +18,8 @@ import typer
 
 from apps.help import make_group
 from apps.jobs import EXIT_SOME_FAILED, resolve_device, run_with_progress
-from apps.options import CLUSTER, DEVICE, JSON, SETTINGS, arg, opt
+from apps.options import CLUSTER, DEVICE, JSON, PICTURE_FORMATS, SETTINGS, arg, opt
 from apps.report import (
-    PICTURE_SUFFIXES,
     RECORD_SUFFIXES,
     make_folder,
     name_beside,
@@ -52,7 +51,7 @@ from apps.verbs.nlos_scenes import compare, demo, simulate
 from apps.verbs.nlos_stream import film, stream
 from nlos.settings import METHODS, Settings
 from tofclip.errors import InputError
-from tofclip.files import identify_file, require_apart
+from tofclip.files import PICTURE_SUFFIXES, identify_file, require_apart
 from tofclip.units import MILLIMETRE, PICOSECOND
 
 if TYPE_CHECKING:
@@ -181,7 +180,9 @@ def reconstruct(
     out: Path = opt(
         "FILE", "The volume to write, .h5, .vti, .npz, .exr or .ply; or a folder.", ...
     ),
-    png: Path | None = opt("PNG", "Picture of the volume, three views.", shown="only in a folder"),
+    png: Path | None = opt(
+        "PNG", f"Picture of the volume, three views: {PICTURE_FORMATS}.", shown="only in a folder"
+    ),
     surface: Path | None = opt(
         "PLY", "What is seen from the wall as a mesh: depth, normals, brightness."
     ),

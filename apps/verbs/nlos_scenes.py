@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from apps.options import JSON, SEED, SETTINGS, opt
+from apps.options import JSON, PICTURE_FORMATS, SEED, SETTINGS, opt
 from apps.progress import show_activity
 from apps.report import (
-    PICTURE_SUFFIXES,
     RECORD_SUFFIXES,
     build_provenance,
     make_folder,
@@ -43,7 +42,7 @@ from apps.verbs.nlos_imaging import (
 from nlos.known_scenes import SceneSettings
 from nlos.settings import METHODS
 from tofclip.errors import InputError
-from tofclip.files import require_apart
+from tofclip.files import PICTURE_SUFFIXES, require_apart
 
 if TYPE_CHECKING:
     from nlos import Capture
@@ -78,7 +77,7 @@ class CompareSettings(ImagingSettings):
 @add_setting_flags(CompareSettings)
 def compare(
     source: Path = CAPTURE,
-    out: Path = opt("PNG", "The picture to write.", ...),
+    out: Path = opt("PNG", f"The picture to write: {PICTURE_FORMATS}.", ...),
     volumes: Path | None = opt("DIR", "Folder for the volumes, one file per method."),
     settings: Path | None = SETTINGS,
     as_json: bool = JSON,
@@ -98,10 +97,10 @@ def compare(
     Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
     """
     from apps.figures.nlos import make_comparison_figure
-    from apps.figures.style import save_figure
     from apps.studies.hidden_scene_adjoint import correlate_views
     from nlos.io import read_capture
     from nlos.known_scenes import HiddenTruth, compare_with_truth, measure_sharpness
+    from tofclip.notebook import save_figure
 
     wanted = load_settings(CompareSettings, settings, flags)
     written = [out, name_beside(out, ".toml")]
@@ -223,11 +222,14 @@ class DemoRun:
     truth: HiddenTruth
     # by method; ``flat`` is the hybrid method for a wall without its depth
     images: Mapping[str, MeasuredVolume]
+    wavelength: float  # of all methods, m
 
 
 def demo(
     out: Path = opt("DIR", "Folder for the results; made if missing.", Path("nlos-demo-output")),
-    png: Path | None = opt("PNG", "The picture to write.", shown="nlos_demo.png in --out"),
+    png: Path | None = opt(
+        "PNG", f"The picture to write: {PICTURE_FORMATS}.", shown="nlos_demo.png in --out"
+    ),
     seed: int = SEED,
     as_json: bool = JSON,
 ) -> None:
@@ -241,9 +243,9 @@ def demo(
     Example: tofclip nlos demo --out nlos-demo-output
     """
     from apps.figures.nlos import make_demo_figure
-    from apps.figures.style import save_figure
     from apps.studies.hidden_scene_adjoint import correlate_views
     from nlos.known_scenes import compare_with_truth
+    from tofclip.notebook import save_figure
 
     started = time.perf_counter()
     make_folder(out)
@@ -297,7 +299,7 @@ def run_demo(seed: int) -> DemoRun:
         "backprojection": measure_imaging("backprojection", slow, capture, grid),
         "flat": measure_imaging("as if flat", hybrid, flat, grid),
     }
-    return DemoRun(capture, truth, images)
+    return DemoRun(capture, truth, images, WAVELENGTH_M)
 
 
 def _simulate_letters(seed: int) -> tuple[Capture, HiddenTruth]:

@@ -7,11 +7,12 @@ import time
 from pathlib import Path
 
 from apps.help import make_group
-from apps.options import JSON, NO_BROWSER, PORT, TIME_ZERO, flag, opt
+from apps.options import JSON, NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, flag, opt
 from apps.progress import show_activity, show_progress
-from apps.report import PICTURE_SUFFIXES, make_folder, report, require_writable
+from apps.report import make_folder, report, require_writable
 from apps.verbs.view import PageDoor
 from tofclip.errors import InputError
+from tofclip.files import PICTURE_SUFFIXES
 
 SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board")
 """Those of `apps.occlusion.scenes`, named here so that help appears without loading them."""
@@ -31,7 +32,7 @@ def region(
     ),
     width: float = opt("MM", "Width of the occluder's solid part.", 6.0, name="--width-mm"),
     distance: float = opt("MM", "From the views to the occluder.", 50.0, name="--distance-mm"),
-    out: Path | None = opt("PNG", "Draw it.", shown="no picture"),
+    out: Path | None = opt("PNG", f"Draw it: {PICTURE_FORMATS}.", shown="no picture"),
     as_json: bool = JSON,
 ) -> None:
     """Report how far behind a solid occluder nothing can be seen by any view.
@@ -43,7 +44,7 @@ def region(
     region.png
     """
     from apps.figures.occlusion import make_region_figure
-    from apps.figures.style import save_figure
+    from tofclip.notebook import save_figure
     from tofclip.occlusion import InactiveRegion
 
     if out is not None:
@@ -118,11 +119,11 @@ def demo(
         save_flash_film,
         save_walk_film,
     )
-    from apps.figures.style import save_figure
     from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
     from apps.occlusion.probe import DISTANCE_FACTORS, probe_target
     from apps.occlusion.scenes import make_occlusion_scene, make_walking_scene
     from tofclip.metrics import correlation_coefficient, nmse
+    from tofclip.notebook import save_figure
 
     started = time.perf_counter()
     if live and out is not None:

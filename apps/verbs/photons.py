@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from apps.options import JSON, arg, flag, opt
 from apps.progress import show_share
-from apps.report import PICTURE_SUFFIXES, build_provenance, report, require_writable
+from apps.report import build_provenance, report, require_writable
 from apps.verbs.recover import CLOUD_SUFFIXES, DEPTH_SUFFIX
 from tofclip.errors import InputError
+from tofclip.files import PICTURE_SUFFIXES
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
@@ -117,10 +118,10 @@ def photons(
     import numpy as np
 
     from apps.figures.shot import make_range_figure
-    from apps.figures.style import save_figure
     from tofclip.camera import Camera
     from tofclip.lidar import Pulse, point_cloud, save_depth
     from tofclip.lidar.photons import estimate_pixels, estimate_surface
+    from tofclip.notebook import save_figure
 
     started = time.perf_counter()
     suffix = out.suffix.lower()

@@ -113,7 +113,7 @@ def recover(
     Example: tofclip recover shot.tif --camera camera.h5 --out frames.h5 --time-zero-ns -10.784
     """
     from apps.figures.shot import make_preview_figure
-    from apps.figures.style import save_figure
+    from tofclip.notebook import save_figure
     from tofclip.recovery import (
         compute_view_delays_bins,
         make_method,

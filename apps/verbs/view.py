@@ -10,10 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apps.options import JSON, NO_BROWSER, PORT, TIME_ZERO, arg, flag, opt
+from apps.options import JSON, NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, arg, flag, opt
 from apps.progress import show_activity, show_progress
 from apps.report import report, require_writable
 from tofclip.errors import InputError
+from tofclip.files import PICTURE_SUFFIXES
 from tofclip.plugins import METHODS
 
 if TYPE_CHECKING:
@@ -49,7 +50,9 @@ def view(
     ),
     no_browser: bool = NO_BROWSER,
     desktop: bool = flag("--desktop", "Open a window instead of a page."),
-    png: Path | None = opt("PNG", "Write a picture, without a screen.", shown="none"),
+    png: Path | None = opt(
+        "PNG", f"Write a picture, without a screen: {PICTURE_FORMATS}.", shown="none"
+    ),
     mp4: Path | None = opt("MP4", "Write a film, without a screen.", shown="none"),
     as_json: bool = JSON,
 ) -> None:
@@ -74,9 +77,9 @@ def view(
     # Truth values add up: more than one was asked for.
     if desktop + (png is not None) + (mp4 is not None) > 1:
         raise InputError("choose one of --desktop, --png and --mp4")
-    for out, suffix in ((png, ".png"), (mp4, ".mp4")):
+    for out, suffixes in ((png, PICTURE_SUFFIXES), (mp4, (".mp4",))):
         if out is not None:
-            require_writable(out, suffix, inputs=(source, camera))
+            require_writable(out, *suffixes, inputs=(source, camera))
     started = time.perf_counter()
     is_page = not (desktop or png or mp4)
     door = PageDoor(host, port, no_browser, as_json)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.figures.style import DOTS_PER_INCH, make_figure, save_figure
+from apps.figures.style import DOTS_PER_INCH, make_figure
 from apps.mp4 import open_film
 from apps.viewer.look import Image, Scale, choose_ticks, format_length, load_palette
 from apps.viewer.session import DisplayedFrame, Session
@@ -26,6 +26,7 @@ from apps.viewer.viewpoint import (
     place_viewpoint,
 )
 from tofclip.errors import InputError, MissingDependencyError
+from tofclip.notebook import save_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -258,6 +258,12 @@ class TestReadme:
         assert names["frames"].camera.time_zero == pytest.approx(float(zero) * 1e-9)
         assert Path("scene.ply").stat().st_size > 0
         assert names["volume"].values.shape == names["grid"].shape
+        plate = names["plate"].range
+        # the pulse's middle is at frame 100: 15 ns of flight
+        assert np.median(plate) == pytest.approx(299792458 * 15e-9 / 2, abs=1e-3)
+        assert np.count_nonzero(np.abs(plate - np.median(plate)) < 0.01) == pytest.approx(
+            1200, abs=60
+        )
 
     def test_continuous_integration_runs_its_test_command(self):
         (line,) = [line for line in self.commands("python3 -m venv") if "pytest" in line]

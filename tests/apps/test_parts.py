@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apps.figures.shot import MAX_MOMENTS, choose_moments, make_preview_figure
-from apps.figures.style import make_figure, save_figure
+from apps.figures.style import make_figure
 from apps.progress import show_progress
 from apps.report import build_provenance, make_folder, report, require_writable, to_json_value
 from apps.settings import load_settings, save_settings, setting, settings_to_dict
@@ -27,6 +27,7 @@ from nlos import simulate
 from nlos.known_scenes import WALLS, SceneSettings
 from tofclip import Frames, Streak
 from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.notebook import save_figure
 from tofclip.storage import Record
 
 
