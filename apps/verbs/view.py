@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 
 
 def view(
-    source: str = arg(
-        "SOURCE",
-        "Frames, cloud, volume, raw shot, a folder or stack of clouds or shots, or an instrument's address.",
+    source: list[str] = arg(
+        "SOURCE...",
+        "Frames, cloud, volume, raw shot, a folder or stack of clouds or shots, or an instrument's address; "
+        "several are layers of one scene. Or a state that the page has saved.",
         read=True,
     ),
     camera: Path | None = opt(
@@ -37,9 +38,9 @@ def view(
     time_zero: float | None = TIME_ZERO,
     method: str | None = opt(
         "NAME",
-        f"For raw shots: {', '.join(METHODS.own)}, those with iterations with few, or another of tofclip plugins; "
+        f"For shots and frames: {', '.join(METHODS.own)}, with few iterations, or one of tofclip plugins; "
         "surfaces for one shot.",
-        shown="l1 for one shot, linear for many",
+        shown="l1; frames as they were recovered",
         choices=METHODS,
     ),
     port: int | None = PORT,
@@ -64,8 +65,10 @@ def view(
 
     Example: tofclip view frames.h5 --png scene.png
     """
+    from apps.viewer.layers import LayeredSource
     from apps.viewer.session import Session
     from apps.viewer.source_factory import ShotOptions, open_source
+    from apps.viewer.state import read_state, restore_state
     from apps.viewer.still import (
         choose_frames,
         choose_renderer,
@@ -79,17 +82,29 @@ def view(
         raise InputError("choose one of --desktop, --png and --mp4")
     for out, suffixes in ((png, PICTURE_SUFFIXES), (mp4, (".mp4",))):
         if out is not None:
-            require_writable(out, *suffixes, inputs=(source, camera))
+            require_writable(out, *suffixes, inputs=(*source, camera))
+    known, state = ShotOptions(camera, bin_width, time_zero, method), None
+    if len(source) == 1 and source[0].endswith(".json"):
+        state_file = Path(source[0])
+        state = read_state(state_file)
+        source, known = state["sources"], ShotOptions.from_dict(state.get("options", {}))
     started = time.perf_counter()
     is_page = not (desktop or png or mp4)
     door = PageDoor(host, port, no_browser, as_json)
     # Closing stops a live source and its threads, however the view ends.
     with contextlib.closing(door), contextlib.ExitStack() as opened:
-        with show_activity(f"opening {source}"):
-            announce = partial(door.open_waiting, source) if is_page else lambda _: None
-            known = ShotOptions(camera, bin_width, time_zero, method)
-            found = opened.enter_context(contextlib.closing(open_source(source, known, announce)))
-            session = Session(found)
+        title = ", ".join(one if "://" in one else Path(one).name for one in source)
+        with show_activity(f"opening {title}"):
+            announce = partial(door.open_waiting, title) if is_page else lambda _: None
+            found = [
+                opened.enter_context(contextlib.closing(open_source(one, known, announce)))
+                for one in source
+            ]
+            session = Session(found[0] if len(found) == 1 else LayeredSource(found))
+            names = [one if "://" in one else str(Path(one).resolve()) for one in source]
+            session.opened = {"sources": names, "options": known.to_dict()}
+            if state is not None:
+                restore_state(session, state, state_file)
         if is_page:
             door.serve(session)
             return
@@ -98,9 +113,7 @@ def view(
             return
         renderer, points, further = choose_renderer(), 0, {}
         if png is not None:
-            shown = session.frame_at(0.0)
-            save_picture(session.title, shown, renderer, png)
-            points = len(shown.cloud)
+            points = save_picture(session, renderer, png)
         elif mp4 is not None:
             further = {"pictures": len(choose_frames(session))}
             with show_progress("filming", further["pictures"]) as advance:
@@ -122,12 +135,14 @@ class PageDoor:
     as_json: bool = False  # whether its address is reported as JSON
     _waiting: Served | None = None
 
-    def open_waiting(self, source: str, words: str) -> None:
-        """Serve a page that says what is being done with a source, as the user named it."""
-        from apps.viewer.page import serve_waiting
+    def open_waiting(self, title: str, words: str) -> None:
+        """Serve a page that says what is being done, if there is none yet."""
+        from apps.viewer.page import say_waiting, serve_waiting
         from apps.viewer.server import parse_host
 
-        title = source if "://" in source else Path(source).name
+        if self._waiting is not None:
+            say_waiting(self._waiting[0], words)
+            return
         self._waiting = serve_waiting(title, words, self.port, parse_host(self.host))
         self._show_address(self._waiting[1])
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apps.viewer.source import FloatArray, Limits, Picture
+from apps.viewer.source import FloatArray, Limits, Picture, View
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 from tofclip.units import NANOSECOND
@@ -29,22 +29,36 @@ MIN_SHADE, GAMMA = 0.15, 0.8
 SMALLEST_IN_METRES, SMALLEST_IN_MILLIMETRES = 0.1, 1e-4
 # points from which an equalised scale is made; more would cost time and change nothing to be seen
 MAX_RANKED_POINTS = 100_000
-# all but turbo are perceptually uniform; turbo separates most ranges
+# all but turbo are perceptually uniform
 PALETTES = ("viridis", "cividis", "inferno", "magma", "plasma", "turbo", "grey")
 # turbo's darkest blue and red are left out: shaded, the nearest and the farthest would be black
 TURBO_ENDS = 0.09, 0.93
 
 
-# what every point has: its unit, and how it is taken from a cloud, (n,); heights count upwards from
-# the camera, though y points down
-QUANTITIES: Mapping[str, tuple[str, Callable[[PointCloud], NDArray[Any]]]] = {
-    "range": ("m", lambda cloud: cloud.range),
-    "height": ("m", lambda cloud: -cloud.xyz[:, 1]),
-    "intensity": ("counts", lambda cloud: cloud.intensity),
-    "standard deviation": ("m", lambda cloud: cloud.range_sigma),
-    "return number": ("", lambda cloud: cloud.return_number),
-    "time": ("ns", lambda cloud: cloud.time / np.float32(NANOSECOND)),
+# what points are coloured and filtered by: its unit, and how it is taken from a view, (n,); heights
+# count upwards from the camera, though y points down
+QUANTITIES: Mapping[str, tuple[str, Callable[[View], NDArray[Any]]]] = {
+    "range": ("m", lambda view: view.cloud.range),
+    "height": ("m", lambda view: -view.cloud.xyz[:, 1]),
+    "intensity": ("counts", lambda view: view.cloud.intensity),
+    "brightness": ("", lambda view: view.cloud.intensity),  # of hidden scenes: no photons
+    "standard deviation": ("m", lambda view: view.cloud.range_sigma),
+    "return number": ("", lambda view: view.cloud.return_number),
+    "time": ("ns", lambda view: view.cloud.time / np.float32(NANOSECOND)),
+    "false alarm": ("", lambda view: view.cloud.false_alarm),
+    "layer": ("", lambda view: view.layers),
+    "x": ("m", lambda view: view.cloud.xyz[:, 0]),
+    "y": ("m", lambda view: view.cloud.xyz[:, 1]),
+    "z": ("m", lambda view: view.cloud.xyz[:, 2]),
 }
+
+
+def list_quantities(view: View, first: str = "range") -> tuple[str, ...]:
+    """Return what the points of a view have; `first`: what says most about them."""
+    missing = {"intensity" if first == "brightness" else "brightness"}
+    missing |= set() if np.isfinite(view.cloud.false_alarm).any() else {"false alarm"}
+    missing |= set() if view.layers.size else {"layer"}
+    return tuple(name for name in QUANTITIES if name not in missing)
 
 
 @dataclass(frozen=True)
@@ -52,7 +66,7 @@ class Colouring:
     """How points are coloured."""
 
     quantity: str = "range"  # one of `QUANTITIES`
-    palette: str = "turbo"  # one of `PALETTES`
+    palette: str = "viridis"  # one of `PALETTES`
     # values of the first and the last colour, in the quantity's unit; `LIMIT_PERCENTILES`
     # percentiles by default
     limits: Limits | None = None
@@ -60,7 +74,7 @@ class Colouring:
     equalised: bool = False
     # whether dim points are drawn darker, so that what is written on a surface can be read in
     # colours of range
-    shaded: bool = True
+    shaded: bool = False
 
     def __post_init__(self) -> None:
         low, high = self.limits or (0.0, 1.0)
@@ -93,6 +107,18 @@ class Scale:
         """Values of the first and the last colour."""
         return float(self.values[0]), float(self.values[-1])
 
+    @property
+    def factor(self) -> float:
+        """What its values are multiplied with where they are written: 1000 where they are in mm."""
+        is_small = self.unit == "m" and max(map(abs, self.limits)) < SMALLEST_IN_METRES
+        return 1e3 if is_small else 1.0
+
+    @property
+    def title(self) -> str:
+        """Quantity and unit, as they are written."""
+        unit = "mm" if self.factor > 1 else self.unit
+        return f"{self.quantity} ({unit})" if unit else self.quantity
+
     def colours(self, values: NDArray[Any]) -> NDArray[np.uint8]:
         """Return red, green and blue, (n, 3); values beyond the limits get the outermost colours."""
         low, high = self.limits
@@ -107,10 +133,10 @@ class Scale:
         return colours
 
 
-def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
-    """Return the scale of a cloud's colours."""
+def make_scale(view: View, colouring: Colouring) -> Scale:
+    """Return the scale of a view's colours."""
     unit, extract = QUANTITIES[colouring.quantity]
-    values = extract(cloud)
+    values, cloud = extract(view), view.cloud
     low, high = colouring.limits or _find_limits(values)
     scale = np.linspace(low, high, PALETTE_SIZE)
     inside = values[(values >= low) & (values <= high)]
@@ -120,7 +146,7 @@ def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
         scale[0], scale[-1] = low, high
     full_light = 0.0
     # Intensity is in the colour already.
-    is_plain = not colouring.shaded or colouring.quantity == "intensity" or len(cloud) == 0
+    is_plain = not colouring.shaded or extract is QUANTITIES["intensity"][1] or len(cloud) == 0
     if not is_plain and np.ptp(cloud.intensity) > 0:
         full_light = float(np.percentile(cloud.intensity, FULL_LIGHT_PERCENTILE))
     return Scale(colouring.quantity, unit, colouring.palette, scale, full_light)
@@ -136,12 +162,12 @@ def _find_limits(values: NDArray[Any]) -> Limits:
     return low - 0.5, low + 0.5  # all values alike, to rounding: any width will do but zero
 
 
-def colour_points(cloud: PointCloud, scale: Scale) -> NDArray[np.uint8]:
+def colour_points(view: View, scale: Scale) -> NDArray[np.uint8]:
     """Return each point's red, green and blue, (n, 3)."""
-    colours = scale.colours(QUANTITIES[scale.quantity][1](cloud))
+    colours = scale.colours(QUANTITIES[scale.quantity][1](view))
     if scale.full_light <= 0:
         return colours
-    light = np.clip(cloud.intensity / np.float32(scale.full_light), 0, 1) ** np.float32(GAMMA)
+    light = np.clip(view.cloud.intensity / np.float32(scale.full_light), 0, 1) ** np.float32(GAMMA)
     shade = MIN_SHADE + (1 - MIN_SHADE) * light
     return np.asarray(colours * shade[:, np.newaxis], np.uint8)
 
@@ -159,10 +185,7 @@ def choose_ticks(scale: Scale, count: int = 6) -> tuple[list[tuple[float, str]],
     """Return about `count` round values of a scale, each with where it lies, 0 for the first colour
     to 1 for the last; and the scale's title, in a unit in which the numbers are short.
     """
-    low, high = scale.limits
-    factor, unit = 1.0, scale.unit
-    if unit == "m" and max(abs(low), abs(high)) < SMALLEST_IN_METRES:
-        factor, unit = 1e3, "mm"
+    (low, high), factor = scale.limits, scale.factor
     values = choose_round_values(low * factor, high * factor, count)
     step = values[1] - values[0] if len(values) > 1 else (high - low) * factor
     places = np.interp(values / factor, scale.values, np.linspace(0, 1, PALETTE_SIZE))
@@ -171,8 +194,7 @@ def choose_ticks(scale: Scale, count: int = 6) -> tuple[list[tuple[float, str]],
         f"{value:.1e}".replace("e+0", "e") if abs(value) >= 1e4 else f"{value:.{digits}f}"
         for value in values + 0.0  # no -0
     ]
-    title = f"{scale.quantity} ({unit})" if unit else scale.quantity
-    return list(zip(places.tolist(), labels, strict=True)), title
+    return list(zip(places.tolist(), labels, strict=True)), scale.title
 
 
 def choose_round_values(low: float, high: float, count: int) -> FloatArray:
@@ -210,7 +232,7 @@ class Pick:
     def description(self) -> str:
         """One line for each thing that is known."""
         (x, y, z), point = self.position, self.point
-        return_text = f"{point.intensity[0]:.4g} counts, return {point.return_number[0]}"
+        return_text = f"intensity {point.intensity[0]:,.0f}, return {point.return_number[0]}"
         lines = [
             f"x {x:.4f}, y {y:.4f}, z {z:.4f} m",
             # give or take one standard deviation
@@ -218,7 +240,7 @@ class Pick:
             f"{point.time[0] / NANOSECOND:.3f} ns, {return_text}",
         ]
         if self.pixel is not None:
-            lines.append(f"pixel row {self.pixel[0]}, column {self.pixel[1]}")
+            lines.append(f"pixel row {self.pixel[0] + 1}, column {self.pixel[1] + 1}")
         return "\n".join(lines)
 
 

@@ -50,8 +50,14 @@ def serve_waiting(title: str, words: str, port: int | None = None, host: str = L
     """
     server, address = start_server(port, host)
     _set_up_panel(server, title)
-    server.gui.add_html(render_text_html("waiting", f"{words} ..."))
+    say_waiting(server, words)
     return server, address
+
+
+def say_waiting(server: viser.ViserServer, words: str) -> None:
+    """Say on a waiting page what is being done now."""
+    server.gui.reset()
+    server.gui.add_html(render_text_html("waiting", f"{words} ..."))
 
 
 class Page:
@@ -71,7 +77,7 @@ class Page:
         self._commands: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._stopping, self._woken = threading.Event(), threading.Event()
         first = session.frame_at(time.monotonic())
-        self.viewpoint = place_viewpoint(first.cloud.xyz, SCENE_ASPECT)
+        self.viewpoint = session.viewpoint or place_viewpoint(first.cloud.xyz, SCENE_ASPECT)
         server, self.address = waiting or start_server(port, host)
         server.gui.reset()
         self.server, title = server, session.source.title
@@ -83,8 +89,9 @@ class Page:
         left.dock_left()
         left.set_width(PICTURES_PANEL_PX)
         self.controls = Controls(server, session, self.post, first, self.points.resize)
+        self._show_bar: Callable[[Any], None] = lambda _: None
         if len(first.cloud):
-            draw_furniture(server, Box.around(first.cloud.xyz))
+            self._show_bar = draw_furniture(server, Box.around(first.cloud.xyz))
         add_selection(server, session, self.post, left)
         self._framed_cloud = first.cloud.xyz
         list_views = partial(make_presets, first.cloud.xyz)
@@ -156,10 +163,11 @@ class Page:
 
         def follow_window(camera: Any) -> None:
             self.points.note_movement()
+            self._show_bar(client)
             aspect = camera.image_width / max(camera.image_height, 1)
             if framed and not np.allclose(camera.position, framed[-1].eye, atol=1e-4):
                 return  # moved by hand
-            viewpoint = place_viewpoint(self._framed_cloud, aspect)
+            viewpoint = self.session.viewpoint or place_viewpoint(self._framed_cloud, aspect)
             if framed and viewpoint.is_close_to(framed[-1]):
                 return
             framed.append(viewpoint)

@@ -6,6 +6,7 @@ Each control changes the session by way of `post`, which has that done by the th
 
 from __future__ import annotations
 
+import contextlib
 import html
 import io
 import tempfile
@@ -24,24 +25,37 @@ from apps.viewer.look import (
     PALETTE_SIZE,
     PALETTES,
     QUANTITIES,
+    Colouring,
     Pick,
     Scale,
     choose_round_values,
     choose_ticks,
     format_length,
+    list_quantities,
     load_palette,
+    make_scale,
 )
-from apps.viewer.points import NO_SHADOWS, ClipBox, Post, add_lines
-from apps.viewer.session import DisplayedFrame, Filters, Session, list_filtered
-from apps.viewer.source import NO_LIMITS, Choice, FloatArray, Limits
+from apps.viewer.points import NO_SHADOWS, ClipBox, Post, SectionPlane, add_lines
+from apps.viewer.session import DisplayedFrame, Session
+from apps.viewer.source import NO_LIMITS, OFF_ON, Choice, FloatArray, Limits, Setting
+from apps.viewer.state import write_state
 from apps.viewer.still import BACKGROUND, draw_colour_bar
-from apps.viewer.viewpoint import Box, Viewpoint, measure_point_spacing, move_camera
+from apps.viewer.viewpoint import (
+    Box,
+    Viewpoint,
+    measure_point_spacing,
+    move_camera,
+    read_viewpoint,
+)
+from tofclip.lidar import PointCloud
+from tofclip.lidar.processing import fit_plane
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
     import viser
 
 GRADIENT_STOPS, LABEL_MARGIN = 24, 0.04
+HANDLES_EM = 7.3  # where sliders begin, in widths of an m
 TEXT_STYLE = "padding:0.2em 0.8em 0.6em;font-size:0.85em"
 HTML_STYLE = f"{TEXT_STYLE};line-height:1.5"
 LINE_STYLE = (
@@ -52,6 +66,10 @@ RED, BLUE, AMBER = "#e5484d", "#3e8ed0", "#ffb020"
 # shown by that very style, which needs no script.
 LOST_STYLE = """
 .tofclip-lost {display: none}
+.tofclip-notes {
+  position: fixed; z-index: 5; pointer-events: none; bottom: 0.6em; left: 260px;
+  max-width: calc(100vw - 640px); text-shadow: 0 0 4px black}
+@media (max-width: 576px) {.tofclip-notes {position: static; max-width: none}}
 div[style*="pointer-events: none"] .tofclip-lost {
   display: block; position: fixed; z-index: 1000; top: 1em; left: 50%; transform: translateX(-50%);
   padding: 0.8em 1.2em; border-radius: 0.4em; background: #e5484d; color: white; font-size: 1.1em}
@@ -64,6 +82,12 @@ LOST_TEXT = (
 SHARED_TEXT = (
     "Every browser at this address shows the same frame, colours, filters and picked points; where "
     "you look from is your own."
+)
+# On a phone the panel lies over the scene: it begins folded, once.
+FOLD_SCRIPT = (
+    "if(innerWidth<576&&!window.tofclipFolded){window.tofclipFolded=1;"
+    "[...document.querySelectorAll('[class*=Paper-root] div')].find("
+    "e=>getComputedStyle(e).cursor=='pointer')?.click()}"
 )
 BLANK_PIXEL = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7"
 
@@ -79,7 +103,7 @@ def render_status_html(
     is_live, frames = label == "LIVE", len(session.source)
     what = html.escape(shown.whole_name or source.frame_name)
     if not shown.whole_name and (frames > 1 or is_live):
-        what += f" <b id='frame-number'>{shown.frame}</b> of {frames}"
+        what += f" <b id='frame-number'>{shown.frame + 1}</b> of {frames}"
     colour = RED if is_live else BLUE
     lines = [f"<b id='label' style='color:{colour}'>{label}</b> <span id='what'>{what}</span>"]
     if np.isfinite(shown.time):
@@ -98,10 +122,12 @@ def render_status_html(
         delay = f"{1e3 * inflow.latency:.0f} ms" if is_known else "not known yet"
         lines.append(f"shot to cloud {delay}, {inflow.lost} dropped")
     parts = [f"<div style='{LINE_STYLE}'>{line}</div>" for line in lines]
+    # over the scene: in the panel, a note that comes would push the controls down
     amber = f"<div class='note' style='color:{AMBER}'>"
-    parts += [f"{amber}{html.escape(note)}</div>" for note in session.notes]
+    notes = [f"{amber}{html.escape(note)}</div>" for note in session.notes]
     if inflow.failure_text:
-        parts.append(f"<div style='color:{RED}'>{html.escape(inflow.failure_text)}</div>")
+        notes.append(f"<div style='color:{RED}'>{html.escape(inflow.failure_text)}</div>")
+    parts.append(f"<div class='tofclip-notes'>{''.join(notes)}</div>")
     return f"<div style='{HTML_STYLE}'>{''.join(parts)}</div>"
 
 
@@ -125,11 +151,38 @@ def render_scale_html(scale: Scale) -> str:
     )
 
 
+BAR_COUNT, OUTSIDE_COLOUR = 64, (70, 76, 88)
+
+
+def render_histogram_html(
+    values: NDArray[Any], span: Limits, limits: Limits, scale: Scale | None
+) -> str:
+    """Return bars of how many points have which value, in the colours of a scale; grey beyond the
+    limits. Their heights go with the square root of the numbers, so that a few points are seen.
+    """
+    counts, edges = np.histogram(values, BAR_COUNT, span)
+    middles = (edges[1:] + edges[:-1]) / 2
+    blue = np.full((BAR_COUNT, 3), (62, 142, 208), np.uint8)
+    colours = blue if scale is None else scale.colours(middles)
+    colours[(middles < limits[0]) | (middles > limits[1])] = OUTSIDE_COLOUR
+    heights = 20 * np.sqrt(counts / max(1, counts.max()))
+    bars = "".join(
+        f"<rect x='{n}' y='{20 - height:.1f}' width='1.02' height='{height:.1f}' fill='rgb({r},{g},{b})'/>"
+        for n, (height, (r, g, b)) in enumerate(zip(heights, colours.tolist(), strict=True))
+        if height
+    )
+    return (
+        f"<div style='padding:0 1.1em 0 {HANDLES_EM}em'><svg viewBox='0 0 {BAR_COUNT} 20' "
+        f"preserveAspectRatio='none' style='width:100%;height:44px;display:block'>{bars}</svg></div>"
+    )
+
+
 def render_page_html(title: str) -> str:
     """Return what is said at the foot of the controls, and what names the browser's tab."""
     name = html.escape(format_page_title(title), quote=True)
     # a picture's event is the one script that runs in a text put into a page
-    tab = f'<img hidden src="{BLANK_PIXEL}" data-name="{name}" onload="document.title=this.dataset.name">'
+    act = f"document.title=this.dataset.name;{FOLD_SCRIPT}"
+    tab = f'<img hidden src="{BLANK_PIXEL}" data-name="{name}" onload="{act}">'
     return (
         f"<style>{LOST_STYLE}</style>{tab}<div class='tofclip-lost'>{LOST_TEXT}</div>"
         f"<div id='shared' style='{HTML_STYLE};opacity:0.7'>{SHARED_TEXT}</div>"
@@ -154,7 +207,7 @@ SPEEDS = {"1/16": 1 / 16, "1/8": 1 / 8, "1/4": 1 / 4, "1/2": 1 / 2} | {
 FRAME_STEPS = {"|<": -(10**9), "-10": -10, "-1": -1, "+1": 1, "+10": 10, ">|": 10**9}
 MAX_TIME_MARKS = 4
 MIN_POINT_SIZE_MM, MAX_POINT_SIZE_MM = 0.1, 50.0
-FILTER_NAMES = ("range", "intensity", "x", "y", "z")
+HISTOGRAM_PERCENTILES = 0.2, 99.8  # strays do not make the rest narrow
 
 
 def bind_user_input(handle: Any, post: Post, act: Callable[[Any], object]) -> None:
@@ -169,6 +222,58 @@ def bind_user_input(handle: Any, post: Post, act: Callable[[Any], object]) -> No
             post(lambda: act(value))
 
     (handle.on_update if hasattr(handle, "on_update") else handle.on_click)(changed)
+
+
+class Handles:
+    """A histogram, two handles below it and two boxes to type into, for the limits of a quantity. `act`
+    is called with what a user sets, in the quantity's unit; it is shown in the unit of its legend.
+    """
+
+    def __init__(
+        self, gui: Any, names: tuple[str, str], post: Post, act: Callable[[Limits], object]
+    ) -> None:
+        self._bars = gui.add_html("")
+        self._slider = gui.add_multi_slider(names[0], 0.0, 1.0, 0.01, (0.0, 1.0))
+        hint = "least and most, in the unit of the histogram"
+        self._boxes = gui.add_vector2(names[1], (0.0, 1.0), step=0.01, hint=hint)
+        self._factor = 1.0
+        self._known: tuple[Any, ...] = ()
+
+        def set_limits(value: Any) -> None:
+            low, high = (float(side) / self._factor for side in value)
+            act((low, high))
+
+        for handle in (self._slider, self._boxes):
+            bind_user_input(handle, post, set_limits)
+
+    def show(self, values: NDArray[Any], limits: Limits, scale: Scale, coloured: bool) -> None:
+        """Bring it up to date. `scale`: says the unit; `coloured`: whether the bars have its colours."""
+        known = values.size, values[:1].tobytes(), limits, scale.title, coloured and scale.palette
+        if known == self._known:
+            return
+        self._known, self._factor = known, scale.factor
+        finite = values[np.isfinite(values)].astype(np.float64)
+        ends = np.percentile(finite, HISTOGRAM_PERCENTILES) if finite.size else np.array([0.0, 1.0])
+        set_ones = [side for side in limits if np.isfinite(side)]
+        low, high = min([ends[0], *set_ones]), max([ends[1], *set_ones])
+        step = 10.0 ** np.floor(np.log10(max(high - low, 1e-9) * self._factor / 100))
+        digits = max(0, -round(np.log10(step)))
+        low = float(np.floor(low * self._factor / step) * step)
+        high = max(float(np.ceil(high * self._factor / step) * step), low + step)
+        span = low / self._factor, high / self._factor
+        self._bars.content = render_histogram_html(
+            finite, span, limits, scale if coloured else None
+        )
+        least, most = (round(end, digits) for end in (low, high))
+        value = tuple(
+            round(float(np.clip(side * self._factor, least, most)), digits) for side in limits
+        )
+        self._slider.min, self._slider.max, self._slider.step = least, most, step
+        self._slider.precision = self._boxes.precision = digits
+        self._slider._marks = None
+        for handle in (self._slider, self._boxes):
+            if tuple(handle.value) != value:
+                handle.value = value
 
 
 class Controls:
@@ -190,19 +295,18 @@ class Controls:
         self._frame: Any = None
         if session.source.inflow.is_live or len(session.source) > 1:
             self._add_playback()
-        handle: Any
+        groups: dict[str, Any] = {"": contextlib.nullcontext()}
         for setting in session.source.settings:
-            if isinstance(setting, Choice):
-                words: Any = {"initial_value": setting.value, "hint": setting.hint}
-                handle = self._gui.add_dropdown(setting.name, setting.options, **words)
-            else:
-                extent = (setting.low, setting.high, setting.step, setting.value)
-                handle = self._gui.add_slider(setting.name, *extent, hint=setting.hint)
-            self._on(handle, partial(setattr, setting, "value"))
+            if setting.group not in groups:
+                groups[setting.group] = self._gui.add_folder(setting.group)
+            with groups[setting.group]:
+                self._add_setting(setting)
         with self._gui.add_folder("colours"):
             self._add_colours(first, resize)
         with self._gui.add_folder("filters", expand_by_default=False):
             self._add_filters(first, ClipBox(server.scene, self._take_clip_box))
+        with self._gui.add_folder("section and plane", expand_by_default=False):
+            self._add_section(SectionPlane(server.scene, lambda: post(self._take_section)))
 
     @property
     def point_size(self) -> float:
@@ -211,6 +315,14 @@ class Controls:
 
     def show(self, shown: DisplayedFrame, status: str) -> None:
         """Bring texts and controls up to date with what is shown."""
+        session, view = self._session, shown.whole
+        name = self._field.value
+        values = QUANTITIES[name][1](view)
+        limits = session.filters.limits.get(name, NO_LIMITS)
+        of_field = make_scale(view, Colouring(name)) if values.size else shown.scale
+        self._kept.show(values, limits, of_field, False)
+        values = QUANTITIES[shown.scale.quantity][1](view)
+        self._limits.show(values, shown.scale.limits, shown.scale, True)
         for text, content in (
             (self._status, status),
             (self._scale, render_scale_html(shown.scale)),
@@ -218,26 +330,44 @@ class Controls:
             if text.content != content:
                 text.content = content
         if self._frame is not None:
-            last = max(1, len(self._session.source) - 1)
+            last = max(2, len(self._session.source))
             if self._frame.max != last:
                 self._frame.max = last
-            self._frame.value = shown.frame
-        # Limits that the user has set are not overwritten.
-        if self._session.colouring.limits is None:
-            low, high = shown.scale.limits
-            self._limits.value = (round(low, 4), round(high, 4))
+            self._frame.value = shown.frame + 1
 
     def _on(self, handle: Any, act: Callable[[Any], object]) -> None:
         bind_user_input(handle, self._post, act)
 
+    def _add_setting(self, setting: Setting | Choice) -> None:
+        """Add the control of what a source lets one set."""
+        gui: Any = self._gui
+        handle: Any
+
+        def set_value(value: Any) -> None:
+            setting.value = OFF_ON[value] if isinstance(value, bool) else value
+            # what follows may take seconds, in which nothing is shown
+            self._status.content = self._status.content.replace(
+                f">{self._session.label}<", ">WORKING<"
+            )
+
+        if isinstance(setting, Setting):
+            extent = (setting.low, setting.high, setting.step, setting.value)
+            handle = gui.add_slider(setting.name, *extent, hint=setting.hint)
+        elif setting.options == OFF_ON:
+            handle = gui.add_checkbox(setting.name, setting.value == "on", hint=setting.hint)
+        else:
+            words: Any = {"initial_value": setting.value, "hint": setting.hint}
+            handle = gui.add_dropdown(setting.name, setting.options, **words)
+        self._on(handle, set_value)
+
     def _add_playback(self) -> None:
         source, clock, gui = self._session.source, self._session.clock, self._gui
         # A slider needs two different ends, even for a single frame.
-        last = max(1, len(source) - 1)
+        last = max(2, len(source))
         marks = None if source.times is None else mark_times(source.times)
-        now = min(clock.frame, last)
-        self._frame = gui.add_slider(source.frame_name, 0, last, 1, now, marks=marks)
-        self._on(self._frame, clock.jump)
+        now = min(clock.frame + 1, last)
+        self._frame = gui.add_slider(source.frame_name, 1, last, 1, now, marks=marks)
+        self._on(self._frame, lambda number: clock.jump(number - 1))
         words = {"play": clock.play, "pause": clock.pause}
         if source.inflow.is_live:
             words["live"] = clock.follow
@@ -256,103 +386,156 @@ class Controls:
             session.colouring = replace(session.colouring, **changes)
             automatic.value = session.colouring.limits is None
 
-        def set_limits(limits: Limits | None) -> None:
-            look(limits=None if limits is None else (float(limits[0]), float(limits[1])))
-
         def add_checkbox(name: str, is_on: bool, hint: str, act: Callable[[bool], object]) -> Any:
             box = gui.add_checkbox(name, is_on, hint=hint)
             self._on(box, act)
             return box
 
         self._scale = gui.add_html(render_scale_html(first.scale))
-        quantity = gui.add_dropdown("colour", tuple(QUANTITIES), initial_value="range")
+        names = list_quantities(first.whole, session.source.quantity)
+        quantity = gui.add_dropdown("colour", names, initial_value=colouring.quantity)
         # Limits of one quantity mean nothing for another, which may have another unit.
         self._on(quantity, lambda name: look(quantity=name, limits=None))
         palette = gui.add_dropdown("palette", PALETTES, initial_value=colouring.palette)
         self._on(palette, lambda name: look(palette=name))
-        limits = gui.add_vector2("limits", first.scale.limits, hint="in the unit of the scale")
-        self._limits: Any = limits
-        self._on(limits, set_limits)
+        self._limits = Handles(
+            gui, ("limits", "from, to"), self._post, lambda limits: look(limits=limits)
+        )
         automatic = add_checkbox(
             "automatic",
-            True,
+            colouring.limits is None,
             "limits that suit nearly all points",
-            lambda on: set_limits(None if on else limits.value),
+            lambda on: look(
+                limits=None if on or session.latest is None else session.latest.scale.limits
+            ),
         )
         hint = "give every colour to equally many points"
         add_checkbox("equalise", colouring.equalised, hint, lambda on: look(equalised=on))
         hint = "draw dim points darker"
         add_checkbox("shade", colouring.shaded, hint, lambda on: look(shaded=on))
-        side_mm = 5.0
-        if len(first.cloud) > 1:  # neighbours about touch
-            side_mm = 1e3 * measure_point_spacing(first.cloud.xyz)
+        side_mm = 5.0 if session.point_size is None else 1e3 * session.point_size
+        if session.point_size is None and len(first.cloud) > 1:  # neighbours about touch
+            own = first.layers == first.layers[0] if first.layers.size else slice(None)
+            side_mm = 1e3 * measure_point_spacing(first.cloud.xyz[own])
         side_mm = round(min(max(side_mm, MIN_POINT_SIZE_MM), MAX_POINT_SIZE_MM), 1)
         extent = (MIN_POINT_SIZE_MM, MAX_POINT_SIZE_MM, 0.1, side_mm)
         self._size = gui.add_slider("point size", *extent, hint="mm")
-        self._on(self._size, lambda _: resize(self.point_size))
+        session.point_size = side_mm / 1e3
+
+        def set_size(side_mm: float) -> None:
+            session.point_size = side_mm / 1e3
+            resize(side_mm / 1e3)
+
+        self._on(self._size, set_size)
 
     def _add_filters(self, first: DisplayedFrame, clip: ClipBox) -> None:
         session, gui = self._session, self._gui
-        columns = list_filtered(session.source.view(first.frame).cloud)  # whole, as without filters
-        self._filters: dict[str, tuple[Any, Limits]] = {}
 
         def show_clip_box(is_shown: bool) -> None:
             if not is_shown:
                 clip.hide()
-                return
-            sides = np.array([self._filters[axis][0].value for axis in "xyz"], float)
-            clip.show(Box(sides[:, 0], sides[:, 1]))
+            elif session.latest is not None:
+                view = session.latest.whole
+                limits = [session.filters.limits.get(axis, NO_LIMITS) for axis in "xyz"]
+                low, high = np.array(limits, float).T
+                whole = Box(view.cloud.xyz.min(axis=0), view.cloud.xyz.max(axis=0))
+                clip.show(Box(np.maximum(low, whole.low), np.minimum(high, whole.high)))
 
         def reset() -> None:
-            for handle, whole in self._filters.values():
-                handle.value = whole
-            session.filters = Filters()
+            session.filters = replace(session.filters, limits={})
             show_clip_box(clip.is_shown)
 
-        hint = "least and most; in m, intensities in counts"
-        for name in FILTER_NAMES:
-            values, whole = columns[name], (0.0, 1.0)
-            if len(values):  # rounded outwards
-                whole = (
-                    float(np.floor(values.min() * 100) / 100),
-                    float(np.ceil(values.max() * 100) / 100),
-                )
-            low, high = getattr(session.filters, name)
-            handle = gui.add_vector2(name, (max(low, whole[0]), min(high, whole[1])), hint=hint)
-            self._filters[name] = handle, whole
-            self._on(handle, lambda _: self._set_filters())
+        def keep(limits: Limits) -> None:
+            session.filters = session.filters.limit(self._field.value, limits)
+
+        names = list_quantities(first.whole, session.source.quantity)
+        hint = "points are left out by any of these, by all that were set"
+        self._field = gui.add_dropdown("quantity", names, initial_value=names[0], hint=hint)
+        self._kept = Handles(gui, ("keep", "keep from, to"), self._post, keep)
         hint = "drag the corners of a box in the scene; same as x, y and z"
         self._on(gui.add_checkbox("clip box", False, hint=hint), show_clip_box)
         gui.add_button("reset filters").on_click(lambda _: self._post(reset))
-
-    def _set_filters(self) -> None:
-        sides = {}
-        for name, (handle, whole) in self._filters.items():
-            # A side that was not moved does not limit later frames.
-            low = handle.value[0] if handle.value[0] > whole[0] else NO_LIMITS[0]
-            high = handle.value[1] if handle.value[1] < whole[1] else NO_LIMITS[1]
-            sides[name] = low, high
-        self._session.filters = Filters(**sides)
 
     def _take_clip_box(self, box: Box) -> None:
         """Filter by a box that was dragged."""
 
         def take() -> None:
-            for axis, low, high in zip("xyz", box.low, box.high, strict=True):
-                self._filters[axis][0].value = (round(float(low), 4), round(float(high), 4))
-            self._set_filters()
+            for axis, low, high in zip("xyz", box.low.tolist(), box.high.tolist(), strict=True):
+                self._session.filters = self._session.filters.limit(axis, (low, high))
 
         self._post(take)
 
+    def _add_section(self, plane: SectionPlane) -> None:
+        session, gui, self._plane = self._session, self._gui, plane
+
+        def find_cloud() -> PointCloud:
+            """Of what the filters leave, also beyond the section."""
+            assert session.latest is not None
+            view = session.latest.whole
+            return view.cloud[replace(session.filters, section=None).select(view)]
+
+        def show_plane(is_shown: bool) -> None:
+            cloud, section = find_cloud(), session.filters.section
+            if is_shown and len(cloud):
+                point, normal = (
+                    np.median(cloud.xyz, axis=0).astype(float),
+                    np.array((0.0, 0.0, 1.0)),
+                )
+                if section is not None:
+                    normal = np.array(section.normal)
+                    point += (section.offset - normal @ point) * normal
+                plane.show(point, normal, Box.around(cloud.xyz).reach / 2)
+            else:
+                plane.hide()
+            self._take_section()
+
+        def fit() -> None:
+            cloud = find_cloud()
+            found = fit_plane(cloud, self._thickness.value / 2e3)
+            away = np.degrees(np.arccos(min(1.0, abs(float(found.normal[2])))))
+            x, y, z = found.normal
+            words = (
+                f"{found.inliers.sum():,} of {len(cloud):,} points, "
+                f"residual {format_length(found.rms)} rms\n"
+                f"normal {x:.3f}, {y:.3f}, {z:.3f}, {away:.1f}° from z\n"
+                f"{abs(found.offset):.4f} m from the origin"
+            )
+            self._fitted.content = render_text_html("plane", words)
+            if plane.is_shown:
+                middle = cloud.xyz[found.inliers].mean(axis=0).astype(float)
+                plane.show(middle, found.normal, Box.around(cloud.xyz).reach / 2)
+                self._take_section()
+
+        section = session.filters.section
+        hint = "drag and turn a plane in the scene; only points close to it are shown"
+        switch = gui.add_checkbox("section", section is not None, hint=hint)
+        self._on(switch, show_plane)
+        thick_mm = 20.0 if section is None else 1e3 * section.thickness
+        hint = "mm: of the section, and of what counts as on a fitted plane"
+        self._thickness = gui.add_slider("thickness", 0.5, 200.0, 0.5, thick_mm, hint=hint)
+        self._on(self._thickness, lambda _: self._take_section())
+        hint = "through most of the points that are shown; a section goes there"
+        gui.add_button("fit plane", hint=hint).on_click(lambda _: self._post(fit))
+        self._fitted = gui.add_html(render_text_html("plane", "no plane fitted yet\n \n "))
+        if section is not None:
+            show_plane(True)
+
+    def _take_section(self) -> None:
+        """Show what lies about the plane."""
+        section = self._plane.find_section(self._thickness.value / 1e3)
+        self._session.filters = replace(self._session.filters, section=section)
+
 
 def mark_times(times: FloatArray) -> tuple[tuple[int, str], ...]:
-    """Return the frames at round times of flight, with their times in ns, for a time line. `times`
+    """Return the frames, from 1, at round times of flight, with their times in ns, for a time line. `times`
     (frames,): s; rising.
     """
     in_ns = times / NANOSECOND
     places = choose_round_values(in_ns[0], in_ns[-1], MAX_TIME_MARKS)
     frames = np.abs(in_ns - places[:, np.newaxis]).argmin(axis=1)
-    return tuple((int(frame), f"{place:g} ns") for frame, place in zip(frames, places, strict=True))
+    return tuple(
+        (int(frame) + 1, f"{place:g} ns") for frame, place in zip(frames, places, strict=True)
+    )
 
 
 MARKER_COLOURS = ((255, 80, 80), (80, 220, 255))
@@ -366,8 +549,8 @@ PLOT_LOOK: Any = {
         {"label": "return", "stroke": "#ff5050", "fill": "#ff505066", "width": 1.5},
     ),
     "axes": (
-        {"stroke": "#aab", "label": "range (m), c t / 2", "size": 30, "labelSize": 18},
-        {"stroke": "#aab", "label": "counts", "size": 40, "labelSize": 18},
+        {"stroke": "#aab", "label": "range (m), c t / 2", "size": 32, "labelSize": 16, "space": 60},
+        {"stroke": "#aab", "label": "counts", "size": 56, "labelSize": 16},
     ),
     "scales": {"x": {"time": False}},
     "legend": {"show": False},
@@ -431,6 +614,7 @@ def add_selection(
     )
 
 
+CHOOSE_VIEW = "..."
 RENDER_TIMEOUT_S = 60.0  # a software renderer takes ten for millions of points
 MAX_SIDE_PX = 1600
 LEGEND_PX = 70  # below the picture
@@ -469,19 +653,21 @@ def add_export(
             session.latest.cloud.save(path)
             client.send_file_download("tofclip.ply", path.read_bytes(), save_immediately=True)
 
+    def send_state(client: viser.ClientHandle) -> None:
+        state = write_state(session, read_viewpoint(client.camera)).encode()
+        client.send_file_download("tofclip.json", state, save_immediately=True)
+
     def add_bookmark(client: viser.ClientHandle) -> None:
         name = f"view {len(bookmarked) + 1}"
-        camera = client.camera
-        # Copied, because the page goes on changing the camera's own arrays.
-        bookmarked[name] = Viewpoint(camera.position.copy(), camera.look_at.copy(), camera.fov)
-        bookmarks.options = (*list_views(1.0), *bookmarked)
-        bookmarks.value = name
+        bookmarked[name] = read_viewpoint(client.camera)
+        bookmarks.options = (CHOOSE_VIEW, *list_views(1.0), *bookmarked)
 
     def go_to_bookmark(event: Any) -> None:
-        if event.client is not None:
+        if event.client is not None and event.target.value != CHOOSE_VIEW:
             camera = event.client.camera
             presets = list_views(camera.image_width / max(camera.image_height, 1))
             move_camera(camera, {**presets, **bookmarked}[event.target.value])
+            bookmarks.value = CHOOSE_VIEW  # where one looks from is each browser's own
 
     def show_keys(client: viser.ClientHandle) -> None:
         with client.gui.add_modal("keys") as modal:
@@ -498,10 +684,13 @@ def add_export(
     gui.add_button("screenshot").on_click(for_client(send_screenshot))
     export = gui.add_button("export", hint="the points that are shown, as PLY")
     export.on_click(for_client(lambda client: post(lambda: send_points(client))))
-    bookmarks: Any = gui.add_dropdown("view from", tuple(list_views(1.0)))
+    bookmarks: Any = gui.add_dropdown("view from", (CHOOSE_VIEW, *list_views(1.0)))
     bookmarks.on_update(go_to_bookmark)
     bookmark = gui.add_button("bookmark", hint="remember where one looks from")
     bookmark.on_click(for_client(add_bookmark))
+    hint = "sources, frame, settings, colours, filters and view: tofclip view FILE opens it"
+    save = gui.add_button("save state", hint=hint)
+    save.on_click(for_client(lambda client: post(lambda: send_state(client))))
     gui.add_button("keys", hint="also: K").on_click(for_client(show_keys))
     toggle = posted(lambda: (clock.pause if clock.playing else clock.play)())
     keys: dict[Any, tuple[str, Callable[[Any], None]]] = {

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.viewer.look import format_length
-from apps.viewer.session import DisplayedFrame
+from apps.viewer.session import DisplayedFrame, Section
+from apps.viewer.source import FloatArray
 from apps.viewer.viewpoint import Box
 
 if TYPE_CHECKING:
@@ -118,6 +119,7 @@ class Points:
         self._drawn_moving = 0
         self._xyz = np.empty((0, 3), np.float32)
         self._colours: Any = None
+        self._opacities: NDArray[np.float32] | None = None  # of soft balls
         self._points, self._size_m = 0, 0.0
         self._surface: Any = None
         self._order: NDArray[np.intp] | None = None
@@ -142,12 +144,16 @@ class Points:
             elif self._surface is not None:
                 self._surface.remove()
                 self._surface = None
-            self._xyz = shown.cloud.xyz if mesh is None else shown.cloud.xyz[:0]
+            # the corners of a surface need no points, but for other layers beside it
+            is_bare = mesh is None or shown.layers.size > 0
+            self._xyz = shown.cloud.xyz if is_bare else shown.cloud.xyz[:0]
+            self._opacities = shown.opacities if is_bare else None
             # the page complains about no colours at all
             self._colours = shown.colours if len(self._xyz) else (0, 0, 0)
             self._points, self._size_m = shown.points, size_m
             # drawn by lot: every n-th point of rows of pixels would make stripes
-            is_large, random = len(self._xyz) > MIN_DRAWN_POINTS, np.random.default_rng(0)
+            is_large = len(self._xyz) > MIN_DRAWN_POINTS and self._opacities is None
+            random = np.random.default_rng(0)
             self._order = random.permutation(len(self._xyz)) if is_large else None
             self._send()
         self._server.flush()
@@ -155,6 +161,9 @@ class Points:
     def resize(self, size_m: float) -> None:
         """Give points another size, m."""
         self._size_m = size_m
+        if self._opacities is not None:
+            self._still = self._add("/points", self.drawn)
+            return
         for node, count in ((self._still, self.drawn), (self._moving, self._drawn_moving)):
             if node is not None:
                 node.point_size = self._widen(count)
@@ -197,8 +206,10 @@ class Points:
     def _send(self) -> None:
         """Send what is drawn at rest, and what is drawn instead of it in movement."""
         points = len(self._xyz)
-        self.drawn = self.detail.count(points, moving=False)
-        self._drawn_moving = self.detail.count(points, moving=True)
+        self.drawn = self._drawn_moving = points
+        if self._order is not None:
+            self.drawn = self.detail.count(points, moving=False)
+            self._drawn_moving = self.detail.count(points, moving=True)
         self._still = self._add("/points", self.drawn)
         if self._moving is not None:
             self._moving.remove()
@@ -214,6 +225,11 @@ class Points:
             part = self._order[:count]
             xyz, colours = xyz[part], colours[part]
         scene = self._server.scene
+        if self._opacities is not None and len(xyz):
+            spreads = np.tile(np.eye(3) * (self._size_m / 2) ** 2, (len(xyz), 1, 1))
+            return scene.add_gaussian_splats(
+                name, xyz, spreads, colours, self._opacities[:, np.newaxis]
+            )
         return scene.add_point_cloud(
             name, xyz, colours, point_size=self._widen(count), **POINT_STYLE
         )
@@ -248,6 +264,7 @@ BOX_COLOUR, SCALE_BAR_COLOUR, CLIP_COLOUR = (139, 147, 163), (235, 238, 245), (2
 AXIS_COLOURS = ((229, 72, 77), (70, 167, 88), (62, 142, 208))
 # length of the axes, and of the clip box's handles, of half the box's diagonal
 AXES_FRACTION = 0.12
+BAR_TURN = 0.03  # of its length that an end has to move for a scale bar to be drawn anew
 # quaternions, w x y z: upright, and half a turn after which the arrows at the high corner point
 # into the box
 UPRIGHT, POINTING_INWARDS = (1.0, 0.0, 0.0, 0.0), (0.0, 0.5**0.5, -(0.5**0.5), 0.0)
@@ -262,8 +279,10 @@ def add_lines(
     return scene.add_line_segments(name, points, colour, **width)
 
 
-def draw_furniture(server: viser.ViserServer, box: Box) -> None:
-    """Draw what gives the scene its scale: box, scale bar and axes around a cloud, and a switch."""
+def draw_furniture(server: viser.ViserServer, box: Box) -> Callable[[viser.ClientHandle], None]:
+    """Draw what gives the scene its scale: box and axes around a cloud, and a switch. Return what draws
+    the scale bar of a browser, to be called when its viewpoint has changed: it faces the viewer.
+    """
     scene: Any = server.scene
 
     def add_label(name: str, text: str, place: NDArray[Any], anchor: str) -> Any:
@@ -274,11 +293,6 @@ def draw_furniture(server: viser.ViserServer, box: Box) -> None:
         words = f"{name} {format_length(float(length_m))}"
         anchor = "top-right" if name == "z" else "top-left"  # z is written at the right
         drawn.append(add_label(f"/box_{name}", words, place, anchor))
-    bar = box.scale_bar
-    if (length_m := float(bar[1, 0] - bar[0, 0])) > 0:
-        drawn.append(add_lines(scene, "/scale", bar[np.newaxis], SCALE_BAR_COLOUR, 4.0))
-        words = format_length(length_m)
-        drawn.append(add_label("/scale_length", words, bar.mean(axis=0), "top-center"))
     # x, y and z are named at the far lower left corner, which is nearly always in the picture; small
     origin = np.array([box.low[0], box.high[1], box.high[2]])
     ends = origin + max(box.reach, 0.01) * AXES_FRACTION * np.eye(3)
@@ -288,11 +302,27 @@ def draw_furniture(server: viser.ViserServer, box: Box) -> None:
         drawn.append(add_label(f"/axes_{name}_name", name, end, "center-center"))
     hint = "box with lengths, scale bar and axes of the first cloud"
     switch = server.gui.add_checkbox("box", True, hint=hint)
+    bars: dict[int, tuple[FloatArray, list[Any]]] = {}  # by browser: ends, and what is drawn
+
+    def show_bar(client: viser.ClientHandle) -> None:
+        bar = box.scale_bar(np.asarray(client.camera.position, float))
+        length_m = float(np.linalg.norm(bar[1] - bar[0]))
+        known = bars.get(client.client_id)
+        if length_m == 0 or (known and np.allclose(known[0], bar, atol=BAR_TURN * length_m)):
+            return
+        words, own = format_length(length_m), client.scene
+        line = add_lines(own, "/scale", bar[np.newaxis], SCALE_BAR_COLOUR, 4.0)
+        look: Any = {"anchor": "top-center", "font_screen_scale": 0.9, "visible": switch.value}
+        label = own.add_label("/scale_length", words, position=bar.mean(axis=0), **look)
+        line.visible = switch.value
+        bars[client.client_id] = bar, [line, label]
 
     @switch.on_update
     def _(_: Any) -> None:
-        for node in drawn:
+        for node in (*drawn, *(node for _, nodes in bars.values() for node in nodes)):
             node.visible = switch.value
+
+    return show_bar
 
 
 class ClipBox:
@@ -337,3 +367,49 @@ class ClipBox:
 
     def _draw_edges(self, box: Box) -> None:
         self._edges = add_lines(self._scene, "/clip/box", box.edges, CLIP_COLOUR)
+
+
+class SectionPlane:
+    """A plane in the scene that can be dragged and turned; only points close to it are shown."""
+
+    def __init__(self, scene: Any, changed: Callable[[], None]) -> None:
+        self._scene, self._changed = scene, changed
+        self._handle: Any = None
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether there is something to drag."""
+        return self._handle is not None
+
+    def show(self, point: NDArray[Any], normal: NDArray[Any], reach: float) -> None:
+        """Draw the plane through a point; `reach`: half of the side of the square drawn, m."""
+        self.hide()
+        look: Any = {"depth_test": False, "scale": 0.4 * reach, "wxyz": turn_to(normal)}
+        self._handle = self._scene.add_transform_controls("/section", position=point, **look)
+        corners = reach * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+        edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+        add_lines(self._scene, "/section/edge", edges, CLIP_COLOUR)
+        self._handle.on_update(lambda _: self._changed())
+
+    def hide(self) -> None:
+        """Take the plane away."""
+        if self._handle is not None:
+            self._handle.remove()
+        self._handle = None
+
+    def find_section(self, thickness: float) -> Section | None:
+        """Return the slab about the plane, m thick; None where it is hidden."""
+        if self._handle is None:
+            return None
+        w, x, y, z = np.asarray(self._handle.wxyz, float)
+        # where the turn takes the z axis
+        normal = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+        offset = float(normal @ np.asarray(self._handle.position, float))
+        return Section((float(normal[0]), float(normal[1]), float(normal[2])), offset, thickness)
+
+
+def turn_to(normal: NDArray[Any]) -> tuple[float, float, float, float]:
+    """Return the quaternion w, x, y, z that turns the z axis to a direction of length 1."""
+    x, y, z = normal if normal[2] >= 0 else -normal  # a plane has two normals
+    length = float(np.sqrt(2 * (1 + z)))
+    return length / 2, -y / length, x / length, 0.0

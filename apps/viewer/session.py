@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apps.viewer.look import (
+    QUANTITIES,
     Colouring,
     Pick,
     Scale,
@@ -20,11 +21,9 @@ from apps.viewer.look import (
     make_scale,
     project_front,
 )
-from apps.viewer.source import NO_LIMITS, Limits, Picture, Source, View
+from apps.viewer.source import Limits, Picture, Source, View
+from apps.viewer.viewpoint import Viewpoint
 from tofclip.errors import InputError
-from tofclip.lidar import PointCloud
-
-DIM_NOTE = "dim points are left out (filters, intensity)"
 
 
 @dataclass
@@ -92,38 +91,44 @@ class PlaybackClock:
 
 
 @dataclass(frozen=True)
-class Filters:
-    """Limits, all of them inclusive; a point must keep every one."""
+class Section:
+    """A slab of the scene."""
 
-    range: Limits = NO_LIMITS  # m
-    intensity: Limits = NO_LIMITS  # counts, referred to 1 m
-    time: Limits = NO_LIMITS  # time of flight, s
-    x: Limits = NO_LIMITS  # sides of the box, m
-    y: Limits = NO_LIMITS
-    z: Limits = NO_LIMITS
+    normal: tuple[float, float, float]
+    offset: float  # of its middle plane from the origin along the normal, m
+    thickness: float  # m
+
+
+@dataclass(frozen=True)
+class Filters:
+    """Limits of quantities by name, in their units and inclusive; a point must keep every one, and lie
+    within the section.
+    """
+
+    limits: Mapping[str, Limits] = field(default_factory=dict)
+    section: Section | None = None
 
     def __post_init__(self) -> None:
-        for name, (low, high) in vars(self).items():
+        for name, (low, high) in self.limits.items():
             if not low <= high:
                 raise InputError(f"the limits of {name} must rise, got {low:g} and {high:g}")
 
-    def select(self, cloud: PointCloud) -> NDArray[np.bool_]:
+    def limit(self, name: str, limits: Limits | None) -> Filters:
+        """Return filters with other limits of a quantity, or none."""
+        others = {other: its for other, its in self.limits.items() if other != name}
+        return replace(self, limits=others if limits is None else {**others, name: limits})
+
+    def select(self, view: View) -> NDArray[np.bool_]:
         """Return for each point whether it is shown, (n,)."""
-        kept = np.ones(len(cloud), bool)
-        for name, values in list_filtered(cloud).items():
-            low, high = getattr(self, name)
-            # Limits that are not set cost no comparison, and keep NaN.
-            if low > -np.inf:
-                kept &= values >= np.float32(low)
-            if high < np.inf:
-                kept &= values <= np.float32(high)
+        kept = np.ones(len(view.cloud), bool)
+        for name, (low, high) in self.limits.items():
+            values = QUANTITIES[name][1](view)
+            if np.isfinite(values).any():  # not every frame may know it
+                kept &= (values >= np.float32(low)) & (values <= np.float32(high))
+        if self.section is not None:
+            away = view.cloud.xyz @ np.array(self.section.normal) - np.float32(self.section.offset)
+            kept &= np.abs(away) <= self.section.thickness / 2
         return kept
-
-
-def list_filtered(cloud: PointCloud) -> dict[str, NDArray[np.float32]]:
-    """Return what points can be filtered by, each (n,), by the names of `Filters`."""
-    columns = {"range": cloud.range, "intensity": cloud.intensity, "time": cloud.time}
-    return columns | dict(zip("xyz", cloud.xyz.T, strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +139,8 @@ class DisplayedFrame(View):
     colours: NDArray[np.uint8]  # (n, 3)
     scale: Scale
     points: int  # of which some may be left out while frames pass
+    whole: View  # before the filters
+    opacities: NDArray[np.float32] | None = None  # (n,) of soft balls
 
 
 def render_frame(
@@ -145,20 +152,21 @@ def render_frame(
     if is_thinned := max_points is not None and whole_points > max_points:
         drawn = np.random.default_rng(0).integers(0, whole_points, max_points)
         view = view.select(np.unique(drawn))
-    # The scale is that of all points, so that colours keep their meaning while time passes; of all
-    # but the dim ones, which would have the others shine alike.
-    lit = view.cloud.intensity >= source.min_intensity
-    usual = view.cloud if lit.all() or not lit.any() else view.cloud[lit]
-    scale = make_scale(usual, colouring)
-    kept = filters.select(view.cloud)
-    if view.times != NO_LIMITS:
-        kept &= Filters(time=view.times).select(view.cloud)
-    shown = view if kept.all() else view.select(kept)
-    number = f"{source.frame_name} {frame}" if len(source) > 1 else ""
+    # The scale is that of all points, so that colours keep their meaning while time passes.
+    scale = make_scale(view, colouring)
+    kept = filters.select(view)
+    if view.due is not None:
+        kept &= view.due
+    shown, opacities = view if kept.all() else view.select(kept), None
+    number = f"{source.frame_name} {frame + 1}" if len(source) > 1 else ""
     facts = {**vars(shown), "caption": view.caption or number}
-    colours = colour_points(shown.cloud, scale)
+    if view.opacity < 1:
+        values = QUANTITIES[scale.quantity][1](shown)
+        opacities = view.opacity * np.interp(values, scale.limits, (0, 1)).astype(np.float32)
+    colours = colour_points(shown, scale)
     points = whole_points if is_thinned else len(shown.cloud)
-    return DisplayedFrame(**facts, frame=frame, colours=colours, scale=scale, points=points)
+    further: Any = {"points": points, "whole": view, "opacities": opacities}
+    return DisplayedFrame(**facts, frame=frame, colours=colours, scale=scale, **further)
 
 
 class Session:
@@ -176,9 +184,16 @@ class Session:
         if source.times is not None:
             self.clock.position = float(len(source) - 1)  # a transient is complete at its end
             self.clock.loop = False
-        self.colouring = Colouring()
-        least = source.min_intensity
-        self.filters = Filters(intensity=(least, np.inf)) if least > 0 else Filters()
+        palette = "inferno" if source.quantity == "brightness" else Colouring.palette
+        self.colouring = Colouring(source.quantity, palette)
+        self.filters = Filters()
+        self.viewpoint: Viewpoint | None = (
+            None  # by default that from which the scene fills a window
+        )
+        self.point_size: float | None = None  # m; by default neighbours about touch
+        self.opened: dict[str, Any] = {
+            "sources": []
+        }  # names of the sources and how they are opened
         self.picks: list[Pick] = []
         self.max_playing_points: int | None = None
         self.latest: DisplayedFrame | None = None  # what was drawn last
@@ -197,10 +212,8 @@ class Session:
     @property
     def notes(self) -> tuple[str, ...]:
         """What has to be known about what is shown, each once."""
-        least = self.source.min_intensity
-        dim = (DIM_NOTE,) if least > 0 and self.filters.intensity[0] == least else ()
         of_view = () if self.latest is None else self.latest.notes
-        return tuple(dict.fromkeys((*of_view, *dim, *self.source.notes)))
+        return tuple(dict.fromkeys((*of_view, *self.source.notes)))
 
     @property
     def distance(self) -> float | None:
@@ -236,10 +249,14 @@ class Session:
             self.picks = []
             return None
         pick = Pick(shown.cloud[number : number + 1])
-        if shown.pixels is not None:
+        if shown.pixels is not None and shown.pixels[number, 0] >= 0:
             row, column = shown.pixels[number].tolist()
             beside = np.all(shown.pixels == (row, column), axis=1)
-            waveform = self.source.waveform(shown.frame, (row, column))
+            layer, time = 1, float(shown.cloud.time[number])
+            if shown.layers.size:
+                layer = int(shown.layers[number])
+                beside &= shown.layers == layer
+            waveform = self.source.waveform(shown.frame, (row, column), time, layer)
             pick = replace(
                 pick, pixel=(row, column), waveform=waveform, return_times=shown.cloud.time[beside]
             )

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -32,8 +32,12 @@ class View:
     cloud: PointCloud
     pixels: NDArray[np.int32] | None = None  # (n, 2), row and column that saw each point
     surface: Mesh | None = None  # drawn instead of the points
-    # points of other times of flight, s, are not shown, though they count for the colours
-    times: Limits = NO_LIMITS
+    # (n,) points that are not due are not shown, though they count for the colours; all by default
+    due: NDArray[np.bool_] | None = None
+    # (n,) number of the source, from 1, where several are in one view
+    layers: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
+    # of the brightest; below 1 points are soft balls, the clearer the fainter they are
+    opacity: float = 1.0
     time: float = np.nan  # time of flight of the frame, s; NaN where frames have none
     whole_name: str = ""  # what is shown where it is not one frame, such as a maximum projection
     text: str = ""  # what the frame is beyond its number and time, in a few words
@@ -43,7 +47,9 @@ class View:
     def select(self, chosen: NDArray[Any]) -> Self:
         """Return a view of some of the points, by mask or by numbers."""
         pixels = None if self.pixels is None else self.pixels[chosen]
-        return replace(self, cloud=self.cloud[chosen], pixels=pixels)
+        due = None if self.due is None else self.due[chosen]
+        layers = self.layers[chosen] if self.layers.size else self.layers
+        return replace(self, cloud=self.cloud[chosen], pixels=pixels, due=due, layers=layers)
 
 
 @dataclass
@@ -56,6 +62,10 @@ class Setting:
     step: float
     value: float
     hint: str = ""
+    group: str = ""  # under which it stands with others
+
+
+OFF_ON = "off", "on"  # the options of a choice that is a box to tick
 
 
 @dataclass
@@ -66,6 +76,7 @@ class Choice:
     options: tuple[str, ...]
     value: str
     hint: str | None = None
+    group: str = ""
 
 
 @dataclass(frozen=True)
@@ -94,8 +105,7 @@ class Source(abc.ABC):
     # what has to be known about everything that is shown, such as that ranges have no time zero
     notes: tuple[str, ...] = ()
     settings: tuple[Setting | Choice, ...] = ()  # what is set while one looks; `view` obeys them
-    # counts; dimmer points are left out until the filters are reset. 0 for none
-    min_intensity: float = 0.0
+    quantity: str = "range"  # what says most about the points, which are coloured by it at first
 
     @abc.abstractmethod
     def __len__(self) -> int:
@@ -116,9 +126,11 @@ class Source(abc.ABC):
         """
         return {}
 
-    def waveform(self, number: int, pixel: tuple[int, int]) -> FloatArray | None:
-        """Return times of flight, s, and the counts of a pixel (row, column) in frame `number`, (2,
-        n); None where they are not known.
+    def waveform(
+        self, number: int, pixel: tuple[int, int], time: float, layer: int = 1
+    ) -> FloatArray | None:
+        """Return times of flight, s, about `time` and the counts of a pixel (row, column) in frame
+        `number`, (2, n); None where they are not known.
         """
         return None
 

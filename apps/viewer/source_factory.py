@@ -3,62 +3,60 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any
 
 from apps.viewer.shots import LiveShots, StoredShots
 from apps.viewer.sources import (
+    LOOK_ITERATIONS,
+    LOOK_METHOD,
+    SURFACES,
     CloudSource,
     PhotonSource,
     StreakSource,
     TransientSource,
     VolumeSource,
+    make_look_method,
 )
 from devices.tracking import TrackedShots
 from devices.transients import read_transient, read_transients
-from tofclip.camera import Camera, measure
+from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import read_streak
 from tofclip.io.streaks import StreakStack
 from tofclip.lidar.photons import PhotonCube
 from tofclip.loading import CLOUD_SUFFIXES, load, outline
-from tofclip.plugins import METHODS, list_settings
-from tofclip.recovery import make_method, open_shot, plan_recovery
+from tofclip.plugins import METHODS
+from tofclip.recovery import open_shot, plan_recovery
 from tofclip.sequences import make_pipeline
 from tofclip.shots import Streak
-from tofclip.solvers import LinearInverse, Method, ProximalMethod
+from tofclip.solvers import LinearInverse, ProximalMethod
 
 if TYPE_CHECKING:
     from apps.viewer.source import Source
 
-SURFACES = "surfaces"  # takes some ten seconds, for which a single shot has the time
-# enough to read what is written on a surface; `tofclip recover` takes 40
-FIRST_LOOK_METHOD, FIRST_LOOK_ITERATIONS = "l1", 25
 # Refinements of a camera whose sweep the shot itself has to tell; `tofclip recover` takes up to ten,
 # which is most of its time. Two leave 0.2 rows and 0.6 px of them on a recorded shot: no letter moves.
 FIRST_LOOK_ROUNDS = 2
 FIRST_LOOK_NOTE = (
-    f"quick look ({FIRST_LOOK_METHOD}, {FIRST_LOOK_ITERATIONS} iterations); "
+    f"quick look ({LOOK_METHOD}, {LOOK_ITERATIONS} iterations); "
     "for measurements run tofclip recover"
 )
 # called with what is about to be done, before it takes seconds
 Announce = Callable[[str], None]
 
 
-def make_look_method(name: str | None) -> Method | None:
-    """Return a method quick enough to look by; None where a source is to choose."""
-    if name is None:
-        return None
+def check_method(name: str | None) -> str:
+    """Return the name of a method to look by."""
     if name == SURFACES:
         raise InputError(
             "surfaces take too long for shots one after the other, and need a shot; choose one of "
             f"{', '.join(one for one in METHODS if one != SURFACES)}, or make frames by tofclip recover"
         )
-    takes = list_settings(METHODS[name])
-    iterations = FIRST_LOOK_ITERATIONS if {"iterations", "start"} & takes.keys() else None
-    return cast(Method, make_method(name, iterations=iterations))
+    make_look_method(name or LOOK_METHOD)  # refuses what is unknown
+    return name or LOOK_METHOD
 
 
 @dataclass(frozen=True)
@@ -70,9 +68,19 @@ class ShotOptions:
     bin_width: float | None = None  # duration of a row, s; by default the shot's own time axis
     # reading of the time axis at which light of range 0 would arrive, s; by default the camera's
     time_zero: float | None = None
-    # of `tofclip.plugins.METHODS`, ``"surfaces"`` for a single shot only. By default a single one by some
-    # iterations of ``"l1"``, and one after the other by ``"linear"``
+    # of `tofclip.plugins.METHODS`, ``"surfaces"`` for a single shot only. By default some iterations of
+    # ``"l1"``, and frames as they were recovered
     method: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return them as JSON takes them."""
+        return {**asdict(self), "camera": self.camera and str(self.camera.resolve())}
+
+    @classmethod
+    def from_dict(cls, known: dict[str, Any]) -> ShotOptions:
+        """Return what `to_dict` was made of."""
+        given: dict[str, Any] = {one.name: known.get(one.name) for one in fields(cls)}
+        return cls(**{**given, "camera": given["camera"] and Path(given["camera"])})
 
 
 def open_source(
@@ -115,7 +123,10 @@ def open_source(
     if kind in ("cloud", "range image", "depth picture"):
         return CloudSource(path.name, [path])
     if kind == "frames":
-        return TransientSource(path.name, load(path), method=make_look_method(options.method))
+        frames = TransientSource(path.name, load(path))
+        if options.method is not None:
+            frames.method_choice.value = check_method(options.method)
+        return frames
     if kind == "volume":
         return VolumeSource(path.name, load(path))
     if kind == "streak":
@@ -138,20 +149,16 @@ def _open_shots(
     """Shots in files. A single one becomes a transient, so that time can be walked through."""
     first = shots[0]()
     if len(shots) > 1:
+        name = check_method(options.method)
         camera = _find_camera(title, first, options, announce)
-        method = make_look_method(options.method)
-        return StreakSource(title, StoredShots(shots), camera, first.times, method)
-    if options.method == SURFACES:
-        opened = open_shot(first, options.camera, options.time_zero)
-        announce(f"recovering the surfaces of {title}")
-        frames = plan_recovery(opened, SURFACES).run()
-        measured = measure(first.counts, first.saturated, frames.camera).values
-        # a refocus, which shows frames, is quick
-        return TransientSource(title, frames, measured, make_look_method(FIRST_LOOK_METHOD))
-    camera = _find_camera(title, first, options, announce)
-    method = make_look_method(options.method or FIRST_LOOK_METHOD)
-    shot = StreakSource(title, StoredShots([lambda: first]), camera, first.times, method)
-    source = TransientSource(title, shot.recover_frames(0), shot.measurements(0), method)
+        return StreakSource(title, StoredShots(shots), camera, first.times, name)
+    name = options.method or LOOK_METHOD
+    method: Any = name if name == SURFACES else make_look_method(name)
+    opened = open_shot(first, options.camera, options.time_zero)
+    announce(f"recovering {title}")
+    if name != SURFACES:
+        opened = opened.fit_camera(max_rounds=FIRST_LOOK_ROUNDS)
+    source = TransientSource(title, plan_recovery(opened, method).run())
     if options.method is None:
         source.notes = (FIRST_LOOK_NOTE, *source.notes)
     return source
@@ -159,6 +166,8 @@ def _open_shots(
 
 def _open_instrument(address: str, options: ShotOptions, announce: Announce) -> Source:
     """An instrument that goes on, or a recording, of which streak images are gathered once."""
+    name = check_method(options.method)
+    announce(f"waiting for the first shot of {address}")
     shots = TrackedShots(read_transients(address, options.bin_width))
     first = shots.peek()
     if first is None:
@@ -172,12 +181,12 @@ def _open_instrument(address: str, options: ShotOptions, announce: Announce) -> 
         whole = read_transient(address, options.bin_width)
         assert isinstance(whole, Streak)
         return _open_shots(address, [lambda: whole], options, announce)
-    method = make_look_method(options.method or LinearInverse.name)
+    method = make_look_method(name)
     camera = _find_camera(address, first, options, announce)
     # by a method that makes no clouds while shots come, they are made when one looks
     by = method if isinstance(method, LinearInverse | ProximalMethod) else LinearInverse.name
     pipeline = make_pipeline(first, camera, options.time_zero, method=by)
-    return StreakSource(address, LiveShots(address, shots, pipeline), camera, first.times, method)
+    return StreakSource(address, LiveShots(address, shots, pipeline), camera, first.times, name)
 
 
 def _find_camera(title: str, shot: Streak, options: ShotOptions, announce: Announce) -> Camera:

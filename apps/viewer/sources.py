@@ -6,19 +6,19 @@ from __future__ import annotations
 
 import abc
 import functools
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from apps.viewer.shots import LiveShots, Shots, make_view
 from apps.viewer.source import (
-    NO_LIMITS,
     Choice,
     FloatArray,
     Inflow,
@@ -30,15 +30,17 @@ from apps.viewer.source import (
 )
 from tofclip.camera import Camera, Rectifier
 from tofclip.errors import FileFormatError
-from tofclip.lidar import Detection, PointCloud, depth
+from tofclip.lidar import PointCloud, depth
 from tofclip.lidar.export import read_table
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.photons import PhotonCube
-from tofclip.lidar.significance import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.loading import CLOUD_SUFFIXES, load
+from tofclip.plugins import METHODS, list_settings
+from tofclip.recovery import make_method
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
+from tofclip.sequences.ranger import RangingPipeline
 from tofclip.shots import Frames, Streak
-from tofclip.solvers import LinearInverse, Method
+from tofclip.solvers import LinearInverse, Method, ProximalMethod
 from tofclip.storage import Record
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -48,30 +50,6 @@ if TYPE_CHECKING:
 
 CLOUD_RATE_HZ = SHOT_RATE_HZ = 10.0
 MAX_CACHED_CLOUDS, MAX_CACHED_VIEWS = 32, 16
-MIN_PIXEL_FRACTION = 0.3  # of a pixel's strongest return, which weaker ones before it would hide
-
-
-def find_min_intensity(whole: PointCloud) -> float:
-    """Return the intensity below which a return of a shot does not count, as `Detection` has it for
-    all of its frames.
-    """
-    if not whole.intensity.size:
-        return 0.0
-    scene = float(np.quantile(whole.intensity, SCENE_BRIGHTNESS_QUANTILE))
-    return scene * Detection().min_scene_fraction
-
-
-def leave_out_rays(view: View) -> View:
-    """Return a view without dim points: of the whole scene, and beside a brighter one of their
-    pixel.
-    """
-    bright = view.select(view.cloud.intensity >= find_min_intensity(view.cloud))
-    if bright.pixels is None or len(bright.cloud) == 0:
-        return bright
-    strongest = np.zeros(bright.pixels.max(axis=0) + 1, np.float32)
-    row, column = bright.pixels.T
-    np.maximum.at(strongest, (row, column), bright.cloud.intensity)
-    return bright.select(bright.cloud.intensity >= MIN_PIXEL_FRACTION * strongest[row, column])
 
 
 class CloudSource(Source):
@@ -81,11 +59,7 @@ class CloudSource(Source):
         super().__init__(title, CLOUD_RATE_HZ, frame_name="cloud")
         self._paths = paths
         self._read = functools.lru_cache(MAX_CACHED_CLOUDS)(read_cloud)
-        cloud = self.view(0).cloud
-        # Of a cloud of this program: the dim rays that few views leave around bright things would
-        # hide the others. What intensities of other programs mean is not known.
-        if np.any(cloud.range_sigma > 0):
-            self.min_intensity = find_min_intensity(cloud)
+        self.view(0)  # what cannot be read is refused before there is a page
 
     def __len__(self) -> int:
         return len(self._paths)
@@ -135,6 +109,7 @@ PROJECTION_MODE = "maximum projection"
 THRESHOLD_HINT = "share of the brightest voxel below which nothing is shown"
 VOLUME_PLAY_TIME_S = 8.0
 BRIGHT_FRACTION = 0.3  # of the brightest voxel: brighter ones are shown
+OPACITY_HINT = "of voxels at the upper limit of the colours; those at the lower one are clear. 1: all are opaque"
 
 
 class VolumeSource(Source):
@@ -147,7 +122,9 @@ class VolumeSource(Source):
         modes = (PROJECTION_MODE, VOXEL_MODE, *surface, SLICE_MODE)
         self.mode = Choice("show as", modes, PROJECTION_MODE)
         self.threshold = Setting("threshold", 0.02, 0.98, 0.01, BRIGHT_FRACTION, THRESHOLD_HINT)
-        super().__init__(title, rate, frame_name="slice", settings=(self.mode, self.threshold))
+        self.opacity = Setting("opacity", 0.02, 1.0, 0.02, 1.0, OPACITY_HINT)
+        settings = self.mode, self.threshold, self.opacity
+        super().__init__(title, rate, "slice", settings=settings, quantity="brightness")
         self.volume = volume
         self._magnitude = volume.magnitude.astype(np.float32)
         self._make_view = functools.lru_cache(1)(self._make_view_of)
@@ -162,6 +139,7 @@ class VolumeSource(Source):
             return replace(view, text=f"z {self.volume.grid.z[number]:.3f} m")
         text = f"of all {len(self)} slices"
         view = self._make_view(mode, self.threshold.value, 0)
+        view = replace(view, opacity=self.opacity.value)
         return replace(view, whole_name=mode, text=text, caption=f"{mode} {text}")
 
     def pictures(self, number: int) -> Mapping[str, Picture]:
@@ -199,7 +177,7 @@ class VolumeStreamSource(Source):
     """The newest volume of a stream that has one; every volume is a frame, the last one is kept."""
 
     def __init__(self, title: str, stream: VolumeStream) -> None:
-        super().__init__(title, 1.0, frame_name="volume")
+        super().__init__(title, 1.0, frame_name="volume", quantity="brightness")
         self._stream = stream
 
     def __len__(self) -> int:
@@ -217,22 +195,35 @@ class VolumeStreamSource(Source):
 
 
 NO_TIME_ZERO_NOTE = "no time zero: ranges are right up to a constant (--time-zero-ns)"
-LINEAR_NOTE = "quick look (linear): --method tv shows it sharper"
-LINEAR_FRAMES_NOTE = "quick look (linear): tofclip recover --method tv gives sharper frames"
+LINEAR_NOTE = "linear inverse, which leaves rays: methods tv and l1 do not"
+METHOD_HINT = "recovers what is shown once more, with few iterations; at first, as it was recovered"
+SURFACES = "surfaces"  # takes some ten seconds, for which a single shot has the time
+# enough to read what is written on a surface; `tofclip recover` takes 40
+LOOK_METHOD, LOOK_ITERATIONS = "l1", 25
 
 Readings = NDArray[np.float32]  # rectified measurements of a shot, (columns, frames)
 SHEAR_LIMITS = (-3.0, 3.0)  # pixels per view step between which a picture can be refocused
 SHEAR_HINT = "recovers the gate once more, at this shear in pixels per view step; 0: as it was"
+NEAR_FRAMES = 16  # on either side of a return, that its waveform shows: some pulses
 MIN_FRAMES = 3  # without a neighbour on either side no return is located
 ALL_FRAMES = slice(None)
+
+
+@functools.cache
+def make_look_method(name: str, weight: float | None = None) -> Method:
+    """Return a method with few iterations, to look by; `weight` of its prior: its own by default."""
+    takes = list_settings(METHODS[name])
+    iterations = LOOK_ITERATIONS if {"iterations", "start"} & takes.keys() else None
+    return cast(Method, make_method(name, iterations=iterations, weight=weight))
 
 
 class RecoveredSource(Source):
     """Light over time that one camera measured, from which frames can be recovered at any shear.
 
-    `measured_times` (frames,): time of flight of each column of measurements, s; `method`: by default
-    the linear inverse: one operator and one matrix (columns, columns) for each of the last 16
-    shears, which every recovery of this process shares. Safe to share by threads.
+    `measured_times` (frames,): time of flight of each column of measurements, s; `method`: what it
+    is recovered by at first, with this `weight` of its prior. The linear inverse keeps one operator
+    and one matrix (columns, columns) for each of the last 16 shears, which every recovery of this
+    process shares. Safe to share by threads.
     """
 
     def __init__(
@@ -241,17 +232,32 @@ class RecoveredSource(Source):
         rate: float,
         camera: Camera,
         measured_times: FloatArray,
-        method: Method | None = None,
+        method: str = LOOK_METHOD,
+        weight: float | None = None,
     ) -> None:
         super().__init__(title, rate)
         self.camera, self.measured_times = camera, measured_times
-        self.method: Method = LinearInverse() if method is None else method
-        self.is_linear = isinstance(self.method, LinearInverse)  # a quick look
+        self._first_method, self._weight = method, weight
         self._cached_camera = get_cached_camera(camera)
+        options = (method, *(one for one in METHODS if one not in (method, SURFACES)))
+        self.method_choice = Choice("method", options, method, METHOD_HINT)
         self.refocus = Setting("refocus", *SHEAR_LIMITS, 0.1, 0.0, SHEAR_HINT)
-        self.settings = (self.refocus,) if camera.views > 1 else ()
+        self.settings = self.method_choice, *((self.refocus,) if camera.views > 1 else ())
         # Without a time zero all ranges are off by one constant.
         self.notes = (NO_TIME_ZERO_NOTE,) if camera.time_zero == 0 else ()
+
+    @property
+    def method(self) -> Method:
+        """The method that is chosen."""
+        name = self.method_choice.value
+        if name not in METHODS or name == SURFACES:  # which cannot be refocused
+            name = LOOK_METHOD
+        return make_look_method(name, self._weight if name == self._first_method else None)
+
+    @property
+    def method_notes(self) -> tuple[str, ...]:
+        """What has to be known about the method that is chosen."""
+        return (LINEAR_NOTE,) if self.method_choice.value == LinearInverse.name else ()
 
     @abc.abstractmethod
     def measurements(self, number: int) -> Readings:
@@ -261,15 +267,17 @@ class RecoveredSource(Source):
         self, measurements: Readings, shear: float = 0.0, gate: slice = ALL_FRAMES
     ) -> Frames:
         """Recover the frames of a gate."""
-        part = np.ascontiguousarray(measurements[:, gate])
-        if self.is_linear:
+        known = np.isfinite(measurements[:, gate])  # dazzled ones are not
+        part = np.where(known, measurements[:, gate], np.float32(0))
+        method = self.method
+        if isinstance(method, LinearInverse):
             # Rounded, because sliders give numbers that differ by rounding only.
             operator = self._cached_camera.operator(round(shear, 6))
-            inverse = prepare_inverse(LinearInverse(), operator, ~self.camera.dead_columns)
+            inverse = prepare_inverse(method, operator, ~self.camera.dead_columns)
             values = inverse.recover(part).frames
         elif part.max(initial=0.0) > 0:
-            valid = np.broadcast_to(~self.camera.dead_columns[:, np.newaxis], part.shape)
-            values = self.method.recover(self.camera.operator(shear), part, valid).frames
+            valid = known & ~self.camera.dead_columns[:, np.newaxis]
+            values = method.recover(self.camera.operator(shear), part, valid).frames
         else:  # a dark gate has no brightest frame to set a prior's weight by
             values = np.zeros((part.shape[1], *self.camera.image_shape), np.float32)
         times = self.measured_times[gate]
@@ -288,9 +296,22 @@ class RecoveredSource(Source):
         """Return all frames of shot `number`."""
         return self.recover(self.measurements(number))
 
-    def waveform(self, number: int, pixel: tuple[int, int]) -> FloatArray:
-        frames, (row, column) = self.recover_frames(number), pixel
+    def waveform(
+        self, number: int, pixel: tuple[int, int], time: float, layer: int = 1
+    ) -> FloatArray:
+        row, column = pixel
+        frames = self.recover_near(number, find_near(self.measured_times, time))
         return np.stack([frames.times, frames.values[:, row, column]])
+
+    def recover_near(self, number: int, near: slice) -> Frames:
+        """Return some frames of shot `number`."""
+        return self.recover(self.measurements(number), 0.0, near)
+
+
+def find_near(times: FloatArray, time: float) -> slice:
+    """Return the frames about a time."""
+    middle = int(np.searchsorted(times, time))
+    return slice(max(0, middle - NEAR_FRAMES), middle + NEAR_FRAMES + 1)
 
 
 def render_depth(view: View, shape: tuple[int, int]) -> Picture:
@@ -313,31 +334,22 @@ HALF_GATE_HINT = "frames before and after the current one, for 'around the frame
 
 
 class TransientSource(RecoveredSource):
-    """Recovered frames: frame `n` of the source is instant `n`; the cloud is that of all instants.
+    """Recovered frames: frame `n` of the source is instant `n`; the cloud is that of all instants, the
+    same as `tofclip cloud` makes.
 
-    Refocusing needs measurements. Where they are not at hand, as with a file of frames,
-    the camera predicts them from the frames, which explain the measured ones but for the recovery's
+    Another method, or another focus, needs measurements. Where the frames do not hold theirs, the
+    camera predicts them from the frames, which explain the measured ones but for the recovery's
     residual.
-
-    `measurements` (columns, frames): rectified, of the frames; `method`: of a refocus; the linear
-    inverse by default.
     """
 
-    def __init__(
-        self,
-        title: str,
-        frames: Frames,
-        measurements: Readings | None = None,
-        method: Method | None = None,
-    ) -> None:
+    def __init__(self, title: str, frames: Frames) -> None:
         rate = frames.times.size / TRANSIENT_PLAY_TIME_S
-        super().__init__(title, rate, frames.camera, frames.times, method)
-        self.times = frames.times
-        self.frames, self._measured = frames, measurements
-        if measurements is not None and self.is_linear:
-            self.notes = (LINEAR_NOTE, *self.notes)
-        elif measurements is None and frames.figures.get("method") == LinearInverse.name:
-            self.notes = (LINEAR_FRAMES_NOTE, *self.notes)
+        name = str(frames.figures.get("method", LOOK_METHOD))
+        settings = frames.provenance.get("settings", {})
+        weight = re.search(r"\bweight=([\d.e+-]+)", str(settings.get("method", "")))
+        known = float(weight[1]) if weight else None
+        super().__init__(title, rate, frames.camera, frames.times, name, known)
+        self.times, self.frames = frames.times, frames
         modes = (GATE_UP_TO_FRAME, GATE_AROUND_FRAME, GATE_ALL_TIMES)
         self.gate = Choice("time gate", modes, GATE_UP_TO_FRAME, GATE_HINT)
         self.half_gate = Setting("half gate", 1, 200, 1, 12, HALF_GATE_HINT)
@@ -358,21 +370,22 @@ class TransientSource(RecoveredSource):
         gate, every = self.find_gate(number), range(len(self))
         # Only a gate around the frame changes with it; else all instants are recovered once.
         recovered = gate if self.gate.value == GATE_AROUND_FRAME else every
-        shear = self.refocus.value
-        view = self._refocus(shear, recovered) if shear else self._whole_view
-        times, limits = self.frames.times, NO_LIMITS
+        shear, method = self.refocus.value, self.method_choice.value
+        is_as_it_was = shear == 0 and method == self._first_method
+        view = self._whole_view if is_as_it_was else self._refocus(method, shear, recovered)
+        times, due = self.frames.times, None
         if gate != every:
             half = (times[-1] - times[0]) / (2 * max(1, times.size - 1))
             first = times[gate.start] - half if gate.start > 0 else -np.inf
-            limits = float(first), float(times[gate.stop - 1] + half)
+            due = (view.cloud.time >= first) & (view.cloud.time <= times[gate.stop - 1] + half)
         return replace(
             view,
-            times=limits,
+            due=due,
             time=float(times[number]),
             caption=f"all {gate.stop} frames"
             if gate == every
-            else f"frames {gate.start} to {gate.stop - 1}",
-            notes=(LINEAR_NOTE,) if shear and self.is_linear else (),
+            else f"frames {gate.start + 1} to {gate.stop}",
+            notes=self.method_notes,
         )
 
     def measurements(self, number: int) -> Readings:
@@ -381,36 +394,47 @@ class TransientSource(RecoveredSource):
     def recover_frames(self, number: int) -> Frames:
         return self.frames
 
+    def recover_near(self, number: int, near: slice) -> Frames:
+        return cast(Frames, self.frames[near])
+
     def pictures(self, number: int) -> Mapping[str, Picture]:
         gate = self.find_gate(number)
         frames = slice(gate.start, gate.stop)
         distance = np.maximum(self.frames.times[frames], 0) * SPEED_OF_LIGHT / 2
+        readings = self._measurements
         # As the intensity of a point, referred to 1 m: far objects would be lost beside near ones.
         light = np.tensordot((distance**2).astype(np.float32), self.frames.values[frames], 1)
         return {
-            "streak": self._measurements.T,
+            "streak": np.nan_to_num(readings, nan=float(np.nanmax(readings))).T,
             "intensity": light,
             "depth": render_depth(self._whole_view, self.camera.image_shape),
         }
 
-    def _refocus_gate(self, shear: float, gate: range) -> View:
+    def _refocus_gate(self, _: str, shear: float, gate: range) -> View:
+        own = self.frames
+        if (
+            len(gate) == len(self) and own.measured.size
+        ):  # then judged as the frames' own points are
+            found = self.recover(self._measurements, shear)
+            return make_view(depth(replace(found, figures=own.figures, measured=own.measured)))
         view = self.recover_view(self._measurements, shear, slice(gate.start, gate.stop))
         # a threshold relative to the gate would find noise in a dark one
-        return view.select(view.cloud.intensity >= find_min_intensity(self._whole_view.cloud))
+        return view.select(
+            view.cloud.intensity >= self._whole_view.cloud.intensity.min(initial=np.inf)
+        )
 
     @cached_property
     def _whole_view(self) -> View:
         # Surfaces were found with their points; frames are searched for theirs.
-        if self.frames.returns is not None:
-            return make_view(self.frames.returns)
-        # Of these the dim ones, rays that few views leave around bright things, would hide the others.
-        return leave_out_rays(make_view(depth(self.frames)))
+        return make_view(depth(self.frames) if self.frames.returns is None else self.frames.returns)
 
     @cached_property
     def _measurements(self) -> Readings:
-        """What the camera read or would read; neighbouring frames of one shear share an operator."""
-        if self._measured is not None:
-            return self._measured
+        """What the camera read, NaN where it was dazzled, or would read; neighbouring frames of one
+        shear share an operator.
+        """
+        if self.frames.measured.size:
+            return self.frames.measured
         frames, shears = self.frames, self.frames.shears
         measurements = np.empty((frames.camera.slit_width_px, frames.times.size), np.float32)
         cuts = np.flatnonzero(np.concatenate([[True], np.diff(shears) != 0, [True]]))
@@ -424,7 +448,7 @@ class TransientSource(RecoveredSource):
 class StreakSource(RecoveredSource):
     """Streak images of one camera, wherever they come from; frame `n` is the cloud of shot `n`.
 
-    `row_times` (rows,): instant of each row, s. `method`: the linear inverse by default.
+    `row_times` (rows,): instant of each row, s.
     """
 
     def __init__(
@@ -433,17 +457,15 @@ class StreakSource(RecoveredSource):
         shots: Shots,
         camera: Camera,
         row_times: FloatArray,
-        method: Method | None = None,
+        method: str = LOOK_METHOD,
     ) -> None:
         super().__init__(title, SHOT_RATE_HZ, camera, row_times - camera.time_zero, method)
-        self.frame_name = "shot"
-        if self.is_linear:
-            self.notes = (LINEAR_NOTE, *self.notes)
+        self.frame_name, self._row_times = "shot", row_times
         self._shots, self._rectifier = shots, Rectifier(camera, row_times.size)
         self._measured = functools.lru_cache(2)(self._rectify)
-        self._recover_view = functools.lru_cache(MAX_CACHED_VIEWS)(
-            lambda number, shear: self.recover_view(self.measurements(number), shear)
-        )
+        self._recover_view = functools.lru_cache(MAX_CACHED_VIEWS)(self._find_view)
+        self._pipeline: RangingPipeline | None = None
+        self._last = -1
 
     def __len__(self) -> int:
         return len(self._shots)
@@ -456,14 +478,26 @@ class StreakSource(RecoveredSource):
         self._shots.close()
 
     def view(self, number: int) -> View:
-        return self.view_at(number, self.refocus.value)
+        view = self.view_at(number, self.refocus.value)
+        return replace(view, notes=self.method_notes)
 
     def view_at(self, number: int, shear: float) -> View:
         """Return the points of shot `number`, recovered at a shear."""
-        made = self._shots.get(number).view
-        if made is None or shear or self._shots.method_name != self.method.name:
-            return self._recover_view(number, shear)
+        made, name = self._shots.get(number).view, self.method_choice.value
+        if made is None or shear or self._shots.method_name != name:
+            return self._recover_view(name, number, shear)
         return made
+
+    def _find_view(self, _: str, number: int, shear: float) -> View:
+        measurements, method = self.measurements(number), self.method
+        if shear or not isinstance(method, LinearInverse | ProximalMethod):
+            return self.recover_view(measurements, shear)
+        pipeline = self._pipeline
+        # a prior begins at the shot before, if that is the one that was just recovered
+        if pipeline is None or number != self._last + 1 or pipeline.method is not method:
+            pipeline = RangingPipeline(self.camera, self._row_times, method)
+        self._pipeline, self._last = pipeline, number
+        return make_view(pipeline.find_returns(measurements))
 
     def measurements(self, number: int) -> Readings:
         return self._measured(number)
@@ -474,15 +508,11 @@ class StreakSource(RecoveredSource):
         return self._rectifier.measure(shot.counts, shot.saturated).values
 
     def pictures(self, number: int) -> Mapping[str, Picture]:
-        measurements = self.measurements(number)
-        # the 64 frames about the brightest one: a picture of all would cost as much as the cloud
-        brightest = int(measurements.sum(axis=0).argmax())
-        bright = self.recover(measurements, 0.0, slice(max(0, brightest - 32), brightest + 32))
-        return {
-            "streak": measurements.T,
-            "intensity": bright.values.sum(axis=0),
-            "depth": render_depth(self.view_at(number, 0.0), self.camera.image_shape),
-        }
+        view, light = self.view(number), np.zeros(self.camera.image_shape, np.float32)
+        if view.pixels is not None:
+            np.add.at(light, tuple(view.pixels.T), view.cloud.intensity)
+        picture = render_depth(view, light.shape)
+        return {"streak": self.measurements(number).T, "intensity": light, "depth": picture}
 
 
 class PhotonSource(Source):
@@ -513,7 +543,11 @@ class PhotonSource(Source):
         depth_picture = render_depth(self.view(number), self.camera.image_shape)
         return {"intensity": light, "depth": depth_picture}
 
-    def waveform(self, number: int, pixel: tuple[int, int]) -> FloatArray:
-        shot = self._shots.get(number).shot
+    def waveform(
+        self, number: int, pixel: tuple[int, int], time: float, layer: int = 1
+    ) -> FloatArray:
+        shot, (row, column) = self._shots.get(number).shot, pixel
         assert isinstance(shot, PhotonCube)
-        return np.stack([shot.times - self.camera.time_zero, shot.counts[:, pixel[0], pixel[1]]])
+        times = shot.times - self.camera.time_zero
+        near = find_near(times, time)
+        return np.stack([times[near], shot.counts[near, row, column]])

@@ -146,10 +146,16 @@ class SceneFigure:
     says from where one looks.
     """
 
-    def __init__(self, title: str, first: DisplayedFrame, renderer: Renderer) -> None:
+    def __init__(
+        self,
+        title: str,
+        first: DisplayedFrame,
+        renderer: Renderer,
+        viewpoint: Viewpoint | None = None,
+    ) -> None:
         self._title, self._renderer = title, renderer
         rows, columns = PICTURE_SHAPE_PX
-        self.viewpoint = place_viewpoint(first.cloud.xyz, columns / rows)
+        self.viewpoint = viewpoint or place_viewpoint(first.cloud.xyz, columns / rows)
         figure = make_figure(columns / DOTS_PER_INCH + 1.2, rows / DOTS_PER_INCH + 0.4)
         self._figure, self._axes = figure, figure.subplots()
         empty = np.zeros((rows, columns, 3), np.uint8)
@@ -209,11 +215,14 @@ class SceneFigure:
         look: Any = {"color": BOX_COLOUR, "fontsize": 7, "va": "bottom", "clip_on": True}
         for name, length_m, x, y in zip("xyz", box.high - box.low, column, row, strict=True):
             axes.text(x, y, f"{name} {format_length(float(length_m))}", ha="center", **look)
-        bar = box.scale_bar
+        bar = box.scale_bar(self.viewpoint.eye)
         row, column, _ = self.viewpoint.project(bar, shape)
         axes.plot(column, row, color=SCALE_BAR_COLOUR, linewidth=2.5, solid_capstyle="butt")
         look = {"color": SCALE_BAR_COLOUR, "fontsize": 8, "va": "top"}
-        words, below = format_length(float(bar[1, 0] - bar[0, 0])), row.mean() + SCALE_LABEL_PX
+        words, below = (
+            format_length(float(np.linalg.norm(bar[1] - bar[0]))),
+            row.mean() + SCALE_LABEL_PX,
+        )
         axes.text(column.mean(), below, words, ha="center", **look)
         axes.set_xlim(-0.5, shape[1] - 0.5)
         axes.set_ylim(shape[0] - 0.5, -0.5)
@@ -238,9 +247,14 @@ def choose_point_size(points: int) -> int:
     return 6 if points < FEW_POINTS else 3 if points < MANY_POINTS else 2
 
 
-def save_picture(title: str, shown: DisplayedFrame, renderer: Renderer, out: Path) -> None:
-    """Write a picture of what is shown, whole or not at all, in the format of its suffix."""
-    save_figure(SceneFigure(title, shown, renderer).draw(shown), out)
+def save_picture(session: Session, renderer: Renderer, out: Path) -> int:
+    """Write a picture of what is shown, whole or not at all, in the format of its suffix; return its
+    number of points.
+    """
+    shown = session.frame_at(0.0)
+    figure = SceneFigure(session.title, shown, renderer, session.viewpoint)
+    save_figure(figure.draw(shown), out)
+    return len(shown.cloud)
 
 
 MAX_FRAME_RATE_HZ = 15.0
@@ -262,7 +276,7 @@ def save_film(
     every picture. Returns the largest number of points in a picture.
     """
     whole = session.frame_at(0.0)  # a transient begins at its end: with all of its points
-    figure, most = SceneFigure(session.title, whole, renderer), 0
+    figure, most = SceneFigure(session.title, whole, renderer, session.viewpoint), 0
     frames = choose_frames(session)
     if not frames:
         raise InputError(f"{session.source.title}: there is nothing to film")
@@ -310,7 +324,7 @@ class DesktopWindow:
             self._drawn = shown
             add_to_plotter(self.plotter, shown, choose_point_size(len(shown.cloud)))
             what = f"{self.session.label}  {self.session.source.title}"
-            words = f"{what}  frame {shown.frame}, {len(shown.cloud)} points"
+            words = f"{what}  frame {shown.frame + 1}, {len(shown.cloud)} points"
             look = {"position": "upper_left", "font_size": 9, "color": "white", "name": "words"}
             self.plotter.add_text(words, **look)
         return shown

@@ -63,7 +63,7 @@ class Viewpoint:
 SCALE_BAR_FRACTION = 0.4  # the scale bar is at most as long as this fraction of the box's width
 # fractions of the box's depth, from its front: little stands before the scale bar, which farther in
 # front would need much of the window, and neither hides the other's words from any side
-SCALE_BAR_DEPTH, Z_MARK_DEPTH = 0.3, 0.85
+SCALE_BAR_DEPTH, Z_MARK_DEPTH, X_MARK = 0.3, 0.85, 0.12
 EDGES = [(n, n | bit) for bit in (1, 2, 4) for n in range(8) if not n & bit]  # by their corners
 
 
@@ -97,14 +97,17 @@ class Box:
         edges: FloatArray = np.where(bits, self.high, self.low)[np.array(EDGES)]
         return edges
 
-    @property
-    def scale_bar(self) -> FloatArray:
-        """Ends of a bar of a round length across the floor, near the front, (2, 3) in m."""
-        width = float(self.high[0] - self.low[0])
+    def scale_bar(self, eye: FloatArray) -> FloatArray:
+        """Ends of a bar of a round length, (2, 3) in m: on the floor, near the side that an eye is at,
+        across its line of sight.
+        """
+        right = Viewpoint(eye, self.middle).axes[0]
+        ahead, sides = np.cross(right, DOWN), self.high - self.low
+        width, depth = float(np.abs(right) @ sides), float(np.abs(ahead) @ sides)
         length = round_length_down(SCALE_BAR_FRACTION * width) if width > 0 else 0.0
-        depth = (1 - SCALE_BAR_DEPTH) * self.low[2] + SCALE_BAR_DEPTH * self.high[2]
-        start = np.array([self.middle[0] - length / 2, self.high[1], depth])
-        return np.stack([start, start + np.array([length, 0.0, 0.0])])
+        middle = self.middle + (SCALE_BAR_DEPTH - 0.5) * depth * ahead
+        middle[1] = self.high[1]
+        return middle + np.outer((-length / 2, length / 2), right)
 
     @property
     def length_marks(self) -> FloatArray:
@@ -112,7 +115,8 @@ class Box:
         far side, which is always in the picture, and of the floor close to it.
         """
         (left, ceiling, front), (right, floor, back) = self.low, self.high
-        x, y, _ = self.middle
+        y = self.middle[1]
+        x = (1 - X_MARK) * left + X_MARK * right  # over the middle it would hide what stands there
         near_back = (1 - Z_MARK_DEPTH) * front + Z_MARK_DEPTH * back
         return np.array([[x, ceiling, back], [left, y, back], [right, floor, near_back]])
 
@@ -193,7 +197,7 @@ def _fit_field_of_view(viewpoint: Viewpoint, xyz: NDArray[Any], box: Box, aspect
     them, which may lie lower than any.
     """
     fields = []
-    for points in (xyz, box.scale_bar):
+    for points in (xyz, box.scale_bar(viewpoint.eye)):
         right, down, depth = np.abs(viewpoint.axes @ (points - viewpoint.eye).T)
         slopes = np.maximum(down, right / aspect) / np.maximum(depth, 1e-6)
         # One stray point must not make everything else small: within bounds its tip may be cut off.
@@ -207,6 +211,12 @@ def move_camera(camera: Any, viewpoint: Viewpoint) -> None:
     """Move a camera of the page, or the one that pages start with, to a viewpoint."""
     camera.position, camera.look_at = viewpoint.eye, viewpoint.target
     camera.fov = max(viewpoint.field_of_view, math.radians(5.0))
+
+
+def read_viewpoint(camera: Any) -> Viewpoint:
+    """Return where a camera of the page stands."""
+    # Copied, because the page goes on changing the camera's own arrays.
+    return Viewpoint(camera.position.copy(), camera.look_at.copy(), camera.fov)
 
 
 def aim_plotter(plotter: Any, viewpoint: Viewpoint) -> None:

@@ -25,14 +25,15 @@ from apps.viewer.look import (
     colour_points,
     find_point_on_ray,
     format_length,
+    list_quantities,
     make_scale,
     project_front,
     render_pictures,
 )
 from apps.viewer.panels import bind_user_input, mark_times
 from apps.viewer.points import MIN_DRAWN_POINTS, DetailChooser, FramePacer
-from apps.viewer.session import Filters, PlaybackClock, Session
-from apps.viewer.source import make_cloud
+from apps.viewer.session import Filters, PlaybackClock, Section, Session
+from apps.viewer.source import View, make_cloud
 from apps.viewer.viewpoint import (
     MAX_FIELD_OF_VIEW_RAD,
     SCALE_BAR_DEPTH,
@@ -113,9 +114,10 @@ def test_a_number_that_was_typed_outlives_the_frame_that_is_being_shown() -> Non
 
 def test_limits_get_the_outermost_colours_and_the_middle_the_middle_one() -> None:
     cloud = column([0.5, 1.0, 2.0, 3.0, 9.0])
-    scale = make_scale(cloud, Colouring("range", "grey", (1.0, 3.0)))
+    view = View(cloud)
+    scale = make_scale(view, Colouring("range", "grey", (1.0, 3.0)))
     assert scale.limits == (1.0, 3.0)
-    assert colour_points(cloud, scale)[:, 0].tolist() == [0, 0, 128, 255, 255]
+    assert colour_points(view, scale)[:, 0].tolist() == [0, 0, 128, 255, 255]
     for limits in ((2.0, 1.0), (0.0, np.nan), (0.0, np.inf)):
         with pytest.raises(InputError, match="must rise"):
             Colouring(limits=limits)
@@ -123,38 +125,40 @@ def test_limits_get_the_outermost_colours_and_the_middle_the_middle_one() -> Non
 
 def test_an_equalised_scale_gives_every_colour_equally_many_points() -> None:
     cloud = column(np.exp(np.random.default_rng(1).normal(size=20_000)).tolist())
-    scale = make_scale(cloud, Colouring("range", "grey", equalised=True))
+    scale = make_scale(View(cloud), Colouring("range", "grey", equalised=True))
     inside = (cloud.range >= scale.limits[0]) & (cloud.range <= scale.limits[1])
-    share = np.histogram(colour_points(cloud, scale)[inside, 0], 8, (0, 256))[0] / inside.sum()
+    share = (
+        np.histogram(colour_points(View(cloud), scale)[inside, 0], 8, (0, 256))[0] / inside.sum()
+    )
     # 20 000 points in 255 steps: 1/255 at either edge, and rounding
     assert np.allclose(share, 1 / 8, atol=0.01)
     assert np.all(np.diff(scale.values) >= 0)
 
 
 def test_height_counts_upwards_and_time_is_in_nanoseconds() -> None:
-    cloud = make_cloud(np.array([[0.0, -0.3, 1.0]]))
-    assert QUANTITIES["height"][1](cloud) == pytest.approx([0.3])
+    view = View(make_cloud(np.array([[0.0, -0.3, 1.0]])))
+    assert QUANTITIES["height"][1](view) == pytest.approx([0.3])
     # There and back at the speed of light: 6.67 ns for each metre.
-    assert QUANTITIES["time"][1](cloud) == pytest.approx([6.671 * np.hypot(0.3, 1)], rel=1e-3)
+    assert QUANTITIES["time"][1](view) == pytest.approx([6.671 * np.hypot(0.3, 1)], rel=1e-3)
 
 
-@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("quantity", list_quantities(View(column([]))))
 @pytest.mark.parametrize("equalised", [False, True])
 def test_clouds_of_one_value_or_none_have_colours_too(quantity: str, equalised: bool) -> None:
     for cloud in (column([]), column([2.0, 2.0])):
-        scale = make_scale(cloud, Colouring(quantity, equalised=equalised))
+        scale = make_scale(View(cloud), Colouring(quantity, equalised=equalised))
         assert scale.limits[0] < scale.limits[1]
-        assert colour_points(cloud, scale).shape == (len(cloud), 3)
+        assert colour_points(View(cloud), scale).shape == (len(cloud), 3)
 
 
 def test_dim_points_are_darker_where_asked_for() -> None:
-    cloud = make_cloud(np.ones((100, 3)), {"intensity": np.linspace(0, 99, 100)})
-    colouring = Colouring("range", "grey", (0.0, 1.0))
-    shaded = colour_points(cloud, make_scale(cloud, colouring))[:, 0]
+    view = View(make_cloud(np.ones((100, 3)), {"intensity": np.linspace(0, 99, 100)}))
+    colouring = Colouring("range", "grey", (0.0, 1.0), shaded=True)
+    shaded = colour_points(view, make_scale(view, colouring))[:, 0]
     assert np.all(np.diff(shaded.astype(int)) >= 0)
     assert (shaded[0], shaded[-1]) == (38, 255)  # 15 % of the light stays
-    plain = make_scale(cloud, replace(colouring, shaded=False))
-    assert colour_points(cloud, plain).min() == 255
+    plain = make_scale(view, replace(colouring, shaded=False))
+    assert colour_points(view, plain).min() == 255
 
 
 def test_filters_keep_what_lies_within_all_limits() -> None:
@@ -162,14 +166,16 @@ def test_filters_keep_what_lies_within_all_limits() -> None:
     cloud = make_cloud(xyz, {"intensity": np.array([1, 2, 3, 4])})
     for filters, kept in (
         (Filters(), [0, 1, 2, 3]),
-        (Filters(range=(1.5, 2.1)), [1]),
-        (Filters(intensity=(2, 3)), [1, 2]),
-        (Filters(z=(2, 3), x=(-0.5, 0.5)), [1, 3]),
-        (Filters(time=(0, 7e-9)), [0]),
+        (Filters({"range": (1.5, 2.1)}), [1]),
+        (Filters({"intensity": (2, 3)}), [1, 2]),
+        (Filters({"z": (2, 3), "x": (-0.5, 0.5)}), [1, 3]),
+        (Filters({"time": (0, 7)}), [0]),
+        (Filters({"false alarm": (0, 0.1)}), [0, 1, 2, 3]),  # of nobody known
+        (Filters(section=Section((0.6, 0.0, 0.8), 1.6, 0.02)), [1]),  # a plane aslant
     ):
-        assert np.flatnonzero(filters.select(cloud)).tolist() == kept
+        assert np.flatnonzero(filters.select(View(cloud))).tolist() == kept
     with pytest.raises(InputError, match="limits of y"):
-        Filters(y=(1, 0))
+        Filters({"y": (1, 0)})
 
 
 @given(st.integers(0, 399), st.tuples(*[st.floats(-3, 3)] * 2), st.floats(-3, 1))
@@ -201,7 +207,7 @@ def test_what_is_known_about_a_pick() -> None:
     point = make_cloud(np.array([[0.3, 0.4, 1.2]]), sigma)
     lines = ["x 0.3000, y 0.4000, z 1.2000 m", "range 1.3000 m ± 2 mm"]
     assert Pick(point, (3, 4)).description.splitlines()[:2] == lines
-    assert Pick(point, (3, 4)).description.endswith("pixel row 3, column 4")
+    assert Pick(point, (3, 4)).description.endswith("pixel row 4, column 5")
     assert "pixel" not in Pick(point).description
 
 
@@ -230,24 +236,29 @@ def test_lengths_and_instants_are_round_and_in_the_unit_that_a_person_would_use(
     lengths = (3.86e-6, 0.00042, 0.0314, 1.853)
     assert list(map(format_length, lengths)) == ["3.86 um", "0.42 mm", "31.4 mm", "1.85 m"]
     times = 10.02e-9 + 20e-12 * np.arange(96)
-    assert mark_times(times) == ((24, "10.5 ns"), (49, "11 ns"), (74, "11.5 ns"))
-    assert mark_times(times[:1]) == ((0, "10.02 ns"),)
+    assert mark_times(times) == ((25, "10.5 ns"), (50, "11 ns"), (75, "11.5 ns"))
+    assert mark_times(times[:1]) == ((1, "10.02 ns"),)
 
 
 @pytest.mark.parametrize(("longest", "bar"), [(1.0, 1.0), (0.43, 0.2), (0.0199, 0.01), (7.0, 5.0)])
 def test_a_scale_bar_is_one_two_or_five(longest: float, bar: float) -> None:
     assert round_length_down(longest) == pytest.approx(bar)
     width = longest / SCALE_BAR_FRACTION
-    ends = Box(np.zeros(3), np.array([width, 1.0, 2.0])).scale_bar
-    assert np.diff(ends, axis=0)[0] == pytest.approx([bar, 0, 0])
-    assert ends.mean(axis=0) == pytest.approx([width / 2, 1.0, 2.0 * SCALE_BAR_DEPTH])
+    box = Box(np.zeros(3), np.array([width, 1.0, width]))
+    # it faces the viewer, in front and from the side
+    for eye, along in (((0, 0, -9), 0), ((9, 0, 0), 2)):
+        ends = box.scale_bar(box.middle + eye)
+        assert np.abs(np.diff(ends, axis=0)[0]) == pytest.approx(bar * np.eye(3)[along])
+        near = np.where(np.array(eye) > 0, 1 - SCALE_BAR_DEPTH, SCALE_BAR_DEPTH)
+        middle = np.where(eye, near * width, width / 2)
+        assert ends.mean(axis=0) == pytest.approx([middle[0], 1.0, middle[2]])
 
 
 @pytest.mark.parametrize("direction", [0, 1, 2])
 def test_lengths_of_the_box_are_written_apart_from_the_scale_bar(direction: int) -> None:
     """Seen along any axis, no two words stand within a twentieth of the box."""
     box = Box(np.array([-1.0, -0.5, 1.5]), np.array([1.0, 0.7, 4.0]))
-    places = np.vstack([box.length_marks, box.scale_bar.mean(axis=0)])
+    places = np.vstack([box.length_marks, box.scale_bar(np.array([0.0, 0.1, -3.0])).mean(axis=0)])
     seen = np.delete((places - box.low) / (box.high - box.low), direction, axis=1)
     apart = np.linalg.norm(seen[:, np.newaxis] - seen, axis=-1)
     assert apart[np.triu_indices(4, 1)].min() > 0.05
@@ -300,7 +311,9 @@ def test_the_scale_bar_is_in_the_first_picture(aspect: float) -> None:
     near = random.uniform((-0.05, -0.05, 1.0), (0.05, 0.05, 1.01), (400, 3))
     xyz = np.concatenate([far, near]).astype(np.float32)
     # its length is written below
-    assert find_inside(Box.around(xyz).scale_bar, xyz, aspect, floor=0.97).all()
+    assert find_inside(
+        Box.around(xyz).scale_bar(place_viewpoint(xyz, aspect).eye), xyz, aspect, floor=0.97
+    ).all()
 
 
 def test_panes_have_a_handy_size_and_dark_holes() -> None:
