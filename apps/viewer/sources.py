@@ -405,7 +405,7 @@ class TransientSource(RecoveredSource):
         # As the intensity of a point, referred to 1 m: far objects would be lost beside near ones.
         light = np.tensordot((distance**2).astype(np.float32), self.frames.values[frames], 1)
         return {
-            "streak": np.nan_to_num(readings, nan=float(np.nanmax(readings))).T,
+            "streak": np.where(np.isfinite(readings), readings, self._predictions).T,
             "intensity": light,
             "depth": render_depth(self._whole_view, self.camera.image_shape),
         }
@@ -428,13 +428,14 @@ class TransientSource(RecoveredSource):
         # Surfaces were found with their points; frames are searched for theirs.
         return make_view(depth(self.frames) if self.frames.returns is None else self.frames.returns)
 
-    @cached_property
+    @property
     def _measurements(self) -> Readings:
-        """What the camera read, NaN where it was dazzled, or would read; neighbouring frames of one
-        shear share an operator.
-        """
-        if self.frames.measured.size:
-            return self.frames.measured
+        """What the camera read, NaN where it was dazzled or blind, or would read."""
+        return self.frames.measured if self.frames.measured.size else self._predictions
+
+    @cached_property
+    def _predictions(self) -> Readings:
+        """What the camera would read; neighbouring frames of one shear share an operator."""
         frames, shears = self.frames, self.frames.shears
         measurements = np.empty((frames.camera.slit_width_px, frames.times.size), np.float32)
         cuts = np.flatnonzero(np.concatenate([[True], np.diff(shears) != 0, [True]]))
