@@ -220,12 +220,53 @@ def make_moving(r, frame: int = 0) -> list[Surface]:
     ]
 
 
+def make_stairs(r) -> list[Surface]:
+    steps = []
+    for k in range(5):  # each a riser and a tread, further away the higher
+        y, z = 0.42 - 0.2 * k, 2.2 + 0.28 * k
+        steps.append(plate("riser", (0, y, z), (1.6, 0.16), 0.55))
+        steps.append(plate("tread", (0, y - 0.1, z + 0.14), (1.6, 0.28), 0.6, 0.0, 1.45))
+    return [
+        *steps,
+        cylinder("rail", (-0.5, 0.2, 2.1), (-0.4, -0.7, 3.3), r.uniform(0.015, 0.02), 0.6),
+        plate("wall", (0, 0, 4.3), (4, 4), 0.45, yaw=r.uniform(-0.15, 0.15)),
+    ]
+
+
+def make_lamp(r) -> list[Surface]:
+    x, turn = r.uniform(-0.15, 0.15), r.uniform(-0.5, 0.5)
+    return [
+        cylinder("cable", (x, -0.9, 2.5), (x, -0.2, 2.5), 0.006, 0.4),
+        sphere("lamp", (x, -0.08, 2.5), r.uniform(0.11, 0.14), 0.75),
+        sphere("retroreflector", (x - 0.4, 0.3, 3.0), 0.012, 0.1, r.uniform(8, 20)),
+        sphere("retroreflector", (x + 0.35, 0.35, 3.5), 0.014, 0.1, r.uniform(8, 20)),
+        plate("slanted picture", (-x, 0.4, 3.2), (0.7, 0.4), checker(0.1, 0.2, 0.7), turn, 0.5),
+        plate("wall", (0, 0, 3.8), (4, 4), 0.3, yaw=turn / 5),
+    ]
+
+
+def make_fence(r) -> list[Surface]:
+    slats = [
+        plate("slat", (x, 0.1, 2.4 + 0.3 * x), (0.045, 1.0), 0.6, 0.3)
+        for x in np.arange(-0.6, 0.65, 0.1) + r.uniform(-0.03, 0.03)
+    ]
+    return [
+        *slats,
+        cylinder("rod", (-0.7, -0.1, 2.15), (0.7, -0.1, 2.6), 0.008, 0.6),
+        cylinder("trunk", (0.3, -0.8, 3.2), (0.2, 0.8, 3.2), r.uniform(0.08, 0.12), 0.4),
+        plate("wall", (0, 0, 3.9), (4, 4), checker(0.3, 0.3, 0.5), yaw=r.uniform(-0.1, 0.1)),
+    ]
+
+
 SCENES = {
     "room": make_room,
     "wires": make_wires,
     "gauze": make_gauze,
     "table": make_table,
     "bush": make_bush,
+    "stairs": make_stairs,
+    "lamp": make_lamp,
+    "fence": make_fence,
 }
 
 

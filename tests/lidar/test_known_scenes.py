@@ -64,9 +64,11 @@ def test_rays_are_left_out_and_marked_where_all_points_are_asked_for(scene, miss
     found = score(shot, tofclip.point_cloud(tofclip.depth(frames)))
     assert found["miss"] < missed
     assert found["false"] < false
+    # Deviations are true on each surface, flat, slanted or round; those of wires are not.
+    assert {k: z for k, z in found["z"].items() if not 0.4 < z < 2.2 and "wire" not in k} == {}
     everything = score(shot, tofclip.point_cloud(tofclip.depth(frames, false_alarm=1.0)))
     assert everything["miss"] < 0.01
     assert everything["false"] > 0.15
     true_fractions = [fraction for *_, fraction, number in everything["calibration"] if number > 50]
     assert true_fractions[0] < 0.03
-    assert true_fractions[-1] > max(0.5, 2 * true_fractions[-3])
+    assert true_fractions[-1] > max(0.5, 1.5 * true_fractions[-3])

@@ -46,6 +46,7 @@ from tofclip.lidar.significance import (
     DEFAULT_FALSE_ALARM,
     Detection,
     EvidenceJudge,
+    join_candidates,
 )
 from tofclip.shots import Frames, Returns
 from tofclip.threads import run_blocks, split_blocks
@@ -103,6 +104,10 @@ class ReturnSearch:
             kept = self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
             kept &= time > 0
         else:
+            pixel, (time, signal, deviation) = join_candidates(
+                judge.frames, self.pulse, pixel, np.array([time, signal, deviation])
+            )
+            intensity = signal * _square_distance(time)
             doubt = judge.judge(pixel, time, signal)
             kept = (time > 0) & (doubt <= judge.max_false_alarm)
             false_alarm = doubt[kept]

@@ -16,6 +16,7 @@ a return is true if it is neither noise nor spread.
   light there and the others are dark. Without the candidate and those around it they would be
   explained better.
 
+Ripples on light that is spread over time are one candidate before that (`join_candidates`).
 Both are logistic functions of these numbers, whose few weights (`NOISE`, `SPREAD`) were found on scenes
 of known returns by a forward model of their own (docs/recovery_algorithm.md has the table).
 """
@@ -205,6 +206,7 @@ NOISE = np.array([0.93, 0.41, -3.118])
 # of the logs of the brightness, over that of the light at its instant, over that of the scene's light, and
 # over the most in the pixel, and of the relative excess of light
 SPREAD = np.array([0.567, 1.3, 0.981, 3.915, 3.582])
+SPREAD_ERROR = 0.5  # of the middle of light that is spread over time, in its deviations
 FRAMES_PER_BLOCK = 32
 CLIPPED_KEY = "clipped_readings"  # of the figures of frames, see `tofclip.recovery.defects`
 
@@ -339,6 +341,45 @@ def weigh_candidates(
     # The pulse's samples are a shape; a candidate's counts are its sum over the bins.
     height = signal / np.maximum(total, TINY)
     return height * np.sqrt(information), height * missing, height * light
+
+
+def join_candidates(
+    frames: Frames, pulse: Pulse, pixel: NDArray[np.int64], found: FloatArray
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Make one candidate of those of a pixel that are ripples of one surface's light, which the recovery
+    spread over time. `pixel` (n,) and `found` (3, n), times (s), signals and deviations (s), in the order
+    of pixels and times; return the same of the surfaces. Of such a surface the light says how far off its
+    middle may be.
+    """
+    if pixel.size == 0:
+        return pixel, found
+    # the compiler takes as long to import as all else
+    from tofclip.lidar.spread_kernels import join_spread
+
+    times, (time, signal, deviation) = frames.times, found
+    values = to_numpy(frames.values).reshape(times.size, -1)
+    step = float(times[-1] - times[0]) / (times.size - 1)
+    fine = np.linspace(*pulse.support, 256)
+    shape = pulse(fine) ** 2
+    late = float(np.average(fine, weights=shape))
+    own = float(np.average((fine - late) ** 2, weights=shape))
+    place = np.clip(np.searchsorted(times, time), 1, times.size - 1)
+    place -= time - times[place - 1] < times[place] - time
+    joined, moments = np.empty(time.size, np.int64), np.empty((3, time.size))
+    half = int(pulse.fwhm / (2 * step))
+    join_spread(values, times, pixel, place, half, own, joined, moments)
+    first, number = np.unique(joined, return_inverse=True)
+    alone = np.bincount(number) == 1
+    _, middle, variance = moments[:, first]
+    spread = np.sqrt(np.maximum(variance - own, 0))
+    surfaces = np.array(
+        [
+            np.where(alone, time[first], middle - late),
+            np.bincount(number, signal),
+            np.hypot(deviation[first], np.where(alone, 0, SPREAD_ERROR * spread)),
+        ]
+    )
+    return pixel[first], surfaces
 
 
 @dataclass(frozen=True)
