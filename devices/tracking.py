@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from time import monotonic
+from functools import cached_property
+from time import monotonic, time_ns
 from typing import Protocol, runtime_checkable
 
 from tofclip.errors import TofclipError
@@ -27,6 +28,14 @@ class ShotStamp:
     taken_at: float = 0.0
     # when the last of it came, s of `time.monotonic`; 0 where it comes from a file
     received_at: float = 0.0
+
+    @cached_property
+    def epoch_ns(self) -> int:
+        """When it was taken, or came, in nanoseconds since 1970 by this computer's clock; of a file, a
+        tenth of a second for each shot.
+        """
+        age = self.compute_age()
+        return self.number * 10**8 if age is None else time_ns() - round(age * 1e9)
 
     def compute_age(self) -> float | None:
         """Return the seconds since it was taken, or came; None for a file."""

@@ -27,6 +27,7 @@ from apps.progress import show_progress
 from apps.report import (
     RECORD_SUFFIXES,
     describe_ranges,
+    make_folder,
     report,
     require_writable,
 )
@@ -46,29 +47,53 @@ app.command()(photons)
 
 @app.command()
 def bag(
-    clouds: Path = arg("CLOUDS", "A folder or quoted pattern of point clouds.", read=True),
+    clouds: Path = arg(
+        "CLOUDS",
+        "A folder or quoted pattern of point clouds; or a bag or MCAP file with them.",
+        read=True,
+    ),
     out: Path = opt(
         "BAG",
-        "Ends in .mcap for one MCAP file; any other name is a new folder, a ROS 2 bag.",
+        "Ends in .mcap for one MCAP file; any other name is a new folder, a ROS 2 bag; or where a bag's clouds go.",
         ...,
     ),
+    topic: str | None = opt(
+        "NAME", "Of the messages.", shown="/tofclip/points; of a bag, its only one"
+    ),
+    frame_id: str = opt("NAME", "Frame of reference of the messages.", "tofclip_optical"),
+    suffix: str = SUFFIX,
     rate_hz: float = opt("HZ", "Clouds a second, in the order of their names.", 10.0),
     start_s: float = opt("S", "Stamp of the first cloud, since the epoch.", 0.0),
     as_json: bool = JSON,
 ) -> None:
-    """Write clouds with stamps as ROS 2 messages (sensor_msgs/PointCloud2 in an optical frame).
+    """Write clouds with stamps as ROS 2 messages (sensor_msgs/PointCloud2 in an optical frame), or the
+    clouds of such a recording, whichever program made it, as files.
 
-    Needs no ROS, but rosbags: pip install 'tofclip[exchange]'.
+    Stamps of an instrument are written by stream --out run.mcap. Needs no ROS, but rosbags:
+    pip install 'tofclip[exchange]'.
 
     Example: tofclip lidar bag clouds/ --out drive.mcap --rate-hz 25
     """
-    from tofclip.lidar import PointCloud
-    from tofclip.lidar.ros import MCAP_SUFFIX, NANOSECONDS_PER_SECOND, StampedCloud, write_bag
+    from tofclip.lidar import PointCloud, ros
+    from tofclip.lidar.ros import MCAP_SUFFIX, NANOSECONDS_PER_SECOND, StampedCloud
     from tofclip.sequences import list_files
+    from tofclip.sequences.ranger import build_cloud_path
     from tofclip.sequences.ranging import PLAN_NAME
 
     if not (rate_hz > 0 and start_s >= 0):
         raise InputError("the rate must be positive and the start not negative")
+    if clouds.suffix.lower() == MCAP_SUFFIX or (clouds / "metadata.yaml").exists():
+        require_format(suffix)
+        points, stamps = 0, []
+        for number, one in enumerate(ros.read_bag(clouds, topic)):
+            if not number:
+                make_folder(out)
+            one.cloud.save(build_cloud_path(out, number, suffix))
+            points += len(one.cloud)
+            stamps.append(one.stamp_ns)
+        seconds = (stamps[-1] - stamps[0]) / NANOSECONDS_PER_SECOND if stamps else 0.0
+        report({"clouds": len(stamps), "points": points, "seconds": seconds}, as_json, [out])
+        return
     files = [
         file
         for file in list_files(clouds).values()
@@ -89,7 +114,7 @@ def bag(
             advance(1)
 
     with show_progress("writing", len(files)) as advance:
-        number = write_bag(read(), out)
+        number = ros.write_bag(read(), out, topic or ros.TOPIC, frame_id)
     figures = {"clouds": number, "points": points, "seconds": (number - 1) / rate_hz}
     report(figures, as_json, [out])
 

@@ -13,13 +13,14 @@ import typer
 
 from apps.jobs import EXIT_SOME_FAILED
 from apps.options import BIN_WIDTH, CAMERA, FOCUS, JSON, SUFFIX, TIME_ZERO, arg, flag, opt
-from apps.report import make_folder, report
+from apps.report import make_folder, report, require_writable
 from apps.verbs.recover import require_format
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
 
 if TYPE_CHECKING:
-    from devices.tracking import TrackedShots
+    from devices.tracking import ShotStamp, TrackedShots
+    from tofclip.lidar import PointCloud
     from tofclip.sequences.pipelines import LiveShot
     from tofclip.sequences.streaming import StreamedCloud
 
@@ -32,7 +33,11 @@ def stream(
         "An instrument's address such as 'sim+remoteex://?seed=1', a folder of shots or an HDF5 stack.",
         read=True,
     ),
-    out: Path | None = opt("FOLDER", "Where the clouds go.", shown="nowhere"),
+    out: Path | None = opt(
+        "FOLDER",
+        "Where the clouds go; a name that ends in .mcap is one file of ROS 2 messages with the instrument's stamps.",
+        shown="nowhere",
+    ),
     camera: Path | None = CAMERA,
     bin_width: float | None = BIN_WIDTH,
     time_zero: float | None = TIME_ZERO,
@@ -75,7 +80,10 @@ def stream(
     require_format(suffix)
     if shots is not None and shots < 1:
         raise InputError(f"--shots must be positive, got {shots}")
-    if out is not None:
+    is_file = out is not None and out.suffix.lower() == ".mcap"
+    if out is not None and is_file:
+        require_writable(out, inputs=(source, camera))
+    elif out is not None:
         require_apart([out, *out.glob(f"cloud_*{suffix}")], [source, camera])
     coming = TrackedShots(_read_shots(source, bin_width))
     # The first shot brings the camera and the time axis of all.
@@ -86,7 +94,7 @@ def stream(
             raise fault
         raise InputError(f"{source}: the source ended before it gave a shot")
     pipeline = make_pipeline(first, camera, time_zero, parse_focus(focus), method)
-    if out is not None:  # only now: what cannot be streamed leaves no empty folder
+    if out is not None and not is_file:  # only now: what cannot be streamed leaves no empty folder
         make_folder(out)
     failed = 0
 
@@ -103,11 +111,20 @@ def stream(
         "drop_oldest" if drop or coming.is_live else "block",
         on_failure=note_failure,
     )
+    tally = _Tally()
     with closing(made):
-        figures = _take_clouds(islice(made, shots), out, suffix, coming)
+        taken = tally.watch(islice(made, shots), coming)
+        if out is None:
+            deque(taken, maxlen=0)
+        else:
+            _save_clouds(taken, out, suffix)
     # Counted last: only when the instrument has been stopped are its accounts final.
-    accounts = coming.count_shots(figures["clouds"], failed)
-    figures |= {"method": pipeline.method_name, "dropped": accounts.dropped, **asdict(accounts)}
+    accounts = coming.count_shots(tally.clouds, failed)
+    figures = tally.list_figures() | {
+        "method": pipeline.method_name,
+        "dropped": accounts.dropped,
+        **asdict(accounts),
+    }
     report(figures, as_json, [] if out is None else [out])
     if failed:
         raise typer.Exit(EXIT_SOME_FAILED)
@@ -136,42 +153,62 @@ def _read_or_fail(shot: Callable[[], LiveShot]) -> LiveShot | TofclipError:
         return fault
 
 
-def _take_clouds(
-    made: Iterable[StreamedCloud], out: Path | None, suffix: str, shots: TrackedShots
-) -> dict[str, Any]:
-    """Take the clouds as they come; return what is reported of them at the end."""
-    from time import perf_counter
+class _Tally:
+    """What is reported of clouds as they come."""
 
+    def __init__(self) -> None:
+        self.clouds = self.points = 0
+        self._stages: dict[str, deque[float]] = {}
+        self._latency: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
+        self._ages: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
+        self._origin, self._seconds = "file", 0.0
+
+    def watch(
+        self, made: Iterable[StreamedCloud], shots: TrackedShots
+    ) -> Iterator[tuple[PointCloud, ShotStamp]]:
+        """Yield every cloud with its shot's stamp."""
+        from time import perf_counter
+
+        started = perf_counter()
+        for one in made:
+            stamp = shots.get_stamp(one.shot)
+            age = stamp.compute_age()
+            self._ages.append(one.latency if age is None else age)
+            known = "instrument" if stamp.taken_at else "arrival" if stamp.received_at else ""
+            self._origin = known or self._origin
+            self._latency.append(one.latency)
+            yield one.cloud, stamp
+            self.clouds += 1
+            self.points += len(one.cloud)
+            for name, seconds in one.seconds.items():
+                self._stages.setdefault(name, deque(maxlen=MAX_LATENCY_SAMPLES)).append(seconds)
+            self._seconds = perf_counter() - started
+
+    def list_figures(self) -> dict[str, Any]:
+        """What is reported at the end."""
+        ages = compute_quantiles(self._ages)
+        stages = {name: compute_quantiles(seconds) for name, seconds in self._stages.items()}
+        return {
+            "clouds": self.clouds,
+            **{f"latency_{name}_s": value for name, value in ages.items()},
+            "latency_from": self._origin,
+            "points": self.points,
+            "clouds_per_second": self.clouds / self._seconds if self.clouds else 0.0,
+            "latency_s": compute_quantiles(self._latency),
+            "stages_s": stages,
+        }
+
+
+def _save_clouds(taken: Iterable[tuple[PointCloud, ShotStamp]], out: Path, suffix: str) -> None:
+    """Write clouds as they come: files of a folder, or messages of an MCAP file."""
+    from tofclip.lidar.ros import MCAP_SUFFIX, StampedCloud, write_bag
     from tofclip.sequences.ranger import build_cloud_path
 
-    stages: dict[str, deque[float]] = {}
-    latency: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
-    ages: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
-    clouds = points = 0
-    origin = "file"
-    started = perf_counter()
-    for one in made:
-        stamp = shots.get_stamp(one.shot)
-        age = stamp.compute_age()
-        ages.append(one.latency if age is None else age)
-        origin = "instrument" if stamp.taken_at else "arrival" if stamp.received_at else origin
-        latency.append(one.latency)
-        if out is not None:
-            one.cloud.save(build_cloud_path(out, stamp.number, suffix))
-        clouds += 1
-        points += len(one.cloud)
-        for name, seconds in one.seconds.items():
-            stages.setdefault(name, deque(maxlen=MAX_LATENCY_SAMPLES)).append(seconds)
-    passed = perf_counter() - started
-    return {
-        "clouds": clouds,
-        **{f"latency_{name}_s": value for name, value in compute_quantiles(ages).items()},
-        "latency_from": origin,
-        "points": points,
-        "clouds_per_second": clouds / passed,
-        "latency_s": compute_quantiles(latency),
-        "stages_s": {name: compute_quantiles(seconds) for name, seconds in stages.items()},
-    }
+    if out.suffix.lower() == MCAP_SUFFIX:
+        write_bag((StampedCloud(cloud, stamp.epoch_ns) for cloud, stamp in taken), out)
+        return
+    for cloud, stamp in taken:
+        cloud.save(build_cloud_path(out, stamp.number, suffix))
 
 
 def compute_quantiles(seconds: Iterable[float]) -> dict[str, float]:

@@ -16,6 +16,7 @@ from devices import registry
 from devices.emulation.harness import HOST, Connection, LoopbackServer
 from tofclip.camera import Camera
 from tofclip.lidar import PointCloud
+from tofclip.lidar.ros import read_bag
 from tofclip.units import SPEED_OF_LIGHT
 
 SIGNAL, BACKGROUND, PULSE_S = 20.0, 0.02, 300e-12  # photons, photons a bin, standard deviation
@@ -101,4 +102,11 @@ def test_one_file_and_every_verb(shell: Any, address: str) -> None:
     assert played["acquired"] == played["delivered"] == verified["records"]
     assert shell.figures("view run.h5 --png view.png")["points"] > 0.95 * SIDE**2
     shell.figures("lidar photons run.h5 --out range.npz")
-    assert shell.figures("lidar bag played --rate-hz 25 --out played.mcap")["clouds"] > 10
+    assert shell.figures("info range.npz")["kind"] == "range image"
+    assert shell.figures("view range.npz --png range.png")["points"] > 0.95 * SIDE**2
+    before = time.time_ns()
+    shell.figures(f"stream {address} --shots 3 --out live.mcap")
+    stamps = [one.stamp_ns for one in read_bag("live.mcap")]
+    assert before < stamps[0] < stamps[1] < stamps[2] < time.time_ns()
+    assert shell.figures("lidar bag live.mcap --out back")["clouds"] == 3
+    assert len(PointCloud.load("back/cloud_000002.ply")) > 0.95 * SIDE**2

@@ -97,6 +97,52 @@ def test_every_layout_gives_the_same_photons(name, counts, tmp_path):
             read_photons(path)
 
 
+def list_events(cube):
+    """(n, 3) columns x, y, t of single photons, in no order."""
+    y, x, t = np.repeat(np.nonzero(cube), cube[cube > 0], axis=1)
+    return np.random.default_rng(0).permutation(np.stack([x, y, t], axis=1))
+
+
+def save_rows(folder, cube):
+    folder.mkdir()
+    for number, row in enumerate(cube):
+        np.save(folder / f"row{number}.npy", row)
+
+
+# Layouts that need a word about their axes, or hold a part of the picture: how they are written, the word,
+# and which part.
+FURTHER = {
+    "line.npy": (lambda path, cube: np.save(path, cube[3].T), "tx", np.s_[3:4]),
+    "column.npy": (lambda path, cube: np.save(path, cube[:, 2]), "yt", np.s_[:, 2:3]),
+    "histogram.npy": (lambda path, cube: np.save(path, cube[3, 2]), "t", np.s_[3:4, 2:3]),
+    "one.npz": (
+        lambda path, cube: np.savez(path, s_TDC=np.repeat(np.arange(BINS), cube[3, 2])[None]),
+        None,
+        np.s_[3:4, 2:3],
+    ),
+    "xyt.npy": (lambda path, cube: np.save(path, list_events(cube)), None, np.s_[:]),
+    "tyx.npy": (lambda path, cube: np.save(path, list_events(cube).T[::-1]), "tyx", np.s_[:]),
+    "rows": (save_rows, None, np.s_[:]),
+}
+
+
+@pytest.mark.parametrize("name", FURTHER)
+def test_further_layouts_give_the_same_photons(name, counts, tmp_path):
+    write, axes, part = FURTHER[name]
+    write(tmp_path / name, counts)
+    photons = read_photons(tmp_path / name, BIN, axes)
+    expected = counts[part]
+    assert photons.image_shape == expected.shape[:2]
+    assert photons.photons == expected.sum()
+    expected = expected.reshape(-1, BINS)[:, : photons.bins]
+    np.testing.assert_array_equal(all_histograms(photons), expected)
+    if axes and len(axes) < 3:
+        with pytest.raises(
+            FileFormatError, match=f"give `axes`, e.g. {axes[-1] if axes == 't' else 'xt'}"
+        ):
+            read_photons(tmp_path / name, BIN)
+
+
 @pytest.mark.parametrize("name", WRITERS)
 def test_damaged_files_are_refused_in_one_line(name, counts, tmp_path):
     path = tmp_path / name
@@ -172,7 +218,7 @@ def test_axes_in_any_order(axes, counts, tmp_path):
     np.testing.assert_array_equal(found, counts.reshape(-1, BINS))
     if axes.index("y") < axes.index("x"):  # a mirrored picture cannot be recognised
         assert read_photons(path, BIN).image_shape == (ROWS, COLUMNS)
-    with pytest.raises(InputError, match="yxt"):
+    with pytest.raises((InputError, FileFormatError), match="yxt"):
         read_photons(path, BIN, axes[:2])
 
 
@@ -220,7 +266,7 @@ def test_what_has_no_suitable_layout_is_told_which_would_do(tmp_path):
     (tmp_path / "empty.npy").touch()
     for name, problem in {
         "line.npy": "holds no photons",
-        "flat.npy": "cube of counts",
+        "flat.npy": "give `axes`, e.g. xt of a line",
         "two.npz": "several cubes",
         "objects.npy": "cube of counts",
         "text.txt": "cube of counts",

@@ -8,7 +8,7 @@ import pytest
 
 from tofclip.errors import InputError, MissingDependencyError, StorageError
 from tofclip.lidar import PointCloud
-from tofclip.lidar.ros import StampedCloud, write_bag
+from tofclip.lidar.ros import StampedCloud, read_bag, write_bag
 
 pytest.importorskip("rosbags")
 
@@ -54,6 +54,21 @@ def test_mcap_reads_the_stamps_and_the_points(cloud, tmp_path):
         assert "time" not in layout.names
     np.testing.assert_array_equal(rows["false_alarm"], other.false_alarm)
     np.testing.assert_array_equal(rows["reflectance"], other.reflectance)
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "run"])
+def test_what_was_written_is_read_back(name, cloud, tmp_path):
+    stamps = [7, 5_000_000_001]
+    clouds = [StampedCloud(cloud, stamps[0]), StampedCloud(cloud[:9], stamps[1])]
+    write_bag(clouds, tmp_path / name, "/lidar", "mast")
+    assert b"mast" in b"".join(one.read_bytes() for one in tmp_path.rglob("*") if one.is_file())
+    found = list(read_bag(tmp_path / name))
+    assert [one.stamp_ns for one in found] == stamps
+    for one, written in zip(found, clouds, strict=True):
+        for column, kept in zip(one.cloud.columns, written.cloud.columns, strict=True):
+            np.testing.assert_array_equal(column.values, kept.values)
+    with pytest.raises(InputError, match=r"choose one topic .*: /lidar"):
+        list(read_bag(tmp_path / name, "/other"))
 
 
 def test_sqlite_and_the_standard_show_what_is_in_a_bag(cloud, tmp_path):

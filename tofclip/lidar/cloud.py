@@ -247,17 +247,9 @@ class PointCloud(Storable):
         require_type(cloud, open3d.t.geometry.PointCloud, "from_open3d takes Open3D's point cloud")
         known = {name: values.cpu().numpy() for name, values in cloud.point.items()}
         xyz = known.get("positions", np.empty((0, 3))).astype(np.float64)
-        unknown = np.full(len(xyz), np.nan)
-        distance = np.linalg.norm(xyz, axis=1)
-        columns = {
-            "intensity": known["colors"].mean(axis=1) if "colors" in known else unknown,
-            "range_sigma": unknown,
-            "range": distance,
-            "return_number": np.ones(len(xyz)),
-            "time": 2 * distance / SPEED_OF_LIGHT,
-        }
-        columns |= {name: known[name].ravel() for name in PROPERTY_COLUMNS if name in known}
-        return cls(xyz, **columns)
+        if "colors" in known:
+            known = {"intensity": known["colors"].mean(axis=1)} | known
+        return complete_cloud(xyz, known)
 
     def to_torch(self) -> Any:
         """Return the positions as a PyTorch tensor (points, 3), m, which shares NumPy's memory.
@@ -350,6 +342,22 @@ class PointCloud(Storable):
             for name, unit in COLUMN_UNITS.items()
             if name not in OPTIONAL_COLUMNS or np.isfinite(getattr(self, name)).any()
         ]
+
+
+def complete_cloud(xyz: FloatArray, known: Mapping[str, NDArray[Any]]) -> PointCloud:
+    """Make a cloud of another program's positions (n, 3), m, and columns. What is missing is made up
+    where it follows from the positions, is otherwise NaN.
+    """
+    unknown, distance = np.full(len(xyz), np.nan), np.linalg.norm(xyz, axis=1)
+    columns: dict[str, Any] = {
+        "intensity": unknown,
+        "range_sigma": unknown,
+        "range": distance,
+        "return_number": np.ones(len(xyz)),
+        "time": 2 * distance / SPEED_OF_LIGHT,
+    }
+    columns |= {name: np.ravel(known[name]) for name in PROPERTY_COLUMNS if name in known}
+    return PointCloud(np.asarray(xyz, np.float32), **columns)
 
 
 def point_cloud(returns: Returns) -> PointCloud:

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import FloatArray, to_numpy
 from tofclip.camera import Camera
 from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError, ShapeError, require_type
@@ -56,6 +56,10 @@ BATCH_BYTES, MAX_PIXELS_PER_BATCH = 1 << 19, 512  # traces that fit the second-l
 # the response at the bin of a peak is up to 5 % below that at its top, and the fit makes up for more
 SAMPLE_THRESHOLD_FACTOR = 0.85
 MIN_SAMPLED_BATCHES, SAMPLING_STEP = 32, 7  # odd, or all of a sample might lie in one column
+# Of counted photons: a histogram's length at least, in bins and pulses, returns of a pixel at most,
+# and how often one is announced where there is none.
+MIN_COUNTED_BINS, MIN_COUNTED_PULSES = 16, 10.0
+MAX_COUNTED_RETURNS, DEFAULT_COUNTED_ALARM = 3, 0.01
 MIN_PULSE_BINS = 2.0  # anything shorter falls between the samples
 
 
@@ -221,6 +225,10 @@ def depth(
     are judged by that (`tofclip.lidar.significance`). Those of other frames, or where `detection` is
     given, are judged by its fractions.
 
+    Counted photons, whole numbers that a camera of one view saw (`Camera.pinhole`), are no recovered
+    frames: their returns are found pixel by pixel by `tofclip.lidar.photons.estimate_pixels`, and
+    deviations are those of photons.
+
     Parameters
     ----------
     frames : Frames
@@ -232,7 +240,8 @@ def depth(
         As for `ReturnSearch`.
     false_alarm : float, optional
         Probability of being false, noise or spread by the recovery, up to which a candidate counts as a
-        return; 0.1 by default. 1 keeps them all.
+        return; 0.1 by default. 1 keeps them all. Of counted photons the share of pixels without a
+        return in which one is announced, 0.01 by default.
 
     Returns
     -------
@@ -263,6 +272,9 @@ def depth(
         raise ShapeError(
             "frames", f"(time, y, x) with (y, x) = {camera.image_shape}", frames.values.shape
         )
+    shape = Pulse.gaussian(camera.pulse_fwhm) if pulse is None else pulse
+    if detection is None and _holds_counts(frames, shape):
+        return _count_returns(frames, camera, shape, false_alarm)
     judged = detection is None and frames.measured.size > 0
     noise = MeasurementNoise.from_figures(frames.figures) if judged else None
     if noise is None and false_alarm is not None:
@@ -278,6 +290,37 @@ def depth(
         limit = DEFAULT_FALSE_ALARM if false_alarm is None else false_alarm
         judge = EvidenceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
     return search.find_returns(FrameTraces(frames), frames.provenance, judge)
+
+
+def _holds_counts(frames: Frames, pulse: Pulse) -> bool:
+    """Whether frames are counted photons: whole numbers, some above one, on an even time axis that is
+    longer than a few pulses.
+    """
+    if frames.camera.views > 1 or frames.measured.size or len(frames) < MIN_COUNTED_BINS:
+        return False
+    steps = np.diff(frames.times)
+    if steps.sum() < MIN_COUNTED_PULSES * pulse.fwhm:
+        return False
+    values = to_numpy(frames.values)
+    whole = values.max() > 1 and values.min() >= 0 and not np.any(values != np.rint(values))
+    return bool(whole and np.ptp(steps) < 1e-3 * steps.mean())
+
+
+def _count_returns(
+    frames: Frames, camera: Camera, pulse: Pulse, false_alarm: float | None
+) -> Returns:
+    from tofclip.lidar.photons import PhotonImage, estimate_pixels
+
+    cube = np.moveaxis(to_numpy(frames.values), 0, -1)
+    found = estimate_pixels(
+        PhotonImage.from_cube(cube, frames.bin_width),
+        pulse,
+        DEFAULT_COUNTED_ALARM if false_alarm is None else false_alarm,
+        max_returns=MAX_COUNTED_RETURNS,
+    )
+    # the frames' times are times of flight already
+    found = found.calibrate(camera.replace(time_zero=0.0), float(frames.times[0]))
+    return found.to_returns(camera, frames.provenance)
 
 
 def _square_distance(time: FloatArray) -> FloatArray:

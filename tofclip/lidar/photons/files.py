@@ -8,6 +8,7 @@ memory: a size is believed only if the file can hold it and if it stays below a 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -50,8 +51,8 @@ MAX_LOOKED_AT = 1 << 25  # values, evenly chosen, that say which axis is time
 MAX_SECONDS = 1e-3  # photon times that are all shorter and not whole are seconds, others bins
 
 SUITABLE = (
-    "a cube of counts (y, x, t), a list of photon times for each pixel (cells (y, x)), or events "
-    "x, y, time would do"
+    "a cube of counts (y, x, t), a list of photon times for each pixel (cells (y, x)) or of one "
+    "(`time`), or events x, y, time would do"
 )
 CUBE_NAMES = ("counts", "histogram", "histograms", "cube", "photons", "spad", "data")
 TIME_NAMES = ("time", "t", "bin", "tof", "times")
@@ -82,11 +83,13 @@ def read_photons(
 ) -> PhotonImage:
     """Read the photons that every pixel of a picture counted. `bin_width`: duration of a bin, or
     unit of the photon times, s; overrides the file's own; `axes`: order of a cube's axes, such as
-    ``"yxt"`` or ``"txy"``; by default that is time along which light is most concentrated and which
-    is longest; `PhotonImage.axes` says how surely.
+    ``"yxt"`` or ``"txy"``, of a line's, such as ``"xt"``, of one histogram, ``"t"``, or of the columns
+    of a list of events; by default that is time along which light is most concentrated and which is
+    longest, `PhotonImage.axes` says how surely, and events are x, y, t. `path` may be a folder with a
+    file for each row.
     """
     source = Path(path)
-    if axes is not None and sorted(axes) != ["t", "x", "y"]:
+    if axes is not None and ("t" not in axes or len({*axes} & {*"yxt"}) != len(axes)):
         raise InputError(f"axes are an order of y, x and t such as yxt, got '{axes}'")
     opened = _open_photons(source)
     width = opened.bin_width if bin_width is None else bin_width
@@ -103,6 +106,8 @@ def describe_photons(path: str | Path) -> dict[str, Any]:
     try:
         layout = _find_layout(opened, Path(path))
     except FileFormatError:
+        if not any(len(one.shape) == 3 for one in opened.arrays.values()):
+            raise
         # a picture of one row or one pixel, whose axes no shape tells: any order shows its array
         layout = _find_layout(opened, Path(path), "yxt")
         axes = "not recognised: give --axes, e.g. yxt"
@@ -116,6 +121,8 @@ def describe_photons(path: str | Path) -> dict[str, Any]:
 
 def _open_photons(path: Path) -> _PhotonFile:
     """List the arrays of a file by the reader that its first bytes or its name ask for."""
+    if path.is_dir():
+        return _open_rows(path)
     with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(520)
     if not start:
@@ -133,6 +140,25 @@ def _open_photons(path: Path) -> _PhotonFile:
         return reader(path)
 
 
+def _open_rows(folder: Path) -> _PhotonFile:
+    """A cube with a file for each row, in the order of their names, numbers in them as numbers."""
+
+    def count(file: Path) -> list[tuple[int, str]]:
+        words = re.split(r"(\d+)", file.stem)
+        return [(int(word), "") if word.isdigit() else (-1, word) for word in words]
+
+    files = sorted((one for one in folder.iterdir() if one.name[0] != "."), key=count)
+    opened = [_open_photons(file) for file in files]
+    rows = [one for each in opened for one in each.arrays.values() if len(one.shape) == 2]
+    if len(rows) != len(files) or len({(one.shape, one.dtype) for one in rows}) != 1:
+        raise FileFormatError(
+            folder, "is no cube with an array of one shape (x, t) in a file for each row"
+        )
+    shape = len(rows), *rows[0].shape  # each file bounds its own
+    entry = ArchiveEntry(shape, rows[0].dtype, lambda: np.stack([one.load() for one in rows]))
+    return _PhotonFile({"rows": entry}, opened[0].bin_width)
+
+
 def _is_cell(entry: ArchiveEntry) -> bool:
     return bool(entry.dtype.hasobject)
 
@@ -143,9 +169,10 @@ def _find_layout(
     """Choose the arrays that hold the photons."""
     arrays = opened.arrays
     numbers = {name: one for name, one in arrays.items() if not _is_cell(one)}
-    small = {name: one for name, one in numbers.items() if len(one.shape) == 3}
+    sides = len(axes) if axes else 3
+    small = {name: one for name, one in numbers.items() if len(one.shape) == sides}
     thick = {name: sum(length != 1 for length in one.shape) for name, one in arrays.items()}
-    cubes = {name: one for name, one in numbers.items() if thick[name] == 3}
+    cubes = {name: one for name, one in numbers.items() if thick[name] == sides}
     if axes or opened.axes:  # known: there may be one row, or one pixel
         cubes = cubes or small
     named = [one for n, one in cubes.items() if n.rpartition("/")[2].lower() in CUBE_NAMES]
@@ -154,13 +181,28 @@ def _find_layout(
         return "cube", named if len(named) == 1 else list(cubes.values())
     if not cubes and len(cells) == 1:
         return "cells", cells
-    flat = {name.lower(): one for name, one in arrays.items() if thick[name] == 1}
+    flat = {name.lower(): one for name, one in numbers.items() if thick[name] == 1}
     times = [flat[name] for name in TIME_NAMES if name in flat]
-    if not cubes and not cells and times and "x" in flat and "y" in flat:
-        return "events", [flat["y"], flat["x"], times[0]]
+    if not cubes and not cells:
+        if times and "x" in flat and "y" in flat:
+            return "events", [flat["y"], flat["x"], times[0]]
+        # three rows may be a line of three pixels: that they are x, y and t has to be said
+        side = slice(None) if sides == 3 and axes else slice(1, None)
+        tables = [one for one in numbers.values() if len(one.shape) == 2 and 3 in one.shape[side]]
+        if len(tables) == 1 and max(tables[0].shape) > 3:
+            return "table", tables
+        if len(flat) == 1:
+            ((name, alone),) = flat.items()
+            words = re.split(r"[^a-z]+", f"{name} {path.stem.lower()}")
+            if {*words} & {*TIME_NAMES, "tdc", "stamps"}:
+                return "times", [alone]
     held = ", ".join(f"{name} {one.shape}" for name, one in [*arrays.items()][:6]) or "no arrays"
     problem = "several cubes of photons" if len(cubes) > 1 else "no photons"
-    remedy = "give `axes`, e.g. yxt, of a picture of one row" if small and not cubes else SUITABLE
+    remedy = SUITABLE
+    if not cubes and len(numbers) == 1:
+        fitting = {1: "t of one histogram", 2: "xt of a line", 3: "yxt of a picture of one row"}
+        shape = next(iter(numbers.values())).shape
+        remedy = f"give `axes`, e.g. {fitting[len(shape)]}" if len(shape) in fitting else SUITABLE
     raise FileFormatError(path, f"holds {problem} ({held}); {remedy}")
 
 
@@ -170,11 +212,15 @@ def _read_layout(
     layout, arrays = _find_layout(opened, path, axes)
     if layout == "cube":
         cube = arrays[0].load()
-        if cube.ndim > 3:
+        sides = len(axes) if axes else 3
+        if cube.ndim > sides:
             cube = np.squeeze(cube)
+            cube = cube.reshape(cube.shape + (1,) * (sides - cube.ndim))
         if cube.dtype.kind not in "uifb":
             raise FileFormatError(path, f"its cube holds {cube.dtype}, not counts; {SUITABLE}")
         order, how = axes or opened.axes, ""
+        missing = "" if not order else "".join(axis for axis in "yx" if axis not in order)
+        cube, order = cube.reshape((1,) * len(missing) + cube.shape), missing + order
         if not order:
             order, certainty = recognise_axes(cube, path)
             how = f"{order}, ahead of the next axis by a factor of {certainty:.2g}"
@@ -186,8 +232,18 @@ def _read_layout(
         pixel = np.repeat(np.arange(len(lists)), [one.size for one in lists])
         times = np.concatenate(lists) if pixel.size else np.zeros(0)
         rows, columns = cells.shape
+    elif layout == "times":
+        times = arrays[0].load().ravel()
+        pixel, (rows, columns) = np.zeros(times.size, np.int64), (1, 1)
     else:
-        y, x, times = (np.squeeze(entry.load()) for entry in arrays)
+        if layout == "table":
+            table = np.asarray(arrays[0].load())
+            columns_of = dict(
+                zip(axes or "xyt", table.T if table.shape[1] == 3 else table, strict=True)
+            )
+            y, x, times = (columns_of[axis] for axis in "yxt")
+        else:
+            y, x, times = (np.squeeze(entry.load()) for entry in arrays)
         if not y.shape == x.shape == times.shape or min(y.min(initial=0), x.min(initial=0)) < 0:
             raise FileFormatError(path, "its x, y and time are not lists of the same events")
         seen = int(y.max(initial=0)) + 1, int(x.max(initial=0)) + 1

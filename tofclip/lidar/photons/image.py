@@ -295,7 +295,11 @@ def _find_pixels_hot_throughout(photons: PhotonImage) -> NDArray[np.bool_]:
 
 
 def _rank_neighbours(values: FloatArray, rank: int) -> FloatArray:
-    """Value of that rank among each pixel's eight neighbours, of a line the eight along it."""
+    """Value of that rank among each pixel's eight neighbours, of a line the eight along it; of a lone
+    pixel its own.
+    """
+    if values.size == 1:
+        return values
     footprint = np.ones(
         (3, 3) if min(values.shape) > 1 else np.where(np.array(values.shape) > 1, 9, 1)
     )

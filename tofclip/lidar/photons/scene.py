@@ -50,6 +50,7 @@ MIN_PULSE_S = 1e-12  # superconducting counters, the quickest there are, spread 
 # Of the gaps between bins with photons, the one that is taken for the counter's step; and how many
 # such bins with how many photons each say that the bins between them stay empty for a reason.
 STEP_QUANTILE, MIN_STEP_BINS, MIN_PHOTONS_PER_STEP = 0.05, 64, 4.0
+MAX_CELLS = 1 << 26  # bins of all pixels; longer time axes are put together, for memory's sake
 DENSITY_FLOOR = 1e-4  # of the peak: no instant is impossible, so that no single photon decides
 LEARNT_SLOPE_FLOOR = 0.03
 MIN_SIGNAL_PHOTONS = 0.05
@@ -151,6 +152,9 @@ def prepare_photons(
         photons = photons.join_bins(find_time_step(photons))
     pulse = Pulse.gaussian(measure_pulse_width(photons)) if pulse is None else pulse
     require_plausible_pulse(photons, pulse)
+    if join and photons.bins * (photons.offsets.size - 1) > MAX_CELLS:
+        # photons keep their times, and a pulse that is spread over a quarter of itself its width
+        photons = photons.join_bins(max(int(pulse.fwhm / 4 / photons.bin_width), 1))
     return photons, pulse, hot
 
 
