@@ -1,5 +1,6 @@
 """A TCP instrument of one's own, all of it in this file: 32 x 32 histograms of 128 bins, each picture
-behind a header of 8 bytes, its number and the bytes that follow. `register` it, and `tofclip` has it.
+behind a header of 8 bytes, its number and the bytes that follow. Registered, or offered as an
+entry point `tofclip.sources`, every verb has it.
 """
 
 from __future__ import annotations

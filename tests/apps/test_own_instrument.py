@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tcp_histograms
 from tcp_histograms import BIN_S, BINS, HEADER, PICTURE_BYTES, SIDE
 
+import devices
 from devices import registry
 from devices.emulation.harness import HOST, Connection, LoopbackServer
 from tofclip.camera import Camera
@@ -64,7 +66,8 @@ class HistogramServer:
 
 @pytest.fixture
 def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    monkeypatch.setitem(registry.OPENERS, "histograms", "tcp_histograms:open_histograms")
+    monkeypatch.setattr(registry.SOURCES, "registered", {})
+    devices.register_source("histograms", tcp_histograms.open_histograms)
     server = HistogramServer(draw_scene())
     yield server.address
     server.close()
@@ -81,9 +84,7 @@ def list_errors(cloud: PointCloud) -> np.ndarray:
 
 
 def test_one_file_and_every_verb(shell: Any, address: str) -> None:
-    assert (
-        len(Path(registry.import_entry("tcp_histograms:__file__")).read_text().splitlines()) <= 120
-    )
+    assert len(Path(tcp_histograms.__file__).read_text().splitlines()) <= 120
     live = shell.figures(f"stream {address} --shots 12 --out live")
     assert (live["method"], live["clouds"]) == ("photons", 12)
     assert live["acquired"] == live["delivered"] + live["dropped"] + live["failed"]

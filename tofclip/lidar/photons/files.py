@@ -187,8 +187,8 @@ def _find_layout(
         if times and "x" in flat and "y" in flat:
             return "events", [flat["y"], flat["x"], times[0]]
         # three rows may be a line of three pixels: that they are x, y and t has to be said
-        side = slice(None) if sides == 3 and axes else slice(1, None)
-        tables = [one for one in numbers.values() if len(one.shape) == 2 and 3 in one.shape[side]]
+        first = 0 if sides == 3 and axes else 1
+        tables = [one for one in numbers.values() if len(one.shape) == 2 and 3 in one.shape[first:]]
         if len(tables) == 1 and max(tables[0].shape) > 3:
             return "table", tables
         if len(flat) == 1:
