@@ -254,7 +254,7 @@ def test_a_cube_of_counts_has_the_deviations_of_photons(photons: float, backgrou
     found = depth(Frames(cube.astype(np.float32), times, Camera.pinhole((24, 24), 60.0, width)))
     strongest = found.select("strongest")
     assert len(strongest) > 0.98 * ranges.size
-    z = (strongest.range - ranges[strongest.y, strongest.x]) / strongest.confidence
+    z = (strongest.range - ranges[strongest.y, strongest.x]) / strongest.range_sigma
     assert np.median(np.abs(z)) / 0.6745 == pytest.approx(1, abs=0.15)
 
 
