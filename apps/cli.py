@@ -98,6 +98,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   occlusion         what stands behind an occluder: inactive region, demo
   clip              light fields from few measurements: simulate, recover
   reproduce         the paper's tables and figures, made again
+  design            an instrument before it is built: what it will see, how well
   bench             how fast and how large all this is on this machine
   devices           instruments and recordings: list, info, test, verify, repair
   record            an instrument's bytes, to be replayed exactly
@@ -122,6 +123,7 @@ VERBS = {
     "clip": "Light fields from few nonlocal measurements.",
     "occlusion": "See through occluders: which places no view can see, and a demonstration of the others.",
     "reproduce": "Make tables and figures of the paper again, its figures beside ours.",
+    "design": "Tell what a CLIP instrument will see before it is built, by theory and by simulated shots.",
     "bench": "Measure time and memory, each beside the least that the work needs.",
     "devices": "Streak cameras, SPAD sensors, time taggers and their recordings, which tofclip record makes.",
     "record": "Record an instrument: its bytes as they come, with clock, accounts and calibration.",

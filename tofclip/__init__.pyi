@@ -1,6 +1,7 @@
 # The public names of this package and their homes; they are imported on first use.
 
 from .camera import Camera as Camera
+from .designs import design as design
 from .errors import TofclipError as TofclipError
 from .io import read_streak as read_streak
 from .lidar import PointCloud as PointCloud

@@ -95,6 +95,8 @@ def provide(folder: Path, files: Path, curved: Path) -> None:
     cube = noise.poisson(0.03, (12, 14, 100))
     cube[:, :, 40:46] += noise.poisson(2.0, (12, 14, 6))
     np.save(folder / "cube.npy", cube.astype(np.uint8))
+    small = "rows_px = 24\ncolumns_px = 24\nfocal_length_px = 105.0\nbins = 250\n"
+    (folder / "small.toml").write_text(small + "bin_width_ps = 50.0\npulse_ps = 150.0\n")
     # a bright square before a dark ground, 4 x 4 views
     views = [(v, u) for v in range(-2, 2) for u in range(-2, 2)]
     y, x = np.mgrid[:40, :40]
@@ -152,6 +154,7 @@ clip simulate field.h5 --encoder line-even --sampling-ratio 2 --out measured.h5
 clip recover measured.h5 --shear -1 --truth field.h5 --out picture.h5
 clip recover measured.h5 --shear -1 --truth field.h5 --out picture.h5 --preset surfaces\
  --weight 3e-4 --all-in-focus sharp.h5
+design small.toml --shots 2 --out small.png
 occlusion region
 occlusion demo --scene plate --side-px 24 --out occlusion
 reproduce table1 --seeds 1 --out paper

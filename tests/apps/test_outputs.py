@@ -35,7 +35,7 @@ OUTPUTS = {
 INPUTS = {
     *("streak", "shots", "frames", "source", "file", "clouds", "uri", "measurement", "light_field"),
     *("line", "line_background", "dot", "dot_background", "camera", "pulse", "background"),
-    *("truth", "depth_map", "settings", "mesh", "recording", "data", "peers"),
+    *("truth", "depth_map", "settings", "mesh", "recording", "data", "peers", "compare"),
 }
 NO_FILES = {"name"}
 """Arguments that name something else."""

@@ -386,9 +386,11 @@ class GroundTruth:
         )
 
 
-def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1.0) -> Frames:
-    """Transient frames that a perfect camera at the reference viewpoint would deliver, without
-    noise or background.
+def render_true_frames(
+    scene: Scene, instrument: Instrument, exposure: float = 1.0, position: float = 0.0
+) -> Frames:
+    """Transient frames that a perfect camera at the reference viewpoint, or at that of another view,
+    would deliver, without noise or background.
 
     Parameters
     ----------
@@ -396,6 +398,8 @@ def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1
     instrument : Instrument
     exposure : float
         Photons for reflectance 1 at 1 m that fills a pixel.
+    position : float
+        Of the viewpoint, in view steps.
 
     Returns
     -------
@@ -403,7 +407,7 @@ def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1
         On the time axis of the instrument's streak images, time zero taken off.
     """
     camera, detector = instrument.camera, instrument.detector
-    hits = instrument.look_at(scene)
+    hits = instrument.look_at(scene, position)
     pixel = number_ray_pixels(camera.image_shape, instrument.rays_per_pixel_side)
     seen = hits.body != NO_BODY
     brightness = hits.reflectance[seen] / hits.distance[seen] ** 2

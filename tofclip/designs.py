@@ -1,0 +1,830 @@
+"""A CLIP instrument on paper: what its views see, what they leave undetermined, and how well it will
+measure brightness and range.
+
+Every figure is that of the regularised linear inverse, ``h = A' (A A' + mu I)^-1 f`` (method
+"linear"), of which all is known beforehand: with R for the matrix before f, a picture errs by the
+bias ``(R A - 1) h`` and by noise of covariance ``R C R'``, C that of the photons. That is the
+Cramer-Rao bound of all estimates with this bias. Methods with a prior on pictures do better, by an
+amount that only the scene can tell. `predict_accuracy` computes this from the operator; `try_out`
+draws shots with the ray caster, which shares no code with the operator, and recovers them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import time
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+import tomli_w
+from numpy.typing import NDArray
+
+from tofclip.arrays import FloatArray
+from tofclip.camera import Camera, Measurement, SkewSweep, measure
+from tofclip.errors import FileFormatError, InputError
+from tofclip.files import atomic_path, translate_read_errors
+from tofclip.lidar import Pulse, depth
+from tofclip.light_field.measurement import CameraSetup, ClipMeasurement
+from tofclip.notebook import plot_picture
+from tofclip.occlusion import InactiveRegion
+from tofclip.operators import LinearOperator, LineProjection
+from tofclip.operators.cameras import CAMERAS, LightFieldCamera
+from tofclip.recovery.focus import DepthLockedFocus, FixedFocus, FrameSegment
+from tofclip.shots import Frames, Streak
+from tofclip.simulate import (
+    GroundTruth,
+    Instrument,
+    Scene,
+    StreakDetector,
+    make_plate,
+    render_true_frames,
+    simulate_shot,
+)
+from tofclip.simulate.patterns import (
+    cut_pattern,
+    make_checkerboard,
+    make_letter,
+    make_mottled_pattern,
+    make_plain_pattern,
+    make_rings,
+    make_stripes,
+)
+from tofclip.simulate.streak import MIN_REFLECTANCE
+from tofclip.solvers import LinearInverse, PreparedInverse
+from tofclip.storage import collect_provenance
+from tofclip.threads import limit_blas_threads
+from tofclip.units import MAD_TO_SIGMA, MILLIMETRE, PICOSECOND, SPEED_OF_LIGHT
+
+__all__ = ["Accuracy", "Design", "DesignReport", "Sight", "design"]
+
+ENCODERS = {"2d": "diffuser", "0d": "single-pixel"}
+"""Cameras of `tofclip.operators.cameras` by their sensors; "slit" and "1d" are a `Camera`."""
+SENSORS = ("slit", "1d", *ENCODERS)
+MARGIN_PULSES = 4.0  # of the sweep before the nearest light and after the farthest
+MAX_SAMPLED_PIXELS = 1500  # of which ranges are predicted: each costs a row of the inverse
+BYTES_PER_READING = 2
+FIT_STEPS = 6  # of Gauss and Newton, after which a fit stands still
+
+
+@dataclass(frozen=True)
+class Design:
+    """The description of an instrument; keys of a TOML file, with their units.
+
+    Parameters
+    ----------
+    sensor : str
+        "slit" of a streak camera or "1d" line of counting pixels, on which all lenslets lie beside
+        each other; "2d", one sparse area sensor behind a diffuser; "0d", a single pixel with codes
+        behind each lenslet.
+    views : int
+        Lenslets, in a row.
+    pitch_mm, focus_distance_m : float
+        Between lenslets, and where their pictures coincide; `inf` is far away.
+    focal_length_px : float
+    angles_deg : tuple of float
+        Of the lines from the vertical; evenly from -45 to 45 by default. Slit and 1d only.
+    rows_px, columns_px : int
+        The picture.
+    sensor_px : int
+        Pixels of the slit or line; 0 gives each view as many as its lines cross.
+    centres_px : tuple of float
+        Of the views on it; evenly by default.
+    sampling_ratio : float
+        Of 2d and 0d: readings over pixels of the picture.
+    bins, bin_width_ps, pulse_ps
+        Time axis and full width at half maximum of the response.
+    photons, background_photons : float
+        Expected of the brightest reading in a bin, and of every one.
+    near_m, far_m : float
+        Range of the scene.
+    shots_per_second : float
+    occluder_mm, occluder_distance_m : float
+        Width of a solid occluder on the axis and its distance; 0: none.
+    damping : float
+        mu over the largest eigenvalue of A A'.
+    max_angle_deg : float
+        The steepest line that better angles may have.
+    """
+
+    sensor: str = "slit"
+    views: int = 7
+    pitch_mm: float = 2.3
+    focus_distance_m: float = 2.3
+    focal_length_px: float = 560.0
+    angles_deg: tuple[float, ...] = ()
+    rows_px: int = 128
+    columns_px: int = 128
+    sensor_px: int = 0
+    centres_px: tuple[float, ...] = ()
+    sampling_ratio: float = 0.25
+    bins: int = 576
+    bin_width_ps: float = 20.0
+    pulse_ps: float = 60.0
+    photons: float = 2000.0
+    background_photons: float = 2.0
+    near_m: float = 1.7
+    far_m: float = 3.2
+    shots_per_second: float = 30.0
+    occluder_mm: float = 0.0
+    occluder_distance_m: float = 0.0
+    damping: float = 1e-2
+    max_angle_deg: float = 60.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value: Any = getattr(self, item.name)
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if item.name == "sensor":
+                good, wanted = value in SENSORS, f"one of {', '.join(SENSORS)}"
+            elif item.name in ("angles_deg", "centres_px"):
+                good = isinstance(value, list | tuple) and len(value) in (0, self.views)
+                wanted = f"a list of {self.views} numbers, one for each of the views"
+            elif isinstance(item.default, int):
+                good = isinstance(value, int) and number and value >= (item.name != "sensor_px")
+                wanted = "a whole number, 1 or more"
+            else:
+                least = 0 if item.default == 0 or item.name == "background_photons" else 1e-300
+                good, wanted = number and value >= least, "a positive number"
+                good = good and (np.isfinite(value) or item.name == "focus_distance_m")
+            if not good:
+                raise InputError(f"{item.name} must be {wanted}, got {value!r}")
+            if isinstance(value, list):
+                object.__setattr__(self, item.name, tuple(map(float, value)))
+        if not self.near_m < self.far_m:
+            raise InputError(f"far_m must be more than near_m, {self.near_m:g}; got {self.far_m:g}")
+        span = 2 * (self.far_m - self.near_m) * self._secant / SPEED_OF_LIGHT
+        needed = int(np.ceil((span + 2 * self._margin) / (self.bin_width_ps * PICOSECOND)))
+        if self.bins < needed:
+            raise InputError(
+                f"{self.bins} bins of {self.bin_width_ps:g} ps do not cover {self.near_m:g} to {self.far_m:g} m: "
+                f"set bins to {needed} or more"
+            )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Design:
+        """Read a TOML file.
+
+        Raises
+        ------
+        FileFormatError, InputError
+            It is no TOML file, has an unknown key, or a value that no instrument has.
+        """
+        with translate_read_errors(Path(path)), open(path, "rb") as opened:
+            try:
+                found = tomllib.load(opened)
+            except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
+                raise FileFormatError(
+                    Path(path), f"is not a TOML file of a design ({fault})"
+                ) from fault
+        try:
+            return cls.of(found)
+        except InputError as fault:
+            raise InputError(f"{path}: {fault}") from fault
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> Design:
+        """Return the design of a mapping with the keys of a TOML file."""
+        known = [item.name for item in fields(cls)]
+        for key in settings:
+            if key not in known:
+                like = difflib.get_close_matches(key, known, 1, 0.5)
+                hint = f"did you mean '{like[0]}'?" if like else f"known are {', '.join(known)}"
+                raise InputError(f"a design has no key '{key}'; {hint}")
+        return cls(**settings)
+
+    def save(self, path: str | Path) -> None:
+        """Write a TOML file, whole or not at all."""
+        with atomic_path(Path(path)) as temporary:
+            temporary.write_text(tomli_w.dumps(asdict(self)), encoding="utf-8")
+
+    @property
+    def _secant(self) -> float:
+        """By how much a range at the picture's corner is longer than the depth."""
+        half = np.hypot(self.rows_px, self.columns_px) / 2 / self.focal_length_px
+        return float(np.hypot(1, half))
+
+    @property
+    def _margin(self) -> float:
+        return MARGIN_PULSES * max(self.pulse_ps, self.bin_width_ps) * PICOSECOND
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera; of 2d and 0d its picture and its time axis only."""
+        even = np.linspace(-45, 45, self.views) if self.views > 1 else np.zeros(1)
+        angles = np.radians(self.angles_deg or even)
+        width = self.sensor_px
+        if width == 0:
+            # a view's lines from the picture's corners lie so far apart
+            reach = self.columns_px + self.rows_px * np.abs(np.tan(angles)).mean() / 2
+            width = int(np.ceil(self.views * reach))
+        centres = np.array(self.centres_px or (np.arange(self.views) + 0.5) * width / self.views)
+        still = np.zeros(self.views)
+        return Camera(
+            centres,
+            angles,
+            (self.rows_px, self.columns_px),
+            width,
+            sweep=SkewSweep(centres, still, still),
+            time_zero=self._margin - 2 * self.near_m / SPEED_OF_LIGHT,
+            pulse_fwhm=self.pulse_ps * PICOSECOND,
+            focal_length_px=self.focal_length_px,
+            lenslet_pitch=self.pitch_mm * MILLIMETRE,
+            focus_distance=self.focus_distance_m,
+        )
+
+    @cached_property
+    def instrument(self) -> Instrument:
+        """The camera with its detector, for simulations."""
+        width = self.bin_width_ps * PICOSECOND
+        counts = self.photons, self.background_photons
+        return Instrument(self.camera, StreakDetector(self.bins, width, *counts))
+
+    @cached_property
+    def encoder(self) -> LightFieldCamera | None:
+        """Which readings each view of a 2d or 0d camera gets; None of slit and line."""
+        if self.sensor not in ENCODERS:
+            return None
+        views = [(0.0, float(u)) for u in self.camera.view_positions]
+        kind = CAMERAS[ENCODERS[self.sensor]]
+        return kind(self.camera.image_shape, views, self.sampling_ratio, 0)
+
+    @cached_property
+    def weights(self) -> NDArray[np.float32]:
+        """W that readings and operator get in the recovery, (readings, readings)."""
+        if self.encoder is None:
+            return np.eye(self.camera.slit_width_px, dtype=np.float32)
+        return _make_dense(self.encoder.weighting())
+
+    def matrix(self, shear: float) -> Any:
+        """Return A, (readings, pixels), sparse for slit and line; shear in pixels per view step."""
+        if self.encoder is None:
+            return self.camera.operator(shear).matrix
+        return _make_dense(self.encoder.model(shear))
+
+    def plan_segments(self, frames: Frames) -> list[FrameSegment]:
+        """Cut the frames where another shear is needed."""
+        nothing = np.zeros((1, frames.times.size), np.float32)
+        locked = self.views > 1
+        focus = DepthLockedFocus() if locked else FixedFocus()
+        return focus.plan_segments(
+            self.camera, frames.times, Measurement(nothing, nothing.astype(bool))
+        )
+
+    def prepare(self, shear: float) -> PreparedInverse:
+        """Return the linear inverse; its Gram matrix is that of W A."""
+        if self.encoder is None:
+            return LinearInverse(self.damping).prepare(self.camera.operator(shear))
+        operator = self.encoder.weighting() @ self.encoder.model(shear)
+        weighted = (self.weights @ self.matrix(shear)).astype(np.float64)
+        gram = weighted @ weighted.T
+        gram[np.diag_indices_from(gram)] += self.damping * operator.squared_norm
+        return PreparedInverse(operator, np.linalg.inv(gram).astype(np.float32))
+
+
+def _make_dense(operator: LinearOperator) -> NDArray[np.float32]:
+    rows = operator.adjoint(np.eye(operator.shape_out[0], dtype=np.float32))
+    return np.ascontiguousarray(rows.reshape(-1, operator.shape_out[0]).T)
+
+
+# pattern, middle and sides as parts of half the picture and of the picture, depth as a part of the
+# scene's, yaw in rad
+Plate = tuple[Callable[[], Any], tuple[float, float], tuple[float, float], float, float]
+
+
+def _letter(name: str) -> Callable[[], Any]:
+    return lambda: cut_pattern(make_letter(name), make_plain_pattern(0.8))
+
+
+SCENES: dict[str, tuple[Plate, ...]] = {
+    "letters": (
+        (_letter("C"), (-0.45, -0.42), (0.34, 0.34), 0.05, 0.0),
+        (_letter("L"), (0.42, -0.45), (0.32, 0.32), 0.3, 0.1),
+        (_letter("U"), (-0.4, 0.42), (0.32, 0.32), 0.55, 0.0),
+        (_letter("A"), (0.42, 0.4), (0.36, 0.36), 0.8, -0.1),
+    ),
+    "plates": (
+        (lambda: make_checkerboard(4, 0.3, 0.9), (-0.4, -0.35), (0.36, 0.36), 0.1, -0.3),
+        (lambda: make_rings(3, 0.3, 0.9), (0.4, 0.35), (0.4, 0.4), 0.4, 0.0),
+        (lambda: make_stripes(4, 0.3, 0.9), (0.05, 0.0), (0.7, 0.7), 0.9, 0.0),
+    ),
+    "poles": (
+        (lambda: make_plain_pattern(0.6), (-0.55, 0.0), (0.08, 0.8), 0.1, 0.0),
+        (lambda: make_plain_pattern(0.8), (0.2, -0.1), (0.12, 0.6), 0.35, 0.0),
+        (lambda: make_plain_pattern(0.5), (0.0, 0.6), (0.8, 0.1), 0.6, 0.0),
+        (lambda: make_mottled_pattern(0.2, 0.9, 5, 0), (0.35, -0.2), (0.4, 0.4), 0.9, 0.2),
+    ),
+}
+
+
+def make_scene(name: str, design: Design) -> Scene:
+    """Return one of `SCENES` in an instrument's field, from its near to its far end."""
+    if name not in SCENES:
+        raise InputError(f"no scene is called '{name}'; take one of {', '.join(SCENES)}")
+    bodies = []
+    for pattern, (x, y), sides, part, yaw in SCENES[name]:
+        z = design.near_m + (0.05 + 0.85 * part) * (design.far_m - design.near_m)
+        width, height = (
+            z / design.focal_length_px * side for side in design.camera.image_shape[::-1]
+        )
+        size = (sides[0] * width, sides[1] * height)
+        bodies.append(make_plate((x * width / 2, y * height / 2, z), size, pattern(), yaw))
+    return Scene(tuple(bodies))
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the views determine of a picture at one shear.
+
+    Parameters
+    ----------
+    singular_values : (readings,) array
+        Of W A, falling.
+    least : float
+        The one of which the linear inverse returns half, sqrt(mu).
+    undetermined : float
+        Share of the picture's dimensions of which less is returned.
+    by_pixel : (rows, columns) array
+        Part of a point's energy there that is undetermined.
+    by_frequency : (rows, columns) array
+        The same of waves, frequency 0 in the middle: what is undetermined there shows as rays.
+    points : (rows, columns) array
+        What the linear inverse makes of points.
+    """
+
+    singular_values: FloatArray
+    least: float
+    undetermined: float
+    by_pixel: FloatArray
+    by_frequency: FloatArray
+    points: FloatArray
+
+
+def analyse_sight(design: Design, shear: float = 0.0) -> Sight:
+    """Decompose a design's operator; see `Sight`."""
+    matrix, shape = design.matrix(shear).astype(np.float64), design.camera.image_shape
+    if design.encoder is not None:
+        matrix = design.weights @ matrix
+    gram = matrix @ matrix.T
+    eigenvalues, vectors = np.linalg.eigh(gram.toarray() if scipy.sparse.issparse(gram) else gram)
+    eigenvalues = np.maximum(eigenvalues, 0)
+    mu = design.damping * eigenvalues[-1]
+    known = eigenvalues > mu
+    basis = (matrix.T @ vectors[:, known] / np.sqrt(eigenvalues[known])).reshape(*shape, -1)
+    waves = np.zeros(shape)
+    for part in np.array_split(np.arange(basis.shape[-1]), 1 + basis.shape[-1] // 64):
+        spectra = np.fft.fft2(basis[..., part], axes=(0, 1), norm="ortho")
+        waves += np.sum(np.abs(spectra) ** 2, axis=-1)
+    points = np.zeros(shape)
+    points[shape[0] // 4 :: shape[0] // 2, shape[1] // 4 :: shape[1] // 2] = 1
+    seen = vectors.T @ (matrix @ points.ravel())
+    answer = matrix.T @ (vectors @ (seen / (eigenvalues + mu)))
+    return Sight(
+        np.sqrt(eigenvalues[::-1]),
+        float(np.sqrt(mu)),
+        1 - float(known.sum()) / points.size,
+        1 - np.sum(basis**2, axis=-1),
+        np.fft.fftshift(1 - waves),
+        answer.reshape(shape),
+    )
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How well a scene is measured, predicted or found in simulated shots.
+
+    Parameters
+    ----------
+    picture_bias, picture_noise : float
+        Squared error of the picture of all light, over the variance of the truth: what noiseless
+        shots err by, and what the noise adds.
+    range_deviation : (rows, columns) array
+        From shot to shot, m; NaN where no surface is asked for.
+    range_offset : (rows, columns) array
+        Mean error, m: the rays of other pixels.
+    picture : (rows, columns) array
+        The mean picture, photons.
+    seconds : float
+        Of one shot on this machine, from readings to ranges; NaN of a prediction.
+    """
+
+    picture_bias: float
+    picture_noise: float
+    range_deviation: FloatArray
+    range_offset: FloatArray
+    picture: FloatArray
+    seconds: float = float("nan")
+
+    @property
+    def picture_error(self) -> float:
+        """Of one shot (NMSE)."""
+        return self.picture_bias + self.picture_noise
+
+    @property
+    def median_deviation(self) -> float:
+        """Of the pixels that have one, m."""
+        return float(np.nanmedian(self.range_deviation))
+
+    @property
+    def median_offset(self) -> float:
+        """Of the sizes of the mean errors, m."""
+        return float(np.nanmedian(np.abs(self.range_offset)))
+
+
+def predict_accuracy(design: Design, scene: Scene) -> Accuracy:
+    """Compute bias and noise of picture and ranges from the operator alone; no chance is involved."""
+    frames = render_true_frames(scene, design.instrument)
+    target, pixels = _choose_pixels(design, scene)
+    times = 2 * target.ravel()[pixels] / SPEED_OF_LIGHT
+    width = design.bin_width_ps * PICOSECOND
+    reach = 2 * np.hypot(design.pulse_ps * PICOSECOND, width)
+    flat = frames.values.reshape(len(frames.values), -1).T
+    segments = design.plan_segments(frames)
+    matrices = [design.matrix(one.shear) for one in segments]
+    scale = design.photons / _find_peak(matrices, segments, flat)
+    mean, noise = np.zeros(flat.shape[0]), np.zeros(flat.shape[0])
+    expected = np.zeros((pixels.size, flat.shape[1]), np.float32)
+    variance = np.zeros_like(expected)
+    for segment, matrix in zip(segments, matrices, strict=True):
+        weighted = matrix if design.encoder is None else design.weights @ matrix
+        linear = weighted.T @ (design.prepare(segment.shear).inverse_gram @ design.weights)
+        light = scale * (matrix @ flat[:, segment.frames])
+        counts = light + design.background_photons
+        mean += linear @ light.sum(axis=1)
+        noise += linear**2 @ counts.sum(axis=1)
+        at = frames.times[segment.frames]
+        near = np.flatnonzero((times > at[0] - reach) & (times < at[-1] + reach))
+        rows = linear[pixels[near]]
+        expected[near, segment.frames] = rows @ light
+        variance[near, segment.frames] = rows**2 @ counts
+    truth = scale * flat.sum(axis=1)
+    spread = np.sum((truth - truth.mean()) ** 2)
+    deviation, offset = np.full((2, flat.shape[0]), np.nan)
+    fitted = _fit_pulses(frames.times, times, expected, variance, design)
+    deviation[pixels], offset[pixels] = (SPEED_OF_LIGHT / 2 * part for part in fitted)
+    shape = frames.values.shape[1:]
+    return Accuracy(
+        float(np.sum((mean - truth) ** 2) / spread),
+        float(noise.sum() / spread),
+        deviation.reshape(shape),
+        offset.reshape(shape),
+        mean.reshape(shape),
+    )
+
+
+def _find_peak(matrices: list[Any], segments: list[FrameSegment], flat: Any) -> float:
+    """The brightest reading at an exposure of 1."""
+    pairs = zip(matrices, segments, strict=True)
+    return max(float((matrix @ flat[:, one.frames]).max()) for matrix, one in pairs)
+
+
+def _choose_pixels(design: Design, scene: Scene) -> tuple[FloatArray, NDArray[np.intp]]:
+    """True ranges, and the pixels whose ranges are asked for, spread evenly."""
+    truth = GroundTruth.from_scene(scene, design.instrument)
+    # in a small picture no pixel has neighbours on its own surface all around
+    asked = truth.target if truth.target.any() else truth.reflectance >= MIN_REFLECTANCE
+    pixels = np.flatnonzero(asked & np.isfinite(truth.range))
+    step = -(-pixels.size // MAX_SAMPLED_PIXELS)
+    return truth.range.astype(np.float64), pixels[::step]
+
+
+def _fit_pulses(
+    at: FloatArray, times: FloatArray, expected: Any, variance: Any, design: Design
+) -> tuple[FloatArray, FloatArray]:
+    """Deviation and mean error of arrivals that least squares find in traces (pixels, time), s."""
+    width = design.bin_width_ps * PICOSECOND
+    pulse = Pulse.gaussian(max(design.pulse_ps * PICOSECOND, 2 * width))
+    arrival = times.copy()
+    for _ in range(FIT_STEPS):
+        shape = pulse(at - arrival[:, np.newaxis])
+        slope = -pulse.slope_at(at - arrival[:, np.newaxis])
+        height = np.maximum(np.sum(shape * expected, axis=1) / np.sum(shape**2, axis=1), 1e-9)
+        left = expected - height[:, np.newaxis] * shape
+        information = height * np.sum(slope**2, axis=1)
+        step = np.sum(slope * left, axis=1) / information
+        arrival += np.clip(step, -pulse.fwhm / 4, pulse.fwhm / 4)
+    deviation = np.sqrt(np.sum(slope**2 * variance, axis=1)) / information
+    return deviation, arrival - times
+
+
+def draw_shots(
+    design: Design, scene: Scene, shots: int, seed: int
+) -> tuple[float, Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]]:
+    """Return the exposure and noisy readings (bins, readings) with where they are saturated, shot by
+    shot.
+    """
+    detector, noise = design.instrument.detector, np.random.default_rng(seed)
+    if design.encoder is None:
+        shot = simulate_shot(scene, design.instrument, seed)
+        exposure, signal = shot.exposure, shot.signal.astype(np.float64)
+    else:
+        views = [
+            render_true_frames(scene, design.instrument, 1.0, float(u)).values
+            for u in design.camera.view_positions[list(design.encoder.used_views)]
+        ]
+        light = design.encoder.light_field_model()(np.moveaxis(np.stack(views), 1, -1)).T
+        exposure = float(design.photons / light.max())
+        signal = exposure * np.maximum(light, 0).astype(np.float64)
+    return exposure, (detector.expose(signal, noise) for _ in range(shots))
+
+
+def take_shots(
+    design: Design, scene: Scene, shots: int, seed: int
+) -> tuple[float, Iterator[Streak | ClipMeasurement]]:
+    """Return the exposure and shots as files hold them: streak images, or of 2d and 0d sensors readings
+    summed over all instants.
+    """
+    exposure, drawn = draw_shots(design, scene, shots, seed)
+    camera, past = design.camera, collect_provenance({**asdict(design), "seed": seed})
+
+    def pack(counts: Any, saturated: Any) -> Streak | ClipMeasurement:
+        if design.encoder is None:
+            at = design.instrument.detector.row_times
+            source = "simulated streak image"
+            return Streak(counts, at, saturated, camera=camera, source=source, provenance=past)
+        setup = CameraSetup(design.encoder.name, design.sampling_ratio, 0)
+        views = np.array(design.encoder.views)
+        values = (counts - np.float32(design.background_photons)).sum(axis=0)
+        return ClipMeasurement(values, views, camera.image_shape, setup, 1.0, past)
+
+    return exposure, (pack(*one) for one in drawn)
+
+
+def try_out(design: Design, scene: Scene, shots: int = 20, seed: int = 0) -> Accuracy:
+    """Simulate shots, recover each by the linear inverse at the shear of its range, find the returns,
+    and compare with the truth.
+    """
+    exposure, drawn = draw_shots(design, scene, shots, seed)
+    frames = render_true_frames(scene, design.instrument, exposure)
+    true_ranges, pixels = _choose_pixels(design, scene)
+    truth = frames.values.sum(axis=0, dtype=np.float64)
+    segments = design.plan_segments(frames)
+    inverses = [design.prepare(one.shear) for one in segments]
+    shears = np.repeat([one.shear for one in segments], [one.size for one in segments])
+    pictures, ranges, seconds = [], [], []
+    for counts, saturated in drawn:
+        started = time.perf_counter()
+        if design.encoder is None:
+            values = measure(counts, saturated, design.camera).values
+        else:
+            values = design.weights @ (counts.T - np.float32(design.background_photons))
+        cube = np.empty_like(frames.values)
+        for segment, inverse in zip(segments, inverses, strict=True):
+            cube[segment.frames] = inverse.recover(values[:, segment.frames]).frames
+        found = depth(Frames(cube, frames.times, design.camera, shears=shears))
+        ranges.append(found.image("range").ravel()[pixels])
+        seconds.append(time.perf_counter() - started)
+        pictures.append(cube.sum(axis=0, dtype=np.float64))
+    mean = np.mean(pictures, axis=0)
+    spread = np.sum((truth - truth.mean()) ** 2)
+    # the mean of a few shots has a share of their noise, which is taken off its error
+    scatter = np.sum(np.var(pictures, axis=0, ddof=min(1, shots - 1))) / spread
+    bias = float(np.sum((mean - truth) ** 2) / spread - scatter / shots)
+    middle = np.nanmedian(ranges, axis=0)
+    # robust: a shot in which another return is the stronger one does not count
+    deviation, offset = np.full((2, truth.size), np.nan)
+    deviation[pixels] = (
+        MAD_TO_SIGMA
+        * shots
+        / (shots - 0.8)
+        * np.nanmedian(np.abs(np.array(ranges) - middle), axis=0)
+    )
+    offset[pixels] = middle - true_ranges.ravel()[pixels]
+    maps = [part.reshape(truth.shape) for part in (deviation, offset)]
+    return Accuracy(bias, float(scatter), maps[0], maps[1], mean, float(np.median(seconds)))
+
+
+@dataclass(frozen=True)
+class DesignReport:
+    """What is known of an instrument before it is built; `design` makes it.
+
+    Parameters
+    ----------
+    design : Design
+    sight : Sight
+        At the middle of its range.
+    figures : mapping
+        By name, with units at the end: ``field_of_view_deg`` (down, across); ``overlap_near`` and
+        ``overlap_far``, share of the picture's width that all views have in common;
+        ``sensor_overlap``, share of the slit that several views use; ``undetermined``;
+        ``refocus_nearest_m``, from where on the outermost views have half of their
+        field in common; ``refocus_planes``,
+        distances that the views' parallax tells apart between near and far; ``inactive_m`` behind
+        the occluder; ``bytes_per_second``.
+    predicted, simulated : mapping
+        Of scenes' names to `Accuracy`.
+    """
+
+    design: Design
+    sight: Sight
+    figures: Mapping[str, Any]
+    predicted: Mapping[str, Accuracy]
+    simulated: Mapping[str, Accuracy]
+
+    def __repr__(self) -> str:
+        known = self.design
+        errors = ", ".join(
+            f"{name} {one.picture_error:.3g}" for name, one in self.predicted.items()
+        )
+        return (
+            f"DesignReport({known.sensor}, {known.views} views, {100 * self.sight.undetermined:.1f} % of the picture "
+            f"undetermined, picture errors: {errors})"
+        )
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw what the views leave undetermined of waves: rays run across the dark sectors."""
+        title = f"undetermined: {100 * self.sight.undetermined:.1f} %"
+        return plot_picture(self.sight.by_frequency, title, ax, unit="share")
+
+
+def design(
+    settings: str | Path | Mapping[str, Any] | Design, shots: int = 0, seed: int = 0
+) -> DesignReport:
+    """Tell what an instrument will see, before it is built.
+
+    Parameters
+    ----------
+    settings : path-like, mapping or Design
+        A TOML file or its keys; see `Design`.
+    shots : int
+        Simulated ones of each scene beside the prediction; 0 or at least 2.
+    seed : int
+        Of their photons.
+
+    Returns
+    -------
+    DesignReport
+
+    Raises
+    ------
+    InputError, FileFormatError
+        A description of no instrument.
+
+    Examples
+    --------
+    >>> import tofclip
+    >>> report = tofclip.design({"rows_px": 32, "columns_px": 32, "focal_length_px": 140.0})
+    >>> 0.5 < report.sight.undetermined < 0.9
+    True
+    """
+    if isinstance(settings, Design):
+        known = settings
+    else:
+        known = Design.of(settings) if isinstance(settings, Mapping) else Design.load(settings)
+    if shots == 1 or shots < 0:
+        raise InputError(f"a deviation takes two shots or more, or 0 for none; got {shots}")
+    scenes = {name: make_scene(name, known) for name in SCENES}
+    sight = analyse_sight(known, float(known.camera.shear_at((known.near_m + known.far_m) / 2)))
+    return DesignReport(
+        known,
+        sight,
+        _list_figures(known) | {"undetermined": sight.undetermined},
+        {name: predict_accuracy(known, scene) for name, scene in scenes.items()},
+        {name: try_out(known, scene, shots, seed) for name, scene in scenes.items() if shots},
+    )
+
+
+def _list_figures(known: Design) -> dict[str, Any]:
+    camera, columns = known.camera, known.columns_px
+    positions = camera.view_positions
+    near, far = camera.shear_at([known.near_m, known.far_m])
+    fields_deg = 2 * np.degrees(np.arctan(np.array(camera.image_shape) / 2 / known.focal_length_px))
+    figures: dict[str, Any] = {"field_of_view_deg": fields_deg.tolist()}
+    for name, shear in (("near", near), ("far", far)):
+        figures[f"overlap_{name}"] = float(max(0, 1 - abs(shear) * np.ptp(positions) / columns))
+    readings = camera.slit_width_px if known.encoder is None else known.encoder.measurements
+    # what of u is no translation of the picture
+    down, across = camera.displacement_per_shear
+    rest = positions - across + down * np.tan(camera.angles)
+    if known.encoder is None:
+        lit = np.stack([one > 0 for one in list_footprints(known)])
+        figures["sensor_overlap"] = float(np.mean(lit.sum(axis=0) > 1))
+    else:
+        rest = positions
+    # pixels between the outermost views, for each 1/m of nearness
+    parallax = known.focal_length_px * camera.lenslet_pitch * np.ptp(positions)
+    if parallax:
+        nearness = 1 / known.focus_distance_m + columns / 2 / parallax
+        figures["refocus_nearest_m"] = float(1 / nearness)
+    figures["refocus_planes"] = float(1 + abs(far - near) * np.ptp(rest)) if parallax else 1.0
+    if known.occluder_mm and known.occluder_distance_m and parallax:
+        figures["inactive_m"] = find_inactive_region(known).length
+    figures["readings"] = readings
+    rate = readings * known.bins * known.shots_per_second * BYTES_PER_READING
+    figures["bytes_per_second"] = float(rate)
+    return figures
+
+
+def find_inactive_region(known: Design) -> InactiveRegion:
+    """Return what the design's occluder hides from all of its views."""
+    baseline = float(np.ptp(known.camera.view_positions)) * known.camera.lenslet_pitch
+    return InactiveRegion(baseline, known.occluder_mm * MILLIMETRE, known.occluder_distance_m)
+
+
+def list_footprints(known: Design) -> list[FloatArray]:
+    """Return the light of an even picture on the slit, view by view, (readings,) each."""
+    camera, even = known.camera, np.ones(known.camera.image_shape)
+    parts = zip(camera.centres_px, camera.angles, strict=True)
+    views = (
+        LineProjection(camera.image_shape, camera.slit_width_px, [centre], [angle], [1.0])
+        for centre, angle in parts
+    )
+    return [np.asarray(view(even), np.float64) for view in views]
+
+
+SMALL_SIDE_PX = 24  # angles do not depend on the scale: pictures are scaled down to try them
+CANDIDATE_ANGLES = 13
+CORRELATION_LENGTH = 0.15  # of random pictures, in parts of the picture
+USUAL_CONTRAST = 0.5  # their deviation, relative to their mean
+MAX_ROUNDS = 4
+
+
+@limit_blas_threads()
+def optimise_angles(known: Design) -> Design:
+    """Return a design whose angles, up to `max_angle_deg`, leave the least error that a random
+    picture is expected to have, at the near and the far end of the range: bias and noise of the
+    linear inverse, for pictures of exponential correlation. Scenes take no part.
+
+    Raises
+    ------
+    InputError
+        The sensor has no lines.
+    """
+    if known.encoder is not None:
+        raise InputError(f"a {known.sensor} sensor has no lines whose angles could be better")
+    scale = SMALL_SIDE_PX / max(known.rows_px, known.columns_px)
+    sizes = {
+        name: max(1, round(getattr(known.camera, side)[axis] * scale))
+        for name, side, axis in (("rows_px", "image_shape", 0), ("columns_px", "image_shape", 1))
+    }
+    centres = tuple(float(c) for c in known.camera.centres_px * scale)
+    small = replace(
+        known,
+        **sizes,
+        focal_length_px=known.focal_length_px * scale,
+        sensor_px=round(known.camera.slit_width_px * scale),
+        centres_px=centres,
+    )
+    y, x = np.indices(small.camera.image_shape).reshape(2, -1)
+    apart = np.hypot(y[:, np.newaxis] - y, x[:, np.newaxis] - x)
+    covariance = USUAL_CONTRAST**2 * np.exp(-apart / (CORRELATION_LENGTH * SMALL_SIDE_PX))
+    shears = small.camera.shear_at([small.near_m, small.far_m])
+    tried: dict[tuple[float, ...], float] = {}
+
+    def expect_error(angles: tuple[float, ...]) -> float:
+        if angles not in tried:
+            camera = small.camera.replace(angles=np.radians(angles))
+            tried[angles] = sum(
+                _expect_error(camera.operator(shear, np.float64).matrix, covariance, small)
+                for shear in map(float, shears)
+            )
+        return tried[angles]
+
+    candidates = np.linspace(-known.max_angle_deg, known.max_angle_deg, CANDIDATE_ANGLES).tolist()
+    own = tuple(np.degrees(known.camera.angles).tolist())
+    even = tuple(np.linspace(candidates[0], candidates[-1], known.views).tolist())
+    found = [_descend(expect_error, start, candidates) for start in (own, even)]
+    best = min(found, key=expect_error)
+    return replace(known, angles_deg=tuple(round(angle, 2) for angle in best))
+
+
+def _descend(
+    expect_error: Callable[[tuple[float, ...]], float],
+    angles: tuple[float, ...],
+    candidates: list[float],
+) -> tuple[float, ...]:
+    """Change one angle after the other for the best candidate, until none is better."""
+    for _ in range(MAX_ROUNDS):
+        before = angles
+        for view in range(len(angles)):
+            choices = (
+                (*angles[:view], angle, *angles[view + 1 :])
+                for angle in (angles[view], *candidates)
+            )
+            angles = min(choices, key=expect_error)
+        if angles == before:
+            break
+    return angles
+
+
+def _expect_error(matrix: Any, covariance: FloatArray, known: Design) -> float:
+    """Expected squared error of a pixel of random pictures with mean 1."""
+    gram = (matrix @ matrix.T).toarray()
+    mu = known.damping * float(np.linalg.eigvalsh(gram)[-1])
+    inverse = np.linalg.inv(gram + mu * np.eye(len(gram)))
+    seen = matrix @ covariance  # (readings, pixels)
+    spread = np.asarray((matrix @ seen.T).T)
+    linear = inverse @ gram
+    light = np.asarray(matrix.sum(axis=1)).ravel()
+    # half of the brightest reading is what an even picture is expected to bring
+    noise = 2 * light.max() * light / known.photons
+    bias = (
+        np.trace(covariance) - 2 * np.sum(inverse * spread) + np.sum((inverse @ spread) * linear.T)
+    )
+    variance = np.sum(np.sum(linear * inverse.T, axis=1) * noise)
+    return float(bias + variance) / len(covariance)
