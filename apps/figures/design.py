@@ -140,7 +140,8 @@ def _draw_accuracy(axes: Axes, report: DesignReport) -> None:
     ):
         for place, one in enumerate(kinds.values()):
             _draw_bar(axes, place + shift, one, colour)
-        axes.bar(0, 0, color=colour, label=kind)
+        if kinds:
+            axes.bar(0, 0, color=colour, label=kind)
     axes.set_xticks(range(len(report.predicted)), list(report.predicted))
     axes.set_ylim(0, 1.25 * axes.get_ylim()[1])
     axes.legend(fontsize=SMALL_FONT_PT, ncols=2, frameon=False)
