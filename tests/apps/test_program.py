@@ -146,7 +146,7 @@ sys.exit(cli.main(sys.argv[1:]))
     def test_a_missing_file_is_refused_before_anything_else(self, shell, verb):
         said = shell.refuses(f"{verb} absent.h5")
         assert said == "tofclip: error: absent.h5: no such file\n"
-        assert len(READERS) == 21
+        assert len(READERS) == 22
 
 
 def read_terminal(terminal: int, until: str = "") -> str:
