@@ -6,10 +6,11 @@ import statistics
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apps.options import JSON, SEED, arg, opt
+from apps.options import JSON, PICTURE_FORMATS, SEED, arg, opt
 from apps.progress import show_activity
-from apps.report import PICTURE_SUFFIXES, make_folder, report, require_writable
+from apps.report import make_folder, report, require_writable
 from tofclip.errors import InputError
+from tofclip.files import PICTURE_SUFFIXES
 
 if TYPE_CHECKING:
     from tofclip.designs import Design, DesignReport
@@ -19,7 +20,9 @@ SCENE_NAMES = ("letters", "plates", "poles")
 
 def design(
     camera: Path = arg("TOML", "The instrument; keys as in tofclip.designs.Design.", read=True),
-    out: Path = opt("PNG", "The picture; with --simulate a folder.", Path("design.png")),
+    out: Path = opt(
+        "PNG", f"The picture, {PICTURE_FORMATS}; with --simulate a folder.", Path("design.png")
+    ),
     compare: Path | None = opt("TOML", "Another instrument to draw below.", shown="none"),
     optimise: str | None = opt(
         "WHAT",
@@ -82,7 +85,7 @@ def design(
             written.append(file)
         reports = {name: examine(one, shots, seed) for name, one in known.items()}
     from apps.figures.design import make_design_figure
-    from apps.figures.style import save_figure
+    from tofclip.notebook import save_figure
 
     save_figure(make_design_figure(reports), out)
     told = {name: _list_figures(one) for name, one in reports.items()}
