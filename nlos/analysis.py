@@ -31,11 +31,12 @@ MIN_EARLY_FRACTION = 0.02
 # Of all frequencies, the highest are taken for noise.
 NOISE_BAND_FRACTION = 0.25
 # Wall points whose signals are looked at.
-MAX_ANALYSED_POINTS = 1024
+MAX_ANALYSED_POINTS = 4096
 # Of the strongest wave's energy, the least that is noise and not the tail of a pulse.
 MIN_FLOOR_RATIO = 1e-5
-# What noise's energy may change from the lower to the upper half of the highest frequencies.
-MAX_FLOOR_SLOPE = 0.15
+# What white noise's energy may change from the lower to the upper half of the highest frequencies;
+# beyond, and up to the second, it is coloured noise: of recovered frames, or rounded.
+MAX_FLOOR_SLOPE, MAX_COLOURED_SLOPE = 0.1, 1.0
 # Of the brightest light, what the last bins hold if light still comes.
 LIT_END_FRACTION = 0.01
 # Signal over noise of all wall points together that a wavelength needs: with it a letter of some
@@ -142,11 +143,21 @@ class SignalSpectrum:
         """Whether white noise is seen in the spectrum, as in all that was recorded. It is flat at
         the highest frequencies, where the tail of a pulse falls.
         """
+        return self._floor_slope < MAX_FLOOR_SLOPE
+
+    @property
+    def is_coloured(self) -> bool:
+        """Whether noise is seen that is not white, so that the spectrum does not tell its level."""
+        return MAX_FLOOR_SLOPE <= self._floor_slope < MAX_COLOURED_SLOPE
+
+    @property
+    def _floor_slope(self) -> float:
+        """Change of the energy at the highest frequencies; infinite where no floor is seen."""
+        if not self.floor > MIN_FLOOR_RATIO * float(self.power.max(initial=0.0)):
+            return np.inf
         count = max(1, int(NOISE_BAND_FRACTION * self.power.size) // 2)
-        below = float(np.mean(self.power[-2 * count : -count]))
-        above = float(np.mean(self.power[-count:]))
-        seen = self.floor > MIN_FLOOR_RATIO * float(self.power.max(initial=0.0))
-        return seen and abs(below / above - 1) < MAX_FLOOR_SLOPE
+        below, above = self.power[-2 * count : -count].mean(), self.power[-count:].mean()
+        return abs(float(below / above) - 1)
 
     def coherent_signal(self, pulse: VirtualPulse) -> float:
         """Signal over noise of all wall points together in a pulse's band."""
@@ -255,23 +266,25 @@ def require_usable_cycles(capture: Capture, cycles: float) -> None:
         )
 
 
-def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str]:
+def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str] | None:
     """Choose the carrier of a virtual pulse for a capture without the wall's own light.
 
     It is the shortest that wall points and time bins carry, and that the signal has more of than
     noise. In a noisy record only waves that stand out of the noise can make false images: the wall
     has to sample these, at the steepest angle at which they arrive.
 
-    Returns m of path, and the reason.
+    Returns m of path, and the reason; none where the spectrum does not tell: pictures have to.
     """
     sampled = find_shortest_wavelength(capture, cycles)
     reason = "the shortest that wall points and time bins carry"
     longest = max(sampled * WAVELENGTH_STEP_RATIO, find_longest_wavelength(capture))
     spectrum = SignalSpectrum.of(capture, sampled)
+    if spectrum.is_coloured:
+        return None
     wavelength, aliased = sampled, 0.0
     if spectrum.is_noisy:
         aliased = _sampling_limit(capture, _steepest_angle(capture))
-        wavelength = max(min(aliased, sampled), 4 * capture.axis.spacing)
+        wavelength = find_finest_wavelength(capture, cycles)
         reason = "the shortest above the noise that the wall points carry"
     while wavelength < longest:
         pulse = VirtualPulse(wavelength, cycles)
@@ -285,8 +298,17 @@ def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str]:
             break
         wavelength *= WAVELENGTH_STEP_RATIO
     else:
-        return round_wavelength_up(sampled), "no wave stands out of the noise: the shortest sampled"
+        return None
     return round_wavelength_up(wavelength), reason
+
+
+def find_finest_wavelength(capture: Capture, cycles: float) -> float:
+    """Shortest carrier worth a try: of waves that the wall samples at the steepest angle at which
+    they arrive, m.
+    """
+    aliased = _sampling_limit(capture, _steepest_angle(capture))
+    sampled = find_shortest_wavelength(capture, cycles)
+    return max(min(aliased, sampled), 4 * capture.axis.spacing)
 
 
 def round_wavelength_up(wavelength: float) -> float:
@@ -364,8 +386,11 @@ def _compute_profile(capture: Capture) -> tuple[FloatArray, FloatArray]:
 
 
 def _select_traces(capture: Capture) -> tuple[FloatArray, FloatArray]:
-    """Signals (n, t) of some wall points, evenly picked, and the path to each from its laser, m."""
-    some = np.arange(len(capture.points))[:: len(capture.points) // MAX_ANALYSED_POINTS + 1]
+    """Signals (n, t) of some wall points, evenly picked whatever their order, and the path to each
+    from its laser, m.
+    """
+    some = np.lexsort((capture.points + capture.lasers).T)
+    some = some[:: len(some) // MAX_ANALYSED_POINTS + 1]
     flat = to_numpy(capture.signal).reshape(capture.axis.bins, -1)
     traces = flat[:, np.flatnonzero(capture.valid)[some]].T.astype(np.float64)
     lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[some]

@@ -8,6 +8,7 @@ voxels, the box, and the quickest method. The command line and Python use the sa
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -16,19 +17,21 @@ import numpy as np
 
 from nlos.analysis import (
     choose_wavelength,
+    find_finest_wavelength,
     find_first_bounce,
     find_lit_end,
     find_longest_wavelength,
     require_plausible,
     require_usable_cycles,
     require_usable_wavelength,
+    round_wavelength_up,
 )
 from nlos.capture import Capture
-from nlos.illumination import choose_roles
+from nlos.evidence import measure_evidence
+from nlos.illumination import AliasingWarning, choose_roles
 from nlos.preparation import fade_record_end, join_near_lasers
 from nlos.settings import Limits, Settings, Wanted
 from nlos.volume import Grid, Volume
-from tofclip.arrays import namespace, to_numpy
 from tofclip.errors import InputError
 
 VOXELS_PER_WAVELENGTH = 8
@@ -52,10 +55,10 @@ SCOUT_WAVELENGTHS, QUICK_SCOUT_VOXELS = 2.0, 1 << 13
 GATE_DEPTH_FRACTION = 0.4
 # They see no finer than the wall's lattice and the time bins, whatever the wavelength.
 TRANSFORM_METHODS = ("lct", "fk")
-# A picture is judged by what this fraction of its voxels exceeds, against that of so many decoys.
-BRIGHT_QUANTILE, DECOYS = 0.999, 2
-# With less evidence than this, a picture may be of noise, a glow, or of wrong units.
-MIN_EVIDENCE = 2.0
+# Where pictures choose the wavelength: the brightest of one is clear if it is so many times a
+# shuffled copy's (letters and a mannequin of a streak camera, a bunny), from so few wall points;
+# and the ratio of wavelengths tried.
+CLEAR_EVIDENCE, MAX_JUDGED_POINTS, WAVELENGTH_RATIO = 30.0, 4096, math.sqrt(2)
 # A voxel nearer to a wall point than this is on the wall.
 BRIGHTEST_ON_WALL_WAVELENGTHS = 0.5
 
@@ -123,12 +126,11 @@ def complete_settings(capture: Capture, wanted: Wanted) -> Wanted:
         )
     require_usable_cycles(capture, found.cycles)
     if found.wavelength is None:
-        found = found.with_found("wavelength", *choose_wavelength(gated, found.cycles))
+        chosen = choose_wavelength(gated, found.cycles)
+        found = found.with_found("wavelength", *(chosen or _choose_by_pictures(gated, found)))
     else:
         require_usable_wavelength(capture, found.wavelength, found.cycles)
-    for rule in (_find_bins, _find_voxel):
-        found = _complete(found, rule(capture, found))
-    return _complete_box(gated, found)
+    return _complete_voxels(gated, found)
 
 
 def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | None:
@@ -156,31 +158,6 @@ def find_bright_box(settings: Wanted, scouted: Volume) -> Wanted:
     """
     x, y, (near, far) = _find_ends(Grid.around(scouted, settings.voxel_size))
     return replace(settings, x=x, y=y, near=near, far=far, everywhere=True)
-
-
-def measure_evidence(capture: Capture, settings: Settings) -> float:
-    """How much brighter the brightest of a coarse picture is than that of decoys: of the capture
-    itself, its signals shuffled among the wall points. About 1 says that there is nothing to see.
-
-    Each depth's brightness is taken relative to the decoys': noise and the wall's glow fade with it.
-    `capture`, `settings`: as they are imaged.
-    """
-    coarse = find_scout(capture, replace(settings, everywhere=False))
-    scout, grid = coarse or (settings, settings.grid())
-    _, plan = scout.plan_quickest(capture, grid)
-    xp, places = namespace(capture.signal), np.flatnonzero(capture.valid)
-    flat, energies = xp.reshape(capture.signal, (capture.axis.bins, -1)), []
-    for seed in range(DECOYS + 1):
-        order = np.arange(capture.valid.size)
-        if seed:
-            order[places] = np.random.default_rng(seed).permutation(places)
-        signal = xp.take(flat, capture.device.put(order), axis=1)
-        shuffled = replace(capture, signal=xp.reshape(signal, capture.signal.shape))
-        energies.append(to_numpy(plan.image(shuffled).values).astype(np.float64) ** 2)
-    level = np.mean(energies[1:], axis=(0, 2, 3))[:, np.newaxis, np.newaxis]
-    level = np.maximum(level, np.finfo(np.float32).tiny)
-    own, *decoys = (float(np.quantile(energy / level, BRIGHT_QUANTILE)) for energy in energies)
-    return own / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
 
 
 def is_brightest_on_wall(volume: Volume, capture: Capture, wavelength: float) -> bool:
@@ -217,6 +194,58 @@ def _find_gate(capture: Capture, settings: Settings) -> Found:
     yield "gate", bounce.end, f"{reason}{bounce.end:.3g} m later it has faded"
     yield "gate_ramp", GATE_RAMP_FRACTION * bounce.end, ""
     yield "gate_found", True, ""
+
+
+def _complete_voxels(gated: Capture, found: Wanted) -> Wanted:
+    """Find the bins, the voxels and the box for the settings' wavelength."""
+    for rule in (_find_bins, _find_voxel):
+        found = _complete(found, rule(gated, found))
+    return _complete_box(gated, found)
+
+
+def _choose_by_pictures(gated: Capture, settings: Settings) -> tuple[float, str]:
+    """Choose the wavelength where the spectrum does not tell noise from signal: the shortest whose
+    coarse picture is clear, between those tried by the logarithms; else that of most evidence.
+
+    Waves are tried from long ones on, whose pictures cost next to nothing.
+    """
+    capture = _thin_out(gated)
+    shortest = find_finest_wavelength(capture, settings.cycles)
+    tried: list[tuple[float, float]] = []
+    longest = max(shortest, find_longest_wavelength(gated) / 2)
+    for step in range(math.ceil(math.log(longest / shortest, WAVELENGTH_RATIO)) + 1):
+        wavelength = max(longest / WAVELENGTH_RATIO**step, shortest)
+        tried.append((wavelength, _judge_wavelength(capture, settings, wavelength)))
+        if tried[-1][1] < CLEAR_EVIDENCE <= max(evidence for _, evidence in tried):
+            break
+    waves, evidences = np.log(tried).T
+    if evidences.max() < np.log(CLEAR_EVIDENCE):
+        best = float(np.exp(waves[evidences.argmax()]))
+        return round_wavelength_up(best), "no picture is clear; that of most evidence"
+    # Beyond the last two the first or the second is taken: that waves exceed the shortest.
+    chosen = np.interp(np.log(CLEAR_EVIDENCE), evidences[:-3:-1], waves[:-3:-1])
+    return round_wavelength_up(float(np.exp(chosen))), "the shortest whose coarse picture is clear"
+
+
+def _judge_wavelength(capture: Capture, settings: Settings, wavelength: float) -> float:
+    """Evidence of a capture's coarse picture by one wavelength, m."""
+    found = _complete_voxels(capture, replace(settings, wavelength=wavelength))
+    prepared = replace(found, gate=None, fade=None, flip=None).prepare(capture)
+    plan = found.plan_quickest(prepared, found.grid(wavelength / 2))[1]
+    with warnings.catch_warnings():
+        # Of a wave that is only tried.
+        warnings.simplefilter("ignore", AliasingWarning)
+        return measure_evidence(prepared, plan, plan.image(prepared))
+
+
+def _thin_out(capture: Capture) -> Capture:
+    """Return a capture of at most `MAX_JUDGED_POINTS`, every nth along each axis of the wall."""
+    axes = capture.wall.ndim - 1
+    step = math.ceil((capture.valid.size / MAX_JUDGED_POINTS) ** (1 / axes)) if axes else 1
+    some = (slice(None, None, step),) * axes
+    laser = capture.laser if capture.laser.ndim == 1 else capture.laser[some]
+    signal = capture.signal[(slice(None), *some)]
+    return replace(capture, signal=signal, wall=capture.wall[some], laser=laser)
 
 
 def _by_lattice(capture: Capture, settings: Settings) -> bool:

@@ -15,6 +15,7 @@ from nlos.video import TransientVideo
 from nlos.volume import Volume
 from tofclip.files import PICTURE_SUFFIXES, atomic_path, require_suffix
 from tofclip.notebook import letter_panels, save_figure
+from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 
-# The depth map shows columns whose brightest voxel has at least this fraction of the volume's
-# brightest.
-DEPTH_THRESHOLD = 0.4
+# The depth map shows columns whose brightest voxel has at least this fraction of the brightest about
+# its depth, by so many voxels, and that of the volume's: a thing behind a brighter one is shown too.
+DEPTH_THRESHOLD, NEIGHBOUR_VOXELS, MIN_DEPTH_BRIGHTNESS = 0.4, 8, 0.15
 COLOUR_MAP = "inferno"
 DEPTH_COLOUR_MAP = "viridis"
 # Of the colours' scale: a flat thing whose depths are one voxel apart would look like steps.
@@ -82,12 +83,15 @@ def _describe_imaging(volume: Volume) -> str:
     past = volume.provenance
     while "imaging" not in past and isinstance(past.get("earlier"), Mapping):
         past = past["earlier"]
-    past = past.get("imaging", {})
+    past, widths = past.get("imaging", {}), past.get("resolution_m")
     said = [str(past["method"])] if "method" in past else []
     if past.get("wavelength_m"):
         said.append(f"wavelength {1e3 * past['wavelength_m']:.3g} mm")
     if volume.grid.x.size > 1:
         said.append(f"voxels of {1e3 * np.diff(volume.grid.x).mean():.3g} mm")
+    if widths:
+        size = " x ".join(f"{widths[axis] / MILLIMETRE:.0f}" for axis in "xyz")
+        said.append(f"a point appears {size} mm wide (x, y, z)")
     return ", ".join(said)
 
 
@@ -103,11 +107,20 @@ def _draw_views(volume: Volume, front: Axes, side: Axes, top: Axes) -> AxesImage
     return _draw_picture(front, magnitude.max(axis=0), (x, y), ("x (m)", "y (m), down"))
 
 
+def map_depths(volume: Volume) -> NDArray[np.float64]:
+    """Depth of every column's brightest voxel (y, x), m; NaN where that is weak at its depth."""
+    from scipy.ndimage import maximum_filter1d
+
+    projection, layers = volume.maximum_projection(), volume.magnitude.max(axis=(1, 2))
+    about = maximum_filter1d(layers, 2 * NEIGHBOUR_VOXELS + 1)
+    least = np.maximum(DEPTH_THRESHOLD * about, MIN_DEPTH_BRIGHTNESS * layers.max())
+    own = least[np.searchsorted(volume.grid.z, projection.depth)]
+    return np.where(projection.brightness < own, np.nan, projection.depth)
+
+
 def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
-    projection = volume.maximum_projection()
-    weak = projection.brightness < DEPTH_THRESHOLD * projection.brightness.max()
-    depth = np.where(weak, np.nan, projection.depth)
-    axes.set_title(f"depth above {DEPTH_THRESHOLD:.0%} brightness")
+    depth = map_depths(volume)
+    axes.set_title(f"depth above {DEPTH_THRESHOLD:.0%} about it")
     drawn = _draw_picture(
         axes, depth, (volume.grid.x, volume.grid.y), ("x (m)", "y (m), down"), None
     )

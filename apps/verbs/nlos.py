@@ -19,6 +19,7 @@ import typer
 from apps.help import make_group
 from apps.jobs import EXIT_SOME_FAILED, resolve_device, run_with_progress
 from apps.options import CLUSTER, DEVICE, JSON, PICTURE_FORMATS, SETTINGS, arg, opt
+from apps.progress import show_activity
 from apps.report import (
     RECORD_SUFFIXES,
     make_folder,
@@ -37,7 +38,6 @@ from apps.verbs.nlos_imaging import (
     CAPTURE,
     PORTABLE_METHODS,
     ImagingSettings,
-    PreparedImaging,
     add_provenance,
     choose_methods,
     image_capture,
@@ -56,6 +56,7 @@ from tofclip.units import MILLIMETRE, PICOSECOND
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid, Method, Volume
+    from nlos.imaging import PreparedImaging
     from tofclip.sequences.jobs import Report
 
 PHOTONS = "photons"
@@ -282,7 +283,8 @@ def reconstruct_single(
     source: Path, results: ResultFiles, wanted: ReconstructSettings, device: str
 ) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
-    from nlos.completion import MIN_EVIDENCE, is_brightest_on_wall, measure_evidence
+    from nlos.completion import is_brightest_on_wall
+    from nlos.evidence import MIN_EVIDENCE
     from nlos.io import read_capture
     from nlos.normals import find_imaged_surface
     from tofclip.arrays import ComputeDevice, parse_device
@@ -292,7 +294,8 @@ def reconstruct_single(
     used = ComputeDevice() if device == "auto" and not portable else parse_device(device)
     # Before it is read: a capture that is replaced meanwhile is imaged again next time.
     content = note_content(source)
-    capture = read_capture(source)
+    with show_activity(f"reading {source.name}"):  # raw archives are recovered
+        capture = read_capture(source)
     if wanted.refine not in (None, PHOTONS):
         wanted = replace(wanted, method=REFINED_METHOD)
     started = time.perf_counter()
@@ -305,7 +308,8 @@ def reconstruct_single(
             "blank more of it by --gate-m, or begin farther away by --near-m",
             file=sys.stderr,
         )
-    evidence = measure_evidence(prepared.capture, prepared.settings)
+    volume = prepared.describe(volume)
+    evidence = volume.provenance["evidence"]
     if not evidence >= MIN_EVIDENCE:
         print(
             f"tofclip: warning: {source}: the picture's brightest is {evidence:.2g} times that of shuffled copies "
@@ -316,6 +320,7 @@ def reconstruct_single(
     volume = volume.on(ComputeDevice())
     seconds, imaging = time.perf_counter() - started, volume.provenance.get("imaging", {})
     shown = settings_to_dict(found)
+    resolution = volume.provenance.get("resolution_m")
     past = {"verb": "nlos reconstruct", "device": str(used), **shown}
     volume = add_provenance(volume, source, past)
     for path in results.volumes:
@@ -345,6 +350,7 @@ def reconstruct_single(
         "bins_together": found.bins_together,
         "brightest_on_wall": on_wall,
         "evidence": evidence,
+        "resolution_m": resolution,
         "voxel_mm": shown["voxel_mm"],
         "voxels": volume.grid.shape,
         "wall_points": len(capture.points),
@@ -508,7 +514,8 @@ def info(
     from nlos.known_scenes import HiddenTruth
     from nlos.resolution import compute_diffraction_limit
 
-    recorded = read_capture(source)
+    with show_activity(f"reading {source.name}"):
+        recorded = read_capture(source)
     found = find_settings(recorded, load_settings(ImagingSettings, settings, flags))
     capture, grid = found.prepare(recorded), found.grid()
     shown = settings_to_dict(found)

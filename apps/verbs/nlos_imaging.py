@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from apps.options import arg
 from apps.progress import show_activity, show_progress
@@ -22,6 +22,7 @@ from tofclip.errors import InputError
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid, Method, Plan, Volume
+    from nlos.imaging import PreparedImaging
     from tofclip.arrays import ComputeDevice
 
 PORTABLE_METHODS = METHODS_BY_SPEED
@@ -136,38 +137,15 @@ def show_settings(found: Imaging, methods: Sequence[str]) -> Imaging:
     return replace(found, **shown | made)
 
 
-@dataclass(frozen=True, eq=False)
-class PreparedImaging(Generic[Imaging]):
-    """A capture ready to be imaged, with every setting known."""
-
-    capture: Capture  # gated, its bins put together
-    grid: Grid
-    settings: Imaging
-    recorded: Capture  # as it came
-
-
 def prepare_imaging(
     recorded: Capture, wanted: Imaging, device: ComputeDevice | None = None
 ) -> PreparedImaging[Imaging]:
-    """Find every setting that is not given, and the voxels: all that the box holds, or the part
-    that coarse voxels show to be bright. By default it computes where the capture is.
-    """
-    from nlos.completion import complete_settings, find_bright_box, find_scout
+    """Do what `nlos.imaging.prepare_imaging` does, under a progress bar."""
+    from nlos import imaging
 
-    found = complete_settings(recorded, wanted)
-    capture = found.prepare(recorded)
-    if device is not None:
-        capture = capture.on(device)
-    scout = find_scout(capture, found)
-    if scout is not None or found.method is None:
-        coarse, grid = scout or (found, found.grid())
-        quickest, plan = coarse.plan_quickest(capture, grid)
-        found = found if found.method else found.with_method(quickest)
-    if scout is not None:
-        found = find_bright_box(found, image_capture("looking over", plan, capture))
-    found = replace(found, everywhere=True)
-    _warn_of_given_wavelength(capture, found)
-    return PreparedImaging(capture, found.grid(), found, recorded)
+    prepared = imaging.prepare_imaging(recorded, wanted, device, image_capture)
+    _warn_of_given_wavelength(prepared.capture, prepared.settings)
+    return prepared
 
 
 def _warn_of_given_wavelength(capture: Capture, found: Settings) -> None:

@@ -31,7 +31,6 @@ from apps.verbs.nlos_imaging import (
     CAPTURE,
     ImagingSettings,
     MeasuredVolume,
-    PreparedImaging,
     add_provenance,
     measure_imaging,
     parse_method_names,
@@ -46,6 +45,7 @@ from tofclip.files import PICTURE_SUFFIXES, require_apart
 
 if TYPE_CHECKING:
     from nlos import Capture
+    from nlos.imaging import PreparedImaging
     from nlos.known_scenes import HiddenTruth
 
 WALL_SHAPE, WALL_POINTS = "cylinder", 64

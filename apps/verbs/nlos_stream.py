@@ -48,8 +48,8 @@ from tofclip.files import require_apart
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
-    from apps.verbs.nlos_imaging import PreparedImaging
     from nlos import Capture, Plan, Volume
+    from nlos.imaging import PreparedImaging
 
 POLL_INTERVAL_S = 0.02
 SETTINGS_NAME = "stream.toml"

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 from scenes import planar_wall, see
 
-from nlos import Capture, Grid, Settings, Volume, settings_for
+from nlos import Capture, Grid, Settings, Volume, reconstruct, settings_for
 from nlos.analysis import choose_wavelength, find_brightest_path, find_first_bounce
 from nlos.band import VirtualPulse
 from nlos.capture import TimeAxis
-from nlos.completion import (
-    MIN_EVIDENCE,
-    complete_settings,
-    is_brightest_on_wall,
-    measure_evidence,
-)
+from nlos.completion import complete_settings, is_brightest_on_wall
+from nlos.evidence import MIN_EVIDENCE
+from nlos.imaging import prepare_imaging
+from nlos.resolution import measure_point_spread
 from nlos.simulate import add_poisson_noise
 from tofclip.errors import InputError
 
@@ -170,12 +168,46 @@ def test_evidence_separates_a_scene_from_noise_and_from_a_shuffled_record(
     noise = random.poisson(0.5, signal.shape)
 
     def judge(capture: Capture) -> float:
-        settings = complete_settings(capture, Settings())
-        return measure_evidence(settings.prepare(capture), settings)
+        return prepare_imaging(capture, Settings()).measure_evidence()
 
     assert judge(counts) > 2 * MIN_EVIDENCE
     assert judge(replace(counts, signal=shuffled)) < MIN_EVIDENCE
     assert judge(replace(counts, signal=noise)) < MIN_EVIDENCE
+
+
+def reordered(capture: Capture, kept: np.ndarray, start: float = 0.0) -> Capture:
+    """Some of a capture's points in another order, of a record that begins earlier by so much path."""
+    bins = round(start / capture.axis.spacing)
+    signal = np.pad(capture.signal.reshape(capture.axis.bins, -1)[:, kept], ((bins, 0), (0, 0)))
+    wall, laser = capture.wall.reshape(-1, 3)[kept], capture.laser
+    laser = laser if laser.ndim == 1 else laser.reshape(-1, 3)[kept]
+    return replace(
+        capture, signal=signal, wall=wall, laser=laser, start=-bins * capture.axis.spacing
+    )
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.25])
+def test_settings_do_not_hang_on_the_order_of_points_or_the_seed(colour: float) -> None:
+    """Of white noise, and of noise that neighbouring bins share, which the spectrum does not tell."""
+    random, found = np.random.default_rng(3), []
+    for seed in range(2):
+        counts = add_poisson_noise(clean(), 100, 0.5, seed)
+        counts = replace(counts, signal=counts.signal + colour * np.roll(counts.signal, 1, axis=0))
+        everyone = np.arange(counts.valid.size)
+        shuffled, fewer = random.permutation(everyone), everyone[everyone % 100 > 0]
+        variants = [reordered(counts, one) for one in (everyone, shuffled, everyone[24:], fewer)]
+        variants.append(reordered(counts, everyone, 0.3))
+        found += [complete_settings(one, Settings()).wavelength or 0.0 for one in variants]
+    assert max(found) < 1.1 * min(found)
+
+
+def test_reconstructing_says_what_was_found_and_why() -> None:
+    volume = reconstruct(add_poisson_noise(clean(), 300, 0.5, seed=1))
+    assert volume.find_brightest() == pytest.approx(HIDDEN[0], abs=0.03)
+    settings, widths = volume.provenance["settings"], volume.provenance["resolution_m"]
+    assert settings["reasons"].keys() >= {"wavelength", "method", "voxel"}
+    assert volume.provenance["evidence"] > MIN_EVIDENCE
+    assert measure_point_spread(volume).x == pytest.approx(widths["x"], rel=0.2)
 
 
 def test_the_box_before_a_wall_with_relief_begins_by_its_middle() -> None:

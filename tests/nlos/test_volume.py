@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scenes import voxels_of
 
 from nlos import Capture, Grid, Volume
-from nlos.picture import _draw_figure
+from nlos.picture import _draw_figure, map_depths
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.storage import Record
 
@@ -321,3 +321,13 @@ def test_the_surface_encloses_the_ball(tmp_path: Path) -> None:
     read = pyvista.read(tmp_path / "ball.ply")
     assert (read.n_points, read.n_cells) == (len(mesh.vertices), len(mesh.faces))
     assert read.volume == pytest.approx(4 / 3 * np.pi * half**3, rel=0.03)
+
+
+def test_the_depth_map_shows_a_weak_thing_behind_a_bright_one_and_no_noise() -> None:
+    axis = 0.01 * np.arange(60)
+    values = 0.05 * np.random.default_rng(1).random((60, 30, 30))
+    values[15, 5:25, 5:10], values[45, 5:25, 20:25] = 1.0, 0.2
+    depth = map_depths(Volume(values, Grid(axis[:30], axis[:30], axis + 0.2)))
+    assert np.all(depth[5:25, 5:10] == pytest.approx(0.35))
+    assert np.all(depth[5:25, 20:25] == pytest.approx(0.65))
+    assert np.isfinite(depth).sum() == 200
