@@ -59,6 +59,8 @@ TRANSFORM_METHODS = ("lct", "fk")
 # shuffled copy's (letters and a mannequin of a streak camera, a bunny), from so few wall points;
 # and the ratio of wavelengths tried.
 CLEAR_EVIDENCE, MAX_JUDGED_POINTS, WAVELENGTH_RATIO = 30.0, 4096, math.sqrt(2)
+# Where none is so clear: of the most evidence.
+CLEAR_FRACTION = 2 / 3
 # A voxel nearer to a wall point than this is on the wall.
 BRIGHTEST_ON_WALL_WAVELENGTHS = 0.5
 
@@ -205,26 +207,23 @@ def _complete_voxels(gated: Capture, found: Wanted) -> Wanted:
 
 def _choose_by_pictures(gated: Capture, settings: Settings) -> tuple[float, str]:
     """Choose the wavelength where the spectrum does not tell noise from signal: the shortest whose
-    coarse picture is clear, between those tried by the logarithms; else that of most evidence.
+    coarse picture is clear, or nearly as clear as any; between those tried by the logarithms.
 
     Waves are tried from long ones on, whose pictures cost next to nothing.
     """
     capture = _thin_out(gated)
     shortest = find_finest_wavelength(capture, settings.cycles)
-    tried: list[tuple[float, float]] = []
     longest = max(shortest, find_longest_wavelength(gated) / 2)
+    waves, evidences, least = [], [0.0], 0.0
     for step in range(math.ceil(math.log(longest / shortest, WAVELENGTH_RATIO)) + 1):
-        wavelength = max(longest / WAVELENGTH_RATIO**step, shortest)
-        tried.append((wavelength, _judge_wavelength(capture, settings, wavelength)))
-        if tried[-1][1] < CLEAR_EVIDENCE <= max(evidence for _, evidence in tried):
+        waves.append(max(longest / WAVELENGTH_RATIO**step, shortest))
+        evidences.append(_judge_wavelength(capture, settings, waves[-1]))
+        least = min(CLEAR_EVIDENCE, CLEAR_FRACTION * max(evidences))
+        if evidences[-1] < least:
+            chosen = np.interp(np.log(least), np.log(evidences[:-3:-1]), np.log(waves[:-3:-1]))
+            waves.append(float(np.exp(chosen)))
             break
-    waves, evidences = np.log(tried).T
-    if evidences.max() < np.log(CLEAR_EVIDENCE):
-        best = float(np.exp(waves[evidences.argmax()]))
-        return round_wavelength_up(best), "no picture is clear; that of most evidence"
-    # Beyond the last two the first or the second is taken: that waves exceed the shortest.
-    chosen = np.interp(np.log(CLEAR_EVIDENCE), evidences[:-3:-1], waves[:-3:-1])
-    return round_wavelength_up(float(np.exp(chosen))), "the shortest whose coarse picture is clear"
+    return round_wavelength_up(waves[-1]), "the shortest whose coarse picture is clear"
 
 
 def _judge_wavelength(capture: Capture, settings: Settings, wavelength: float) -> float:

@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.method import Plan
@@ -27,10 +28,12 @@ def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
     `capture`: as it is imaged; `plan`: that the picture was made by, with coarse voxels.
     """
     xp, places = namespace(capture.signal), np.flatnonzero(capture.valid)
+    # Whatever order the points come in, the decoys are the same.
+    ordered = places[np.lexsort((capture.points + capture.lasers).T)]
     flat, energies = xp.reshape(capture.signal, (capture.axis.bins, -1)), [_find_energy(picture)]
     for seed in range(1, DECOYS + 1):
         order = np.arange(capture.valid.size)
-        order[places] = np.random.default_rng(seed).permutation(places)
+        order[ordered] = np.random.default_rng(seed).permutation(ordered)
         signal = xp.take(flat, capture.device.put(order), axis=1)
         shuffled = replace(capture, signal=xp.reshape(signal, capture.signal.shape))
         energies.append(_find_energy(plan.image(shuffled)))
@@ -40,5 +43,5 @@ def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
     return own / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
 
 
-def _find_energy(volume: Volume) -> np.ndarray:
-    return to_numpy(volume.values).astype(np.float64) ** 2
+def _find_energy(volume: Volume) -> NDArray[np.float64]:
+    return np.square(to_numpy(volume.values), dtype=np.float64)
