@@ -44,4 +44,5 @@ def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
 
 
 def _find_energy(volume: Volume) -> NDArray[np.float64]:
-    return np.square(to_numpy(volume.values), dtype=np.float64)
+    energy: NDArray[np.float64] = np.square(to_numpy(volume.values), dtype=np.float64)
+    return energy
