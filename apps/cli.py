@@ -27,11 +27,17 @@ from apps.help import (
     EXIT_DEFECT,
     EXIT_INPUT_ERROR,
     EXIT_INTERRUPTED,
+    HELP_OPTIONS,
     MAX_HELP_WIDTH,
+    OVERWRITE_FLAG,
     PROGRAM,
+    QUIET_FLAGS,
+    VERBOSE_FLAGS,
     find_help,
     make_verb_group,
 )
+from apps.progress import silence
+from apps.report import replace_results
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import describe_missing_package
 from tofclip.version import __version__
@@ -54,6 +60,21 @@ OPTIONS_OF_ARGUMENTS = {
     "time_zero": "--time-zero-ns",
 }
 """The command line's option for an argument that the libraries' messages name."""
+
+QUANTITIES = {
+    **{
+        name: ("length", 10.0**power)
+        for name, power in (("um", -6), ("mm", -3), ("cm", -2), ("m", 0))
+    },
+    **{
+        name: ("time", 10.0**power)
+        for name, power in (("fs", -15), ("ps", -12), ("ns", -9), ("us", -6), ("ms", -3), ("s", 0))
+    },
+}
+"""Units that a value may carry, such as 20ps, and that options' names end in: kind, and in SI units."""
+QUANTITY = re.compile(
+    rf"(?P<number>[-+]?[\d.]+(e[-+]?\d+)?) ?(?P<unit>{'|'.join(QUANTITIES)})", re.I
+)
 
 COMPILING = "tofclip.compiling"  # its logger; the module itself would import the compiler
 
@@ -147,7 +168,7 @@ app = typer.Typer(
     name=PROGRAM,
     cls=make_verb_group(VERBS, HOMES),
     pretty_exceptions_enable=False,
-    context_settings={"max_content_width": MAX_HELP_WIDTH},
+    context_settings={"max_content_width": MAX_HELP_WIDTH, "help_option_names": HELP_OPTIONS},
     epilog=EPILOG,
 )
 
@@ -168,10 +189,19 @@ def _show_overview(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program and return its exit status. `arguments`: defaults to the command line's."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    debug = DEBUG_FLAG in words
+    debug, verbose, quiet, replacing = (
+        not {*words}.isdisjoint(flags)
+        for flags in ([DEBUG_FLAG], VERBOSE_FLAGS, QUIET_FLAGS, [OVERWRITE_FLAG])
+    )
+    own = {DEBUG_FLAG, OVERWRITE_FLAG, *QUIET_FLAGS, *VERBOSE_FLAGS}
+    words = [word for word in words if word not in own]
     _heed_end_signals()
-    with _keep_to_one_line(debug):
-        status = int(_run([word for word in words if word != DEBUG_FLAG], debug) or 0)
+    with (
+        _keep_to_one_line(debug or verbose),
+        replace_results(replacing),
+        silence() if quiet else contextlib.nullcontext(),
+    ):
+        status = int(_run(words, debug) or 0)
     if status == EXIT_INTERRUPTED:
         print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
     return status
@@ -181,6 +211,7 @@ def _run(words: Sequence[str], debug: bool) -> Any:
     """Run a verb and return its exit status."""
     try:
         _require_no_empty(words)
+        words = convert_quantities(words)
         text = find_help(app, words)
         if text is not None:
             print(text)
@@ -198,6 +229,32 @@ def _run(words: Sequence[str], debug: bool) -> Any:
     return status
 
 
+def convert_quantities(words: Sequence[str]) -> list[str]:
+    """Write quantities in the unit that their option's name ends in.
+
+    Examples
+    --------
+    >>> convert_quantities(["--bin-width-ps", "0.02ns", "--gate-m=30mm"])
+    ['--bin-width-ps', '20', '--gate-m=0.03']
+    """
+    converted: list[str] = []
+    for word in words:
+        option, equals, value = word.partition("=")
+        if not equals:
+            option, value = (converted or [""])[-1], word
+        wanted, found = option.rpartition("-")[2], QUANTITY.fullmatch(value)
+        if option.startswith("--") and wanted in QUANTITIES and found:
+            (kind, unit), (given, factor) = QUANTITIES[wanted], QUANTITIES[found["unit"]]
+            if kind != given:
+                raise InputError(
+                    f"{option} {value}: give a {kind}, such as {found['number']}{wanted}"
+                )
+            value = f"{float(found['number']) * factor / unit:.15g}"
+            word = f"{option}={value}" if equals else value
+        converted.append(word)
+    return converted
+
+
 def _require_no_empty(words: Sequence[str]) -> None:
     # As a path, an empty word would be the folder that one is in.
     if "" in words:
@@ -205,15 +262,15 @@ def _require_no_empty(words: Sequence[str]) -> None:
 
 
 @contextlib.contextmanager
-def _keep_to_one_line(debug: bool) -> Iterator[None]:
+def _keep_to_one_line(verbose: bool) -> Iterator[None]:
     """Say what the compiler has to say, and keep the libraries' warnings and log lines off the
-    screen, where they would stand before the one line about an error; ``--debug`` shows them.
+    screen, where they would stand before the one line about an error, unless they are asked for.
     """
     root, compiling, show = logging.getLogger(), logging.getLogger(COMPILING), warnings.showwarning
     notes, silence, level = _CompileNotes(), logging.NullHandler(), compiling.level
     compiling.addHandler(notes)
     compiling.setLevel(logging.INFO)
-    if not debug:
+    if not verbose:
         root.addHandler(silence)
         warnings.showwarning = lambda *_, **__: None
     try:

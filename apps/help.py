@@ -19,8 +19,9 @@ import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
 PROGRAM = "tofclip"
-HELP_OPTION = "--help"
-DEBUG_FLAG = "--debug"
+HELP_OPTIONS = ["-h", "--help"]
+DEBUG_FLAG, OVERWRITE_FLAG = "--debug", "--overwrite"
+QUIET_FLAGS, VERBOSE_FLAGS = ("-q", "--quiet"), ("-v", "--verbose")
 
 EXIT_INPUT_ERROR = 2
 EXIT_DEFECT = 1
@@ -29,7 +30,8 @@ EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
 EPILOG = (
     f"Exit status: 0 done; {EXIT_INPUT_ERROR} unusable input, with one line on standard error that says what to do; "
     f"{EXIT_INTERRUPTED} interrupted; {EXIT_DEFECT} some of a sequence failed, or a defect of this program. "
-    f"{DEBUG_FLAG} anywhere shows where an error came from."
+    f"Anywhere: {OVERWRITE_FLAG} replaces results that exist; {QUIET_FLAGS[0]} prints errors only, "
+    f"{VERBOSE_FLAGS[0]} what the libraries say as well, {DEBUG_FLAG} where an error came from."
 )
 
 EXAMPLE_MARK = "Example:"
@@ -125,7 +127,7 @@ def find_help(app: typer.Typer, words: Sequence[str]) -> str | None:
     which takes longer to import than all the rest.
     """
     *names, last = words or ("",)
-    if last != HELP_OPTION or not names or any(name.startswith("-") for name in names):
+    if last not in HELP_OPTIONS or not names or any(name.startswith("-") for name in names):
         return None
     command: Any = typer.main.get_group(app)
     context = typer.Context(command, info_name=PROGRAM, **command.context_settings)
@@ -136,9 +138,9 @@ def find_help(app: typer.Typer, words: Sequence[str]) -> str | None:
 
 
 def simplify_help(command: Command) -> None:
-    """Let a command, and those of a group, show their help as plain text, and an option that takes
-    no value as one, such as ``--json``, where typer writes ``--json <bool>``. Importing what draws
-    frames around the help takes longer than all the rest of showing it.
+    """Let a command, and those of a group, show their help as plain text, without Python's types, and
+    take ``-o`` for ``--out``. Importing what draws frames around the help takes longer than all the
+    rest of showing it.
     """
     command.rich_markup_mode = None
     command.format_options = partial(_write_options, command)  # type: ignore[method-assign]
@@ -147,7 +149,10 @@ def simplify_help(command: Command) -> None:
     command.collect_usage_pieces = lambda ctx: [  # type: ignore[method-assign]
         re.sub(r"^\{(.*?)(\.\.\.)?\}", r"\1", piece) for piece in usage(ctx)
     ]
-    _hide_types_of_flags(command.get_params(typer.Context(command)))
+    context = typer.Context(command, help_option_names=HELP_OPTIONS)
+    for param in _hide_types_of_flags(command.get_params(context)):
+        if param.opts == ["--out"]:
+            param.opts.insert(0, "-o")
     for further in getattr(command, "commands", {}).values():
         simplify_help(further)
 
@@ -162,7 +167,8 @@ def _write_options(command: Command, ctx: Any, formatter: Any) -> None:
             heading = getattr(param, "rich_help_panel", None) or usual
             # typer puts a default in words into brackets of its own
             text = re.sub(r"\[default: \((.*)\)\]$", r"[default: \1]", entry[1])
-            panels.setdefault(heading, []).append((entry[0], text))
+            name = re.sub(r" <.*>$", "", entry[0])
+            panels.setdefault(heading, []).append((name, text.removesuffix("  [default: none]")))
     for heading, entries in panels.items():
         with formatter.section(heading):
             formatter.write_dl(entries)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from apps.progress import show_progress
-from apps.report import report
+from apps.report import may_replace, report
 from tofclip.errors import MissingDependencyError
 
 if TYPE_CHECKING:
@@ -28,11 +28,15 @@ def run_with_progress(
     cluster: str | None,
     watch: Callable[[Report], object] = lambda _: None,
 ) -> Summary:
-    """Run the jobs that are not done yet, one after the other in this process unless a cluster is
-    named, with a bar that shows the time left; `watch` is called with each report.
+    """Run the jobs that are not done yet, or all where results may be replaced, one after the other in
+    this process unless a cluster is named, with a bar that shows the time left; `watch` is called
+    with each report.
     """
     from tofclip.sequences.jobs import run_jobs, select_unfinished
 
+    if may_replace():
+        for job in jobs:
+            job.result.unlink(missing_ok=True)
     missing = select_unfinished(jobs)
     with show_progress(title, len(missing)) as advance:
 

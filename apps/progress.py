@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import signal
 import sys
 import threading
@@ -64,6 +65,13 @@ def show_share(title: str, whole: float | None) -> Iterator[Callable[[float], No
             shown = step
 
         yield watch
+
+
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Print nothing but errors: no figures, and no bars, as inside another one."""
+    with _screen_lock, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        yield
 
 
 @contextlib.contextmanager

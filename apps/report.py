@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +23,36 @@ MAX_TABLE_WIDTH = 100  # columns of a terminal for several things side by side
 UNITS = {"m", "mm", "s", "ns", "ps", "px"}
 
 
+_replaces = ContextVar(
+    "replaces", default=True
+)  # from Python as any library; see `replace_results`
+
+
+@contextlib.contextmanager
+def replace_results(allowed: bool) -> Iterator[None]:
+    """Let verbs write over results that exist, or refuse to."""
+    before = _replaces.set(allowed)
+    try:
+        yield
+    finally:
+        _replaces.reset(before)
+
+
+def may_replace() -> bool:
+    """Say whether results that exist are made again."""
+    return _replaces.get()
+
+
+def require_new(*results: Path) -> None:
+    """Refuse to write over results that exist, unless that is allowed."""
+    for result in results:
+        if result.exists() and not may_replace():
+            raise StorageError(f"{result}: exists already; name another, or give --overwrite")
+
+
 def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | None] = ()) -> None:
-    """Refuse an output that cannot be written, or that would overwrite an input: finding out after
-    minutes of work would be too late. The writing itself is all or nothing in any case.
+    """Refuse an output that exists, that cannot be written, or that would overwrite an input: finding
+    out after minutes of work would be too late. The writing itself is all or nothing in any case.
     `*suffixes`: endings that the name may have; none given: any; `inputs`: what must survive, see
     `tofclip.files.require_apart`.
     """
@@ -37,6 +66,7 @@ def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | No
     if not os.access(out.parent, os.W_OK):
         raise StorageError(f"{out}: cannot be written: writing is not permitted there")
     require_apart([out], inputs)
+    require_new(out)
 
 
 def _require_file_name(out: Path) -> None:

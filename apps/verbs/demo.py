@@ -8,7 +8,7 @@ from pathlib import Path
 
 from apps.options import JSON, SEED, opt
 from apps.progress import show_progress
-from apps.report import build_provenance, make_folder, report
+from apps.report import build_provenance, make_folder, report, require_new
 
 BORDER_PX = 12  # views leave the slit there, so the picture's rim is not scored
 
@@ -43,6 +43,8 @@ def demo(
 
     started = time.perf_counter()
     make_folder(out)
+    written = [out / name for name in ("streak.h5", "frames.h5", "cloud.ply", "preview.png")]
+    require_new(*written)
     scene, instrument = make_default_scene(), make_default_instrument()
     shot = simulate_shot(scene, instrument, seed)
     streak = replace(shot.streak, camera=make_nominal_camera(shot.camera))
@@ -57,7 +59,6 @@ def demo(
     frames = replace(frames, provenance=past)
     returns = depth(frames) if frames.returns is None else frames.returns
     cloud = point_cloud(returns)
-    written = [out / name for name in ("streak.h5", "frames.h5", "cloud.ply", "preview.png")]
     streak.save(written[0])
     frames.save(written[1])
     cloud.save(written[2])

@@ -13,9 +13,9 @@ from typing import Any
 import typer
 
 from apps.help import make_group
-from apps.options import JSON, arg, flag, opt
+from apps.options import JSON, arg, opt
 from apps.progress import show_share
-from apps.report import RECORD_SUFFIXES, build_provenance, report, require_writable
+from apps.report import RECORD_SUFFIXES, build_provenance, may_replace, report, require_writable
 from tofclip.errors import InputError
 
 EXIT_DAMAGED = 2
@@ -130,7 +130,6 @@ def record(
     uri: str = arg("URI", "Such as timetag://SERIAL, or 'sim+timetag://?seed=1'; see devices."),
     out: Path = opt("H5", "The recording to write.", ...),
     seconds: float | None = opt("S", "How long.", shown="until its end, or Ctrl-C"),
-    overwrite: bool = flag("--overwrite", "Replace a recording that exists."),
     as_json: bool = JSON,
 ) -> None:
     """Record an instrument: its bytes as they come, with clock, accounts and calibration.
@@ -149,7 +148,7 @@ def record(
     past = build_provenance({"verb": "record", "uri": uri, "seconds": seconds})
     limit = math.inf if seconds is None else seconds
     with show_share("recording", seconds) as watch:
-        done = record_source(devices.open(uri), out, limit, past, watch, overwrite)
+        done = record_source(devices.open(uri), out, limit, past, watch, may_replace())
     figures = done.stats.as_dict()
     rate = {
         "bytes": done.bytes,

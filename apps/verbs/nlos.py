@@ -23,6 +23,7 @@ from apps.progress import show_activity
 from apps.report import (
     RECORD_SUFFIXES,
     make_folder,
+    may_replace,
     name_beside,
     report,
     require_writable,
@@ -429,7 +430,7 @@ def _reconstruct_folder(
     jobs, skipped, imaged = [], [], list[dict[str, Any]]()
     for path in sources:
         made = _name_results(out.resolve(), path.stem, suffixes)
-        if made.is_up_to_date(path):
+        if made.is_up_to_date(path) and not may_replace():
             skipped.append(path.name)
             continue
         made.settings.unlink(missing_ok=True)  # it says that results are whole, and these are old

@@ -18,6 +18,7 @@ from apps.report import (
     make_folder,
     name_beside,
     report,
+    require_new,
     require_writable,
 )
 from apps.settings import (
@@ -252,8 +253,9 @@ def demo(
     picture = out / "nlos_demo.png" if png is None else png
     # Before the simulation and three images, which take a while.
     require_writable(picture, *PICTURE_SUFFIXES)
-    run = run_demo(seed)
     written = [out / f"{name}.h5" for name in ("capture", "hybrid", "backprojection")]
+    require_new(*written)
+    run = run_demo(seed)
     run.truth.attach_to_record(run.capture).save(written[0])
     for path in written[1:]:
         run.images[path.stem].volume.save(path)

@@ -20,7 +20,14 @@ import typer
 from apps.jobs import EXIT_SOME_FAILED
 from apps.options import JSON, SETTINGS, arg, flag, opt
 from apps.progress import show_progress
-from apps.report import build_provenance, make_folder, name_beside, report, require_writable
+from apps.report import (
+    build_provenance,
+    make_folder,
+    name_beside,
+    report,
+    require_new,
+    require_writable,
+)
 from apps.settings import (
     add_setting_flags,
     load_settings,
@@ -114,7 +121,9 @@ def stream(
     wanted = replace(load_settings(StreamSettings, settings, flags), everywhere=True)
     _check_stream(wanted, follow_s, captures)
     renderings = (path.parent for path in source.glob(f"*/{GEOMETRY_FILE}"))
-    require_apart([out, out / SETTINGS_NAME, *out.glob("*.h5")], [source, settings, *renderings])
+    existing = list(out.glob("*.h5"))
+    require_apart([out, out / SETTINGS_NAME, *existing], [source, settings, *renderings])
+    require_new(*existing)
     coming = islice(_read_captures(source, follow_s), captures)
     first = next((one for one in coming if one.capture is not None), None)
     if first is None or first.capture is None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from apps.help import make_group
 from apps.options import JSON, NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, flag, opt
 from apps.progress import show_activity, show_progress
-from apps.report import make_folder, report, require_writable
+from apps.report import make_folder, report, require_new, require_writable
 from apps.verbs.view import PageDoor
 from tofclip.errors import InputError
 from tofclip.files import PICTURE_SUFFIXES
@@ -159,6 +159,7 @@ def demo(
     # Before anything is written: this refuses settings of which no camera can be built.
     measurement_count = experiment.rig.camera.measurements
     make_folder(out)
+    require_new(out / "occlusion.png")
     seen, probes = experiment.scene, []
     # Small targets inside the inactive region and beyond; without a bound nothing is beyond.
     factors = DISTANCE_FACTORS if seen.region.is_bounded else ()

@@ -13,7 +13,7 @@ import typer
 
 from apps.jobs import EXIT_SOME_FAILED
 from apps.options import BIN_WIDTH, CAMERA, FOCUS, JSON, SUFFIX, TIME_ZERO, arg, flag, opt
-from apps.report import make_folder, report, require_writable
+from apps.report import make_folder, report, require_new, require_writable
 from apps.verbs.recover import require_format
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
@@ -84,7 +84,9 @@ def stream(
     if out is not None and is_file:
         require_writable(out, inputs=(source, camera))
     elif out is not None:
-        require_apart([out, *out.glob(f"cloud_*{suffix}")], [source, camera])
+        existing = list(out.glob(f"cloud_*{suffix}"))
+        require_apart([out, *existing], [source, camera])
+        require_new(*existing)
     coming = TrackedShots(_read_shots(source, bin_width))
     # The first shot brings the camera and the time axis of all.
     first = coming.peek()
