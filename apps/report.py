@@ -17,6 +17,7 @@ from tofclip.files import PICTURE_SUFFIXES, require_apart, require_suffix
 if TYPE_CHECKING:
     from tofclip.shots import Frames
 
+SETTINGS_SUFFIX = ".toml"
 RECORD_SUFFIXES = (".h5", ".hdf5")
 MAX_LISTED_VALUES = 12  # of a list that are printed one by one
 MAX_TABLE_WIDTH = 100  # columns of a terminal for several things side by side
@@ -66,7 +67,8 @@ def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | No
     if not os.access(out.parent, os.W_OK):
         raise StorageError(f"{out}: cannot be written: writing is not permitted there")
     require_apart([out], inputs)
-    require_new(out)
+    if out.suffix != SETTINGS_SUFFIX:  # settings belong to the result that they lie beside
+        require_new(out)
 
 
 def _require_file_name(out: Path) -> None:

@@ -29,7 +29,6 @@ from apps.report import (
     describe_ranges,
     make_folder,
     report,
-    require_new,
     require_writable,
 )
 from apps.verbs.photons import photons
@@ -102,7 +101,6 @@ def bag(
     ]
     if not files:
         raise InputError(f"{clouds}: there is no cloud; names end in {', '.join(CLOUD_SUFFIXES)}")
-    require_new(out)
     if out.suffix.lower() == MCAP_SUFFIX:
         require_writable(out, inputs=files)
     points = 0

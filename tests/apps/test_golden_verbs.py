@@ -152,7 +152,7 @@ info volume.h5
 info {{confocal}}
 clip simulate field.h5 --encoder line-even --sampling-ratio 2 --out measured.h5
 clip recover measured.h5 --shear -1 --truth field.h5 --out picture.h5
-clip recover measured.h5 --shear -1 --truth field.h5 --out picture.h5 --preset surfaces\
+clip recover measured.h5 --shear -1 --truth field.h5 --out surfaces.h5 --preset surfaces\
  --weight 3e-4 --all-in-focus sharp.h5
 design small.toml --shots 2 --out small.png
 occlusion region

@@ -135,7 +135,7 @@ def test_a_scene_is_listed_and_drawn(shell):
     assert 0 < first["range_sigma_m"] == first["confidence_m"] < 0.02
     assert Path("scene.png").read_bytes()[:4] == b"\x89PNG"
     shell.refuses(f"{SCENE} --fewest-points 9999")
-    assert "object 2" in shell(f"{SCENE} --reach-mm 60").out
+    assert "object 2" in shell(f"{SCENE} --reach-mm 60 --overwrite").out
 
 
 @pytest.mark.parametrize("time_zero", [0.0, -2e-9])
@@ -145,4 +145,4 @@ def test_ranges_without_a_time_zero_are_said_to_be_right_up_to_a_constant(shell,
     cloud = "cloud frames.h5 --out cloud.ply"
     for line in (f"{SCENE} --reach-mm 60", cloud):
         assert (note in shell(line).out) == (time_zero == 0)
-    assert "note" not in shell.figures(cloud)
+    assert "note" not in shell.figures(f"{cloud} --overwrite")

@@ -231,7 +231,7 @@ def test_inputs_are_not_taken_for_results(shell, here, line):
     (here / "linked" / "a.h5").symlink_to(here / "other" / "a.h5")
     (here / "in" / "hard.mcap").hardlink_to(here / "in" / "a.ply")
     before = take_stock(here)
-    shell.refuses(line, "is an input too")
+    shell.refuses(f"{line} --overwrite", "is an input too")
     assert take_stock(here) == before
 
 

@@ -88,7 +88,7 @@ def test_a_hot_pixel_is_counted_and_changes_nothing(shell, ball, surface):
     cube[30, 50, 20] += 1_000_000
     np.save("hot.npy", cube)
     for words in ("", "--single-pixel"):
-        line = f"lidar photons hot.npy --out range.npz --bin-width-ps 80 {words}"
+        line = f"lidar photons hot.npy --overwrite --out range.npz --bin-width-ps 80 {words}"
         settings = shell.figures(line)["settings"]
         assert settings["hot_pixels"] == 1
         # learnt from 13,000 photons; 0.4 ps where the hot pixel was listened to
@@ -139,7 +139,7 @@ def test_a_recording_of_a_gated_array_becomes_ranges(shell):
     assert shell.figures(line)["settings"]["image_shape"] == [32, 32]
     assert_gates_show_the_scene(0.144)  # steps are 288 mm, see above
     # A pixel alone: a pulse that hardly more than a bin sees once divided by a rounded zero.
-    assert shell(f"{line} --single-pixel").status == 0
+    assert shell(f"{line} --single-pixel --overwrite").status == 0
 
 
 def test_a_recording_of_time_stamps_becomes_ranges(shell):
@@ -181,7 +181,7 @@ def test_a_given_background_and_cycles_are_used(shell):
     line = "lidar photons cube.npy --bin-width-ps 80 --pulse-ps 160 --single-pixel"
     signal = {}
     for cycles in ("", "--cycles 120"):
-        shell.figures(f"{line} --background dark.npy {cycles} --out range.npz")
+        shell.figures(f"{line} --background dark.npy {cycles} --out range.npz --overwrite")
         written = load()
         signal[cycles] = written["intensity"][0, 0]
         assert written["range_m"][0, 0] == pytest.approx(41 * BIN_M, abs=0.2 * BIN_M)
@@ -198,7 +198,7 @@ def test_all_returns_of_a_pixel_are_in_a_range_image(shell):
         add_photons(cube, np.full((24, 32), place), 40, noise)
     np.save("pane.npy", cube.astype(np.uint16))
     for words in ("", "--single-pixel"):
-        line = f"lidar photons pane.npy --out range.npz {PULSE} --returns 3 {words}"
+        line = f"lidar photons pane.npy --overwrite --out range.npz {PULSE} --returns 3 {words}"
         figures, written = shell.figures(line), load()
         assert set(written) == FIELDS | {f"returns_{name}" for name in FIELDS}
         for name in FIELDS:

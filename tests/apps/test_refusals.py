@@ -126,7 +126,8 @@ def test_a_mistake_is_answered_in_a_line(shell, files, spoilt, curved, typed, sa
 def test_a_result_that_exists_survives_a_failure(shell):
     Path("frames.h5").write_text("last week's frames")
     words = "--camera {files}/camera.h5 --out frames.h5"
-    shell.refuses(f"recover {{files}}/streak.tif {words}", "--bin-width-ps")
+    shell.refuses(f"recover {{files}}/streak.tif {words}", "exists already")
+    shell.refuses(f"recover {{files}}/streak.tif {words} --overwrite", "--bin-width-ps")
     assert Path("frames.h5").read_text() == "last week's frames"
 
 

@@ -172,7 +172,7 @@ class TestConvertAndNlos:
         signal = np.exp(-(((bins - path / (SPEED_OF_LIGHT * 10e-12)) / 2) ** 2) / 2)
         Capture(signal, wall, np.zeros(3), 10e-12).save("capture.h5")
         line = "nlos reconstruct capture.h5 --out volume.h5 --everywhere"
-        line += " --voxel-mm 20 --wavelength-mm 60"
+        line += " --voxel-mm 20 --wavelength-mm 60 --overwrite"
         found = shell.figures(line)
         # Within a voxel across; along z the pulse of three cycles is 18 cm of path long, peaked
         # within a voxel.
