@@ -290,7 +290,7 @@ def sequence(
         "shots": len(late),
         "shots_per_second": len(late) / summary.seconds,
         "points": sum(points for points, _ in made),
-        # Root mean square; 0 where nothing was done.
-        "jitter_rms_bins": (sum(one**2 for one in late) / len(late)) ** 0.5 if late else 0.0,
+        # Root mean square; 0 where nothing was done, and of one shot but for rounding.
+        "jitter_rms_bins": round((sum(one**2 for one in late) / max(len(late), 1)) ** 0.5, 6),
     }
     report_summary(summary, len(jobs), as_json, out, figures)

@@ -203,7 +203,7 @@ class PhotonFit:
             report_pass()
             if number > len(FINE_SUBSETS) and self.likelihood - before < MIN_GAIN * abs(before):
                 return "converged"
-        return "iteration limit"
+        return "iterations done"
 
     def improve(self, subsets: int, prior_weight: float | None = None) -> None:
         """Improve albedo and background once by every subset of the wall points."""

@@ -211,7 +211,7 @@ class TestRefine:
         shell.figures(f"{line} one.h5 --method hybrid")
         found = shell.figures(f"{line} two.h5 --refine {prior} --iterations 8")
         assert (found["method"], found["refine"], found["iterations"]) == ("hybrid", prior, 8)
-        assert found["stopped_because"] == "iteration limit"
+        assert found["stopped_because"] == "iterations done"
         plain, refined = pair()
         axes = np.meshgrid(plain.grid.z, plain.grid.y, plain.grid.x, indexing="ij")
         near = np.linalg.norm(np.stack(axes[::-1], axis=-1) - HIDDEN_POINT, axis=-1) < 0.04

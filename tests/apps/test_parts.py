@@ -50,7 +50,7 @@ class TestReport:
         [
             (
                 {"range_m": [1.23456, float("inf")], "points": 3, "at": {"x": 0.5, "z": 12345.6}},
-                ["range m  1.235, unknown", "points   3", "at       x 0.5, z 12346"],
+                ["range m  1.235, -", "points   3", "at       x 0.5, z 12346"],
             ),
             # what is said of several things stands side by side
             (
@@ -87,7 +87,7 @@ class TestReport:
                 ],
             ),
             # units stand behind their figures
-            ({"wall": {"width_m": 2.0, "gap_mm": None}}, ["wall  width 2 m, gap unknown"]),
+            ({"wall": {"width_m": 2.0, "gap_mm": None}}, ["wall  width 2 m, gap -"]),
             (
                 {"why": {"a": "x" * 60, "long_one": "y" * 60}},
                 ["why", f"  a         {'x' * 60}", f"  long one  {'y' * 60}"],

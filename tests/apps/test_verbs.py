@@ -206,7 +206,7 @@ class TestInfo:
         assert "kind: frames" in lines
         assert any(line.startswith("  values: 96 x 32 x 32 (time, y, x) float32") for line in lines)
         assert "    kind: camera" in lines
-        assert "  angle_uncertainty: unknown" not in lines
+        assert "  angle_uncertainty: -" not in lines
         (residual,) = (line for line in lines if line.startswith("  relative_residual: "))
         assert len(residual.split(": ")[1]) <= 11  # six digits, a sign and an exponent
         assert not any(line.endswith((": None", ": []")) for line in lines)

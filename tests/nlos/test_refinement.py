@@ -146,7 +146,7 @@ def test_progress_counts_every_voxel_in_every_iteration() -> None:
         seen("single"), small, done.append
     )
     assert sum(done) == 3 * small.size
-    assert volume.provenance["imaging"]["stopped_because"] == "iteration limit"
+    assert volume.provenance["imaging"]["stopped_because"] == "iterations done"
 
 
 def test_what_cannot_be_refined_is_refused() -> None:

@@ -220,7 +220,7 @@ def test_frames_say_what_they_are(shot, frames):
     assert frames.values.dtype == np.float32
     np.testing.assert_allclose(frames.times, shot.streak.times - shot.camera.time_zero)
     assert frames.figures["method"] == "tv"
-    assert frames.figures["stopped_because"] == "iteration limit"
+    assert frames.figures["stopped_because"] == "iterations done"
     objective = frames.provenance["objective"]
     assert len(objective) == frames.figures["iterations"] + 1
     assert all(after <= before for before, after in itertools.pairwise(objective))

@@ -176,7 +176,7 @@ def test_bad_readings_have_no_influence():
 
 def test_tolerance_stops_and_says_so():
     limited = Sparse(1e-2, 5).recover(projection(), noise(7))
-    assert (limited.iterations, limited.stop_reason) == (5, "iteration limit")
+    assert (limited.iterations, limited.stop_reason) == (5, "iterations done")
     assert limited.objective.size == 6
     done = Sparse(1e-2, 3000, 1e-7).recover(projection(), noise(7))
     assert done.stop_reason == "converged"
@@ -270,7 +270,7 @@ def test_the_duality_gap_bounds_what_is_left(data_term):
 def test_the_gap_ends_a_run_and_is_told():
     operator, measurements = projection(), noise(7)
     limited = Sparse(0.1, 10).recover(operator, measurements)
-    assert (limited.stop_reason, limited.iterations) == ("iteration limit", 10)
+    assert (limited.stop_reason, limited.iterations) == ("iterations done", 10)
     done = Sparse(0.1, 3000).recover(operator, measurements)
     assert done.stop_reason == "converged"
     assert 10 < done.iterations < 3000

@@ -407,7 +407,7 @@ def _join_results(frames: Array, results: list[Result]) -> Result:
         frames,
         max(result.iterations for result in results),
         objective,
-        "iteration limit" if "iteration limit" in reasons else results[0].stop_reason,
+        "iterations done" if "iterations done" in reasons else results[0].stop_reason,
         sum(result.setup_seconds for result in results),
         float(excess / whole) if whole > 0 else float("nan"),
     )

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import glob
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tofclip.errors import InputError, StorageError
+from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.io import read_streak
 from tofclip.io.streaks import StreakStack
 from tofclip.sequences.jobs import SETTINGS_NAME
 from tofclip.shots import Streak
+from tofclip.storage import is_own_file, read_outline
+
+RESULT_SUFFIXES = (".png", ".pdf", ".svg", ".ply", ".toml", ".json")
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,8 @@ def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, 
     Parameters
     ----------
     source : path-like
-        Folder, glob pattern or HDF5 stack (`tofclip.shots`).
+        Folder, glob pattern or HDF5 stack (`tofclip.shots`). Cameras, frames and pictures that lie
+        beside the shots of a folder are left out.
     bin_width : float, optional
         Duration of a row, s; overrides time axes.
 
@@ -91,14 +96,27 @@ def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, 
     """
     path = Path(source)
     if path.is_dir() or not path.exists():
-        return {name: FileShot(file, bin_width) for name, file in list_files(source).items()}
+        return {name: FileShot(file, bin_width) for name, file in list_files(source, _may_be_shot).items()}
     path = path.absolute()
     numbers = range(len(StreakStack(path)))
     return {f"{path.stem}_{number:06d}": StackShot(path, number, bin_width) for number in numbers}
 
 
-def list_files(source: str | Path) -> dict[str, Path]:
-    """Return the files of a folder or a glob pattern by name, in the order of their names.
+def _may_be_shot(path: Path) -> bool:
+    """Whether a file of a folder is not one that this program makes of shots, or for them."""
+    if path.suffix.lower() in RESULT_SUFFIXES:
+        return False
+    try:
+        return not is_own_file(path) or read_outline(path).kind == Streak.RECORD_KIND
+    except FileFormatError:
+        return True  # a damaged one is reported
+
+
+def list_files(
+    source: str | Path, accept: Callable[[Path], bool] = lambda path: True
+) -> dict[str, Path]:
+    """Return the files of a folder or a glob pattern by name, in the order of their names. `accept`:
+    which files of a folder count; those of a pattern all do.
 
     A file's name is its path from the folder that they have in common, without the ending. Paths
     are absolute: a cluster's workers run in other folders. Hidden files are left out, and the settings
@@ -113,7 +131,7 @@ def list_files(source: str | Path) -> dict[str, Path]:
     """
     folder = Path(source)
     if folder.is_dir():
-        found = [path for path in folder.iterdir() if path.name != SETTINGS_NAME]
+        found = [path for path in folder.iterdir() if path.name != SETTINGS_NAME and accept(path)]
     elif glob.has_magic(str(source)):
         found = [Path(name) for name in glob.glob(str(source), recursive=True)]
     else:
@@ -129,7 +147,7 @@ def list_files(source: str | Path) -> dict[str, Path]:
         name = path.relative_to(common).with_suffix("").as_posix()
         if name in named:
             raise InputError(
-                f"{named[name]} and {path.name} have one name; choose some by a pattern: '*{path.suffix}'"
+                f"{named[name]} and {path.name} have one name; choose some by a pattern such as '*{path.suffix}'"
             )
         named[name] = path
     return named

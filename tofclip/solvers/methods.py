@@ -207,7 +207,7 @@ class Result:
         Sum over all frames; blocks that stopped early count with their last value. Empty for direct
         methods.
     stop_reason : str
-        ``"converged"``, ``"iteration limit"`` or ``"direct method"``.
+        ``"converged"``, ``"iterations done"`` or ``"direct method"``.
     setup_seconds : float
         Time spent on what depends on the operator only and on loading compiled loops, not on the
         measurements.
@@ -232,7 +232,7 @@ class Result:
         padded = [np.pad(one.objective, (0, longest - one.iterations), "edge") for one in histories]
         total = np.sum(padded, axis=0)
         converged = all(history.converged for history in histories)
-        why = "converged" if converged else "iteration limit"
+        why = "converged" if converged else "iterations done"
         gap = sum(history.gap for history in histories) / (total[-1] if total[-1] > 0 else 1)
         return cls(frames, longest, total, why, setup_seconds, gap)
 

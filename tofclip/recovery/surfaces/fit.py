@@ -608,7 +608,7 @@ class SurfaceRecovery:
             "iterations": START_ITERATIONS
             + fit.refinement.steps * REFINEMENT_ITERATIONS
             + self.iterations,
-            "stopped_because": "iteration limit",
+            "stopped_because": "iterations done",
             "relative_residual": residual,
             "surfaces": len(fit.model.masks),
         }
