@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from small_instrument import Shell
+from small_instrument import Outcome, Shell
 
 import tofclip
 from apps.cli import app
@@ -339,3 +339,19 @@ def test_a_range_image_keeps_its_ranges(written):
     depth = tofclip.load(written / "depth.exr").fields["Z"].values
     row, column = depth.shape[0] // 2, depth.shape[1] // 2  # on the optical axis
     assert depth[row, column] == pytest.approx(loaded.values[row, column], rel=1e-6)
+
+
+@pytest.mark.parametrize("given", ["0.02ns", "20 ps", "20"])
+def test_quantities_may_carry_a_unit(shell, given):
+    figures = "lidar accuracy --photons 50 --background 0.1 --pulse-ps 60 --trials 20"
+    line = f"{figures} --bin-width-ps '{given}'"
+    assert shell.figures(line) == shell.figures(f"{figures} --bin-width-ps=20ps")
+    shell.refuses(line.replace(given, "3mm"), "give a time, such as 3ps")
+
+
+def test_common_words_of_every_verb(shell, here):
+    assert shell("lidar accuracy -h").out == shell("lidar accuracy --help").out
+    line = "occlusion region --baseline-mm 15 --width-mm 6 --distance-mm 50 -o region.png"
+    assert shell(f"{line} -q") == Outcome(0, "", "")
+    shell.refuses(line, "region.png: exists already; name another, or give --overwrite")
+    assert shell(f"{line} --overwrite").out

@@ -96,7 +96,10 @@ def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, 
     """
     path = Path(source)
     if path.is_dir() or not path.exists():
-        return {name: FileShot(file, bin_width) for name, file in list_files(source, _may_be_shot).items()}
+        return {
+            name: FileShot(file, bin_width)
+            for name, file in list_files(source, _may_be_shot).items()
+        }
     path = path.absolute()
     numbers = range(len(StreakStack(path)))
     return {f"{path.stem}_{number:06d}": StackShot(path, number, bin_width) for number in numbers}
