@@ -123,17 +123,18 @@ def test_background_is_not_the_walls_own_light() -> None:
         assert settings_for(counts).gate is None
 
 
-def test_noise_makes_the_wave_longer() -> None:
+def test_noise_makes_the_wave_longer_and_nothing_makes_it_jump() -> None:
+    """From photons whose spectrum tells the wave to so few that pictures have to."""
     random, light = np.random.default_rng(1), clean().signal / clean().signal.max()
-    captures = [clean()]
-    for peak in (100, 10):
+    found = []
+    for peak in (30, 20, 10, 5, 2):
         counts = random.poisson(peak * light + 0.5).astype(np.float32)
-        captures.append(replace(clean(), signal=counts))
-    quiet, many, few = (complete_settings(one, Settings()).wavelength for one in captures)
-    assert quiet is not None
-    assert many is not None
-    assert few is not None
-    assert few > many
+        found.append(complete_settings(replace(clean(), signal=counts), Settings()))
+    waves = [one.wavelength or 0.0 for one in found]
+    assert waves[0] < waves[-1]
+    assert max(abs(np.diff(np.log(waves)))) < np.log(1.1)
+    assert "noise" in found[1].reasons["wavelength"]
+    assert "picture" in found[2].reasons["wavelength"]
 
 
 def test_transforms_see_the_lattice_whatever_the_wavelength() -> None:
