@@ -325,7 +325,8 @@ def test_walls_are_those_of_the_simulation():
 @pytest.mark.parametrize("kind", [ReconstructSettings, CompareSettings, SceneSettings])
 def test_every_setting_can_be_told_by_a_file(kind: type, tmp_path: Path):
     """Values of each field's own type go out and come back."""
-    examples = {"float": 0.5, "int": 3, "str": "a", "bool": True, "tuple[float, float]": (0.5, 1.5)}
+    examples = {"float": 0.5, "int": 3, "str": "a", "bool": True, "list[str]": ["cycles=3"]}
+    examples["tuple[float, float]"] = (0.5, 1.5)
     values = {
         field.name: examples[
             str(field.type).removesuffix(" | None").replace("Limits", "tuple[float, float]")
