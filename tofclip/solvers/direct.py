@@ -37,11 +37,13 @@ from tofclip.solvers.methods import (
     ignore_progress,
     validate_measurements,
 )
-from tofclip.threads import LANES, count_block_threads, limit_blas_threads, run_blocks
+from tofclip.threads import LANES, limit_blas_threads, run_blocks
 
 # Numbers between rows of weights: at a distance of a power of two they would share few places of the
 # cache.
 ROW_GAP = 16
+# Of a product, whatever the number of threads is: sums are rounded as their block's size has it.
+ROWS_AT_ONCE = 192
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,7 @@ class PreparedInverse:
             np.matmul(self.inverse_gram[piece], measurements, out=weights[piece, :frames])
 
         with limit_blas_threads():
-            run_blocks(solve, number, -(-number // count_block_threads()))
+            run_blocks(solve, number, ROWS_AT_ONCE)
         return weights
 
 
