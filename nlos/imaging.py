@@ -38,19 +38,17 @@ class PreparedImaging(Generic[Wanted]):
     scouted: tuple[Plan, Volume] | None  # coarse voxels that were looked over
 
     def describe(self, volume: Volume) -> Volume:
-        """Return the volume that was imaged with a provenance that names the settings with their
-        reasons, `evidence`, and for a virtual pulse `resolution_m`, widths of a point's image where
-        the volume is brightest.
+        """Return the volume that was imaged, its provenance under ``imaging`` completed by the
+        settings with their reasons, `evidence`, and for a virtual pulse `resolution_m`, widths of a
+        point's image where the volume is brightest.
         """
-        described: dict[str, Any] = {
-            "settings": self.settings.to_dict(),
-            "evidence": self.measure_evidence(),
-        }
+        described = {**volume.provenance.get("imaging", {}), "settings": self.settings.to_dict()}
+        described["evidence"] = self.measure_evidence()
         if "wavelength" in list_taken(self.settings.method or METHODS_BY_SPEED[0]):
             pulse = VirtualPulse(self.settings.wavelength or 0.0, self.settings.cycles)
             widths = compute_diffraction_limit(self.capture, volume.find_brightest(), pulse)
             described["resolution_m"] = asdict(widths)
-        return replace(volume, provenance={**volume.provenance, **described})
+        return replace(volume, provenance={**volume.provenance, "imaging": described})
 
     def measure_evidence(self) -> float:
         """How much brighter the coarse picture's brightest is than that of shuffled copies."""
@@ -101,7 +99,7 @@ def reconstruct(capture: Capture, **given: Any) -> Volume:
     Returns
     -------
     Volume
-        The part of the space before the wall that is bright. Its provenance names the settings
+        The part of the space before the wall that is bright. ``provenance["imaging"]`` names the ``settings``
         with the reasons for what was found; ``evidence``, how much brighter the picture's brightest
         is than that of shuffled copies of the capture, about 1 where there is nothing; and
         ``resolution_m``, how wide a point's image is where the volume is brightest.

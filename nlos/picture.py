@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # The depth map shows columns whose brightest voxel has at least this fraction of the brightest about
 # its depth, by so many voxels, and that of the volume's: a thing behind a brighter one is shown too.
-DEPTH_THRESHOLD, NEIGHBOUR_VOXELS, MIN_DEPTH_BRIGHTNESS = 0.4, 8, 0.15
+DEPTH_THRESHOLD, NEIGHBOUR_VOXELS, MIN_DEPTH_BRIGHTNESS = 0.4, 8, 0.25
 COLOUR_MAP = "inferno"
 DEPTH_COLOUR_MAP = "viridis"
 # Of the colours' scale: a flat thing whose depths are one voxel apart would look like steps.
@@ -83,13 +83,13 @@ def _describe_imaging(volume: Volume) -> str:
     past = volume.provenance
     while "imaging" not in past and isinstance(past.get("earlier"), Mapping):
         past = past["earlier"]
-    past, widths = past.get("imaging", {}), past.get("resolution_m")
+    past = past.get("imaging", {})
     said = [str(past["method"])] if "method" in past else []
     if past.get("wavelength_m"):
         said.append(f"wavelength {1e3 * past['wavelength_m']:.3g} mm")
     if volume.grid.x.size > 1:
         said.append(f"voxels of {1e3 * np.diff(volume.grid.x).mean():.3g} mm")
-    if widths:
+    if widths := past.get("resolution_m"):
         size = " x ".join(f"{widths[axis] / MILLIMETRE:.0f}" for axis in "xyz")
         said.append(f"a point appears {size} mm wide (x, y, z)")
     return ", ".join(said)

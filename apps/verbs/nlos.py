@@ -310,7 +310,7 @@ def reconstruct_single(
             file=sys.stderr,
         )
     volume = prepared.describe(volume)
-    evidence = volume.provenance["evidence"]
+    evidence = volume.provenance["imaging"]["evidence"]
     if not evidence >= MIN_EVIDENCE:
         print(
             f"tofclip: warning: {source}: the picture's brightest is {evidence:.2g} times that of shuffled copies "
@@ -321,7 +321,7 @@ def reconstruct_single(
     volume = volume.on(ComputeDevice())
     seconds, imaging = time.perf_counter() - started, volume.provenance.get("imaging", {})
     shown = settings_to_dict(found)
-    resolution = volume.provenance.get("resolution_m")
+    resolution = imaging.get("resolution_m")
     past = {"verb": "nlos reconstruct", "device": str(used), **shown}
     volume = add_provenance(volume, source, past)
     for path in results.volumes:

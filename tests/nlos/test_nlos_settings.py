@@ -215,9 +215,10 @@ def test_pictures_choose_where_noise_is_coloured_in_any_order_of_points() -> Non
 def test_reconstructing_says_what_was_found_and_why() -> None:
     volume = reconstruct(add_poisson_noise(clean(), 300, 0.5, seed=1))
     assert volume.find_brightest() == pytest.approx(HIDDEN[0], abs=0.03)
-    settings, widths = volume.provenance["settings"], volume.provenance["resolution_m"]
+    imaging = volume.provenance["imaging"]
+    settings, widths = imaging["settings"], imaging["resolution_m"]
     assert settings["reasons"].keys() >= {"wavelength", "method", "voxel"}
-    assert volume.provenance["evidence"] > MIN_EVIDENCE
+    assert imaging["evidence"] > MIN_EVIDENCE
     assert measure_point_spread(volume).x == pytest.approx(widths["x"], rel=0.2)
 
 

@@ -326,7 +326,7 @@ def test_the_surface_encloses_the_ball(tmp_path: Path) -> None:
 def test_the_depth_map_shows_a_weak_thing_behind_a_bright_one_and_no_noise() -> None:
     axis = 0.01 * np.arange(60)
     values = 0.05 * np.random.default_rng(1).random((60, 30, 30))
-    values[15, 5:25, 5:10], values[45, 5:25, 20:25] = 1.0, 0.2
+    values[15, 5:25, 5:10], values[45, 5:25, 20:25] = 1.0, 0.3
     depth = map_depths(Volume(values, Grid(axis[:30], axis[:30], axis + 0.2)))
     assert np.all(depth[5:25, 5:10] == pytest.approx(0.35))
     assert np.all(depth[5:25, 20:25] == pytest.approx(0.65))
