@@ -39,7 +39,8 @@ from tofclip.simulate import simulate_shot
 
 def find_patches_in(distance: np.ndarray, ray_length: np.ndarray):
     pixels = np.flatnonzero(np.isfinite(distance))
-    return find_patches(pixels, distance.ravel()[pixels], ray_length, BIN_M)
+    sure = np.full(pixels.size, BIN_M / 10)
+    return find_patches(pixels, distance.ravel()[pixels], sure, ray_length, BIN_M)
 
 
 def test_patches_are_planes_to_rounding_and_halves_of_one_are_joined():

@@ -251,7 +251,9 @@ class EvidenceJudge:
         own, missing, light = weigh_candidates(self.frames, noise, self.pulse, pixel, time, signal)
         pooled, neighbours = pool.sum_around(own), pool.sum_around(np.ones(own.size))
         most = AT_INSTANT.compute_least_intensity(pixel, time, pooled, width, time)
-        excess = pool.sum_around(missing) / np.maximum(pool.sum_around(light), TINY)
+        # float32's least: a quotient by float64's may overflow
+        explained = np.maximum(pool.sum_around(light), np.finfo(np.float32).tiny)
+        excess = pool.sum_around(missing) / explained
         # of what is hardly seen, noise makes as much
         excess = np.clip(excess, *EXCESS_LIMITS) * pooled**2 / (pooled**2 + 4 * neighbours)
         intensity = signal * distance**2

@@ -25,16 +25,16 @@ from tofclip.recovery.surfaces.model import (
     SurfaceState,
     compare_smoothed,
     find_rows,
+    weigh_measurements,
 )
 from tofclip.recovery.surfaces.patches import (
     COEFFICIENTS,
     MARGIN_PX,
-    MIN_PATCH_PX,
     FloatArray,
+    Patch,
     Pixels,
     find_dimmer_patches,
     find_patches,
-    leave_out_rough,
     rank_within_pixels,
     reach_further,
 )
@@ -45,9 +45,8 @@ from tofclip.solvers import Method, Progress, Sparse, ignore_progress
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
-# Of a return that makes a surface: what is left out the surface still reaches. Where so few returns do
-# not explain a shot, as one of many small and dim things, those of the cloud are taken.
-SURE_FALSE_ALARM = 0.04
+SURE_FALSE_ALARM = 0.04  # of a return that makes a surface
+MIN_SURE_FRACTION = 0.8  # of a patch's returns
 START_ITERATIONS = 25
 MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 4, 10
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
@@ -80,7 +79,7 @@ SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
 MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
 # Of what certainly is a surface, and beyond: points that are fainter are looked at no further.
-LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 5.0, 0.05, 3
+LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 3.5, 0.05, 3
 
 
 NO_SHARES = Detection(min_scene_fraction=0.0, min_time_bin_fraction=0.0, min_pixel_fraction=0.0)
@@ -115,12 +114,29 @@ def fit_surfaces(
     """
     # 1. Frames by a fast method, whose returns are a picture of ranges. The model explains what was
     # measured: corrections come when its own returns are listed.
-    plain = frames.camera.replace(range_calibration=None)
+    found = depth(frames, frames.camera.replace(range_calibration=None))
     try:
-        sure = depth(frames, plain, false_alarm=SURE_FALSE_ALARM)
-        return _fit_returns(sure, streak, frames, weight, iterations, progress)
-    except InputError:
-        return _fit_returns(depth(frames, plain), streak, frames, weight, iterations, progress)
+        return _fit_returns(found, streak, frames, weight, iterations, progress)
+    except InputError as fault:
+        dark = estimate_darkness(streak, frames)
+        if dark <= MAX_UNEXPLAINED:
+            raise
+        raise InputError(
+            f"noise is {100 * dark:.0f} % of this shot's signal: it is too dark for surfaces; "
+            'choose `method="tv"`, or average shots'
+        ) from fault
+
+
+def estimate_darkness(streak: Streak, frames: Frames) -> float:
+    """Return how large noise is beside a shot's signal, both smoothed as what is left unexplained."""
+    noise = MeasurementNoise.from_figures(frames.figures)
+    if noise is None:
+        return 0.0
+    image, _ = weigh_measurements(streak, frames.camera)
+    variance = float(np.sum(noise.compute_variance(np.maximum(image, 0))))
+    signal = np.linalg.norm(scipy.ndimage.gaussian_filter(image, SMOOTHING_PX))
+    # what is left of the variance of neighbours' mean
+    return float(np.sqrt(variance / (4 * np.pi)) / SMOOTHING_PX / max(signal, LEAST_COUNT))
 
 
 def _fit_returns(
@@ -131,26 +147,25 @@ def _fit_returns(
     iterations: int,
     progress: Progress,
 ) -> SurfaceFit:
-    """Fit the surfaces that some returns show."""
+    """Fit the surfaces that returns show."""
     camera, count = frames.camera, frames.times.size
     bin_m = SPEED_OF_LIGHT * frames.bin_width / 2
     directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
     ray_length = (1 / directions[:, 2]).reshape(camera.image_shape)
     require_gentle_slopes(found, bin_m)
 
-    # 2. Patches. Weaker returns of a pixel are often the frames' own: they would widen the surfaces.
-    strongest = found.image("range").astype(np.float64).ravel()
-    pixels = np.flatnonzero(np.isfinite(strongest))
-    patches = find_patches(pixels, strongest[pixels], ray_length, bin_m)
+    # 2. Patches.
+    shown = leave_out_doubtful(found, ray_length, bin_m)
+    patches = _find_brightest_patches(shown, ray_length, bin_m)
     on_surface = np.zeros(camera.image_shape, bool)
     for patch in patches:
         on_surface.ravel()[patch.pixels] = True
-    share = _measure_light(found, on_surface)
+    share = _measure_light(shown, on_surface)
     if share < MIN_SURFACE_SHARE:
         raise _refuse(f"only {100 * share:.0f} % of the returns' light lies on smooth surfaces")
-    patches = leave_out_rough(patches, bin_m)
-    patches += find_dimmer_patches(patches, found, ray_length, bin_m)
+    patches += find_dimmer_patches(patches, shown, ray_length, bin_m)
     seen = np.concatenate([patch.pixels for patch in patches])
+    strongest = shown.image("range").astype(np.float64).ravel()
     pulse = measure_pulse(frames, seen, strongest[seen])
     if pulse.tail_share > MAX_TAIL_SHARE:
         late = f"{100 * pulse.tail_share:.0f} % of each pixel's light"
@@ -162,7 +177,7 @@ def _fit_returns(
     brightness = frames.values.sum(axis=0).ravel()
     for patch, mask, picture in zip(patches, masks, pictures, strict=True):
         picture.ravel()[patch.pixels] = brightness[patch.pixels]
-        reached = reach_further(patch, found, bin_m)
+        reached = reach_further(patch, shown, bin_m)
         mask[...] = scipy.ndimage.binary_dilation(reached, np.ones((3, 3)), MARGIN_PX)
     state = SurfaceState.start([patch.coefficients for patch in patches], camera)
     model = SurfaceModel(streak, camera, masks, [patch.basis for patch in patches], state, pulse)
@@ -170,7 +185,11 @@ def _fit_returns(
     # 4. Amplitudes.
     solver = AmplitudeSolver(model, pictures[masks], weight)
     solver.run(START_ITERATIONS, progress, count)
-    require_explained(solver, frames, streak)
+    limit = float(np.hypot(MAX_UNEXPLAINED, estimate_darkness(streak, frames)))
+    if model.unexplained(solver.amplitude) > limit:
+        # what is too small for a surface may be all that is bright
+        _, whole = find_others(solver, found, bin_m, progress, count)
+        require_explained(whole, limit, frames, streak)
     solver = keep_lit(solver)
     solver.model.find_behind(solver.amplitude)
 
@@ -182,6 +201,31 @@ def _fit_returns(
     reference = solver.model.unexplained(solver.amplitude)
     others, whole = find_others(solver, found, bin_m, progress, count)
     return SurfaceFit(solver.model, solver, refinement, remainder, reference, others, whole)
+
+
+def _find_brightest_patches(returns: Returns, ray_length: FloatArray, bin_m: float) -> list[Patch]:
+    """Patches of each pixel's strongest return: weaker ones are often the frames' own, and would widen
+    the surfaces.
+    """
+    strongest, deviation = (
+        returns.image(name).astype(np.float64).ravel() for name in ("range", "confidence")
+    )
+    pixels = np.flatnonzero(np.isfinite(strongest))
+    return find_patches(pixels, strongest[pixels], deviation[pixels], ray_length, bin_m)
+
+
+def leave_out_doubtful(found: Returns, ray_length: FloatArray, bin_m: float) -> Returns:
+    """Leave out returns that may be false, but not where most of a patch are so, as on a surface that
+    is turned far: what is left out elsewhere the surface still reaches.
+    """
+    sure = ~(found.false_alarm > SURE_FALSE_ALARM)
+    pixel = found.y.astype(np.intp) * ray_length.shape[1] + found.x
+    kept = sure.copy()
+    for patch in _find_brightest_patches(found, ray_length, bin_m):
+        own = np.isin(pixel, patch.pixels)
+        if sure[own].mean() < MIN_SURE_FRACTION:
+            kept |= own
+    return found[kept]
 
 
 def find_others(
@@ -202,27 +246,36 @@ def find_others(
     others = found[np.isinf(apart)]
     if not len(others):
         return others, solver
-    pixel = others.y.astype(np.intp) * model.camera.image_shape[1] + others.x
+    least = max(LIT_SIGMAS, find_sure_level(solver.measure_significance()) / 2)
+    together, own = add_returns(solver, others, progress, count)
+    weights = together.model.weights / together.estimate_local_variance()
+    information = together.model.gather(weights, squared=True)[own]
+    others = others[together.amplitude[own] * np.sqrt(information) > least]
+    # light of those that are left out goes to the others
+    return others, add_returns(solver, others, progress, count)[0]
+
+
+def add_returns(
+    solver: AmplitudeSolver, others: Returns, progress: Progress, count: int
+) -> tuple[AmplitudeSolver, Pixels]:
+    """Solve for the light of surfaces and of returns beside them; also return the returns' points."""
+    shape = solver.model.camera.image_shape
+    pixel = others.y.astype(np.intp) * shape[1] + others.x
     order, rank = rank_within_pixels(pixel, others.range)
-    others, pixel = others[order], pixel[order]
-    masks = np.zeros((int(rank.max()) + 1, *model.camera.image_shape), bool)
+    layer = np.empty_like(rank)
+    layer[order] = rank
+    masks = np.zeros((int(rank.max(initial=-1)) + 1, *shape), bool)
     inverse = np.ones(masks.shape)
-    masks.reshape(len(masks), -1)[rank, pixel] = True
-    depths = compute_ray_directions(model.camera, others.y, others.x)[:, 2] * others.range
-    inverse.reshape(len(masks), -1)[rank, pixel] = 1 / depths
-    whole = model.add(masks, inverse)
+    masks[layer, others.y, others.x] = True
+    depths = compute_ray_directions(solver.model.camera, others.y, others.x)[:, 2] * others.range
+    inverse[layer, others.y, others.x] = 1 / depths
+    whole = solver.model.add(masks, inverse)
     begin = np.concatenate([solver.amplitude, np.zeros(pixel.size, np.float32)])
     together = AmplitudeSolver(whole, begin, solver.weight)
     together.run(START_ITERATIONS, progress, count)
-    # what no surface explains is judged by what they leave, not by what takes it up
-    variance = solver.estimate_local_variance()
-    sure = find_sure_level(solver.measure_significance(variance))
-    shown = together.measure_significance(variance) > sure / 2
-    shown[: model.surface.size] = True
-    together.amplitude = np.where(shown, together.amplitude, np.float32(0))
-    kept = np.zeros(masks.shape, bool)
-    kept[masks] = shown[model.surface.size :]
-    return others[kept.reshape(len(masks), -1)[rank, pixel]], together
+    point = np.empty_like(pixel)
+    point[np.lexsort((pixel, layer))] = solver.model.surface.size + np.arange(pixel.size)
+    return together, point
 
 
 def _measure_light(found: Returns, where: NDArray[np.bool_]) -> float:
@@ -280,18 +333,12 @@ def measure_slopes(distance: Image) -> tuple[FloatArray, FloatArray]:
     return np.where(share > 0.5, np.hypot(across, down), 0.0), scatter
 
 
-def require_explained(solver: AmplitudeSolver, frames: Frames, streak: Streak) -> None:
-    """Refuse a shot that surfaces explain neither well nor as well as its frames do."""
-    model = solver.model
-    unexplained = model.unexplained(solver.amplitude)
-    noise = MeasurementNoise.from_figures(frames.figures)
-    dark = 0.0
-    if noise is not None:
-        variance = float(np.sum(noise.compute_variance(np.maximum(model.image, 0))))
-        signal = np.linalg.norm(scipy.ndimage.gaussian_filter(model.image, SMOOTHING_PX))
-        # what is left of the variance of neighbours' mean
-        dark = float(np.sqrt(variance / (4 * np.pi)) / SMOOTHING_PX / max(signal, LEAST_COUNT))
-    if unexplained**2 <= MAX_UNEXPLAINED**2 + dark**2:
+def require_explained(whole: AmplitudeSolver, limit: float, frames: Frames, streak: Streak) -> None:
+    """Refuse a shot that surfaces, with returns beside them, explain neither to a limit nor nearly as
+    well as its frames do.
+    """
+    unexplained = whole.model.unexplained(whole.amplitude)
+    if unexplained <= limit:
         return
     camera = frames.camera
     seen = measure(streak.counts, streak.saturated, camera)
@@ -301,12 +348,7 @@ def require_explained(solver: AmplitudeSolver, frames: Frames, streak: Streak) -
         pictures = np.ascontiguousarray(np.moveaxis(frames.values[own], 0, -1))
         predicted[:, own] = camera.operator(float(shear))(pictures)
     by_frames = compare_smoothed(predicted, seen.values, seen.valid)
-    if unexplained > by_frames and dark > MAX_UNEXPLAINED:
-        raise InputError(
-            f"noise is {100 * dark:.0f} % of this shot's signal: it is too dark for surfaces; "
-            'choose `method="tv"`, or average shots'
-        )
-    if unexplained > by_frames:
+    if unexplained > CHANGED_RATIO * by_frames:
         raise _refuse(
             f"surfaces leave {100 * unexplained:.0f} % of the signal unexplained, and frames "
             f"{100 * by_frames:.0f} %"
@@ -359,21 +401,17 @@ def find_sure_level(significance: Image) -> float:
 
 
 def keep_lit(solver: AmplitudeSolver) -> AmplitudeSolver:
-    """Leave out the points of surfaces that are dark and far from any that is not, and surfaces too few
-    of whose points are sure, as what frames spread about bright ones.
+    """Leave out the points of surfaces that are dark and far from any that is not, beside what is usual
+    on their own surface: others may be far brighter.
     """
     model, significance = solver.model, solver.measure_significance()
-    sure = significance > find_sure_level(significance)
     kept = np.zeros_like(model.masks)
     near = np.ones((2 * LIT_MARGIN_PX + 1,) * 2)
     for surface, (part, mask) in enumerate(zip(model.parts, model.masks, strict=True)):
-        amplitude = solver.amplitude[part]
-        if sure[part].sum() >= MIN_PATCH_PX:
-            usual = float(np.median(amplitude[sure[part]]))
-            kept[surface][mask] = (significance[part] > LIT_SIGMAS) & (
-                amplitude > LIT_FRACTION * usual
-            )
-            kept[surface] = mask & scipy.ndimage.binary_dilation(kept[surface], near)
+        amplitude, own = solver.amplitude[part], significance[part]
+        least = LIT_FRACTION * find_usual_brightness(amplitude, own, LIT_SIGMAS)
+        kept[surface][mask] = (own > LIT_SIGMAS) & (amplitude > least)
+        kept[surface] = mask & scipy.ndimage.binary_dilation(kept[surface], near)
     return solver.cover(kept) if kept.any() else solver
 
 

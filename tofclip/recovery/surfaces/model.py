@@ -55,6 +55,7 @@ MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
 SWEEP_LEFT_FRACTION = (
     0.6  # of the corrections to a sweep, which are lines: what is left of its shape
 )
+PARALLEL_POINTS = 20_000  # threads take as long to begin as so many need
 MIN_BEHIND_PX = 100  # of a surface, seen through another; fewer are a rim, of which each has a part
 FRONT_FRACTION = 0.5  # of a surface's usual brightness: it ends where its rim is darker
 
@@ -405,6 +406,8 @@ class SurfaceModel:
     def _map_views(self, work: Callable[[int], Result]) -> list[Result]:
         """Return ``work(view)`` of all views; each thread takes its share of them at once."""
         views = self.camera.views
+        if self.surface.size < PARALLEL_POINTS:
+            return [work(view) for view in range(views)]
         shares = split_blocks(views, -(-views // thread_count()))
         found = map_parallel(lambda share: [work(v) for v in range(views)[share]], shares)
         return [one for part in found for one in part]
@@ -524,6 +527,6 @@ class SurfaceModel:
         """Return amplitudes, of the points in `part`, as a view sees them."""
         if not self.state.shading[:, view].any():
             return amplitude
-        behind = self.behind[part]
-        brightness = np.exp(self.state.shading[self.surface[part], view])
-        return np.where(behind, amplitude * brightness, amplitude).astype(np.float32)
+        behind, shaded = np.flatnonzero(self.behind[part]), amplitude.astype(np.float32)
+        shaded[behind] *= np.exp(self.state.shading[:, view])[self.surface[part][behind]]
+        return shaded

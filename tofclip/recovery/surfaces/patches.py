@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -36,14 +37,16 @@ DIMMER_REACH_BINS = 4.0  # nearer to a surface, a return is a part of it
 MERGE_BINS = 0.5  # misfit of either of two patches to one surface for both
 MERGE_EXCESS = 1.3  # or of their misfit to a surface of their own
 MERGE_REACH_BINS = 7.0  # of the larger's fit at the smaller: further off it is not tried
+# Of returns, also in their deviations: further off a patch's surface they may be another's.
+SPLIT_BINS, SPLIT_SIGMAS = 4.0, 3.0
+MERGE_SIGMAS = 1.0  # median; 0.67 are expected of returns of the surface
 FIT_ITERATIONS = 10
+FITTED_RETURNS = 2000  # of a patch, evenly chosen: with more a start is no better
 RIDGE = 1e-9  # per return: those along a line say nothing about what is across it
 CURVATURE_PENALTY = 1e-3  # keeps small patches from bending
+FLAT_PENALTY = 1e3  # keeps all from it: a bent one would follow what stands on it
 KNOT_SPACING_PX, MAX_PIECES = 12, 8
-RETURNS_PER_UNKNOWN = 8.0  # of splines: they share their errors
-# Misfit of a patch, also over what is usual in the shot: of more it is no one surface, or one that is
-# turned so far that its returns are anywhere.
-ROUGH_BINS, ROUGH_RATIO = 1.5, 2.0
+RETURNS_PER_UNKNOWN = 3.0  # of splines: they share their errors
 BEND_BINS = 0.3  # misfit of a quadratic from which on splines are tried
 BENT_FRACTION = 0.6  # of a quadratic's misfit: splines are worth their freedom below
 EVIDENCE_ROUNDS = 2
@@ -127,6 +130,7 @@ class Patch:
 
     pixels: Pixels  # (n,)
     distance: FloatArray  # (n,), ranges of the returns there
+    deviation: FloatArray  # (n,), theirs
     ray_length: FloatArray  # range over depth of each pixel of the picture
     basis: SmoothBasis
     coefficients: FloatArray  # (size,), inverse depth, 1/m, over the basis
@@ -142,17 +146,31 @@ class Patch:
         fitted = (surface or self).compute_ranges(self.pixels)
         return float(np.median(np.abs(fitted - self.distance)))
 
+    def compute_misfit(self, surface: Patch) -> float:
+        """The same in the returns' deviations."""
+        fitted = surface.compute_ranges(self.pixels)
+        return float(np.median(np.abs(fitted - self.distance) / self.deviation))
+
+    def take(self, which: Any, penalty: float = CURVATURE_PENALTY) -> Patch:
+        """Return the patch of some of the returns."""
+        some = self.pixels[which], self.distance[which], self.deviation[which]
+        return _fit_quadratic(*some, self.ray_length, penalty)
+
 
 def find_patches(
-    pixels: Pixels, distance: FloatArray, ray_length: FloatArray, bin_m: float
+    pixels: Pixels,
+    distance: FloatArray,
+    deviation: FloatArray,
+    ray_length: FloatArray,
+    bin_m: float,
 ) -> list[Patch]:
     """Find the smooth surfaces in a picture's returns, (n,) each, the largest first. A pixel may
     have several returns.
     """
-    patches = [
-        _fit_quadratic(pixels[own], distance[own], ray_length)
-        for own in _connect_neighbours(pixels, distance, ray_length.shape, NEIGHBOUR_BINS * bin_m)
-    ]
+    if pixels.size == 0:
+        return []
+    patches = _split(_fit_quadratic(pixels, distance, deviation, ray_length), bin_m)
+    patches.sort(key=lambda patch: -patch.pixels.size)
     before = len(patches) + 1
     while len(patches) < before:
         before, first = len(patches), 0
@@ -167,12 +185,32 @@ def find_patches(
     return [_bend_where_needed(patch, bin_m) for patch in patches]
 
 
-def leave_out_rough(patches: list[Patch], bin_m: float) -> list[Patch]:
-    """Leave out patches whose returns scatter far about their surface."""
-    misfits = np.array([patch.compute_error() for patch in patches])
-    usual = np.repeat(misfits, [patch.pixels.size for patch in patches])
-    limit = max(ROUGH_BINS * bin_m, ROUGH_RATIO * float(np.median(usual)) if usual.size else 0.0)
-    return [patch for patch, misfit in zip(patches, misfits, strict=True) if misfit < limit]
+def _split(patch: Patch, bin_m: float) -> list[Patch]:
+    """Return the connected parts of returns, and apart from these what touches them but lies on
+    another surface: a ball on a table, a book that leans on it.
+    """
+    found: list[Patch] = []
+    tolerance = NEIGHBOUR_BINS * bin_m
+    for own in _connect_neighbours(patch.pixels, patch.distance, patch.ray_length.shape, tolerance):
+        part, apart = patch.take(own), []
+        flat = part.take(slice(None), FLAT_PENALTY)
+        off = np.abs(flat.compute_ranges(part.pixels) - part.distance)
+        far = off > np.maximum(SPLIT_BINS * bin_m, SPLIT_SIGMAS * part.deviation)
+        if far.sum() >= MIN_DIMMER_PX and not far.all():
+            # what splines follow is the rim of a round surface
+            whole = _bend_where_needed(part, bin_m)
+            apart = [
+                one
+                for one in _split(part.take(far), bin_m)
+                if one.pixels.size >= MIN_DIMMER_PX
+                and one.compute_error() < BENT_FRACTION * one.compute_error(whole)
+            ]
+        if apart:
+            left = ~np.isin(part.pixels, np.concatenate([one.pixels for one in apart]))
+            found += [*apart, *_split(part.take(left), bin_m)]
+        else:
+            found.append(part)
+    return found
 
 
 def _connect_neighbours(
@@ -185,8 +223,6 @@ def _connect_neighbours(
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    if pixels.size == 0:
-        return []
     order, rank = rank_within_pixels(pixels, distance)
     # the nearest returns of all pixels, the second ones and so on; a rim stands for no neighbour
     layers = np.full((int(rank.max()) + 1, shape[0] + 2, shape[1] + 2), -1)
@@ -220,18 +256,26 @@ def rank_within_pixels(pixels: Pixels, distance: FloatArray) -> tuple[Pixels, Pi
     return order, np.arange(order.size) - np.repeat(starts, np.diff(starts, append=order.size))
 
 
-def _fit_quadratic(pixels: Pixels, distance: FloatArray, ray_length: FloatArray) -> Patch:
+def _fit_quadratic(
+    pixels: Pixels,
+    distance: FloatArray,
+    deviation: FloatArray,
+    ray_length: FloatArray,
+    curvature_penalty: float = CURVATURE_PENALTY,
+) -> Patch:
     basis = SmoothBasis((ray_length.shape[0], ray_length.shape[1]))
-    penalty = CURVATURE_PENALTY * pixels.size * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+    penalty = curvature_penalty * pixels.size * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
     inverse = ray_length.ravel()[pixels] / distance
     coefficients, _ = _fit_robustly(basis.evaluate(pixels), inverse, penalty)
-    return Patch(pixels, distance, ray_length, basis, coefficients)
+    return Patch(pixels, distance, deviation, ray_length, basis, coefficients)
 
 
 def _fit_robustly(
     design: FloatArray, values: FloatArray, penalty: FloatArray
 ) -> tuple[FloatArray, float]:
     """Coefficients and scale of the errors; outliers are weighted down (Cauchy's weights)."""
+    some = slice(None, None, 1 + values.size // FITTED_RETURNS)
+    design, penalty, values = design[some], penalty * values[some].size / values.size, values[some]
     weights, coefficients, scale = np.ones(values.size), np.zeros(design.shape[1]), 0.0
     penalty = penalty + RIDGE * values.size * np.eye(design.shape[1])
     for _ in range(FIT_ITERATIONS):
@@ -244,15 +288,20 @@ def _fit_robustly(
 
 
 def _merge(large: Patch, small: Patch, bin_m: float) -> Patch | None:
-    """Return both as one patch if one surface fits either as well as a surface of its own."""
+    """Return both as one patch if one surface fits either as well as a surface of its own, or as well
+    as returns are known.
+    """
     if small.compute_error(large) > MERGE_REACH_BINS * bin_m:
         return None
-    pixels = np.concatenate([large.pixels, small.pixels])
-    distance = np.concatenate([large.distance, small.distance])
-    joint = _fit_quadratic(pixels, distance, large.ray_length)
-    for one in (large, small):
+    both = large, small
+    pixels = np.concatenate([one.pixels for one in both])
+    distance = np.concatenate([one.distance for one in both])
+    deviation = np.concatenate([one.deviation for one in both])
+    joint = _fit_quadratic(pixels, distance, deviation, large.ray_length)
+    for one in both:
         # in little light returns scatter by more than that about a surface of their own
-        if one.compute_error(joint) >= max(MERGE_BINS * bin_m, MERGE_EXCESS * one.compute_error()):
+        least = max(MERGE_BINS * bin_m, MERGE_EXCESS * one.compute_error())
+        if one.compute_error(joint) >= least and one.compute_misfit(joint) >= MERGE_SIGMAS:
             return None
     return joint
 
@@ -304,9 +353,10 @@ def find_dimmer_patches(
     for patch in patches:
         free &= np.abs(returns.range - patch.compute_ranges(pixel)) > DIMMER_REACH_BINS * bin_m
     pixel, distance, intensity = pixel[free], returns.range[free], returns.intensity[free]
+    deviation = returns.confidence[free].astype(np.float64)
     light = MIN_DIMMER_LIGHT * float(returns.intensity.sum())
     found = []
-    for patch in find_patches(pixel, distance, ray_length, bin_m):
+    for patch in find_patches(pixel, distance, deviation, ray_length, bin_m):
         own = np.isin(pixel, patch.pixels)
         own &= np.abs(distance - patch.compute_ranges(pixel)) < NEIGHBOUR_BINS * bin_m
         here = patch.compute_ranges(patch.pixels)
