@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,8 @@ from apps.viewer.source import (
     View,
     make_cloud,
 )
-from tofclip.camera import Camera, Rectifier
+from tofclip.camera import Camera, Measurement, Rectifier
+from tofclip.camera.noise import MeasurementNoise, find_dazzled
 from tofclip.errors import FileFormatError
 from tofclip.lidar import PointCloud, depth
 from tofclip.lidar.export import read_table
@@ -36,11 +37,17 @@ from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.photons import PhotonCube
 from tofclip.loading import CLOUD_SUFFIXES, load
 from tofclip.plugins import METHODS, list_settings
-from tofclip.recovery import make_method
-from tofclip.sequences.cache import get_cached_camera, prepare_inverse
-from tofclip.sequences.ranger import RangingPipeline
+from tofclip.recovery import FixedFocus, make_method
+from tofclip.recovery.defects import (
+    clip_from_below,
+    describe_noise,
+    find_clipping_level,
+    mask_defects,
+)
+from tofclip.recovery.plan import recover_measurement
+from tofclip.sequences.cache import get_cached_camera
 from tofclip.shots import Frames, Streak
-from tofclip.solvers import LinearInverse, Method, ProximalMethod
+from tofclip.solvers import DataTermMaker, LeastSquares, LinearInverse, Method
 from tofclip.storage import Record
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -201,11 +208,18 @@ SURFACES = "surfaces"  # takes some ten seconds, for which a single shot has the
 # enough to read what is written on a surface; `tofclip recover` takes 40
 LOOK_METHOD, LOOK_ITERATIONS = "l1", 25
 
-Readings = NDArray[np.float32]  # rectified measurements of a shot, (columns, frames)
+
+class Measured(NamedTuple):
+    """What a camera measured of a shot."""
+
+    measurement: Measurement
+    noise: MeasurementNoise | None  # None where it is not known
+    data_term: DataTermMaker = LeastSquares
+
+
 SHEAR_LIMITS = (-3.0, 3.0)  # pixels per view step between which a picture can be refocused
 SHEAR_HINT = "recovers the gate once more, at this shear in pixels per view step; 0: as it was"
 NEAR_FRAMES = 16  # on either side of a return, that its waveform shows: some pulses
-MIN_FRAMES = 3  # without a neighbour on either side no return is located
 ALL_FRAMES = slice(None)
 
 
@@ -221,9 +235,7 @@ class RecoveredSource(Source):
     """Light over time that one camera measured, from which frames can be recovered at any shear.
 
     `measured_times` (frames,): time of flight of each column of measurements, s; `method`: what it
-    is recovered by at first, with this `weight` of its prior. The linear inverse keeps one operator
-    and one matrix (columns, columns) for each of the last 16 shears, which every recovery of this
-    process shares. Safe to share by threads.
+    is recovered by at first, with this `weight` of its prior. Safe to share by threads.
     """
 
     def __init__(
@@ -245,6 +257,9 @@ class RecoveredSource(Source):
         self.settings = self.method_choice, *((self.refocus,) if camera.views > 1 else ())
         # Without a time zero all ranges are off by one constant.
         self.notes = (NO_TIME_ZERO_NOTE,) if camera.time_zero == 0 else ()
+        self._recover_view = functools.lru_cache(MAX_CACHED_VIEWS)(
+            lambda _, number, shear: make_view(depth(self.recover(number, shear)))
+        )
 
     @property
     def method(self) -> Method:
@@ -260,41 +275,27 @@ class RecoveredSource(Source):
         return (LINEAR_NOTE,) if self.method_choice.value == LinearInverse.name else ()
 
     @abc.abstractmethod
-    def measurements(self, number: int) -> Readings:
-        """Return the rectified measurements of a shot."""
+    def measure(self, number: int) -> Measured:
+        """Return what the camera measured of a shot."""
 
-    def recover(
-        self, measurements: Readings, shear: float = 0.0, gate: slice = ALL_FRAMES
-    ) -> Frames:
-        """Recover the frames of a gate."""
-        known = np.isfinite(measurements[:, gate])  # dazzled ones are not
-        part = np.where(known, measurements[:, gate], np.float32(0))
+    def recover(self, number: int, shear: float = 0.0, part: slice = ALL_FRAMES) -> Frames:
+        """Recover frames of shot `number`, as `tofclip recover` does."""
+        measurement, noise, data_term = self.measure(number)
         method = self.method
-        if isinstance(method, LinearInverse):
-            # Rounded, because sliders give numbers that differ by rounding only.
-            operator = self._cached_camera.operator(round(shear, 6))
-            inverse = prepare_inverse(method, operator, ~self.camera.dead_columns)
-            values = inverse.recover(part).frames
-        elif part.max(initial=0.0) > 0:
-            valid = known & ~self.camera.dead_columns[:, np.newaxis]
-            values = method.recover(self.camera.operator(shear), part, valid).frames
-        else:  # a dark gate has no brightest frame to set a prior's weight by
-            values = np.zeros((part.shape[1], *self.camera.image_shape), np.float32)
-        times = self.measured_times[gate]
-        return Frames(values, times, self.camera, shears=np.full(times.size, shear))
-
-    def recover_view(
-        self, measurements: Readings, shear: float = 0.0, gate: slice = ALL_FRAMES
-    ) -> View:
-        """Recover the frames of a gate and locate their returns."""
-        first, stop, _ = gate.indices(self.measured_times.size)
-        first = max(0, min(first, self.measured_times.size - MIN_FRAMES))
-        widened = slice(first, max(stop, first + MIN_FRAMES))
-        return make_view(depth(self.recover(measurements, shear, widened)))
+        return recover_measurement(
+            method,
+            self._cached_camera,
+            self.measured_times[part],
+            Measurement(measurement.values[:, part], measurement.valid[:, part]),
+            noise if method.has_prior else None,
+            # rounded, because sliders give numbers that differ by rounding only
+            FixedFocus(round(shear, 6)),
+            data_term=data_term,
+        )
 
     def recover_frames(self, number: int) -> Frames:
         """Return all frames of shot `number`."""
-        return self.recover(self.measurements(number))
+        return self.recover(number)
 
     def waveform(
         self, number: int, pixel: tuple[int, int], time: float, layer: int = 1
@@ -305,7 +306,7 @@ class RecoveredSource(Source):
 
     def recover_near(self, number: int, near: slice) -> Frames:
         """Return some frames of shot `number`."""
-        return self.recover(self.measurements(number), 0.0, near)
+        return self.recover(number, part=near)
 
 
 def find_near(times: FloatArray, time: float) -> slice:
@@ -354,7 +355,6 @@ class TransientSource(RecoveredSource):
         self.gate = Choice("time gate", modes, GATE_UP_TO_FRAME, GATE_HINT)
         self.half_gate = Setting("half gate", 1, 200, 1, 12, HALF_GATE_HINT)
         self.settings = (self.gate, self.half_gate, *self.settings)
-        self._refocus = functools.lru_cache(1)(self._refocus_gate)
 
     def __len__(self) -> int:
         return int(self.frames.times.size)
@@ -368,11 +368,9 @@ class TransientSource(RecoveredSource):
 
     def view(self, number: int) -> View:
         gate, every = self.find_gate(number), range(len(self))
-        # Only a gate around the frame changes with it; else all instants are recovered once.
-        recovered = gate if self.gate.value == GATE_AROUND_FRAME else every
         shear, method = self.refocus.value, self.method_choice.value
         is_as_it_was = shear == 0 and method == self._first_method
-        view = self._whole_view if is_as_it_was else self._refocus(method, shear, recovered)
+        view = self._whole_view if is_as_it_was else self._recover_view(method, 0, shear)
         times, due = self.frames.times, None
         if gate != every:
             half = (times[-1] - times[0]) / (2 * max(1, times.size - 1))
@@ -388,8 +386,8 @@ class TransientSource(RecoveredSource):
             notes=self.method_notes,
         )
 
-    def measurements(self, number: int) -> Readings:
-        return self._measurements
+    def measure(self, number: int) -> Measured:
+        return self._measured
 
     def recover_frames(self, number: int) -> Frames:
         return self.frames
@@ -401,40 +399,33 @@ class TransientSource(RecoveredSource):
         gate = self.find_gate(number)
         frames = slice(gate.start, gate.stop)
         distance = np.maximum(self.frames.times[frames], 0) * SPEED_OF_LIGHT / 2
-        readings = self._measurements
         # As the intensity of a point, referred to 1 m: far objects would be lost beside near ones.
         light = np.tensordot((distance**2).astype(np.float32), self.frames.values[frames], 1)
         return {
-            "streak": np.where(np.isfinite(readings), readings, self._predictions).T,
+            "streak": self._measured.measurement.values.T,
             "intensity": light,
             "depth": render_depth(self._whole_view, self.camera.image_shape),
         }
-
-    def _refocus_gate(self, _: str, shear: float, gate: range) -> View:
-        own = self.frames
-        if (
-            len(gate) == len(self) and own.measured.size
-        ):  # then judged as the frames' own points are
-            found = self.recover(self._measurements, shear)
-            return make_view(depth(replace(found, figures=own.figures, measured=own.measured)))
-        view = self.recover_view(self._measurements, shear, slice(gate.start, gate.stop))
-        # a threshold relative to the gate would find noise in a dark one
-        return view.select(
-            view.cloud.intensity >= self._whole_view.cloud.intensity.min(initial=np.inf)
-        )
 
     @cached_property
     def _whole_view(self) -> View:
         # Surfaces were found with their points; frames are searched for theirs.
         return make_view(depth(self.frames) if self.frames.returns is None else self.frames.returns)
 
-    @property
-    def _measurements(self) -> Readings:
-        """What the camera read, NaN where it was dazzled or blind, or would read."""
-        return self.frames.measured if self.frames.measured.size else self._predictions
+    @cached_property
+    def _measured(self) -> Measured:
+        """What the camera read, where it was dazzled what it would have read."""
+        frames, predictions = self.frames, self._predictions
+        alive = np.repeat(~self.camera.dead_columns[:, np.newaxis], len(self), axis=1)
+        if not frames.measured.size:
+            return Measured(Measurement(predictions, alive), None)
+        noise, known = MeasurementNoise.from_figures(frames.figures), np.isfinite(frames.measured)
+        whole = Measurement(np.where(known, frames.measured, predictions), alive)
+        dazzled = find_dazzled(whole, noise) if noise is not None else ~alive
+        return Measured(Measurement(whole.values, known | (dazzled & alive)), noise)
 
     @cached_property
-    def _predictions(self) -> Readings:
+    def _predictions(self) -> NDArray[np.float32]:
         """What the camera would read; neighbouring frames of one shear share an operator."""
         frames, shears = self.frames, self.frames.shears
         measurements = np.empty((frames.camera.slit_width_px, frames.times.size), np.float32)
@@ -461,12 +452,9 @@ class StreakSource(RecoveredSource):
         method: str = LOOK_METHOD,
     ) -> None:
         super().__init__(title, SHOT_RATE_HZ, camera, row_times - camera.time_zero, method)
-        self.frame_name, self._row_times = "shot", row_times
+        self.frame_name = "shot"
         self._shots, self._rectifier = shots, Rectifier(camera, row_times.size)
-        self._measured = functools.lru_cache(2)(self._rectify)
-        self._recover_view = functools.lru_cache(MAX_CACHED_VIEWS)(self._find_view)
-        self._pipeline: RangingPipeline | None = None
-        self._last = -1
+        self._measure = functools.lru_cache(2)(self._measure_shot)
 
     def __len__(self) -> int:
         return len(self._shots)
@@ -479,41 +467,30 @@ class StreakSource(RecoveredSource):
         self._shots.close()
 
     def view(self, number: int) -> View:
-        view = self.view_at(number, self.refocus.value)
-        return replace(view, notes=self.method_notes)
-
-    def view_at(self, number: int, shear: float) -> View:
-        """Return the points of shot `number`, recovered at a shear."""
         made, name = self._shots.get(number).view, self.method_choice.value
+        shear = self.refocus.value
         if made is None or shear or self._shots.method_name != name:
-            return self._recover_view(name, number, shear)
-        return made
+            made = self._recover_view(name, number, shear)
+        return replace(made, notes=self.method_notes)
 
-    def _find_view(self, _: str, number: int, shear: float) -> View:
-        measurements, method = self.measurements(number), self.method
-        if shear or not isinstance(method, LinearInverse | ProximalMethod):
-            return self.recover_view(measurements, shear)
-        pipeline = self._pipeline
-        # a prior begins at the shot before, if that is the one that was just recovered
-        if pipeline is None or number != self._last + 1 or pipeline.method is not method:
-            pipeline = RangingPipeline(self.camera, self._row_times, method)
-        self._pipeline, self._last = pipeline, number
-        return make_view(pipeline.find_returns(measurements))
+    def measure(self, number: int) -> Measured:
+        return self._measure(number)
 
-    def measurements(self, number: int) -> Readings:
-        return self._measured(number)
-
-    def _rectify(self, number: int) -> Readings:
+    def _measure_shot(self, number: int) -> Measured:
         shot = self._shots.get(number).shot
         assert isinstance(shot, Streak)
-        return self._rectifier.measure(shot.counts, shot.saturated).values
+        streak = mask_defects(shot, self.camera.pulse_fwhm)
+        measurement = self._rectifier.measure(streak.counts, streak.saturated)
+        data_term = clip_from_below(streak, find_clipping_level(streak.counts))
+        return Measured(measurement, describe_noise(streak, measurement), data_term)
 
     def pictures(self, number: int) -> Mapping[str, Picture]:
         view, light = self.view(number), np.zeros(self.camera.image_shape, np.float32)
         if view.pixels is not None:
             np.add.at(light, tuple(view.pixels.T), view.cloud.intensity)
         picture = render_depth(view, light.shape)
-        return {"streak": self.measurements(number).T, "intensity": light, "depth": picture}
+        streak = self.measure(number).measurement.values.T
+        return {"streak": streak, "intensity": light, "depth": picture}
 
 
 class PhotonSource(Source):

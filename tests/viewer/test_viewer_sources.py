@@ -42,13 +42,15 @@ from apps.viewer.sources import (
     StreakSource,
     TransientSource,
     VolumeSource,
+    make_look_method,
     render_depth,
 )
 from apps.viewer.texts import render_status_html
 from tofclip.camera import registration
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io.streaks import save_stack
-from tofclip.lidar import PointCloud
+from tofclip.lidar import PointCloud, depth, point_cloud
+from tofclip.recovery import FixedFocus, open_shot, plan_recovery
 from tofclip.sequences import make_pipeline
 from tofclip.sequences.ranger import RangingPipeline, SummedShot
 from tofclip.shots import Streak
@@ -184,6 +186,21 @@ def test_refocusing_moves_the_squares_along_the_slit_and_back(transient: Transie
     assert len(show_cloud(session, 45)) == 0
 
 
+@pytest.mark.parametrize(("method", "shear"), [("l1", 0.0), ("tv", 0.5), ("linear", 0.0)])
+def test_points_by_another_method_are_those_that_recover_and_cloud_make(
+    method: str, shear: float
+) -> None:
+    """They are judged by what this recovery leaves of the shot, not by figures of the frames' own."""
+    shot, focus = open_shot(streak()), FixedFocus(shear)
+    source = TransientSource("frames.h5", plan_recovery(shot, "wavelet").run())
+    source.method_choice.value, source.refocus.value = method, shear
+    expected = depth(plan_recovery(shot, make_look_method(method), focus).run())
+    shown = source.view(0).cloud
+    assert 25 < len(shown) == len(expected.range)
+    np.testing.assert_allclose(shown.range, expected.range, rtol=1e-6)
+    np.testing.assert_allclose(shown.false_alarm, point_cloud(expected).false_alarm, atol=1e-6)
+
+
 def test_clouds_follow_one_another(folder: Path) -> None:
     source = open_source(str(folder / "clouds"))
     session = Session(source)
@@ -246,7 +263,7 @@ def test_a_quick_look_is_called_one_and_another_method_can_be_asked_for(folder: 
         light = np.maximum(source.recover_frames(0).values, 0).sum(axis=0)
         fractions.append(light[INSIDE].sum() / light.sum())
     assert fractions[0] > 2 * fractions[1]  # 0.78 and 0.2: far from noise of a per cent
-    assert sharp.view(0).cloud.range.min() == pytest.approx(range_of(NEAR_FRAME), abs=3e-3)
+    assert count_close(sharp, NEAR_FRAME) > 25
     no_zero = open_source(shot, ShotOptions(time_zero=0.0))
     assert no_zero.notes == (FIRST_LOOK_NOTE, NO_TIME_ZERO_NOTE)
     # frames are refocused by their own method until another is chosen on the page
@@ -283,7 +300,7 @@ def test_a_stack_of_shots_is_recovered_shot_by_shot(folder: Path) -> None:
     shown = session.frame_at(0.0)
     # the other time zero moves everything by 1.5 m
     nearest = range_of(NEAR_FRAME) + 10e-9 * 0.149896
-    assert shown.cloud.range.min() == pytest.approx(nearest + 1.498, abs=0.02)
+    assert np.sum(np.abs(shown.cloud.range - nearest - 1.498) < 0.02) > 25
     assert set(session.pictures(shown)) == {"streak", "intensity", "depth"}
     pick = session.pick((0, 0, 0), shown.cloud.xyz[0])
     assert pick is not None

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy, zeros
+from tofclip.arrays import CPU, Array, ComputeDevice, namespace, parse_device, to_numpy, zeros
 from tofclip.camera import Camera, Measurement, measure
-from tofclip.camera.noise import find_dazzled, find_glints
+from tofclip.camera.noise import MeasurementNoise, find_dazzled, find_glints
 from tofclip.camera.registration import count_registration_iterations
 from tofclip.errors import require_type
 from tofclip.plugins import DENOISERS, METHODS, list_settings
@@ -36,6 +36,8 @@ from tofclip.recovery.shot import Shot, open_shot
 from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import (
+    DataTermMaker,
+    LeastSquares,
     Method,
     Progress,
     Result,
@@ -156,49 +158,31 @@ class RecoveryPlan:
         streak, camera = shot.streak, shot.camera
         measurement = measure(streak.counts, streak.saturated, camera)
         noise = describe_noise(streak, measurement) if self.method.has_prior else None
-        solving = time.perf_counter()
-        segments = self.focus.plan_segments(camera, shot.times, measurement, progress)
-        dazzled = None if noise is None else find_dazzled(measurement, noise)
-        used = measurement.valid if dazzled is None else measurement.valid & ~dazzled
-        with self.device.activate():
-            on_device = Measurement(self.device.put(measurement.values), self.device.put(used))
-            clipping = find_clipping_level(streak.counts)
-            method = self.method.with_data_term(clip_from_below(streak, clipping))
-            result = recover_segments(method, camera, on_device, segments, progress)
-            values = to_numpy(result.frames)
-            if dazzled is not None and dazzled.any():
-                values = recover_glints(
-                    values, self.method, camera, measurement, segments, dazzled, self.device
-                )
-            solved = time.perf_counter()
-            # measured with the frames where they were recovered: nothing is fetched twice
-            residual = compute_segments_residual(camera, result.frames, on_device, segments)
-        figures: dict[str, Scalar] = {
+        clipping = find_clipping_level(streak.counts)
+        data_term = clip_from_below(streak, clipping)
+        found = recover_measurement(
+            self.method,
+            camera,
+            shot.times,
+            measurement,
+            noise,
+            self.focus,
+            self.device,
+            data_term,
+            progress,
+        )
+        of_shot = {
             "method": self.method.name,
             "focus": str(self.focus),
-            "iterations": result.iterations,
-            "stopped_because": result.stop_reason,
-            "relative_residual": residual,
             "seconds": time.perf_counter() - started,
-            "frames_per_second": result.frames.shape[0] / (solved - solving - result.setup_seconds),
-            "setup_seconds": result.setup_seconds,
             "device": str(self.device),
             **count_defects(streak, clipping),
-            **({} if noise is None else list_noise_figures(noise, measurement, used, residual)),
         }
-        if np.isfinite(result.duality_gap):
-            figures["duality_gap"] = result.duality_gap
-        return Frames(
-            values=values,
-            times=shot.times,
-            camera=camera,
-            shears=np.repeat(
-                [segment.shear for segment in segments], [segment.size for segment in segments]
-            ),
-            figures=figures,
+        return replace(
+            found,
+            figures={**found.figures, **of_shot},
             attachments=streak.attachments,
-            provenance={**streak.provenance, "objective": result.objective.tolist()},
-            measured=np.where(used, measurement.values, np.float32(np.nan)),
+            provenance={**streak.provenance, **found.provenance},
         )
 
     def _recover_surfaces(
@@ -336,6 +320,55 @@ def recover(
     require_type(streak, Streak, "recover takes a Streak, see tofclip.read_streak")
     shot = open_shot(streak, camera)
     return plan_recovery(shot, method, focus or DEFAULT_FOCUS, device).run(progress)
+
+
+def recover_measurement(
+    method: Method,
+    camera: Camera,
+    times: NDArray[np.float64],
+    measurement: Measurement,
+    noise: MeasurementNoise | None,
+    focus: Focus = DEFAULT_FOCUS,
+    device: ComputeDevice = CPU,
+    data_term: DataTermMaker = LeastSquares,
+    progress: Progress = ignore_progress,
+) -> Frames:
+    """Recover frames from rectified measurements (columns, frames) at `times`, s, with the figures by
+    which their returns are judged where the `noise` of the measurements is known.
+    """
+    solving = time.perf_counter()
+    segments = focus.plan_segments(camera, times, measurement, progress)
+    dazzled = None if noise is None else find_dazzled(measurement, noise)
+    used = measurement.valid if dazzled is None else measurement.valid & ~dazzled
+    with device.activate():
+        on_device = Measurement(device.put(measurement.values), device.put(used))
+        fitted = method.with_data_term(data_term)
+        result = recover_segments(fitted, camera, on_device, segments, progress)
+        values = to_numpy(result.frames)
+        if dazzled is not None and dazzled.any():
+            values = recover_glints(values, method, camera, measurement, segments, dazzled, device)
+        solved = time.perf_counter()
+        # measured with the frames where they were recovered: nothing is fetched twice
+        residual = compute_segments_residual(camera, result.frames, on_device, segments)
+    figures: dict[str, Scalar] = {
+        "iterations": result.iterations,
+        "stopped_because": result.stop_reason,
+        "relative_residual": residual,
+        "frames_per_second": times.size / (solved - solving - result.setup_seconds),
+        "setup_seconds": result.setup_seconds,
+        **({} if noise is None else list_noise_figures(noise, measurement, used, residual)),
+    }
+    if np.isfinite(result.duality_gap):
+        figures["duality_gap"] = result.duality_gap
+    return Frames(
+        values=values,
+        times=times,
+        camera=camera,
+        shears=np.repeat([one.shear for one in segments], [one.size for one in segments]),
+        figures=figures,
+        provenance={"objective": result.objective.tolist()},
+        measured=np.where(used, measurement.values, np.float32(np.nan)),
+    )
 
 
 def recover_segments(
