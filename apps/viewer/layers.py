@@ -106,11 +106,6 @@ def _fill(values: NDArray[Any] | None, shape: tuple[int, ...], by: Any) -> NDArr
 
 
 def _join_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
-    """Join clouds; columns that one of them lacks are left out."""
-    columns: dict[str, Any] = {}
-    for name, first in vars(clouds[0]).items():
-        if isinstance(first, np.ndarray):
-            parts = [getattr(cloud, name) for cloud in clouds]
-            complete = all(len(part) == len(own) for part, own in zip(parts, clouds, strict=True))
-            columns[name] = np.concatenate(parts) if complete else first[:0]
+    names = [name for name, column in vars(clouds[0]).items() if isinstance(column, np.ndarray)]
+    columns: Any = {name: np.concatenate([getattr(one, name) for one in clouds]) for name in names}
     return PointCloud(**columns)

@@ -156,7 +156,8 @@ class Controls:
         with self._gui.add_folder("colours"):
             self._add_colours(first, resize)
         with self._gui.add_folder("filters", expand_by_default=False):
-            self._add_filters(first, ClipBox(server.scene, self._take_clip_box))
+            clip = ClipBox(server.scene, lambda box: post(partial(self._take_clip_box, box)))
+            self._add_filters(first, clip)
         with self._gui.add_folder("section and plane", expand_by_default=False):
             self._add_section(SectionPlane(server.scene, lambda: post(self._take_section)))
 
@@ -175,10 +176,8 @@ class Controls:
         self._kept.show(values, limits, of_field, False)
         values = QUANTITIES[shown.scale.quantity][1](view)
         self._limits.show(values, shown.scale.limits, shown.scale, True)
-        for text, content in (
-            (self._status, status),
-            (self._scale, render_scale_html(shown.scale)),
-        ):
+        scale = render_scale_html(shown.scale)
+        for text, content in ((self._status, status), (self._scale, scale)):
             if text.content != content:
                 text.content = content
         if self._frame is not None:
@@ -238,10 +237,8 @@ class Controls:
             session.colouring = replace(session.colouring, **changes)
             automatic.value = session.colouring.limits is None
 
-        def add_checkbox(name: str, is_on: bool, hint: str, act: Callable[[bool], object]) -> Any:
-            box = gui.add_checkbox(name, is_on, hint=hint)
-            self._on(box, act)
-            return box
+        def set_automatic(is_on: bool) -> None:
+            look(limits=None if is_on or session.latest is None else session.latest.scale.limits)
 
         self._scale = gui.add_html(render_scale_html(first.scale))
         names = list_quantities(first.whole, session.source.quantity)
@@ -253,18 +250,14 @@ class Controls:
         self._limits = Handles(
             gui, ("limits", "from, to"), self._post, lambda limits: look(limits=limits)
         )
-        automatic = add_checkbox(
-            "automatic",
-            colouring.limits is None,
-            "limits that suit nearly all points",
-            lambda on: look(
-                limits=None if on or session.latest is None else session.latest.scale.limits
-            ),
-        )
+        hint, is_on = "limits that suit nearly all points", colouring.limits is None
+        automatic = gui.add_checkbox("automatic", is_on, hint=hint)
+        self._on(automatic, set_automatic)
         hint = "give every colour to equally many points"
-        add_checkbox("equalise", colouring.equalised, hint, lambda on: look(equalised=on))
-        hint = "draw dim points darker"
-        add_checkbox("shade", colouring.shaded, hint, lambda on: look(shaded=on))
+        equalise = gui.add_checkbox("equalise", colouring.equalised, hint=hint)
+        self._on(equalise, lambda on: look(equalised=on))
+        shade = gui.add_checkbox("shade", colouring.shaded, hint="draw dim points darker")
+        self._on(shade, lambda on: look(shaded=on))
         side_mm = 5.0 if session.point_size is None else 1e3 * session.point_size
         if session.point_size is None and len(first.cloud) > 1:  # neighbours about touch
             own = first.layers == first.layers[0] if first.layers.size else slice(None)
@@ -310,12 +303,8 @@ class Controls:
 
     def _take_clip_box(self, box: Box) -> None:
         """Filter by a box that was dragged."""
-
-        def take() -> None:
-            for axis, low, high in zip("xyz", box.low.tolist(), box.high.tolist(), strict=True):
-                self._session.filters = self._session.filters.limit(axis, (low, high))
-
-        self._post(take)
+        for axis, low, high in zip("xyz", box.low.tolist(), box.high.tolist(), strict=True):
+            self._session.filters = self._session.filters.limit(axis, (low, high))
 
     def _add_section(self, plane: SectionPlane) -> None:
         session, gui, self._plane = self._session, self._gui, plane
@@ -328,17 +317,13 @@ class Controls:
 
         def show_plane(is_shown: bool) -> None:
             cloud, section = find_cloud(), session.filters.section
+            plane.hide()
             if is_shown and len(cloud):
-                point, normal = (
-                    np.median(cloud.xyz, axis=0).astype(float),
-                    np.array((0.0, 0.0, 1.0)),
-                )
+                point, normal = np.median(cloud.xyz, axis=0).astype(float), np.eye(3)[2]
                 if section is not None:
                     normal = np.array(section.normal)
                     point += (section.offset - normal @ point) * normal
                 plane.show(point, normal, Box.around(cloud.xyz).reach / 2)
-            else:
-                plane.hide()
             self._take_section()
 
         def fit() -> None:

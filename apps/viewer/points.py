@@ -401,11 +401,10 @@ class SectionPlane:
         """Return the slab about the plane, m thick; None where it is hidden."""
         if self._handle is None:
             return None
-        w, x, y, z = np.asarray(self._handle.wxyz, float)
+        w, x, y, z = np.asarray(self._handle.wxyz, float).tolist()
         # where the turn takes the z axis
-        normal = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-        offset = float(normal @ np.asarray(self._handle.position, float))
-        return Section((float(normal[0]), float(normal[1]), float(normal[2])), offset, thickness)
+        normal = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+        return Section(normal, float(np.dot(normal, self._handle.position)), thickness)
 
 
 def turn_to(normal: NDArray[Any]) -> tuple[float, float, float, float]:

@@ -187,13 +187,11 @@ class Session:
         palette = "inferno" if source.quantity == "brightness" else Colouring.palette
         self.colouring = Colouring(source.quantity, palette)
         self.filters = Filters()
-        self.viewpoint: Viewpoint | None = (
-            None  # by default that from which the scene fills a window
-        )
+        # by default that from which the scene fills a window
+        self.viewpoint: Viewpoint | None = None
         self.point_size: float | None = None  # m; by default neighbours about touch
-        self.opened: dict[str, Any] = {
-            "sources": []
-        }  # names of the sources and how they are opened
+        # names of the sources and how they are opened
+        self.opened: dict[str, Any] = {"sources": []}
         self.picks: list[Pick] = []
         self.max_playing_points: int | None = None
         self.latest: DisplayedFrame | None = None  # what was drawn last

@@ -437,11 +437,24 @@ class TransientSource(RecoveredSource):
         return measurements
 
 
-class StreakSource(RecoveredSource):
-    """Streak images of one camera, wherever they come from; frame `n` is the cloud of shot `n`.
+class ShotSource(Source):
+    """Shots, from files or while they come in; frame `n` is the cloud of shot `n`."""
 
-    `row_times` (rows,): instant of each row, s.
-    """
+    _shots: Shots
+
+    def __len__(self) -> int:
+        return len(self._shots)
+
+    @property
+    def inflow(self) -> Inflow:
+        return self._shots.inflow
+
+    def close(self) -> None:
+        self._shots.close()
+
+
+class StreakSource(ShotSource, RecoveredSource):
+    """Streak images of one camera. `row_times` (rows,): instant of each row, s."""
 
     def __init__(
         self,
@@ -455,16 +468,6 @@ class StreakSource(RecoveredSource):
         self.frame_name = "shot"
         self._shots, self._rectifier = shots, Rectifier(camera, row_times.size)
         self._measure = functools.lru_cache(2)(self._measure_shot)
-
-    def __len__(self) -> int:
-        return len(self._shots)
-
-    @property
-    def inflow(self) -> Inflow:
-        return self._shots.inflow
-
-    def close(self) -> None:
-        self._shots.close()
 
     def view(self, number: int) -> View:
         made, name = self._shots.get(number).view, self.method_choice.value
@@ -493,23 +496,13 @@ class StreakSource(RecoveredSource):
         return {"streak": streak, "intensity": light, "depth": picture}
 
 
-class PhotonSource(Source):
-    """Histograms of a picture as they come; frame `n` is the cloud of shot `n`."""
+class PhotonSource(ShotSource):
+    """Histograms of a picture as they come."""
 
     def __init__(self, title: str, shots: LiveShots, camera: Camera) -> None:
         super().__init__(title, SHOT_RATE_HZ, frame_name="shot")
         self._shots, self.camera = shots, camera
         self.notes = (NO_TIME_ZERO_NOTE,) if camera.time_zero == 0 else ()
-
-    def __len__(self) -> int:
-        return len(self._shots)
-
-    @property
-    def inflow(self) -> Inflow:
-        return self._shots.inflow
-
-    def close(self) -> None:
-        self._shots.close()
 
     def view(self, number: int) -> View:
         made = self._shots.get(number).view
