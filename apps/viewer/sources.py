@@ -218,7 +218,7 @@ class Measured(NamedTuple):
 
 
 SHEAR_LIMITS = (-3.0, 3.0)  # pixels per view step between which a picture can be refocused
-SHEAR_HINT = "recovers the gate once more, at this shear in pixels per view step; 0: as it was"
+SHEAR_HINT = "recovers once more, at this shear in pixels per view step; 0: as it was"
 NEAR_FRAMES = 16  # on either side of a return, that its waveform shows: some pulses
 ALL_FRAMES = slice(None)
 
