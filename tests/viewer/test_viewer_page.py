@@ -212,10 +212,16 @@ class Seen:
         fills = max(np.ptp(row) / shape[0], np.ptp(column) / shape[1]) > 0.6
         return bool(same_view and inside and fills)
 
-    def open_filters(self) -> None:
-        """Unfold the filters, unless another test has done so."""
-        if not self.row("clip box").is_visible():
-            self.tab.get_by_text("filters", exact=True).click()
+    def unfold(self, folder: str, label: str) -> None:
+        """Unfold a folder until a control in it is seen: a click on what moves is lost."""
+
+        def click() -> bool:
+            if not self.row(label).is_visible():
+                self.tab.get_by_text(folder, exact=True).click()
+                self.tab.wait_for_timeout(1000)
+            return bool(self.row(label).is_visible())
+
+        until(click, f"'{folder}' is unfolded")
 
     def reset_filters(self) -> bool:
         """Whether all points are shown after the button. A browser reports a drag in pieces, of
@@ -307,7 +313,7 @@ def test_recolour(seen: Seen) -> None:
 
 
 def test_filter(seen: Seen) -> None:
-    seen.open_filters()
+    seen.unfold("filters", "clip box")
     seen.type("keep from, to", "1.6", field=1)  # the squares are at 1.59 m and 1.68 m
     seen.until_number("#points", 36)
     until(seen.reset_filters, "it is back")
@@ -315,7 +321,7 @@ def test_filter(seen: Seen) -> None:
 
 def test_a_plane_is_fitted_and_a_section_lies_in_it(seen: Seen) -> None:
     """The farther square, of 49 points, is a plane but for the noise of its ranges."""
-    seen.tab.get_by_text("section and plane", exact=True).click()
+    seen.unfold("section and plane", "section")
     seen.tick("section")
     seen.type("thickness", "10")
     seen.press("fit plane")
@@ -327,7 +333,7 @@ def test_a_plane_is_fitted_and_a_section_lies_in_it(seen: Seen) -> None:
 
 def test_the_clip_box_is_dragged_by_its_corners(seen: Seen) -> None:
     seen.until_number("#points", 85)
-    seen.open_filters()
+    seen.unfold("filters", "clip box")
     before = seen.picture()
     seen.tick("clip box")
     scene = seen.page.server.scene
