@@ -94,6 +94,10 @@ CAMERA = opt("H5", "Made by calibrate.", shown="the one inside the shot")
 FOCUS = opt("SHEAR", "depth-locked or fixed:S.", "fixed:0")
 PICTURE_FORMATS = ".png, .pdf or .svg"
 PREVIEW = opt("PNG", f"Where the picture goes: {PICTURE_FORMATS}.", shown="beside --out, .png")
+TOPIC = opt(
+    "NAME", "Of the ROS 2 messages.", shown="/tofclip/points; of a bag that is read, its only one"
+)
+FRAME_ID = opt("NAME", "Frame of reference of the ROS 2 messages.", "tofclip_optical")
 SUFFIX = opt(".EXT", "Format of the clouds.", ".ply")
 PORT = opt("N", "Of the page.", shown="a free one", min=1, max=65535)
 NO_BROWSER = flag("--no-browser", "Print the page's address; open nothing.")

@@ -337,7 +337,7 @@ def _read_scans(
                 if done % gathering.pictures == 0:
                     yield (
                         begun // steps // gathering.pictures - 1,
-                        PhotonCube(total, times, pulse=pulse),
+                        PhotonCube(total, times, pulse=pulse, sampled=True),
                     )
                     total = None
     if done < gathering.pictures:

@@ -12,7 +12,19 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from apps.jobs import EXIT_SOME_FAILED
-from apps.options import BIN_WIDTH, CAMERA, FOCUS, JSON, SUFFIX, TIME_ZERO, arg, flag, opt
+from apps.options import (
+    BIN_WIDTH,
+    CAMERA,
+    FOCUS,
+    FRAME_ID,
+    JSON,
+    SUFFIX,
+    TIME_ZERO,
+    TOPIC,
+    arg,
+    flag,
+    opt,
+)
 from apps.report import make_folder, report, require_new, require_writable
 from apps.verbs.recover import require_format
 from tofclip.errors import InputError, TofclipError
@@ -42,12 +54,12 @@ def stream(
     bin_width: float | None = BIN_WIDTH,
     time_zero: float | None = TIME_ZERO,
     focus: str = FOCUS,
-    method: str = opt(
+    method: str | None = opt(
         "NAME",
-        "l1 or tv: twelve iterations that begin at the last shot's pictures; linear, the fastest "
-        "on small pictures, which draws rays around bright objects; or surfaces, the truest and "
+        "Of streak images. l1 or tv: twelve iterations that begin at the last shot's pictures; linear, the "
+        "fastest on small pictures, which draws rays around bright objects; or surfaces, the truest and "
         "slowest, which follow those of the last shot.",
-        "l1",
+        shown="l1",
     ),
     shots: int | None = opt("N", "Stop after this number of clouds.", shown="at the source's end"),
     held: int = opt("N", "Shots that may wait for their turn.", 1),
@@ -56,6 +68,8 @@ def stream(
         "Drop the oldest waiting shot where they come too fast, as always for an instrument.",
     ),
     suffix: str = SUFFIX,
+    topic: str | None = TOPIC,
+    frame_id: str = FRAME_ID,
     as_json: bool = JSON,
 ) -> None:
     """Make a cloud of each shot while the next ones come; report method, rate and latencies.
@@ -119,7 +133,7 @@ def stream(
         if out is None:
             deque(taken, maxlen=0)
         else:
-            _save_clouds(taken, out, suffix)
+            _save_clouds(taken, out, suffix, topic, frame_id)
     # Counted last: only when the instrument has been stopped are its accounts final.
     accounts = coming.count_shots(tally.clouds, failed)
     figures = tally.list_figures() | {
@@ -201,13 +215,20 @@ class _Tally:
         }
 
 
-def _save_clouds(taken: Iterable[tuple[PointCloud, ShotStamp]], out: Path, suffix: str) -> None:
+def _save_clouds(
+    taken: Iterable[tuple[PointCloud, ShotStamp]],
+    out: Path,
+    suffix: str,
+    topic: str | None,
+    frame_id: str,
+) -> None:
     """Write clouds as they come: files of a folder, or messages of an MCAP file."""
-    from tofclip.lidar.ros import MCAP_SUFFIX, StampedCloud, write_bag
+    from tofclip.lidar.ros import MCAP_SUFFIX, TOPIC, StampedCloud, write_bag
     from tofclip.sequences.ranger import build_cloud_path
 
     if out.suffix.lower() == MCAP_SUFFIX:
-        write_bag((StampedCloud(cloud, stamp.epoch_ns) for cloud, stamp in taken), out)
+        clouds = (StampedCloud(cloud, stamp.epoch_ns) for cloud, stamp in taken)
+        write_bag(clouds, out, topic or TOPIC, frame_id)
         return
     for cloud, stamp in taken:
         cloud.save(build_cloud_path(out, stamp.number, suffix))

@@ -174,7 +174,7 @@ def _open_instrument(address: str, options: ShotOptions, announce: Announce) -> 
         raise InputError(f"{address}: the source ended before it gave anything")
     if isinstance(first, PhotonCube):
         announce(f"finding the ranges of {address}")
-        pipeline = make_pipeline(first, options.camera, options.time_zero)
+        pipeline = make_pipeline(first, options.camera, options.time_zero, method=options.method)
         return PhotonSource(address, LiveShots(address, shots, pipeline), pipeline.camera)
     if not shots.is_live:
         shots.close()

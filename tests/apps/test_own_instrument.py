@@ -106,8 +106,10 @@ def test_one_file_and_every_verb(shell: Any, address: str) -> None:
     assert shell.figures("info range.npz")["kind"] == "range image"
     assert shell.figures("view range.npz --png range.png")["points"] > 0.95 * SIDE**2
     before = time.time_ns()
-    shell.figures(f"stream {address} --shots 3 --out live.mcap")
+    shell.figures(f"stream {address} --shots 3 --out live.mcap --topic /kit/points --frame-id kit")
     stamps = [one.stamp_ns for one in read_bag("live.mcap")]
     assert before < stamps[0] < stamps[1] < stamps[2] < time.time_ns()
-    assert shell.figures("lidar bag live.mcap --out back")["clouds"] == 3
+    assert shell.figures("lidar bag live.mcap --out back --topic /kit/points")["clouds"] == 3
+    for verb in ("stream run.h5", "view run.h5 --png tv.png"):
+        assert "leave out the method" in shell(f"{verb} --method tv").stderr
     assert len(PointCloud.load("back/cloud_000002.ply")) > 0.95 * SIDE**2

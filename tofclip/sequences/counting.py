@@ -1,9 +1,11 @@
 """Histograms of a picture to clouds while they come: photons of a pixel are summed over the shots in
-which nothing moves there, and its returns found by these photons alone.
+which nothing jumps there, its return is found by these photons alone, and moved to where it is by now:
+how fast a surface moves its newer photons and its older ones say, with those of pixels around it.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,19 +17,28 @@ from tofclip.lidar.photons import PhotonCube, PhotonDetector, SurfaceImage
 from tofclip.lidar.photons.scene import prepare_photons
 from tofclip.lidar.pulse import Pulse
 from tofclip.shots import Returns
+from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
 
 BLOCK_SHOTS = 8  # a pixel is summed over this block of shots and the block before
 # Standard deviations by which a window of a pixel's light has to differ, in a shot from all before it
-# and in a block from the block before. Chance drops 4 pixels of 10 000 in a shot of 64 windows, and the
-# older half of every sixth pixel in a block: what drifts is noticed before it is late by its deviation.
+# and in a block from the block before. Chance drops 4 pixels of 10 000 in a shot of 64 windows, and
+# leaves out the older half of every sixth pixel.
 SHOT_SIGMAS, BLOCK_SIGMAS = 4.5, 3.0
+POOL_PX = 5  # along the square in which pixels of one surface move alike
+MIN_BACKGROUND_PHOTONS = 0.1  # of a shot in all bins of a pixel
+TINY = 1e-12  # in the place of nothing that is known
+# Returns between two steps of a gate of which the error is found: photons of a picture in which a
+# return is seen, background as a share of them, and how well noise lets their place in a step be known
+STEP_PHASES, STEP_PHOTONS, STEP_BACKGROUND, STEP_BLUR = 64, 200.0, 0.02, 0.05
+DRIFT_ROUNDS = 2  # a shift that is as far as the pulse is long is underestimated by the first one
 
 
 class StillSum:
-    """Sums the histograms of each pixel over up to two blocks of shots, and forgets what no longer
-    holds: all of it where a shot shows something else, the older block where the newer one does.
+    """Sums the histograms of each pixel over an older block of shots and a newer one, which follow each
+    other, and forgets both where a shot shows something else.
 
     Numbers are compared in windows as long as a pulse, by their square roots, whose deviation is a
     half at any mean. Memory: two cubes.
@@ -36,35 +47,30 @@ class StillSum:
     def __init__(self, pixels: int, bins: int, window: int) -> None:
         self._starts = np.arange(0, bins, min(max(window, 1), bins))
         # the older block and the newer one, with and without windows, and their shots
-        self._blocks = np.zeros((2, pixels, bins), np.float32)
+        self.blocks = np.zeros((2, pixels, bins), np.float32)
         self._windows = np.zeros((2, pixels, self._starts.size), np.float32)
         self.shots = np.zeros((2, pixels), np.int64)
 
-    def add(self, histograms: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
-        """Add a shot (pixels, bins); return the sums, and of how many shots they are."""
+    def add(self, histograms: FloatArray) -> NDArray[np.bool_]:
+        """Add a shot (pixels, bins); say of which pixels the older block shows what the newer does."""
         seen = np.add.reduceat(histograms, self._starts, axis=1)
-        known = self.shots.sum(axis=0)
-        moved = _differ(seen, 1, self._windows.sum(axis=0), known, SHOT_SIGMAS)
-        self._forget(slice(None), moved)
-        self._blocks[1] += histograms
+        moved = _differ(seen, 1, self._windows.sum(axis=0), self.shots.sum(axis=0), SHOT_SIGMAS)
+        full = self.shots[1] >= self.shots[0]
+        grown = full & (self.shots[0] < BLOCK_SHOTS)
+        for held in (self.blocks, self._windows, self.shots):
+            if moved.any():
+                held[:, moved] = 0
+            if grown.any():
+                held[0, grown] += held[1, grown]
+            if (replaced := full & ~grown).any():
+                held[0, replaced] = held[1, replaced]
+            if full.any():
+                held[1, full] = 0
+        self.blocks[1] += histograms
         self._windows[1] += seen
         self.shots[1] += 1
-        newer, older = self._windows[1], self._windows[0]
-        full = self.shots[1] == BLOCK_SHOTS
-        if full.any():
-            drifted = full & _differ(newer, self.shots[1], older, self.shots[0], BLOCK_SIGMAS)
-            self._forget(0, drifted)
-        total, shots = self._blocks.sum(axis=0), self.shots.sum(axis=0)
-        if full.any():
-            for held in (self._blocks, self._windows, self.shots):
-                held[0, full] = held[1, full]
-            self._forget(1, full)
-        return total, shots
-
-    def _forget(self, block: int | slice, pixels: NDArray[np.bool_]) -> None:
-        if pixels.any():
-            for held in (self._blocks, self._windows, self.shots):
-                held[block, pixels] = 0
+        older, newer = zip(self._windows, self.shots, strict=True)
+        return ~_differ(*newer, *older, BLOCK_SIGMAS)
 
 
 def _differ(
@@ -88,7 +94,8 @@ class PhotonPipeline:
 
     The pulse's width, the background's shape and hot pixels are learnt from the first shot that
     shows a pulse; where none does, the camera's pulse holds. Deviations are the Cramer-Rao bounds of
-    the photons that were summed. Shots are taken in order. Memory: `StillSum`, and a copy of a shot.
+    the photons that were summed, what is not known of a surface's speed, and, of a gate, where between
+    two of its steps an edge lies. Shots are taken in order. Memory: `StillSum`, and a copy of a shot.
     """
 
     in_order = True
@@ -100,8 +107,10 @@ class PhotonPipeline:
         times: NDArray[np.float64],
         detector: PhotonDetector,
         hot: NDArray[np.bool_],
+        step_errors: Float64Array | None = None,
     ) -> None:
         self.camera, self.times, self.detector, self.hot = camera, times, detector, hot
+        self.step_errors = np.zeros(1) if step_errors is None else step_errors
         window = round(detector.shape.fwhm / detector.bin_width)
         self._sum = StillSum(hot.size, times.size, window)
 
@@ -127,8 +136,12 @@ class PhotonPipeline:
             raise ShapeError("the camera's picture", shot.image_shape, seen_by.image_shape)
         if time_zero is not None:
             seen_by = seen_by.replace(time_zero=time_zero)
-        detector = PhotonDetector(pulse, photons.bin_width, photons.bins).learn(photons)
-        return cls(seen_by, shot.times, detector, hot)
+        detector = PhotonDetector(pulse, photons.bin_width, photons.bins)
+        if not shot.sampled:
+            return cls(seen_by, shot.times, detector.learn(photons), hot)
+        # A gate is open as long at every step: what looks uneven are returns, which last as long.
+        detector = replace(detector, background=np.ones(photons.bins))
+        return cls(seen_by, shot.times, detector, hot, list_step_errors(detector))
 
     def rectify(self, shot: PhotonCube) -> FloatArray:
         """Put the bins of a pixel side by side, (pixels, bins)."""
@@ -137,18 +150,83 @@ class PhotonPipeline:
             raise ShapeError("histograms", expected, shot.counts.shape)
         return shot.histograms
 
-    def recover_shot(
-        self, shot: PhotonCube, rectified: FloatArray
-    ) -> tuple[FloatArray, NDArray[np.int64]]:
-        """Add the shots before it, pixel by pixel, as far as nothing has moved."""
+    def recover_shot(self, shot: PhotonCube, rectified: FloatArray) -> NDArray[np.bool_]:
+        """Add the shots before it, pixel by pixel, as far as nothing has jumped."""
         return self._sum.add(rectified)
 
-    def search(self, found: tuple[FloatArray, NDArray[np.int64]]) -> Returns:
-        """Find the returns of the sums; their intensity is that of one shot."""
-        sums, shots = found
+    def search(self, still: NDArray[np.bool_]) -> Returns:
+        """Find the returns of the sums where they are now; their intensity is that of one shot."""
+        (older, newer), (before, shots) = self._sum.blocks, self._sum.shots
+        used = before * still
+        sums = newer + older * still[:, np.newaxis]
         layers = self.detector.locate_pixels(lambda piece: sums[piece], shots.size)
-        layers[..., 2] /= shots
+        layers[..., 2] /= used + shots
         layers[:, self.hot.ravel()] = np.nan
+        age = (used * (shots + (used - 1) / 2) + shots * (shots - 1) / 2) / (used + shots)
+        speed, speed_sigma = self._measure_speed(layers[0], sums.sum(axis=1) / (used + shots), age)
+        step = SPEED_OF_LIGHT / 2 * self.detector.bin_width
+        places = np.nan_to_num(layers[0, :, 0] / step % 1 * self.step_errors.size).astype(np.int64)
+        missing = np.hypot(speed_sigma * age, self.step_errors[places % self.step_errors.size])
+        layers[0, :, 0] += speed * age
+        layers[0, :, 1] = np.hypot(layers[0, :, 1], missing)
         picture = layers.reshape(-1, *self.camera.image_shape, 4)
         image = SurfaceImage.from_layers(picture, self.detector.shape, {}, self.hot)
         return image.calibrate(self.camera, float(self.times[0])).to_returns(self.camera)
+
+    def _measure_speed(
+        self, layer: Float64Array, photons: Float64Array, age: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
+        """How far the surface of each pixel moves in a shot, m, and the standard deviation, by newer and
+        older photons of the pixels around it that lie on the same surface. `photons`: of all bins in a
+        shot; `age`: of what gave the range, in shots.
+        """
+        from tofclip.lidar.photons.kernels import weigh_shifts
+
+        sums, metres, shape = self._sum, SPEED_OF_LIGHT / 2, self.detector.shape
+        before, shots = sums.shots
+        ages = np.stack([shots + (before - 1) / 2, (shots - 1) / 2])
+        gap = ages[0] - ages[1]
+        level = np.maximum(photons - layer[:, 2], MIN_BACKGROUND_PHOTONS) / self.times.size
+        curve = self.detector.relative_background, *shape.kernel_table(), self.detector.times
+        speed = sigma = np.zeros(shots.size)
+        for _ in range(DRIFT_ROUNDS):
+            found = np.zeros((2, shots.size, 2))
+            for block, number, old, own in zip(sums.blocks, sums.shots, ages, found, strict=True):
+                arrival = (layer[:, 0] + speed * (age - old)) / metres
+                weigh_shifts(block, arrival, layer[:, 2] * number, level * number, *curve, own)
+            slope, known = np.moveaxis(found, -1, 0)
+            # of the difference of both blocks' shifts; an empty block knows nothing
+            weight = known[0] * known[1] / np.maximum(known[0] + known[1], TINY) / metres**2
+            older, newer = metres * slope / np.maximum(known, TINY)
+            terms = np.stack([weight * gap * (newer - older + speed * gap), weight * gap**2])
+            pushed, held = self._pool(terms, layer[:, 0], shape.fwhm * metres / 2)
+            held = np.maximum(held, TINY)
+            speed, sigma = pushed / held, 1 / np.sqrt(held)
+        return speed, sigma
+
+    def _pool(self, terms: Float64Array, ranges: Float64Array, near: float) -> Float64Array:
+        """Add up what the pixels around each one say, (terms, pixels), that are as near as that, m."""
+        stack = np.concatenate([ranges[np.newaxis], terms]).reshape(-1, *self.camera.image_shape)
+        edge, square = POOL_PX // 2, (POOL_PX, POOL_PX)
+        padded = np.pad(stack, ((0, 0), (edge, edge), (edge, edge)), constant_values=np.nan)
+        around, *further = np.lib.stride_tricks.sliding_window_view(padded, square, (1, 2))
+        same = np.abs(around - stack[0][..., np.newaxis, np.newaxis]) < near
+        return np.stack([np.sum(one, axis=(2, 3), where=same).ravel() for one in further])
+
+
+def list_step_errors(detector: PhotonDetector) -> Float64Array:
+    """List by how far two thirds of the returns between two steps of a gate err, m, however many
+    photons there are, by where in the step they seem to be, (places,): a picture shows the gate at
+    one instant, not its mean over a step.
+    """
+    phase = (np.arange(STEP_PHASES) + 0.5) / STEP_PHASES
+    truth = (detector.bins // 2 + phase) * detector.bin_width
+    light = detector.pulse(detector.times - truth[:, np.newaxis])
+    seen = STEP_PHOTONS * (light + STEP_BACKGROUND * detector.relative_background)
+    found = detector.locate(seen).range[:, 0]
+    step = SPEED_OF_LIGHT / 2 * detector.bin_width
+    apart = (found / step - phase[:, np.newaxis] + 0.5) % 1 - 0.5
+    weight = np.exp(-((apart / STEP_BLUR) ** 2) / 2)
+    error = (found - SPEED_OF_LIGHT / 2 * truth) ** 2
+    # two thirds of what is spread evenly lie within 2 / sqrt(3) of its root mean square
+    return np.asarray(np.sqrt(4 / 3 * (weight @ error) / weight.sum(axis=1)))

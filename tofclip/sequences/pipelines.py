@@ -47,10 +47,9 @@ def make_pipeline(
     camera: Path | Camera | None = None,
     time_zero: float | None = None,
     focus: Focus = DEFAULT_FOCUS,
-    method: str | LinearInverse | ProximalMethod = "l1",
+    method: str | LinearInverse | ProximalMethod | None = None,
 ) -> CloudPipeline:
-    """Prepare for shots like this one: `PhotonPipeline` for histograms of a picture, which need neither
-    focus nor method; `SurfacePipeline` by method "surfaces"; else `RangingPipeline`.
+    """Prepare for shots like this one: `PhotonPipeline` for histograms of a picture; `SurfacePipeline` by method "surfaces"; else `RangingPipeline`.
 
     Parameters
     ----------
@@ -62,25 +61,30 @@ def make_pipeline(
         Reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
     focus : Focus
         One that needs no look at the shot: ``FixedFocus`` or ``DepthLockedFocus``.
-    method : str, LinearInverse or ProximalMethod
-        ``"l1"``, ``"tv"``, ``"linear"``, ``"surfaces"``, or another name of
+    method : str, LinearInverse or ProximalMethod, optional
+        Of streak images alone: ``"l1"``, the default, ``"tv"``, ``"linear"``, ``"surfaces"``, or another name of
         `tofclip.plugins.METHODS` that stands for one with a prior.
 
     Raises
     ------
     InputError
-        No such method or focus, or a streak image without a camera.
+        No such method or focus, a method for histograms, or a streak image without a camera.
     """
     if isinstance(focus, SharpestFocus):
         raise InputError("a stream has one focus for all shots: depth-locked or fixed:S")
-    chosen = METHODS.make(method, {}) if isinstance(method, str) else method
+    if isinstance(shot, PhotonCube):
+        if method is not None:
+            raise InputError(
+                "histograms of a picture are ranged by their photons alone: leave out the method"
+            )
+        return PhotonPipeline.for_shot(shot, camera, time_zero)
+    wanted = "l1" if method is None else method
+    chosen = METHODS.make(wanted, {}) if isinstance(wanted, str) else wanted
     if not isinstance(chosen, LinearInverse | ProximalMethod | SurfaceRecovery):
         raise InputError(
             "a stream's method is linear, surfaces or one with a prior such as l1 or tv, "
             f"not '{method}'"
         )
-    if isinstance(shot, PhotonCube):
-        return PhotonPipeline.for_shot(shot, camera, time_zero)
     if isinstance(chosen, SurfaceRecovery):  # each surface is recovered at the shear of its range
         return SurfacePipeline.for_shot(shot, camera, time_zero)
     return RangingPipeline.for_shot(shot, camera, focus, time_zero, chosen)

@@ -22,7 +22,7 @@ from typing import Any, Literal, NamedTuple
 from tofclip.errors import InputError, TofclipError
 from tofclip.lidar import PointCloud, point_cloud
 from tofclip.sequences.pipelines import CloudPipeline, LiveShot, make_pipeline
-from tofclip.shots import Returns
+from tofclip.shots import Returns, Streak
 from tofclip.threads import open_worker_pool, thread_count
 
 Policy = Literal["block", "drop_oldest"]
@@ -248,8 +248,9 @@ def stream_clouds(
             return
         if isinstance(first, TofclipError):
             raise first
-        # shots on workers of one's own cannot begin at the last one's pictures
-        pipeline = make_pipeline(first, method="l1" if executor is None else "linear")
+        # streak images on workers of one's own cannot begin at the last one's pictures
+        alone = executor is not None and isinstance(first, Streak)
+        pipeline = make_pipeline(first, method="linear" if alone else None)
         coming = _prepend_shot(first, coming)
     pool: AbstractContextManager[Executor]
     if executor is not None:

@@ -30,6 +30,8 @@ class PhotonCube:
         Where the pixels look; `Camera.pinhole` where only that is known.
     pulse : Pulse, optional
         How a return at one instant shows in successive bins, where the instrument knows.
+    sampled : bool
+        Whether a bin shows one instant, as a picture behind a gate does, not all up to the next bin.
     source : str
         Where it came from, for messages.
     provenance : mapping
@@ -45,6 +47,7 @@ class PhotonCube:
     times: NDArray[np.float64]
     camera: Camera | None = None
     pulse: Pulse | None = None
+    sampled: bool = False
     source: str = "histograms"
     provenance: Mapping[str, Any] = field(default_factory=dict)
 

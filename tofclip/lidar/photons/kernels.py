@@ -219,6 +219,27 @@ def summarise_return(around, estimate, k, variance, found):
         found[2] = np.sqrt(pp / determinant) / height
 
 
+@per_histogram
+def weigh_shifts(histograms, arrival, photons, level, relative, curve, scale, times, found):
+    """What each histogram, (n, bins), says about a shift of the return that is expected at `arrival`
+    (n,), NaN where there is none, with so many `photons` and the background's `level` (n,): slope of
+    the log-likelihood and its Fisher information, `found` (n, 2).
+    """
+    for row in range(histograms.shape[0]):
+        slope = information = area = 0.0
+        if arrival[row] == arrival[row]:
+            first, last = find_pulse_window(times, (0, 0), arrival[row], scale)
+            for i in range(first, last):
+                area += interpolate_pulse(times[i] - arrival[row], curve, scale)[0]
+            height = max(photons[row], MIN_PHOTONS) / max(area, 1e-3)
+            for i in range(first, last):
+                p, d = interpolate_pulse(times[i] - arrival[row], curve, scale)
+                expected = max(relative[i] * level[row] + height * p, 1e-9)
+                slope += (1 - histograms[row, i] / expected) * height * d
+                information += (height * d) ** 2 / expected
+        found[row, 0], found[row, 1] = slope, information
+
+
 @compiled
 def score_labels(offsets, coarse_bin, count, place, weights, first, score):
     """Log-likelihood ratio of a surface at each label against none, `score` (pixels, labels).
