@@ -49,7 +49,8 @@ def make_pipeline(
     focus: Focus = DEFAULT_FOCUS,
     method: str | LinearInverse | ProximalMethod | None = None,
 ) -> CloudPipeline:
-    """Prepare for shots like this one: `PhotonPipeline` for histograms of a picture; `SurfacePipeline` by method "surfaces"; else `RangingPipeline`.
+    """Prepare for shots like this one: `PhotonPipeline` for histograms of a picture; of streak images
+    `SurfacePipeline` by method "surfaces", else `RangingPipeline`.
 
     Parameters
     ----------
