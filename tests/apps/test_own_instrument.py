@@ -111,5 +111,5 @@ def test_one_file_and_every_verb(shell: Any, address: str) -> None:
     assert before < stamps[0] < stamps[1] < stamps[2] < time.time_ns()
     assert shell.figures("lidar bag live.mcap --out back --topic /kit/points")["clouds"] == 3
     for verb in ("stream run.h5", "view run.h5 --png tv.png"):
-        assert "leave out the method" in shell(f"{verb} --method tv").stderr
+        assert "leave out the method" in shell(f"{verb} --method tv").err
     assert len(PointCloud.load("back/cloud_000002.ply")) > 0.95 * SIDE**2
