@@ -212,10 +212,7 @@ class Band:
         real, bins = traces.dtype.type, traces.shape[1]
         # A library's own threads would go on waiting, busily, where ours want to work.
         with limit_blas_threads():
-            shapes, coefficients = (
-                part.astype(real)
-                for part in self._build_fourier_matrices(bins, 8 * float(np.finfo(real).eps))
-            )
+            shapes, coefficients = self._get_fourier_matrices(bins, real)
             parts = np.empty((len(traces), coefficients.shape[1]), real)
 
             def filter_block(some: slice) -> None:
@@ -235,25 +232,33 @@ class Band:
             run_blocks(filter_block, len(traces), POINTS_PER_BLOCK)
         return parts.view(np.result_type(real, np.complex64))
 
-    def _build_fourier_matrices(
-        self, bins: int, precision: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _get_fourier_matrices(
+        self, bins: int, real: type[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
         """Matrices of two steps of a Fourier transform at the band's frequencies.
 
         Within a block of bins a narrow band's waves are made up of few shapes (bins, n), whatever
         their phases; the second matrix (blocks * n, 2 * frequencies) has what `compute_phasors` are
         made of, real and imaginary parts interleaved.
         """
+        if (bins, real) in self._matrices:
+            return self._matrices[bins, real]
         phases = np.outer(self.axis.spacing * np.arange(BLOCK_BINS), self.wavenumbers)
         waves = np.exp(-1j * phases)
         shapes, strengths, _ = np.linalg.svd(
             np.concatenate([waves.real, waves.imag], axis=1), full_matrices=False
         )
-        shapes = shapes[:, strengths > precision * strengths[0]]
+        shapes = shapes[:, strengths > 8 * np.finfo(real).eps * strengths[0]]
         starts = self.axis.start + self.axis.spacing * np.arange(0, bins, BLOCK_BINS)
         carriers = self.weights * np.exp(-1j * np.outer(starts, self.wavenumbers))
         coefficients = carriers[:, np.newaxis] * (shapes.T @ waves)
-        return shapes, coefficients.reshape(-1, self.wavenumbers.size).view(np.float64)
+        parts = coefficients.reshape(-1, self.wavenumbers.size).view(np.float64)
+        self._matrices[bins, real] = shapes.astype(real), parts.astype(real)
+        return self._matrices[bins, real]
+
+    @cached_property
+    def _matrices(self) -> dict[tuple[int, type[Any]], tuple[NDArray[Any], NDArray[Any]]]:
+        return {}
 
     def waveforms(self, phasors: NDArray[Any]) -> Waveforms:
         """Return ``sum_k P_k * exp(1j * k * L)`` on an axis of path lengths L fine enough for

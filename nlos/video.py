@@ -39,18 +39,25 @@ from tofclip.storage import Field, Record
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
+# The share of a depth's voxels that change least tells the noise, as no moving thing fills the rest;
+# squares of noise are exponentially distributed, and this share of them is taken for changes.
+QUIET_SHARE, FALSE_CHANGES = 0.1, 0.004
+CHANGE_RATIO = float(np.log(FALSE_CHANGES) / np.log(1 - QUIET_SHARE))
+
 
 class DepthAverage:
-    """A running mean of fields, over a number of captures that grows with depth.
+    """A running mean of fields, over a number of captures that grows with depth, without those in
+    which a voxel was another one.
 
     Light of a hidden thing falls with the fourth power of its distance, so that what is far is
     noisy, and what is resolved grows with the distance, so that a moving thing stays as long within
     its own image: captures are averaged in proportion to the distance from the wall. Nam et al.,
     "Low-latency time-of-flight non-line-of-sight imaging at 5 frames per second", Nat. Commun. 12,
-    6526 (2021).
+    6526 (2021). What moves faster, or shifts its phase, would cancel: of the earlier captures every
+    voxel takes those that agree with the newest within their noise.
 
     `grid`: of the fields; `wall`: z from which depths count, m; `captures`: how many are averaged
-    at the last depth; nearer by at least the newest alone.
+    at most at the last depth; nearer by at least the newest alone.
     """
 
     def __init__(self, grid: Grid, wall: float, captures: int) -> None:
@@ -59,29 +66,29 @@ class DepthAverage:
         depth = np.maximum(grid.z - wall, 0)
         farthest = max(float(depth[-1]), np.finfo(float).tiny)
         self._windows = np.maximum(np.rint(captures * depth / farthest), 1).astype(int)
-        self._latest: deque[Array] = deque(maxlen=captures)
+        self._earlier: deque[Array] = deque(maxlen=captures - 1)  # the latest first
 
     @property
     def windows(self) -> NDArray[np.int_]:
-        """Captures that are averaged at every depth, (z,)."""
+        """Captures that are averaged at most at every depth, (z,)."""
         return self._windows
 
     def add(self, field: Volume) -> Volume:
         """Take the complex field of a new capture, and return the brightness, float32, of the
         average; of a stream's first captures it holds those that there are.
         """
-        self._latest.append(field.values)
-        newest_first = list(self._latest)[::-1]
-        brightness = np.empty(field.values.shape, np.float32)
-        # Windows grow with depth: each is a block of depths.
-        begins = np.flatnonzero(np.diff(self._windows, prepend=0))
-        for begin, end in zip(begins, [*begins[1:], len(self._windows)], strict=True):
-            some = newest_first[: self._windows[begin]]
-            total = some[0][begin:end]
-            for other in some[1:]:
-                total = total + other[begin:end]
-            brightness[begin:end] = np.abs(total) / len(some)
-        return Volume(brightness, field.grid, field.provenance)
+        newest = field.values
+        total, count = newest.copy(), np.ones(newest.shape, np.float32)
+        for number, earlier in enumerate(self._earlier, 1):
+            far = slice(int(np.searchsorted(self._windows, number, "right")), None)
+            changes = np.abs(newest[far] - earlier[far]) ** 2
+            # every other voxel is enough
+            quiet = np.quantile(changes[:, ::2, ::2], QUIET_SHARE, axis=(1, 2), keepdims=True)
+            is_same = changes <= CHANGE_RATIO * quiet
+            total[far] += earlier[far] * is_same
+            count[far] += is_same
+        self._earlier.appendleft(newest)
+        return Volume(np.abs(total) / count, field.grid, field.provenance)
 
 
 # Instants of one depth in memory at once.

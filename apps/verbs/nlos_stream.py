@@ -269,23 +269,25 @@ class VolumeStream:
         latencies: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
         started = time.perf_counter()
         try:
-            # One capture at a time on all cores: the next is read meanwhile.
+            # One capture at a time on all cores; meanwhile the next is read, and the last written.
             with (
                 ThreadPoolExecutor(1, "volumes") as worker,
                 closing(
                     run_in_order(
                         self._count(),
-                        self._work,
+                        self._image_named,
                         worker,
-                        at_once=1,
+                        at_once=1 if self._live else 2,
                         policy="drop_oldest" if self._live else "block",
                         on_failure=self._note_failure,
                     )
                 ) as made,
             ):
                 for item in made:
-                    self.latency = item.latency
-                    latencies.append(item.latency)
+                    began = time.perf_counter()
+                    if self._write(item.number, *item.value):
+                        self.latency = item.latency + time.perf_counter() - began
+                        latencies.append(self.latency)
                     if self.stopping.is_set():
                         break
         finally:
@@ -309,8 +311,7 @@ class VolumeStream:
             self._acquired += 1
             yield one
 
-    def _work(self, one: _NamedCapture) -> None:
-        """Image a capture and write its volume."""
+    def _image_named(self, one: _NamedCapture) -> tuple[str, Volume]:
         try:
             if one.capture is None:
                 raise InputError(one.problem)
@@ -318,11 +319,20 @@ class VolumeStream:
             started = time.perf_counter()
             volume = self._image(capture)
             self._imaging.append(time.perf_counter() - started)
-            volume.save(self._out / f"{one.name}.h5", compressed=False)
         except TofclipError as fault:
             raise InputError(f"{one.name}: {fault}") from fault
+        return one.name, volume
+
+    def _write(self, number: int, name: str, volume: Volume) -> bool:
+        """Write a volume and show it; a disk that is full fails it alone."""
+        try:
+            volume.save(self._out / f"{name}.h5", compressed=False)
+        except TofclipError as fault:
+            self._note_failure(number, fault)
+            return False
         self.latest.append(volume)
         self.delivered += 1
+        return True
 
     def _note_failure(self, _: int, fault: TofclipError) -> None:
         self.failed += 1

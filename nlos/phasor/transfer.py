@@ -20,9 +20,9 @@ Sides = tuple[float, float]
 
 # Where the window begins to fall at least, relative to the largest distance of a source and a
 # target, and how much farther out for each digit of the tolerance. Between two squares few pairs
-# are so far apart: independent signals (noise) miss 0.1 % of their amplitude beyond 0.88, and 0.01
-# % beyond 0.94.
-INNER_RADIUS_FRACTION, INNER_RADIUS_FRACTION_PER_DIGIT = 0.76, 0.06
+# are so far apart: independent signals (noise) miss some 0.1 % of their amplitude beyond 0.87, 0.01
+# % beyond 0.93.
+INNER_RADIUS_FRACTION, INNER_RADIUS_FRACTION_PER_DIGIT = 0.75, 0.06
 # Width of the window's edge, relative to the largest distance along one axis.
 MIN_EDGE_FRACTION, MAX_EDGE_FRACTION = 0.25, 0.5
 # Lengths of single-precision Fourier transforms, among the multiples of 16, that take no longer
