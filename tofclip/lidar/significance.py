@@ -313,6 +313,7 @@ def weigh_candidates(
     order = np.argsort(time)
     at, first, last = time[order], *pulse.support
     information, missing, light, total = np.zeros((4, time.size))
+    alive = np.isfinite(measured).any(axis=1, keepdims=True)
     # blocks of one shear
     number = frames.times.size
     changes = np.flatnonzero(np.diff(frames.shears)) + 1
@@ -322,9 +323,11 @@ def weigh_candidates(
         pictures = values[start:stop].reshape(stop - start, -1).T.astype(np.float32)
         explained = operator @ pictures
         variance = noise.compute_variance(np.maximum(explained, 0))
-        used = np.isfinite(measured[:, start:stop])
-        precision = used / np.maximum(variance, np.finfo(np.float32).tiny)
-        rest = np.where(used, measured[:, start:stop] - explained, 0)
+        # Readings that are left out where the column measures otherwise are too bright, and speak for
+        # what is bright there; whether it was spread they cannot tell.
+        precision = alive / np.maximum(variance, np.finfo(np.float32).tiny)
+        rest = measured[:, start:stop] - explained
+        rest[~np.isfinite(rest)] = 0
         squares = operator.copy()
         squares.data = squares.data**2
         known = squares.T @ precision
