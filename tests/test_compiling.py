@@ -90,6 +90,7 @@ sys.exit(main([*words.split(), "--out", sys.argv[1]]))
         return the lines that it says.
         """
         made = home.parent / "made.h5"
+        made.unlink(missing_ok=True)
         code = "import sys; " + "; ".join(first) + self.CALL_A_VERB
         places = {"HOME": str(home), "XDG_CACHE_HOME": str(home), "NUMBA_CACHE_DIR": str(cache)}
         done = subprocess.run(

@@ -152,9 +152,9 @@ class TestConvertAndNlos:
         assert found["attachments"] == ["relay_wall"]
         assert shell("recover wall.h5 --out frames.h5 --method linear").status == 0
         words = "--out volume.h5 --png mip.png --voxel-mm 40 --far-m 0.4"
-        # Nothing is hidden there: the brightest voxel is the wall's own light, which is said.
-        found = shell.figures(f"nlos reconstruct frames.h5 {words}", said="lies on the wall")
-        assert found["brightest_on_wall"]
+        # Nothing is hidden there, which is said.
+        found = shell.figures(f"nlos reconstruct frames.h5 {words}", said="noise or a glow")
+        assert found["evidence"] < 2
         stored = Volume.load("volume.h5")
         assert list(stored.values.shape) == found["voxels"]
         assert found["wall_points"] == 144

@@ -208,8 +208,8 @@ def test_ranges_are_true_and_fitting_the_camera_costs_no_accuracy(shot, frames):
     figures = score_returns(depth(frames), shot.truth)
     assert figures["median_depth_error_m"] < figures["bin_m"] / 2
     assert figures["share_within_one_bin"] > 0.95
-    # Robust errors are what each return says of its own: 1.0 over seeds.
-    assert 0.8 < figures["range_z"] < 1.5
+    # Errors are what each return says of its own, on its surface: 0.6 to 1.6 is what is promised.
+    assert 0.6 < figures["range_z"] < 1.6
     # The fitted camera explains the measurements as well as the true one, to within photon noise.
     with_truth = recover(shot.streak, shot.camera)
     assert frames.figures["relative_residual"] < 1.05 * with_truth.figures["relative_residual"]
