@@ -126,6 +126,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   convert           any readable streak image to this program's own HDF5
   warm-up           compile everything now, so that no later run waits for it
   plugins           methods, denoisers, readers, instruments, and whose they are
+  doctor            what this installation has: packages, GPU, USB, graphics, cache
   info              what a file holds
 
   tofclip VERB --help explains a verb. Exit status: 0 done, 1 some failed,
@@ -151,6 +152,7 @@ VERBS = {
     "convert": "Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall inside.",
     "warm-up": "Run everything that is compiled on first use once, on small data.",
     "plugins": "List methods, denoisers, readers and instruments, by whom they are, and what does not load.",
+    "doctor": "Say what this installation has: packages, GPU, USB, compiled loops, graphics, disk and memory.",
     "info": "Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.",
 }
 """The verbs, and groups of them, with their lines in the list of commands."""

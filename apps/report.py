@@ -126,16 +126,22 @@ def describe_ranges(frames: Frames) -> str:
 
 
 def report(
-    figures: Mapping[str, Any], as_json: bool, written: Sequence[Path] = (), note: str = ""
+    figures: Mapping[str, Any],
+    as_json: bool,
+    written: Sequence[Path] = (),
+    note: str = "",
+    json_only: Sequence[str] = (),
 ) -> None:
     """Print the figures of a run: numbers, strings, and lists or mappings of these by name.
     `as_json`: one object on one line (NaN becomes null) instead of a table; `written`: files to
-    name in the table; `note`: what has to be known about its figures.
+    name in the table; `note`: what has to be known about its figures; `json_only`: figures that are
+    for programs.
     """
     plain = to_json_value(figures)
     if as_json:
         print(json.dumps(plain, allow_nan=False))
         return
+    plain = {name: value for name, value in plain.items() if name not in json_only}
     width = max(map(len, plain), default=0)
     compared = _find_compared(plain)
     for name, value in plain.items():

@@ -23,7 +23,7 @@ author = "The ToF-CLIP developers"
 copyright = author  # noqa: A001 - Sphinx wants this name
 version = release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 exclude_patterns = [
     "_build",
     "notebooks/*.ipynb",
@@ -38,6 +38,7 @@ autodoc_default_options = {"members": True}
 autodoc_typehints = "signature"  # the docstrings add shapes and units
 # NumPy's own unions fill five lines of a signature
 autodoc_type_aliases = {"DTypeLike": "DTypeLike", "ArrayLike": "ArrayLike"}
+autosummary_generate = False  # the tables of what is called first; every name has its place already
 napoleon_google_docstring = False
 napoleon_use_param = False
 napoleon_use_rtype = False
@@ -45,6 +46,7 @@ napoleon_use_rtype = False
 html_theme = "furo"
 html_static_path = ["static"]
 html_js_files, html_css_files = ["copy.js"], ["copy.css"]
+html_search_scorer = "static/scorer.js"
 html_title = f"ToF-CLIP {release}"
 html_show_sphinx = False
 
@@ -57,6 +59,7 @@ def write_verb_pages(app: Sphinx) -> None:
 NUMPY_ARRAY = re.compile(
     r"~?numpy\.ndarray\[tuple\[~?typing\.Any, \.\.\.\], ~?numpy\.dtype\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\]"
 )
+CLASS = re.compile(r"<class '(?:builtins\.)?([\w.]+)'>")  # a default, as Python shows it
 
 
 def shorten_signature(
@@ -74,6 +77,7 @@ def shorten_signature(
     """
 
     def shorten(text: str | None) -> str | None:
+        text = text and CLASS.sub(r"\1", text)
         return text and NUMPY_ARRAY.sub(r"~numpy.typing.NDArray[\1]", text)
 
     return shorten(signature and signature.replace("<factory>", "...")), shorten(returned)

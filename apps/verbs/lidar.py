@@ -25,7 +25,7 @@ from apps.options import (
     flag,
     opt,
 )
-from apps.progress import show_progress
+from apps.progress import show_activity, show_progress
 from apps.report import (
     RECORD_SUFFIXES,
     describe_ranges,
@@ -177,7 +177,8 @@ def parallax(
     from tofclip.recovery import count_parallax_work, fit_parallax_to_shot, open_shot
 
     require_writable(out, *RECORD_SUFFIXES, inputs=(streak, camera))
-    shot = open_shot(streak, camera, time_zero)
+    with show_activity(f"reading {streak}"):
+        shot = open_shot(streak, camera, time_zero)
     with show_progress("focusing", count_parallax_work(shot, shears)) as advance:
         found = fit_parallax_to_shot(shot, gates, shears, advance)
     found.camera.save(out)
@@ -218,18 +219,20 @@ def scene(
     from tofclip.shots import Frames
 
     require_writable(out, *PICTURE_SUFFIXES, inputs=(frames,))
-    recovered = Frames.load(frames)
-    cloud = point_cloud(depth(recovered))
-    if len(cloud):
-        brightest = np.quantile(cloud.intensity, SCENE_BRIGHTNESS_QUANTILE)
-        cloud = cloud[cloud.intensity >= Detection().min_scene_fraction * brightest]
-    objects = find_objects(cloud, reach, fewest_points)
+    with show_activity("finding objects"):
+        recovered = Frames.load(frames)
+        cloud = point_cloud(depth(recovered))
+        if len(cloud):
+            brightest = np.quantile(cloud.intensity, SCENE_BRIGHTNESS_QUANTILE)
+            cloud = cloud[cloud.intensity >= Detection().min_scene_fraction * brightest]
+        objects = find_objects(cloud, reach, fewest_points)
     # Before the picture, which would show an empty scene.
     if not objects:
         raise InputError(
             f"{frames}: no {fewest_points} points lie together within {1000 * reach:g} mm"
         )
-    save_figure(make_scene_figure(recovered, cloud, objects), out)
+    with show_activity("drawing"):
+        save_figure(make_scene_figure(recovered, cloud, objects), out)
     named = ("range", "width", "height", "range_sigma", "scatter")
     rows = [
         {f"{name}_m": getattr(one, name) for name in named} | {"points": one.points.size}

@@ -21,7 +21,7 @@ from apps.options import (
     flag,
     opt,
 )
-from apps.progress import show_progress
+from apps.progress import show_activity, show_progress
 from apps.report import (
     build_provenance,
     choose_preview,
@@ -101,11 +101,8 @@ def recover(
     """Recover every transient frame of a raw streak image, or of each one of a sequence.
 
     Where the camera's sweep is not known, skew, gains and centres are found from the shot itself.
-    frames_per_second is the pace of the iterations alone, frames_per_second_overall that of the
-    whole run, from reading the shot to writing the frames. duality_gap (of l1): the objective is
-    above the least one by at most this fraction of it. defective_readings are hot, dead or struck
-    by a particle and left out; clipped_readings are cut off at the sensor's limit and may be
-    brighter.
+    Readings of the sensor that are hot, dead or struck by a particle are left out, and those cut
+    off at its limit may be brighter in the frames; both are counted.
 
     Of a sequence, what is in the folder already is kept: started again, a run goes on where it
     stopped. Shots that cannot be recovered are listed at the end, and the exit status is 1.
@@ -162,32 +159,34 @@ def recover(
     solver = make_method(method, **{"iterations": iterations, "weight": weight, **own})
     chosen_focus = parse_focus(focus)
     started = time.perf_counter()
-    # Outputs and settings have been checked by now: an instrument is not started for nothing.
-    if "://" in streak:
-        from devices.transients import read_transient
-        from tofclip.shots import Streak
+    with show_activity(f"reading {streak}"):
+        # Outputs and settings have been checked by now: an instrument is not started for nothing.
+        if "://" in streak:
+            from devices.transients import read_transient
+            from tofclip.shots import Streak
 
-        taken = read_transient(streak, bin_width)
-        if not isinstance(taken, Streak):
-            raise InputError(
-                f"{streak}: its pixels look at the scene themselves, so that nothing is to be recovered; "
-                "tofclip stream and tofclip lidar photons make clouds"
-            )
-        shot = open_shot(taken, camera, time_zero)
-    else:
-        shot = open_shot(streak, camera, time_zero, bin_width)
-    plan = plan_recovery(shot, solver, chosen_focus, device)
+            taken = read_transient(streak, bin_width)
+            if not isinstance(taken, Streak):
+                raise InputError(
+                    f"{streak}: its pixels look at the scene themselves, so that nothing is to be recovered; "
+                    "tofclip stream and tofclip lidar photons make clouds"
+                )
+            shot = open_shot(taken, camera, time_zero)
+        else:
+            shot = open_shot(streak, camera, time_zero, bin_width)
+        plan = plan_recovery(shot, solver, chosen_focus, device)
     # An instrument's address is no file with a checksum.
     inputs = [Path(one) for one in (streak, camera) if one is not None and "://" not in str(one)]
     with show_progress("recovering", plan.work) as advance:
         frames = plan.add_provenance(plan.run(advance), *inputs)
-    frames.save(out)
-    seconds = time.perf_counter() - started
-    save_figure(make_preview_figure(shot.streak, frames), preview)
-    if cloud is not None:
-        clouds = CloudSettings(device=device, false_alarm=1.0 if all_points else None)
-        points, _ = clouds.make_cloud(frames, "the recovered frames")
-        points.save(cloud)
+    with show_activity("writing"):
+        frames.save(out)
+        seconds = time.perf_counter() - started
+        save_figure(make_preview_figure(shot.streak, frames), preview)
+        if cloud is not None:
+            clouds = CloudSettings(device=device, false_alarm=1.0 if all_points else None)
+            points, _ = clouds.make_cloud(frames, "the recovered frames")
+            points.save(cloud)
     known = frames.figures
     names = ("method", "iterations", "relative_residual", "seconds", "frames_per_second")
     # methods that know how far they are from the best there is say so, and shots that are not clean
@@ -203,7 +202,8 @@ def recover(
         "device": known["device"],
         **{name: known[name] for name in further if name in known},
     }
-    report(figures, as_json, [out, preview, *([cloud] if cloud else [])])
+    written = [out, preview, *([cloud] if cloud else [])]
+    report(figures, as_json, written, json_only=("seconds", "frames_per_second"))
 
 
 def cloud(
@@ -281,11 +281,12 @@ def cloud(
         )
     suffixes = ORGANISED_SUFFIXES if organised else (*CLOUD_SUFFIXES, DEPTH_SUFFIX)
     require_writable(out, *suffixes, inputs=(frames,))
-    recovered = Frames.load(frames)
-    # The cloud carries the history of its frames, and so that of the shot.
-    past = build_provenance({"verb": "cloud"}, frames, earlier=recovered.provenance)
-    points, kept = settings.make_cloud(replace(recovered, provenance=past), str(frames))
-    save_cloud(points, kept, out, organised)
+    with show_activity("finding returns"):
+        recovered = Frames.load(frames)
+        # The cloud carries the history of its frames, and so that of the shot.
+        past = build_provenance({"verb": "cloud"}, frames, earlier=recovered.provenance)
+        points, kept = settings.make_cloud(replace(recovered, provenance=past), str(frames))
+        save_cloud(points, kept, out, organised)
     rows, columns = kept.camera.image_shape
     figures = {
         "points": len(points),

@@ -141,7 +141,7 @@ def stream(
         "dropped": accounts.dropped,
         **asdict(accounts),
     }
-    report(figures, as_json, [] if out is None else [out])
+    report(figures, as_json, [] if out is None else [out], json_only=["latency_s"])
     if failed:
         raise typer.Exit(EXIT_SOME_FAILED)
 

@@ -133,6 +133,7 @@ info cube.npy
 lidar accuracy --trials 10
 devices list
 plugins
+doctor
 devices info '{TAGGER}'
 devices test '{TAGGER}' --seconds 0.1
 record '{TAGGER}' --out run.h5 --seconds 0.1

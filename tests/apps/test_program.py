@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -294,6 +295,22 @@ sys.meta_path.insert(0, Absent())
             assert done.stderr.startswith("tofclip: error: ")
             assert f"install {distribution}" in done.stderr
             assert "unforeseen" not in done.stderr
+
+    def test_the_small_installation_leaves_out_open3d_and_pyvista_only(self):
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        small = (ROOT / "requirements-core.txt").read_text().splitlines()[1:]
+        left_out = {*project["dependencies"]} - {*small}
+        assert {*small} <= {*project["dependencies"]}
+        assert all(one.startswith(("open3d", "pyvista")) for one in left_out)
+
+    def test_doctor_names_what_is_missing(self, hook):
+        done = start([*PROGRAM, "doctor", "--json"], path=hook, ABSENT="h5py usb")
+        found = json.loads(done.stdout)
+        assert (done.returncode, found["faults"]) == (
+            1,
+            ["the package 'h5py' is missing: pip install h5py"],
+        )
+        assert "pyusb" in found["usb"]
 
     def test_help_needs_none_of_them(self, hook):
         hidden = " ".join(set(NEEDED) - {"typer"})
