@@ -46,7 +46,7 @@ napoleon_use_rtype = False
 html_theme = "furo"
 html_static_path = ["static"]
 html_js_files, html_css_files = ["copy.js"], ["copy.css"]
-html_search_scorer = "static/scorer.js"
+html_search_scorer = str(HERE / "static" / "scorer.js")
 html_title = f"ToF-CLIP {release}"
 html_show_sphinx = False
 
