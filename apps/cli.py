@@ -126,7 +126,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   convert           any readable streak image to this program's own HDF5
   warm-up           compile everything now, so that no later run waits for it
   plugins           methods, denoisers, readers, instruments, and whose they are
-  doctor            what this installation has: packages, GPU, USB, graphics, cache
+  doctor            what this installation has, and what installs the rest
   info              what a file holds
 
   tofclip VERB --help explains a verb. Exit status: 0 done, 1 some failed,
