@@ -27,7 +27,7 @@ from nlos.analysis import (
     round_wavelength_up,
 )
 from nlos.capture import Capture
-from nlos.evidence import measure_evidence
+from nlos.evidence import measure_brightness
 from nlos.illumination import AliasingWarning, choose_roles
 from nlos.preparation import fade_record_end, join_near_lasers
 from nlos.settings import Limits, Settings, Wanted
@@ -214,11 +214,15 @@ def _choose_by_pictures(gated: Capture, settings: Settings) -> tuple[float, str]
     capture = _thin_out(gated)
     shortest = find_finest_wavelength(capture, settings.cycles)
     longest = max(shortest, find_longest_wavelength(gated) / 2)
-    waves, evidences, least = [], [0.0], 0.0
+    waves, brightest, decoys = [], [0.0], []
     for step in range(math.ceil(math.log(longest / shortest, WAVELENGTH_RATIO)) + 1):
         waves.append(max(longest / WAVELENGTH_RATIO**step, shortest))
-        evidences.append(_judge_wavelength(capture, settings, waves[-1]))
-        least = min(CLEAR_EVIDENCE, CLEAR_FRACTION * max(evidences))
+        own, shuffled = _judge_wavelength(capture, settings, waves[-1])
+        brightest.append(own)
+        # Decoys of all waves are about as bright: together they tell how bright.
+        decoys.append(float(np.mean(shuffled)))
+        evidences = np.array(brightest) / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
+        least = min(CLEAR_EVIDENCE, CLEAR_FRACTION * float(evidences.max()))
         if evidences[-1] < least:
             chosen = np.interp(np.log(least), np.log(evidences[:-3:-1]), np.log(waves[:-3:-1]))
             waves.append(float(np.exp(chosen)))
@@ -226,15 +230,17 @@ def _choose_by_pictures(gated: Capture, settings: Settings) -> tuple[float, str]
     return round_wavelength_up(waves[-1]), "the shortest whose coarse picture is clear"
 
 
-def _judge_wavelength(capture: Capture, settings: Settings, wavelength: float) -> float:
-    """Evidence of a capture's coarse picture by one wavelength, m."""
+def _judge_wavelength(
+    capture: Capture, settings: Settings, wavelength: float
+) -> tuple[float, list[float]]:
+    """Brightness of a capture's coarse picture by one wavelength, m, and of its decoys."""
     found = _complete_voxels(capture, replace(settings, wavelength=wavelength))
     prepared = replace(found, gate=None, fade=None, flip=None).prepare(capture)
     plan = found.plan_quickest(prepared, found.grid(wavelength / 2))[1]
     with warnings.catch_warnings():
         # Of a wave that is only tried.
         warnings.simplefilter("ignore", AliasingWarning)
-        return measure_evidence(prepared, plan, plan.image(prepared))
+        return measure_brightness(prepared, plan, plan.image(prepared))
 
 
 def _thin_out(capture: Capture) -> Capture:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,12 @@ from nlos import (
     Hybrid,
     LightCone,
     PlanarRSD,
+    Settings,
     Volume,
     settings_for,
 )
 from nlos.capture import unwarp_signal
+from nlos.completion import complete_settings
 from nlos.io import read_capture
 from nlos.preparation import rebin_capture, remove_first_bounce
 from tofclip.units import SPEED_OF_LIGHT
@@ -126,6 +129,41 @@ def test_settings_of_recorded_captures(
     assert shortest <= (settings.wavelength or 0) <= longest
     if gated:
         assert settings.gate == pytest.approx(0.72, abs=0.1)
+
+
+def perturb(capture: Capture, tmp_path: Path) -> dict[str, Capture]:
+    """The same capture as others would hand it over: a scan of a lattice (t, y, x), confocal."""
+    counts, wall, laser = capture.signal, capture.wall, capture.laser
+    order, bins = np.random.default_rng(0).permutation(wall[..., 0].size), capture.axis.bins
+
+    def pick(places: np.ndarray[Any, Any]) -> Capture:
+        signal, spots = counts.reshape(bins, -1)[:, places], wall.reshape(-1, 3)[places]
+        return replace(capture, signal=signal, wall=spots, laser=laser.reshape(-1, 3)[places])
+
+    capture.save(tmp_path / "capture.h5")
+    return {
+        "order": pick(order),
+        "missing": pick(np.sort(order[order.size // 100 :])),
+        "row": replace(capture, signal=counts[:, 1:], wall=wall[1:], laser=laser[1:]),
+        "saved": Capture.load(tmp_path / "capture.h5"),
+    }
+
+
+@pytest.mark.parametrize("name", [OUTDOOR, "nlos/otoole2018_diffuse_s.npz"])
+def test_settings_do_not_hang_on_the_order_or_number_of_wall_points(
+    name: str, shared_data: Path, tmp_path: Path
+) -> None:
+    recorded = read_capture(shared_data / name)
+    wall, laser = (spots[:32, :32] for spots in (recorded.wall, recorded.laser))
+    signal = np.ascontiguousarray(recorded.signal[:, :32, :32])
+    capture = replace(recorded, signal=signal, wall=wall, laser=laser)
+    expected = complete_settings(capture, Settings())
+    for change, same in perturb(capture, tmp_path).items():
+        found = complete_settings(same, Settings())
+        for setting in ("wavelength", "gate", "voxel"):
+            value = getattr(expected, setting)
+            close = None if value is None else pytest.approx(value, rel=0.1)
+            assert getattr(found, setting) == close, (change, setting)
 
 
 def test_the_outdoor_letter_reads_as_an_s(shared_data: Path) -> None:
