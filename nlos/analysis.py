@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from nlos.band import VirtualPulse
 from nlos.capture import Capture
 from nlos.illumination import is_confocal
-from tofclip.arrays import to_numpy
+from tofclip.arrays import FloatArray, to_numpy
 from tofclip.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 # Steps of the mean signal's profile per width of the wall.
 PROFILE_STEPS_PER_WALL = 50

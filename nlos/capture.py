@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.kernels import shift_signals
-from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, require_numpy, to_numpy
+from tofclip.arrays import (
+    Array,
+    ComputeDevice,
+    FloatArray,
+    is_numpy,
+    namespace,
+    require_numpy,
+    to_numpy,
+)
 from tofclip.errors import InputError, ShapeError, require_type
 from tofclip.notebook import render_html
 from tofclip.shots import Frames
@@ -71,8 +79,6 @@ class TimeAxis:
         """Path length of every bin, m, shape (bins,)."""
         return self.start + self.spacing * np.arange(self.bins, dtype=np.float64)
 
-
-FloatArray = NDArray[np.float64]
 
 # m; a wider one was not measured in metres.
 MAX_WALL_EXTENT_M = 1e3

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.method import Method, Plan
-from nlos.volume import FloatArray, Grid, Volume
-from tofclip.arrays import require_numpy
+from nlos.volume import Grid, Volume
+from tofclip.arrays import FloatArray, require_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
 from tofclip.solvers import Backprojection

@@ -16,7 +16,8 @@ from nlos.capture import Capture
 from nlos.kernels import migrate_row, shift_signals
 from nlos.method import VOXEL_BYTES, Method, Plan, Progress, require_imageable, require_numpy_signal
 from nlos.plane import PlanarWall, Plane, axis_step
-from nlos.volume import FloatArray, Grid, Volume
+from nlos.volume import Grid, Volume
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, thread_count
 

@@ -17,9 +17,8 @@ from nlos.capture import Capture, TimeAxis
 from nlos.phasor.to_depths_compiled import LaserSource
 from nlos.phasor.transfer import SphericalWaves
 from nlos.volume import Grid
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 # Of the wall's width: nearer to each other, a laser spot and a wall point are one.
 SAME_SPOT_FRACTION = 1e-6

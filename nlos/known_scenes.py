@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     from nlos.capture import Capture, TimeAxis
     from nlos.simulate import HiddenScene, PointScene
-    from nlos.volume import FloatArray, Grid, Volume
+    from nlos.volume import Grid, Volume
+    from tofclip.arrays import FloatArray
     from tofclip.storage import Record
 
 SCANS = ("single", "confocal")

@@ -21,8 +21,8 @@ from nlos.confocal import (
 )
 from nlos.export import write_ply
 from nlos.plane import axis_step
-from nlos.volume import FloatArray, Grid, Volume
-from tofclip.arrays import ComputeDevice
+from nlos.volume import Grid, Volume
+from tofclip.arrays import ComputeDevice, FloatArray
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, thread_count
 

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 
 if TYPE_CHECKING:
     from nlos.phasor.transfer import SphericalWaves
     from nlos.volume import Grid
 
-FloatArray = NDArray[np.float64]
 
 # Points may be off an even spacing by this fraction of it; at half a wavelength that is a phase of
 # 3 mrad.

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from nlos.capture import Capture
 from nlos.illumination import is_confocal
 from nlos.method import PhasorMethod, PhasorPlan, PlannedGeometry, Progress
-from nlos.volume import FloatArray, Grid, Volume
-from tofclip.arrays import is_numpy, namespace
+from nlos.volume import Grid, Volume
+from tofclip.arrays import FloatArray, is_numpy, namespace
 from tofclip.errors import InputError
 from tofclip.threads import split_blocks
 

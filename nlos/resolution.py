@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from nlos.band import VirtualPulse
 from nlos.capture import Capture
-from nlos.volume import FloatArray, Volume
+from nlos.volume import Volume
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 
 # Places along each axis at which the ideal image is computed.

@@ -32,8 +32,8 @@ from nlos.phasor.arrays import ArrayLibrary
 from nlos.phasor.plan import GroupPlan, Hybrid, PlanarRSD, plan_groups, require_even_grid
 from nlos.phasor.propagate import choose_backend
 from nlos.phasor.to_depths import DepthPropagator
-from nlos.volume import FloatArray, Grid, Volume
-from tofclip.arrays import Array
+from nlos.volume import Grid, Volume
+from tofclip.arrays import Array, FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks

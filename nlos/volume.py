@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, to_numpy
+from tofclip.arrays import Array, ComputeDevice, FloatArray, is_numpy, namespace, to_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
 from tofclip.storage import Field, Record
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from nlos.capture import Capture
     from nlos.export import Mesh
 
-
-FloatArray = NDArray[np.float64]
 
 # Deeper than this a wall is too narrow an aperture to resolve much.
 MAX_DEPTH_WALL_WIDTHS = 2.0

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.source import OFF_ON, Choice, FloatArray, Inflow, Picture, Setting, Source, View
+from apps.viewer.source import OFF_ON, Choice, Inflow, Picture, Setting, Source, View
+from tofclip.arrays import FloatArray
 from tofclip.lidar import PointCloud
 
 BESIDE_HINT = "moved to the right by this many widths of the first layer"

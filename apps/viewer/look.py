@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apps.viewer.source import FloatArray, Limits, Picture, View
+from apps.viewer.source import Limits, Picture, View
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 from tofclip.units import NANOSECOND

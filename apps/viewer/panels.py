@@ -34,7 +34,7 @@ from apps.viewer.look import (
 )
 from apps.viewer.points import NO_SHADOWS, ClipBox, Post, SectionPlane, add_lines
 from apps.viewer.session import DisplayedFrame, Session
-from apps.viewer.source import NO_LIMITS, OFF_ON, Choice, FloatArray, Limits, Setting
+from apps.viewer.source import NO_LIMITS, OFF_ON, Choice, Limits, Setting
 from apps.viewer.state import write_state
 from apps.viewer.still import BACKGROUND, draw_colour_bar
 from apps.viewer.texts import render_histogram_html, render_scale_html, render_text_html
@@ -45,6 +45,7 @@ from apps.viewer.viewpoint import (
     move_camera,
     read_viewpoint,
 )
+from tofclip.arrays import FloatArray
 from tofclip.lidar import PointCloud
 from tofclip.lidar.processing import fit_plane
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT

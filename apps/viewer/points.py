@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from apps.viewer.look import format_length
 from apps.viewer.session import DisplayedFrame, Section
-from apps.viewer.source import FloatArray
 from apps.viewer.viewpoint import Box
+from tofclip.arrays import FloatArray
 
 if TYPE_CHECKING:
     import viser

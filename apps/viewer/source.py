@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.lidar import PointCloud
 from tofclip.lidar.cloud import OPTIONAL_COLUMNS
 from tofclip.units import SPEED_OF_LIGHT
@@ -19,7 +20,6 @@ from tofclip.units import SPEED_OF_LIGHT
 if TYPE_CHECKING:
     from nlos.export import Mesh
 
-FloatArray = NDArray[np.float64]
 Picture = NDArray[np.float32]  # (rows, columns)
 Limits = tuple[float, float]  # both inclusive
 NO_LIMITS: Limits = (-np.inf, np.inf)

@@ -18,16 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.viewer.shots import LiveShots, Shots, make_view
-from apps.viewer.source import (
-    Choice,
-    FloatArray,
-    Inflow,
-    Picture,
-    Setting,
-    Source,
-    View,
-    make_cloud,
-)
+from apps.viewer.source import Choice, Inflow, Picture, Setting, Source, View, make_cloud
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.camera.noise import MeasurementNoise, find_dazzled
 from tofclip.errors import FileFormatError

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.source import FloatArray
+from tofclip.arrays import FloatArray
 
 FIELD_OF_VIEW_RAD = math.radians(35.0)
 # A cloud that fills more than this is looked at from further back than from where it was taken

@@ -26,10 +26,9 @@ from nlos.phasor.transfer import (
 )
 from nlos.plane import Plane, StraightPaths, axis_step
 from nlos.volume import Grid
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.threads import split_blocks
-
-FloatArray = NDArray[np.float64]
 
 # Chebyshev nodes over the distances on a plane; enough for a band that turns by 25 periods across
 # them.

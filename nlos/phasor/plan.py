@@ -55,8 +55,8 @@ from nlos.plane import (
     choose_virtual_plane,
     is_evenly_spaced,
 )
-from nlos.volume import FloatArray, Grid, Volume
-from tofclip.arrays import Array
+from nlos.volume import Grid, Volume
+from tofclip.arrays import Array, FloatArray
 from tofclip.errors import InputError
 
 # Per voxel: a complex64 sum, and its float32 magnitude.

@@ -27,8 +27,8 @@ from nlos.phasor.wall_to_plane import WallBeforePlane
 from nlos.phasor.wall_to_plane_arrays import PortablePropagation
 from nlos.phasor.wall_to_plane_compiled import CompiledPropagation
 from nlos.plane import Plane, PlaneField, WallLattice
-from nlos.volume import FloatArray, Grid
-from tofclip.arrays import Array, is_numpy
+from nlos.volume import Grid
+from tofclip.arrays import Array, FloatArray, is_numpy
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks
 

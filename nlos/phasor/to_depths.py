@@ -20,10 +20,8 @@ from nlos.phasor.arrays import ArrayLibrary, remove_whole_cycles
 from nlos.phasor.depth_steps import DepthInterpolation, DiffractionPlan, Illumination
 from nlos.phasor.to_depths_compiled import LaserSource
 from nlos.phasor.to_depths_kernels import TAPS
-from tofclip.arrays import Array
+from tofclip.arrays import Array, FloatArray
 from tofclip.threads import run_blocks, split_blocks, thread_count
-
-FloatArray = NDArray[np.float64]
 
 # Transfer functions and illuminations of all depths are kept for the next field if they take no
 # more.

@@ -41,9 +41,9 @@ from nlos.phasor.to_depths_kernels import (
 )
 from nlos.phasor.transfer import VECTOR_LENGTH, TransferFunction
 from nlos.plane import Plane
+from tofclip.arrays import FloatArray
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 FREQUENCIES_PER_BLOCK = 4

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from nlos.phasor.to_depths_kernels import TAPS, find_interpolation_weights, sample_waves
 from nlos.plane import Plane, axis_step
+from tofclip.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 Sides = tuple[float, float]
 
 # Where the window begins to fall at least, relative to the largest distance of a source and a

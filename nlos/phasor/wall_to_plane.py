@@ -28,13 +28,13 @@ from nlos.phasor.transfer import (
 )
 from nlos.phasor.wall_kernels import VECTOR_FLOATS
 from nlos.plane import Plane, StraightPaths, WallLattice, axis_step
+from tofclip.arrays import FloatArray
 from tofclip.threads import run_blocks, split_blocks
 
 if TYPE_CHECKING:
     import finufft
 
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex64]
 

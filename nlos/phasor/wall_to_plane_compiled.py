@@ -22,9 +22,9 @@ from nlos.phasor.wall_kernels import (
 )
 from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, has_finufft, plan_transforms
 from nlos.plane import Plane
+from tofclip.arrays import FloatArray
 from tofclip.threads import limit_blas_threads, run_blocks
 
-FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex64]
 
 # Enough wall points to tell the strength of a frequency from.

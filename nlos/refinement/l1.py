@@ -23,6 +23,7 @@ from nlos.phasor.to_depths import PortableDiffraction
 from nlos.phasor.wall_to_plane_compiled import sum_spherical_waves
 from nlos.plane import axis_step
 from nlos.volume import Grid, Volume
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.operators import Diagonal, LinearOperator, Stack
 from tofclip.solvers import Method as Prior
@@ -31,7 +32,6 @@ from tofclip.solvers.fista import LightFieldVariation
 from tofclip.threads import limit_blas_threads, split_blocks
 
 Array = NDArray[Any]
-FloatArray = NDArray[np.float64]
 
 # Distances held at a time in double precision: 16 MB of waves.
 PAIRS_PER_BLOCK = 1 << 20

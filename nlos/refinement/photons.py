@@ -24,7 +24,8 @@ from nlos.method import (
 )
 from nlos.preparation import remove_first_bounce
 from nlos.refinement.time_of_flight import TimeOfFlight
-from nlos.volume import FloatArray, Grid, Volume
+from nlos.volume import Grid, Volume
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 
 Array = NDArray[Any]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.refinement.kernels import VOXELS_PER_RUN, add_backprojected_light, add_expected_light
-from nlos.volume import FloatArray, Grid
+from nlos.volume import Grid
+from tofclip.arrays import FloatArray
 from tofclip.threads import run_blocks, thread_count
 
 Array = NDArray[Any]

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.capture import Capture, TimeAxis
-from tofclip.arrays import require_numpy
+from tofclip.arrays import FloatArray, require_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -58,9 +57,6 @@ def add_poisson_noise(
     signal = np.random.default_rng(seed).poisson(expected).astype(np.float32)
     noise = {"peak_counts": peak_counts, "background": background, "seed": seed}
     return replace(capture, signal=signal, provenance={**capture.provenance, "noise": noise})
-
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

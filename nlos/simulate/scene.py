@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.capture import Capture, TimeAxis
 from nlos.simulate.kernels import add_facet_light
 from nlos.simulate.walls import compute_wall_normals
+from tofclip.arrays import FloatArray
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.files import format_error_line, translate_read_errors
 from tofclip.threads import run_blocks
@@ -77,8 +77,6 @@ class Retroreflector(Material):
     def __init__(self, albedo: float = 1.0, spread: float = 0.1) -> None:
         super().__init__(0.0, albedo, spread)
 
-
-FloatArray = NDArray[np.float64]
 
 TOWARDS_WALL = (0.0, 0.0, -1.0)
 # A surface is refused rather than cut into more.

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 
-FloatArray = NDArray[np.float64]
 DepthFunction = Callable[[FloatArray, FloatArray, float], FloatArray]
 """Depth z of the wall, m, at x and y in half wall widths, from -1 to 1; the third argument is that
 half width, m.

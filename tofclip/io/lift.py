@@ -20,16 +20,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, PolynomialSweep, ProjectiveSweep, SkewSweep, Sweep
 from tofclip.errors import CalibrationError, FileFormatError, InputError
 from tofclip.io.archive import Archive
 from tofclip.io.hamamatsu import StreakFile
 from tofclip.shots import Streak, outline_streak
 from tofclip.storage import Field, Record
-
-FloatArray = NDArray[np.float64]
 
 # Flags of the archive and the only value whose meaning is known.
 EXPECTED_FLAGS = {"resample_flag": 1, "image_inverted_flag": 0}

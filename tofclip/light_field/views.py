@@ -14,6 +14,7 @@ import scipy.ndimage
 import scipy.sparse
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearShear
 from tofclip.operators.shear import View
@@ -80,7 +81,6 @@ class LightField(Storable):
 
 
 Labels = NDArray[np.int64]
-FloatArray = NDArray[np.float64]
 
 SAME_SURFACE_PX = 1.0  # by which neighbours drift apart in the outermost view at most
 SEEN_FRACTION = 0.5  # of a pixel, from which on a surface covers it

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, Measurement, measure
 from tofclip.camera.parallax import (
     GATE_METHOD,
@@ -24,8 +24,6 @@ from tofclip.errors import CalibrationError, InputError
 from tofclip.recovery.shot import Shot
 from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
-
-FloatArray = NDArray[np.float64]
 
 MIN_GATES = 3
 MIN_RANGE_M = 0.2  # in front of it the shear would change from bin to bin; such light is stray

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.errors import ShapeError
 from tofclip.lidar import Detection, PointCloud, point_cloud
@@ -23,8 +24,6 @@ from tofclip.sequences.following import WarmStartedRecovery
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse, ProximalMethod
 from tofclip.solvers.direct import InverseTraces, order_by_patch
-
-FloatArray = NDArray[np.float64]
 
 
 class SummedShot(NamedTuple):

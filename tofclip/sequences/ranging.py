@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.files import compute_sha256, require_apart
@@ -23,8 +24,6 @@ from tofclip.sequences.jobs import Job, lock_output_folder
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.shots import Streak
 from tofclip.storage import Storable, stored_array, stored_child, stored_value
-
-FloatArray = NDArray[np.float64]
 
 PLAN_NAME = "plan.h5"
 MAX_JITTER_BINS = 32

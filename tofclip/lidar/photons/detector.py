@@ -11,8 +11,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
-from tofclip.lidar.photons.image import FloatArray, PhotonImage, SurfaceImage
+from tofclip.lidar.photons.image import PhotonImage, SurfaceImage
 from tofclip.lidar.photons.scene import learn_background, prepare_photons
 from tofclip.lidar.pulse import Pulse, Table
 from tofclip.threads import run_blocks, split_blocks

@@ -11,8 +11,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
-from tofclip.lidar.photons.image import FloatArray, PhotonImage
+from tofclip.lidar.photons.image import PhotonImage
 from tofclip.lidar.photons.matching import PLANE_ROUNDS, TRIAL_ROUNDS, fit_surface
 from tofclip.lidar.photons.scene import LEARNT_SLOPE_FLOOR, BinnedResponse, Scene, learn_response
 

@@ -15,14 +15,13 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.errors import CalibrationError, InputError, ShapeError
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.range_calibration import correct_ranges
 from tofclip.shots import Returns
 from tofclip.units import SPEED_OF_LIGHT, require_credible_bin_width
-
-FloatArray = NDArray[np.float64]
 
 # Of the cycles that no photon has ended yet: what fewer show is not worth its noise, and of more
 # photons their number is not known.

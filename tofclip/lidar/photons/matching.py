@@ -16,7 +16,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tofclip.lidar.photons.image import FloatArray, PhotonImage
+from tofclip.arrays import FloatArray
+from tofclip.lidar.photons.image import PhotonImage
 from tofclip.lidar.photons.scene import MIN_SIGNAL_PHOTONS, Scene
 from tofclip.threads import run_blocks
 

@@ -28,13 +28,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
-from tofclip.lidar.photons.image import (
-    FloatArray,
-    PhotonImage,
-    find_hot_pixels,
-    leave_out_pixels,
-)
+from tofclip.lidar.photons.image import PhotonImage, find_hot_pixels, leave_out_pixels
 from tofclip.lidar.pulse import Pulse
 from tofclip.units import PICOSECOND
 

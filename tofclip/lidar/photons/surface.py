@@ -19,6 +19,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.photons.detector import Arrivals, PhotonDetector
 from tofclip.lidar.photons.held_out import (
@@ -27,7 +28,7 @@ from tofclip.lidar.photons.held_out import (
     learn_scene,
     weigh_evidence,
 )
-from tofclip.lidar.photons.image import FloatArray, PhotonImage, SurfaceImage, find_dim_pixels
+from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, find_dim_pixels
 from tofclip.lidar.photons.matching import (
     LabelAxis,
     choose_label_axis,

@@ -6,8 +6,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.model import SurfaceModel
-from tofclip.recovery.surfaces.patches import FloatArray
 from tofclip.recovery.surfaces.pulse import Image
 from tofclip.solvers import Progress
 from tofclip.threads import run_blocks

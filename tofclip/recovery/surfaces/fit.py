@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, measure
 from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
@@ -30,7 +31,6 @@ from tofclip.recovery.surfaces.model import (
 from tofclip.recovery.surfaces.patches import (
     COEFFICIENTS,
     MARGIN_PX,
-    FloatArray,
     Patch,
     Pixels,
     find_dimmer_patches,

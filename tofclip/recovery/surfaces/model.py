@@ -25,14 +25,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, estimate_dark_level
 from tofclip.lidar import compute_ray_directions
-from tofclip.recovery.surfaces.patches import (
-    MIN_BEHIND_FRACTION,
-    FloatArray,
-    KnownBasis,
-    SmoothBasis,
-)
+from tofclip.recovery.surfaces.patches import MIN_BEHIND_FRACTION, KnownBasis, SmoothBasis
 from tofclip.recovery.surfaces.pulse import (
     EXTENT_SIGMAS,
     FWHM_PER_SIGMA,

@@ -16,9 +16,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.shots import Returns
 
-FloatArray = NDArray[np.float64]
 Pixels = NDArray[np.intp]
 
 COEFFICIENTS = 6  # of a quadratic

@@ -13,11 +13,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.lidar.pulse import Pulse
 from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
-FloatArray = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))

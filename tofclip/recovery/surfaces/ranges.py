@@ -17,9 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.amplitudes import TINY, explain_by_amplitude, scale_amplitude
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, Window
-from tofclip.recovery.surfaces.patches import COEFFICIENTS, FloatArray
+from tofclip.recovery.surfaces.patches import COEFFICIENTS
 from tofclip.recovery.surfaces.pulse import Image, differentiate_pulse
 from tofclip.threads import map_parallel
 from tofclip.units import SPEED_OF_LIGHT
