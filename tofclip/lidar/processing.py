@@ -192,6 +192,9 @@ def find_objects(cloud: PointCloud, reach: float, min_points: int = 40) -> list[
     if len(cloud) == 0:
         return []
     pairs = scipy.spatial.cKDTree(cloud.xyz).query_pairs(reach, output_type="ndarray")
+    # a point whose range is not known to half of that may lie on either of two objects
+    known = ~(cloud.range_sigma > reach / 2)
+    pairs = pairs[known[pairs].all(axis=1)]
     links = scipy.sparse.coo_array((np.ones(len(pairs)), tuple(pairs.T)), (len(cloud), len(cloud)))
     groups, label = scipy.sparse.csgraph.connected_components(links, directed=False)
     objects = []
