@@ -323,15 +323,20 @@ def weigh_candidates(
         pictures = values[start:stop].reshape(stop - start, -1).T.astype(np.float32)
         explained = operator @ pictures
         variance = noise.compute_variance(np.maximum(explained, 0))
-        # Readings that are left out where the column measures otherwise are too bright, and speak for
-        # what is bright there; whether it was spread they cannot tell.
+        # Readings that are left out where the column measures otherwise are too bright: they speak for
+        # what is bright there, and cannot tell whether it was spread. By what the others tell, an
+        # excess counts as the root of their share of the light.
         precision = alive / np.maximum(variance, np.finfo(np.float32).tiny)
         rest = measured[:, start:stop] - explained
-        rest[~np.isfinite(rest)] = 0
+        told = np.isfinite(rest)
+        rest[~told] = 0
         squares = operator.copy()
         squares.data = squares.data**2
         known = squares.T @ precision
-        exceeds, explains = (operator.T @ (part * precision) for part in (rest, explained))
+        exceeds, explains, seen_light = (
+            operator.T @ (part * precision) for part in (rest, explained, told * explained)
+        )
+        explains = np.sqrt(np.maximum(explains, 0) * np.maximum(seen_light, 0))
         for place in range(start, stop):
             instant = frames.times[place]
             # candidates whose pulse reaches this frame
