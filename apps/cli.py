@@ -73,7 +73,7 @@ QUANTITIES = {
 }
 """Units that a value may carry, such as 20ps, and that options' names end in: kind, and in SI units."""
 QUANTITY = re.compile(
-    rf"(?P<number>[-+]?[\d.]+(e[-+]?\d+)?) ?(?P<unit>{'|'.join(QUANTITIES)})", re.I
+    rf"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?) ?(?P<unit>{'|'.join(QUANTITIES)})"
 )
 
 COMPILING = "tofclip.compiling"  # its logger; the module itself would import the compiler

@@ -24,9 +24,8 @@ MAX_TABLE_WIDTH = 100  # columns of a terminal for several things side by side
 UNITS = {"m", "mm", "s", "ns", "ps", "px"}
 
 
-_replaces = ContextVar(
-    "replaces", default=True
-)  # from Python as any library; see `replace_results`
+# From Python results are replaced, as any library does; see `replace_results`.
+_replaces = ContextVar("replaces", default=True)
 
 
 @contextlib.contextmanager

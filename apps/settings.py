@@ -8,10 +8,8 @@ unit that it is written with is the key in the file and, with dashes, the flag: 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import inspect
 import math
-import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
@@ -22,8 +20,8 @@ import tomli_w
 import typer
 
 from apps.options import UNITS, make_completer
-from tofclip.errors import FileFormatError, InputError
-from tofclip.files import atomic_path, translate_read_errors
+from tofclip.errors import InputError
+from tofclip.files import atomic_path, read_toml, suggest_name
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -163,16 +161,10 @@ def save_settings(settings: DataclassInstance, path: Path, heading: str) -> None
 
 
 def _read_file(kind: type[DataclassInstance], file: Path) -> dict[str, Any]:
-    with translate_read_errors(file), open(file, "rb") as opened:
-        try:
-            found = tomllib.load(opened)
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
-            raise FileFormatError(file, f"is not a TOML file of settings ({fault})") from fault
-    known = _list_settings(kind)
+    found, known = read_toml(file, "settings"), _list_settings(kind)
     for key in found:
         if key not in known:
-            like = difflib.get_close_matches(key, known, 1)
-            hint = f"did you mean '{like[0]}'?" if like else f"known are {', '.join(known)}"
+            hint = suggest_name(key, known)
             raise InputError(f"{file}: no setting is called '{key}'; {hint}")
     return {
         key: _convert_value(value, known[key].hint, f"{file}: {key}")

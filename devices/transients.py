@@ -247,7 +247,7 @@ def _sum_frames(
     """Add up a camera's frames; a pixel that reached its limit in one of them is not to be trusted."""
     if gathering.line and "bin_times" not in known.fields:
         raise InputError(
-            "it counts no photons in time for each pixel; a SPAD array does with mode=gated"
+            "this instrument counts no photons in time for each pixel; a SPAD array does with mode=gated"
         )
     kind = first.records.dtype["counts"].base
     limit = np.iinfo(kind).max if kind.kind in "ui" else np.inf

@@ -11,9 +11,7 @@ draws shots with the ray caster, which shares no code with the operator, and rec
 
 from __future__ import annotations
 
-import difflib
 import time
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
@@ -27,8 +25,8 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, Measurement, SkewSweep, measure
-from tofclip.errors import FileFormatError, InputError
-from tofclip.files import atomic_path, translate_read_errors
+from tofclip.errors import InputError
+from tofclip.files import atomic_path, read_toml, suggest_name
 from tofclip.lidar import Pulse, depth
 from tofclip.light_field.measurement import CameraSetup, ClipMeasurement
 from tofclip.notebook import plot_picture
@@ -175,13 +173,7 @@ class Design:
         FileFormatError, InputError
             It is no TOML file, has an unknown key, or a value that no instrument has.
         """
-        with translate_read_errors(Path(path)), open(path, "rb") as opened:
-            try:
-                found = tomllib.load(opened)
-            except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
-                raise FileFormatError(
-                    Path(path), f"is not a TOML file of a design ({fault})"
-                ) from fault
+        found = read_toml(path, "a design")
         try:
             return cls.of(found)
         except InputError as fault:
@@ -193,9 +185,7 @@ class Design:
         known = [item.name for item in fields(cls)]
         for key in settings:
             if key not in known:
-                like = difflib.get_close_matches(key, known, 1, 0.5)
-                hint = f"did you mean '{like[0]}'?" if like else f"known are {', '.join(known)}"
-                raise InputError(f"a design has no key '{key}'; {hint}")
+                raise InputError(f"a design has no key '{key}'; {suggest_name(key, known)}")
         return cls(**settings)
 
     def save(self, path: str | Path) -> None:

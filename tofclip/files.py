@@ -360,6 +360,26 @@ def guard(path: str | Path, problem: str = "is truncated or damaged") -> Iterato
             raise FileFormatError(path, f"{problem} ({format_error_line(fault)})") from fault
 
 
+def read_toml(path: str | Path, what: str) -> dict[str, Any]:
+    """Read a TOML file; `what` it is of, such as "settings", for the message where it is none."""
+    import tomllib
+
+    with translate_read_errors(path), open(path, "rb") as opened:
+        try:
+            return tomllib.load(opened)
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
+            raise FileFormatError(path, f"is not a TOML file of {what} ({fault})") from fault
+
+
+def suggest_name(name: str, known: Iterable[str]) -> str:
+    """Say which of the known names a wrong one may stand for, or all of them."""
+    import difflib
+
+    known = list(known)
+    like = difflib.get_close_matches(name, known, 1)
+    return f"did you mean '{like[0]}'?" if like else f"known are {', '.join(known)}"
+
+
 def _is_endless(path: str | Path) -> bool:
     with contextlib.suppress(OSError):  # opening it will say
         mode = os.stat(path).st_mode
