@@ -280,7 +280,7 @@ def test_sections_stand_in_public_names_only(public: dict[str, Any]) -> None:
 
 
 def list_undocumented(name: str, value: Any) -> Iterator[str]:
-    """Arguments that no Parameters section names; a class may describe those of its fields anywhere."""
+    """Arguments in no Parameters section and no sentence; a class describes its fields anywhere."""
     if inspect.isclass(value):
         described = inspect.getdoc(value) or ""
         functions = {own: one for own, one in vars(value).items() if own[0] != "_"}
@@ -304,7 +304,7 @@ def list_undocumented(name: str, value: Any) -> Iterator[str]:
             text = inspect.getdoc(getattr(value, own)) or ""
         for one in inspect.signature(function).parameters:
             if one not in ("self", "cls") and not re.search(
-                rf"^ *\**[\w, *]*\b{one}\b[\w, *]*( : |$)", text, re.M
+                rf"^ *\**[\w, *]*\b{one}\b[\w, *]*( : |$)|``\**{one}``", text, re.M
             ):
                 yield f"{name}{'.' * bool(own)}{own}({one})"
 
