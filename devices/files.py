@@ -275,11 +275,6 @@ def open_sdt(uri: Uri) -> RecordFile:
     return RecordFile(uri.location, _read_becker_hickl_histograms)
 
 
-def compute_photon_times(photons: Records, calibration: Record) -> NDArray[np.float64]:
-    """Return when each photon came, s after the laser's pulse: the beginning of its bin."""
-    return np.asarray(photons["bin"] * calibration.number("resolution_s"))
-
-
 def _make_photons(pulse: Any, delay: Any, channel: Any) -> Records:
     photons = np.empty(len(pulse), PHOTON_DTYPE)
     photons["sync"], photons["bin"], photons["channel"] = pulse, delay, channel

@@ -47,7 +47,7 @@ class GateScan:
         return (self.offset_ps + self.step_ps * steps) * 1e-12
 
     def to_record(self) -> Record:
-        """Return the calibration that `devices.counted_photons.read_photons` reads."""
+        """Return the calibration that `devices.transients.read_photons` reads."""
         times = Field(self.opening_times, "s", ("gate_step",))
         return Record("gate_scan", {"gate_times": times}, {"gate_width_s": self.width_ns * 1e-9})
 

@@ -5,6 +5,7 @@ One histogram for each kind of photon record.
 
 from __future__ import annotations
 
+import abc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,19 +17,9 @@ from numpy.typing import NDArray
 from devices.linospad2 import CLOCK_PERIOD_S, PIXELS, BoardCalibration
 from devices.source import Records
 from devices.timetag_codec import DELTA
-from tofclip.camera import Camera
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError
 from tofclip.shots import Streak
 from tofclip.threads import run_blocks, thread_count
-
-__all__ = [
-    "Accumulator",
-    "BinAxis",
-    "StampHistogram",
-    "TagHistogram",
-    "TimeHistogram",
-]
-
 
 MAX_CELLS = 1 << 26  # Bins of all pixels together: half a gigabyte for each thread
 
@@ -40,23 +31,9 @@ _MIN_PIECE = 1 << 16
 
 @dataclass(frozen=True)
 class BinAxis:
-    """Bins of equal width; bin k lies around ``start + k * bin_width``.
-
-    Parameters
-    ----------
-    bin_width : float
-        s.
-    bins : int
-    start : float
-        Middle of the first bin, s after the laser's pulse.
-    period : float or None
-        Time between two pulses of the laser, s: photons of all periods add up. None: there is one
-        pulse only, or every photon is already counted from its own pulse.
-
-    Raises
-    ------
-    InputError
-        A number is not positive and finite, or the bins are longer than the period.
+    """`bins` bins of `bin_width` s; bin k lies around ``start + k * bin_width``, `start` s after the
+    laser's pulse. Photons of all the laser's periods of `period` s add up; None: there is one pulse
+    only, or every photon is already counted from its own.
     """
 
     bin_width: float
@@ -101,17 +78,9 @@ class BinAxis:
         return 0.0 if self.period is None else self.period / self.bin_width
 
 
-class Accumulator:
-    """Photons of a line of pixels, added up over any number of batches.
-
-    Memory: 8 bytes for each bin, pixel and thread, however many photons come.
-
-    Parameters
-    ----------
-    pixels : int
-    axis : BinAxis
-    hot_pixels : sequence of int
-        Pixels of which nothing can be believed.
+class Histogram(abc.ABC):
+    """Photons of a line of `pixels`, added up over any number of batches; nothing of `hot_pixels` can
+    be believed. Memory: 8 bytes for each bin, pixel and thread, however many photons come.
     """
 
     def __init__(
@@ -125,6 +94,12 @@ class Accumulator:
         self._hot = np.asarray(hot_pixels, np.int64)
         self._parts: list[NDArray[np.float64]] = []
 
+    @abc.abstractmethod
+    def add(self, records: Records, after_gap: bool = False) -> None:
+        """Add photons (n,), records of the histogram's own kind; `after_gap`: some are missing before
+        them.
+        """
+
     @property
     def counts(self) -> NDArray[np.float64]:
         """Photons so far, (bins, pixels); right to a millionth of a photon."""
@@ -137,32 +112,14 @@ class Accumulator:
         photons[photons < ROUNDING_PHOTONS] = 0
         return photons
 
-    def to_streak(self, camera: Camera | None = None, source: str = "photon histogram") -> Streak:
-        """Return the sum so far as a streak image: rows are instants after the laser's pulse,
-        columns are pixels.
-
-        Hot pixels are marked in ``Streak.saturated``, so that recovery does not rely on them.
-
-        Parameters
-        ----------
-        camera : Camera, optional
-        source : str
-            What the streak image calls its source.
-
-        Returns
-        -------
-        Streak
-            Counts (bins, pixels) float32.
-
-        Raises
-        ------
-        InputError
-            No photon came.
+    def to_streak(self) -> Streak:
+        """Return the sum so far as a streak image: rows are instants after the laser's pulse, columns
+        are pixels, of which hot ones are marked as saturated; `InputError` where no photon came.
         """
         counts = self.counts.astype(np.float32)
         untrusted = np.zeros(counts.shape, bool)
         untrusted[:, self._hot] = True
-        return Streak(counts, self.axis.times, untrusted, camera=camera, source=source)
+        return Streak(counts, self.axis.times, untrusted, source="photon histogram")
 
     def _add_in_parallel(self, add: Callable[[slice, NDArray[Any]], None], total: int) -> None:
         """Call `add` on pieces of ``range(total)``, each with steps that no other thread uses."""
@@ -173,43 +130,31 @@ class Accumulator:
         run_blocks(lambda piece: add(piece, self._parts[piece.start // size]), total, size)
 
 
-_WORD_DTYPE = np.dtype("<u4")
-
-
-class StampHistogram(Accumulator):
-    """Time stamps of LinoSPAD2.
+class StampHistogram(Histogram):
+    """Time stamps of LinoSPAD2 (`devices.linospad2.STAMP_DTYPE`, with or without counter), by the
+    tables of its board.
 
     The laser's pulses are locked to the board's clock and a cycle begins with one of them, so that
     a stamp's time since its cycle began, modulo the laser's period, is its time after a pulse. A
     photon is shared out evenly over the instants that its code covers.
-
-    Parameters
-    ----------
-    axis : BinAxis
-    calibration : BoardCalibration
     """
 
     def __init__(self, axis: BinAxis, calibration: BoardCalibration) -> None:
         super().__init__(PIXELS, axis, calibration.hot_pixels)
-        begins = (
-            calibration.code_begins + calibration.offsets[:, np.newaxis]
-        ) / axis.bin_width + axis.shift_bins
-        widths = np.maximum(
-            (calibration.code_ends - calibration.code_begins) / axis.bin_width, MIN_WIDTH_BINS
-        )
+        first = calibration.code_begins + calibration.offsets[:, np.newaxis]
+        begins = first / axis.bin_width + axis.shift_bins
+        widths = (calibration.code_ends - calibration.code_begins) / axis.bin_width
         if axis.period is not None:
             begins %= axis.period_bins  # small numbers keep their digits in float32
-        self._codes = np.stack([begins, widths], axis=-1).astype(np.float32)
+        codes = [begins, np.maximum(widths, MIN_WIDTH_BINS)]
+        self._codes = np.stack(codes, axis=-1).astype(np.float32)
 
-    def add(self, records: Records) -> None:
-        """Add time stamps, an array of `devices.linospad2.STAMP_DTYPE` (with or without
-        counter).
-        """
+    def add(self, records: Records, after_gap: bool = False) -> None:
         if records.dtype.names is None or records.dtype.names[-2:] != ("code", "pixel"):
             raise InputError(f"LinoSPAD2's time stamps end in code and pixel, got {records.dtype}")
         from devices.histogram_kernels import add_stamps
 
-        rows = np.ascontiguousarray(records).view(_WORD_DTYPE).reshape(len(records), -1)
+        rows = np.ascontiguousarray(records).view("<u4").reshape(len(records), -1)
         clock, period = CLOCK_PERIOD_S / self.axis.bin_width, self.axis.period_bins
 
         strays: list[int] = []  # appending is safe on several threads
@@ -224,21 +169,12 @@ class StampHistogram(Accumulator):
             )
 
 
-class TagHistogram(Accumulator):
-    """Time tags of a counter with a few channels, one of which sees the laser.
+class TagHistogram(Histogram):
+    """Time tags (`devices.timetag_codec.RECORD_DTYPE`) of a counter with a few channels and ticks of
+    `tick` s. `sync_channel` sees the laser, `pixel_channels` are those of the line's pixels.
 
     A photon's time is counted from the last pulse before it; after a gap, photons are left out
     until the next pulse.
-
-    Parameters
-    ----------
-    axis : BinAxis
-    sync_channel : int
-        Where the laser's pulses arrive.
-    pixel_channels : tuple of int
-        The channel of each pixel of the line.
-    tick : float
-        Duration of a tick of the counter, s.
     """
 
     def __init__(
@@ -259,82 +195,46 @@ class TagHistogram(Accumulator):
         self._known = -1
 
     def add(self, records: Records, after_gap: bool = False) -> None:
-        """Add time tags, an array of `devices.timetag_codec.RECORD_DTYPE`; `after_gap`: some are
-        missing before them.
-
-        Parameters
-        ----------
-        records : (n,) array of `devices.timetag_codec.RECORD_DTYPE`
-        after_gap : bool
-        """
         from devices.histogram_kernels import add_tags, find_last_sync
 
         # Sync pulses may be among the missing records, so that the last known one may be of an
         # earlier period.
-        if after_gap:
-            self._known = -1
-        known, columns = (
-            self._known,
-            [records[name] for name in ("time_ticks", "channels", "flags")],
-        )
+        known = -1 if after_gap else self._known
+        columns = [records[name] for name in ("time_ticks", "channels", "flags")]
+        place = (self._pixel_of, self._tick_bins, self.axis.shift_bins, self.axis.period_bins)
 
         def add(piece: slice, steps: NDArray[Any]) -> None:
             # Each thread begins in the middle of the batch and looks back for the pulse that counts
             # there.
             start = find_last_sync(*columns, DELTA, self._sync, piece.start, known)
-            place = (self._pixel_of, self._tick_bins, self.axis.shift_bins, self.axis.period_bins)
-            add_tags(
-                *(column[piece] for column in columns), DELTA, self._sync, start, *place, steps
-            )
+            own = (column[piece] for column in columns)
+            add_tags(*own, DELTA, self._sync, start, *place, steps)
 
         self._add_in_parallel(add, len(records))
         self._known = find_last_sync(*columns, DELTA, self._sync, len(records), known)
 
 
-class TimeHistogram(Accumulator):
-    """Photons of which pixel and time are known, as files of photon-counting electronics hold them.
-
-    Parameters
-    ----------
-    pixels : int
-    axis : BinAxis
-    resolution : float
-        Width of the electronics' own bins, s, over which a photon is shared out.
+class BinHistogram(Histogram):
+    """Photons as files of photon-counting electronics hold them (`devices.files.PHOTON_DTYPE`): each
+    is shared out over its bin of `resolution` s, which begins ``bin * resolution`` after the pulse.
     """
 
-    def __init__(self, pixels: int, axis: BinAxis, resolution: float = 0.0) -> None:
+    def __init__(self, pixels: int, axis: BinAxis, resolution: float) -> None:
         super().__init__(pixels, axis)
-        if not (np.isfinite(resolution) and resolution >= 0):
-            raise InputError(f"a resolution must be a number of seconds from 0, got {resolution}")
-        self._width = max(resolution / axis.bin_width, MIN_WIDTH_BINS)
+        if not (np.isfinite(resolution) and resolution > 0):
+            raise InputError(f"a resolution must be a positive number of seconds, got {resolution}")
+        self._resolution = resolution
 
-    def add(self, pixels: NDArray[Any], times: NDArray[Any]) -> None:
-        """Add photons.
-
-        Parameters
-        ----------
-        pixels : (n,) int array
-        times : (n,) array
-            Beginning of the electronics' bin, s after the laser's pulse.
-
-        Raises
-        ------
-        ShapeError
-            Pixels and times differ in number.
-        InputError
-            There is no such pixel, or a time is not finite.
-        """
-        if pixels.ndim != 1 or pixels.shape != times.shape:
-            raise ShapeError("pixels and times", "(photons,) both", (pixels.shape, times.shape))
-        if len(pixels) and not (pixels.min() >= 0 and pixels.max() < self.pixels):
-            raise InputError(f"there are {self.pixels} pixels, got {pixels.min()}..{pixels.max()}")
-        if not np.all(np.isfinite(times)):
-            raise InputError("a photon's time must be finite")
+    def add(self, records: Records, after_gap: bool = False) -> None:
         from devices.histogram_kernels import add_times
 
+        pixels, times = records["channel"], records["bin"] * self._resolution
+        if len(pixels) and not 0 <= pixels.min() <= pixels.max() < self.pixels:
+            raise InputError(f"there are {self.pixels} pixels, got {pixels.min()}..{pixels.max()}")
         scale, shift, period = 1 / self.axis.bin_width, self.axis.shift_bins, self.axis.period_bins
+        width = max(self._resolution * scale, MIN_WIDTH_BINS)
 
         def add(piece: slice, steps: NDArray[Any]) -> None:
-            add_times(pixels[piece], times[piece], scale, shift, self._width, period, steps)
+            add_times(pixels[piece], times[piece], scale, shift, width, period, steps)
 
-        self._add_in_parallel(add, len(pixels))
+        self._add_in_parallel(add, len(records))

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
@@ -34,10 +33,8 @@ from devices.linospad2_kernels import (
     ADDRESSES,
     CODE_MASK,
     CONVERTERS,
-    COUNTERS_DIFFER,
-    OUT_OF_ORDER,
-    OVERFULL,
     PIXEL_CONVERTERS,
+    VALID_BIT,
 )
 from devices.source import (
     ByteView,
@@ -51,7 +48,7 @@ from devices.source import (
     as_bytes,
 )
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
-from tofclip.files import guard, translate_read_errors
+from tofclip.files import guard, read_toml, suggest_name, translate_read_errors
 from tofclip.storage import Record, Scalar, Storable, stored_array
 from tofclip.threads import run_blocks
 
@@ -68,11 +65,6 @@ COUNTER_WORDS = 2
 _WORD_DTYPE = np.dtype("<u4")
 _MAX_ENCODED_BYTES = 1 << 30
 _BLOCK_BYTES = 1 << 21
-_ENCODE_ERRORS = {
-    OUT_OF_ORDER: "time stamps must be in order of cycle and converter; sort_stamps brings them there",
-    OVERFULL: "a converter has more time stamps in a cycle than it can hold",
-    COUNTERS_DIFFER: "all time stamps of a cycle must have the same counter",
-}
 
 
 @dataclass(frozen=True)
@@ -173,16 +165,33 @@ class LinoSpad2Codec(Codec):
 
     def encode(self, records: Records) -> bytes:
         """Return the bytes of all cycles from 0 up to that of the last time stamp."""
-        from devices.linospad2_kernels import encode_stamps
-
-        self._require_valid(records)
+        self._require_records(records)
+        if np.any(records["pixel"] >= PIXELS) or np.any(records["code"] > CODE_MASK):
+            raise InputError(f"a time stamp has a pixel below {PIXELS} and a code below 2**28")
         if len(records) == 0:
             return b""
-        cycles = np.zeros((int(records["cycle"].max()) + 1, self.cycle_words), _WORD_DTYPE)
-        rows = np.ascontiguousarray(records).view(_WORD_DTYPE).reshape(len(records), -1)
-        outcome = encode_stamps(rows, self.header, self.address_of, cycles)
-        if outcome in _ENCODE_ERRORS:
-            raise InputError(_ENCODE_ERRORS[outcome])
+        cycle = records["cycle"].astype(np.int64)
+        if (cycle.max() + 1) * self.unit_bytes > _MAX_ENCODED_BYTES:
+            raise InputError(
+                f"{cycle.max() + 1} cycles take more than {_MAX_ENCODED_BYTES} bytes; encode them in pieces"
+            )
+        converter, address = np.divmod(self.address_of[records["pixel"]], np.uint32(ADDRESSES))
+        queue = cycle * CONVERTERS + converter
+        if np.any(np.diff(queue) < 0):
+            raise InputError(
+                "time stamps must be in order of cycle and converter; sort_stamps brings them there"
+            )
+        slot = np.arange(len(queue)) - np.searchsorted(queue, queue)
+        if slot.max() >= self.timestamps:
+            raise InputError("a converter has more time stamps in a cycle than it can hold")
+        cycles = np.zeros((cycle[-1] + 1, self.cycle_words), _WORD_DTYPE)
+        if self.counter:
+            counter = np.ascontiguousarray(records["counter"])
+            if np.any(counter != counter[np.searchsorted(cycle, cycle)]):
+                raise InputError("all time stamps of a cycle must have the same counter")
+            cycles[cycle, :COUNTER_WORDS] = counter.view(_WORD_DTYPE).reshape(-1, COUNTER_WORDS)
+        place = self.header + converter * self.timestamps + slot
+        cycles[cycle, place] = VALID_BIT | address << np.uint32(28) | records["code"]
         return cycles.tobytes()
 
     def sort_stamps(self, records: Records) -> Records:
@@ -202,16 +211,6 @@ class LinoSpad2Codec(Codec):
 
         run_blocks(work, len(cycles), max(1, _BLOCK_BYTES // self.unit_bytes))
         return kept, sum(strays)
-
-    def _require_valid(self, records: Records) -> None:
-        self._require_records(records)
-        if np.any(records["pixel"] >= PIXELS) or np.any(records["code"] > CODE_MASK):
-            raise InputError(f"a time stamp has a pixel below {PIXELS} and a code below 2**28")
-        cycles = int(records["cycle"].max(initial=0)) + 1
-        if cycles * self.unit_bytes > _MAX_ENCODED_BYTES:
-            raise InputError(
-                f"{cycles} cycles take more than {_MAX_ENCODED_BYTES} bytes; encode them in pieces"
-            )
 
 
 CODES_PER_PERIOD = 140  # Codes in one period of the board's clock
@@ -341,9 +340,6 @@ def make_calibration_record(
     return Record(record.kind, record.fields, attributes, children)
 
 
-_MAX_SIDECAR_BYTES = 1 << 16
-
-
 @dataclass(frozen=True)
 class Sidecar:
     """What the TOML file beside a recording says; names of files are relative to it."""
@@ -393,24 +389,13 @@ def read_sidecar(recording: str | Path) -> Sidecar:
             f"{recording}: its format is not in the file itself; write {', '.join(required)} into "
             f"{path.name} beside it"
         )
-    with translate_read_errors(path), open(path, "rb") as file:
-        # One byte more than allowed shows that there is more, without reading all of it.
-        data = file.read(_MAX_SIDECAR_BYTES + 1)
-    if len(data) > _MAX_SIDECAR_BYTES:
-        raise FileFormatError(
-            path,
-            f"is larger than any description of a recording: more than {_MAX_SIDECAR_BYTES} bytes",
-        )
-    with guard(path, "is not TOML"):
-        found = tomllib.loads(data.decode())
+    found = read_toml(path, "a recording")
     for key in required:
         if key not in found:
             raise FileFormatError(path, f"lacks the key '{key}'")
     for key, value in found.items():
         if key not in kinds:
-            raise FileFormatError(
-                path, f"has the unknown key '{key}'; known are {', '.join(kinds)}"
-            )
+            raise FileFormatError(path, f"has the unknown key '{key}'; {suggest_name(key, kinds)}")
         kind = kinds[key]
         # TOML distinguishes 50000 from 50000.0, which people do not. By exact type, because bool is
         # an int in Python.

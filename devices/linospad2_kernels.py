@@ -14,9 +14,6 @@ ADDRESSES = 4
 CODE_MASK = np.uint32(0x0FFFFFFF)
 VALID_BIT = np.uint32(0x80000000)
 
-ENCODED_OK, OUT_OF_ORDER, OVERFULL, COUNTERS_DIFFER = 0, 1, 2, 3  # Outcomes of encoding
-
-
 compiled = compile_and_keep(error_model="numpy")
 
 
@@ -68,34 +65,3 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
                 # every word is written, and the next one overwrites it if it was not valid: no
                 # branch
                 row += word >> np.uint32(31)
-
-
-@compiled
-def encode_stamps(records, header, address_of, cycles):
-    """Put rows, as `decode_stamps` writes them, into the words of empty cycles; return `ENCODED_OK`,
-    or what keeps them from being encoded.
-    """
-    depth = (cycles.shape[1] - header) // CONVERTERS
-    previous, slot = np.int64(-1), 0
-    for row in range(records.shape[0]):
-        cycle, place = np.int64(records[row, header]), address_of[records[row, header + 2]]
-        converter = np.int64(place) // ADDRESSES
-        # time stamps must come converter by converter, cycle by cycle
-        queue = cycle * CONVERTERS + converter
-        if queue < previous:
-            return OUT_OF_ORDER
-        if previous < 0 or cycle != previous // CONVERTERS:
-            for column in range(header):
-                cycles[cycle, column] = records[row, column]
-        slot = slot + 1 if queue == previous else 0
-        if slot == depth:
-            return OVERFULL
-        previous = queue
-        for column in range(header):
-            if cycles[cycle, column] != records[row, column]:
-                return COUNTERS_DIFFER
-        address = place % np.uint32(ADDRESSES)
-        cycles[cycle, header + converter * depth + slot] = (
-            VALID_BIT | (address << np.uint32(28)) | records[row, header + 1]
-        )
-    return ENCODED_OK

@@ -66,20 +66,6 @@ def decode_timetags(data, epoch, previous, after_loss, ticks, channels, flags):
 
 
 @compiled
-def encode_timetags(ticks, channels, flags, data):
-    """Write records as 6-byte words, the highest byte first."""
-    for number in range(ticks.size):
-        time = ticks[number] & TIME_MASK
-        at = number * RECORD_BYTES
-        data[at] = flags[number] << 5
-        data[at + 1] = (channels[number] << 4) | (time >> 32)
-        data[at + 2] = (time >> 24) & 0xFF
-        data[at + 3] = (time >> 16) & 0xFF
-        data[at + 4] = (time >> 8) & 0xFF
-        data[at + 5] = time & 0xFF
-
-
-@compiled
 def _next_random(state):
     """One step of splitmix64 (Steele, Lea, Flood, OOPSLA 2014): new state, 64 random bits."""
     state = state + np.uint64(0x9E3779B97F4A7C15)

@@ -43,12 +43,12 @@ from numpy.typing import NDArray
 
 from devices import registry
 from devices.address import Options, Uri, option, parse_integers, parse_shape
-from devices.files import compute_photon_times
-from devices.histogram import BinAxis, StampHistogram, TagHistogram, TimeHistogram
+from devices.histogram import BinAxis, BinHistogram, Histogram, StampHistogram, TagHistogram
 from devices.linospad2 import BoardCalibration
+from devices.recording.read import read_head_if_recording
 from devices.source import READ_TIMEOUT_S, Batch, Source, Stats
 from devices.stream import InstrumentClock, StreamSource
-from devices.tracking import ShotStamp
+from devices.tracking import LiveShot, ShotStamp
 from tofclip.camera import Camera
 from tofclip.errors import DeviceTimeoutError, InputError
 from tofclip.lidar import Pulse
@@ -61,7 +61,7 @@ PICOSECOND_S = 1e-12
 MAX_CUBE_BYTES = 1 << 32
 # Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s
 EDGE_S = 1e-10
-LiveShot = Streak | PhotonCube
+STAMPS_SUFFIX = ".dat"
 
 
 @dataclass(frozen=True)
@@ -138,56 +138,60 @@ def read_transient(address: str, bin_width: float | None = None) -> LiveShot:
     DeviceError
         The instrument failed before there was anything to gather.
     """
-    return read_shot(Uri.parse(address), bin_width)
+    return _read_shot(Uri.parse(address), bin_width)
 
 
-def read_shot(uri: Uri, bin_width: float | None = None, line: bool = False) -> LiveShot:
-    """As `read_transient`; `line`: whether a line that counts photons is a picture of one row."""
+def read_photons(address: str, bin_width: float | None = None) -> PhotonCube:
+    """Read photons counted in time for each pixel of a picture, as `read_transient` does; a line of
+    pixels that count photons is a picture of one row.
+    """
+    found = _read_shot(Uri.parse(address), bin_width, line=True)
+    assert isinstance(found, PhotonCube)
+    return found
+
+
+def find_address(file: str) -> str | None:
+    """Return the address of a file that holds an instrument's records, None of any other file."""
+    path = Path(file)
+    is_stamps = path.suffix.lower() == STAMPS_SUFFIX
+    return f"file://{file}" if is_stamps or read_head_if_recording(path) is not None else None
+
+
+def _read_shot(uri: Uri, bin_width: float | None, line: bool = False) -> LiveShot:
     gathering = replace(Accumulation.of(uri, bin_width), line=line)
     with registry.open(strip_options(uri)) as source:
         known = source.calibration
-        batches = read_batches(source, gathering.seconds)
-        if find_gate_steps(known):
-            batches = read_batches(source, inf)  # a scan lasts as long as it does
-            shot: LiveShot = next(_read_scans(batches, known, gathering))[1]
+        if find_gate_steps(known):  # a scan lasts as long as it does
+            shots = _read_scans(read_batches(source, inf), known, gathering)
+            shot: LiveShot = next(shots)[1]
         else:
-            shot = accumulate_shot(batches, known, gathering)
+            shot = _accumulate(read_batches(source, gathering.seconds), known, gathering)
         past = collect_provenance({"address": uri.text, "bin_width_s": bin_width})
         source.drain()
     past |= {"source": source.info.as_dict(), "stats": source.stats.as_dict()}
     return replace(shot, camera=read_camera(known), source=uri.text, provenance=past)
 
 
-def accumulate_shot(
+def _accumulate(
     batches: Iterator[Batch], calibration: Record | None, gathering: Accumulation
 ) -> LiveShot:
-    """Make one shot of everything that comes."""
+    """Make one shot of everything that comes. Histograms of a line are those of a picture where the
+    address gives a shape; hot pixels count nothing there.
+    """
     first = next(batches, None)
     if first is None:
         raise InputError("the source ended before it gave anything")
-    known = calibration or Record("none")
+    known, all_batches = calibration or Record("none"), itertools.chain([first], batches)
     names = first.records.dtype.names or ()
     if "counts" in names:
-        return _sum_frames(first, batches, known, gathering)
+        return _sum_frames(first.records.dtype["counts"], all_batches, known, gathering)
     if "histogram" in names:
-        streak = _stack_histograms([first, *batches], known, gathering)
-        return _make_picture(streak, gathering)
-    histogram = _make_histogram(names, known, gathering)
-    for batch in itertools.chain([first], batches):
-        records = batch.records
-        if isinstance(histogram, TagHistogram):
-            histogram.add(records, batch.after_gap)
-        elif isinstance(histogram, TimeHistogram):
-            histogram.add(records["channel"], compute_photon_times(records, known))
-        else:
-            histogram.add(records)
-    return _make_picture(histogram.to_streak(), gathering)
-
-
-def _make_picture(streak: Streak, gathering: Accumulation) -> LiveShot:
-    """Make histograms of a picture of a line's, where the address gives a shape; hot pixels count
-    nothing.
-    """
+        streak = _stack_histograms(all_batches, known, gathering)
+    else:
+        histogram = _make_histogram(names, known, gathering)
+        for batch in all_batches:
+            histogram.add(batch.records, batch.after_gap)
+        streak = histogram.to_streak()
     shape = gathering.shape or (gathering.line and (1, streak.counts.shape[1]))
     if not shape:
         return streak
@@ -217,9 +221,7 @@ def read_batches(source: Source, seconds: float) -> Iterator[Batch]:
         yield batch
 
 
-def _make_histogram(
-    names: tuple[str, ...], known: Record, gathering: Accumulation
-) -> StampHistogram | TagHistogram | TimeHistogram:
+def _make_histogram(names: tuple[str, ...], known: Record, gathering: Accumulation) -> Histogram:
     """Return an empty histogram for records of this kind."""
     if names[-2:] == ("code", "pixel"):
         period = known.number("laser_period_s", 0.0) or None
@@ -229,11 +231,13 @@ def _make_histogram(
         return TagHistogram(gathering.axis(None), gathering.sync, gathering.pixels, tick)
     if "bin" in names:
         axis = gathering.axis(known.number("laser_period_s", 0.0) or None)
-        return TimeHistogram(int(known.number("channels")), axis, known.number("resolution_s"))
+        return BinHistogram(int(known.number("channels")), axis, known.number("resolution_s"))
     raise InputError(f"records of {', '.join(names)} are not photons of a line of pixels")
 
 
-def _stack_histograms(batches: list[Batch], calibration: Record, gathering: Accumulation) -> Streak:
+def _stack_histograms(
+    batches: Iterator[Batch], calibration: Record, gathering: Accumulation
+) -> Streak:
     """Return histograms that the instrument has made itself, a channel in each column."""
     counts = np.concatenate([batch.records["histogram"] for batch in batches]).T
     times = calibration.number("resolution_s") * (np.arange(len(counts), dtype=np.float64) + 0.5)
@@ -242,18 +246,17 @@ def _stack_histograms(batches: list[Batch], calibration: Record, gathering: Accu
 
 
 def _sum_frames(
-    first: Batch, batches: Iterator[Batch], known: Record, gathering: Accumulation
+    dtype: np.dtype[Any], batches: Iterator[Batch], known: Record, gathering: Accumulation
 ) -> LiveShot:
     """Add up a camera's frames; a pixel that reached its limit in one of them is not to be trusted."""
     if gathering.line and "bin_times" not in known.fields:
         raise InputError(
             "this instrument counts no photons in time for each pixel; a SPAD array does with mode=gated"
         )
-    kind = first.records.dtype["counts"].base
-    limit = np.iinfo(kind).max if kind.kind in "ui" else np.inf
-    total: NDArray[np.float64] = np.zeros(first.records.dtype["counts"].shape)
+    limit = np.iinfo(dtype.base).max if dtype.base.kind in "ui" else np.inf
+    total: NDArray[np.float64] = np.zeros(dtype.shape)
     saturated, left = np.zeros(total.shape, bool), gathering.pictures
-    for batch in itertools.chain([first], batches):
+    for batch in batches:
         pictures = batch.records["counts"][:left]
         total += pictures.sum(axis=0, dtype=np.float64)
         saturated |= (pictures == limit).any(axis=0)
@@ -308,38 +311,34 @@ def _read_scans(
     _require_own_bins(gathering)
     times, binning = known.array("gate_times", np.float64, 1, "s"), gathering.binning
     pulse, steps = _make_gate_response(known, times), times.size
-    total: NDArray[np.float32] | None = None
-    present: NDArray[np.float32] | None = None
-    done = step = begun = 0  # `begun`: number of the scan's first picture
-    for batch in batches:
-        for record in batch.records:
-            counts = record["counts"]
-            rows, columns = (size // binning for size in counts.shape)
-            if total is None or present is None:
-                if steps * rows * columns * 4 > MAX_CUBE_BYTES:
-                    raise InputError(
-                        "that number of photons does not fit into 4 GiB: choose binning=2 or 4"
-                    )
-                total = np.zeros((steps, rows, columns), np.float32)
-                present = np.zeros_like(total)
-            number = int(record["number"])
-            if number != begun + step:  # cut: wait for the next beginning
-                step = 0
-                if number % steps:
-                    continue
-                begun = number
-            whole = counts[: rows * binning, : columns * binning]
-            present[step] = whole.reshape(rows, binning, columns, binning).sum(axis=(1, 3))
-            step += 1
-            if step == steps:
-                total += present
-                step, done, begun = 0, done + 1, begun + steps
-                if done % gathering.pictures == 0:
-                    yield (
-                        begun // steps // gathering.pictures - 1,
-                        PhotonCube(total, times, pulse=pulse, sampled=True),
-                    )
-                    total = None
+    total: NDArray[np.float32] = np.zeros(0, np.float32)
+    scan: list[NDArray[np.float32]] = []
+    done = begun = 0  # `begun`: number of the scan's first picture
+    for record in itertools.chain.from_iterable(batch.records for batch in batches):
+        number = int(record["number"])
+        if number != begun + len(scan):  # cut: wait for the next beginning
+            scan = []
+            if number % steps:
+                continue
+            begun = number
+        rows, columns = (size // binning for size in record["counts"].shape)
+        if steps * rows * columns * 4 > MAX_CUBE_BYTES:
+            raise InputError(
+                "that number of photons does not fit into 4 GiB: choose binning=2 or 4"
+            )
+        whole = record["counts"][: rows * binning, : columns * binning]
+        blocks = whole.reshape(rows, binning, columns, binning)
+        scan.append(blocks.sum(axis=(1, 3)).astype(np.float32))
+        if len(scan) < steps:
+            continue
+        if done % gathering.pictures == 0:
+            total = np.zeros((steps, rows, columns), np.float32)
+        for picture, own in zip(total, scan, strict=True):
+            picture += own
+        scan, done, begun = [], done + 1, begun + steps
+        if done % gathering.pictures == 0:
+            place = begun // steps // gathering.pictures - 1
+            yield place, PhotonCube(total, times, pulse=pulse, sampled=True)
     if done < gathering.pictures:
         raise InputError(f"the source ended after {done} of {gathering.pictures} whole scans")
 
@@ -472,7 +471,7 @@ def _accumulate_shots(
 ) -> Iterator[tuple[int, LiveShot]]:
     """Yield shots of as many records as they have, each with its number."""
     for number, parts in itertools.groupby(_split_shots(batches, gathering), itemgetter(0)):
-        yield number, accumulate_shot((part for _, part in parts), known, gathering)
+        yield number, _accumulate((part for _, part in parts), known, gathering)
 
 
 def _split_shots(batches: Iterator[Batch], gathering: Accumulation) -> Iterator[tuple[int, Batch]]:

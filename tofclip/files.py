@@ -105,6 +105,7 @@ MAX_COMPRESSION = 1032  # of deflate; other compressions are not believed to do 
 MAX_CHUNK_BYTES = 1 << 26  # of an HDF5 dataset: unpacked whole, however little of it is wanted
 # Of larger files, size, time of change and so many first bytes stand for the content.
 MAX_HASHED_BYTES = 1 << 24
+MAX_TOML_BYTES = 1 << 20  # of a file that a person writes
 MIN_FREE_BYTES = 4096  # a disk with less, a block of most file systems, is full
 DISK_IS_FULL = "the disk is full; free some space or choose another folder"
 MAX_MESSAGE_LENGTH = 200  # of another library's message that is part of ours
@@ -365,10 +366,13 @@ def read_toml(path: str | Path, what: str) -> dict[str, Any]:
     import tomllib
 
     with translate_read_errors(path), open(path, "rb") as opened:
-        try:
-            return tomllib.load(opened)
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
-            raise FileFormatError(path, f"is not a TOML file of {what} ({fault})") from fault
+        data = opened.read(MAX_TOML_BYTES + 1)  # one byte more shows that there is more
+    if len(data) > MAX_TOML_BYTES:
+        raise FileFormatError(path, f"is larger than any TOML file of {what}")
+    try:
+        return tomllib.loads(data.decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
+        raise FileFormatError(path, f"is not a TOML file of {what} ({fault})") from fault
 
 
 def suggest_name(name: str, known: Iterable[str]) -> str:

@@ -245,7 +245,7 @@ class _ShotReader:
 
     def _load_frames(self, shot: str, distance: float) -> Frames | None:
         """Load frames or recover them; None of counted photons."""
-        from devices.counted_photons import find_address
+        from devices.transients import find_address
         from tofclip.files import translate_read_errors
         from tofclip.io import read_streak
         from tofclip.recovery import make_method, open_shot, parse_focus, plan_recovery

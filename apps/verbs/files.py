@@ -73,8 +73,8 @@ def describe_file(file: Path) -> dict[str, Any]:
     """Describe our own records, streak images, point clouds and counted photons by their headers:
     their values may not fit into memory.
     """
-    from devices.counted_photons import STAMPS_SUFFIX
     from devices.linospad2 import LinoSpad2File
+    from devices.transients import STAMPS_SUFFIX
     from tofclip.lidar.photons.files import describe_photons
     from tofclip.loading import outline
     from tofclip.storage import Record, is_own_file

@@ -205,8 +205,8 @@ def read_any_photons(
     """Read a file or an instrument; return its photons, its response where it knows that, and the
     time of its first bin, s.
     """
-    from devices.counted_photons import find_address
-    from devices.counted_photons import read_photons as read_instrument
+    from devices.transients import find_address
+    from devices.transients import read_photons as read_instrument
     from tofclip.lidar.photons.files import read_photons
 
     address = file if "://" in file else find_address(file)

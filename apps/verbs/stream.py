@@ -152,8 +152,7 @@ def _read_shots(
     """Shots of an instrument, a folder or a stack; in the place of one that cannot be read its
     error, which lets those behind it go on.
     """
-    from devices.counted_photons import find_address
-    from devices.transients import read_transients
+    from devices.transients import find_address, read_transients
     from tofclip.sequences import list_shots
 
     address = source if "://" in source else Path(source).is_file() and find_address(source)

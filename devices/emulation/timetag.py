@@ -43,7 +43,7 @@ from devices.timetag import (
     TimeTagOptions,
     open_on_backend,
 )
-from devices.timetag_codec import COUNTER_RANGE, LOST, RECORD_BYTES, RECORD_DTYPE, WRAP
+from devices.timetag_codec import COUNTER_RANGE, LOST, RECORD_BYTES, RECORD_DTYPE, WRAP, pack_words
 from tofclip.errors import InputError
 
 MAX_TICK = (1 << 62) - 1  # A tick that never comes
@@ -144,8 +144,6 @@ class PulsedSceneStream:
 
     def _fill_block(self) -> None:
         """Make the records of the next pulses; the same number of a block gives the same records."""
-        from devices.timetag_kernels import encode_timetags
-
         records = self._draw_records(np.random.default_rng([self._seed, self._block]))
         first = self._block * BLOCK_TICKS
         self._block += 1
@@ -153,9 +151,8 @@ class PulsedSceneStream:
             records = records[records["time_ticks"] > 0]  # a zero would be taken for a wrap
         elif first % COUNTER_RANGE == 0:
             records["flags"][0] = WRAP
-        self._ticks = records["time_ticks"] + first
-        self._words = np.empty(len(records) * RECORD_BYTES, np.uint8)
-        encode_timetags(self._ticks, records["channels"], records["flags"], self._words)
+        records["time_ticks"] += first
+        self._ticks, self._words = records["time_ticks"], pack_words(records)
 
     def _draw_records(self, random: np.random.Generator) -> Records:
         """Draw a block's pulses and photons, in ticks since the block began."""

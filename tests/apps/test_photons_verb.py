@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from small_instrument import BACKGROUND, BIN_WIDTH, IMAGE_SHAPE, ROWS, save_plate
 
-from devices.counted_photons import find_address, read_photons
 from devices.emulation.linospad2 import LASER_PERIOD_S, SimulatedBoard
 from devices.emulation.scenes import render_array_delays, simulate_line_light
 from devices.linospad2 import BoardCalibration, LinoSpad2Codec
+from devices.transients import find_address, read_photons
 from tofclip.camera import Camera
 from tofclip.lidar import PointCloud, compute_ray_directions
 from tofclip.lidar.photons import detector

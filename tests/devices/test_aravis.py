@@ -15,11 +15,10 @@ from instruments import finish, take
 
 import devices
 from devices.aravis import UNNUMBERED, find_cameras, load_aravis
-from devices.counted_photons import read_photons
 from devices.emulation.aravis import EmulatedCamera
 from devices.emulation.scenes import EmulatedLight, draw_exposure, simulate_line_light
 from devices.source import Stats
-from devices.transients import read_transient, read_transients
+from devices.transients import read_photons, read_transient, read_transients
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceNotFoundError,

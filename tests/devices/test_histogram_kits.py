@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from instruments import finish, take
 
 import devices
-from devices.counted_photons import read_photons
 from devices.emulation.histogram_kits import (
     compute_zone_ranges,
     format_tmf8828,
@@ -26,6 +25,7 @@ from devices.histogram_kits import (
     Tmf8828Parser,
     Vl53l8Parser,
 )
+from devices.transients import read_photons
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceNotFoundError,

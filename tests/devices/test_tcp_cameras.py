@@ -18,7 +18,6 @@ from hypothesis import given
 from instruments import finish, read_gaps, take
 
 import devices
-from devices.counted_photons import read_photons
 from devices.emulation.harness import HOST, Connection, Fault, LoopbackServer
 from devices.emulation.remoteex import EmulatedStreakCamera
 from devices.emulation.scenes import (
@@ -41,6 +40,7 @@ from devices.remoteex import (
 from devices.source import Source
 from devices.spad512 import BIT_DEPTHS, IMAGE_WIDTHS_PX, ROWS, ExposureRequest, find_error_text
 from devices.tcp import TcpLink
+from devices.transients import read_photons
 from tofclip.camera import Camera
 from tofclip.errors import (
     DeviceBusyError,
