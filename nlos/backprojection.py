@@ -18,7 +18,6 @@ from nlos.capture import Capture
 from nlos.illumination import warn_of_aliasing
 from nlos.kernels import MIN_DISTANCE_M, add_backprojection
 from nlos.method import (
-    VOXEL_BYTES,
     Method,
     PhasorMethod,
     PhasorPlan,
@@ -124,22 +123,11 @@ class BackprojectionPlan(PhasorPlan):
     ) -> None:
         super().__init__(capture, grid)
         self.band, self.weighting, self.settings = band, weighting, dict(settings)
-        self._points = len(capture.points)
-        self._warned = False
-
-    @property
-    def cost(self) -> int:
-        """Look-ups: one per voxel and wall point."""
-        return self._points * self.grid.size
-
-    @property
-    def memory_bytes(self) -> int:
-        return self.grid.size * VOXEL_BYTES + TABLE_COPIES * TABLE_BYTES
+        self.cost = len(capture.points) * grid.size  # look-ups
+        self.memory_bytes += TABLE_COPIES * TABLE_BYTES
 
     def _field(self, capture: Capture, progress: Progress) -> Volume:
-        if not self._warned:
-            warn_of_aliasing(capture, self.band)
-            self._warned = True
+        warn_of_aliasing(capture, self.band)
         history = {**capture.provenance, "imaging": self.settings}
         grid, band, weighting = self.grid, self.band, self.weighting
         if not is_numpy(capture.signal):
@@ -308,18 +296,10 @@ class FilteredBackprojectionPlan(Plan):
 
     def __init__(self, capture: Capture, grid: Grid, method: FilteredBackprojection) -> None:
         super().__init__(capture, grid)
-        self.method = method
-        self._points, self._bins = len(capture.points), capture.axis.bins
-
-    @property
-    def cost(self) -> int:
-        """Look-ups: one per voxel and wall point."""
-        return self._points * self.grid.size
-
-    @property
-    def memory_bytes(self) -> int:
-        signals = min(TABLE_BYTES, 8 * self._points * self._bins)
-        return self.grid.size * (VOXEL_BYTES + 4 * LAPLACIAN_COPIES) + TABLE_COPIES * signals
+        points, bins = len(capture.points), capture.axis.bins
+        self.method, self.cost = method, points * grid.size  # look-ups
+        self.memory_bytes += 4 * LAPLACIAN_COPIES * grid.size
+        self.memory_bytes += TABLE_COPIES * min(TABLE_BYTES, 8 * points * bins)
 
     def _image(self, capture: Capture, progress: Progress) -> Volume:
         grid, method, spacing = self.grid, self.method, capture.axis.spacing
@@ -328,7 +308,7 @@ class FilteredBackprojectionPlan(Plan):
             values = np.pad(traces, ((0, 0), PADDING_SAMPLES)).astype(np.complex64)
             return Waveforms(values, capture.start - spacing, spacing)
 
-        samples = self._bins + sum(PADDING_SAMPLES)
+        samples = capture.axis.bins + sum(PADDING_SAMPLES)
         total = backproject_signals(capture, grid, pad_signals, samples, method.weighting, progress)
         sharpened = _apply_laplacian(np.ascontiguousarray(total.real), grid, method.sigma)
         settings = {"method": "filtered backprojection", "sigma_m": method.sigma}

@@ -86,7 +86,7 @@ class VirtualPulse:
         return BAND_EDGE / self.sigma
 
     def spectrum(self, wavenumbers: Any) -> NDArray[np.float64]:
-        """Strength of the pulse at wavenumbers in rad/m, 1 at the carrier, 0 from the band's edges on.
+        """Strength of the pulse at ``wavenumbers``, rad/m, 1 at the carrier, 0 beyond the band.
 
         J. F. Kaiser, R. W. Schafer, IEEE Trans. Acoust. Speech Signal Process. 28, 105 (1980).
         """
@@ -96,7 +96,7 @@ class VirtualPulse:
         return np.where(inside, (i0(KAISER * root) - 1) / (i0(KAISER) - 1), 0.0)
 
     def slope(self, wavenumbers: Any) -> NDArray[np.float64]:
-        """Change of the logarithm of `spectrum` with the wavenumber inside the band, m."""
+        """Slope, m, of the logarithm of `spectrum` at ``wavenumbers``, rad/m, of the band."""
         from scipy.special import i0, i1
 
         _, root = self._find_in_band(wavenumbers)
@@ -124,22 +124,8 @@ class Waveforms:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """The frequencies at which a virtual pulse sees a capture.
-
-    They are harmonics of a period that holds the whole record and the pulse before and after it, so
-    that no signal wraps around.
-
-    Parameters
-    ----------
-    pulse : VirtualPulse
-    axis : TimeAxis
-        Time axis of the capture.
-
-    Raises
-    ------
-    InputError
-        The pulse is too short for the time bins: no frequency is left, or its carrier itself is
-        lost.
+    """The frequencies at which a virtual pulse sees captures of a time axis: harmonics of a period
+    that holds the record and the pulse before and after it, so that no signal wraps around.
     """
 
     pulse: VirtualPulse
@@ -199,16 +185,7 @@ class Band:
         return strength
 
     def compute_phasors(self, traces: NDArray[Any]) -> NDArray[Any]:
-        """Return ``P_k = G_k * sum_i H_i * exp(-1j * k * L_i)`` of every signal.
-
-        Parameters
-        ----------
-        traces : (points, t) float32 or float64 array
-
-        Returns
-        -------
-        (points, frequencies) complex64 or complex128 array
-        """
+        """Return the phasors P_k (points, frequencies) of signals (points, t), as precise as these."""
         real, bins = traces.dtype.type, traces.shape[1]
         # A library's own threads would go on waiting, busily, where ours want to work.
         with limit_blas_threads():

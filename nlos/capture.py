@@ -238,9 +238,7 @@ class Capture:
         return ComputeDevice.of(self.signal)
 
     def on(self, device: ComputeDevice) -> Capture:
-        """Return the capture with its signal brought to a place, such as
-        ``tofclip.arrays.parse_device("cuda")``.
-        """
+        """Return the capture with its signal on ``device``, such as `parse_device("cuda")`."""
         return replace(self, signal=device.put(self.signal))
 
     @property
@@ -282,10 +280,8 @@ class Capture:
         return float(np.median(cKDTree(places).query(some, 2)[0][:, 1]))
 
     def traces(self, selection: slice = slice(None)) -> NDArray[np.float32]:
-        """Signals of some valid wall points, in the order of `points`, shape (points, t).
-
-        All signals of a complete wall are not copied: then time is the slow axis in memory. Refuses
-        signals of other libraries.
+        """Signals (points, t) of the ``selection`` of `points`, NumPy's only; all of a complete wall
+        are not copied, so that time is the slow axis in memory.
         """
         require_numpy("this treatment of a capture's signal", self.signal)
         in_time: NDArray[np.float32] = self.signal.reshape(self.signal.shape[0], -1)
@@ -355,7 +351,7 @@ class Capture:
 
     @classmethod
     def from_record(cls, record: Record) -> Capture:
-        """Rebuild a capture from what was stored."""
+        """Rebuild a capture from its ``record``."""
         dimensions = {name: entry.values.ndim for name, entry in record.fields.items()}
         return cls(
             signal=record.array("signal", np.float32, dimensions.get("signal", 0), "count"),
@@ -367,15 +363,14 @@ class Capture:
         )
 
     def save(self, path: str | Path, compressed: bool = True) -> None:
-        """Write the capture to an HDF5 file, whole or not at all; `compressed` as of `Record.save`.
-
-        What is imaged while it comes is read several times faster where it is not compressed.
+        """Write the capture to an HDF5 file ``path``, whole or not at all; one that is not
+        ``compressed`` is read several times faster.
         """
         self.to_record().save(path, compressed)
 
     @classmethod
     def load(cls, path: str | Path) -> Capture:
-        """Read a capture that `save` wrote."""
+        """Read the capture that `save` wrote to ``path``."""
         return cls.from_record(Record.load(path, "capture"))
 
 

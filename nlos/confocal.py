@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.kernels import migrate_row, shift_signals
-from nlos.method import VOXEL_BYTES, Method, Plan, Progress, require_imageable, require_numpy_signal
+from nlos.method import Method, Plan, Progress, require_imageable, require_numpy_signal
 from nlos.plane import PlanarWall, Plane, axis_step
 from nlos.volume import Grid, Volume
 from tofclip.arrays import FloatArray
@@ -80,12 +80,8 @@ class ConfocalPlan(Plan):
         require_imageable(capture, grid)
         super().__init__(capture, grid)
         plane = _require_lattice(capture, grid)
-        self._memory_bytes = _require_memory(capture, plane) + grid.size * VOXEL_BYTES
+        self.memory_bytes += _require_memory(capture, plane)
         self._compute, self.settings = compute, dict(settings)
-
-    @property
-    def memory_bytes(self) -> int:
-        return self._memory_bytes
 
     def _image(self, capture: Capture, progress: Progress) -> Volume:
         image = self._compute(ConfocalScan.of(capture, self.grid), self.grid)

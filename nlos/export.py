@@ -40,7 +40,7 @@ class Mesh:
     faces: NDArray[np.int32]
 
     def save(self, path: str | Path) -> None:
-        """Write the mesh as binary PLY, whole or not at all."""
+        """Write the mesh to ``path`` as binary PLY, whole or not at all."""
         write_ply(path, tuple("xyz"), self.vertices, self.faces)
 
 

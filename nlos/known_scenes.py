@@ -84,23 +84,7 @@ class SceneSettings:
 
 
 def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:
-    """Simulate the capture that settings describe.
-
-    Parameters
-    ----------
-    settings : SceneSettings
-
-    Returns
-    -------
-    capture : Capture
-    truth : HiddenTruth
-        Where things are hidden.
-
-    Raises
-    ------
-    InputError
-        The settings contradict each other, or name what there is not.
-    """
+    """Simulate the capture that settings describe, and say where things are hidden."""
     from nlos.simulate import add_poisson_noise, build_relay_wall
 
     if settings.scan not in SCANS:

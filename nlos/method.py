@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 
@@ -34,10 +35,7 @@ def ignore_progress(_: int) -> None:
 
 
 class SubProgress:
-    """Progress of one step of several, reported as a portion of all work; may be called from
-    several threads. `progress`: of the whole; `work`: what the step counts up to; `portion`: what
-    that is of the whole.
-    """
+    """Progress of one step of several, which counts up to `work`, as a `portion` of the whole."""
 
     def __init__(self, progress: Progress, work: int, portion: int) -> None:
         self._progress, self._work, self._portion = progress, work, portion
@@ -86,26 +84,23 @@ class Plan(ABC):
     grid : Grid
     """
 
+    images = 1  # how many are made and added up
+
     def __init__(self, capture: Capture, grid: Grid) -> None:
         self.grid = grid
         self.geometry = PlannedGeometry(capture)
 
-    @property
+    @cached_property
     def cost(self) -> int:
         """What `image` reports as progress in all: look-ups, or voxels once per laser spot."""
         return self.grid.size
 
-    @property
-    def images(self) -> int:
-        """Images that are made and added up."""
-        return 1
-
-    @property
-    @abstractmethod
+    @cached_property
     def memory_bytes(self) -> int:
         """Most bytes that the arrays of an image hold at a time, the volume included and the
         capture not; an estimate, good to about a factor of two.
         """
+        return self.grid.size * VOXEL_BYTES
 
     def image(self, capture: Capture, progress: Progress = ignore_progress) -> Volume:
         """Image the hidden scene.
@@ -127,38 +122,20 @@ class Plan(ABC):
         InputError
             Wall, laser, time axis or device differ from those that were planned for.
         """
-        self.require_same_geometry(capture)
+        self.geometry.require_same(capture)
         return self._image(capture, progress)
 
     @abstractmethod
     def _image(self, capture: Capture, progress: Progress) -> Volume:
         """Image a capture whose geometry is that of the plan."""
 
-    def require_same_geometry(self, capture: Capture) -> None:
-        """Refuse a capture that was not planned for."""
-        self.geometry.require_same(capture)
-
 
 class PhasorPlan(Plan):
     """A plan whose image is the magnitude of a complex field."""
 
     def field(self, capture: Capture, progress: Progress = ignore_progress) -> Volume:
-        """Return the complex sum whose magnitude `image` gives, complex64; linear in the signal.
-
-        Parameters and errors are those of `image`.
-
-        Parameters
-        ----------
-        capture : Capture
-        progress : callable
-            Called with the amount of work just done.
-
-        Returns
-        -------
-        Volume
-            (z, y, x) complex64.
-        """
-        self.require_same_geometry(capture)
+        """Return the complex sum whose magnitude `image` gives, complex64; linear in the signal."""
+        self.geometry.require_same(capture)
         return self._field(capture, progress)
 
     @abstractmethod
@@ -224,15 +201,12 @@ class PhasorMethod(Method):
     """A method whose image is the magnitude of a complex field."""
 
     @abstractmethod
-    def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
-        """Make the method ready for captures like `capture` on `grid`; see `Method.plan`."""
+    def plan(self, capture: Capture, grid: Grid) -> PhasorPlan: ...
 
     def phasor_field(
         self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
     ) -> Volume:
-        """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear in the
-        signal within the method's tolerance. Returns (z, y, x) complex64.
-        """
+        """Return the complex sum whose magnitude `reconstruct` gives; see `PhasorPlan.field`."""
         return self.plan(capture, grid).field(capture, progress)
 
 

@@ -176,7 +176,6 @@ class MidpointImaging(PhasorMethod):
         self.method = method
 
     def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
-        """Make the method ready for captures like `capture` on `grid`; see `Method.plan`."""
         join = MidpointJoin(capture)
         joined = join.join(capture)
         plan = self.method.plan(joined, grid)
@@ -191,14 +190,7 @@ class _MidpointPlan(PhasorPlan):
     ) -> None:
         super().__init__(capture, grid)
         self.join, self.joined = join, joined
-
-    @property
-    def cost(self) -> int:
-        return self.joined.cost
-
-    @property
-    def memory_bytes(self) -> int:
-        return self.joined.memory_bytes
+        self.cost, self.memory_bytes = joined.cost, joined.memory_bytes
 
     def _field(self, capture: Capture, progress: Progress) -> Volume:
         return self.joined.field(self.join.join(capture), progress)

@@ -188,7 +188,7 @@ class Settings:
         return self._join_bins(capture)
 
     def prepare_counts(self, capture: Capture) -> Capture:
-        """Do what `prepare` does but for blanking and midpoints: whatever is counted stays a count."""
+        """Do what `prepare` does to a ``capture``, but what is counted stays counted: no blanking."""
         return self._join_bins(self._orient(capture))
 
     def _orient(self, capture: Capture) -> Capture:
@@ -203,7 +203,7 @@ class Settings:
         return capture if bins == 1 else rebin_capture(capture, bins)
 
     def grid(self, voxel: float | None = None) -> Grid:
-        """Fill the box with voxels, of the settings' size unless `voxel` (m) says otherwise."""
+        """Fill the box with voxels, of the settings' size unless ``voxel`` (m) says otherwise."""
         from nlos.volume import Grid
 
         return Grid.box(*self.box, self.voxel_size if voxel is None else voxel)
@@ -214,7 +214,7 @@ class Settings:
         return math.nan if self.voxel is None else self.voxel
 
     def make_method(self, name: str | None = None) -> Method:
-        """Build a method by its name, the settings' own by default; what is None is left to it."""
+        """Build a method by its ``name``, the settings' own by default; what is None is left to it."""
         chosen = name or self.method or METHODS_BY_SPEED[0]
         given = {key: getattr(self, key) for key in list_taken(chosen)}
         own = split_assignments(self.set or ()) if chosen == self.method else {}
@@ -254,11 +254,11 @@ class Settings:
         return last, self.make_method(last).plan(capture, grid)
 
     def with_method(self: Wanted, name: str) -> Wanted:
-        """Return the settings with the method that was found to be the quickest."""
+        """Return the settings with the method ``name`` that was found to be the quickest."""
         return self.with_found("method", name, "the quickest that takes this wall, laser and grid")
 
     def with_found(self: Wanted, name: str, value: Any, reason: str) -> Wanted:
-        """Return the settings with one more that was found, and why."""
+        """Return the settings with the ``value`` that was found for ``name``, and the ``reason``."""
         reasons = {**self.reasons, name: reason} if reason else self.reasons
         return replace(self, **{name: value}, reasons=reasons)
 

@@ -149,7 +149,7 @@ class TransientVideo:
 
     @classmethod
     def from_record(cls, record: Record) -> TransientVideo:
-        """Rebuild a video from what was stored."""
+        """Rebuild a video from its ``record``."""
         dimensions = record.fields["values"].values.ndim if "values" in record.fields else 4
         x, y, z = (record.array(name, np.float64, 1, "m") for name in "xyz")
         values = record.array("values", np.float32, dimensions)
@@ -158,18 +158,18 @@ class TransientVideo:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the video to an HDF5 file, whole or not at all."""
+        """Write the video to an HDF5 file ``path``, whole or not at all."""
         self.to_record().save(path)
 
     def save_film(self, path: str | Path) -> None:
-        """Draw the front view at every instant into a GIF, with axes in metres."""
+        """Draw the front view at every instant into a GIF ``path``, with axes in metres."""
         from nlos.picture import save_film
 
         save_film(self, path)
 
     @classmethod
     def load(cls, path: str | Path) -> TransientVideo:
-        """Read a video that `save` wrote."""
+        """Read the video that `save` wrote to ``path``."""
         return cls.from_record(Record.load(path, "transient video"))
 
 

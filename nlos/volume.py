@@ -189,7 +189,7 @@ class Grid:
         return self.z.size * self.y.size * self.x.size
 
     def find_nearest(self, point: Sequence[float]) -> tuple[int, int, int]:
-        """Index (z, y, x) of the voxel nearest to a point (x, y, z) in m."""
+        """Index (z, y, x) of the voxel nearest to a ``point`` (x, y, z) in m."""
         axes = zip((self.x, self.y, self.z), point, strict=True)
         x, y, z = (int(np.argmin(np.abs(axis - place))) for axis, place in axes)
         return z, y, x
@@ -298,7 +298,7 @@ class Volume:
         return ComputeDevice.of(self.values)
 
     def on(self, device: ComputeDevice) -> Volume:
-        """Return the volume with its values brought to a place; ``ComputeDevice()`` is NumPy."""
+        """Return the volume with its values on ``device``; ``ComputeDevice()`` is NumPy."""
         return replace(self, values=device.put(self.values))
 
     @property
@@ -321,9 +321,7 @@ class Volume:
         return Projection(magnitude.max(axis=0), self.grid.z[magnitude.argmax(axis=0)])
 
     def threshold(self, fraction: float) -> Volume:
-        """Return the volume with every voxel set to 0 that is weaker than `fraction` (0..1) of the
-        brightest.
-        """
+        """Set every voxel to 0 that is weaker than ``fraction`` (0..1) of the brightest."""
         if not 0 <= fraction <= 1:
             raise InputError(f"a threshold is a fraction between 0 and 1, got {fraction}")
         xp, magnitude = namespace(self.values), abs(self.values)
@@ -331,16 +329,14 @@ class Volume:
         return replace(self, values=xp.where(bright, self.values, xp.zeros_like(self.values)))
 
     def surface(self, fraction: float = 0.3) -> Mesh:
-        """Draw the surface on which the magnitude is `fraction` (0..1) of the largest; save it with
-        ``.save``.
-        """
+        """Draw the surface on which the magnitude is ``fraction`` (0..1) of the largest."""
         from nlos.export import extract_surface
 
         return extract_surface(self, fraction)
 
     def points(self, fraction: float = 0.3) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Positions (n, 3) in m, and magnitudes (n,), of voxels with at least `fraction` (0..1) of
-        the brightest.
+        """Positions (n, 3), m, and magnitudes (n,) of voxels of at least ``fraction`` (0..1) of the
+        brightest.
         """
         from nlos.export import extract_points
 
@@ -370,9 +366,7 @@ class Volume:
         export_volume(self, path, fraction)
 
     def save_picture(self, path: str | Path) -> None:
-        """Draw front view, depth map, top and side view with axes in metres; PNG, PDF or SVG by the
-        file's name.
-        """
+        """Draw front view, depth map, top and side view, axes in m, to ``path``: PNG, PDF or SVG."""
         from nlos.picture import save_picture
 
         save_picture(self, path)
@@ -435,7 +429,7 @@ class Volume:
 
     @classmethod
     def from_record(cls, record: Record) -> Volume:
-        """Rebuild a volume from what was stored."""
+        """Rebuild a volume from its ``record``."""
         field = record.fields.get("values")
         kept = field is not None and field.values.dtype.kind in "fc"
         values = record.array("values", field.values.dtype if field and kept else np.float32, 3)
@@ -443,10 +437,10 @@ class Volume:
         return cls(values, Grid(x, y, z), record.provenance)
 
     def save(self, path: str | Path, compressed: bool = True) -> None:
-        """Write the volume to an HDF5 file, whole or not at all; `compressed` as of `Record.save`."""
+        """Write the volume to an HDF5 file ``path``, ``compressed`` or not, whole or not at all."""
         self.to_record().save(path, compressed)
 
     @classmethod
     def load(cls, path: str | Path) -> Volume:
-        """Read a volume that `save` wrote."""
+        """Read the volume that `save` wrote to ``path``."""
         return cls.from_record(Record.load(path, "volume"))

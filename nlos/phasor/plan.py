@@ -9,6 +9,7 @@ spots and wall points may take each other's place: light takes the same path eit
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -49,7 +50,6 @@ from nlos.phasor.propagate import (
 from nlos.phasor.wall_to_plane import WallBeforePlane
 from nlos.plane import (
     PlanarWall,
-    Plane,
     StraightPaths,
     WallLattice,
     choose_virtual_plane,
@@ -59,11 +59,9 @@ from nlos.volume import Grid, Volume
 from tofclip.arrays import Array, FloatArray
 from tofclip.errors import InputError
 
-# Per voxel: a complex64 sum, and its float32 magnitude.
-SUM_BYTES, MAGNITUDE_BYTES = 8, 4
-# Per voxel, at most: the complex64 images of those depths that are computed, from which the others
-# follow.
-COMPUTED_BYTES = 8
+# Per voxel: a complex64 sum, and, at most, the images of the depths from which the others follow; and
+# per sample of the signal.
+SUM_BYTES, COMPUTED_BYTES, SIGNAL_BYTES = 8, 8, 4
 # Spectra are held before and after they are transformed.
 SPECTRUM_COPIES = 2
 
@@ -78,13 +76,6 @@ class GroupPlan:
     wall_to_plane: WallToPlane
     plane_to_depths: DiffractionPlan  # from the plane, the wall's own or a virtual one
     wall_fraction: float = 0.0  # of all time, what the way from the wall to the plane takes
-
-    @property
-    def memory_bytes(self) -> int:
-        """What fields and plane waves take, all frequencies together, bytes; an estimate."""
-        plan = self.plane_to_depths
-        values = int(plan.plane_wave_count) + plan.plane.x.size * plan.plane.y.size
-        return (values + len(self.group.indices)) * plan.waves.count * BYTES_PER_WAVE
 
 
 class WavePlan(PhasorPlan):
@@ -101,36 +92,20 @@ class WavePlan(PhasorPlan):
     ) -> None:
         super().__init__(capture, grid)
         self.band, self.groups, self.settings = band, groups, dict(settings)
-        self._backend = backend
-        self._memory_bytes = (
-            grid.size * (SUM_BYTES + COMPUTED_BYTES + MAGNITUDE_BYTES)
-            + MAGNITUDE_BYTES * capture.axis.bins * capture.valid.size
-            + SPECTRUM_COPIES * groups[0].memory_bytes
+        self._backend, self.images, self.cost = backend, len(groups), len(groups) * grid.size
+        self.plane = groups[0].plane_to_depths.plane
+        # What fields and plane waves of a group take, all frequencies together.
+        depths = groups[0].plane_to_depths
+        values = int(depths.plane_wave_count) + math.prod(self.plane.shape)
+        values += len(groups[0].group.indices)
+        self.memory_bytes += (
+            grid.size * COMPUTED_BYTES + SIGNAL_BYTES * capture.axis.bins * capture.valid.size
         )
+        self.memory_bytes += SPECTRUM_COPIES * values * depths.waves.count * BYTES_PER_WAVE
         self._held: tuple[DiffractionPlan | None, dict[int, Diffraction]] = None, {}
-        self._warned = False
-
-    @property
-    def cost(self) -> int:
-        return len(self.groups) * self.grid.size
-
-    @property
-    def images(self) -> int:
-        return len(self.groups)
-
-    @property
-    def memory_bytes(self) -> int:
-        return self._memory_bytes
-
-    @property
-    def plane(self) -> Plane:
-        """The plane of the first illumination group."""
-        return self.groups[0].plane_to_depths.plane
 
     def _field(self, capture: Capture, progress: Progress) -> Volume:
-        if not self._warned:
-            warn_of_aliasing(capture, self.band)
-            self._warned = True
+        warn_of_aliasing(capture, self.band)
         total = self.zeros()
         for number in range(len(self.groups)):
             on_plane = self.propagate_to_plane(number, capture, progress)
@@ -146,8 +121,8 @@ class WavePlan(PhasorPlan):
         this and `add_to_depths` report all voxels together.
         """
         group = self.groups[number]
-        plane, waves = group.plane_to_depths.plane, group.plane_to_depths.waves
-        points = plane.x.size * plane.y.size * waves.count
+        depths = group.plane_to_depths
+        points = math.prod(depths.plane.shape) * depths.waves.count
         part = SubProgress(progress, points, self._wall_work(number))
         return group.wall_to_plane(capture, part, group.group)
 
@@ -191,19 +166,8 @@ class ReciprocalPlan(PhasorPlan):
 
     def __init__(self, capture: Capture, grid: Grid, swapped: WavePlan) -> None:
         super().__init__(capture, grid)
-        self.swapped = swapped
-
-    @property
-    def cost(self) -> int:
-        return 2 * self.swapped.cost
-
-    @property
-    def images(self) -> int:
-        return 2 * self.swapped.images
-
-    @property
-    def memory_bytes(self) -> int:
-        return self.swapped.memory_bytes + 2 * SUM_BYTES * self.grid.size
+        self.swapped, self.cost, self.images = swapped, 2 * swapped.cost, 2 * swapped.images
+        self.memory_bytes = swapped.memory_bytes + 2 * SUM_BYTES * grid.size
 
     def _field(self, capture: Capture, progress: Progress) -> Volume:
         plain, device = swap_roles(capture), capture.device
@@ -258,24 +222,6 @@ class WaveMethod(PhasorMethod):
         return {"method": self.name, **pulse, "tolerance": self.tolerance}
 
     def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
-        """Make the method ready for captures like `capture` on `grid`.
-
-        Parameters
-        ----------
-        capture : Capture
-            Of few laser spots, or of few wall points; the wall such as the method takes.
-        grid : Grid
-            In front of the wall, evenly spaced along x and y.
-
-        Returns
-        -------
-        PhasorPlan
-
-        Raises
-        ------
-        InputError
-            The method cannot image such a capture on the grid, or not within memory.
-        """
         quicker = choose_roles(capture)
         plan = plan_waves(self, quicker, grid)
         return plan if quicker is capture else ReciprocalPlan(capture, grid, plan)

@@ -254,15 +254,8 @@ class RefinementPlan(Plan):
     def __init__(self, capture: Capture, grid: Grid, method: Refinement, hybrid: WavePlan) -> None:
         super().__init__(capture, grid)
         self.method, self.hybrid = method, hybrid
-
-    @property
-    def cost(self) -> int:
-        """Voxels in all iterations."""
-        return self.method.prior.work(self.grid.size)
-
-    @property
-    def memory_bytes(self) -> int:
-        return self.hybrid.memory_bytes + 4 * SOLVER_VOLUMES * self.grid.size
+        self.cost = method.prior.work(grid.size)  # voxels in all iterations
+        self.memory_bytes = hybrid.memory_bytes + 4 * SOLVER_VOLUMES * grid.size
 
     def _image(self, capture: Capture, progress: Progress) -> Volume:
         warn_of_aliasing(capture, self.hybrid.band)

@@ -411,16 +411,10 @@ class PhotonPlan(Plan):
     ) -> None:
         super().__init__(capture, grid)
         self.method, self.linear = method, linear
-
-    @property
-    def cost(self) -> int:
-        """Two linear images, and as much for each pass."""
-        return self.linear.cost * (2 + COARSE_PASSES + self.method.iterations)
-
-    @property
-    def memory_bytes(self) -> int:
-        signals = self.geometry.axis.bins * self.geometry.wall.size // 3
-        return self.linear.memory_bytes + 4 * VOLUME_COPIES * self.grid.size + 24 * signals
+        # two linear images, and as much for each pass
+        self.cost = linear.cost * (2 + COARSE_PASSES + method.iterations)
+        signals = capture.axis.bins * capture.valid.size
+        self.memory_bytes = linear.memory_bytes + 4 * VOLUME_COPIES * grid.size + 24 * signals
 
     def _image(self, capture: Capture, progress: Progress) -> Volume:
         photons = CountedPhotons.of(capture, self.method.blank, self.method.ramp)
