@@ -127,10 +127,8 @@ class AravisFeed(FrameFeed):
     def calibration(self) -> Record | None:
         """Times of the gate, or of the rows of a streak picture, where the address gives them."""
         options = self._options
-        if options.gate is not None:
-            return options.gate.to_record()
-        if options.row_ps is None:
-            return None
+        if options.is_gated or options.row_ps is None:
+            return options.gate_record
         times = (np.arange(self.codec.rows) + 0.5) * options.row_ps * PICOSECOND_S
         return Record("streak_calibration", {"row_times": Field(times, "s", ("row",))})
 
@@ -286,7 +284,7 @@ class AravisFeed(FrameFeed):
         except DeviceError:
             self._count_unnumbered()
             self._reconnect(self._reopen, self._options.reconnect_s)
-            self._end_scan(self._options.gate)
+            self._end_scan(self._options)
 
     def _reopen(self) -> None:
         self._open_camera()

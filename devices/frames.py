@@ -21,58 +21,46 @@ from tofclip.storage import Field, Record, Scalar
 
 
 @dataclass(frozen=True)
-class GateScan:
-    """A scan of a gate; a picture's number modulo `steps` is its step."""
+class GatedOptions(LiveOptions):
+    """Values of cameras that may stand behind a gate, or be one: ``mode=gated&gate_steps=...``. A
+    picture's number modulo `scan_pictures` is its step in a scan.
+    """
 
-    steps: int = 72  # pictures of one scan
-    step_ps: float = 252.0  # how much later the gate opens from one to the next
-    width_ns: float = 5.0  # how long it is open
-    offset_ps: float = 5000.0  # when it opens in the first one, after the laser's pulse
+    mode: str = option("", choices=("free", "gated"))
+    gate_steps: int = option(72, least=2, most=4096)  # pictures of one scan
+    # how much later the gate opens from one to the next
+    gate_step_ps: float = option(252.0, least=1, most=1e9)
+    gate_width_ns: float = option(5.0, above=0, most=1e6)  # how long it is open
+    # when it opens in the first one, after the laser's pulse
+    gate_offset_ps: float = option(5000.0, least=0, most=1e9)
 
-    def __post_init__(self) -> None:
-        if not (
-            2 <= self.steps <= 4096
-            and 1 <= self.step_ps <= 1e9
-            and 0 < self.width_ns <= 1e6
-            and 0 <= self.offset_ps <= 1e9
-        ):
-            raise InputError(
-                f"a gate moves in 2 to 4096 steps of 1 ps to 1 ms and is open for up to 1 ms, got {self}"
-            )
+    @property
+    def is_gated(self) -> bool:
+        """Whether there is a gate."""
+        return self.mode == "gated"
+
+    @property
+    def scan_pictures(self) -> int:
+        """Pictures of a scan, 1 where there is no gate."""
+        return self.gate_steps if self.is_gated else 1
 
     @property
     def opening_times(self) -> NDArray[np.float64]:
         """When the gate opens in each picture of a scan, s after the laser's pulse."""
-        steps = np.arange(self.steps, dtype=np.float64)
-        return (self.offset_ps + self.step_ps * steps) * 1e-12
+        steps = np.arange(self.gate_steps, dtype=np.float64)
+        return (self.gate_offset_ps + self.gate_step_ps * steps) * 1e-12
 
-    def to_record(self) -> Record:
-        """Return the calibration that `devices.transients.read_photons` reads."""
-        times = Field(self.opening_times, "s", ("gate_step",))
-        return Record("gate_scan", {"gate_times": times}, {"gate_width_s": self.width_ns * 1e-9})
-
-
-@dataclass(frozen=True)
-class GatedOptions(LiveOptions):
-    """Values of cameras that may stand behind a gate, or be one: ``mode=gated&gate_steps=...``."""
-
-    mode: str = option("", choices=("free", "gated"))
-    gate_steps: int = option(GateScan.steps)
-    gate_step_ps: float = option(GateScan.step_ps)
-    gate_width_ns: float = option(GateScan.width_ns)
-    gate_offset_ps: float = option(GateScan.offset_ps)
-
-    @cached_property
-    def gate(self) -> GateScan | None:
-        """The scan, None where there is no gate."""
-        if self.mode != "gated":
-            return None
-        return GateScan(self.gate_steps, self.gate_step_ps, self.gate_width_ns, self.gate_offset_ps)
+    @property
+    def gate_record(self) -> Record | None:
+        """The calibration that `devices.transients.read_photons` reads; None where there is no gate."""
+        times = {"gate_times": Field(self.opening_times, "s", ("gate_step",))}
+        width = {"gate_width_s": self.gate_width_ns * 1e-9}
+        return Record("gate_scan", times, width) if self.is_gated else None
 
     @classmethod
     def from_uri(cls, uri: Uri, *others: str) -> Self:
         found = super().from_uri(uri, *others)
-        if found.gate is None and any(name.startswith("gate_") for name in uri.values):
+        if not found.is_gated and any(name.startswith("gate_") for name in uri.values):
             raise InputError(f"'{uri.text}': a gate needs mode=gated")
         return found
 
@@ -209,7 +197,6 @@ class FrameFeed(Feed):
         self.ledger.reconnect()
         self._gap = Gap.RESTART
 
-    def _end_scan(self, gate: GateScan | None) -> None:
+    def _end_scan(self, options: GatedOptions) -> None:
         """Count up to the beginning of the next scan: one that was cut is never finished."""
-        if gate is not None:
-            self._number += -self._number % gate.steps
+        self._number += -self._number % options.scan_pictures

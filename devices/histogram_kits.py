@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from math import isqrt
 from time import monotonic
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,27 +73,16 @@ class KitFrame:
     stamp: float | None = None  # s of the kit's clock
 
 
-@dataclass
 class Tmf8828Parser:
     """See the module's text."""
 
-    zones: int = 64  # 64, or 9 for the 3 x 3 mode
-    scale: ClassVar[float] = 1.0  # what one stored count stands for
-
-    def __post_init__(self) -> None:
-        if self.zones not in TMF_ZONES:
-            raise InputError(f"a TMF8828 has 64 zones or 9, not {self.zones}")
-        self._captures = TMF_CAPTURES if self.zones == 64 else 1
-        self._halves = 2 if self.zones == 64 else 1
+    def __init__(self, options: Tmf8828Options) -> None:
+        self._zones = find_tmf_zones(options.zones)
+        self._captures, self._halves = (TMF_CAPTURES, 2) if options.zones == 64 else (1, 1)
         self._last_frame: int | None = None
-        self._counts = np.zeros((TMF_BINS, self.zones), np.uint32)
+        self._counts = np.zeros((TMF_BINS, options.zones), np.uint32)
         self._complete = 0
         self._begin_capture()
-
-    @property
-    def codec(self) -> FrameCodec:
-        """Histograms as pictures of one row for each bin, one column for each zone."""
-        return FrameCodec(TMF_BINS, self.zones, 32)
 
     def parse_line(self, line: bytes) -> KitFrame | None:
         """Take the next line; return the frame that it completes, if it does."""
@@ -129,10 +118,9 @@ class Tmf8828Parser:
             # Counts of 24 bits come as three lines of bytes, the lowest first.
             channels = lanes[:, 0] | lanes[:, 1] << 8 | lanes[:, 2] << 16
             # Channel 0 is the reference that looks at the emitter, not at the scene.
-            looking = channels[:, 1 : 1 + self.zones // (self._captures * self._halves)]
-            width = self.zones // self._captures
-            own = find_tmf_zones(self.zones)[place * width : (place + 1) * width]
-            self._counts[:, own] = looking.reshape(width, -1).T
+            own = np.split(self._zones, self._captures)[place]
+            looking = channels[:, 1 : 1 + own.size // self._halves]
+            self._counts[:, own] = looking.reshape(own.size, -1).T
             self._complete |= 1 << place
         self._begin_capture()
         if place != self._captures - 1:
@@ -145,26 +133,12 @@ class Tmf8828Parser:
         return KitFrame(counts, missing, tick * TMF_TICK_S if tick else None)
 
 
-@dataclass
 class Vl53l8Parser:
     """See the module's text."""
 
-    zones: int = 16  # as the kit's program was set
-    bins: int = 24  # as the kit's program was set
-    scale: ClassVar[float] = 1 / VL53_SCALE
-
-    def __post_init__(self) -> None:
-        if not (1 <= self.zones <= 64 and 1 <= self.bins <= 144):
-            raise InputError(
-                f"a VL53L8CH has up to 64 zones and 144 bins, not {self.zones} and {self.bins}"
-            )
-        self._counts = np.zeros((self.bins, self.zones), np.uint32)
+    def __init__(self, options: Vl53l8Options) -> None:
+        self._counts = np.zeros((options.bins, options.zones), np.uint32)
         self._next = 0
-
-    @property
-    def codec(self) -> FrameCodec:
-        """As of a `Tmf8828Parser`."""
-        return FrameCodec(self.bins, self.zones, 32)
 
     def parse_line(self, line: bytes) -> KitFrame | None:
         """Take the next line; return the frame that it completes, if it does."""
@@ -182,20 +156,18 @@ class Vl53l8Parser:
             self._next = 0
         # Behind every value stands a comma: without the last one it may have lost digits.
         is_ended = tail.rstrip().endswith(b",")
-        is_whole = len(values) == self.bins and bool(np.all(np.isfinite(values)))
+        bins, zones = self._counts.shape
+        is_whole = len(values) == bins and bool(np.all(np.isfinite(values)))
         if is_ended and is_whole and place == self._next:
             # The sensor subtracts the ambient light itself, which may leave less than nothing.
             self._counts[:, place] = np.rint(np.clip(values, 0, 4e8) * VL53_SCALE)
             self._next += 1
         else:
             self._next = -1  # wait for the next beginning
-        if place != self.zones - 1:
+        if place != zones - 1:
             return None
-        is_complete, self._next = self._next == self.zones, 0
+        is_complete, self._next = self._next == zones, 0
         return KitFrame(self._counts.copy() if is_complete else None)
-
-
-Parser = Tmf8828Parser | Vl53l8Parser
 
 
 def _parse_integers(words: list[bytes]) -> NDArray[np.int64] | None:
@@ -209,55 +181,48 @@ PICOSECOND_S = 1e-12
 
 
 @dataclass(frozen=True)
-class KitOptions(LiveOptions):
-    """Values of an address that all kits share."""
-
-    instrument: ClassVar[str]
-    baud: int = option(460_800)
-    start: str = option("")  # letters that begin measuring; none: the program does so by itself
-    zones: int = option(16)
-    stop: ClassVar[bytes] = b""  # what ends measuring, where something began it
-
-
-@dataclass(frozen=True)
-class Tmf8828Options(KitOptions):
+class Tmf8828Options(LiveOptions):
     """Values of a TMF8828's address."""
 
-    instrument = "TMF8828 histogram kit"
+    instrument: ClassVar = "TMF8828 histogram kit"
+    parser: ClassVar[Any] = Tmf8828Parser
+    bins: ClassVar = TMF_BINS
+    begin: ClassVar = 0.0  # of the first bin, s
+    scale: ClassVar = 1.0  # what one stored count stands for
+    stop: ClassVar = b"s"  # ends measuring, where something began it
     bin_ps: float = option(0.0)  # depends on the kit's settings and has to be given
     baud: int = option(1_000_000)
-    # Enable, dump histograms, measure: the state after the reset that opening the port brings.
+    # Letters that begin measuring: enable, dump histograms, measure, the state after the reset that
+    # opening the port brings. None: the kit's program begins by itself.
     start: str = option("ezm")
-    zones: int = option(64)
-    stop = b"s"
+    zones: int = option(64)  # 64, or 9 for the 3 x 3 mode
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 < self.bin_ps < 1e6:
             raise InputError("add bin_ps=..., the duration of a bin as the kit was set")
+        if self.zones not in TMF_ZONES:
+            raise InputError(f"a TMF8828 has 64 zones or 9, not {self.zones}")
 
     @property
     def bin_width(self) -> float:
         """Duration of a bin, s."""
         return self.bin_ps * PICOSECOND_S
 
-    @property
-    def first_bin(self) -> float:
-        """Middle of the first bin, s."""
-        return self.bin_width / 2
-
-    def make_parser(self) -> Tmf8828Parser:
-        """Return a parser of the kit's lines that has seen none of them."""
-        return Tmf8828Parser(self.zones)
-
 
 @dataclass(frozen=True)
-class Vl53l8Options(KitOptions):
+class Vl53l8Options(LiveOptions):
     """Values of a VL53L8CH's address: as the kit's program was set."""
 
-    instrument = "VL53L8CH histogram kit"
-    bins: int = option(24)
-    sub_sample: int = option(4, least=1, most=64)
+    instrument: ClassVar = "VL53L8CH histogram kit"
+    parser: ClassVar[Any] = Vl53l8Parser
+    scale: ClassVar = 1 / VL53_SCALE
+    stop: ClassVar = b""
+    baud: int = option(460_800)
+    start: str = option("")
+    zones: int = option(16, least=1, most=64)
+    bins: int = option(24, least=1, most=144)
+    sub_sample: int = option(4, least=1, most=64)  # of the sensor's own bins, in one
     start_bin: int = option(0, least=0, most=144)
 
     @property
@@ -266,13 +231,9 @@ class Vl53l8Options(KitOptions):
         return self.sub_sample * VL53_NATIVE_BIN_S
 
     @property
-    def first_bin(self) -> float:
-        """Middle of the first bin, s."""
-        return self.start_bin * VL53_NATIVE_BIN_S + self.bin_width / 2
-
-    def make_parser(self) -> Vl53l8Parser:
-        """Return a parser of the kit's lines that has seen none of them."""
-        return Vl53l8Parser(self.zones, self.bins)
+    def begin(self) -> float:
+        """Begin of the first bin, s."""
+        return self.start_bin * VL53_NATIVE_BIN_S
 
 
 class KitFeed(FrameFeed):
@@ -289,14 +250,15 @@ class KitFeed(FrameFeed):
         self._ready: deque[tuple[int, bytes, float]] = deque()
         self._is_stopped = False
         self._open_port()
-        self.codec = self._parser.codec
+        # a row for each bin, a column for each zone
+        self.codec = FrameCodec(options.bins, options.zones, 32)
 
     @property
     def info(self) -> Info:
-        codec, options = self.codec, self._options
-        shape = {"bins": codec.rows, "zones": codec.columns, "bin_width_s": options.bin_width}
+        options = self._options
+        known = {"bins": options.bins, "zones": options.zones, "bin_width_s": options.bin_width}
         limits = "written from public programs; no such kit was at hand"
-        return Info(options.instrument, "", {"port": self._name, **shape, "limits": limits})
+        return Info(options.instrument, "", {"port": self._name, **known, "limits": limits})
 
     @property
     def calibration(self) -> Record | None:
@@ -304,15 +266,14 @@ class KitFeed(FrameFeed):
         by row as they come; of other numbers, and where `shape` of an address says so, a picture of
         its own.
         """
-        options = self._options
-        times = Field(
-            options.first_bin + options.bin_width * np.arange(self.codec.rows), "s", ("bin",)
-        )
-        side = isqrt(self.codec.columns)
-        rows = side if side**2 == self.codec.columns else 1
-        shape = Field(np.array([rows, self.codec.columns // rows]), "px", ("yx",))
-        known = {"bin_times": times, "image_shape": shape}
-        return Record("histograms", known, {"count_scale": self._parser.scale})
+        options, zones = self._options, self._options.zones
+        times = options.begin + options.bin_width * (np.arange(options.bins) + 0.5)
+        rows = isqrt(zones) if isqrt(zones) ** 2 == zones else 1
+        known = {
+            "bin_times": Field(times, "s", ("bin",)),
+            "image_shape": Field(np.array([rows, zones // rows]), "px", ("yx",)),
+        }
+        return Record("histograms", known, {"count_scale": options.scale})
 
     def start(self) -> None:
         with self._translate_errors():
@@ -350,7 +311,7 @@ class KitFeed(FrameFeed):
             raise MissingDependencyError(
                 "histogram kits need pyserial: pip install 'tofclip[serial]'"
             ) from fault
-        self._parser = self._options.make_parser()
+        self._parser = self._options.parser(self._options)
         self._line, self._is_line_too_long = b"", False
         self._clock.reset()
         try:

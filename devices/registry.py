@@ -13,7 +13,8 @@ from pathlib import Path
 from devices.address import Uri
 from devices.source import Codec, Source
 from tofclip.errors import InputError
-from tofclip.plugins import Parts, load_target
+from tofclip.files import format_error_line
+from tofclip.plugins import Parts
 from tofclip.storage import Scalar
 
 SOURCES = Parts(
@@ -59,11 +60,15 @@ CODECS = Parts(
         "timetag": "devices.timetag_codec:TimeTagCodec",
     },
 )
-# Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail,
-# without hardware.
-FINDERS: tuple[str, ...] = (
-    "devices.timetag:find_timetaggers",
-    "devices.aravis:find_cameras",
+# Functions ``() -> list[DiscoveredInstrument]`` that look for connected instruments, by the scheme of
+# their addresses. They return nothing, and never fail, without hardware.
+FINDERS = Parts(
+    "tofclip.finders",
+    "finder",
+    {
+        "timetag": "devices.timetag:find_timetaggers",
+        "aravis": "devices.aravis:find_cameras",
+    },
 )
 
 
@@ -137,8 +142,17 @@ def list_endings() -> list[str]:
 
 
 def discover() -> list[DiscoveredInstrument]:
-    """Look for instruments; without any hardware, or libraries for it, the list is empty."""
-    return [found for finder in FINDERS for found in load_target(finder)()]
+    """Look for instruments, also those of other packages; without any hardware, or libraries for it,
+    the list is empty.
+    """
+    found: list[DiscoveredInstrument] = []
+    for name in FINDERS:
+        try:
+            found += FINDERS[name]()
+        except Exception as fault:  # whatever another package does: the others are found
+            said = f"cannot be looked for: {format_error_line(fault)}"
+            found.append(DiscoveredInstrument(f"{name}://", FINDERS.get_origin(name), said))
+    return found
 
 
 def build_codec(name: str, settings: Mapping[str, Scalar]) -> Codec:

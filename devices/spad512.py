@@ -18,9 +18,10 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic
+from typing import Any
 
 from devices.address import Uri, option
-from devices.frames import FrameCodec, FrameFeed, GatedOptions, GateScan
+from devices.frames import FrameCodec, FrameFeed, GatedOptions
 from devices.source import Info
 from devices.stream import StreamSource, Transfer
 from devices.tcp import TcpLink
@@ -53,45 +54,48 @@ _GATED = re.compile(
     % (_BITS, _NUMBER, _COUNT, _NUMBER, _NUMBER, _NUMBER)
 )
 _ERROR_TEXT = re.compile(rb"[\t\n\r -~]{0,240}\Z")
-_MICROSECOND_DEPTHS = (1, 4)  # the others take milliseconds
 
 
 @dataclass(frozen=True)
-class ExposureRequest:
-    """A request for pictures."""
+class SpadOptions(GatedOptions):
+    """Values of an address that say what pictures to take; the request for them, and what comes."""
 
-    bits: int = 8  # depth of a picture; 1, 4, 6..12, behind a gate 6..12
-    seconds: float = 1e-3  # integration time of a picture
-    images: int = 1  # pictures of one request, or scans of a gate
+    mode: str = option("", choices=("intensity", "gated"))
+    gate_step_ps: float = option(252.0, least=GATE_STEP_PS, most=1e9)
+    bits: int = option(8)  # depth of a picture; 1, 4, 6..12, behind a gate 6..12
+    exposure_us: float = option(1000.0)  # integration time of a picture
+    images: int = option(1)  # pictures of one request, or scans of a gate
     # columns, a power of two within 4..512; 512 for single bits and behind a gate
-    width: int = ROWS
+    width: int = option(ROWS)
     # whether the server corrects counts for photons that came in a pixel's dead time; they have 16
     # bits then
-    pile_up: bool = False
-    gate: GateScan | None = None
+    pile_up: bool = option(False)
+    timeout_s: float = option(5.0, above=0, most=600)  # for an answer, beyond the exposure
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.bits not in BIT_DEPTHS or self.width not in IMAGE_WIDTHS_PX:
             raise InputError(
                 f"a SPAD512 has depths of {BIT_DEPTHS} and widths of {IMAGE_WIDTHS_PX}, not {self.bits}, {self.width}"
             )
         if self.bits == 1 and (self.width != ROWS or self.pile_up):
             raise InputError("single bits come at full width and without correction of pile-up")
-        if self.gate is not None and (self.bits not in GATED_BIT_DEPTHS or self.width != ROWS):
+        if self.is_gated and (self.bits not in GATED_BIT_DEPTHS or self.width != ROWS):
             raise InputError("pictures behind a gate have full width and 6 to 12 bits")
-        if self.gate is not None and self.gate.step_ps < GATE_STEP_PS:
-            raise InputError(
-                f"a SPAD512's gate moves by at least {GATE_STEP_PS} ps, got {self.gate.step_ps:g}"
-            )
         if not (0 < self.seconds <= 3600 and self.images >= 1 and self.frames <= MAX_IMAGES):
             raise InputError(
                 f"pictures need an exposure within 0..3600 s, and 1..{MAX_IMAGES} of them, got {self}"
             )
 
     @property
+    def seconds(self) -> float:
+        """Integration time of a picture, s."""
+        return self.exposure_us * 1e-6
+
+    @property
     def frames(self) -> int:
-        """Pictures in the answer: behind a gate all steps of the first scan, then of the second."""
-        return self.images * (1 if self.gate is None else self.gate.steps)
+        """Pictures in an answer: behind a gate all steps of the first scan, then of the second."""
+        return self.images * self.scan_pictures
 
     @property
     def codec(self) -> FrameCodec:
@@ -101,37 +105,41 @@ class ExposureRequest:
         return FrameCodec(ROWS, self.width, 16 if self.bits > 8 or self.pile_up else 8)
 
     def encode(self) -> bytes:
-        """Return the command."""
-        unit = 1e-6 if self.bits in _MICROSECOND_DEPTHS else 1e-3
-        amount = f"{self.bits},{self.seconds / unit:.9g},{self.images}"
-        if self.gate is None:
+        """Return the command that asks for the pictures."""
+        amount = f"{self.bits},{self.exposure_us / _find_time_unit_us(self.bits):.9g},{self.images}"
+        if not self.is_gated:
             return f"I,{amount},0,1,0,1,{self.width}".encode()
-        gate = self.gate
+        steps = f"{self.gate_steps},{self.gate_step_ps:.9g}"
+        gate = f"{self.gate_width_ns:.9g},{self.gate_offset_ps:.9g}"
         # Even steps; forwards; the laser's own trigger; no reading during exposure; streamed.
-        return (
-            f"G,{amount},{gate.steps},{gate.step_ps:.9g},0,{gate.width_ns:.9g},{gate.offset_ps:.9g},0,1,0,1"
-        ).encode()
+        return f"G,{amount},{steps},0,{gate},0,1,0,1".encode()
 
     def encode_pile_up(self) -> bytes:
         """Return the command that has to be sent before."""
         return f"PU,{int(self.pile_up)}".encode()
 
     @classmethod
-    def decode(cls, line: bytes, pile_up: bool = False) -> ExposureRequest:
+    def decode(cls, line: bytes, pile_up: bool = False) -> SpadOptions:
         """Read a command; `pile_up`: as in the class."""
         found = _INTENSITY.fullmatch(line) or _GATED.fullmatch(line)
         if found is None:
             raise ProtocolError(f"{line[:60]!r} is not a request for pictures")
         bits, time, images, *rest = found.groups()
-        unit = 1e-6 if int(bits) in _MICROSECOND_DEPTHS else 1e-3
-        exposure = int(bits), float(time) * unit, int(images)
+        known: dict[str, Any] = {"width": int(rest[0] or ROWS)}
+        if line.startswith(b"G"):
+            names = ("gate_step_ps", "gate_width_ns", "gate_offset_ps")
+            known = dict(zip(names, map(float, rest[1:]), strict=True))
+            known |= {"mode": "gated", "gate_steps": int(rest[0])}
+        known |= {"bits": int(bits), "images": int(images), "pile_up": pile_up}
         try:
-            if line.startswith(b"I"):
-                return cls(*exposure, int(rest[0] or ROWS), pile_up)
-            steps, *numbers = rest
-            return cls(*exposure, ROWS, pile_up, GateScan(int(steps), *map(float, numbers)))
+            return cls(exposure_us=float(time) * _find_time_unit_us(int(bits)), **known)
         except InputError as fault:
             raise ProtocolError(f"{line[:60]!r} requests pictures that cannot be") from fault
+
+
+def _find_time_unit_us(bits: int) -> float:
+    """Commands for pictures of 1 and 4 bits count us, the others ms."""
+    return 1.0 if bits in (1, 4) else 1e3
 
 
 def find_error_text(data: bytes | bytearray) -> str | None:
@@ -152,25 +160,6 @@ def find_error_text(data: bytes | bytearray) -> str | None:
 INSTRUMENT = "SPAD512 array"
 
 
-@dataclass(frozen=True)
-class SpadOptions(GatedOptions):
-    """Values of an address that say what pictures to take."""
-
-    mode: str = option("", choices=("intensity", "gated"))
-    bits: int = option(8)
-    exposure_us: float = option(1000.0)
-    images: int = option(1)
-    width: int = option(ROWS)
-    pile_up: bool = option(False)
-    timeout_s: float = option(5.0, above=0, most=600)  # for an answer, beyond the exposure
-
-    @property
-    def request(self) -> ExposureRequest:
-        """What is asked for."""
-        exposure = self.bits, self.exposure_us * 1e-6, self.images
-        return ExposureRequest(*exposure, self.width, self.pile_up, self.gate)
-
-
 _SILENCE_S = 0.2  # Seconds after which a text of unknown length has ended
 
 # Seconds that the server may calibrate itself when it is first asked
@@ -188,8 +177,7 @@ class Spad512Feed(FrameFeed):
     def __init__(self, connect: Callable[[], TcpLink], options: SpadOptions) -> None:
         super().__init__()
         self._connect, self._options = connect, options
-        self._exposure, self._patience = options.request, options.timeout_s
-        self.codec = self._exposure.codec
+        self._patience, self.codec = options.timeout_s, options.codec
         self._frames_due = 0
         self._received = bytearray()
         self._stopped = False
@@ -203,8 +191,8 @@ class Spad512Feed(FrameFeed):
             {
                 "greeting": self._greeting,
                 "system": "; ".join(self._facts),
-                "bits": self._exposure.bits,
-                "exposure_s": self._exposure.seconds,
+                "bits": self._options.bits,
+                "exposure_s": self._options.seconds,
                 "rows": self.codec.rows,
                 "columns": self.codec.columns,
             },
@@ -213,17 +201,16 @@ class Spad512Feed(FrameFeed):
     @property
     def calibration(self) -> Record | None:
         """When the gate opens in each picture of a scan, s; None where there is no gate."""
-        gate = self._exposure.gate
-        return None if gate is None else gate.to_record()
+        return self._options.gate_record
 
     def pull(self, timeout: float) -> Transfer | None:
         while True:
             if self._frames_due == 0:
                 if self._stopped:
                     return None
-                self._link.send(self._exposure.encode(), self._patience)
-                self._frames_due = self._exposure.frames
-                self._deadline = monotonic() + self._exposure.seconds + self._patience
+                self._link.send(self._options.encode(), self._patience)
+                self._frames_due = self._options.frames
+                self._deadline = monotonic() + self._options.seconds + self._patience
             try:
                 return self._read_frame(timeout)
             except DeviceDisconnectedError:
@@ -243,7 +230,7 @@ class Spad512Feed(FrameFeed):
         try:
             self._greeting = self._read_text(self._patience)
             self._facts = self._ask_system()
-            link.send(self._exposure.encode_pile_up(), self._patience)
+            link.send(self._options.encode_pile_up(), self._patience)
             self._read_text(self._patience)
         except BaseException:
             link.close()
@@ -285,7 +272,7 @@ class Spad512Feed(FrameFeed):
             )
         self._received.clear()
         self._frames_due -= 1
-        self._deadline = monotonic() + self._exposure.seconds + self._patience
+        self._deadline = monotonic() + self._options.seconds + self._patience
         self._number += 1
         return self._hand_over(self._number - 1, pixels)
 
@@ -312,7 +299,7 @@ class Spad512Feed(FrameFeed):
         if self._received:
             self.ledger.truncate()
             self._number += 1
-        self._end_scan(self._exposure.gate)
+        self._end_scan(self._options)
         self._frames_due = 0
         self._received.clear()
 

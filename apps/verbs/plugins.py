@@ -44,11 +44,12 @@ def plugins(
 
 def list_parts() -> Iterator[dict[str, Any]]:
     """Describe every part; `fault`: why it cannot be used, where it cannot."""
-    from devices.registry import CODECS, SOURCES
+    from devices.registry import CODECS, FINDERS, SOURCES
     from nlos.io.format_detection import READERS as CAPTURE_READERS
     from nlos.settings import METHODS as HIDDEN_SCENE_METHODS
 
-    own = METHODS, DENOISERS, READERS, SOURCES, CODECS, HIDDEN_SCENE_METHODS, CAPTURE_READERS
+    streaks = METHODS, DENOISERS, READERS, SOURCES, FINDERS, CODECS
+    own = *streaks, HIDDEN_SCENE_METHODS, CAPTURE_READERS
     for parts in own:
         for name in parts:
             yield _describe(parts, name)

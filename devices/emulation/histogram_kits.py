@@ -8,9 +8,8 @@ import select
 import threading
 import time
 import tty
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +32,6 @@ from devices.histogram_kits import (
 from devices.stream import StreamSource
 from tofclip.units import SPEED_OF_LIGHT
 
-LineFormatter = Callable[[NDArray[np.uint32], int, int], list[bytes]]
 PEAK_COUNTS, BACKGROUND_COUNTS = 400.0, 4.0
 PULSE_S = 0.375e-9  # Standard deviation of the emulated pulse
 
@@ -92,11 +90,14 @@ class EmulatedTmf8828Options(EmulationOptions, Tmf8828Options):
     """Of a TMF8828."""
 
     bin_ps: float = option(250.0)
+    format_lines: ClassVar = staticmethod(format_tmf8828)
 
 
 @dataclass(frozen=True)
 class EmulatedVl53l8Options(EmulationOptions, Vl53l8Options):
     """Of a VL53L8CH."""
+
+    format_lines: ClassVar = staticmethod(format_vl53l8)
 
 
 EmulatedOptions = EmulatedTmf8828Options | EmulatedVl53l8Options
@@ -105,10 +106,8 @@ EmulatedOptions = EmulatedTmf8828Options | EmulatedVl53l8Options
 class EmulatedKit:
     """A kit that sends frames once it has been asked to, or at once where it needs no asking."""
 
-    def __init__(self, options: EmulatedOptions, format_lines: LineFormatter) -> None:
-        self._options, self._format = options, format_lines
-        codec = options.make_parser().codec
-        self._bins, self._zones = codec.rows, codec.columns
+    def __init__(self, options: EmulatedOptions) -> None:
+        self._options = options
         self._controller, self._terminal = os.openpty()
         tty.setraw(self._terminal)  # without echo, as a serial port
         self.port = os.ttyname(self._terminal)
@@ -121,11 +120,12 @@ class EmulatedKit:
 
     def draw_counts(self, number: int) -> NDArray[np.uint32]:
         """Return frame `number`'s counts (bins, zones); the same number gives the same frame."""
-        times = self._options.first_bin + self._options.bin_width * np.arange(self._bins)
-        delays = 2 * compute_zone_ranges(self._zones) / SPEED_OF_LIGHT
+        options = self._options
+        times = options.begin + options.bin_width * (np.arange(options.bins) + 0.5)
+        delays = 2 * compute_zone_ranges(options.zones) / SPEED_OF_LIGHT
         off = (times[:, np.newaxis] - delays) / PULSE_S
         light = BACKGROUND_COUNTS + PEAK_COUNTS * np.exp(-(off**2) / 2)
-        return np.random.default_rng([self._options.seed, number]).poisson(light).astype(np.uint32)
+        return np.random.default_rng([options.seed, number]).poisson(light).astype(np.uint32)
 
     def close(self) -> None:
         """Unplug it."""
@@ -147,7 +147,7 @@ class EmulatedKit:
                 return
             number, self.taken = self.taken, self.taken + 1
             tick = round((time.monotonic() - began + 1) / TMF_TICK_S) % (1 << 32)
-            lines = self._format(self.draw_counts(number), number, tick)
+            lines = options.format_lines(self.draw_counts(number), number, tick)
             if options.torn and (number + 1) % options.torn == 0:
                 lines[len(lines) // 2] = lines[len(lines) // 2][:20]
             if not (options.lost and (number + 1) % options.lost == 0):
@@ -171,14 +171,14 @@ def open_tmf8828(uri: Uri) -> StreamSource:
     """Open ``sim+tmf8828://?seed=1&rate=5&bin_ps=250``: an emulated kit that looks at an inclined
     wall. ``torn=N`` and ``lost=N`` cut or lose every Nth frame.
     """
-    return _open_emulated(EmulatedTmf8828Options.from_uri(uri), format_tmf8828)
+    return _open_emulated(EmulatedTmf8828Options.from_uri(uri))
 
 
 def open_vl53l8(uri: Uri) -> StreamSource:
     """Open ``sim+vl53l8://?seed=1&rate=5&sub_sample=4``, likewise."""
-    return _open_emulated(EmulatedVl53l8Options.from_uri(uri), format_vl53l8)
+    return _open_emulated(EmulatedVl53l8Options.from_uri(uri))
 
 
-def _open_emulated(options: EmulatedOptions, format_lines: LineFormatter) -> StreamSource:
-    kit = EmulatedKit(options, format_lines)
+def _open_emulated(options: EmulatedOptions) -> StreamSource:
+    kit = EmulatedKit(options)
     return StreamSource(EmulatedFeed(kit, lambda: KitFeed(kit.port, options)), options)

@@ -22,14 +22,12 @@ from devices.emulation.harness import (
     index_faults,
 )
 from devices.emulation.scenes import render_array_delays, render_array_light
-from devices.frames import GateScan
 from devices.spad512 import (
     DONE_MARK,
     ERROR_MARK,
     GATE_STEP_PS,
     INFORMATION_COMMAND,
     ROWS,
-    ExposureRequest,
     Spad512Feed,
     SpadOptions,
 )
@@ -91,11 +89,11 @@ class EmulatedSpadArray:
         """Where it listens."""
         return self._server.port
 
-    def draw_frame(self, request: int, number: int, exposure: ExposureRequest) -> NDArray[np.uint8]:
+    def draw_frame(self, request: int, number: int, exposure: SpadOptions) -> NDArray[np.uint8]:
         """Return picture `number` of a request; the same numbers give the same bytes."""
         light = self._photons[:, : exposure.width] * exposure.seconds
-        if exposure.gate is not None:
-            light = self._gate_light(light, exposure.gate, number)
+        if exposure.is_gated:
+            light = self._gate_light(light, exposure, number)
         drawn = np.random.default_rng([self._seed, request, number]).poisson(light)
         # a pixel's counter stops at the largest number it can hold
         counts = np.minimum(drawn, 2**exposure.bits - 1)
@@ -110,11 +108,11 @@ class EmulatedSpadArray:
         self._server.close()
 
     def _gate_light(
-        self, light: NDArray[np.float64], gate: GateScan, number: int
+        self, light: NDArray[np.float64], gate: SpadOptions, number: int
     ) -> NDArray[np.float64]:
         """Return what comes while the gate is open, of light that comes once in a laser's period."""
-        opens = gate.opening_times[number % gate.steps]
-        width = gate.width_ns * 1e-9
+        opens = gate.opening_times[number % gate.gate_steps]
+        width = gate.gate_width_ns * 1e-9
         since = (self._delays[:, : light.shape[1]] - opens) / GATE_EDGE_S
         passed = np.nan_to_num(ndtr(since) - ndtr(since - width / GATE_EDGE_S))
         ambient = AMBIENT_FRACTION * float(light.max(initial=0.0)) * width / LASER_PERIOD_S
@@ -142,7 +140,7 @@ class EmulatedSpadArray:
                 said = _suggest_gate(command)
             else:
                 try:
-                    exposure = ExposureRequest.decode(command, pile_up)
+                    exposure = SpadOptions.decode(command, pile_up)
                 except ProtocolError:
                     said = ERROR_MARK + b": unknown command"
                 else:
@@ -150,7 +148,7 @@ class EmulatedSpadArray:
                     continue
             connection.send(said + self._end)
 
-    def _send_exposure(self, exposure: ExposureRequest, connection: Connection) -> None:
+    def _send_exposure(self, exposure: SpadOptions, connection: Connection) -> None:
         request, self._requests = self._requests, self._requests + 1
         fault = self._faults.get(request)
         kind, pause = (fault.kind, fault.amount * FAULT_DELAY_S) if fault else ("", 0.0)
@@ -211,7 +209,7 @@ def open_emulated(uri: Uri) -> StreamSource:
         options.seed,
         options.pictures,
         options.faults,
-        None if options.gate is None else render_array_delays(),
+        render_array_delays() if options.is_gated else None,
     )
 
     def connect() -> TcpLink:

@@ -17,6 +17,7 @@ import tofclip
 from devices import registry
 from devices.recorder import record_source
 from devices.recording.check import verify
+from tofclip.plugins import Parts
 
 SIM = "sim+timetag://?seed=1&pace=realtime&rate=1e6"
 ROOT = Path(tofclip.__file__).parents[1]
@@ -38,7 +39,8 @@ def test_listing_needs_no_hardware(shell, monkeypatch):
     assert isinstance(found["devices"], list)
     assert {"timetag", "sim+timetag", "file"} <= set(found["kinds"])
     assert "instruments are connected" in shell("devices list").out
-    monkeypatch.setattr(registry, "FINDERS", (f"{__name__}:find_one",))
+    one = Parts("tofclip.finders", "finder", {"one": f"{__name__}:find_one"})
+    monkeypatch.setattr(registry, "FINDERS", one)
     assert "timetag://T9" in shell("devices list").out
     note = {"uri": "timetag://T9", "instrument": "a tagger", "note": "asleep"}
     assert shell.figures("devices list")["devices"] == [note]

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import devices
 import tofclip
 from apps.cli import main
-from devices.registry import CODECS, SOURCES
+from devices.registry import CODECS, FINDERS, SOURCES
 from nlos.io.format_detection import READERS as CAPTURE_READERS
 from nlos.settings import METHODS as HIDDEN_SCENE_METHODS
 from nlos.settings import Settings
@@ -34,13 +35,23 @@ KEPT = {
     "tofclip.denoisers": "collaborative bm3d nlm",
     "tofclip.readers": "tiff lift hdf5 itex",
     "tofclip.codecs": "frames linospad2 timetag",
+    "tofclip.finders": "timetag aravis",
     "nlos.methods": "rsd hybrid backprojection filtered-backprojection lct fk",
     "nlos.readers": "npz matlab hdf5",
     "tofclip.sources": "aravis linospad2 remoteex spad512 timetag tmf8828 vl53l8 sim+aravis"
     " sim+linospad2 sim+remoteex sim+spad512 sim+timetag sim+tmf8828 sim+vl53l8"
     " .dat .img .tif .tiff .phu .ptu .sdt .ttbin .h5 .hdf5",
 }
-EVERY = (METHODS, DENOISERS, READERS, CODECS, SOURCES, HIDDEN_SCENE_METHODS, CAPTURE_READERS)
+EVERY = (
+    METHODS,
+    DENOISERS,
+    READERS,
+    CODECS,
+    SOURCES,
+    FINDERS,
+    HIDDEN_SCENE_METHODS,
+    CAPTURE_READERS,
+)
 PAGE = Path(tofclip.__file__).parents[1] / "docs" / "extending.md"
 PACKAGE = """
 from tofclip.plugins import Reader
@@ -56,6 +67,10 @@ def read(path):
     return Streak(np.full((4, 5), float(path.read_text().split()[1]), np.float32))
 
 TEXTS = Reader((b"MINE",), read)
+
+def find():
+    from devices import DiscoveredInstrument
+    return [DiscoveredInstrument("mine://7", "my instrument")]
 """
 ENTRIES = """
 [tofclip.denoisers]
@@ -65,6 +80,9 @@ broken = mine.absent:Half
 [tofclip.readers]
 texts = mine:TEXTS
 broken = mine:ABSENT
+[tofclip.finders]
+mine = mine:find
+broken = mine:absent
 """
 
 
@@ -168,13 +186,21 @@ def test_parts_of_a_package_are_used(package: Path, tmp_path: Path) -> None:
         tofclip.read_streak(tmp_path / "other.txt")
 
 
+def test_instruments_of_a_package_are_found(package: Path) -> None:
+    found = {one.uri: one for one in devices.discover()}
+    assert found["mine://7"].instrument == "my instrument"
+    broken = found["broken://"]
+    assert (broken.instrument, "does not load" in broken.note) == ("mine 1.0", True)
+
+
 def test_what_is_wrong_with_a_package_is_a_line(package: Path, shell: Any) -> None:
     listed = shell.figures("plugins")["parts"]
     own = {(one["name"], one["fault"]) for one in listed if one["origin"] == "mine 1.0"}
     names, faults = [name for name, _ in own], [fault for _, fault in own if fault]
-    assert sorted(names) == ["broken", "broken", "half", "nlm", "texts"]
+    assert sorted(names) == ["broken"] * 3 + ["half", "mine", "nlm", "texts"]
     assert sorted(fault.partition(":")[0] for fault in faults) == [
         "denoiser 'broken' of mine 1.0 does not load",
+        "finder 'broken' of mine 1.0 does not load",
         "not used",
         "reader 'broken' of mine 1.0 does not load",
     ]

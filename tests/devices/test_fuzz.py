@@ -46,7 +46,7 @@ from devices.remoteex import (
     parse_integer,
 )
 from devices.source import Codec, Gap, as_bytes
-from devices.spad512 import ExposureRequest, Spad512Feed, SpadOptions
+from devices.spad512 import Spad512Feed, SpadOptions
 from devices.stream import Feed
 from devices.tcp import TcpLink
 from devices.timetag_codec import RECORD_DTYPE, TimeTagCodec, mark_wraps
@@ -233,7 +233,7 @@ def remoteex_session() -> Target:
 def spad512_session() -> Target:
     """Greeting, two requests of two pictures, the end."""
     options = SpadOptions(images=2, width=4, timeout_s=1e-9, reconnect_s=0)
-    pictures = bytes(range(256)) * (options.request.codec.pixel_bytes * 2 // 256)
+    pictures = bytes(range(256)) * (options.codec.pixel_bytes * 2 // 256)
 
     def decode(data: bytes) -> None:
         texts = [b"hello", b"", b"system", b"", b"off", b""]
@@ -424,7 +424,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
         Command.decode, (b"DevParamSet(TD,MCP Gain,0)", b"AcqStop()")
     ),
     "SPAD512 requests": lambda: Target(
-        ExposureRequest.decode, (b"I,8,2,3,0,1,0,1,128", b"I,1,2.5e-3,1,0,1,0,1,512")
+        SpadOptions.decode, (b"I,8,2,3,0,1,0,1,128", b"I,1,2.5e-3,1,0,1,0,1,512")
     ),
     "addresses": lambda: Target(
         lambda data: Uri.parse(data.decode("latin-1")).host_and_port(9),

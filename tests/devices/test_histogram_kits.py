@@ -21,8 +21,9 @@ from devices.emulation.histogram_kits import (
 )
 from devices.histogram_kits import (
     KitFrame,
-    Parser,
+    Tmf8828Options,
     Tmf8828Parser,
+    Vl53l8Options,
     Vl53l8Parser,
 )
 from devices.transients import read_photons
@@ -36,7 +37,11 @@ from tofclip.units import SPEED_OF_LIGHT
 pytest.importorskip("serial", reason="histogram kits need pyserial")
 
 
-def parse(parser: Parser, lines: list[bytes]) -> list[KitFrame]:
+def make_tmf_parser(zones: int = 64) -> Tmf8828Parser:
+    return Tmf8828Parser(Tmf8828Options(bin_ps=250, zones=zones))
+
+
+def parse(parser: Tmf8828Parser | Vl53l8Parser, lines: list[bytes]) -> list[KitFrame]:
     found = [parser.parse_line(line.rstrip()) for line in lines]
     return [frame for frame in found if frame is not None]
 
@@ -47,7 +52,7 @@ def draw_counts(zones: int, seed: int, bins: int = 128) -> Any:
 
 @pytest.mark.parametrize("zones", [64, 9])
 def test_three_bytes_of_every_bin_come_together(zones: int) -> None:
-    parser = Tmf8828Parser(zones)
+    parser = make_tmf_parser(zones)
     for number, seed in enumerate((1, 2, 3)):
         counts = draw_counts(zones, seed)
         (frame,) = parse(parser, format_tmf8828(counts, number, 5000))
@@ -63,14 +68,14 @@ def test_halves_that_are_both_numbered_from_0() -> None:
         if words[0] == b"#Raw":
             words[2] = b"%d" % (int(words[2]) % 30)
         lines.append(b",".join(words))
-    (frame,) = parse(Tmf8828Parser(), lines)
+    (frame,) = parse(make_tmf_parser(), lines)
     np.testing.assert_array_equal(frame.counts, counts)
     assert frame.stamp is None
 
 
 def test_what_is_missing_is_told() -> None:
     """A line torn, frames not sent, and the beginning missed."""
-    parser = Tmf8828Parser()
+    parser = make_tmf_parser()
     frames = [format_tmf8828(draw_counts(64, seed), seed, 1) for seed in range(70)]
     assert parse(parser, frames[0][100:])[0].counts is None
     torn = frames[1].copy()
@@ -86,13 +91,13 @@ def test_what_is_missing_is_told() -> None:
 @given(st.binary(max_size=300))
 @settings(max_examples=60)
 def test_any_line_is_survived(line: bytes) -> None:
-    for parser in (Tmf8828Parser(), Vl53l8Parser()):
+    for parser in (make_tmf_parser(), Vl53l8Parser(Vl53l8Options())):
         for head in (b"", b"#Raw,65,3,", b"#Obj,65,3,", b"Aggregate ", b"Aggregate 0, Bins: "):
             parser.parse_line(head + line)
 
 
 def test_compact_histograms_of_each_zone() -> None:
-    parser = Vl53l8Parser(16, 24)
+    parser = Vl53l8Parser(Vl53l8Options())
     counts = draw_counts(16, 5, 24) % 100_000
     lines = [b"Zone 3: No target\r\n", *format_vl53l8(counts), *format_vl53l8(counts)[:9]]
     (frame,) = parse(parser, lines)

@@ -12,7 +12,6 @@ from devices import registry
 from devices.address import Uri
 from devices.source import Batch, Info, Source, Stats
 from tofclip.errors import InputError
-from tofclip.plugins import load_target
 
 TABLE = (Path(__file__).parent / "refusals.txt").read_text(encoding="utf-8").splitlines()
 
@@ -56,7 +55,7 @@ def test_public_names_are_importable() -> None:
 
 def test_everything_in_the_tables_exists() -> None:
     assert all(callable(part) for part in registry.SOURCES.values())
-    assert all(callable(load_target(finder)) for finder in registry.FINDERS)
+    assert all(callable(finder) for finder in registry.FINDERS.values())
     assert all(codec.name == name for name, codec in registry.CODECS.items())
     with pytest.raises(InputError, match="unknown codec 'absent'"):
         registry.build_codec("absent", {})

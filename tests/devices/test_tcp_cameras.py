@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import hypothesis.strategies as st
@@ -28,7 +29,6 @@ from devices.emulation.scenes import (
     simulate_line_light,
 )
 from devices.emulation.spad512 import EmulatedSpadArray
-from devices.frames import GateScan
 from devices.remoteex import (
     REFUSALS,
     TERMINATOR,
@@ -38,7 +38,7 @@ from devices.remoteex import (
     RemoteExClient,
 )
 from devices.source import Source
-from devices.spad512 import BIT_DEPTHS, IMAGE_WIDTHS_PX, ROWS, ExposureRequest, find_error_text
+from devices.spad512 import BIT_DEPTHS, IMAGE_WIDTHS_PX, ROWS, SpadOptions, find_error_text
 from devices.tcp import TcpLink
 from devices.transients import read_photons
 from tofclip.camera import Camera
@@ -444,34 +444,39 @@ def test_the_demonstrations_light_comes_with_what_focus_pictures_tell() -> None:
 # The SPAD512's messages
 
 exposures = st.builds(
-    ExposureRequest,
-    st.sampled_from(BIT_DEPTHS[1:]),
-    st.integers(1, 10**9).map(lambda nanoseconds: nanoseconds * 1e-9),
-    st.integers(1, 1000),
-    st.sampled_from(IMAGE_WIDTHS_PX),
+    SpadOptions,
+    bits=st.sampled_from(BIT_DEPTHS[1:]),
+    exposure_us=st.integers(1, 10**9).map(lambda nanoseconds: nanoseconds * 1e-3),
+    images=st.integers(1, 1000),
+    width=st.sampled_from(IMAGE_WIDTHS_PX),
 )
 
 
 @given(exposures)
-def test_requests_come_back(exposure: ExposureRequest) -> None:
-    found = ExposureRequest.decode(exposure.encode())
-    assert found.seconds == pytest.approx(exposure.seconds, rel=1e-8)  # nine digits travel
-    shape = (exposure.bits, exposure.images, exposure.width)
-    assert (found.bits, found.images, found.width) == shape
+def test_requests_come_back(exposure: SpadOptions) -> None:
+    found = SpadOptions.decode(exposure.encode())
+    # nine digits travel
+    assert found.exposure_us == pytest.approx(exposure.exposure_us, rel=1e-8)
+    assert replace(found, exposure_us=exposure.exposure_us) == exposure
 
 
 def test_requests_as_the_makers_examples_write_them() -> None:
-    assert ExposureRequest(8, 2e-3, 3, 128).encode() == b"I,8,2,3,0,1,0,1,128"  # milliseconds
-    assert ExposureRequest(1, 2e-3, 3).encode() == b"I,1,2000,3,0,1,0,1,512"  # microseconds
-    assert ExposureRequest(4, 2e-3, 3, 64).encode() == b"I,4,2000,3,0,1,0,1,64"  # these as well
-    assert ExposureRequest(6, 2e-3, 3).encode() == b"I,6,2,3,0,1,0,1,512"
+    three = SpadOptions(bits=8, exposure_us=2000, images=3)
+    for bits, width, line in (
+        (8, 128, b"I,8,2,3,0,1,0,1,128"),  # milliseconds
+        (1, 512, b"I,1,2000,3,0,1,0,1,512"),  # microseconds
+        (4, 64, b"I,4,2000,3,0,1,0,1,64"),  # these as well
+        (6, 512, b"I,6,2,3,0,1,0,1,512"),
+    ):
+        assert replace(three, bits=bits, width=width).encode() == line
     # The vendor's class leaves the width out, and its gated mode has none.
-    assert ExposureRequest.decode(b"I,8,2,3,0,1,0,1") == ExposureRequest(8, 2e-3, 3)
-    gated = ExposureRequest(8, 2e-3, 3, gate=GateScan(10, 36, 5, 100))
+    assert SpadOptions.decode(b"I,8,2,3,0,1,0,1") == three
+    scan = {"gate_steps": 10, "gate_step_ps": 36, "gate_width_ns": 5, "gate_offset_ps": 100}
+    gated = replace(three, mode="gated", **scan)
     assert gated.encode() == b"G,8,2,3,10,36,0,5,100,0,1,0,1"
-    assert ExposureRequest.decode(gated.encode()) == gated
+    assert SpadOptions.decode(gated.encode()) == gated
     assert gated.frames == 30
-    assert ExposureRequest(pile_up=True).encode_pile_up() == b"PU,1"
+    assert SpadOptions(pile_up=True).encode_pile_up() == b"PU,1"
 
 
 @pytest.mark.parametrize(
@@ -479,21 +484,21 @@ def test_requests_as_the_makers_examples_write_them() -> None:
 )
 def test_lines_that_request_nothing(line: bytes) -> None:
     with pytest.raises(ProtocolError):
-        ExposureRequest.decode(line)
+        SpadOptions.decode(line)
 
 
 @pytest.mark.parametrize(
     ("exposure", "bits", "frame_bytes"),
     [
-        (ExposureRequest(1), 1, 32768),
-        (ExposureRequest(4, width=4), 8, 2048),
-        (ExposureRequest(8, width=4), 8, 2048),
-        (ExposureRequest(9, width=4), 16, 4096),
+        (SpadOptions(bits=1), 1, 32768),
+        (SpadOptions(bits=4, width=4), 8, 2048),
+        (SpadOptions(bits=8, width=4), 8, 2048),
+        (SpadOptions(bits=9, width=4), 16, 4096),
         # corrected for pile-up, counts of 8 bits go beyond 255
-        (ExposureRequest(8, width=4, pile_up=True), 16, 4096),
+        (SpadOptions(bits=8, width=4, pile_up=True), 16, 4096),
     ],
 )
-def test_lengths_are_computed(exposure: ExposureRequest, bits: int, frame_bytes: int) -> None:
+def test_lengths_are_computed(exposure: SpadOptions, bits: int, frame_bytes: int) -> None:
     assert (exposure.codec.bits, exposure.codec.pixel_bytes) == (bits, frame_bytes)
 
 
@@ -521,20 +526,13 @@ def test_array_pictures_come_bit_for_bit(array: Make, values: dict[str, int]) ->
     with opened(server, **values) as source:
         frames, info = take(source, 5), source.info.as_dict()
         finish(source)
-    known = {"exposure_us": 1000, "images": 1, "width": 64, "pile_up": 0, **values}
-    exposure = ExposureRequest(
-        known["bits"],
-        known["exposure_us"] * 1e-6,
-        known["images"],
-        known["width"],
-        known["pile_up"] == 1,
-    )
+    exposure = SpadOptions(**{"width": 64, **values})
     for place, frame in enumerate(frames):
-        sent = server.draw_frame(*divmod(place, known["images"]), exposure).tobytes()
+        sent = server.draw_frame(*divmod(place, exposure.images), exposure).tobytes()
         assert exposure.codec.encode(frame.reshape(1)) == exposure.codec.pack_frame(place, sent)
     assert info["greeting"] == "SPAD512S emulated server, ready"
     assert info["serial"] == "EMULATED-1"
-    assert (info["rows"], info["columns"]) == (512, known["width"])
+    assert (info["rows"], info["columns"]) == (512, exposure.width)
     # Up to 200 photons in the millisecond, or one in five microseconds: the picture is Poisson
     # about the light, and not turned.
     counts = np.mean([frame["counts"] for frame in frames], axis=0)

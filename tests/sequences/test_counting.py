@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from devices.frames import GateScan
+from devices.frames import GatedOptions
 from devices.transients import _make_gate_response
 from tofclip.lidar import Pulse
 from tofclip.lidar.photons import PhotonCube
@@ -61,12 +61,13 @@ def test_gates_in_coarse_steps_say_what_they_do_not_see(step_ps, width_ns, photo
     """At steps of 96 mm a millimetre was said of errors of 14; and light that every pixel sees long
     was taken for background.
     """
-    gate = GateScan(int(20e3 // step_ps), step_ps, width_ns, 3000.0)
+    scan = {"gate_steps": int(20e3 // step_ps), "gate_step_ps": step_ps, "gate_width_ns": width_ns}
+    gate = GatedOptions(mode="gated", gate_offset_ps=3000.0, **scan)
     delays = 6e-9 + 137e-12 * COLUMNS + 83e-12 * ROWS
     late = (delays - gate.opening_times[:, np.newaxis, np.newaxis]) / 1e-10
     light = photons * (ndtr(late) - ndtr(late - width_ns * 10)) + 0.004 * photons * width_ns
     counts = np.random.default_rng(0).poisson(light)
-    pulse = _make_gate_response(gate.to_record(), gate.opening_times)
+    pulse = _make_gate_response(gate.gate_record, gate.opening_times)
     shot = PhotonCube(counts, gate.opening_times, pulse=pulse, sampled=True)
     found = find_returns(make_pipeline(shot), shot)
     assert len(found.range) > 1000
