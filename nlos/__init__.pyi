@@ -3,10 +3,10 @@
 from .backprojection import Backprojection as Backprojection
 from .backprojection import FilteredBackprojection as FilteredBackprojection
 from .capture import Capture as Capture
-from .completion import settings_for as settings_for
 from .confocal import FKMigration as FKMigration
 from .confocal import LightCone as LightCone
 from .imaging import reconstruct as reconstruct
+from .imaging import settings_for as settings_for
 from .method import Method as Method
 from .method import Plan as Plan
 from .phasor.plan import Hybrid as Hybrid

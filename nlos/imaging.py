@@ -1,30 +1,354 @@
 """A capture imaged as its settings ask: what they leave open is found, coarse voxels tell where the
-scene is bright, and that part is imaged.
+scene is bright, and that part is imaged, with evidence that there is something to see.
+
+`settings_for` looks at the capture as it was recorded and completes what is not given: the gate
+that takes the wall's own light away, the virtual pulse, how many time bins are put together, the
+voxels, the box, and the quickest method. The command line and Python use the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Generic
 
+import numpy as np
+
+from nlos import analysis
 from nlos.band import VirtualPulse
 from nlos.capture import Capture
-from nlos.completion import complete_settings, find_bright_box, find_scout
-from nlos.evidence import measure_evidence
+from nlos.illumination import AliasingWarning, choose_roles
 from nlos.method import Plan
+from nlos.preparation import fade_record_end, join_near_lasers
 from nlos.resolution import compute_diffraction_limit
-from nlos.settings import METHODS_BY_SPEED, Settings, Wanted, list_taken
+from nlos.settings import METHODS_BY_SPEED, Limits, Settings, Wanted, list_taken
 from nlos.volume import Grid, Volume
-from tofclip.arrays import ComputeDevice
+from tofclip.arrays import ComputeDevice, namespace, to_numpy
+from tofclip.errors import InputError
+
+VOXELS_PER_WAVELENGTH = 8
+# Of the path of a bin, the voxel of transforms. Half of it is the bin's depth, but a surface that
+# lies between two such voxels would be dimmed and drawn with stripes.
+VOXEL_BIN_FRACTION = 1 / 3
+# A default voxel is not so small that more would fit along the longest side of the wall.
+MAX_VOXELS_PER_SIDE = 256
+# Time bins are put together while a wavelength keeps this number: 0.6 % of the carrier is lost.
+BINS_PER_WAVELENGTH = 16
+# The Laplacian of filtered back-projection is a quarter of a wavelength wide.
+SIGMAS_PER_WAVELENGTH = 4
+# A gate that was found opens over this fraction of its length: a sharp edge would be an image.
+GATE_RAMP_FRACTION = 0.25
+# Of the record, what fades out where light still comes at its end.
+FADE_FRACTION = 0.1
+# Waves by which the box is looked over are this number of times longer, if the wall is so wide and
+# the voxels more than can be imaged in no time: longer waves see less of few photons.
+SCOUT_WAVELENGTHS, QUICK_SCOUT_VOXELS = 2.0, 1 << 13
+# Nearer than this fraction of the gate everything was blanked; the default box begins there.
+GATE_DEPTH_FRACTION = 0.4
+# They see no finer than the wall's lattice and the time bins, whatever the wavelength.
+TRANSFORM_METHODS = ("lct", "fk")
+# Where pictures choose the wavelength: the brightest of one is clear if it is so many times a
+# shuffled copy's (letters and a mannequin of a streak camera, a bunny), from so few wall points;
+# and the ratio of wavelengths tried.
+CLEAR_EVIDENCE, MAX_JUDGED_POINTS, WAVELENGTH_RATIO = 30.0, 4096, math.sqrt(2)
+# Where none is so clear: of the most evidence.
+CLEAR_FRACTION = 2 / 3
+# A voxel nearer to a wall point than this is on the wall.
+BRIGHTEST_ON_WALL_WAVELENGTHS = 0.5
+
+
+def settings_for(capture: Capture, **given: Any) -> Settings:
+    """Find settings that suit a capture.
+
+    Parameters
+    ----------
+    capture : Capture
+        As it was recorded: with the light that the wall returns at once, if that is in the record.
+    **given
+        Fields of `Settings` that are known; they rule over what would be found. Lengths in m.
+
+    Returns
+    -------
+    Settings
+        Complete but for the settings of other methods, with reasons for what was found. The box is
+        all that may be seen; `find_bright_box` makes it smaller.
+
+    Raises
+    ------
+    InputError
+        No settings suit: the record holds nothing, or nothing but the wall's own light.
+
+    Examples
+    --------
+    >>> import numpy as np, nlos
+    >>> x, y = np.meshgrid(np.linspace(-0.5, 0.5, 8), np.linspace(-0.5, 0.5, 8))
+    >>> wall = np.stack([x, y, 0 * x], axis=-1)
+    >>> signal = np.zeros((64, 8, 8)); signal[40] = 1
+    >>> nlos.settings_for(nlos.Capture(signal, wall, [0, 0, 0], 1e-10)).method
+    'rsd'
+    """
+    return find_settings(capture, Settings(**given))
+
+
+def find_settings(capture: Capture, wanted: Wanted) -> Wanted:
+    """Find settings that suit a capture and are as wanted where that is said; see `settings_for`."""
+    found = complete_settings(capture, wanted)
+    if found.method is None:
+        # Which walls a method takes does not depend on the voxels: coarse ones are planned quickly.
+        prepared = found.prepare(capture)
+        scout, grid = find_scout(prepared, found) or (found, found.grid())
+        found = found.with_method(scout.plan_quickest(prepared, grid)[0])
+    return found
+
+
+def complete_settings(capture: Capture, wanted: Wanted) -> Wanted:
+    """Find settings that suit a capture, but for the method; see `settings_for`."""
+    # As recorded: midpoints would hide that lasers stand off the wall.
+    analysis.require_plausible(choose_roles(capture))
+    capture = choose_roles(join_near_lasers(capture))
+    found = wanted
+    if found.gate is None:
+        found = _complete(found, _find_gate(capture, found))
+    gated = replace(found, bins_together=1).prepare(capture)
+    if found.fade is None and analysis.find_lit_end(gated):
+        fade = FADE_FRACTION * float(np.ptp(capture.axis.paths))
+        found = found.with_found("fade", fade, "light still comes when the record ends")
+        gated = fade_record_end(gated, fade)
+    if not float(abs(gated.signal).max()) > 0:
+        raise InputError(
+            f"a gate of {found.gate or 0.0:.4g} m blanks the whole record; blank less (`gate`)"
+        )
+    analysis.require_usable_cycles(capture, found.cycles)
+    if found.wavelength is None:
+        chosen = analysis.choose_wavelength(gated, found.cycles)
+        found = found.with_found("wavelength", *(chosen or _choose_by_pictures(gated, found)))
+    else:
+        analysis.require_usable_wavelength(capture, found.wavelength, found.cycles)
+    return _complete_voxels(gated, found)
+
+
+def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | None:
+    """Return settings and coarse voxels with which all of the box is looked over quickly.
+
+    Waves twice as long have an eighth of the work, on voxels of their half; small boxes are looked
+    over with the waves themselves. `settings`: complete but for the method. Returns none where the
+    voxels asked for are no finer, or all of the box is wanted.
+    """
+    wavelength = settings.wavelength or 0.0
+    if settings.everywhere or (settings.voxel or 0.0) >= wavelength / 2:
+        return None
+    quick = settings.grid(wavelength / 2)
+    if math.prod(quick.shape) <= QUICK_SCOUT_VOXELS:
+        return settings, quick
+    record = float(np.ptp(capture.axis.paths))
+    usable = min(analysis.find_longest_wavelength(capture), record / settings.cycles)
+    longer = max(wavelength, min(SCOUT_WAVELENGTHS * wavelength, usable))
+    return replace(settings, wavelength=longer), settings.grid(longer / 2)
+
+
+def find_bright_box(settings: Wanted, scouted: Volume) -> Wanted:
+    """Return the settings with the box that holds everything bright in a coarse volume, which was
+    imaged as `find_scout` says.
+    """
+    x, y, (near, far) = _find_ends(Grid.around(scouted, settings.voxel_size))
+    return replace(settings, x=x, y=y, near=near, far=far, everywhere=True)
+
+
+def is_brightest_on_wall(volume: Volume, capture: Capture, wavelength: float) -> bool:
+    """Whether the brightest voxel lies on the wall, so that the picture shows the wall's own light.
+    `wavelength`: nearer to a wall point than half of it, m, is on the wall.
+    """
+    away = np.linalg.norm(capture.points - np.array(volume.find_brightest()), axis=1)
+    return bool(away.min() < BRIGHTEST_ON_WALL_WAVELENGTHS * wavelength)
+
+
+def _find_ends(grid: Grid) -> tuple[Limits, Limits, Limits]:
+    x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (grid.x, grid.y, grid.z))
+    return x, y, z
+
+
+Found = Iterator[tuple[str, Any, str]]
+"""Settings that a rule finds: name, value, and the reason, which may be empty."""
+
+
+def _complete(settings: Wanted, found: Found) -> Wanted:
+    """Take what a rule finds for what is not given."""
+    for name, value, reason in found:
+        if (given := getattr(settings, name)) is None or given is False:
+            settings = settings.with_found(name, value, reason)
+    return settings
+
+
+def _find_gate(capture: Capture, settings: Settings) -> Found:
+    bounce = analysis.find_first_bounce(capture)
+    if bounce is None:
+        yield "gate", None, "no light of the wall's own is in the record"
+        return
+    reason = f"the wall's own light is in the record, {bounce.ratio:.3g} times what follows; "
+    yield "gate", bounce.end, f"{reason}{bounce.end:.3g} m later it has faded"
+    yield "gate_ramp", GATE_RAMP_FRACTION * bounce.end, ""
+    yield "gate_found", True, ""
+
+
+def _complete_voxels(gated: Capture, found: Wanted) -> Wanted:
+    """Find the bins, the voxels and the box for the settings' wavelength."""
+    for rule in (_find_bins, _find_voxel):
+        found = _complete(found, rule(gated, found))
+    return _complete_box(gated, found)
+
+
+def _choose_by_pictures(gated: Capture, settings: Settings) -> tuple[float, str]:
+    """Choose the wavelength where the spectrum does not tell noise from signal: the shortest whose
+    coarse picture is clear, or nearly as clear as any; between those tried by the logarithms.
+
+    Waves are tried from long ones on, whose pictures cost next to nothing.
+    """
+    capture = _thin_out(gated)
+    shortest = analysis.find_finest_wavelength(capture, settings.cycles)
+    longest = max(shortest, analysis.find_longest_wavelength(gated) / 2)
+    waves, brightest, decoys = [], [0.0], []
+    for step in range(math.ceil(math.log(longest / shortest, WAVELENGTH_RATIO)) + 1):
+        waves.append(max(longest / WAVELENGTH_RATIO**step, shortest))
+        own, shuffled = _judge_wavelength(capture, settings, waves[-1])
+        brightest.append(own)
+        # Decoys of all waves are about as bright: together they tell how bright.
+        decoys.append(float(np.mean(shuffled)))
+        evidences = np.array(brightest) / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
+        least = min(CLEAR_EVIDENCE, CLEAR_FRACTION * float(evidences.max()))
+        if evidences[-1] < least:
+            chosen = np.interp(np.log(least), np.log(evidences[:-3:-1]), np.log(waves[:-3:-1]))
+            waves.append(float(np.exp(chosen)))
+            break
+    return analysis.round_wavelength_up(waves[-1]), "the shortest whose coarse picture is clear"
+
+
+def _judge_wavelength(
+    capture: Capture, settings: Settings, wavelength: float
+) -> tuple[float, list[float]]:
+    """Brightness of a capture's coarse picture by one wavelength, m, and of its decoys."""
+    found = _complete_voxels(capture, replace(settings, wavelength=wavelength))
+    prepared = replace(found, gate=None, fade=None, flip=None).prepare(capture)
+    plan = found.plan_quickest(prepared, found.grid(wavelength / 2))[1]
+    with warnings.catch_warnings():
+        # Of a wave that is only tried.
+        warnings.simplefilter("ignore", AliasingWarning)
+        return measure_brightness(prepared, plan, plan.image(prepared))
+
+
+def _thin_out(capture: Capture) -> Capture:
+    """Return a capture of at most `MAX_JUDGED_POINTS`, every nth along each axis of the wall."""
+    axes = capture.wall.ndim - 1
+    step = math.ceil((capture.valid.size / MAX_JUDGED_POINTS) ** (1 / axes)) if axes else 1
+    some = (slice(None, None, step),) * axes
+    laser = capture.laser if capture.laser.ndim == 1 else capture.laser[some]
+    signal = capture.signal[(slice(None), *some)]
+    return replace(capture, signal=signal, wall=capture.wall[some], laser=laser)
+
+
+def _by_lattice(capture: Capture, settings: Settings) -> bool:
+    """Whether the wall's lattice, not a virtual pulse, tells what is resolved."""
+    return settings.method in TRANSFORM_METHODS and capture.spacing < math.inf
+
+
+def _find_bins(capture: Capture, settings: Settings) -> Found:
+    if _by_lattice(capture, settings):
+        finest, reason = capture.spacing, "path per bin as neighbouring wall points are apart"
+    else:
+        finest = (settings.wavelength or math.nan) / BINS_PER_WAVELENGTH
+        reason = f"{BINS_PER_WAVELENGTH} bins per wavelength, or as recorded"
+    bins = min(int(finest / capture.axis.spacing + 1e-9), capture.axis.bins // 2)
+    yield "bins_together", max(1, bins), reason
+
+
+def _find_voxel(capture: Capture, settings: Settings) -> Found:
+    if _by_lattice(capture, settings):
+        path = (settings.bins_together or 1) * capture.axis.spacing
+        wanted, reason = path * VOXEL_BIN_FRACTION, "a third of the path of a bin"
+    else:
+        wanted = (settings.wavelength or math.nan) / VOXELS_PER_WAVELENGTH
+        reason = "an eighth of the wavelength"
+    extent = float(np.ptp(capture.points, axis=0).max())
+    yield "voxel", max(wanted, extent / MAX_VOXELS_PER_SIDE), reason
+    yield "sigma", (settings.wavelength or math.nan) / SIGMAS_PER_WAVELENGTH, ""
+
+
+def _complete_box(capture: Capture, settings: Wanted) -> Wanted:
+    """Fill in what is not given of the box: the space in front of the wall that the record covers."""
+    voxel = settings.voxel_size
+    near = settings.near
+    if near is None and settings.gate_found:
+        low, high = capture.points[:, 2].min(), capture.points[:, 2].max()
+        near = float(low + high) / 2 + max(voxel, GATE_DEPTH_FRACTION * (settings.gate or 0.0))
+    last = float(capture.axis.paths[-1])
+    if near is not None and 2 * (near - float(capture.points[:, 2].max())) > last:
+        raise InputError(
+            f"a box from z = {near:.4g} m on lies beyond the record, whose paths end at {last:.4g} m"
+        )
+    x, y, (first, last) = _find_ends(Grid.in_front_of(capture, voxel, near, settings.far))
+    ends = (("x", x, ""), ("y", y, ""), ("near", first, ""), ("far", last, ""))
+    completed = _complete(settings, iter(ends))
+    # The longest path from a laser spot by way of the box to a wall point is one by way of corners.
+    corners = np.array(np.meshgrid(*completed.box)).reshape(3, -1).T
+    longest = sum(
+        max(float(np.linalg.norm(spots - corner, axis=1).max()) for corner in corners)
+        for spots in (capture.lasers, capture.points)
+    )
+    if capture.start > longest:
+        raise InputError(
+            f"the record begins at a path of {capture.start:.4g} m, but none by way of the box up to "
+            f"z = {completed.far:.4g} m is longer than {longest:.4g} m: take the ways to and from the "
+            "devices off, or choose a farther box"
+        )
+    return completed
+
+
+# A picture is judged by what this fraction of its voxels exceeds, against that of so many decoys:
+# at least two, and of small pictures, whose few speckles tell little, as many as fill these voxels.
+BRIGHT_QUANTILE, MIN_DECOYS, MAX_DECOYS, DECOY_VOXELS = 0.999, 2, 8, 1 << 15
+# With less evidence than this, a picture may be of noise, a glow, or of wrong units.
+MIN_EVIDENCE = 2.0
+
+
+def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
+    """How much brighter the brightest of a picture is than that of decoys: of the capture itself,
+    its signals shuffled among the wall points. About 1 says that there is nothing to see.
+
+    Each depth's brightness is taken relative to the decoys': noise and the wall's glow fade with it.
+    `capture`: as it is imaged; `plan`: that the picture was made by, with coarse voxels.
+    """
+    own, decoys = measure_brightness(capture, plan, picture, MIN_DECOYS)
+    return own / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
+
+
+def measure_brightness(
+    capture: Capture, plan: Plan, picture: Volume, count: int | None = None
+) -> tuple[float, list[float]]:
+    """Brightest of a picture, and of its decoys, relative to their mean; see `measure_evidence`.
+    `count`: of decoys; by default as many as the picture's size asks for.
+    """
+    if count is None:
+        count = int(np.clip(DECOY_VOXELS // picture.values.size, MIN_DECOYS, MAX_DECOYS))
+    xp, places = namespace(capture.signal), np.flatnonzero(capture.valid)
+    # Whatever order the points come in, the decoys are the same.
+    ordered = places[np.lexsort((capture.points + capture.lasers).T)]
+    flat, pictures = xp.reshape(capture.signal, (capture.axis.bins, -1)), [picture]
+    for seed in range(1, count + 1):
+        order = np.arange(capture.valid.size)
+        order[ordered] = np.random.default_rng(seed).permutation(ordered)
+        signal = xp.take(flat, capture.device.put(order), axis=1)
+        shuffled = replace(capture, signal=xp.reshape(signal, capture.signal.shape))
+        pictures.append(plan.image(shuffled))
+    energies = [np.square(to_numpy(one.values), dtype=np.float64) for one in pictures]
+    level = np.mean(energies[1:], axis=(0, 2, 3))[:, np.newaxis, np.newaxis]
+    level = np.maximum(level, np.finfo(np.float32).tiny)
+    own, *decoys = (float(np.quantile(energy / level, BRIGHT_QUANTILE)) for energy in energies)
+    return own, decoys
+
 
 Draw = Callable[[str, Plan, Capture], Volume]
 """Images a capture by a plan, under a title that a progress bar may show."""
-
-
-def draw_silently(title: str, plan: Plan, capture: Capture) -> Volume:
-    """Image a capture and show nothing meanwhile."""
-    return plan.image(capture)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +389,7 @@ def prepare_imaging(
     recorded: Capture,
     wanted: Wanted,
     device: ComputeDevice | None = None,
-    draw: Draw = draw_silently,
+    draw: Draw = lambda _, plan, capture: plan.image(capture),
 ) -> PreparedImaging[Wanted]:
     """Find every setting that is not given, and the voxels: all that the box holds, or the part
     that coarse voxels show to be bright. By default it computes where the capture is.

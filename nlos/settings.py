@@ -1,7 +1,7 @@
 """Settings of imaging around corners, declared once for the command line and for Python: name, unit,
 meaning and default of each.
 
-What is not given is found by `nlos.completion`. Importing this loads nothing heavy.
+What is not given is found by `nlos.imaging`. Importing this loads nothing heavy.
 """
 
 from __future__ import annotations

@@ -284,8 +284,7 @@ def reconstruct_single(
     source: Path, results: ResultFiles, wanted: ReconstructSettings, device: str
 ) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
-    from nlos.completion import is_brightest_on_wall
-    from nlos.evidence import MIN_EVIDENCE
+    from nlos.imaging import MIN_EVIDENCE, is_brightest_on_wall
     from nlos.io import read_capture
     from nlos.normals import find_imaged_surface
     from tofclip.arrays import ComputeDevice, parse_device
@@ -510,7 +509,7 @@ def info(
     Example: tofclip nlos info capture.h5
     """
     from nlos.band import VirtualPulse
-    from nlos.completion import find_settings
+    from nlos.imaging import find_settings
     from nlos.io import read_capture
     from nlos.known_scenes import HiddenTruth
     from nlos.resolution import compute_diffraction_limit

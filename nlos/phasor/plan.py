@@ -307,7 +307,7 @@ class PlanarRSD(WaveMethod):
     --------
     >>> import numpy as np
     >>> import nlos
-    >>> from nlos.simulate.points import PointScene
+    >>> from nlos.simulate import PointScene
     >>> from nlos.capture import TimeAxis
     >>> x, y = np.meshgrid(np.linspace(-0.5, 0.5, 16), np.linspace(-0.5, 0.5, 16))
     >>> wall, hidden = np.stack([x, y, 0 * x], axis=-1), PointScene([[0.1, -0.2, 0.8]])

@@ -1,13 +1,15 @@
 """Refinement by photons: the hidden albedo that explains a few photons best, photon by photon.
 
-Counts are read from a capture and some set apart to judge by; albedo and background are fitted to
-the others by expectation maximisation, on coarse voxels first.
+The photons that a wall counts are a linear function of the hidden albedo, by time of flight. Counts
+are read from a capture and some set apart to judge by; albedo and background are fitted to the
+others by expectation maximisation, on coarse voxels first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,10 +25,11 @@ from nlos.method import (
     require_numpy_signal,
 )
 from nlos.preparation import remove_first_bounce
-from nlos.refinement.time_of_flight import TimeOfFlight
+from nlos.refinement.kernels import VOXELS_PER_RUN, add_backprojected_light, add_expected_light
 from nlos.volume import Grid, Volume
 from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
+from tofclip.threads import run_blocks, thread_count
 
 Array = NDArray[Any]
 
@@ -40,6 +43,103 @@ BACKGROUND_PHOTONS = 50.0
 MIN_BACKGROUND = 1e-6
 # Steps in which the brightness of light of a given shape is fitted.
 BRIGHTNESS_STEPS = 10
+
+
+# Wall points that a thread treats at a time.
+POINTS_PER_BLOCK = 64
+
+
+@dataclass(frozen=True, eq=False)
+class TimeOfFlight:
+    """Light of hidden voxels in the bins of a capture's wall points.
+
+    A voxel of albedo a returns ``a / (d_L * d_p)^2`` after the path ``d_L + d_p``, spread over the
+    paths of its whole volume, the bin, and the instrument's response. Nothing is held per pair of
+    voxel and wall point.
+    """
+
+    capture: Capture  # wall, lasers and time axis are what counts
+    grid: Grid
+    # (n,), instrument's response in bins, of sum 1; its middle element stands for no delay
+    response: FloatArray
+    # light also falls with this power of the cosines of both legs with z: 0 for points that scatter
+    # evenly, 2 for matte surfaces that face a matte wall; 1 lies between
+    obliquity: int = 0
+
+    def compute_light(self, albedo: Array, voxels: Array, points: Array) -> Array:
+        """Return the light (m, bins) of some voxels (n,), flat indices into the grid, at some of
+        the capture's points (m,).
+        """
+        light = np.empty((len(points), self._bins), np.float32)
+        places, albedo = np.take(self._places, voxels, axis=1), np.asarray(albedo, np.float32)
+
+        def process_block(some: slice) -> None:
+            changes = np.zeros((some.stop - some.start, self._bins + 2))
+            add_expected_light(*self._pairs(points[some]), *self._scale, places, albedo, changes)
+            light[some] = np.cumsum(changes[:, : self._bins], axis=1)
+
+        run_blocks(process_block, len(points), POINTS_PER_BLOCK)
+        return self.spread(light, self.response)
+
+    def backproject(
+        self, values: Array, voxels: Array, points: Array, squared: bool = False
+    ) -> Array:
+        """Return what some voxels (n,) see of values (m, bins): the adjoint of `compute_light`.
+        `squared`: weight by the square of the light instead: with the inverse of the expected
+        counts this is what they tell of a voxel, Fisher's information.
+        """
+        # Running sums from the end on: a box of light is the difference of two, see the kernel. The
+        # response is turned around, as the adjoint of a convolution asks for.
+        sums = np.zeros((len(points), self._bins + 2), np.float32)
+        spread = self.spread(values, self.response[::-1])
+        np.cumsum(spread[:, ::-1], axis=1, out=sums[:, self._bins - 1 :: -1])
+        places, pairs = np.take(self._places, voxels, axis=1), self._pairs(points)
+        total = np.zeros(len(voxels), np.float32)
+
+        def process_block(some: slice) -> None:
+            block = np.ascontiguousarray(places[:, some])
+            add_backprojected_light(*pairs, *self._scale, block, sums, squared, total[some])
+
+        size = max(VOXELS_PER_RUN, -(-len(voxels) // (4 * thread_count())))
+        run_blocks(process_block, max(len(voxels), 1), size)
+        return total
+
+    @property
+    def _bins(self) -> int:
+        return self.capture.axis.bins
+
+    @cached_property
+    def _places(self) -> NDArray[np.float32]:
+        grid = self.grid
+        z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
+        return np.stack([x.ravel(), y.ravel(), z.ravel()]).astype(np.float32)
+
+    @cached_property
+    def _scale(self) -> tuple[Array, np.float32, np.float32, int]:
+        """Extent of a voxel, path at which the record begins, bins per metre of path, and the
+        obliquity.
+        """
+        axes = (self.grid.x, self.grid.y, self.grid.z)
+        cell = [float(np.median(np.diff(axis))) if axis.size > 1 else 0.0 for axis in axes]
+        axis = self.capture.axis
+        start = np.float32(axis.start - axis.spacing / 2)
+        return np.array(cell, np.float32), start, np.float32(1 / axis.spacing), self.obliquity
+
+    def _pairs(self, points: Array) -> tuple[Array, Array]:
+        lasers = self.capture.lasers
+        return (
+            self.capture.points[points].astype(np.float32),
+            (lasers if len(lasers) == 1 else lasers[points]).astype(np.float32),
+        )
+
+    def spread(self, values: Array, response: FloatArray) -> Array:
+        """Convolve values (m, bins) with a response (n,) in time, whose middle is no delay."""
+        from scipy.ndimage import convolve1d
+
+        values = np.asarray(values, np.float32)
+        if response.size > 1:
+            values = convolve1d(values, response, axis=1, mode="constant")
+        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +174,8 @@ class CountedPhotons:
             direct = np.linalg.norm(capture.points - capture.lasers, axis=1)
             observed = capture.axis.paths > (direct + blank)[:, np.newaxis]
             capture = remove_first_bounce(capture, blank, ramp)
-        return cls(
-            capture, np.where(observed, counts / float(lit.min()), 0).astype(np.float32), observed
-        )
+        counted = np.where(observed, counts / float(lit.min()), 0).astype(np.float32)
+        return cls(capture, counted, observed)
 
     def hold_out(self, fraction: float, seed: int) -> tuple[CountedPhotons, NDArray[np.float32]]:
         """Set some photons aside, (points, bins), each with the same chance: both parts follow
@@ -123,24 +222,19 @@ def fit_brightness(photons: CountedPhotons, light: Array) -> Array:
     return np.asarray(np.maximum(expected, MIN_BACKGROUND))
 
 
-@dataclass(frozen=True)
-class LikelihoodGain:
-    """How much likelier photons are under one expectation than under another."""
-
-    nats: float  # gain of the likelihood's logarithm
-    sigma: float  # standard deviation that the photons' noise gives it
-
-    @classmethod
-    def of(cls, photons: Array, expected: Array, other: Array, observed: Array) -> LikelihoodGain:
-        """Compare two expectations of the same photons, all (points, bins), where observed."""
-        counted, first, second = (
-            one[observed].astype(np.float64) for one in (photons, expected, other)
-        )
-        logarithm = np.log(first / second)
-        return cls(
-            float(np.sum(counted * logarithm - (first - second))),
-            float(np.sqrt(np.sum(counted * logarithm**2))),
-        )
+def compare_likelihoods(
+    photons: Array, expected: Array, other: Array, observed: Array
+) -> tuple[float, float]:
+    """How much likelier photons are under one expectation than under another, all (points, bins),
+    where observed: the gain of the likelihood's logarithm, nats, and the standard deviation that
+    the photons' noise gives it.
+    """
+    counted, first, second = (
+        one[observed].astype(np.float64) for one in (photons, expected, other)
+    )
+    logarithm = np.log(first / second)
+    gain = np.sum(counted * logarithm - (first - second))
+    return float(gain), float(np.sqrt(np.sum(counted * logarithm**2)))
 
 
 MIN_POINTS_PER_SUBSET = 16
@@ -192,7 +286,7 @@ class PhotonFit:
 
     def place(self, values: Array) -> Array:
         """Put values (n,) of the voxels into a volume (z, y, x)."""
-        volume = np.zeros(self.model.grid.size, np.float32)
+        volume = np.zeros(self.model.grid.size, values.dtype)
         volume[self.voxels] = values
         return volume.reshape(self.model.grid.shape)
 
@@ -208,10 +302,16 @@ class PhotonFit:
 
     def improve(self, subsets: int, prior_weight: float | None = None) -> None:
         """Improve albedo and background once by every subset of the wall points."""
+        from scipy.ndimage import gaussian_filter
+
         subsets = max(1, min(subsets, len(self._everyone) // MIN_POINTS_PER_SUBSET))
         weight = self.prior_weight if prior_weight is None else prior_weight
         if weight > 0:
-            self._penalty = weight * self._compute_penalty()
+            # One standard deviation of what noise brings a voxel, less where its neighbours are
+            # bright.
+            sharpness = self.compute_sharpness()
+            around = gaussian_filter(self.place(self.albedo), 1.0).ravel()[self.voxels]
+            self._penalty = weight * sharpness / (1 + around * sharpness / NOISE_SIGMAS)
         self.likelihood = sum(
             self._improve_by(self._everyone[first::subsets], subsets) for first in range(subsets)
         )
@@ -245,16 +345,6 @@ class PhotonFit:
         self.photons = photons
         self.albedo *= np.float32(more)
         self.background *= np.float32(more)
-
-    def _compute_penalty(self) -> Array:
-        """What a voxel pays for its albedo: one standard deviation of what noise brings it, and
-        less where its neighbourhood is bright.
-        """
-        from scipy.ndimage import gaussian_filter
-
-        sharpness = self.compute_sharpness()
-        around = gaussian_filter(self.place(self.albedo), 1.0).ravel()[self.voxels]
-        return np.asarray(sharpness / (1 + around * sharpness / NOISE_SIGMAS))
 
     def compute_sharpness(self) -> Array:
         """Return the inverse of the standard deviation that photon noise gives each voxel's albedo,
@@ -338,7 +428,7 @@ FAINT_FRACTION, FAINT_SIGMAS = 2e-3, 1.0
 # Of the brightest voxel, the least that the albedo starts from: 0 would stay 0.
 START_FRACTION = 1e-3
 # Instrument's responses of which the likeliest is taken.
-RESPONSE_SIGMAS_BINS = (0.0, 0.6, 1.2, 2.5, 5.0)
+RESPONSE_SIGMAS_BINS: tuple[float, ...] = (0.0, 0.6, 1.2, 2.5, 5.0)
 # Of the photons, what is set aside to judge the refinement by, and the seed that chooses them.
 HELD_OUT_FRACTION, HELD_OUT_SEED = 0.1, 0
 # Gain of likelihood of the photons set aside, in standard deviations, with which the refined image
@@ -421,7 +511,6 @@ class PhotonPlan(Plan):
         kept, held = photons.hold_out(HELD_OUT_FRACTION, HELD_OUT_SEED)
         linear = self.linear.image(photons.capture, progress)
         start = self.linear.image(kept.capture, progress).magnitude.astype(np.float32) ** 2
-        # each pass counts as much as the linear image
         passes = iter([self.linear.cost] * (COARSE_PASSES + self.method.iterations))
 
         def report_pass() -> None:
@@ -430,9 +519,9 @@ class PhotonPlan(Plan):
         fit, linear_light = self._look_over(kept, start, report_pass)
         last = min(FINAL_PASSES, self.method.iterations - 1)
         stopped = fit.run(self.method.iterations - last, report_pass)
-        gain = judge(fit, linear_light, held)
+        gain, noise = judge(fit, linear_light, held)
         values = linear.magnitude.astype(np.float32)
-        if gain.nats > MIN_GAIN_SIGMAS * gain.sigma:
+        if gain > MIN_GAIN_SIGMAS * noise:
             fit.take(photons)
             for _ in range(last):
                 fit.improve(1)
@@ -449,8 +538,8 @@ class PhotonPlan(Plan):
             "background_per_bin": float(fit.background.mean()),
             "obliquity": fit.model.obliquity,
             "response_sigma_bins": fit.response_sigma,
-            "held_out_gain_nats": gain.nats,
-            "held_out_gain_sigma": gain.sigma,
+            "held_out_gain_nats": gain,
+            "held_out_gain_sigma": noise,
             "held_out_seed": HELD_OUT_SEED,
             "iterations": fit.passes,
             "stopped_because": stopped,
@@ -463,17 +552,21 @@ class PhotonPlan(Plan):
         """Fit coarse voxels, choose response and fall of light by them, and return a fit of the
         fine voxels that hold light, and the light (points, bins) of the linear image.
         """
-        method, axis = self.method, photons.capture.axis
-        sigmas: tuple[float, ...] = RESPONSE_SIGMAS_BINS
+        from scipy.ndimage import binary_dilation
+
+        method, sigmas = self.method, RESPONSE_SIGMAS_BINS
         if method.response_sigma is not None:
-            sigmas = (method.response_sigma / axis.bin_width,)
-        pairs = [(size + 1) // 2 for size in self.grid.shape]
-        halved = min(pairs) >= MIN_COARSE_VOXELS
-        grid = _merge_pairs_of_voxels(self.grid) if halved else self.grid
-        albedo = _add_pairs(start) if halved else start
-        if not albedo.any():
+            sigmas = (method.response_sigma / photons.capture.bin_width,)
+        grid, halved = self.grid, min(self.grid.shape) >= 2 * MIN_COARSE_VOXELS - 1
+        if halved:
+            axes = (grid.x, grid.y, grid.z)
+            last = (np.append(axis[1::2], axis[-1])[: (axis.size + 1) // 2] for axis in axes)
+            grid = Grid(*((a[::2] + b) / 2 for a, b in zip(axes, last, strict=True)))
+            for axis in range(3):
+                start = np.add.reduceat(start, range(0, start.shape[axis], 2), axis=axis)
+        if not start.any():
             raise InputError("the linear image is dark: there is nothing to refine")
-        seen = albedo.ravel()
+        seen = start.ravel()
         # Updates multiply: a voxel that begins at 0 would stay dark for ever.
         albedo = np.maximum(seen, START_FRACTION * seen.max())
         model = TimeOfFlight(photons.capture, grid, build_response(sigmas[len(sigmas) // 2]), 1)
@@ -487,35 +580,27 @@ class PhotonPlan(Plan):
         significant = fit.albedo * fit.compute_sharpness() >= FAINT_SIGMAS
         if np.any(bright & significant):
             bright &= significant
-        shape, values = grid.shape, np.zeros(grid.size, np.float32)
-        values[bright] = fit.albedo[bright]
-        values, kept = values.reshape(shape), bright.reshape(shape)
+        values, kept = fit.place(np.where(bright, fit.albedo, 0)), fit.place(bright)
         if halved:
-            values, kept = (_repeat_voxels(one, self.grid.shape) for one in (values / 8, kept))
-        from scipy.ndimage import binary_dilation
-
-        kept = binary_dilation(kept, np.ones((3, 3, 3), bool))
-        voxels = np.flatnonzero(kept)
+            halves = np.ix_(*(np.arange(n) // 2 for n in self.grid.shape))
+            values, kept = values[halves] / 8, kept[halves]
+        voxels = np.flatnonzero(binary_dilation(kept, np.ones((3, 3, 3), bool)))
         albedo = np.maximum(values.ravel()[voxels], START_FRACTION * values.max())
         fine = replace(fit.model, grid=self.grid)
         made = PhotonFit(photons, fine, voxels, albedo, method.prior_weight)
         made.background, made.response_sigma = fit.background, fit.response_sigma
-        everyone = np.arange(len(photons.counts))
-        return made, fit.model.compute_light(seen, fit.voxels, everyone)
+        return made, fit.model.compute_light(seen, fit.voxels, np.arange(len(photons.counts)))
 
 
-def judge(fit: PhotonFit, linear_light: Array, held: Array) -> LikelihoodGain:
-    """Compare a fit with light as bright as in the linear image, and with background alone, by
-    photons that neither has seen; return the gain over the better of the two. `linear_light`
-    (points, bins): on any scale; `held` (points, bins): `HELD_OUT_FRACTION` of all.
+def judge(fit: PhotonFit, linear_light: Array, held: Array) -> tuple[float, float]:
+    """Compare a fit with light as bright as in the linear image (points, bins), and with background
+    alone, by the `HELD_OUT_FRACTION` of photons that neither has seen; return the gain over the
+    better of the two, and its standard deviation.
     """
     ratio, photons = HELD_OUT_FRACTION / (1 - HELD_OUT_FRACTION), fit.photons
     expected = ratio * fit.expect()
-    gains = [
-        LikelihoodGain.of(held, expected, ratio * fit_brightness(photons, light), photons.observed)
-        for light in (linear_light, np.zeros_like(linear_light))
-    ]
-    return min(gains, key=lambda gain: gain.nats)
+    others = [fit_brightness(photons, one) for one in (linear_light, np.zeros_like(linear_light))]
+    return min(compare_likelihoods(held, expected, ratio * o, photons.observed) for o in others)
 
 
 def show_with_beam(fit: PhotonFit, linear: Array) -> Array:
@@ -524,39 +609,13 @@ def show_with_beam(fit: PhotonFit, linear: Array) -> Array:
     """
     from scipy.ndimage import gaussian_filter
 
-    grid, volume = fit.model.grid, fit.place(fit.expected_photons)
-    widths = compute_beam(fit)
-    axes = (grid.z, grid.y, grid.x)
+    grid = fit.model.grid
     sigmas = [
         max(width / float(np.median(np.diff(axis))), MIN_BEAM_VOXELS) if axis.size > 1 else 0.0
-        for width, axis in zip(widths, axes, strict=True)
+        for width, axis in zip(compute_beam(fit), (grid.z, grid.y, grid.x), strict=True)
     ]
-    shown = gaussian_filter(volume, sigmas)
+    shown = gaussian_filter(fit.place(fit.expected_photons), sigmas)
     undecided = (linear / max(float(linear.max()), 1e-30)) ** 2
     return np.asarray(
         np.maximum(shown, UNDECIDED_FRACTION * float(shown.max()) * undecided), np.float32
     )
-
-
-def _merge_pairs_of_voxels(grid: Grid) -> Grid:
-    """Return the grid of voxels twice as large along every axis."""
-    x, y, z = (
-        np.add.reduceat(axis, range(0, axis.size, 2))
-        / np.add.reduceat(np.ones_like(axis), range(0, axis.size, 2))
-        for axis in (grid.x, grid.y, grid.z)
-    )
-    return Grid(x, y, z)
-
-
-def _add_pairs(values: Array) -> Array:
-    """Add up a volume (z, y, x) over pairs of voxels along every axis."""
-    for axis in range(3):
-        values = np.add.reduceat(values, range(0, values.shape[axis], 2), axis=axis)
-    return values
-
-
-def _repeat_voxels(values: Array, shape: tuple[int, int, int]) -> Array:
-    """Repeat every voxel of a volume along every axis, cut to `shape`."""
-    for axis in range(3):
-        values = np.repeat(values, 2, axis=axis)
-    return values[: shape[0], : shape[1], : shape[2]]

@@ -4,8 +4,15 @@
 that hide one another.
 """
 
-from nlos.simulate.points import PointScene, add_poisson_noise
-from nlos.simulate.scene import HiddenScene, Lambert, Material, Retroreflector, Surface
+from nlos.simulate.scene import (
+    HiddenScene,
+    Lambert,
+    Material,
+    PointScene,
+    Retroreflector,
+    Surface,
+    add_poisson_noise,
+)
 from nlos.simulate.walls import WALLS, build_relay_wall
 
 __all__ = [

@@ -1,11 +1,12 @@
-"""Hidden scenes of surfaces that hide one another, lit and seen by way of a wall: small flat facets
-of known place, direction and material, and the triangles that hide others.
+"""Hidden scenes, lit and seen by way of a wall: points that scatter evenly, whose image is known
+exactly; and surfaces that hide one another, small flat facets of known place, direction and
+material; and photon noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,131 @@ import numpy as np
 from nlos.capture import Capture, TimeAxis
 from nlos.simulate.kernels import add_facet_light
 from nlos.simulate.walls import compute_wall_normals
-from tofclip.arrays import FloatArray
+from tofclip.arrays import FloatArray, require_numpy
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.files import format_error_line, translate_read_errors
 from tofclip.threads import run_blocks
 from tofclip.units import SPEED_OF_LIGHT
+
+
+def add_poisson_noise(
+    capture: Capture, peak_counts: float, background: float = 0.0, seed: int = 0
+) -> Capture:
+    """Draw Poisson counts.
+
+    Parameters
+    ----------
+    capture : Capture
+        Expected signal, not negative; its largest measurement maps to `peak_counts`.
+    peak_counts : float
+        Expected counts in the brightest bin, without background.
+    background : float
+        Expected counts of background, added to every bin.
+    seed : int
+        Of the random numbers; recorded in the provenance.
+
+    Returns
+    -------
+    Capture
+        Counts.
+
+    Raises
+    ------
+    InputError
+        The peak is not positive, the background negative, or the signal negative or dark.
+    """
+    if not (
+        np.isfinite(peak_counts) and peak_counts > 0 and np.isfinite(background) and background >= 0
+    ):
+        raise InputError(
+            f"counts need a positive peak and a background of 0 or more, got {peak_counts}, {background}"
+        )
+    require_numpy("drawing photons", capture.signal)
+    brightest = float(capture.signal.max())
+    if brightest <= 0 or float(capture.signal.min()) < 0:
+        raise InputError(
+            "photons can only be drawn from a signal that is nowhere negative and not all dark"
+        )
+    expected = capture.signal * (peak_counts / brightest) + background
+    signal = np.random.default_rng(seed).poisson(expected).astype(np.float32)
+    noise = {"peak_counts": peak_counts, "background": background, "seed": seed}
+    return replace(capture, signal=signal, provenance={**capture.provenance, "noise": noise})
+
+
+@dataclass(frozen=True, eq=False)
+class PointScene:
+    """Hidden points that scatter evenly in all directions, see each other not, and hide nothing.
+
+    A point of albedo a, at distance d_L from the laser spot and d_p from wall point p, returns ``a
+    / (d_L * d_p)^2`` after a path of ``d_L + d_p``. No grid of voxels takes part, so the simulation
+    shares nothing with a method that images it.
+
+    Parameters
+    ----------
+    positions : (n, 3) array
+        m.
+    albedo : (n,) array, optional
+        Defaults to 1.
+    """
+
+    positions: FloatArray
+    albedo: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        positions = np.atleast_2d(np.asarray(self.positions, dtype=np.float64))
+        albedo = np.ones(len(positions)) if self.albedo is None else self.albedo
+        albedo = np.asarray(albedo, dtype=np.float64)
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise ShapeError("positions of hidden points", "(n, 3)", positions.shape)
+        if albedo.shape != (len(positions),):
+            raise ShapeError("albedo", (len(positions),), albedo.shape)
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "albedo", albedo)
+
+    def simulate_capture(self, wall: Any, laser: Any, axis: TimeAxis, jitter: float) -> Capture:
+        """Simulate a capture without noise.
+
+        Parameters
+        ----------
+        wall : (..., 3) array
+            Wall points, m; where one is NaN, its signal is 0.
+        laser : (3,) or (..., 3) array
+            Laser spot, m, or one per wall point.
+        axis : TimeAxis
+        jitter : float
+            Standard deviation of the instrument's Gaussian response, s; its integral over every
+            time bin is exact.
+
+        Returns
+        -------
+        Capture
+
+        Raises
+        ------
+        InputError
+            The jitter is not positive.
+        """
+        from scipy.special import ndtr
+
+        dark = _make_dark_capture(wall, laser, axis, jitter)
+        signal = np.zeros(dark.signal.shape)
+        # bin i is centred on its path
+        edges = axis.start + axis.spacing * (np.arange(axis.bins + 1) - 0.5)
+        edges = edges.reshape(-1, *[1] * (signal.ndim - 1))
+        for position, albedo in zip(self.positions, np.asarray(self.albedo), strict=True):
+            outward = np.linalg.norm(dark.laser - position, axis=-1)
+            back = np.linalg.norm(dark.wall - position, axis=-1)
+            below = ndtr((edges - (outward + back)) / (SPEED_OF_LIGHT * jitter))
+            signal += albedo / (outward * back) ** 2 * np.diff(below, axis=0)
+        return replace(dark, signal=np.nan_to_num(signal))
+
+
+def _make_dark_capture(wall: Any, laser: Any, axis: TimeAxis, jitter: float) -> Capture:
+    if not (np.isfinite(jitter) and jitter > 0):
+        raise InputError(f"jitter must be a positive number of seconds, got {jitter}")
+    wall = np.asarray(wall, dtype=np.float64)
+    dark = np.zeros((axis.bins, *wall.shape[:-1]), np.float32)
+    return Capture(dark, wall, laser, axis.bin_width, axis.start)
 
 
 @dataclass(frozen=True)
@@ -135,19 +256,12 @@ class Surface:
             positive.
         """
         vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-            raise ShapeError(
-                "vertices and faces", "(v, 3) and (m, 3)", (vertices.shape, faces.shape)
-            )
-        if (
-            faces.dtype.kind not in "ui"
-            or faces.size == 0
-            or faces.min() < 0
-            or faces.max() >= len(vertices)
-        ):
-            raise InputError(
-                "faces must name vertices by their index, and there must be one at least"
-            )
+        shapes = vertices.shape, faces.shape
+        if any(len(shape) != 2 or shape[1] != 3 for shape in shapes):
+            raise ShapeError("vertices and faces", "(v, 3) and (m, 3)", shapes)
+        known = faces.dtype.kind in "ui" and np.all((faces >= 0) & (faces < len(vertices)))
+        if not (known and faces.size):
+            raise InputError("faces must name vertices by their index, and there must be one")
         if not (np.isfinite(spacing) and spacing > 0 and np.all(np.isfinite(vertices))):
             raise InputError(f"a mesh needs finite vertices and a positive spacing, got {spacing}")
         triangles = vertices[faces]
@@ -216,9 +330,7 @@ class Surface:
         """
         x, y = size[0] / 2, size[1] / 2
         # Counter-clockwise from the wall, which looks along +z with y down.
-        corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]]) + np.asarray(
-            centre, dtype=np.float64
-        )
+        corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]]) + centre
         return cls.mesh(corners, [[0, 1, 2], [0, 2, 3]], spacing, material)
 
     @classmethod
@@ -255,16 +367,13 @@ class Surface:
         x, y = _rasterize_letters(text, height, spacing)
         if x.size == 0:
             raise InputError(f"'{text}' has no ink at a spacing of {spacing} m")
-        positions = np.stack([x, y, np.zeros_like(x)], axis=-1) + np.asarray(
-            centre, dtype=np.float64
-        )
+        positions = np.stack([x, y, 0 * x], axis=-1) + np.asarray(centre, dtype=np.float64)
         normals = np.tile(TOWARDS_WALL, (x.size, 1))
         half = spacing / 2 * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])
         corners = positions[:, np.newaxis] + half
         triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
-        return cls(
-            positions, normals, np.full(x.size, spacing**2), material or Lambert(), triangles
-        )
+        areas = np.full(x.size, spacing**2)
+        return cls(positions, normals, areas, material or Lambert(), triangles)
 
 
 def _subdivide_triangles(
@@ -385,13 +494,8 @@ class HiddenScene:
         """
         from scipy.ndimage import gaussian_filter1d
 
-        if not (np.isfinite(jitter) and jitter > 0):
-            raise InputError(f"jitter must be a positive number of seconds, got {jitter}")
-        wall, laser = np.asarray(wall, dtype=np.float64), np.asarray(laser, dtype=np.float64)
-        dark = Capture(
-            np.zeros((axis.bins, *wall.shape[:-1])), wall, laser, axis.bin_width, axis.start
-        )
-        normals = compute_wall_normals(wall)[dark.valid]
+        dark = _make_dark_capture(wall, laser, axis, jitter)
+        normals = compute_wall_normals(dark.wall)[dark.valid]
         laser_normals = normals
         if len(dark.lasers) == 1:
             # the laser spot lies on the wall: it has the normal of the wall point next to it
@@ -424,4 +528,4 @@ class HiddenScene:
         run_blocks(process_block, len(traces), POINTS_PER_BLOCK)
         signal = dark.signal.copy()
         signal[:, dark.valid] = traces.T
-        return Capture(signal, wall, laser, axis.bin_width, axis.start)
+        return replace(dark, signal=signal)

@@ -12,9 +12,7 @@ from nlos import Capture, Grid, Settings, Volume, reconstruct, settings_for
 from nlos.analysis import choose_wavelength, find_brightest_path, find_first_bounce
 from nlos.band import VirtualPulse
 from nlos.capture import TimeAxis
-from nlos.completion import complete_settings, is_brightest_on_wall
-from nlos.evidence import MIN_EVIDENCE
-from nlos.imaging import prepare_imaging
+from nlos.imaging import MIN_EVIDENCE, complete_settings, is_brightest_on_wall, prepare_imaging
 from nlos.resolution import measure_point_spread
 from nlos.simulate import add_poisson_noise
 from tofclip.errors import InputError

@@ -22,7 +22,7 @@ from nlos import (
     settings_for,
 )
 from nlos.capture import unwarp_signal
-from nlos.completion import complete_settings
+from nlos.imaging import complete_settings
 from nlos.io import read_capture
 from nlos.preparation import rebin_capture, remove_first_bounce
 from tofclip.units import SPEED_OF_LIGHT
