@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from devices.address import Uri, option
-from devices.frames import FrameCodec, FrameFeed, GatedOptions
+from devices.frames import FrameCodec, FrameFeed, GatedOptions, make_streak_calibration
 from devices.registry import DiscoveredInstrument
 from devices.source import Info
 from devices.stream import StreamSource, Transfer
@@ -33,7 +33,6 @@ from tofclip.errors import (
     MissingDependencyError,
     ProtocolError,
 )
-from tofclip.storage import Field, Record
 
 PIXEL_BITS = {"Mono8": 8, "Mono10": 16, "Mono12": 16, "Mono14": 16, "Mono16": 16}
 FRAME_ID_RANGE = 0xFFFF  # GigE Vision's 16-bit identifiers go from 1 to this, and then to 1 again
@@ -105,32 +104,24 @@ class AravisFeed(FrameFeed):
                 f"the camera sends {pixel_format}; choose pixel_format={' or '.join(PIXEL_BITS)}"
             )
         self.codec = FrameCodec(height, width, PIXEL_BITS[pixel_format])
-
-    @property
-    def info(self) -> Info:
         camera = self._camera
         with self._translate_errors():
-            return Info(
+            self.info = Info(
                 f"{camera.get_vendor_name()} {camera.get_model_name()} (Aravis)",
                 camera.get_device_serial_number() or "",
                 {
-                    "pixel_format": camera.get_pixel_format_as_string(),
+                    "pixel_format": pixel_format,
                     "exposure_us": camera.get_exposure_time(),
                     "gain": camera.get_gain(),
                     "frame_rate": camera.get_frame_rate(),
-                    "rows": self.codec.rows,
-                    "columns": self.codec.columns,
+                    "rows": height,
+                    "columns": width,
                 },
             )
-
-    @property
-    def calibration(self) -> Record | None:
-        """Times of the gate, or of the rows of a streak picture, where the address gives them."""
-        options = self._options
-        if options.is_gated or options.row_ps is None:
-            return options.gate_record
-        times = (np.arange(self.codec.rows) + 0.5) * options.row_ps * PICOSECOND_S
-        return Record("streak_calibration", {"row_times": Field(times, "s", ("row",))})
+        self.calibration = options.gate_record
+        if options.row_ps is not None and not options.is_gated:
+            times = (np.arange(height) + 0.5) * options.row_ps * PICOSECOND_S
+            self.calibration = make_streak_calibration(times)
 
     def start(self) -> None:
         with self._translate_errors():

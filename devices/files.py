@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from devices.address import Uri
+from devices.frames import make_streak_calibration
 from devices.source import READ_TIMEOUT_S, Batch, Info, Ledger, Records, Source, Stats
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import (
@@ -39,7 +40,7 @@ from tofclip.io.tcspc import (
     read_sdt_blocks,
     require_pulses,
 )
-from tofclip.storage import Field, Record, Scalar
+from tofclip.storage import Record, Scalar
 
 HISTOGRAM_BYTES = 4  # Of one bin in a PHU file
 
@@ -65,6 +66,8 @@ class RecordFile(Source):
     records the electronics ``lost``, and can ``decode`` a piece.
     """
 
+    is_seekable = True
+
     def __init__(
         self,
         path: str | Path,
@@ -73,26 +76,15 @@ class RecordFile(Source):
         with guard(path, "is a damaged or unsupported file"):
             Path(path).stat()  # some libraries say of an absent file that it is damaged
             self._reader = open_file(Path(path))
+        self.info, self.calibration = self._reader.info, self._reader.calibration
         self._begins = [0, *accumulate(self._reader.sizes)]
         self._closed = False
         self._decoded: tuple[int, Records] | None = None
         self.seek(0)
 
     @property
-    def info(self) -> Info:
-        return self._reader.info
-
-    @property
-    def calibration(self) -> Record | None:
-        return self._reader.calibration
-
-    @property
     def stats(self) -> Stats:
         return self._ledger.stats
-
-    @property
-    def is_seekable(self) -> bool:
-        return True
 
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
         """Return the next batch at once; `timeout` does not matter."""
@@ -358,8 +350,5 @@ def _read_picture(path: Path) -> WholeRecords:
         "date": said.get("Application/Date", ""),
     }
     info = Info("streak image in a file", said.get("Camera/SerialNumber", ""), details)
-    known = None
-    if streak.row_times is not None:
-        times = Field(streak.row_times, "s", ("row",))
-        known = Record("streak_calibration", {"row_times": times})
-    return WholeRecords(frame, info, known)
+    times = streak.row_times
+    return WholeRecords(frame, info, None if times is None else make_streak_calibration(times))

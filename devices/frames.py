@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from devices.address import Uri, option
 from devices.source import ByteView, Codec, DecodeResult, Gap, Ledger, Records
 from devices.stream import Feed, InstrumentClock, LiveOptions, Transfer, retry_connect
+from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.storage import Field, Record, Scalar
 
@@ -63,6 +64,16 @@ class GatedOptions(LiveOptions):
         if not found.is_gated and any(name.startswith("gate_") for name in uri.values):
             raise InputError(f"'{uri.text}': a gate needs mode=gated")
         return found
+
+
+def make_streak_calibration(times: NDArray[np.float64], camera: Camera | None = None) -> Record:
+    """Return what is known of streak pictures whose rows are at these times, s, and of the camera
+    before them.
+    """
+    children = {} if camera is None else {"camera": camera.to_record()}
+    return Record(
+        "streak_calibration", {"row_times": Field(times, "s", ("row",))}, children=children
+    )
 
 
 MAX_FRAME_BYTES = 1 << 26  # No camera here has larger pictures: 16 megapixels of 32 bits

@@ -252,28 +252,19 @@ class KitFeed(FrameFeed):
         self._open_port()
         # a row for each bin, a column for each zone
         self.codec = FrameCodec(options.bins, options.zones, 32)
-
-    @property
-    def info(self) -> Info:
-        options = self._options
         known = {"bins": options.bins, "zones": options.zones, "bin_width_s": options.bin_width}
         limits = "written from public programs; no such kit was at hand"
-        return Info(options.instrument, "", {"port": self._name, **known, "limits": limits})
-
-    @property
-    def calibration(self) -> Record | None:
-        """Middle of each bin, s, what a stored count stands for, and the square that the zones make, row
-        by row as they come; of other numbers, and where `shape` of an address says so, a picture of
-        its own.
-        """
-        options, zones = self._options, self._options.zones
+        self.info = Info(options.instrument, "", {"port": port, **known, "limits": limits})
+        # Zones make a square, row by row as they come; other numbers of them a row, where `shape` of
+        # an address does not say otherwise.
+        side = isqrt(options.zones)
+        rows = side if side**2 == options.zones else 1
         times = options.begin + options.bin_width * (np.arange(options.bins) + 0.5)
-        rows = isqrt(zones) if isqrt(zones) ** 2 == zones else 1
-        known = {
+        fields = {
             "bin_times": Field(times, "s", ("bin",)),
-            "image_shape": Field(np.array([rows, zones // rows]), "px", ("yx",)),
+            "image_shape": Field(np.array([rows, options.zones // rows]), "px", ("yx",)),
         }
-        return Record("histograms", known, {"count_scale": options.scale})
+        self.calibration = Record("histograms", fields, {"count_scale": options.scale})
 
     def start(self) -> None:
         with self._translate_errors():

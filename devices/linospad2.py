@@ -430,8 +430,9 @@ class LinoSpad2File(SeekableSource):
     codec: LinoSpad2Codec
 
     def __init__(self, path: str | Path) -> None:
-        self._sidecar = read_sidecar(path)
-        codec = self._sidecar.codec
+        known = read_sidecar(path)
+        codec = known.codec
+        camera = Record.load(known.folder / known.camera, "camera") if known.camera else None
         with translate_read_errors(path):
             self._file = open(path, "rb")  # noqa: SIM115 - closed by `close`
         size = os.fstat(self._file.fileno()).st_size
@@ -452,18 +453,9 @@ class LinoSpad2File(SeekableSource):
             )
         records = marks[-1].delivered + marks[-1].malformed
         super().__init__(codec, Path(path), pieces, records, int(rest > 0), marks)
-
-    @property
-    def info(self) -> Info:
-        details = {"limits": LIMITATION, **self.codec.settings}
-        return Info("LinoSPAD2 recording", self._sidecar.board, details)
-
-    @property
-    def calibration(self) -> Record:
-        known, camera = self._sidecar, None
-        if known.camera:
-            camera = Record.load(known.folder / known.camera, "camera")
-        return make_calibration_record(known.calibration, known.laser_period, camera)
+        details = {"limits": LIMITATION, **codec.settings}
+        self.info = Info("LinoSPAD2 recording", known.board, details)
+        self.calibration = make_calibration_record(known.calibration, known.laser_period, camera)
 
     def close(self) -> None:
         super().close()

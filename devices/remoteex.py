@@ -19,7 +19,7 @@ import contextlib
 import enum
 import re
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from time import monotonic, sleep
 from typing import NamedTuple
@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from devices.address import Uri, option, parse_numbers
-from devices.frames import MAX_FRAME_BYTES, FrameCodec, FrameFeed
+from devices.frames import MAX_FRAME_BYTES, FrameCodec, FrameFeed, make_streak_calibration
 from devices.source import Gap, Info
 from devices.stream import LiveOptions, StreamSource, Transfer
 from devices.tcp import TcpLink
@@ -41,7 +41,7 @@ from tofclip.errors import (
     ProtocolError,
 )
 from tofclip.io.hamamatsu import TIME_UNITS
-from tofclip.storage import Field, Record, Scalar
+from tofclip.storage import Scalar
 
 COMMAND_PORT = 1001
 TERMINATOR = b"\r"
@@ -441,29 +441,21 @@ class RemoteExFeed(FrameFeed):
         try:
             first = self._first
             self.codec = FrameCodec(first.rows, first.columns, 8 * first.pixel_bytes)
-            self._parameters: dict[str, Scalar] = {}
+            known: dict[str, Scalar] = {}
             for name, parameter in _PARAMETERS.items():
                 with contextlib.suppress(ProtocolError):  # HiPic has no streak tube to ask
                     said = self._link.ask("DevParamGet", STREAK_TUBE, parameter)
-                    self._parameters[name] = ",".join(said)
-            self._row_times = self._read_row_times()
+                    known[name] = ",".join(said)
+            times = self._read_row_times(known)
+            self.calibration = None if times is None else make_streak_calibration(times)
+            self.info = Info(
+                INSTRUMENT, "", {**known, "rows": first.rows, "columns": first.columns}
+            )
         except BaseException:
             # Also a signal to end: nothing else could turn the gain down now.
             with contextlib.suppress(DeviceError):
                 self.close()
             raise
-
-    @property
-    def info(self) -> Info:
-        shape = {"rows": self.codec.rows, "columns": self.codec.columns}
-        return Info(INSTRUMENT, "", {**self._parameters, **shape})
-
-    @property
-    def calibration(self) -> Record | None:
-        """Time of each row in s, where the camera sweeps."""
-        if self._row_times is None:
-            return None
-        return Record("streak_calibration", {"row_times": Field(self._row_times, "s", ("row",))})
 
     def pull(self, timeout: float) -> Transfer | None:
         while True:
@@ -645,12 +637,14 @@ class RemoteExFeed(FrameFeed):
         self.ledger.lose(max(0, self._newest - self._next + 1))
         self._newest, self._unread_frame = self._next - 1, None
 
-    def _read_row_times(self) -> NDArray[np.float64] | None:
-        """Return the rows' times, s; the table is in the unit of the time range, as the files show."""
-        time_range = str(self._parameters.get("time_range", "")).strip()
+    def _read_row_times(self, known: Mapping[str, Scalar]) -> NDArray[np.float64] | None:
+        """Return the rows' times, s, None where the camera does not sweep; the table is in the unit of
+        the time range, as the files show.
+        """
+        time_range = str(known.get("time_range", "")).strip()
         is_numbered = time_range.isdecimal() and len(time_range) < 4
         unit = SYNCHROSCAN_UNIT_S if is_numbered else TIME_UNITS.get(time_range.rpartition(" ")[2])
-        if unit is None or self._parameters.get("mode") == "Focus":
+        if unit is None or known.get("mode") == "Focus":
             return None
         try:
             table = self._link.read_scaling_table().astype(np.float64)

@@ -410,32 +410,28 @@ class Source(Closing):
     A subclass gives `read`, `close`, `info` and `stats`, and where they differ from the defaults
     the rest. Opening is done by the constructor (or the function in `devices.registry`); leaving
     the context closes.
+
+    Attributes
+    ----------
+    info : Info
+        What is known about the instrument.
+    calibration : Record or None
+        Tables and constants that turn records into seconds and pixels, if there are any.
+    is_live : bool
+        Whether the records come from an instrument, real or emulated, and go by if not read.
+    is_seekable : bool
+        Whether `seek` works.
     """
 
-    @property
-    @abc.abstractmethod
-    def info(self) -> Info:
-        """What is known about the instrument."""
+    info: Info
+    calibration: Record | None = None
+    is_live = False
+    is_seekable = False
 
     @property
     @abc.abstractmethod
     def stats(self) -> Stats:
         """Where every record went so far; final after `close`."""
-
-    @property
-    def calibration(self) -> Record | None:
-        """Tables and constants that turn records into seconds and pixels, if there are any."""
-        return None
-
-    @property
-    def is_live(self) -> bool:
-        """Whether the records come from an instrument, real or emulated, and go by if not read."""
-        return False
-
-    @property
-    def is_seekable(self) -> bool:
-        """Whether `seek` works."""
-        return False
 
     @abc.abstractmethod
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
@@ -495,6 +491,9 @@ class Source(Closing):
 class DecodedSource(Source):
     """What live and recorded streams have in common, so that both decode alike."""
 
+    is_complete = True
+    """Whether nothing is missing beyond `stats`; False for a cut or repaired recording."""
+
     def __init__(self, codec: Codec, ledger: Ledger) -> None:
         self.codec = codec
         self.tap: Callable[[Piece], None] | None = None
@@ -505,11 +504,6 @@ class DecodedSource(Source):
     @property
     def stats(self) -> Stats:
         return self._ledger.stats
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether nothing is missing beyond `stats`; False for a cut or repaired recording."""
-        return True
 
     def _decode_piece(self, piece: Piece) -> Batch:
         """Hand a piece to the tap and decode it."""
@@ -544,6 +538,8 @@ class SeekableSource(DecodedSource):
     while reading.
     """
 
+    is_seekable = True
+
     def __init__(
         self,
         codec: Codec,
@@ -558,10 +554,6 @@ class SeekableSource(DecodedSource):
         self._checkpoints = checkpoints or [Checkpoint(codec.start, 0, 0)]
         self._next = self._skip = 0
         self._go_to(0)
-
-    @property
-    def is_seekable(self) -> bool:
-        return True
 
     @abc.abstractmethod
     def _read_piece(self, number: int) -> Piece:

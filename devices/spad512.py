@@ -32,7 +32,6 @@ from tofclip.errors import (
     InputError,
     ProtocolError,
 )
-from tofclip.storage import Record
 
 DEFAULT_PORT = 9999
 DONE_MARK, ERROR_MARK = b"DONE", b"ERROR"
@@ -178,30 +177,23 @@ class Spad512Feed(FrameFeed):
         super().__init__()
         self._connect, self._options = connect, options
         self._patience, self.codec = options.timeout_s, options.codec
+        self.calibration = options.gate_record
         self._frames_due = 0
         self._received = bytearray()
         self._stopped = False
         self._open_link()
-
-    @property
-    def info(self) -> Info:
-        return Info(
+        self.info = Info(
             INSTRUMENT,
             self._facts[0].rpartition(":")[2].strip() if self._facts else "",
             {
                 "greeting": self._greeting,
                 "system": "; ".join(self._facts),
-                "bits": self._options.bits,
-                "exposure_s": self._options.seconds,
+                "bits": options.bits,
+                "exposure_s": options.seconds,
                 "rows": self.codec.rows,
                 "columns": self.codec.columns,
             },
         )
-
-    @property
-    def calibration(self) -> Record | None:
-        """When the gate opens in each picture of a scan, s; None where there is no gate."""
-        return self._options.gate_record
 
     def pull(self, timeout: float) -> Transfer | None:
         while True:

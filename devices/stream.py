@@ -108,16 +108,8 @@ class Feed(abc.ABC):
 
     codec: Codec  # what reads its bytes
     ledger: Ledger  # where the feed enters losses and reconnections
-
-    @property
-    @abc.abstractmethod
-    def info(self) -> Info:
-        """What is known about the instrument."""
-
-    @property
-    def calibration(self) -> Record | None:
-        """What turns records into seconds and pixels."""
-        return None
+    info: Info  # what is known about the instrument
+    calibration: Record | None = None  # what turns records into seconds and pixels
 
     def start(self) -> None:  # noqa: B027 - some instruments run since they were connected
         """Let the instrument send."""
@@ -152,10 +144,12 @@ class LiveOptions(StreamOptions):
 class StreamSource(DecodedSource):
     """A live source. Memory: the buffer's capacity, one transfer and one decoded piece."""
 
+    is_live = True
+
     def __init__(self, feed: Feed, options: StreamOptions | None = None) -> None:
         options = options or StreamOptions()
         super().__init__(feed.codec, feed.ledger)
-        self._feed = feed
+        self._feed, self._rest, self._gap = feed, b"", Gap.NONE
         capacity = int(options.buffer_mib * _MEBIBYTE)
         self._ring = RingBuffer(capacity, options.policy, feed.ledger)
         self._stopping, self._closed = threading.Event(), False
@@ -163,7 +157,7 @@ class StreamSource(DecodedSource):
         try:
             feed.start()
             # Asked before the thread starts, because a feed is used by one thread at a time.
-            self._info, self._calibration = feed.info, feed.calibration
+            self.info, self.calibration = feed.info, feed.calibration
             _open_sources.add(self)
             self._thread.start()
         except BaseException:
@@ -171,23 +165,9 @@ class StreamSource(DecodedSource):
             feed.close()
             raise
 
-    @property
-    def info(self) -> Info:
-        return self._info
-
-    @property
-    def calibration(self) -> Record | None:
-        return self._calibration
-
-    @property
-    def is_live(self) -> bool:
-        return True
-
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
         piece = None if self._closed else self._ring.get(timeout)
-        if piece is None:
-            return None
-        return self._decode_piece(piece)
+        return None if piece is None else self._decode_piece(piece)
 
     def keep_newest(self) -> None:
         """From now on, a late reader gets the newest piece; the others count as dropped."""
@@ -210,14 +190,50 @@ class StreamSource(DecodedSource):
         Whatever goes wrong here, `read` raises it: a thread that ended without a word would look
         like an instrument in the dark.
         """
-        reader = _FeedReader(self._feed, self._ring)
         # The feed is closed even if reading failed, and on the thread that used it.
-        for step in (lambda: reader.run(self._stopping), self._feed.close):
+        for step in (self._pull_all, self._count_truncated, self._feed.close):
             try:
                 step()
             except BaseException as fault:
                 self._ring.fail(fault)
         self._ring.end()
+
+    def _pull_all(self) -> None:
+        """Pull until the end of the stream, or until a stopped instrument has nothing left."""
+        while not self._stopping.is_set():
+            try:
+                arrival = self._feed.pull(POLL_INTERVAL_S)
+            except DeviceTimeoutError:
+                self._ledger.time_out()
+                continue
+            if arrival is None:
+                break
+            self._enqueue(arrival)
+        self._feed.stop()
+        deadline = monotonic() + DRAIN_TIMEOUT_S
+        with contextlib.suppress(DeviceTimeoutError):
+            while monotonic() < deadline and (rest := self._feed.pull(POLL_INTERVAL_S)):
+                self._enqueue(rest)
+
+    def _enqueue(self, arrival: Transfer) -> None:
+        """Cut what came into whole records."""
+        # A record cut by a gap never gets its end.
+        if arrival.gap is not Gap.NONE:
+            self._count_truncated()
+            self._gap = max(self._gap, arrival.gap)
+        data = self._rest + arrival.data
+        end = self.codec.count_complete_bytes(as_bytes(data))
+        whole, self._rest = data[:end], data[end:]
+        if whole:
+            records = self.codec.count_records(as_bytes(whole))
+            self._ring.put(Piece(whole, records, self._gap, monotonic(), arrival.taken_at))
+            self._gap = Gap.NONE
+
+    def _count_truncated(self) -> None:
+        """Enter a record of which the end never came."""
+        if self._rest:
+            self._ledger.truncate()
+            self._rest = b""
 
 
 _open_sources: WeakSet[StreamSource] = WeakSet()
@@ -228,53 +244,6 @@ def _close_open_sources() -> None:
     """Switch off what a program leaves open when it ends, whether it forgot or was interrupted."""
     for source in list(_open_sources):
         source.close()
-
-
-class _FeedReader:
-    """Cuts what a feed brings into whole records."""
-
-    def __init__(self, feed: Feed, ring: RingBuffer) -> None:
-        self._feed, self._codec, self._ledger, self._ring = feed, feed.codec, feed.ledger, ring
-        self._rest, self._gap = b"", Gap.NONE
-
-    def run(self, stopping: threading.Event) -> None:
-        """Pull until the end of the stream, or until a stopped instrument has nothing left."""
-        try:
-            while not stopping.is_set():
-                try:
-                    arrival = self._feed.pull(POLL_INTERVAL_S)
-                except DeviceTimeoutError:
-                    self._ledger.time_out()
-                    continue
-                if arrival is None:
-                    break
-                self._enqueue(arrival)
-            self._feed.stop()
-            deadline = monotonic() + DRAIN_TIMEOUT_S
-            with contextlib.suppress(DeviceTimeoutError):
-                while monotonic() < deadline and (rest := self._feed.pull(POLL_INTERVAL_S)):
-                    self._enqueue(rest)
-        finally:
-            self._count_truncated()
-
-    def _enqueue(self, arrival: Transfer) -> None:
-        # A record cut by a gap never gets its end.
-        if arrival.gap is not Gap.NONE:
-            self._count_truncated()
-            self._gap = max(self._gap, arrival.gap)
-        data = self._rest + arrival.data
-        end = self._codec.count_complete_bytes(as_bytes(data))
-        whole, self._rest = data[:end], data[end:]
-        if whole:
-            records = self._codec.count_records(as_bytes(whole))
-            self._ring.put(Piece(whole, records, self._gap, monotonic(), arrival.taken_at))
-            self._gap = Gap.NONE
-
-    def _count_truncated(self) -> None:
-        """Enter a record of which the end never came."""
-        if self._rest:
-            self._ledger.truncate()
-            self._rest = b""
 
 
 def retry_connect(connect: Callable[[], _Connected], seconds: float) -> _Connected:

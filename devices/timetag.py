@@ -264,28 +264,20 @@ class TimeTaggerFeed(Feed):
         self._is_flushed = False
         self._records_received = 0
         self._bytes_since_gap = 0
-        self._clock_hz = self._tagger.read(Register.CLOCK)
+        clock_hz = self._tagger.read(Register.CLOCK)
         # Ticks become seconds by this number, so that a wrong one is refused before any record.
-        if not MIN_CLOCK_HZ <= self._clock_hz <= MAX_CLOCK_HZ:
-            advice = (
-                "unplug it and plug it in again" if self._clock_hz else "is its gateware loaded?"
-            )
+        if not MIN_CLOCK_HZ <= clock_hz <= MAX_CLOCK_HZ:
+            advice = "unplug it and plug it in again" if clock_hz else "is its gateware loaded?"
             raise ProtocolError(
-                f"the time tagger says that its clock has {self._clock_hz} Hz, which cannot be; {advice}"
+                f"the time tagger says that its clock has {clock_hz} Hz, which cannot be; {advice}"
             )
-
-    @property
-    def info(self) -> Info:
         details: dict[str, Scalar] = {
             "version": self._tagger.version,
-            "clock_hz": self._clock_hz,
-            "usb": str(self._link.identity),
+            "clock_hz": clock_hz,
+            "usb": str(link.identity),
         }
-        return Info(INSTRUMENT, self._link.serial, details)
-
-    @property
-    def calibration(self) -> Record:
-        return Record("calibration", attributes={"tick_s": 1 / self._clock_hz})
+        self.info = Info(INSTRUMENT, link.serial, details)
+        self.calibration = Record("calibration", attributes={"tick_s": 1 / clock_hz})
 
     def start(self) -> None:
         self._tagger.reset()

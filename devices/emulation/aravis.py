@@ -16,9 +16,10 @@ from devices.emulation.scenes import (
     simulate_demonstration_light,
     simulate_line_light,
 )
+from devices.frames import make_streak_calibration
 from devices.stream import StreamSource
 from tofclip.errors import DeviceNotFoundError, MissingDependencyError
-from tofclip.storage import Field, Record
+from tofclip.storage import Record
 
 LIBRARY_FILE = "libaravis-0.8.so.0"
 # ``(buffer, nothing, exposure_us, gain, pixel_format)``, called in the camera's own thread
@@ -121,8 +122,7 @@ def open_emulated(uri: Uri) -> StreamSource:
         return _open_camera(library, camera, options, None)
     options = replace(options, pixel_format="Mono16")
     seen = simulate_line_light() if options.scene == "small" else simulate_demonstration_light()
-    times = {"row_times": Field(seen.row_times, "s", ("row",))}
-    known = Record("streak_calibration", times, children={"camera": seen.camera.to_record()})
+    known = make_streak_calibration(seen.row_times, seen.camera)
     camera = EmulatedCamera(library, serial, lost, EmulatedLight.of(seen, options.seed))
     return _open_camera(library, camera, options, known)
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
-from devices.source import Info
 from devices.stream import Feed, Transfer
 from tofclip.errors import InputError
 from tofclip.storage import Record
@@ -164,22 +163,15 @@ class EmulatedFeed(Feed):
         connect: Callable[[], Feed],
         describe: Callable[[Record | None], Record | None] = lambda known: known,
     ) -> None:
-        self._instrument, self._describe = instrument, describe
+        self._instrument = instrument
         try:
-            self._feed = connect()
+            self._feed = feed = connect()
         except BaseException:
             instrument.close()
             raise
-        self.codec, self.ledger = self._feed.codec, self._feed.ledger
-
-    @property
-    def info(self) -> Info:
-        known = self._feed.info
-        return replace(known, instrument=f"emulated {known.instrument}")
-
-    @property
-    def calibration(self) -> Record | None:
-        return self._describe(self._feed.calibration)
+        self.codec, self.ledger = feed.codec, feed.ledger
+        self.info = replace(feed.info, instrument=f"emulated {feed.info.instrument}")
+        self.calibration = describe(feed.calibration)
 
     def start(self) -> None:
         self._feed.start()

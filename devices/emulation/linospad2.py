@@ -29,7 +29,6 @@ from devices.linospad2_kernels import ADDRESSES
 from devices.source import Info, Ledger, Records
 from devices.stream import Feed, StreamOptions, StreamSource, Transfer
 from tofclip.errors import InputError, ShapeError
-from tofclip.storage import Record
 
 INSTRUMENT = "simulated LinoSPAD2"
 LASER_PERIOD_S = 25e-9
@@ -130,18 +129,10 @@ class SimulatedFeed(Feed):
         self.ledger, self.codec = Ledger(), board.codec
         self._board, self._left, self._cycle_time = board, cycles, cycle_time
         self._number = 0
-
-    @property
-    def info(self) -> Info:
         limits = "LinoSPAD2's USB commands are not public: recordings are read, and boards simulated, not driven"
-        codec = self._board.codec
-        return Info(INSTRUMENT, f"SIM{self._board.seed}", {"limits": limits, **codec.settings})
-
-    @property
-    def calibration(self) -> Record:
-        return make_calibration_record(
-            self._board.calibration, LASER_PERIOD_S, self._board.light.camera.to_record()
-        )
+        self.info = Info(INSTRUMENT, f"SIM{board.seed}", {"limits": limits, **board.codec.settings})
+        camera = board.light.camera.to_record()
+        self.calibration = make_calibration_record(board.calibration, LASER_PERIOD_S, camera)
 
     def start(self) -> None:
         self._began = monotonic()

@@ -364,24 +364,13 @@ class ReplaySource(SeekableSource):
 
     def __init__(self, path: Path, is_paced: bool = False) -> None:
         self._recording = recording = Recording(path)
-        codec, self._info, self._is_paced = recording.codec, recording.info, is_paced
-        self._is_complete = False
+        codec, self.info, self._is_paced = recording.codec, recording.info, is_paced
+        self.calibration = recording.head.children.get("calibration")
+        self.is_complete = False
         self._blocks = list(self._list_blocks())
         self._last_due: tuple[float, int] | None = None
         records = sum(block.header.records for block in self._blocks)
         super().__init__(codec, path, len(self._blocks), records)
-
-    @property
-    def info(self) -> Info:
-        return self._info
-
-    @property
-    def calibration(self) -> Record | None:
-        return self._recording.head.children.get("calibration")
-
-    @property
-    def is_complete(self) -> bool:
-        return self._is_complete
 
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
         if self._is_paced and self._next < self._pieces:
@@ -415,7 +404,7 @@ class ReplaySource(SeekableSource):
                 yield entry
             elif entry.header.kind is BlockKind.END:
                 ending = Ending.from_json(blocks.read_payload(entry), path)
-                self._is_complete = ending.is_complete
+                self.is_complete = ending.is_complete
 
     def _wait_until_due(self, block: Block, timeout: float) -> None:
         """Wait until a block is due; DeviceTimeoutError where that is later than `timeout`."""

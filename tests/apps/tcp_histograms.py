@@ -41,21 +41,15 @@ class HistogramFeed(FrameFeed):
         super().__init__()
         self._place, self._options, self._is_stopped = (host, port), options, False
         self._connect()
-
-    @property
-    def info(self) -> Info:
         shape = {"rows": SIDE, "columns": SIDE, "bins": BINS, "bin_width_s": BIN_S}
-        return Info("histogram array", "", {"address": self._link.name, **shape})
-
-    @property
-    def calibration(self) -> Record:
-        """When each bin is, which picture the histograms make, and where it looks."""
+        self.info = Info("histogram array", "", {"address": self._link.name, **shape})
+        # When each bin is, which picture the histograms make, and where it looks
         fields = {
             "bin_times": Field(BIN_S * (np.arange(BINS) + 0.5), "s", ("bin",)),
             "image_shape": Field(np.array([SIDE, SIDE]), "px", ("yx",)),
         }
         camera = Camera.pinhole((SIDE, SIDE), 40.0, pulse_fwhm=700e-12).to_record()
-        return Record("histograms", fields, {"axes": "yxt"}, {"camera": camera})
+        self.calibration = Record("histograms", fields, {"axes": "yxt"}, {"camera": camera})
 
     def pull(self, timeout: float) -> Transfer | None:
         deadline = monotonic() + timeout
