@@ -7,23 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import Capture
-from nlos.kernels import migrate_row, shift_signals
+from nlos.kernels import migrate_row, rebin, shift_signals
 from nlos.method import Method, Plan, Progress, require_imageable, require_numpy_signal
 from nlos.plane import PlanarWall, Plane, axis_step
 from nlos.volume import Grid, Volume
 from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, thread_count
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
-
 
 # Points may be off the lattice by this fraction of its step.
 LATTICE_TOLERANCE = 0.02
@@ -244,13 +240,17 @@ class LightCone(Method):
 
     def _compute(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
         """Return the image (z, y, x) of a scan on a grid."""
-        from scipy.fft import ifft2, irfft
+        from scipy.fft import dctn, ifft2, irfft
 
         bins, workers = scan.signal.shape[2], thread_count()
         # one sample of u = z^2 for each bin, over the same range of depths
-        squares = (bins * scan.spacing) ** 2 / bins
+        squares = bins * scan.spacing**2
         spectrum, shape = transform_squared_distances(scan, squares, self.falloff)
-        kernel = _transform_paraboloid(scan, squares, shape)
+        # along x and y the kernel is even: cosine transforms of a quadrant suffice
+        sides = zip(scan.plane.steps, shape[:2], strict=True)
+        y, x = (length * np.arange(n // 2 + 1) for length, n in sides)
+        columns = transform_paraboloid(y, x, squares, shape, slice(0, spectrum.shape[2]))
+        kernel = dctn(columns.astype(np.complex64), 1, axes=(0, 1), workers=workers)
         apply_wiener_filter(spectrum, kernel, self.signal_to_noise)
         spectrum = ifft2(spectrum, axes=(0, 1), workers=workers, overwrite_x=True)
         values = irfft(spectrum, shape[2], workers=workers, overwrite_x=True)[..., :bins]
@@ -277,26 +277,6 @@ def apply_wiener_filter(
     run_blocks(process_block, spectrum.shape[0], 8)
 
 
-def build_rebinning_matrix(source_edges: FloatArray, target_edges: FloatArray) -> csr_array:
-    """Matrix (targets, sources) of the means over target intervals of a function given by its means
-    over source ones. The edges (n + 1,) increase; intervals of length 0 are allowed. Targets beyond
-    the sources count as 0 there.
-    """
-    from scipy.sparse import csr_array
-
-    # between two neighbouring edges both source and target are constant
-    edges = np.unique(np.concatenate([source_edges, target_edges]))
-    middles, lengths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
-    source, target = (
-        np.searchsorted(e, middles, side="right") - 1 for e in (source_edges, target_edges)
-    )
-    shape = (target_edges.size - 1, source_edges.size - 1)
-    inside = (source >= 0) & (source < shape[1]) & (target >= 0) & (target < shape[0])
-    source, target, lengths = source[inside], target[inside], lengths[inside]
-    weights = (lengths / np.diff(target_edges)[target]).astype(np.float32)
-    return csr_array((weights, (target, source)), shape=shape)
-
-
 def transform_squared_distances(
     scan: ConfocalScan, squares: float, falloff: float
 ) -> tuple[NDArray[np.complex64], tuple[int, int, int]]:
@@ -311,52 +291,33 @@ def transform_squared_distances(
     shape = (find_padded_length(rows), find_padded_length(columns), find_padded_length(bins))
     # edges of the bins in v; a bin is centred on its distance
     edges = (np.clip(np.arange(bins + 1) - 0.5, 0, None) * scan.spacing) ** 2
-    matrix = build_rebinning_matrix(edges, squares * np.arange(bins + 1))
-    over_squares = matrix @ scan.correct_falloff(falloff).reshape(-1, bins).T
+    # means over even intervals
+    light = scan.correct_falloff(falloff) * (np.diff(edges) / squares).astype(np.float32)
+    over_squares = rebin(light, edges, squares * np.arange(bins + 1))
     workers = thread_count()
-    spectrum = rfft(over_squares.T.reshape(scan.signal.shape), shape[2], workers=workers)
+    spectrum = rfft(over_squares, shape[2], workers=workers)
     return fft2(spectrum, shape[:2], axes=(0, 1), workers=workers), shape
 
 
-def _transform_paraboloid(
-    scan: ConfocalScan, squares: float, shape: tuple[int, int, int]
-) -> NDArray[np.complex64]:
-    """Spectrum of the kernel ``v = x^2 + y^2`` of unit energy, for frequencies that are not
-    negative. Along v every column of it is an impulse between two samples, whose spectrum is known;
-    along x and y it is even, so that cosine transforms of a quadrant suffice.
+def transform_paraboloid(
+    y: NDArray[Any], x: NDArray[Any], squares: float, shape: tuple[int, int, int], some: slice
+) -> NDArray[np.complex128]:
+    """Spectrum along v (y, x, frequencies) of the kernel ``v = x^2 + y^2`` of unit energy, the same
+    at every depth, at some frequencies: an impulse for every column, shared linearly between two
+    samples. `y`, `x`: m; `squares` and `shape` as of `transform_squared_distances`.
     """
-    from scipy.fft import dctn
-
-    y, x = (
-        length * np.arange(n // 2 + 1)
-        for length, n in zip(scan.plane.steps, shape[:2], strict=True)
-    )
     late = (y[:, np.newaxis] ** 2 + x**2) / squares
-    whole = np.floor(late)
-    # an impulse between two samples is shared linearly
+    whole = np.floor(late).astype(np.intp)
     weight = (late - whole)[..., np.newaxis]
-    turn = np.exp(-2j * np.pi * np.arange(shape[2] // 2 + 1) / shape[2])
+    frequencies = np.arange(some.start, some.stop)
+    turn = np.exp(-2j * np.pi / shape[2] * frequencies)
+    # A delay of whole samples is a power of one phase; from a table of one whole turn it is quicker
+    # than an exponential, and as exact.
+    table = np.exp(-2j * np.pi / shape[2] * np.arange(shape[2])).astype(np.complex64)
+    delayed = table[whole[..., np.newaxis] * frequencies % shape[2]]
     # Impulses beyond the padded record would wrap around into it.
     height = (whole < shape[2] - 1) / np.sqrt(shape[0] * shape[1])
-    columns: NDArray[Any] = tabulate_powers(turn, whole.astype(np.intp), shape[2]) * (
-        1 - weight + weight * turn
-    )
-    columns *= height[..., np.newaxis]
-    return np.asarray(
-        dctn(columns.astype(np.complex64), 1, axes=(0, 1), workers=thread_count()), np.complex64
-    )
-
-
-def tabulate_powers(
-    turn: NDArray[np.complex128], power: NDArray[np.intp], period: int, first: int = 0
-) -> NDArray[np.complex64]:
-    """``turn[w] ** power`` from a table of one whole turn. `turn` (w,): ``exp(-2j * pi * (first +
-    w) / period)``. Returns (..., w).
-    """
-    # powers of a root of unity repeat: a table is quicker than exponentials, and as exact
-    table = np.exp(-2j * np.pi * np.arange(period) / period).astype(np.complex64)
-    exponent = power[..., np.newaxis] * np.arange(first, first + turn.size)
-    return np.asarray(table[exponent % period])
+    return np.asarray(delayed * ((1 - weight + weight * turn) * height[..., np.newaxis]))
 
 
 @dataclass(frozen=True)

@@ -73,9 +73,7 @@ def write_ply(
 
 
 def extract_surface(volume: Volume, fraction: float) -> Mesh:
-    """Draw the surface on which the magnitude is `fraction` (0..1) of the largest, by marching
-    cubes. Returns vertices in m, float32, and faces, int32.
-    """
+    """Draw the surface of `Volume.surface` by marching cubes."""
     magnitude = volume.magnitude
     if not 0 < fraction < 1:
         raise InputError(
@@ -91,14 +89,10 @@ def extract_surface(volume: Volume, fraction: float) -> Mesh:
 def extract_points(
     volume: Volume, fraction: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Positions (n, 3) in m, and magnitudes (n,), of the voxels with at least `fraction` (0..1) of
-    the brightest.
-    """
+    """Positions and magnitudes of bright voxels; see `Volume.points`."""
     z, y, x = np.nonzero(volume.threshold(fraction).magnitude)
-    xyz = np.stack([volume.grid.x[x], volume.grid.y[y], volume.grid.z[z]], axis=-1).astype(
-        np.float32
-    )
-    return xyz, volume.magnitude[z, y, x].astype(np.float32)
+    xyz = np.stack([volume.grid.x[x], volume.grid.y[y], volume.grid.z[z]], axis=-1)
+    return xyz.astype(np.float32), volume.magnitude[z, y, x].astype(np.float32)
 
 
 def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
@@ -119,32 +113,19 @@ def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
 
 
 def _write_vti(volume: Volume, path: Path) -> None:
-    """Write XML image data (VTK file formats, "XML formats, ImageData"), with the numbers appended
-    in binary.
-    """
-    axes = {name: getattr(volume.grid, name) for name in "xyz"}
-    for name, axis in axes.items():
+    import pyvista
+
+    axes = [getattr(volume.grid, name) for name in "xyz"]
+    for name, axis in zip("xyz", axes, strict=True):
         if not is_evenly_spaced(axis):
             raise InputError(
                 f"a VTK image needs evenly spaced voxels along {name}; write .npz or .h5 instead"
             )
-    origin = " ".join(f"{axis[0]:.9g}" for axis in axes.values())
-    steps = (axis_step(axis) if axis.size > 1 else FLAT_VOXEL_M for axis in axes.values())
-    spacing = " ".join(f"{step:.9g}" for step in steps)
-    extent = " ".join(f"0 {n - 1}" for n in reversed(volume.grid.shape))
-    head = (
-        '<?xml version="1.0"?>\n'
-        '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
-        f'<ImageData WholeExtent="{extent}" Origin="{origin}" Spacing="{spacing}"><Piece Extent="{extent}">\n'
-        '<PointData Scalars="brightness"><DataArray type="Float32" Name="brightness" format="appended" offset="0"/>'
-        '</PointData>\n</Piece></ImageData>\n<AppendedData encoding="raw">\n_'
-    )
-    values = volume.magnitude.astype("<f4")
-    with open(path, "wb") as file:
-        file.write(head.encode())
-        file.write(np.uint64(values.nbytes).astype("<u8").tobytes())
-        values.tofile(file)
-        file.write(b"\n</AppendedData>\n</VTKFile>\n")
+    steps = [axis_step(axis) if axis.size > 1 else FLAT_VOXEL_M for axis in axes]
+    origin = [axis[0] for axis in axes]
+    image = pyvista.ImageData(dimensions=volume.grid.shape[::-1], spacing=steps, origin=origin)
+    image["brightness"] = volume.magnitude.astype(np.float32).ravel()
+    image.save(path)
 
 
 def _write_npz(volume: Volume, path: Path) -> None:

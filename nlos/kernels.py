@@ -14,45 +14,31 @@ compiled = compile_and_keep(fastmath={"contract"}, error_model="numpy")
 
 # Distance in m below which the weight 1 / distance stops growing, for voxels that touch the wall.
 MIN_DISTANCE_M = 1e-3
-COSINE_COEFFICIENTS = (
-    1.0,
-    -19.739208,
-    64.939392,
-    -85.456657,
-    60.242130,
-    -26.404669,
-    7.8001313,
-    -1.4531124,
-)
 # Polynomials in the square of an angle in cycles, fitted to cos(2 pi t) and sin(2 pi t) / t up to
-# half a cycle.
-SINE_COEFFICIENTS = (6.2831855, -41.341702, 81.605133, -76.703018, 42.025928, -14.899847, 3.2381375)
+# half a cycle; from the constant term on.
+COSINE = (1.0, -19.739208, 64.939392, -85.456657, 60.242130, -26.404669, 7.8001313, -1.4531124)
+SINE = (6.2831855, -41.341702, 81.605133, -76.703018, 42.025928, -14.899847, 3.2381375)
 
 
 @inlined
 def cosine_of_cycles(cycles):
     """Cosine of an angle of -0.5 to 0.5 cycles, to 1e-6."""
-    # Horner's rule in two halves, which the processor works on side by side
     u = cycles * cycles
-    high = np.float32(COSINE_COEFFICIENTS[4]) + u * (
-        np.float32(COSINE_COEFFICIENTS[5])
-        + u * (np.float32(COSINE_COEFFICIENTS[6]) + u * np.float32(COSINE_COEFFICIENTS[7]))
-    )
-    low = np.float32(COSINE_COEFFICIENTS[2]) + u * (np.float32(COSINE_COEFFICIENTS[3]) + u * high)
-    return np.float32(COSINE_COEFFICIENTS[0]) + u * (np.float32(COSINE_COEFFICIENTS[1]) + u * low)
+    return _evaluate(COSINE, u, np.float32(COSINE[6]) + u * np.float32(COSINE[7]))
 
 
 @inlined
 def sine_of_cycles(cycles):
     """Sine of an angle of -0.5 to 0.5 cycles, to 1e-6."""
-    u = cycles * cycles
-    high = np.float32(SINE_COEFFICIENTS[4]) + u * (
-        np.float32(SINE_COEFFICIENTS[5]) + u * np.float32(SINE_COEFFICIENTS[6])
-    )
-    low = np.float32(SINE_COEFFICIENTS[2]) + u * (np.float32(SINE_COEFFICIENTS[3]) + u * high)
-    return cycles * (
-        np.float32(SINE_COEFFICIENTS[0]) + u * (np.float32(SINE_COEFFICIENTS[1]) + u * low)
-    )
+    return cycles * _evaluate(SINE, cycles * cycles, np.float32(SINE[6]))
+
+
+@inlined
+def _evaluate(c, u, last):
+    """Polynomial by Horner's rule, whose coefficients from the sixth order on make up `last`."""
+    last = np.float32(c[4]) + u * (np.float32(c[5]) + u * last)
+    last = np.float32(c[2]) + u * (np.float32(c[3]) + u * last)
+    return np.float32(c[0]) + u * (np.float32(c[1]) + u * last)
 
 
 @compiled
@@ -73,6 +59,18 @@ def shift_signals(signal, delay_bins):
                     signal[before + 1, p] - signal[before, p]
                 )
     return result
+
+
+def rebin(values, edges, wanted):
+    """Sums (..., m) over the intervals between `wanted` edges (m + 1,) of sums (..., n) over those
+    between `edges` (n + 1,), each spread evenly over its own; what lies outside is lost.
+    """
+    # The running sum is interpolated: differences of it lose nothing and count nothing twice.
+    arrived = np.cumsum(values, axis=-1, dtype=np.float64)
+    before = np.clip(np.searchsorted(edges, wanted, side="right") - 1, 0, edges.size - 2)
+    part = np.clip((wanted - edges[before]) / (edges[before + 1] - edges[before]), 0, 1)
+    reached = np.take(arrived, before, axis=-1) - (1 - part) * np.take(values, before, axis=-1)
+    return np.diff(reached, axis=-1).astype(np.float32)
 
 
 @compiled

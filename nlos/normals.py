@@ -16,7 +16,7 @@ from nlos.confocal import (
     ConfocalScan,
     LightCone,
     resample_to_grid,
-    tabulate_powers,
+    transform_paraboloid,
     transform_squared_distances,
 )
 from nlos.export import write_ply
@@ -218,25 +218,13 @@ def _separate(
     """
     from scipy.fft import fft2
 
-    y, x = (
-        length * np.fft.fftfreq(n, 1 / n)
-        for length, n in zip(scan.plane.steps, shape[:2], strict=True)
-    )
-    # In coordinates of squared time a point's light is a paraboloid, late by the square of the
-    # distance across: the same at every depth, hence one convolution for all.
-    late = (y[:, np.newaxis] ** 2 + x**2) / squares
-    whole = np.floor(late)
-    weight = (late - whole)[..., np.newaxis]
-    height = (whole < shape[2] - 1) / np.sqrt(shape[0] * shape[1])
+    lengths = zip(scan.plane.steps, shape[:2], strict=True)
+    y, x = (length * np.fft.fftfreq(n, 1 / n) for length, n in lengths)
     sides = np.stack(np.broadcast_arrays(x / unit, y[:, np.newaxis] / unit, 1.0))
     parts = np.empty((3, *spectrum.shape), np.complex64)
 
     def process_block(some: slice) -> None:
-        # A delay of a whole number of bins is a power of one phase; the fraction is shared between
-        # two bins, as in time.
-        turn = np.exp(-2j * np.pi * np.arange(some.start, some.stop) / shape[2])
-        column = tabulate_powers(turn, whole.astype(np.intp), shape[2], some.start)
-        column = column * ((1 - weight + weight * turn) * height[..., np.newaxis])
+        column = transform_paraboloid(y, x, squares, shape, some)
         kernels = fft2(sides[..., np.newaxis] * column, axes=(1, 2)).astype(np.complex64)
         # Wiener: the floor is the noise over the signal; the three components are what explains the
         # signal with the least power.

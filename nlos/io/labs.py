@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture, remove_device_legs
 from nlos.io.arrays import NamedArrays, read_matlab
-from nlos.kernels import shift_signals
+from nlos.kernels import rebin, shift_signals
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import translate_read_errors
 from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
@@ -322,13 +322,7 @@ def resample_evenly(
             fields.path, f"has time bins so uneven that {bins} even ones would be needed"
         )
     even = edges[0] + spacing * np.arange(bins + 1)
-    flat = signal.reshape(len(signal), -1)
-    # The running sum is interpolated, not the counts: differences of it keep every photon.
-    arrived = np.concatenate([np.zeros((1, flat.shape[1])), np.cumsum(flat, axis=0, dtype=float)])
-    before = np.clip(np.searchsorted(edges, even, side="right") - 1, 0, len(signal) - 1)
-    part = np.clip((even - edges[before]) / (edges[before + 1] - edges[before]), 0, 1)
-    light = arrived[before] + part[:, np.newaxis] * (arrived[before + 1] - arrived[before])
-    resampled = np.diff(light, axis=0).astype(np.float32).reshape(bins, *signal.shape[1:])
+    resampled = np.moveaxis(rebin(np.moveaxis(signal, 0, -1), edges, even), -1, 0)
     return resampled, float(even[0]) + spacing / 2, spacing
 
 
