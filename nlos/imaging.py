@@ -201,9 +201,10 @@ def _complete_voxels(gated: Capture, found: Wanted) -> Wanted:
 
 def _choose_by_pictures(gated: Capture, settings: Settings) -> tuple[float, str]:
     """Choose the wavelength where the spectrum does not tell noise from signal: the shortest whose
-    coarse picture is clear, or nearly as clear as any; between those tried by the logarithms.
+    coarse picture is clear, or nearly as clear as any, by the logarithms of the last two tried.
 
-    Waves are tried from long ones on, whose pictures cost next to nothing.
+    Waves are tried from long ones on, whose pictures cost next to nothing. The last ones would cost
+    most: what large pictures show, whose speckles scatter little, goes on as far as to the next.
     """
     capture = _thin_out(gated)
     shortest = analysis.find_finest_wavelength(capture, settings.cycles)
@@ -217,9 +218,11 @@ def _choose_by_pictures(gated: Capture, settings: Settings) -> tuple[float, str]
         decoys.append(float(np.mean(shuffled)))
         evidences = np.array(brightest) / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
         least = min(CLEAR_EVIDENCE, CLEAR_FRACTION * float(evidences.max()))
-        if evidences[-1] < least:
-            chosen = np.interp(np.log(least), np.log(evidences[:-3:-1]), np.log(waves[:-3:-1]))
-            waves.append(float(np.exp(chosen)))
+        before, last = evidences[-2:]
+        ahead = last * min(last / before, 1.0) if step and len(shuffled) == 1 else last
+        if ahead < least:
+            share = math.log(least / last) / math.log(before / last)
+            waves.append(max(waves[-1] * (waves[-2] / waves[-1]) ** share, shortest))
             break
     return analysis.round_wavelength_up(waves[-1]), "the shortest whose coarse picture is clear"
 
@@ -230,7 +233,10 @@ def _judge_wavelength(
     """Brightness of a capture's coarse picture by one wavelength, m, and of its decoys."""
     found = _complete_voxels(capture, replace(settings, wavelength=wavelength))
     prepared = replace(found, gate=None, fade=None, flip=None).prepare(capture)
-    plan = found.plan_quickest(prepared, found.grid(wavelength / 2))[1]
+    grid = found.grid(wavelength / 2)
+    if grid.size > DECOY_VOXELS:  # every other depth tells as much: a pulse is three of them long
+        grid = Grid(grid.x, grid.y, grid.z[::2])
+    plan = found.plan_quickest(prepared, grid)[1]
     with warnings.catch_warnings():
         # Of a wave that is only tried.
         warnings.simplefilter("ignore", AliasingWarning)
@@ -305,8 +311,8 @@ def _complete_box(capture: Capture, settings: Wanted) -> Wanted:
 
 
 # A picture is judged by what this fraction of its voxels exceeds, against that of so many decoys:
-# at least two, and of small pictures, whose few speckles tell little, as many as fill these voxels.
-BRIGHT_QUANTILE, MIN_DECOYS, MAX_DECOYS, DECOY_VOXELS = 0.999, 2, 8, 1 << 15
+# two, or as many as fill these voxels: the few speckles of small pictures tell little.
+BRIGHT_QUANTILE, DECOYS, MAX_DECOYS, DECOY_VOXELS = 0.999, 2, 8, 1 << 15
 # With less evidence than this, a picture may be of noise, a glow, or of wrong units.
 MIN_EVIDENCE = 2.0
 
@@ -318,7 +324,7 @@ def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
     Each depth's brightness is taken relative to the decoys': noise and the wall's glow fade with it.
     `capture`: as it is imaged; `plan`: that the picture was made by, with coarse voxels.
     """
-    own, decoys = measure_brightness(capture, plan, picture, MIN_DECOYS)
+    own, decoys = measure_brightness(capture, plan, picture, DECOYS)
     return own / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
 
 
@@ -329,7 +335,7 @@ def measure_brightness(
     `count`: of decoys; by default as many as the picture's size asks for.
     """
     if count is None:
-        count = int(np.clip(DECOY_VOXELS // picture.values.size, MIN_DECOYS, MAX_DECOYS))
+        count = int(np.clip(DECOY_VOXELS // picture.values.size, 1, MAX_DECOYS))
     xp, places = namespace(capture.signal), np.flatnonzero(capture.valid)
     # Whatever order the points come in, the decoys are the same.
     ordered = places[np.lexsort((capture.points + capture.lasers).T)]

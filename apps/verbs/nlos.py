@@ -516,7 +516,8 @@ def info(
 
     with show_activity(f"reading {source.name}"):
         recorded = read_capture(source)
-    found = find_settings(recorded, load_settings(ImagingSettings, settings, flags))
+    with show_activity("finding settings"):
+        found = find_settings(recorded, load_settings(ImagingSettings, settings, flags))
     capture, grid = found.prepare(recorded), found.grid()
     shown = settings_to_dict(found)
     middle = [float(axis[[0, -1]].mean()) for axis in (grid.x, grid.y, grid.z)]

@@ -143,6 +143,8 @@ def prepare_imaging(
     """Do what `nlos.imaging.prepare_imaging` does, under a progress bar."""
     from nlos import imaging
 
+    with show_activity("finding settings"):
+        wanted = imaging.complete_settings(recorded, wanted)
     prepared = imaging.prepare_imaging(recorded, wanted, device, image_capture)
     _warn_of_given_wavelength(prepared.capture, prepared.settings)
     return prepared
