@@ -16,7 +16,7 @@ from types import FrameType
 from typing import Any
 
 from devices.recording.write import RecordingWriter, make_head
-from devices.source import DecodedSource, Piece, Source, Stats
+from devices.source import Batch, DecodedSource, Piece, Source, Stats
 from tofclip.errors import DeviceTimeoutError, InputError, TofclipError
 
 # Seconds after which the recorder looks at the clock and at its file, though nothing came
@@ -74,7 +74,9 @@ def record_source(
 
             fault = "interrupted"
             try:
-                _read_all(source, begin + seconds, interrupted, report)
+                for _ in _read_until(source, begin + seconds, interrupted, report):
+                    pass
+                source.drain()
                 fault = "interrupted" if interrupted.is_set() else ""
             except TofclipError as failure:
                 fault = str(failure)
@@ -88,16 +90,17 @@ def record_source(
         return RecordingSummary(monotonic() - begin, writer.bytes_written, source.stats)
 
 
-def _read_all(
+def _read_until(
     source: Source, deadline: float, interrupted: threading.Event, report: Callable[[], None]
-) -> None:
-    """Read until the deadline, the end or a signal, then stop the source and read what is left."""
+) -> Iterator[Batch]:
+    """Yield batches until the deadline, the end or a signal."""
     while (left := deadline - monotonic()) > 0 and not interrupted.is_set():
         report()
         with contextlib.suppress(DeviceTimeoutError):
-            if source.read(min(left, POLL_INTERVAL_S)) is None:
+            batch = source.read(min(left, POLL_INTERVAL_S))
+            if batch is None:
                 return
-    source.drain()
+            yield batch
 
 
 @contextlib.contextmanager
@@ -164,15 +167,10 @@ def measure_throughput(
         is_tapped = isinstance(source, DecodedSource)
         if isinstance(source, DecodedSource):
             source.tap = count
-        begin = now = monotonic()
-        while now < begin + seconds:
-            watch(now - begin)
-            with contextlib.suppress(DeviceTimeoutError):
-                batch = source.read(min(POLL_INTERVAL_S, begin + seconds - now))
-                if batch is None:
-                    break
-                read += 0 if is_tapped else batch.records.nbytes
-            now = monotonic()
+        begin, unlimited = monotonic(), threading.Event()
+        report = lambda: watch(monotonic() - begin)  # noqa: E731
+        for batch in _read_until(source, begin + seconds, unlimited, report):
+            read += 0 if is_tapped else batch.records.nbytes
         # Measured before draining, whose bytes would flatter the rate.
         took, measured = max(monotonic() - begin, 1e-9), read
         source.drain()

@@ -21,8 +21,8 @@ import re
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from sys import maxsize
 from time import monotonic, sleep
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,8 +96,7 @@ class Command:
 
     def encode(self) -> bytes:
         """Return the bytes to send."""
-        _require_valid(self.name, self.arguments)
-        return str(self).encode(ENCODING) + TERMINATOR
+        return _encode_text(str(self), self)
 
     @classmethod
     def decode(cls, message: bytes) -> Command:
@@ -128,9 +127,7 @@ class Answer:
 
     def encode(self) -> bytes:
         """Return the bytes to send."""
-        _require_valid(self.name, self.arguments)
-        words = [str(int(self.code)), self.name, *self.arguments]
-        return ",".join(words).encode(ENCODING) + TERMINATOR
+        return _encode_text(",".join([str(int(self.code)), self.name, *self.arguments]), self)
 
     @classmethod
     def decode(cls, message: bytes) -> Answer:
@@ -159,14 +156,13 @@ def parse_integer(text: str, what: str) -> int:
     return int(text)
 
 
-def _require_valid(name: str, arguments: tuple[str, ...]) -> None:
-    if not _NAME.fullmatch(name):
-        raise InputError(f"'{name}' is not the name of a RemoteEx command")
-    for argument in arguments:
-        if not _ARGUMENT.fullmatch(argument):
-            raise InputError(f"RemoteEx cannot carry the argument {argument!r}")
-    if arguments == ("",):
-        raise InputError("RemoteEx cannot carry a single argument that is empty")
+def _encode_text(text: str, message: Command | Answer) -> bytes:
+    if not _NAME.fullmatch(message.name):
+        raise InputError(f"'{message.name}' is not the name of a RemoteEx command")
+    for argument in message.arguments:
+        if not _ARGUMENT.fullmatch(argument) or message.arguments == ("",):
+            raise InputError(f"RemoteEx cannot carry the argument {argument!r} here")
+    return text.encode(ENCODING) + TERMINATOR
 
 
 def _decode_text(message: bytes) -> str:
@@ -224,7 +220,9 @@ class RemoteExClient:
         self, name: str, arguments: tuple[str, ...], timeout: float | None = None
     ) -> Answer:
         # After a timeout the late answer would be taken for that of the next command.
-        self._wait_for_owed()
+        while self._owed:
+            self._settle_oldest()
+        self._discard_late_data()
         if name in _COMMANDS_WITH_DATA:
             self._data.discard_available()  # of a client before this one
         command = self.send_command(name, *arguments)
@@ -247,14 +245,10 @@ class RemoteExClient:
         last_words = [self.send_command(*words) for words in commands]
         fault: DeviceError | None = None
         while self._owed:
-            command = self._owed[0]
             try:
-                self._discard_late_data()
-                answer = self._read_answer()
+                command, answer = self._settle_oldest()
                 if command in last_words:
                     answer.require_done(command)
-                elif command.name in _COMMANDS_WITH_DATA:
-                    self._unread = parse_data_length(answer)
             except (DeviceTimeoutError, DeviceDisconnectedError) as failure:
                 raise fault or failure from None
             except DeviceError as failure:
@@ -306,16 +300,14 @@ class RemoteExClient:
                 f"{link.name} greeted with {said[:40]!r}, expected '{greeting}'; is RemoteEx there?"
             )
 
-    def _wait_for_owed(self) -> None:
-        """Wait for the answers that are owed, with their data, and forget them."""
-        while self._unread or self._owed:
-            self._discard_late_data()
-            if self._owed:
-                command = self._owed[0]
-                answer = self._read_answer()
-                self._unread = (
-                    parse_data_length(answer) if command.name in _COMMANDS_WITH_DATA else 0
-                )
+    def _settle_oldest(self) -> tuple[Command, Answer]:
+        """Wait for the answer that is owed longest, and note how much data is owed with it."""
+        self._discard_late_data()
+        command = self._owed[0]
+        answer = self._read_answer()
+        if command.name in _COMMANDS_WITH_DATA:
+            self._unread = parse_data_length(answer)
+        return command, answer
 
     def _discard_late_data(self) -> None:
         """Take the rest of a picture that is late; more than any picture has is given up."""
@@ -391,8 +383,6 @@ POLL_INTERVAL_S = 0.05
 SYNCHROSCAN_UNIT_S = 1e-12
 _PARAMETERS = {"time_range": "Time Range", "mode": "Mode", "mcp_gain": GAIN_PARAMETER}
 
-ConnectFunction = Callable[[], RemoteExClient]
-
 
 @dataclass(frozen=True)
 class StreakOptions(LiveOptions):
@@ -421,19 +411,13 @@ class RemoteExOptions(StreakOptions):
     data_port: int | None = option(None, int, least=1, most=65535)  # the command's, and 1
 
 
-class _Announcement(NamedTuple):
-    number: int  # of a picture that was taken
-    stamp: float | None  # its time by the camera's computer, s since live mode was started
-    received_at: float  # s of `time.monotonic`
-
-
 class RemoteExFeed(FrameFeed):
     """Live pictures in the order of their numbers; see `devices.stream.Feed`. Pictures that fell
     out of the ring buffer before they were asked for are lost by the instrument. When the
     connection breaks, so are those that had been announced.
     """
 
-    def __init__(self, connect: ConnectFunction, options: StreakOptions) -> None:
+    def __init__(self, connect: Callable[[], RemoteExClient], options: StreakOptions) -> None:
         super().__init__()
         self._connect, self._options = connect, options
         self._stamps: dict[int, float] = {}
@@ -480,13 +464,9 @@ class RemoteExFeed(FrameFeed):
         """
         self._stopped = True
         # Live mode of an operator goes on with the operator's gain; otherwise 0 protects the tube.
-        gain = self._gain_before if self._has_joined else "0"
-        commands: list[tuple[str, ...]] = [("AcqLiveMonitor", "Off")]
-        if not self._has_joined:
-            commands.insert(0, ("AcqStop",))
-        if gain is not None:
-            commands.insert(0, ("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, gain))
-        self._link.send_and_wait(*commands)
+        gain, live = self._gain_before if self._has_joined else "0", ("AcqLiveMonitor", "Off")
+        turn_down = [("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, gain)] if gain else []
+        self._link.send_and_wait(*turn_down, *([] if self._has_joined else [("AcqStop",)]), live)
 
     def close(self) -> None:
         try:
@@ -495,7 +475,7 @@ class RemoteExFeed(FrameFeed):
             # What was announced before the stop, and not read by now, is lost.
             with contextlib.suppress(DeviceError):
                 while True:
-                    self._note_announcement(self._wait_for_announcement(0))
+                    self._note_announcement(0)
         finally:
             self._count_announced_lost()
             self._link.close()
@@ -519,11 +499,11 @@ class RemoteExFeed(FrameFeed):
                 self._prepare_live(link)
             if not link.is_done("AcqStart", "Live"):
                 self._join_or_restart(link)
-            announced = self._wait_for_announcement(self._options.timeout_s)
-            self._clock.reset()
-            self._stamps.clear()
-            self._note_stamp(announced)
-            self._first = link.read_frame(announced.number)
+            # Whatever is announced first is below this number, as where live mode is started anew.
+            self._announced, self._next, self._newest = maxsize, 0, -1
+            self._note_announcement(self._options.timeout_s)
+            self._gap = Gap.NONE
+            self._first = link.read_frame(self._next)
         except BaseException:
             with contextlib.suppress(DeviceError):
                 self.stop()
@@ -532,8 +512,7 @@ class RemoteExFeed(FrameFeed):
         # The first picture was read for its size, and is delivered as well. Where it has fallen out
         # of the ring buffer already, it is an older one's successor.
         self._unread_frame: CameraFrame | None = self._first
-        self._next = self._announced = announced.number
-        self._newest = max(announced.number, self._first.number)
+        self._newest = max(self._newest, self._first.number)
 
     def _prepare_live(self, link: RemoteExClient) -> None:
         """Set what has to be set before live mode, and ask to be notified of every picture."""
@@ -569,10 +548,9 @@ class RemoteExFeed(FrameFeed):
         while picture is None:
             with contextlib.suppress(DeviceTimeoutError):
                 while self._newest >= self._next:  # all that has been announced meanwhile
-                    self._note_announcement(self._wait_for_announcement(0))
+                    self._note_announcement(0)
             while self._newest < self._next:
-                left = max(deadline - monotonic(), 0)
-                self._note_announcement(self._wait_for_announcement(left))
+                self._note_announcement(max(deadline - monotonic(), 0))
             try:
                 picture = self._link.read_frame(self._next)
             except (DeviceDisconnectedError, DeviceTimeoutError, ProtocolError):
@@ -581,7 +559,7 @@ class RemoteExFeed(FrameFeed):
                 # Refused, as no such picture is there: the numbers begin anew when live mode does,
                 # which the next announcement says.
                 expected = self._next
-                self._note_announcement(self._wait_for_announcement(self._options.timeout_s))
+                self._note_announcement(self._options.timeout_s)
                 if self._next == expected:
                     raise
         lost = picture.number - self._next
@@ -592,45 +570,36 @@ class RemoteExFeed(FrameFeed):
         self._newest = max(self._newest, picture.number)
         return picture
 
-    def _note_announcement(self, announced: _Announcement) -> None:
-        """Note the newest picture; where its number went back, live mode was started anew."""
-        number = announced.number
+    def _note_announcement(self, timeout: float) -> None:
+        """Wait for the next message that announces a picture, and note it; where its number went back,
+        live mode was started anew.
+        """
+        words: tuple[str, ...] = ()
+        while len(words) < 2 or words[0].casefold() != "ringbuffer":
+            message = self._link.read_message(timeout)
+            words = message.arguments
+        number = parse_integer(words[1], "a picture's number")
         if number <= self._announced:
             self._count_announced_lost()
-            self._next = number
-            self._gap = Gap.RESTART
+            self._next, self._gap = number, Gap.RESTART
             self._clock.reset()
             self._stamps.clear()
         self._announced = number
         self._newest = max(number, self._next - 1)
-        self._note_stamp(announced)
-
-    def _note_stamp(self, announced: _Announcement) -> None:
-        if announced.stamp is not None:
-            self._clock.observe(announced.stamp, announced.received_at)
-            self._stamps[announced.number] = announced.stamp
+        if len(words) > 2 and words[2].isdecimal() and len(words[2]) < 16:
+            # by the camera's computer, s since live mode was started
+            self._stamps[number] = stamp = int(words[2]) * 1e-3
+            self._clock.observe(stamp, message.received_at)
 
     def _estimate_time(self, number: int) -> float:
         """Return when a picture was taken, s of `time.monotonic`; 0 where that is not known."""
         # A picture that was sent for one that is gone may be announced right before the answer.
         with contextlib.suppress(DeviceTimeoutError):
             while number not in self._stamps and self._announced < number:
-                self._note_announcement(self._wait_for_announcement(0))
+                self._note_announcement(0)
         stamp = self._stamps.get(number)
         self._stamps = {later: at for later, at in self._stamps.items() if later > number}
         return 0.0 if stamp is None else self._clock.to_host(stamp)
-
-    def _wait_for_announcement(self, timeout: float) -> _Announcement:
-        """Return the next message that announces a picture."""
-        while True:
-            message = self._link.read_message(timeout)
-            words = message.arguments
-            if len(words) >= 2 and words[0].casefold() == "ringbuffer":
-                number = parse_integer(words[1], "a picture's number")
-                is_stamped = len(words) > 2 and words[2].isdecimal() and len(words[2]) < 16
-                return _Announcement(
-                    number, int(words[2]) * 1e-3 if is_stamped else None, message.received_at
-                )
 
     def _count_announced_lost(self) -> None:
         """Enter pictures that were announced and will not come."""

@@ -52,14 +52,6 @@ class UsbIdentity(NamedTuple):
     def __str__(self) -> str:
         return f"{self.vendor:04x}:{self.product:04x}"
 
-    @property
-    def udev_rule(self) -> str:
-        """The line that lets the users of a Linux machine talk to such an instrument."""
-        return (
-            f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{self.vendor:04x}", ATTR{{idProduct}}=="{self.product:04x}", '
-            'TAG+="uaccess"'
-        )
-
 
 def system_backend() -> Any:
     """Return pyusb's backend for this machine's USB, on the libusb that `libusb-package` brings."""
@@ -122,9 +114,11 @@ def translate_errors(identity: UsbIdentity) -> Iterator[None]:
 
 
 def _make_permission_error(identity: UsbIdentity) -> DevicePermissionError:
+    vendor, product = str(identity).split(":")
     return DevicePermissionError(
         f"USB device {identity} may not be opened by this user; put this line into "
-        f"/etc/udev/rules.d/70-tofclip.rules and plug it in again: {identity.udev_rule}"
+        "/etc/udev/rules.d/70-tofclip.rules and plug it in again: "
+        f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}", TAG+="uaccess"'
     )
 
 

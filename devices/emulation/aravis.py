@@ -11,15 +11,10 @@ from typing import Any
 from devices.address import Uri, option
 from devices.aravis import AravisFeed, CameraOptions, load_aravis
 from devices.emulation.harness import HOST, EmulatedFeed
-from devices.emulation.scenes import (
-    EmulatedLight,
-    simulate_demonstration_light,
-    simulate_line_light,
-)
+from devices.emulation.scenes import EmulatedLight, simulate_light
 from devices.frames import make_streak_calibration
 from devices.stream import StreamSource
 from tofclip.errors import DeviceNotFoundError, MissingDependencyError
-from tofclip.storage import Record
 
 LIBRARY_FILE = "libaravis-0.8.so.0"
 # ``(buffer, nothing, exposure_us, gain, pixel_format)``, called in the camera's own thread
@@ -30,7 +25,8 @@ FillPattern = ctypes.CFUNCTYPE(
 
 class EmulatedCamera:
     """Aravis' own emulated camera: of `light`, or of moving stripes where there is none.
-    `lost_per_thousand`: packets of a thousand that are lost on the wire.
+    `lost_per_thousand`: packets of a thousand that are lost on the wire. Pictures are drawn by a
+    function of the library's: the binding drops Python's after the call that sets it.
     """
 
     def __init__(
@@ -43,7 +39,19 @@ class EmulatedCamera:
             )
         self._camera.set_property("gvsp-lost-ratio", lost_per_thousand / 1000)
         self._light = light
-        self._shown = None if light is None else ShownLight(self._camera, light)
+        if light is None:
+            return
+        self._library = called = _load_library()
+        # PyGObject's hash of an object is the address of what it stands for.
+        self._fake = fake = called.arv_gv_fake_camera_get_fake_camera(hash(self._camera))
+
+        def fill(buffer: int, nothing: int, exposure_us: int, gain: int, pixel_format: int) -> None:
+            picture = light.draw_frame(called.arv_buffer_get_frame_id(buffer)).tobytes()
+            if called.arv_fake_camera_get_payload(fake) == len(picture):
+                ctypes.memmove(called.arv_buffer_get_data(buffer, None), picture, len(picture))
+
+        self._pattern = FillPattern(fill)
+        called.arv_fake_camera_set_fill_pattern(fake, self._pattern, None)
 
     def prepare(self, camera: Any) -> None:
         """Let the driver's camera have pictures of the light's size."""
@@ -52,33 +60,10 @@ class EmulatedCamera:
             camera.set_region(0, 0, columns, rows)
 
     def close(self) -> None:
-        """Switch it off."""
-        if self._shown is not None:
-            self._shown.close()
-        self._shown = self._camera = None
-
-
-class ShownLight:
-    """Lets an emulated camera send pictures of some light. The binding drops Python's function
-    after the call that sets it, so that the library itself is asked.
-    """
-
-    def __init__(self, camera_process: Any, light: EmulatedLight) -> None:
-        self._library = library = _load_library()
-        # PyGObject's hash of an object is the address of what it stands for.
-        self._camera = camera = library.arv_gv_fake_camera_get_fake_camera(hash(camera_process))
-
-        def fill(buffer: int, nothing: int, exposure_us: int, gain: int, pixel_format: int) -> None:
-            picture = light.draw_frame(library.arv_buffer_get_frame_id(buffer)).tobytes()
-            if library.arv_fake_camera_get_payload(camera) == len(picture):
-                ctypes.memmove(library.arv_buffer_get_data(buffer, None), picture, len(picture))
-
-        self._pattern = FillPattern(fill)
-        library.arv_fake_camera_set_fill_pattern(camera, self._pattern, None)
-
-    def close(self) -> None:
-        """Draw stripes again: the camera's thread must not wait for Python at the end."""
-        self._library.arv_fake_camera_set_fill_pattern(self._camera, FillPattern(), None)
+        """Switch it off, with stripes: the camera's thread must not wait for Python at the end."""
+        if self._camera is not None and self._light is not None:
+            self._library.arv_fake_camera_set_fill_pattern(self._fake, FillPattern(), None)
+        self._camera = None
 
 
 def _load_library() -> ctypes.CDLL:
@@ -116,21 +101,14 @@ def open_emulated(uri: Uri) -> StreamSource:
     packets lost on the wire.
     """
     options = EmulationOptions.from_uri(uri)
-    library, serial, lost = load_aravis(), uri.location or "EMULATED", options.lost_per_thousand
-    if options.scene == "stripes":
-        camera = EmulatedCamera(library, serial, lost)
-        return _open_camera(library, camera, options, None)
-    options = replace(options, pixel_format="Mono16")
-    seen = simulate_line_light() if options.scene == "small" else simulate_demonstration_light()
-    known = make_streak_calibration(seen.row_times, seen.camera)
-    camera = EmulatedCamera(library, serial, lost, EmulatedLight.of(seen, options.seed))
-    return _open_camera(library, camera, options, known)
-
-
-def _open_camera(
-    library: Any, camera: EmulatedCamera, options: CameraOptions, known: Record | None
-) -> StreamSource:
-    """Open the driver's camera; `known` is the scene's own time axis, where there is a scene."""
+    library, serial = load_aravis(), uri.location or "EMULATED"
+    light, known = None, None
+    if options.scene != "stripes":
+        options = replace(options, pixel_format="Mono16")
+        seen = simulate_light(options.scene)
+        light = EmulatedLight.of(seen, options.seed)
+        known = make_streak_calibration(seen.row_times, seen.camera)
+    camera = EmulatedCamera(library, serial, options.lost_per_thousand, light)
     feed = EmulatedFeed(
         camera,
         lambda: AravisFeed(library, HOST, options, camera.prepare),

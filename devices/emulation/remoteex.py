@@ -20,11 +20,7 @@ from devices.emulation.harness import (
     LoopbackServer,
     index_faults,
 )
-from devices.emulation.scenes import (
-    EmulatedLight,
-    simulate_demonstration_light,
-    simulate_line_light,
-)
+from devices.emulation.scenes import EmulatedLight, simulate_light
 from devices.remoteex import (
     ANNOUNCEMENT,
     DATA_GREETING,
@@ -46,6 +42,12 @@ from tofclip.storage import Record
 SUPPORTED_FAULTS = ("timeout", "short", "unplug", "corrupt", "lost", "overflow")
 SINGLE_SWEEPS = ("1 ns", "20 ns", "100 ns", "1 us", "10 \u00b5s")
 SYNCHROSCAN_SWEEPS = ("1", "2", "3", "4", "5")
+FIXED_ANSWERS: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("append", "acqacqmonitor", "seqstart", "imgsave", "imgload"), ()),
+    "appinfo": ("9.5 pf4",),
+    "applicenceget": ("1", "1", "1"),
+    "imgindexget": ("0",),
+}
 
 
 @dataclass
@@ -117,6 +119,8 @@ class EmulatedStreakCamera:
         self._lock = threading.Lock()
         self._command_server = LoopbackServer(self._serve_commands)
         self._frame_server = LoopbackServer(self._serve_data)
+        self.ports = self._command_server.port, self._frame_server.port
+        """Of commands and of data."""
         if self.is_live:
             self._run = _Acquisition(is_operators=True)
             self._start_acquisition()
@@ -125,11 +129,6 @@ class EmulatedStreakCamera:
     def is_running(self) -> bool:
         """Whether it takes pictures."""
         return self._run.is_running
-
-    @property
-    def ports(self) -> tuple[int, int]:
-        """Ports of commands and of data."""
-        return self._command_server.port, self._frame_server.port
 
     @property
     def gain(self) -> str:
@@ -187,14 +186,8 @@ class EmulatedStreakCamera:
             case ("appstart", *_):
                 self.is_application_up = True
                 return ()
-            case (("append" | "acqacqmonitor" | "seqstart" | "imgsave" | "imgload"), *_):
-                return ()
-            case ("appinfo", *_):
-                return ("9.5 pf4",)
-            case ("applicenceget", *_):
-                return ("1", "1", "1")
-            case ("imgindexget", *_):
-                return ("0",)
+            case (name, *_) if name in FIXED_ANSWERS:
+                return FIXED_ANSWERS[name]
             case ("devparamget", place, name) if place == STREAK_TUBE and name in tube:
                 return (tube[name],)
             case ("devparamset", _, name, value) if name in tube:
@@ -349,7 +342,7 @@ def open_emulated(uri: Uri) -> StreamSource:
     camera behind TCP; ``scene=small`` has a slit of 256 pixels.
     """
     options = EmulationOptions.from_uri(uri)
-    seen = simulate_line_light() if options.scene == "small" else simulate_demonstration_light()
+    seen = simulate_light(options.scene)
     light = EmulatedLight.of(seen, options.seed)
     server = EmulatedStreakCamera(light, options.frame_rate, options.frames, options.faults)
 

@@ -119,6 +119,11 @@ def simulate_demonstration_light() -> LineLight:
     )
 
 
+def simulate_light(scene: str) -> LineLight:
+    """Return the light of a scene as addresses call it: ``small``, or ``demo``."""
+    return simulate_line_light() if scene == "small" else simulate_demonstration_light()
+
+
 def render_array_light() -> NDArray[np.float64]:
     """Return the demonstration's reference view as an array of 512 x 512 pixels sees it, 0..1."""
     return _enlarge(np.nan_to_num(_render_truth().reflectance))

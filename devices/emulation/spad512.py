@@ -83,11 +83,7 @@ class EmulatedSpadArray:
         self._end = b"\n" + DONE_MARK if self.is_framed else b""
         self._requests = 0
         self._server = LoopbackServer(self._serve_client)
-
-    @property
-    def port(self) -> int:
-        """Where it listens."""
-        return self._server.port
+        self.port = self._server.port
 
     def draw_frame(self, request: int, number: int, exposure: SpadOptions) -> NDArray[np.uint8]:
         """Return picture `number` of a request; the same numbers give the same bytes."""

@@ -20,11 +20,11 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from time import monotonic, sleep
 
 import numpy as np
 from numpy.typing import NDArray
-from usb.core import USBError
 
 from devices.address import Uri, option
 from devices.emulation.harness import FOREVER, REPLY_FAULTS, Fault
@@ -405,8 +405,7 @@ class EmulatedTimeTagger(VirtualDevice):
 
     def _clear_memory(self) -> None:
         """Forget the memory; the USB chip keeps what it has, to the end of a record."""
-        self._reported += -(-self._segment_bytes // RECORD_BYTES)
-        self._segment_bytes = 0
+        self._end_segment()
         chip = min(len(self._stream), CHIP_PACKETS * self._window)
         del self._stream[chip + (len(self._stream) - chip) % RECORD_BYTES :]
         if not self._stream:
@@ -547,8 +546,15 @@ class EmulatedTimeTagger(VirtualDevice):
         # Faults of the transfer itself come first, then those of its contents.
         if fault.kind == "timeout":
             raise make_usb_error(errno.ETIMEDOUT)
-        if fault.kind in ("stall", "unplug", "powerloss"):
-            raise self._interrupt(fault)
+        if fault.kind == "stall":
+            self.halted.add(DATA_ENDPOINT)
+            self._stalls = fault.amount
+            raise make_usb_error(errno.EPIPE)
+        if fault.kind in ("unplug", "powerloss"):
+            if fault.kind == "powerloss":
+                self._lose_power()
+            self.unplug(fault.amount)
+            raise make_usb_error(errno.ENODEV)
         if fault.kind == "overflow":
             lost_on_the_wire = self._send_data(buffer, timeout)
             if not self._is_held_empty:
@@ -562,27 +568,23 @@ class EmulatedTimeTagger(VirtualDevice):
             self._records_to_corrupt = fault.amount
         return self._send_data(buffer, timeout)
 
-    def _interrupt(self, fault: Fault) -> USBError:
-        if fault.kind == "stall":
-            self.halted.add(DATA_ENDPOINT)
-            self._stalls = fault.amount
-            return make_usb_error(errno.EPIPE)
-        if fault.kind == "powerloss":
-            self._reported += -(-self._segment_bytes // RECORD_BYTES)
-            self._segment_bytes = 0
-            self._stream.clear()
-            self._unfinished.clear()
-            self._window = self.options.packet_bytes
-            self._replies.clear()
-            self._command = b""
-            self.truth.lost_power_off += (
-                self._registers[Register.RECORDS] + self._registers[Register.LOST] - self._reported
-            )
-            self._registers = _make_registers()
-            self._reported = 0
-            self._mark_lost = False
-        self.unplug(fault.amount)
-        return make_usb_error(errno.ENODEV)
+    def _lose_power(self) -> None:
+        self._end_segment()
+        self._stream.clear()
+        self._unfinished.clear()
+        self._window = self.options.packet_bytes
+        self._replies.clear()
+        self._command = b""
+        counted = self._registers[Register.RECORDS] + self._registers[Register.LOST]
+        self.truth.lost_power_off += counted - self._reported
+        self._registers = _make_registers()
+        self._reported = 0
+        self._mark_lost = False
+
+    def _end_segment(self) -> None:
+        """Count what was handed over since something was thrown away, a part of a record as one."""
+        self._reported += -(-self._segment_bytes // RECORD_BYTES)
+        self._segment_bytes = 0
 
 
 def _make_registers() -> dict[Register, int]:
@@ -599,17 +601,15 @@ def open_timetag(uri: Uri) -> StreamSource:
     ``memory_mib=0.01172``.
     """
     options = EmulationOptions.from_uri(uri)
-    is_scene = options.light == "scene"
-    rate = options.rate
-    if rate is None:
-        rate = SCENE_RATE_HZ if is_scene else POISSON_RATE_HZ
-    scene = simulate_line_light() if is_scene else None
+    make: Callable[..., PoissonStream | PulsedSceneStream] = PoissonStream
+    rate = POISSON_RATE_HZ
+    if options.light == "scene":
+        make, rate = partial(PulsedSceneStream, simulate_line_light()), SCENE_RATE_HZ
+    if options.rate is not None:
+        rate = options.rate
 
     def make_light(resets: int) -> PoissonStream | PulsedSceneStream:
-        seed = options.seed + resets
-        if scene is None:
-            return PoissonStream(rate, CLOCK_HZ, seed)
-        return PulsedSceneStream(scene, rate, CLOCK_HZ, seed)
+        return make(rate, CLOCK_HZ, options.seed + resets)
 
     # The real ones have no serial number.
     return EmulatedTimeTagger(make_light, options, uri.location).open_driver()

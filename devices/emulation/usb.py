@@ -91,33 +91,32 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: VirtualDevice, config: int) -> SimpleNamespace:
-        """Describe the one configuration of a device, as pyusb reads it."""
-        _require_descriptor(config == 0)
-        return SimpleNamespace(
+        """Describe the one configuration of a device; `IndexError` says, as pyusb expects, that there is
+        no other.
+        """
+        one = SimpleNamespace(
             # USB 2.0, table 9-10.
             bLength=9, bDescriptorType=2, wTotalLength=18 + 7 * len(dev.endpoints), bNumInterfaces=1,
             bConfigurationValue=1, iConfiguration=0, bmAttributes=0x80, bMaxPower=250, extra_descriptors=[],
         )  # fmt: skip
+        return [one][config]
 
     def get_interface_descriptor(
         self, dev: VirtualDevice, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """Describe the one interface of a device, as pyusb reads it."""
-        _require_descriptor((intf, alt, config) == (INTERFACE_NUMBER, 0, 0))
-        return SimpleNamespace(
+        """Describe the one interface of a device."""
+        one = SimpleNamespace(
             # USB 2.0, table 9-12.
             bLength=9, bDescriptorType=4, bInterfaceNumber=INTERFACE_NUMBER, bAlternateSetting=0,
             bNumEndpoints=len(dev.endpoints), bInterfaceClass=255, bInterfaceSubClass=255, bInterfaceProtocol=255,
             iInterface=0, extra_descriptors=[],
         )  # fmt: skip
+        return [[one]][intf][alt]
 
     def get_endpoint_descriptor(
         self, dev: VirtualDevice, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """Describe an endpoint of a device, as pyusb reads it."""
-        _require_descriptor(
-            ep < len(dev.endpoints) and (intf, alt, config) == (INTERFACE_NUMBER, 0, 0)
-        )
+        """Describe an endpoint of a device."""
         return SimpleNamespace(
             # USB 2.0, table 9-13.
             bLength=7, bDescriptorType=5, bEndpointAddress=dev.endpoints[ep], bmAttributes=BULK_TRANSFER,
@@ -206,9 +205,3 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
 def _require_plugged(device: VirtualDevice) -> None:
     if not device.is_plugged:
         raise make_usb_error(errno.ENODEV)
-
-
-def _require_descriptor(exists: bool) -> None:
-    """Say, as pyusb expects, that a descriptor is the last of its kind."""
-    if not exists:
-        raise IndexError
