@@ -70,12 +70,8 @@ class FirstBounce:
 
 
 def find_first_bounce(capture: Capture) -> FirstBounce | None:
-    """Recognise the light that the wall returns at once, and how long it lasts.
-
-    It arrives at every wall point after the path from the laser spot, and falls from there on until
-    hidden things' light rises.
-
-    Returns none where no such light is in the record.
+    """Recognise the light that the wall returns at once, after the path from the laser spot, and
+    how long it lasts: it falls until hidden things' light rises. None where the record has none.
     """
     late, level = _compute_profile(capture)
     extent = float(np.ptp(capture.points, axis=0).max())
@@ -105,9 +101,8 @@ def find_first_bounce(capture: Capture) -> FirstBounce | None:
 
 @dataclass(frozen=True, eq=False)
 class SignalSpectrum:
-    """How much of each wave a capture's signals hold, and how much of it is noise. Photons' noise
-    is white: what the highest frequencies hold, all frequencies hold. Other noise is known where
-    the record begins before light can have come.
+    """How much of each wave a capture's signals hold, and how much is noise: photons' is white, as
+    the highest frequencies tell; other noise is known from before light can have come.
     """
 
     power: FloatArray  # (frequencies,), mean over the wall points
@@ -120,9 +115,7 @@ class SignalSpectrum:
 
     @classmethod
     def of(cls, capture: Capture, margin: float) -> SignalSpectrum:
-        """Analyse a capture without the wall's own light. `margin`: m of path before light may come
-        that a wave reaches ahead.
-        """
+        """Analyse a gated capture; a wave reaches `margin` m ahead of its light."""
         traces, direct = _select_traces(capture)
         # Waves would see an edge where the record ends while light still comes.
         spectrum = np.fft.rfft(traces * np.hanning(traces.shape[1]), axis=1)
@@ -138,9 +131,7 @@ class SignalSpectrum:
 
     @property
     def is_noisy(self) -> bool:
-        """Whether white noise is seen in the spectrum, as in all that was recorded. It is flat at
-        the highest frequencies, where the tail of a pulse falls.
-        """
+        """Whether white noise is seen: flat where a pulse's tail would fall."""
         return self._floor_slope < MAX_FLOOR_SLOPE
 
     @property
@@ -165,18 +156,14 @@ class SignalSpectrum:
         return self.points * float(np.sum(weight * self.power) / np.sum(weight) / self.floor - 1)
 
     def fraction_shorter(self, pulse: VirtualPulse, wavelength: float) -> float:
-        """Fraction of a pulse's signal, noise taken off, in waves shorter than `wavelength` m.
-        `wavelength`: metres. Returns 0 to 1.
-        """
+        """Fraction of a pulse's signal, without noise, in waves shorter than `wavelength`, m."""
         signal = pulse.spectrum(self.wavenumbers) ** 2 * np.maximum(self.power - self.floor, 0)
         shorter = self.wavenumbers > 2 * np.pi / wavelength
         total = float(signal.sum())
         return float(signal[shorter].sum()) / total if total > 0 else 0.0
 
     def band_over_early(self, pulse: VirtualPulse) -> float:
-        """Energy in a pulse's band where light may have come, over that before; infinite where the
-        record does not begin so early.
-        """
+        """Energy in a pulse's band over that before light can have come; infinite if unknown."""
         if not self.early.any():
             return np.inf
         # The waves of negative frequencies are left out, so that the magnitude is the envelope.
@@ -253,9 +240,7 @@ def require_usable_wavelength(capture: Capture, wavelength: float, cycles: float
 
 
 def require_usable_cycles(capture: Capture, cycles: float) -> None:
-    """Refuse a virtual pulse that even at the shortest wavelength of the time bins is longer than
-    the record: its band would be computed over that length.
-    """
+    """Refuse a virtual pulse that is longer than the record at every wavelength that bins carry."""
     record, shortest = float(np.ptp(capture.axis.paths)), 2 * capture.axis.spacing
     if cycles * shortest > record:
         raise InputError(
@@ -265,13 +250,10 @@ def require_usable_cycles(capture: Capture, cycles: float) -> None:
 
 
 def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str] | None:
-    """Choose the carrier of a virtual pulse for a capture without the wall's own light.
-
-    It is the shortest that wall points and time bins carry, and that the signal has more of than
-    noise. In a noisy record only waves that stand out of the noise can make false images: the wall
-    has to sample these, at the steepest angle at which they arrive.
-
-    Returns m of path, and the reason; none where the spectrum does not tell: pictures have to.
+    """Choose the carrier for a gated capture, m, and say why: the shortest that wall points and
+    time bins carry, with more signal than noise. Only waves that stand out of noise make false
+    images: these the wall has to sample, at the steepest angle. None where the spectrum does not
+    tell.
     """
     sampled = find_shortest_wavelength(capture, cycles)
     reason = "the shortest that wall points and time bins carry"
@@ -301,9 +283,7 @@ def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str] | No
 
 
 def find_finest_wavelength(capture: Capture, cycles: float) -> float:
-    """Shortest carrier worth a try: of waves that the wall samples at the steepest angle at which
-    they arrive, m.
-    """
+    """Shortest carrier that the wall samples at the steepest angle of arriving waves, m."""
     aliased = _sampling_limit(capture, _steepest_angle(capture))
     sampled = find_shortest_wavelength(capture, cycles)
     return max(min(aliased, sampled), 4 * capture.axis.spacing)
@@ -319,12 +299,8 @@ def round_wavelength_up(wavelength: float) -> float:
 
 
 def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
-    """Carrier of the shortest virtual pulse whose whole band a capture carries, m.
-
-    The band's shortest wave is sampled twice along the wall (four times in a confocal scan, where
-    the path grows on both legs) and twice along the record.
-
-    `cycles`: length of the pulse in wavelengths.
+    """Carrier of the shortest pulse, of so many cycles, whose whole band a capture carries, m:
+    sampled twice along the record and the wall, there four times if both legs grow.
     """
     return _band_reach(cycles) * max(_sampling_limit(capture), 2 * capture.axis.spacing)
 
@@ -336,9 +312,7 @@ def find_longest_wavelength(capture: Capture) -> float:
 
 
 def find_sampling_step(capture: Capture) -> float:
-    """Distance of neighbouring wall points, or of the laser spots where one wall point sees them
-    all, m; else 0.
-    """
+    """Distance of neighbouring wall points, or of spots that one point sees, m; else 0."""
     if math.isfinite(capture.spacing):
         return capture.spacing
     if capture.laser.ndim == 1:
@@ -360,9 +334,7 @@ def _sampling_limit(capture: Capture, sine: float = 1.0) -> float:
 
 
 def _steepest_angle(capture: Capture) -> float:
-    """Sine of the angle between the wall's normal and the way from one end of the wall to what is
-    brightest before the other.
-    """
+    """Sine of the angle at which what is brightest is seen from the far end of the wall."""
     extent = float(np.ptp(capture.points[:, :2], axis=0).max())
     depth = max(find_brightest_path(capture) / 2, 0.0)
     return extent / math.hypot(extent, depth) if extent > 0 else 1.0
@@ -384,9 +356,7 @@ def _compute_profile(capture: Capture) -> tuple[FloatArray, FloatArray]:
 
 
 def _select_traces(capture: Capture) -> tuple[FloatArray, FloatArray]:
-    """Signals (n, t) of some wall points, evenly picked whatever their order, and the path to each
-    from its laser, m.
-    """
+    """Signals (n, t) of some wall points, and their paths from the laser, m, in any order alike."""
     some = np.lexsort((capture.points + capture.lasers).T)
     some = some[:: len(some) // MAX_ANALYSED_POINTS + 1]
     flat = to_numpy(capture.signal).reshape(capture.axis.bins, -1)

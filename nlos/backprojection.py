@@ -151,9 +151,8 @@ def backproject_signals(
     weighting: Weighting,
     progress: Progress,
 ) -> NDArray[np.complex64]:
-    """Smear every wall point's filtered signal over the voxels (z, y, x) that it may come from, and
-    add all up. `apply_filter`: from signals (points, t) to what is back-projected, of so many
-    samples.
+    """Smear every wall point's filtered signal over the voxels (z, y, x) that it may come from.
+    `apply_filter`: from signals (points, t) to so many `samples`.
     """
     total = np.zeros(grid.shape, np.complex64)
     # the loop divides by the distance already
@@ -191,9 +190,8 @@ DEVICE_TABLE_BYTES, BYTES_PER_PAIR = 64 << 20, 16
 def backproject_on_device(
     capture: Capture, grid: Grid, band: Band, weighting: Weighting, progress: Progress
 ) -> Array:
-    """Return the complex sum of `nlos.Backprojection` where the capture's signal lives. Memory: the
-    volume, 64 MiB of waveforms, and five chunks (`ArrayLibrary.chunk_bytes`) for the pairs of voxel
-    and wall point that are looked up at a time.
+    """Return the sum of `nlos.Backprojection` where the signal lives. Memory: the volume, 64 MiB of
+    waveforms, and five chunks (`ArrayLibrary.chunk_bytes`).
     """
     library = ArrayLibrary(capture.device)
     xp = library.xp

@@ -153,9 +153,7 @@ class Band:
 
     @cached_property
     def harmonics(self) -> NDArray[np.int64]:
-        """Indices of the band's frequencies in the transform, without 0 and without the Nyquist
-        frequency, which have no phase.
-        """
+        """Which frequencies of the transform; not 0 nor Nyquist's, which have no phase."""
         indices = np.arange(1, (self.period_bins + 1) // 2)
         return indices[self.pulse.spectrum(indices * self._fundamental_wavenumber) > 0]
 
@@ -170,11 +168,7 @@ class Band:
 
     @property
     def weights(self) -> NDArray[np.float64]:
-        """The pulse's weights G_k, shape (frequencies,).
-
-        Scaled so that a signal ``cos(k * L)`` of the carrier gives phasors that add up to ``exp(1j
-        * k * L)``.
-        """
+        """The pulse's weights G_k; phasors of ``cos(k * L)`` add up to ``exp(1j * k * L)``."""
         # 2 / n: positive frequencies stand for both signs of a real signal
         return self.pulse.spectrum(self.wavenumbers) * (2 / self.period_bins)
 
@@ -212,11 +206,9 @@ class Band:
     def _get_fourier_matrices(
         self, bins: int, real: type[Any]
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Matrices of two steps of a Fourier transform at the band's frequencies.
-
-        Within a block of bins a narrow band's waves are made up of few shapes (bins, n), whatever
-        their phases; the second matrix (blocks * n, 2 * frequencies) has what `compute_phasors` are
-        made of, real and imaginary parts interleaved.
+        """Matrices of two steps of a Fourier transform at the band's frequencies: few shapes (bins,
+        n) make up a narrow band's waves in a block of bins, whatever their phases; (blocks * n, 2 *
+        frequencies) turn their strengths into phasors, real and imaginary parts interleaved.
         """
         if (bins, real) in self._matrices:
             return self._matrices[bins, real]
@@ -238,9 +230,7 @@ class Band:
         return {}
 
     def waveforms(self, phasors: NDArray[Any]) -> Waveforms:
-        """Return ``sum_k P_k * exp(1j * k * L)`` on an axis of path lengths L fine enough for
-        linear interpolation.
-        """
+        """Return ``sum_k P_k * exp(1j * k * L)``, sampled for linear interpolation."""
         # So few frequencies are summed faster by one matrix product than by a Fourier transform
         # padded with zeros.
         carriers, start, spacing = self.carriers
@@ -253,9 +243,9 @@ class Band:
 
     @cached_property
     def carriers(self) -> tuple[NDArray[np.complex128], float, float]:
-        """``exp(1j * k * L)`` over the record and the pulse's tails before and after it, shape
-        (frequencies, samples); path length of sample 0 and path between samples, m. They are 0 at
-        the first and the last two samples: a path outside is clamped there, and reads silence.
+        """``exp(1j * k * L)`` (frequencies, samples) over the record and the pulse's tails, path of
+        sample 0 and between samples, m; 0 at the first and the last two, where paths outside are
+        clamped.
         """
         fineness = SAMPLES_PER_WAVELENGTH * self.axis.spacing / self.pulse.wavelength
         spacing = self.axis.spacing / max(1, int(np.ceil(fineness)))

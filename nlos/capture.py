@@ -260,16 +260,12 @@ class Capture:
 
     @cached_property
     def lasers(self) -> FloatArray:
-        """Laser spots, m: shape (1, 3) if it stands still, else (points, 3) in the order of
-        `points`.
-        """
+        """Laser spots, m: (1, 3) if it stands still, else (points, 3) as `points`."""
         return self.laser[np.newaxis] if self.laser.shape == (3,) else self.laser[self.valid]
 
     @cached_property
     def spacing(self) -> float:
-        """Typical distance of neighbouring wall points, m: the median to the nearest other;
-        infinite for a lone one.
-        """
+        """Median distance of wall points to their nearest, m; infinite for a lone one."""
         from scipy.spatial import cKDTree
 
         # An exhaustive capture names every wall point once per laser.
@@ -413,11 +409,8 @@ def unwarp_signal(
     signal: Any, wall: Any, camera: Any, laser: Any, bin_width: float
 ) -> NDArray[np.float32]:
     """Shift every wall point's signal (t, ...) earlier by ``(|r_p - camera| - |laser - camera|) /
-    c``; wherever it is, the result is NumPy's.
-
-    Afterwards light of one path laser spot -> hidden point -> wall point stands in the same bin for
-    all wall points. Between bins the signal is interpolated linearly; before the first and after
-    the last bin, and where a wall point (..., 3) is NaN, it is 0.
+    c``, so that bins hold one path laser spot -> hidden point -> wall point; linear between bins, 0
+    outside and where a wall point (..., 3) is NaN. The result is NumPy's.
     """
     signal = np.asarray(to_numpy(signal), dtype=np.float32)
     wall = np.asarray(wall, dtype=np.float64)
@@ -429,13 +422,9 @@ def unwarp_signal(
 
 
 def remove_device_legs(capture: Capture, source: Any, camera: Any) -> Capture:
-    """Take the legs device -> laser spot and wall point -> camera off a capture that still holds
-    them.
-
-    Every wall point's signal is moved earlier by ``(|r_L - source| + |r_p - camera|) / c``, by
-    linear interpolation; the part that is common to all goes into the start.
-
-    `source, camera` (3,): position of the laser device and of the camera, m.
+    """Take the legs device -> laser spot and wall point -> camera, (3,) positions in m, off a
+    capture: signals are read ``(|r_L - source| + |r_p - camera|) / c`` earlier, linearly; what all
+    have in common goes into the start.
     """
     source, camera = (_require_position(*one) for one in (("source", source), ("camera", camera)))
     require_numpy("unwarping", capture.signal)

@@ -54,9 +54,8 @@ class CompressedCapture:
 
     @classmethod
     def of(cls, capture: Capture, operator: LinearOperator) -> CompressedCapture:
-        """Read a capture (t, rows, columns) through an operator, as a CLIP camera does; masked wall
-        points are dark. `capture`: signal (t, rows, columns); `operator`: (rows, columns) pictures
-        to (measurements,) vectors.
+        """Read a capture (t, rows, columns) through an operator from pictures (rows, columns), as a
+        CLIP camera does; masked wall points are dark.
         """
         if capture.signal.shape[1:] != operator.shape_in:
             raise ShapeError("signal", ("t", *operator.shape_in), capture.signal.shape)
@@ -67,9 +66,7 @@ class CompressedCapture:
         return cls(measurements, operator, *place, capture.provenance)
 
     def recover_transients(self, method: Recovery | None = None) -> Capture:
-        """Recover the wall's transients. `method`: of `tofclip.solvers`; defaults to the adjoint.
-        `LinearInverse` costs as much and is sharper.
-        """
+        """Recover the wall's transients by the adjoint, or by a method of `tofclip.solvers`."""
         method = method or Backprojection()
         frames = method.recover(self.operator, self.measurements).frames
         history = {

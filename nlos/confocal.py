@@ -43,26 +43,20 @@ class ConfocalScan:
 
     @classmethod
     def of(cls, capture: Capture, grid: Grid) -> ConfocalScan:
-        """Sort a capture onto its lattice, from distance 0 as far as any voxel of the grid is from
-        any wall point; a bin counts distance, not path, and is half as long as the capture's.
-        """
+        """Sort a capture onto its lattice, from distance 0, half the path, to the farthest voxel."""
         wall = PlanarWall.of(capture.points, LATTICE_TOLERANCE)
         traces = _shift_to_distance_zero(capture, _count_useful_bins(capture, wall.plane, grid))
         return cls(wall.lattice.place(traces), wall.plane, capture.axis.spacing / 2)
 
     def correct_falloff(self, falloff: float) -> NDArray[np.float32]:
-        """Undo the loss of brightness with distance d by the factor d^falloff; the farthest bin
-        keeps its scale.
-        """
+        """Return the signal times d^falloff, relative to the farthest bin's distance d."""
         relative = np.arange(self.signal.shape[2], dtype=np.float32) / (self.signal.shape[2] - 1)
         return np.asarray(self.signal * relative**falloff, dtype=np.float32)
 
 
 class ConfocalPlan(Plan):
-    """Imaging by transforms of the whole scan at once, ready for captures of one geometry: confocal
-    scans of a lattice on a plane z = const, up to half a wall beyond its edges.
-
-    `compute`: from a scan and the grid to the values (z, y, x); `settings`: what a volume reports.
+    """Imaging by transforms of whole confocal scans of a lattice on a plane z = const, up to half a
+    wall beyond its edges. `compute`: from a scan and the grid to the values (z, y, x).
     """
 
     def __init__(
@@ -95,9 +89,7 @@ def find_padded_length(count: int) -> int:
 def interpolate_axis(
     values: NDArray[np.float32], position: FloatArray, axis: int
 ) -> NDArray[np.float32]:
-    """Read an axis at fractional positions (n,), in its steps, by linear interpolation; it is
-    periodic.
-    """
+    """Read a periodic axis at fractional positions (n,), in its steps, by linear interpolation."""
     below = np.floor(position).astype(np.intp)
     weight = (position - below).astype(np.float32)
     weight = weight.reshape([-1 if i == axis else 1 for i in range(values.ndim)])
@@ -110,8 +102,8 @@ def interpolate_axis(
 def resample_to_grid(
     values: NDArray[np.float32], scan: ConfocalScan, grid: Grid, depth_position: FloatArray
 ) -> NDArray[np.float32]:
-    """Read an image (y, x, depth) on the padded lattice at the voxels (z, y, x) of a grid, whose
-    planes are at `depth_position` (z,) in steps of the third axis.
+    """Read an image (y, x, depth) on the padded lattice at voxels (z, y, x), whose planes are at
+    `depth_position` (z,) in its steps.
     """
     image = interpolate_axis(values, depth_position, 2)
     for number, wanted, axis in ((1, grid.x, scan.plane.x), (0, grid.y, scan.plane.y)):
@@ -120,9 +112,7 @@ def resample_to_grid(
 
 
 def _require_lattice(capture: Capture, grid: Grid) -> Plane:
-    """Return the plane of the wall; refuse what is no confocal scan of a lattice, and voxels too
-    far beside it.
-    """
+    """Return the plane of a confocal scan of a lattice; refuse others, and voxels too far beside."""
     try:
         plane = PlanarWall.of(capture.points, LATTICE_TOLERANCE).plane
     except InputError as problem:
@@ -175,9 +165,7 @@ def _count_useful_bins(capture: Capture, plane: Plane, grid: Grid) -> int:
 
 
 def _shift_to_distance_zero(capture: Capture, bins: int) -> NDArray[np.float32]:
-    """Signals (points, bins) whose bin 0 is path 0: moved by whole bins where that suffices, else
-    interpolated.
-    """
+    """Signals (points, bins) from path 0 on, by whole bins if that suffices."""
     delay = capture.start / capture.axis.spacing
     whole = round(delay)
     traces = capture.traces()
@@ -263,9 +251,7 @@ class LightCone(Method):
 def apply_wiener_filter(
     spectrum: NDArray[np.complex64], kernel: NDArray[np.complex64], signal_to_noise: float
 ) -> None:
-    """Apply the Wiener filter to a spectrum (y, x, v) in place; the kernel is even in y and x, so
-    that a quarter of its spectrum is enough.
-    """
+    """Filter a spectrum (y, x, v) in place; a quarter of the kernel's, which is even, is enough."""
     # the gain falls where the kernel is weaker than the noise
     gain = kernel.conj() / (np.abs(kernel) ** 2 + np.float32(1 / signal_to_noise))
     row, column = (np.minimum(np.arange(n), n - np.arange(n)) for n in spectrum.shape[:2])
@@ -280,10 +266,8 @@ def apply_wiener_filter(
 def transform_squared_distances(
     scan: ConfocalScan, squares: float, falloff: float
 ) -> tuple[NDArray[np.complex64], tuple[int, int, int]]:
-    """Return the spectrum of the signals over the square v = d^2 of the distance, in which every
-    depth has the same kernel. `squares`: distance of samples of v, m^2; `falloff`: power of the
-    distance by which light is weaker; it is made up for. Returns the half spectrum (y, x, v),
-    padded, so that no convolution wraps around, and the samples along y, x and v with the padding.
+    """Return the half spectrum (y, x, v) of the signals over the square v of the distance, times
+    d^falloff, padded, and its samples with the padding; `squares`: from sample to sample of v, m^2.
     """
     from scipy.fft import fft2, rfft
 
@@ -303,8 +287,7 @@ def transform_paraboloid(
     y: NDArray[Any], x: NDArray[Any], squares: float, shape: tuple[int, int, int], some: slice
 ) -> NDArray[np.complex128]:
     """Spectrum along v (y, x, frequencies) of the kernel ``v = x^2 + y^2`` of unit energy, the same
-    at every depth, at some frequencies: an impulse for every column, shared linearly between two
-    samples. `y`, `x`: m; `squares` and `shape` as of `transform_squared_distances`.
+    at every depth: an impulse for every column (y, x), m, shared linearly between two samples.
     """
     late = (y[:, np.newaxis] ** 2 + x**2) / squares
     whole = np.floor(late).astype(np.intp)

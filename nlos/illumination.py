@@ -56,9 +56,8 @@ def swap_roles(capture: Capture) -> Capture:
 
 
 def choose_roles(capture: Capture) -> Capture:
-    """Return the capture with fewer laser spots than wall points: itself, or its roles swapped. A
-    wave has to be imaged for every laser spot, whatever the number of wall points: a scan by a
-    laser in front of few detectors is quicker the other way round.
+    """Return the capture, or its roles swapped where laser spots are more than wall points: a wave
+    is imaged for every spot, which of a scanning laser before few detectors are the detectors.
     """
     if len(capture.lasers) == 1 or is_confocal(capture):
         return capture
@@ -108,9 +107,7 @@ def require_few_spots(capture: Capture, groups: Sequence[IlluminationGroup]) -> 
 
 
 def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> SphericalWaves:
-    """Return the waves between wall and voxels in one illumination group; `continued` as of
-    `SphericalWaves`.
-    """
+    """Return a group's waves between wall and voxels; `continued` as of `SphericalWaves`."""
     k = group.legs * band.wavenumbers
     step = float(k[1] - k[0]) if k.size > 1 else 1.0
     return SphericalWaves(float(k[0]), step, k.size, continued)
@@ -123,8 +120,7 @@ def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
 
 def choose_unaliased_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Band:
     """Return the pulse's band over a period so long that every voxel sees the record once, or
-    silence. Evenly spaced frequencies repeat a signal with their period; where the paths of the
-    grid go beyond the record, the record is continued with silence.
+    silence: evenly spaced frequencies repeat a signal with their period.
     """
     outward, back = find_leg_bounds(capture.lasers, grid), find_leg_bounds(capture.points, grid)
     return choose_band_for_paths(capture.axis, pulse, outward[0] + back[0], outward[1] + back[1])
@@ -133,9 +129,7 @@ def choose_unaliased_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> 
 def choose_band_for_paths(
     axis: TimeAxis, pulse: VirtualPulse, shortest: float, longest: float
 ) -> Band:
-    """Return the pulse's band over a period in which paths from `shortest` to `longest` (m) meet
-    the record once. `axis`: of the record.
-    """
+    """Return the band whose period holds a record once for paths of these lengths, m."""
     tail = Band(pulse, axis).tail_bins * axis.spacing
     # no image of the record, a period earlier or later, may be reached by a path of the grid
     period = max(longest - (axis.start - tail), axis.paths[-1] + tail - shortest)
@@ -159,9 +153,8 @@ class AliasingWarning(UserWarning):
 
 
 def describe_aliasing(capture: Capture, band: Band) -> str | None:
-    """Say why false images may appear; None where none will. They do if neighbouring wall points
-    lie more than half the band's shortest wavelength apart. In a confocal scan the path grows on
-    both legs from point to point, so that a quarter is the limit.
+    """Say why false images may appear, or None: neighbouring wall points are more than half the
+    band's shortest wavelength apart, a quarter where the path grows on both legs.
     """
     shortest = 2 * np.pi / float(band.wavenumbers[-1])
     finest = shortest / 4 if is_confocal(capture) else shortest / 2

@@ -130,11 +130,9 @@ def complete_settings(capture: Capture, wanted: Wanted) -> Wanted:
 
 
 def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | None:
-    """Return settings and coarse voxels with which all of the box is looked over quickly.
-
-    Waves twice as long have an eighth of the work, on voxels of their half; small boxes are looked
-    over with the waves themselves. `settings`: complete but for the method. Returns none where the
-    voxels asked for are no finer, or all of the box is wanted.
+    """Return settings, complete but for the method, and coarse voxels that look all of the box over
+    quickly: of waves twice as long, an eighth of the work, but in small boxes. None where voxels
+    are to be no finer, or all of the box is wanted.
     """
     wavelength = settings.wavelength or 0.0
     if settings.everywhere or (settings.voxel or 0.0) >= wavelength / 2:
@@ -149,17 +147,13 @@ def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | 
 
 
 def find_bright_box(settings: Wanted, scouted: Volume) -> Wanted:
-    """Return the settings with the box that holds everything bright in a coarse volume, which was
-    imaged as `find_scout` says.
-    """
+    """Return the settings with the bright box of a volume imaged as `find_scout` says."""
     x, y, (near, far) = _find_ends(Grid.around(scouted, settings.voxel_size))
     return replace(settings, x=x, y=y, near=near, far=far, everywhere=True)
 
 
 def is_brightest_on_wall(volume: Volume, capture: Capture, wavelength: float) -> bool:
-    """Whether the brightest voxel lies on the wall, so that the picture shows the wall's own light.
-    `wavelength`: nearer to a wall point than half of it, m, is on the wall.
-    """
+    """Whether the brightest voxel is within half a `wavelength`, m, of the wall: its own light."""
     away = np.linalg.norm(capture.points - np.array(volume.find_brightest()), axis=1)
     return bool(away.min() < BRIGHTEST_ON_WALL_WAVELENGTHS * wavelength)
 
@@ -318,11 +312,9 @@ MIN_EVIDENCE = 2.0
 
 
 def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
-    """How much brighter the brightest of a picture is than that of decoys: of the capture itself,
-    its signals shuffled among the wall points. About 1 says that there is nothing to see.
-
-    Each depth's brightness is taken relative to the decoys': noise and the wall's glow fade with it.
-    `capture`: as it is imaged; `plan`: that the picture was made by, with coarse voxels.
+    """How much brighter the brightest of a coarse picture is than that of decoys, the same capture
+    with its signals shuffled among the wall points; about 1 where there is nothing. Each depth
+    counts relative to the decoys': noise and the wall's glow fade with it.
     """
     own, decoys = measure_brightness(capture, plan, picture, DECOYS)
     return own / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
@@ -331,8 +323,8 @@ def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
 def measure_brightness(
     capture: Capture, plan: Plan, picture: Volume, count: int | None = None
 ) -> tuple[float, list[float]]:
-    """Brightest of a picture, and of its decoys, relative to their mean; see `measure_evidence`.
-    `count`: of decoys; by default as many as the picture's size asks for.
+    """Brightest of a picture, and of decoys, by default as many as it needs; see
+    `measure_evidence`.
     """
     if count is None:
         count = int(np.clip(DECOY_VOXELS // picture.values.size, 1, MAX_DECOYS))
@@ -368,9 +360,8 @@ class PreparedImaging(Generic[Wanted]):
     scouted: tuple[Plan, Volume] | None  # coarse voxels that were looked over
 
     def describe(self, volume: Volume) -> Volume:
-        """Return the volume that was imaged, its provenance under ``imaging`` completed by the
-        settings with their reasons, `evidence`, and for a virtual pulse `resolution_m`, widths of a
-        point's image where the volume is brightest.
+        """Return the volume with settings and reasons, `evidence`, and of a virtual pulse
+        `resolution_m`, widths of a point's image where it is brightest, under ``imaging``.
         """
         described = {**volume.provenance.get("imaging", {}), "settings": self.settings.to_dict()}
         described["evidence"] = self.measure_evidence()
@@ -397,9 +388,7 @@ def prepare_imaging(
     device: ComputeDevice | None = None,
     draw: Draw = lambda _, plan, capture: plan.image(capture),
 ) -> PreparedImaging[Wanted]:
-    """Find every setting that is not given, and the voxels: all that the box holds, or the part
-    that coarse voxels show to be bright. By default it computes where the capture is.
-    """
+    """Find every setting that is not given, and the voxels of the box or of its bright part."""
     found = complete_settings(recorded, wanted)
     capture = found.prepare(recorded)
     if device is not None:

@@ -43,9 +43,7 @@ def _evaluate(c, u, last):
 
 @compiled
 def shift_signals(signal, delay_bins):
-    """Read column p of `signal` (t, points) `delay_bins[p]` bins later, linearly interpolated, 0
-    outside the record. `delay_bins` (points,): bins, fractions included.
-    """
+    """Read column p of `signal` (t, points) `delay_bins[p]` bins later, linearly; 0 outside."""
     bins, points = signal.shape
     result = np.zeros_like(signal)
     for i in range(bins):
@@ -62,8 +60,8 @@ def shift_signals(signal, delay_bins):
 
 
 def rebin(values, edges, wanted):
-    """Sums (..., m) over the intervals between `wanted` edges (m + 1,) of sums (..., n) over those
-    between `edges` (n + 1,), each spread evenly over its own; what lies outside is lost.
+    """Sums (..., m) between `wanted` edges (m + 1,) of sums (..., n) between `edges` (n + 1,), each
+    spread evenly; what lies outside is lost.
     """
     # The running sum is interpolated: differences of it lose nothing and count nothing twice.
     arrived = np.cumsum(values, axis=-1, dtype=np.float64)
@@ -75,17 +73,11 @@ def rebin(values, edges, wanted):
 
 @compiled
 def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers, field):
-    """Add every wall point's waveform, read at each voxel's path and divided by the last leg, to
-    `field`.
-
-    Meant for a brick of voxels so small that their paths to a wall point span a short piece of its
-    waveform, which then stays in the first cache level while the voxels' sums stay in the second.
-
-    `waveforms` (points, 2 * samples): real and imaginary parts interleaved; the first and the last two
-    samples are 0; `start, spacing`: path length of the first sample and path between samples, m;
-    `wall` (points, 3); `lasers` (1, 3): one laser spot for all wall points or one for each; `x, y,
-    z`: axes of the brick; `powers` (2,): further weights: powers of the last leg's length and of
-    the cosine of its angle with z; `field` (z, y, x).
+    """Add every wall point's waveform (points, 2 * samples), real and imaginary parts interleaved,
+    read at each voxel's path and divided by the last leg, to `field` (z, y, x), a brick so small
+    that its paths span a piece of waveform that stays in cache. The first and the last two samples
+    are 0; `start, spacing`: path of the first and between two, m; `lasers`: one or one for each
+    point; `powers` (2,): further weights, of the last leg and of the cosine of its angle with z.
     """
     per_metre = np.float32(1) / spacing
     # Of every voxel: real and imaginary part of the sample before its path, then of the one after.
@@ -148,9 +140,7 @@ def _compute_outward_samples(laser, start, per_metre, x, y, z, outward):
 
 @compiled
 def _find_samples(x, wall_x, across, outward, per_metre, last, sample, before, after):
-    """Where a row of voxels reads a waveform: index of the sample before, and the weights of it and
-    of the next.
-    """
+    """Where a row of voxels reads a waveform: the sample before, and its and the next's weights."""
     across = max(across, np.float32(MIN_DISTANCE_M * MIN_DISTANCE_M))
     for ix in range(x.size):
         distance = math.sqrt((x[ix] - wall_x) ** 2 + across)
@@ -176,9 +166,7 @@ def _raise_to_power(base, exponent):
 
 @compiled
 def _apply_weights(x, wall_x, across, ahead, powers, before, after):
-    """Multiply the weights of a row of voxels by powers of their distance and of the cosine of
-    their direction.
-    """
+    """Multiply a row's weights by powers of their distance and of their direction's cosine."""
     across = max(across, np.float32(MIN_DISTANCE_M * MIN_DISTANCE_M))
     for ix in range(x.size):
         distance = math.sqrt((x[ix] - wall_x) ** 2 + across)
@@ -189,9 +177,7 @@ def _apply_weights(x, wall_x, across, ahead, powers, before, after):
 
 @compiled
 def _add_samples(waveform, sample, before, after, sums):
-    """Add two neighbouring complex samples per voxel: four adjacent numbers, one vector load, one
-    multiply-add.
-    """
+    """Add two neighbouring complex samples per voxel: one vector load, one multiply-add."""
     for ix in range(sample.size):
         first, place = np.uint32(sample[ix]), 4 * ix
         sums[place] += before[ix] * waveform[first]
@@ -203,11 +189,8 @@ def _add_samples(waveform, sample, before, after, sums):
 @compiled
 def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, span, carrier, field):
     """Add ``sum_m terms[m] * f_m(R) * exp(1j * wavenumber * R)``, R the distance from the laser
-    spot, to a plane. `terms` (m, y, x): may be larger than the plane along y and x; `odd`: terms
-    from this one on are multiplied by 1j; `x, y` (n,); `laser` (3,); `wavenumber`: rad/m; carrier
-    of the illumination; `table` (m, samples): the functions f_m, evenly spaced over the distances
-    from ``span[0]`` to ``span[1]``; `span` (2,); `carrier` (x,): multiplies every column; `field`
-    (y, x): added to.
+    spot, to a plane (y, x). Terms from `odd` on are multiplied by 1j; `table` (m, samples): f_m,
+    evenly spaced from ``span[0]`` to ``span[1]``; `carrier` (x,) multiplies columns; m and rad/m.
     """
     before, weight, sums = (
         np.empty(x.size, np.uint32),
@@ -239,9 +222,8 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
 
 @compiled
 def add_with_carrier(values, x, y, z, laser, wavenumber, field):
-    """Add ``values * exp(1j * wavenumber * R)``, R the distance from the laser spot, to some
-    planes. `values` (z, y, x); `x, y, z` (n,); `laser` (3,); `wavenumber`: rad/m; `field` (z, y,
-    x): added to.
+    """Add ``values * exp(1j * wavenumber * R)``, R the distance from the laser spot, to a field (z,
+    y, x); lengths in m, `wavenumber` in rad/m.
     """
     waves = np.empty((2, x.size), np.float32)
     cycles_per_metre = wavenumber / (2 * math.pi)
@@ -280,14 +262,9 @@ def _add_term(term, samples, before, weight, odd, sums):
 
 @compiled
 def migrate_row(spectrum, ky, kx, delay):
-    """Resample a row of a spectrum (kx, frequency) to depth wavenumbers, in place.
-
-    ``F(kx, ky, kz) = kz / k * S(kx, ky, k)`` with ``k = sqrt(kx^2 + ky^2 + kz^2)``, S linearly
-    interpolated and then delayed by the time that was taken off it.
-
-    `spectrum` (columns, frequencies); `kx` (columns,): lateral wavenumbers in samples of the
-    frequency axis; `delay`: phase per sample of frequency by which the spectrum is ahead of its
-    time, rad.
+    """Resample a row of a spectrum (kx, frequency) to depth wavenumbers, in place: ``kz / k * S(kx,
+    ky, k)`` with ``k = sqrt(kx^2 + ky^2 + kz^2)``, S linearly interpolated and delayed by `delay`,
+    rad per sample of frequency; `kx` (columns,) in such samples.
     """
     count = spectrum.shape[1]
     for column in range(spectrum.shape[0]):

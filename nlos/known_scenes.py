@@ -38,9 +38,8 @@ TRUTH_RADIUS_M = 0.04
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """What is hidden, and how it is captured: letters, points or a mesh before a wall that is
-    scanned, and an instrument with its noise. The metadata of each field are those of
-    `nlos.Settings`.
+    """What is hidden before which wall, how it is scanned, and the instrument with its noise. The
+    metadata of each field are those of `nlos.Settings`.
     """
 
     letters: str | None = declare_setting(
@@ -148,9 +147,7 @@ def _parse_points(text: str) -> list[list[float]]:
 
 
 def find_nearest_wall_point(wall: FloatArray, place: tuple[float, float]) -> FloatArray:
-    """Return the wall point (3,) whose x and y are nearest to a place, m. `wall` (..., 3): metres;
-    NaN where there is no wall.
-    """
+    """Return the point (3,) of a wall (..., 3), m, whose x and y are nearest to a place."""
     import numpy as np
 
     known = wall[np.isfinite(wall).all(axis=-1)]
@@ -161,8 +158,8 @@ def find_nearest_wall_point(wall: FloatArray, place: tuple[float, float]) -> Flo
 def _choose_time_axis(
     wall: FloatArray, laser: FloatArray, hidden: FloatArray, settings: SceneSettings
 ) -> TimeAxis:
-    """Choose a time axis from path 0 on that holds the farthest path over anything hidden (n, 3), and
-    the response behind it. A sum of distances is largest at a corner of the box about what is hidden.
+    """Choose a time axis from path 0 to beyond the farthest by way of anything hidden (n, 3), which
+    leads by a corner of the box about it.
     """
     import numpy as np
 
@@ -231,9 +228,8 @@ class HiddenTruth:
 
 
 def compare_with_truth(volume: Volume, truth: HiddenTruth) -> dict[str, float]:
-    """Fraction of the energy near hidden things (``energy_near_truth``), how much brighter voxels are
-    there than elsewhere (``contrast_to_truth``), and the distance that counts as near
-    (``truth_reach_m``).
+    """Fraction of the energy near hidden things (``energy_near_truth``), how much brighter it is
+    there (``contrast_to_truth``), and how far near is (``truth_reach_m``).
     """
     import numpy as np
 

@@ -97,8 +97,8 @@ class Plan(ABC):
 
     @cached_property
     def memory_bytes(self) -> int:
-        """Most bytes that the arrays of an image hold at a time, the volume included and the
-        capture not; an estimate, good to about a factor of two.
+        """Most bytes that arrays of an image hold, the volume included, the capture not; within a
+        factor of two.
         """
         return self.grid.size * VOXEL_BYTES
 
@@ -211,9 +211,7 @@ class PhasorMethod(Method):
 
 
 def require_imageable(capture: Capture, grid: Grid) -> None:
-    """Refuse what no method can image: a single wall point, a grid behind the wall, or a volume
-    larger than `MEMORY_LIMIT_BYTES`.
-    """
+    """Refuse a single wall point, a grid behind the wall, and more than `MEMORY_LIMIT_BYTES`."""
     if len(capture.points) == 1:
         raise InputError("one wall point cannot locate anything: a capture needs several")
     hindmost = float(capture.points[:, 2].min())

@@ -58,7 +58,7 @@ class FrontSurface:
 
     @property
     def faces(self) -> NDArray[np.int32]:
-        """Triangles between neighbouring pixels of one thing: (m, 3) indices into `points`,
+        """Triangles of neighbouring pixels of one thing: (m, 3) indices into `points`,
         counter-clockwise as seen from the wall.
         """
         index = np.full(self.depth.shape, -1, np.int32)
@@ -80,9 +80,8 @@ class FrontSurface:
 
 
 def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
-    """Find the front surface of a volume of at least 3 voxels along every axis; its normals are the
-    directions in which brightness changes most. `fraction`: a line of sight shows a surface where
-    its brightest voxel has this fraction of the brightest of all.
+    """Find the front surface of a volume of at least 3 voxels along every axis, where brightness is
+    `fraction` of the brightest; normals are directions in which it changes most.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -102,9 +101,7 @@ def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
 
 
 def build_front_surface(volume: Volume, normals: NDArray[Any], fraction: float) -> FrontSurface:
-    """Put together the surface of the brightest voxel on every line of sight, whose normals (y, x,
-    3) may have any length and point to either side.
-    """
+    """Put together the surface of the brightest voxels; `normals` (y, x, 3) of any length and side."""
     grid, magnitude = volume.grid, volume.magnitude
     albedo = magnitude.max(axis=0)
     seen = albedo >= fraction * albedo.max()
@@ -155,15 +152,12 @@ FREQUENCIES_PER_BLOCK = 8
 
 @dataclass(frozen=True)
 class DirectionalLightCone:
-    """Surfaces with normals from a confocal scan.
+    """Surfaces with normals from a confocal scan: a matte facet of albedo times normal v at x
+    returns ``<x' - x, v> / d^(falloff + 1)`` to the wall point x'. Over u = z^2 and w = d^2 the
+    signals, times d^(falloff + 1), are the sum of v_x with ``x * h``, v_y with ``y * h``, and ``-z
+    * v_z`` with h, the paraboloid: one Wiener filter gives all three.
 
-    A matte facet of albedo times normal v at x returns ``<x' - x, v> / d^(falloff + 1)`` to the
-    wall point x'. With u = z^2 and w = d^2 (see `LightCone`) the signals, multiplied by d^(falloff
-    + 1), are the sum of three convolutions over x, y and u: of v_x with ``x * h``, of v_y with ``y
-    * h``, of ``-z * v_z`` with h, the paraboloid. All three follow from one Wiener filter.
-
-    Young, Lindell, Girod, Taubman, Wetzstein, "Non-line-of-sight surface reconstruction using the
-    directional light-cone transform", CVPR 2020.
+    Young, Lindell, Girod, Taubman, Wetzstein, CVPR 2020.
     """
 
     transform: LightCone = field(default_factory=LightCone)  # its Wiener filter and falloff
@@ -213,9 +207,7 @@ def _separate(
     unit: float,
     floor: float,
 ) -> NDArray[np.complex64]:
-    """Spectra (3, ky, kx, w) of v_x, v_y and ``-z * v_z / unit``, by a Wiener filter; lengths in
-    the kernels are in multiples of `unit`.
-    """
+    """Spectra (3, ky, kx, w) of v_x, v_y and ``-z * v_z / unit``, by a Wiener filter; `unit`: m."""
     from scipy.fft import fft2
 
     lengths = zip(scan.plane.steps, shape[:2], strict=True)
@@ -236,9 +228,7 @@ def _separate(
 
 
 def find_imaged_surface(capture: Capture, volume: Volume, fraction: float = 0.3) -> FrontSurface:
-    """Find the front surface of a capture that has been imaged: by the directional light-cone
-    transform where it takes the capture, else from the volume's gradients.
-    """
+    """Find the front surface of an imaged capture, by the directional transform if that takes it."""
     here = volume.on(ComputeDevice())
     require_surface(here.magnitude, fraction)
     try:

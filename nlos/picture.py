@@ -37,11 +37,8 @@ MIN_PANEL_RATIO, MAX_PANEL_RATIO = 0.3, 2.0
 
 
 def save_picture(volume: Volume, path: str | Path) -> None:
-    """Draw front, side and top view (brightest voxel along the line of sight) and a depth map into
-    a file.
-
-    The front view looks along +z from the wall into the scene, x to the right and y down; the side
-    view has the wall at its left edge, the top view at its upper edge.
+    """Draw front, side and top view and a depth map into a file; the front looks along +z, y down,
+    the side view has the wall at its left edge, the top view at its upper edge.
     """
     require_suffix(path, *PICTURE_SUFFIXES)  # before the drawing
     save_figure(_draw_figure(volume), path)
@@ -141,9 +138,7 @@ def _draw_picture(
     labels: tuple[str, str],
     brightest: float | None = 1.0,
 ) -> AxesImage:
-    """Draw a picture (rows, columns) with the first coordinate to the right and the second
-    downwards.
-    """
+    """Draw a picture (rows, columns), its first coordinate to the right, the second downwards."""
     lowest, edges = None if brightest is None else 0.0, compute_extent(*coordinates)
     drawn = axes.imshow(
         picture, COLOUR_MAP, vmin=lowest, vmax=brightest, extent=edges, interpolation="nearest"
@@ -156,9 +151,7 @@ def _draw_picture(
 def compute_extent(
     right: NDArray[np.float64], down: NDArray[np.float64]
 ) -> tuple[float, float, float, float]:
-    """Left, right, lower and upper edge of a picture of pixels centred on axes to the right and
-    downwards, m, as matplotlib has it.
-    """
+    """Left, right, lower and upper edge of a picture with axes right and down, m."""
     return (*_find_edges(right), *_find_edges(down)[::-1])
 
 
@@ -175,9 +168,7 @@ NANOSECOND = 1e-9
 
 
 def save_film(video: TransientVideo, path: str | Path) -> None:
-    """Write a GIF that looks along +z from the wall, x to the right and y down; all instants share
-    one scale. Memory for all pictures of the film, 0.2 MB each.
-    """
+    """Write a GIF that looks along +z from the wall, y down, of one scale; 0.2 MB of memory each."""
     from PIL import Image
 
     target = Path(path)

@@ -42,9 +42,8 @@ def crop_capture(capture: Capture, nearest: float, farthest: float) -> Capture:
 
 
 def rebin_capture(capture: Capture, factor: int) -> Capture:
-    """Add up every `factor` neighbouring bins; bins left over at the end are dropped. Counts stay
-    counts. Bins much finer than the wall's sampling carry noise and cost time: path per bin of
-    about the distance of neighbouring wall points loses nothing.
+    """Add up every `factor` neighbouring bins, less what is left over; counts stay counts. Path per
+    bin of about the distance of neighbouring wall points loses nothing.
     """
     bins = capture.axis.bins // factor if factor >= 1 else 0
     if bins < 2:
@@ -62,13 +61,9 @@ def rebin_capture(capture: Capture, factor: int) -> Capture:
 
 
 def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> Capture:
-    """Set to 0 what arrives straight from the laser spot, by way of no hidden thing.
-
-    That light reaches wall point r_p after the path ``|r_L - r_p|``; everything up to `margin`
-    later goes with it: the instrument's response and what the wall sends on.
-
-    `margin`: m of path, 0 or more; `ramp`: m of path over which signals then rise to their whole
-    strength, as a raised cosine; a sharp edge would show as a plane at half the margin.
+    """Set to 0 what arrives straight from the laser spot, after the path ``|r_L - r_p|``, and up to
+    `margin` m later: the instrument's response and what the wall sends on. Signals then rise over
+    `ramp` m, as a raised cosine; a sharp edge would show as a plane at half the margin.
     """
     for name, value in (("margin after the first bounce", margin), ("ramp after it", ramp)):
         if not (np.isfinite(value) and value >= 0):
@@ -94,8 +89,8 @@ def flip_capture(capture: Capture, axis: str) -> Capture:
 
 
 def fade_record_end(capture: Capture, length: float) -> Capture:
-    """Let signals fade out over a length of path, m, before the end of the record, as a raised
-    cosine: where light still comes then, the end would show as a plane.
+    """Let signals fade out over a path of `length`, m, by a raised cosine: where light still comes
+    at the record's end, that would show as a plane.
     """
     if not (np.isfinite(length) and length > 0):
         raise InputError(f"the record's end must fade over more than 0 m, got {length}")
@@ -128,12 +123,10 @@ BYTES_PER_READING, MAX_KEPT_BYTES = 12, 1 << 28
 
 
 def join_near_lasers(capture: Capture) -> Capture:
-    """Take pairs of a laser spot and a wall point close by for confocal ones at their midpoint.
-
-    The path by way of a point at distance R then errs by at most ``d^2 / (4 R)``, d the distance of
-    the two: 0.1 mm for 15 mm and half a metre. Where pairs are farther apart, signals are read at
-    the path that leads by way of the same points; see the module. Where the path would err too
-    much, or all are confocal already, the same capture comes back.
+    """Take pairs of near laser spots and wall points for confocal ones at their midpoint: at
+    distance R paths err by at most ``d^2 / (4 R)``, d apart; wider pairs are read at the path by
+    way of the same points, see the module. The same capture where that errs too much or all are
+    confocal.
     """
     return MidpointJoin(capture).join(capture)
 
@@ -168,9 +161,7 @@ class MidpointJoin:
 
 
 class MidpointImaging(PhasorMethod):
-    """A method that images captures whose pairs are joined by `join_near_lasers`, for captures as
-    they come.
-    """
+    """A method that images captures whose pairs are joined by `join_near_lasers`."""
 
     def __init__(self, method: PhasorMethod) -> None:
         self.method = method
@@ -210,8 +201,8 @@ def _sample_space(points: FloatArray) -> FloatArray:
 
 
 def _find_offsets(capture: Capture, some: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Midpoints (n, 3) of some pairs, and of each the squares of half its laser's offset and of
-    that offset's part along the directions to hidden things, on average, m^2.
+    """Midpoints (n, 3) of pairs, and the squares of half their offset, and of its part along the
+    directions to hidden things on average, m^2.
     """
     middle = (capture.points[some] + capture.lasers[some]) / 2
     half = capture.lasers[some] - middle
@@ -274,8 +265,8 @@ class _Moveout:
         return read
 
     def _find_bins(self, some: slice) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        """Find the bin before each reading of some pairs, as a place in their (t, n) signals, and
-        the weight of the bin after it, both (t, n).
+        """Find the bin before each reading, as a place in (t, n) signals, and the weight of the
+        next.
         """
         axis = self._axis
         confocal = np.maximum(axis.paths, 0)[:, np.newaxis]

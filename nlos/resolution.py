@@ -52,9 +52,8 @@ def compute_diffraction_limit(capture: Capture, point: Any, pulse: VirtualPulse)
 
 
 def measure_point_spread(volume: Volume, point: Any | None = None) -> PeakWidths:
-    """Widths of a volume's peak, along the lines x, y and z through it. `volume`: A quarter of the
-    width per voxel, or finer; `point` (3,): the voxel nearest to it is taken for the peak; defaults
-    to the brightest. Returns full widths at half maximum along x, y and z, m.
+    """Widths of a volume's peak, the voxel nearest to `point` (3,) or the brightest, along x, y and
+    z; voxels of at most a quarter of them.
     """
     z, y, x = volume.grid.find_nearest(volume.find_brightest() if point is None else point)
     magnitude = volume.magnitude
@@ -67,8 +66,8 @@ def measure_point_spread(volume: Volume, point: Any | None = None) -> PeakWidths
 
 
 def measure_fwhm(axis: FloatArray, values: NDArray[Any], peak: int) -> float:
-    """Full width at half of ``values[peak]``, by linear interpolation; NaN if one side does not
-    fall so far. `axis` (n,): metres, ascending; `values` (n,); `peak`: place of the maximum.
+    """Full width at half of ``values[peak]`` along an axis (n,), m; NaN where one side stays
+    higher.
     """
     level = HALF_MAXIMUM * float(values[peak])
     below = np.flatnonzero(values < level)

@@ -46,18 +46,12 @@ CHANGE_RATIO = float(np.log(FALSE_CHANGES) / np.log(1 - QUIET_SHARE))
 
 
 class DepthAverage:
-    """A running mean of fields, over a number of captures that grows with depth, without those in
-    which a voxel was another one.
+    """A running mean of fields on a grid, over up to `captures` at the last depth and in proportion
+    to the distance from `wall`, z in m: far light is noisier, and a moving thing stays longer
+    within its wider image there. Of the earlier captures voxels take those that agree with the
+    newest within their noise: what moves would cancel.
 
-    Light of a hidden thing falls with the fourth power of its distance, so that what is far is
-    noisy, and what is resolved grows with the distance, so that a moving thing stays as long within
-    its own image: captures are averaged in proportion to the distance from the wall. Nam et al.,
-    "Low-latency time-of-flight non-line-of-sight imaging at 5 frames per second", Nat. Commun. 12,
-    6526 (2021). What moves faster, or shifts its phase, would cancel: of the earlier captures every
-    voxel takes those that agree with the newest within their noise.
-
-    `grid`: of the fields; `wall`: z from which depths count, m; `captures`: how many are averaged
-    at most at the last depth; nearer by at least the newest alone.
+    Nam et al., Nat. Commun. 12, 6526 (2021).
     """
 
     def __init__(self, grid: Grid, wall: float, captures: int) -> None:
@@ -74,9 +68,7 @@ class DepthAverage:
         return self._windows
 
     def add(self, field: Volume) -> Volume:
-        """Take the complex field of a new capture, and return the brightness, float32, of the
-        average; of a stream's first captures it holds those that there are.
-        """
+        """Take a new capture's complex field; return the average's brightness, float32."""
         newest = field.values
         total, count = newest.copy(), np.ones(newest.shape, np.float32)
         for number, earlier in enumerate(self._earlier, 1):

@@ -303,9 +303,7 @@ class Volume:
 
     @property
     def magnitude(self) -> NDArray[Any]:
-        """Brightness, real and not negative, shape (z, y, x); a NumPy array wherever the values
-        live.
-        """
+        """Brightness (z, y, x), not negative; a NumPy array wherever the values live."""
         return to_numpy(abs(self.values))
 
     def find_brightest(self) -> tuple[float, float, float]:
@@ -314,9 +312,7 @@ class Volume:
         return float(self.grid.x[x]), float(self.grid.y[y]), float(self.grid.z[z])
 
     def maximum_projection(self) -> Projection:
-        """Project along z: the largest brightness of every column (y, x), and the depth where it
-        stands.
-        """
+        """Find the brightest of every column (y, x) along z, and its depth."""
         magnitude = self.magnitude
         return Projection(magnitude.max(axis=0), self.grid.z[magnitude.argmax(axis=0)])
 
@@ -335,9 +331,7 @@ class Volume:
         return extract_surface(self, fraction)
 
     def points(self, fraction: float = 0.3) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Positions (n, 3), m, and magnitudes (n,) of voxels of at least ``fraction`` (0..1) of the
-        brightest.
-        """
+        """Positions (n, 3), m, and magnitudes (n,) of voxels from ``fraction`` (0..1) on."""
         from nlos.export import extract_points
 
         return extract_points(self, fraction)

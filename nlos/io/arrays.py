@@ -26,9 +26,7 @@ class NamedArrays(Archive):
         return self.array(name, *[None] * self._count_axes(name))
 
     def read_time_last(self, name: str) -> NDArray[Any]:
-        """Return entry `name`, signals of three axes with time last. Two equal axes after a longer
-        one are rows and columns after time, which is refused.
-        """
+        """Return signals (rows, columns, t); refuse rows and columns, two equal axes, after time."""
         signal = self.array(name, None, None, None)
         if signal.shape[1] == signal.shape[2] < signal.shape[0]:
             raise FileFormatError(
@@ -44,9 +42,7 @@ class NamedArrays(Archive):
         return self.array(name, *[None] * (dimensions - 1), 3).astype(np.float64)
 
     def number(self, name: str, absent: float | None = None) -> float:
-        """Return entry `name`, a single finite number with or without axes of length 1; `absent`
-        where there is none.
-        """
+        """Return a single finite number, whatever its axes of length 1; `absent` without it."""
         if absent is not None and name not in self:
             return absent
         return float(self.finite_array(name, *[1] * self._count_axes(name)).squeeze())
@@ -65,8 +61,8 @@ def read_hdf5(path: str | Path) -> NamedArrays:
 
 
 def read_matlab(path: str | Path) -> NamedArrays:
-    """List all numeric variables of a .mat file of version 5 to 7.3, without axes of length 1;
-    structs become dotted names. Axes are in MATLAB's order, whatever the version.
+    """List the numeric variables of a .mat file, version 5 to 7.3, structs by dotted names, in
+    MATLAB's order of axes, without those of length 1.
     """
     with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(MATLAB_HEADER_BYTES + len(HDF5_SIGNATURE))

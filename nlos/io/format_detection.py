@@ -38,9 +38,7 @@ from tofclip.units import PICOSECOND
 
 
 def read_native(path: str | Path) -> Capture | None:
-    """Read a capture, or take one out of recovered frames; None if the HDF5 file is not one of
-    ours.
-    """
+    """Read a capture, or take one out of recovered frames; None of other HDF5 files."""
     import h5py
 
     from tofclip.shots import Frames
@@ -177,9 +175,7 @@ CONFOCAL_LASER = "confocal"
 
 
 def read_streak_folder(folder: str | Path) -> Capture:
-    """Read all EXR files of a folder, in the order of the numbers in their names; colours are
-    averaged.
-    """
+    """Read a folder's EXR files by the numbers in their names; colours are averaged."""
     folder = Path(folder)
     files = sorted(folder.glob("*.exr"), key=_parse_file_number)
     if not files:

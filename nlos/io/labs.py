@@ -31,12 +31,8 @@ MIN_Z_COSINE = 1 - 1e-6
 
 
 def rotate_to_scene(capture: Capture, towards_scene: NDArray[np.float64]) -> Capture:
-    """Turn all coordinates so that a direction becomes +z.
-
-    A direction of +z leaves them as they are; of -z, they turn half around y. Otherwise the old z,
-    upright in most programs, becomes -y, because y points down here.
-
-    `towards_scene` (3,): from the wall into the hidden scene; of any length but 0.
+    """Turn all coordinates so that a direction (3,), from the wall into the hidden scene, becomes
+    +z: by half a turn around y if it is -z; else the old z, upright in most programs, becomes -y.
     """
     length = float(np.linalg.norm(towards_scene))
     if not (np.isfinite(length) and length > 0):
@@ -74,15 +70,13 @@ OPERATIONS: Mapping[type[ast.operator], Callable[[float, float], float]] = {
 
 
 def read_curvelet_data(fields: NamedArrays) -> Capture:
-    """Read ``sub_Sig`` (pairs, t), with laser spots and wall points in ``C_i.mat`` and ``C_d.mat``
-    beside it, (pairs, 3), counted in steps (depth, to the left, up) of ``bx``, ``by`` and ``bz``
-    metres; ``experimental_setup.m``, in the same folder or the one above, sets these steps and ``c *
-    delta_t``, the path of a bin. Seen from their wall the second number grows to the left and the
-    third upwards: their letters N T read as N T only so. Without the script points are metres:
-    (depth, to the left, up) where the first does not vary, else (x, y, z).
+    """Read ``sub_Sig`` (pairs, t), with laser spots and wall points (pairs, 3) in ``C_i.mat`` and
+    ``C_d.mat`` beside it, in steps (depth, to the left, up) of ``bx``, ``by`` and ``bz`` metres,
+    which ``experimental_setup.m`` there or in the folder above sets, with ``c * delta_t``, the path
+    of a bin: their letters N T read as N T only so. Without it points are metres: (depth, to the
+    left, up) where the first does not vary, else (x, y, z).
 
-    Liu et al., "Non-line-of-sight imaging with arbitrary illumination and detection pattern", Nat.
-    Commun. 14, 3230 (2023): CC-SOCR.
+    Liu et al., Nat. Commun. 14, 3230 (2023): CC-SOCR.
     """
     counts = fields.array("sub_Sig", None, None)
     laser, wall = (_read_points(fields, name, len(counts)) for name in ("C_i.mat", "C_d.mat"))
@@ -109,9 +103,7 @@ def read_curvelet_data(fields: NamedArrays) -> Capture:
 
 
 def parse_setup(path: str | Path) -> Mapping[str, float]:
-    """Read the first value of each of `SETUP_NAMES` in a MATLAB script: a sum or product of numbers
-    and of names set before.
-    """
+    """Read the first value, a sum or product of numbers and names, of each of `SETUP_NAMES`."""
     with translate_read_errors(path), open(path, "rb") as file:
         text = file.read(MAX_SCRIPT_BYTES).decode(errors="replace")
     found: dict[str, float] = {}
@@ -301,11 +293,9 @@ def read_numpy_archive(fields: NamedArrays) -> Capture:
 def resample_evenly(
     fields: NamedArrays, signal: NDArray[Any], paths: NDArray[np.float64]
 ) -> tuple[NDArray[Any], float, float]:
-    """Put counts of time bins that need not be even into even ones; no photon is lost or doubled.
-
-    The light of a bin, whose middle stands for one of `paths` (t,), m, is taken to be spread evenly
-    over it; an even bin is as wide as the median. Returns with the signal (t, ...) the path of the
-    first bin and from one to the next, m.
+    """Put counts (t, ...) of bins about `paths` (t,), m, evenly spread over each, into even bins of
+    their median width; no photon is lost or doubled. Returns with them the path of the first bin
+    and from one to the next, m.
     """
     widths = np.diff(paths)
     if len(paths) < 2 or not widths.min() > 0:
@@ -327,13 +317,10 @@ def resample_evenly(
 
 
 def read_surface_optimisation_data(fields: NamedArrays) -> Capture:
-    """Read ``transient`` (points, t) and ``lighting`` (points, 3), m, of a confocal scan.
+    """Read ``transient`` (points, t), in bins of 1.2 mm of path from 0, and ``lighting`` (points,
+    3), m, of a confocal scan; x to the right and y down as their mannequin stands upright.
 
-    A bin is 1.2 mm of path, and bin 0 is path 0. x runs to the right and y down as in the authors'
-    order of points: their mannequin stands upright.
-
-    Tsai, Sankaranarayanan, Gkioulekas, "Beyond volumetric albedo: a surface optimization framework
-    for non-line-of-sight imaging", CVPR 2019.
+    Tsai, Sankaranarayanan, Gkioulekas, "Beyond volumetric albedo", CVPR 2019.
     """
     wall = fields.read_coordinates("lighting")
     counts = fields.array("transient", len(wall), None)
@@ -342,15 +329,11 @@ def read_surface_optimisation_data(fields: NamedArrays) -> Capture:
 
 def read_general_data(fields: NamedArrays) -> Capture:
     """Read ``data`` (rows, columns, t) of irregular pairs, with ``laserpoints`` and
-    ``detectpoints`` (rows, columns, 3), m, in ``setup.mat`` beside the file.
-
-    The bin width, ``timeRes`` s, has to stand in either file: the authors keep it in a file of
-    settings, and it is 8.33, 16 or 32 ps there. Seen from the
-    wall x runs to the left and y up: their script reverses both before it shows a volume, and only
-    so the letter and the number of "tuan" read as in the photograph of them.
-
-    Field names, units and bins are those of https://github.com/hy520484/general-NLOS; of
-    ``data_NAME.mat``, ``setup_NAME.mat`` is taken where there is one.
+    ``detectpoints`` (rows, columns, 3), m, in ``setup.mat`` beside it, or of ``data_NAME.mat`` in
+    ``setup_NAME.mat``, as in https://github.com/hy520484/general-NLOS. The bin width, ``timeRes``
+    s, has to stand in either: there it is 8.33, 16 or 32 ps. x runs to the left and y up: their
+    script reverses both, and only so the letter and the number of "tuan" read as in their
+    photograph.
     """
     counts = fields.read_time_last("data")
     own = fields.path.with_name(fields.path.name.replace("data", "setup", 1))
@@ -411,11 +394,10 @@ def read_phasor_field_data(fields: NamedArrays) -> Capture:
 
 
 def read_rectified_data(fields: NamedArrays) -> Capture:
-    """Read ``rect_data`` (y, x, t) with the ways to and from the devices taken off, ``ts`` in s,
+    """Read ``rect_data`` (y, x, t) without the ways to and from the devices, ``ts`` in s,
     ``sampling_spacing`` in m, and ``SPAD_index``, column and row of the one spot.
 
-    Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
-    imaging systems", Nat. Commun. 11, 1645 (2020).
+    Liu, Bauer, Velten, Nat. Commun. 11, 1645 (2020).
     """
     counts = fields.read_time_last("rect_data")
     rows, columns, _ = counts.shape
@@ -479,9 +461,7 @@ def read_zaragoza(fields: NamedArrays) -> Capture:
 
 
 def _add_up_bounces(fields: NamedArrays, first: bool) -> NDArray[np.float32]:
-    """Signal (t, lasers..., points...) summed over colours and bounces; a lone laser's axes are
-    left out.
-    """
+    """Signal (t, lasers..., points...) of all colours and bounces; a lone laser has no axes."""
     data = fields.read_numbers("data")
     if data.ndim not in (CONFOCAL_AXES, EXHAUSTIVE_AXES):
         raise FileFormatError(

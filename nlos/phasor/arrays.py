@@ -45,9 +45,7 @@ class ArrayLibrary:
 
     @property
     def chunk_bytes(self) -> int:
-        """The largest array that should be made at a time; some four of its size are alive
-        together.
-        """
+        """The largest array to be made at a time; some four of its size live together."""
         return CPU_CHUNK_BYTES if "cpu" in str(self.device.device).lower() else GPU_CHUNK_BYTES
 
     def put(self, values: NDArray[Any]) -> Array:
@@ -65,17 +63,13 @@ class ArrayLibrary:
 
 
 def remove_whole_cycles(cycles: Any) -> NDArray[np.float64]:
-    """Leave out whole cycles while there are digits for it: what is left goes well into single
-    precision.
-    """
+    """Leave out whole cycles in double precision: the rest goes well into single."""
     values = np.asarray(cycles, np.float64)
     return np.asarray(values - np.round(values))
 
 
 class BandTransform:
-    """The Fourier transform of signals at a band's frequencies, as a matrix that is kept where the
-    signals live. `bins`: of the signals; a band may have been made for a longer record.
-    """
+    """The Fourier transform of `bins` of signals at a band's frequencies, where the signals live."""
 
     def __init__(self, band: Band, bins: int, library: ArrayLibrary) -> None:
         paths = band.axis.start + band.axis.spacing * np.arange(bins)
@@ -84,9 +78,7 @@ class BandTransform:
         self._real, self._imaginary = library.put(waves.real), library.put(waves.imag)
 
     def of(self, traces: Array) -> Array:
-        """Return the phasors (points, frequencies) of signals (points, t); see
-        `nlos.band.Band.compute_phasors`.
-        """
+        """Return the phasors (points, frequencies) of signals (points, t)."""
         real, imaginary = (
             self._xp.astype(traces @ part, self._xp.complex64)
             for part in (self._real, self._imaginary)
@@ -105,9 +97,7 @@ def get_traces(capture: Capture, some: slice | NDArray[Any]) -> Array:
 
 
 def arrange_on_lattice(values: Array, wall: WallLattice, library: ArrayLibrary) -> Array:
-    """Put values (..., points) into their places on a lattice, (..., rows, columns); the others are
-    0.
-    """
+    """Put values (..., points) into their places (..., rows, columns); the others are 0."""
     xp = library.xp
     if not wall.is_complete:
         padded = xp.concat([values, library.zeros((*values.shape[:-1], 1))], axis=-1)

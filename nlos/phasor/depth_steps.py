@@ -39,9 +39,8 @@ TABLE_SAMPLES = 512
 
 @dataclass(frozen=True, eq=False)
 class Illumination:
-    """``exp(1j * (k - k_0) * (R - middle)) ~ sum_m b_m(k) * f_m(R)``, the odd functions f times 1j.
-    The even and the odd part in R are each split by their own eigenvectors, which keeps everything
-    real and takes some two thirds of the terms of a Chebyshev expansion.
+    """``exp(1j * (k - k_0) * (R - middle)) ~ sum_m b_m(k) * f_m(R)``, odd functions f times 1j: two
+    thirds of the terms of a Chebyshev expansion, and all real.
     """
 
     coefficients: NDArray[np.float32]  # (frequencies, m), b, even functions first
@@ -60,8 +59,8 @@ def build_constant_illumination(frequencies: int) -> Illumination:
 def split_illumination(
     detuning: FloatArray, strength: FloatArray, half: float, tolerance: float
 ) -> Illumination:
-    """Split the illumination of distances from ``-half`` to ``half``, m, about a middle one, to a
-    root mean square error; `detuning` (frequencies,): ``k - k_0``, rad/m.
+    """Split the illumination of distances within `half`, m, to a root mean square error; `detuning`
+    (frequencies,): ``k - k_0``, rad/m.
     """
     # Even and odd functions are known by their values at the positive half of the nodes.
     angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES
@@ -80,9 +79,7 @@ def split_illumination(
 def _find_leading_functions(
     wave: FloatArray, strength: FloatArray, tolerance: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Fewest orthonormal functions (nodes, m), and their coefficients (frequencies, m), that make
-    up `wave`.
-    """
+    """Fewest orthonormal functions (nodes, m), and coefficients (frequencies, m), of `wave`."""
     weighted = wave * strength
     values, vectors = np.linalg.eigh(weighted @ weighted.T)
     # eigh sorts upwards; of both parts together, half the squared strength times the nodes is the
@@ -95,9 +92,7 @@ def _find_leading_functions(
 
 @cache
 def _build_continuation_matrix(odd: int) -> FloatArray:
-    """Matrix that continues a function from its Chebyshev nodes to all samples by its Chebyshev
-    series.
-    """
+    """Matrix that continues a function from its Chebyshev nodes to all samples."""
     angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES
     orders = 2 * np.arange(len(angles)) + odd
     series = (2 / len(angles)) * np.cos(np.outer(orders, angles))
@@ -137,8 +132,8 @@ class PlaneWaves:
         return y, x
 
     def sort(self, signed: bool) -> tuple[IntArray, IntArray, FloatArray]:
-        """Sort the waves, or those without a negative index, by lateral wavenumber: indices along y
-        and x, and lateral wavenumbers, rad/m.
+        """Sort the waves, or those without a negative index, by lateral wavenumber, rad/m: indices
+        along y and x, and these.
         """
         rows, columns = (np.arange(-n if signed else 0, n + 1) for n in self.max_indices)
         qy, qx = (
@@ -284,9 +279,8 @@ class AxialSpectrum:
         centre: float,
         cosines: tuple[float, float],
     ) -> AxialSpectrum:
-        """Return the spectrum of a field of all directions forward, of wavenumbers k and a carrier
-        k_0 (`centre`), rad/m. `cosines`: range of the cosine of the angle between the laser's wave
-        and z; both 0 without one.
+        """Return the spectrum of a field of all forward directions, wavenumbers k and a carrier k_0
+        (`centre`), rad/m; `cosines`: range of the laser's wave's with z, 0 without one.
         """
         steps = (np.arange(ANGLES) + 0.5) / ANGLES
         low, high = cosines
@@ -300,9 +294,8 @@ class AxialSpectrum:
     def interpolate(
         self, wanted: FloatArray, known: FloatArray, noise: float
     ) -> tuple[NDArray[np.complex128], FloatArray]:
-        """Return the best linear interpolation between depths, weights (wanted, known), and its
-        root mean square errors (wanted,), relative; `noise`: that of the known ones, independent of
-        each other.
+        """Return the best linear interpolation of depths, weights (wanted, known), and its relative
+        errors (wanted,), root mean square; `noise`: that of each known one.
         """
         middle = float(known.mean())
         waves, at_known = (
@@ -334,9 +327,7 @@ class DepthInterpolation:
 
 
 def choose_depths(z: FloatArray, spectrum: AxialSpectrum, error: float) -> DepthInterpolation:
-    """Choose the fewest depths from which all wanted ones, z (n,), m, follow with a root mean
-    square error allowed at every depth, relative.
-    """
+    """Choose the fewest of depths z (n,), m, from which all follow within an error, relative."""
     everything = DepthInterpolation(np.arange(z.size), [])
     ratio = _find_spacing_ratio(z, spectrum, error)
     if ratio == 1:
@@ -356,9 +347,7 @@ def choose_depths(z: FloatArray, spectrum: AxialSpectrum, error: float) -> Depth
 
 
 def _find_spacing_ratio(z: FloatArray, spectrum: AxialSpectrum, error: float) -> float:
-    """Largest spacing of computed depths, relative to the wanted ones', that allows the error
-    half-way between two of many; 1 if none does.
-    """
+    """Largest spacing of computed depths, in wanted ones', with the error half-way; else 1."""
     if z.size <= 2 * NEIGHBOURS:
         return 1.0
     step = float(z[-1] - z[0]) / (z.size - 1)
@@ -373,9 +362,7 @@ def _find_spacing_ratio(z: FloatArray, spectrum: AxialSpectrum, error: float) ->
 def _interpolate_all(
     z: FloatArray, nodes: IntArray, spectrum: AxialSpectrum, error: float
 ) -> tuple[list[InterpolatedBlock], IntArray]:
-    """Interpolate all depths between the nodes; return with them the indices of those that err too
-    much.
-    """
+    """Interpolate all depths between the nodes; return also which err too much."""
     blocks, failed = [], []
     for some in split_blocks(z.size, DEPTHS_PER_BLOCK):
         first = max(int(np.searchsorted(nodes, some.start)) - NEIGHBOURS, 0)

@@ -18,9 +18,7 @@ from scipy import fft
 
 
 def _import_fftw() -> Any:
-    """Import pyfftw without what its interface for dask would bring: dask and pandas, which take
-    longer than an image.
-    """
+    """Import pyfftw without its interface for dask, which takes longer than an image."""
     hidden = "dask" not in sys.modules
     if hidden:
         sys.modules["dask"] = None  # type: ignore[assignment]
@@ -45,9 +43,7 @@ FFTW_FLAGS = ("FFTW_ESTIMATE",)
 
 
 class FourierPlan:
-    """A transform along one axis by scipy.fft, from one buffer to another of its shape: `inverse`,
-    ``exp(+1j ...)``, or ``exp(-1j ...)``, both unscaled. FFTW's plans are used alike.
-    """
+    """A transform along one axis between two buffers by scipy.fft, unscaled, as FFTW's plans."""
 
     def __init__(
         self, source: ComplexArray, target: ComplexArray, axis: int, inverse: bool

@@ -117,9 +117,7 @@ class WavePlan(PhasorPlan):
         return self._backend.zeros(self.grid.shape)
 
     def propagate_to_plane(self, number: int, capture: Capture, progress: Progress) -> Array:
-        """Return the field (y, x, frequencies) of one illumination group on its plane, complex64;
-        this and `add_to_depths` report all voxels together.
-        """
+        """Return a group's field (y, x, frequencies) on its plane, complex64."""
         group = self.groups[number]
         depths = group.plane_to_depths
         points = math.prod(depths.plane.shape) * depths.waves.count
@@ -133,8 +131,8 @@ class WavePlan(PhasorPlan):
         diffraction.add(on_plane, total, SubProgress(progress, self.grid.size, work))
 
     def _hold_diffraction(self, number: int) -> Diffraction:
-        """Return what carries a group's field to the voxels. Tables and threads' memory are those
-        of one plane at a time, which its groups share: a scan may have hundreds of planes.
+        """Return what carries a group's field to the voxels. Groups share the tables of one plane,
+        held at a time: a scan may have hundreds.
         """
         group = self.groups[number]
         plane, made = self._held
@@ -154,14 +152,10 @@ class WavePlan(PhasorPlan):
 
 
 class ReciprocalPlan(PhasorPlan):
-    """A plan for captures whose roles are swapped, for captures as they come.
-
-    Of the swapped capture come waves ``s(L) / |r_L - r|`` that fall with the distance from the
-    laser spots. As the path is ``L = |r_L - r| + |r - r_p|``, the same waves of signals times their
-    path, less those waves times ``|r - r_p|``, fall with neither distance; divided by ``|r - r_p|``
-    they are those of the capture as it came.
-
-    `capture`: as it comes; `swapped`: for the capture whose roles are swapped.
+    """A plan by swapped roles, for captures as they come. Swapped waves ``s(L) / |r_L - r|`` fall
+    with the distance from the laser spots. As ``L = |r_L - r| + |r - r_p|``, those of signals times
+    L, less the waves times ``|r - r_p|``, fall with neither distance; over ``|r - r_p|`` they are
+    the capture's.
     """
 
     def __init__(self, capture: Capture, grid: Grid, swapped: WavePlan) -> None:
@@ -230,9 +224,8 @@ class WaveMethod(PhasorMethod):
     def _plan_points(
         self, capture: Capture, group: IlluminationGroup, grid: Grid, band: Band, backend: Backend
     ) -> tuple[DiffractionPlan, WallToPlane, float]:
-        """Plan an illumination group, and others of the same wall points: their common way from a
-        plane to the voxels, what carries each group to that plane, and the fraction of time that
-        this takes.
+        """Plan groups of the same wall points: their way from a plane to the voxels, what carries
+        each to that plane, and the fraction of time that this takes.
         """
 
 

@@ -75,9 +75,7 @@ class CompiledBackend:
 
 
 class PortableBackend:
-    """Matrix products on the arrays of any library, where these live. `capture`: for the device and
-    the number of bins of its signal.
-    """
+    """Matrix products on the arrays of any library, where a capture's signal lives."""
 
     def __init__(self, band: Band, capture: Capture) -> None:
         self.library = ArrayLibrary(capture.device)
@@ -180,8 +178,8 @@ def plan_wall_to_plane(
     propagation: Propagation = "spectral",
     tolerance: float = 1e-2,
 ) -> WallToPlane:
-    """Return what carries an illumination group of such captures, or another one of the same wall
-    points, onto a plane; see `propagate`. Progress counts points of the plane times frequencies.
+    """Return what carries groups of the same wall points onto a plane; see `propagate`. Progress
+    counts points of the plane times frequencies.
     """
     points, plane = geometry.points, geometry.plane
     require_in_front(plane.z, points)
@@ -210,16 +208,11 @@ def propagate_in_time(
     legs: int,
     progress: Progress = ignore_progress,
 ) -> NDArray[np.complex64]:
-    """Return the band's phasors of transients propagated onto a plane bin by bin.
-
-    Every signal arrives on the plane earlier by its way there, interpolated linearly between bins:
-    an error of some 0.5 % for 15 bins per wavelength, growing as the square of their width. Costs a
-    product per pair of points and bin, and memory for a few transients.
+    """Return the phasors (y, x, frequencies) of transients (n, t) of points (n, 3), m, carried onto
+    a plane bin by bin: earlier by their way there, `legs` times, linear between bins, an error of
+    some 0.5 % for 15 bins per wavelength that grows with their square.
 
     Supplementary Note 12 of X. Feng, Y. Ma, L. Gao, Nat. Commun. 13, 3333 (2022).
-
-    `points` (n, 3): m; `traces` (n, t); `legs`: how often light runs between wall and plane: 2 in a
-    confocal scan. Returns (y, x, frequencies).
     """
     targets = plane.points.reshape(-1, 3)
     scale = legs / band.axis.spacing

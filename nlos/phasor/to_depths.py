@@ -31,9 +31,7 @@ SOLVER_BLOCK_BYTES = 2 << 20
 
 
 class DepthPropagator:
-    """Plane waves between a plane and the depths of a grid. Memory: some 20 bytes per plane wave
-    and frequency in single precision, as much again for every spectrum.
-    """
+    """Plane waves between a plane and depths. Memory: some 20 bytes per wave and frequency."""
 
     def __init__(self, plan: DiffractionPlan, library: ArrayLibrary) -> None:
         self.plan, self.library, self.xp = plan, library, library.xp
@@ -88,9 +86,7 @@ class DepthPropagator:
         return self.xp.take(values, wave, axis=1)
 
     def transfer_nodes(self, depth: float, delay: FloatArray) -> NDArray[np.complex64]:
-        """Return the transfer function to one depth, m, at its nodes (nodes, frequencies); see
-        `TransferFunction.evaluate`.
-        """
+        """Return the transfer function to a depth, m, at its nodes (nodes, frequencies)."""
         parts = self.plan.transfer.evaluate(depth - self.plan.plane.z, delay)
         nodes = np.empty((len(parts), parts.shape[2]), np.complex64)
         nodes.real, nodes.imag = parts[:, 0], parts[:, 1]
@@ -118,9 +114,7 @@ class DepthPropagator:
 
     @cached_property
     def _node_interpolation(self) -> tuple[Array, list[Array], Array]:
-        """First node of every different lateral wavenumber, the weights of all taps, and which of
-        these a wave has.
-        """
+        """First node of every lateral wavenumber, weights of all taps, and which a wave has."""
         lateral, wave = np.unique(self._lateral, return_inverse=True)
         node, weight = self.plan.transfer.interpolation(lateral)
         weights = [self.library.put(weight[:, tap, np.newaxis]) for tap in range(TAPS)]
@@ -129,9 +123,7 @@ class DepthPropagator:
 
 @dataclass(frozen=True, eq=False)
 class _Axial:
-    """Of some depths, each (z, 1, 1): distance along z from the laser spot, m, and the cycles of
-    the illumination's carrier over it.
-    """
+    """Of depths (z, 1, 1): distance along z from the spot, m, and the carrier's cycles over it."""
 
     distance: Array
     cycles: Array
@@ -152,15 +144,11 @@ class _DepthBlock:
 
 
 class PortableDiffraction:
-    """Fields on one plane propagated to all depths of a grid, where they meet the laser's wave.
-
-    Holding one is the cache: the second field of the same geometry needs no planning. Transfer
-    functions and illuminations of all depths are kept up to 1 GiB (50 MB for 128 depths, 120
-    frequencies and 400 nodes), beyond that made anew for every field. Memory besides: four chunks
-    (`ArrayLibrary.chunk_bytes`) for the depths that are treated together, and at least 60 bytes per
-    plane wave and frequency.
-
-    `for_solver`: all depths are computed, a block for every thread, as the way back asks for.
+    """Fields on one plane carried to all depths, where they meet the laser's wave. Transfer
+    functions and illuminations stay for the next field, up to 1 GiB (50 MB for 128 depths, 120
+    frequencies and 400 nodes). Memory besides: four chunks (`ArrayLibrary.chunk_bytes`), and 60
+    bytes per plane wave and frequency. `for_solver`: all depths are computed, a block for every
+    thread.
     """
 
     def __init__(
@@ -185,9 +173,7 @@ class PortableDiffraction:
         return other
 
     def add(self, values: Array, total: Array, progress: Progress = ignore_progress) -> None:
-        """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r; see
-        `nlos.phasor.to_depths_compiled.CompiledDiffraction.add`.
-        """
+        """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r of `total`."""
         xp, waves = self.library.xp, self.waves.to_waves(values)
         between, wanted = self._computed_depths.blocks, total.shape[0]
         count = self._computed_depths.nodes.size
@@ -219,9 +205,8 @@ class PortableDiffraction:
         return self.library.xp.concat([parts[i] for i in range(len(planes))], axis=0)
 
     def to_plane(self, volume: Array) -> Array:
-        """Return the field (y, x, frequencies) on the plane of a real volume (z, y, x): the adjoint
-        of `to_volume`, ``sum_r h(r) * conj(exp(1j * k * |r_L - r|) * w_k(v, r))`` with w the wave
-        from point v of the plane to voxel r.
+        """Return the field (y, x, frequencies) of a real volume (z, y, x): the adjoint of
+        `to_volume`.
         """
         xp, planes, parts = self.library.xp, self._block_slices, {}
 
@@ -241,17 +226,13 @@ class PortableDiffraction:
         return self.waves.to_waves_adjoint(reduce(xp.add, (parts[i] for i in sorted(parts))))
 
     def _illuminate(self, block: _DepthBlock, waves: Array) -> Array:
-        """Let plane waves carried to some depths meet the laser's wave, but for its carrier: the
-        field (z, y, x).
-        """
+        """Let plane waves meet the laser's wave, but for its carrier: the field (z, y, x)."""
         terms = (waves * self.waves.transfer(block.transfer)) @ block.coefficients
         images = self.waves.to_images(terms)
         return self.library.xp.sum(images * self._functions(block), axis=1)
 
     def _functions(self, block: _DepthBlock) -> Array | float:
-        """What the terms of the illumination's split are multiplied by at every voxel, (z, m, y,
-        x), by linear interpolation in their table.
-        """
+        """The functions f_m of the illumination at every voxel (z, m, y, x), from tables."""
         if self.source.laser is None:
             return 1.0
         xp, (start, per_metre) = self.library.xp, block.table_position
@@ -269,9 +250,7 @@ class PortableDiffraction:
         return here + weight * (there - here)
 
     def _extra_distance(self, axial: _Axial) -> Array:
-        """How much longer the path from the laser spot is than straight along z, (z, y, x), m:
-        shorter than the path, and so with finer digits.
-        """
+        """Path from the spot less its part along z (z, y, x), m: with finer digits than it."""
         across = self._lateral_distance_squared
         return across / (self.library.xp.sqrt(across + axial.distance**2) + axial.distance)
 
@@ -343,9 +322,7 @@ class PortableDiffraction:
 
     @cached_property
     def _lateral_distance_squared(self) -> Array:
-        """Squared distance of every column of voxels from the laser spot along x and y, (1, y, x),
-        m^2.
-        """
+        """Squared distance of columns of voxels from the spot across, (1, y, x), m^2."""
         laser = np.zeros(3) if self.source.laser is None else self.source.laser
         y, x = self.plan.grid.y[:, np.newaxis] - laser[1], self.plan.grid.x - laser[0]
         return self.library.put((y**2 + x**2)[np.newaxis])
@@ -354,9 +331,7 @@ class PortableDiffraction:
 def _stack_illuminations(
     lights: list[Illumination],
 ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
-    """Coefficients (z, frequencies, m) and functions (z * samples, m) of several depths, with 0 for
-    missing ones.
-    """
+    """Coefficients (z, frequencies, m) and functions (z * samples, m); 0 for missing ones."""
     max_terms = max(light.coefficients.shape[1] for light in lights)
     coefficients = np.zeros((len(lights), len(lights[0].coefficients), max_terms), np.complex64)
     table = np.zeros((len(lights), len(lights[0].table), max_terms), np.float32)

@@ -60,11 +60,8 @@ class Interpolation(NamedTuple):
 
 
 class WaveGroups:
-    """Plane waves of neighbouring lateral wavenumbers, with those mirrored in the axes.
-
-    A group is `LANES` waves whose indices are not negative, and their `MIRROR_IMAGES` images. Waves
-    on an axis are images of themselves; a fraction of 0 marks repeated ones, and those that fill up
-    the last group.
+    """Plane waves in groups of `LANES` neighbours in lateral wavenumber without negative indices,
+    with their `MIRROR_IMAGES` images in the axes; repeated ones have a fraction of 0.
     """
 
     def __init__(self, waves: PlaneWaves) -> None:
@@ -111,14 +108,9 @@ class WaveGroups:
     def to_plane_waves(
         self, values: NDArray[np.complex64], plane: Plane, origin: tuple[float, float]
     ) -> NDArray[np.float32]:
-        """Return ``sum_p values(p) * exp(-1j * q (r_p - origin)) / area`` of every wave q, area
-        that of a period.
-
-        By matrix products: the plane's spacing need not fit the lattice, and a coarse one repeats
-        itself in q as it should. Waves beyond their limit are 0.
-
-        `values` (y, x, frequencies); `origin`: y and x of the point whose phase is 0, m. Returns
-        (groups, ahead + frequencies, 2, MIRRORED, LANES): real and imaginary parts.
+        """Return ``sum_p values(p) * exp(-1j * q (r_p - origin)) / area`` of every wave q, 0 beyond
+        their limits, of values (y, x, frequencies): (groups, ahead + frequencies, 2, MIRRORED,
+        LANES). By matrix products: the plane's spacing need not fit the lattice.
         """
         waves, count, row, column = self.waves, values.shape[-1], self._row, self._column
         weight = (self.is_distinct / np.prod(waves.period)).astype(np.float32)
@@ -164,9 +156,8 @@ class _AxisTransform:
 
     @classmethod
     def of(cls, axis: FloatArray, origin: float, step: float, reach: int) -> _AxisTransform:
-        """Return the transform of an axis for the plane waves of index 0 to `reach`. `axis`
-        (points,): evenly spaced, m; `origin`: where all waves have phase 0, m; `step`: lateral
-        wavenumber of index 1, rad/m; `reach`: largest index.
+        """Return the transform of an even axis, m, for waves of index 0 to `reach`, phase 0 at
+        `origin`; `step`: lateral wavenumber of index 1, rad/m.
         """
         numbers = step * np.arange(reach + 1)
         half = (axis.size + 1) // 2
@@ -181,9 +172,7 @@ class _AxisTransform:
         )
 
     def project(self, values: NDArray[np.complex64], count: int) -> list[NDArray[np.complex64]]:
-        """Sums of complex values (points, ...) with the first cosines and with the first sines,
-        (count, ...). `count`: number of waves, from index 0 on. Returns cosine and sine sums.
-        """
+        """Sums of values (points, ...) with the first cosines, and sines, (count, ...)."""
         half = self.cosines.shape[1]
         before, after = values[:half], values[::-1][:half]
         even, odd = after + before, after - before
@@ -212,10 +201,9 @@ WaveIndices = tuple[NDArray[np.int64], NDArray[np.int64]]
 def choose_inverse(
     waves: WaveIndices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int
 ) -> InverseProduct | InverseTransform:
-    """Choose the quicker way: few voxels of a long period by matrix products, many by Fourier
-    transforms; a period that is not a whole number of voxels leaves matrix products only. `waves`
-    (rows, columns): indices along y and x; `lattice`: voxels in a period along y and x; `wanted`:
-    voxels wanted along y and x, from the origin on; `terms`: maximum number of spectra.
+    """Choose the quicker way for voxels `wanted` from the origin on: few of a long period by matrix
+    products, and where the `lattice`'s period is no whole number of them; else by Fourier
+    transforms. `terms`: most spectra.
     """
     rows, columns = (2 * int(np.max(index)) + 1 for index in waves)
     high, wide = (int(length) for length in lattice)
@@ -261,14 +249,10 @@ class InverseProduct:
 
 
 class InverseTransform:
-    """Inverse transforms of several spectra by pruned Fourier transforms, with memory of its own;
-    not to be shared between threads.
-
-    Plane waves go to `cell_indices` of `spectra` (n, cells), `spare` being a cell that belongs to
-    none; `images` (terms, y, x) have still to be multiplied by `carrier`, column by column. Along y
-    only the columns that plane waves fall into are transformed, along x only the rows that voxels
-    lie in. Where voxels are too coarse for the finest waves, these are folded into the lattice, as
-    the voxels see them.
+    """Inverse transforms of spectra (n, cells) by pruned Fourier transforms; not to be shared
+    between threads. Waves go to `cell_indices`, `spare` belonging to none; `images` (terms, y, x)
+    have still to be multiplied by `carrier`, by column. Waves too fine for the voxels are folded,
+    as these see them.
     """
 
     def __init__(
@@ -370,9 +354,7 @@ class LaserSource:
         return np.zeros(3) if self.laser is None else self.laser
 
     def choose_depths(self, plan: DiffractionPlan) -> DepthInterpolation:
-        """Choose which depths are computed, and how the others follow from these without the
-        laser's carrier.
-        """
+        """Choose which depths are computed, and how the others follow but for the carrier."""
         cosines = (0.0, 0.0)
         if self.laser is not None:
             # beyond the spot all light goes forward
@@ -407,13 +389,10 @@ class LaserSource:
 
 class CompiledDiffraction:
     """Fields on one plane carried to all depths of a grid, where they meet the laser's wave.
+    Illuminations, transforms and each thread's memory stay for the next field.
 
-    The counterpart of `nlos.phasor.to_depths.PortableDiffraction`. Holding one is the cache:
-    illuminations, transforms and each thread's memory stay for the next field.
-
-    Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
-    imaging systems", Nat. Commun. 11, 1645 (2020); the illumination is split per depth, so that few
-    inverse transforms replace one per frequency.
+    Liu, Bauer, Velten, Nat. Commun. 11, 1645 (2020); the illumination is split per depth, so that
+    few inverse transforms replace one per frequency.
     """
 
     def __init__(self, plan: DiffractionPlan, source: LaserSource) -> None:
@@ -437,8 +416,8 @@ class CompiledDiffraction:
         total: NDArray[np.complex64],
         progress: Progress = ignore_progress,
     ) -> None:
-        """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r of `total` (z, y, x), S_k
-        the field (y, x, frequencies) carried there from the plane; progress counts voxels.
+        """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r of `total` (z, y, x), of
+        the field S_k (y, x, frequencies) on the plane; progress counts voxels.
         """
         plan = self.plan
         with limit_blas_threads():
@@ -534,9 +513,7 @@ class _Workspace:
         total: Field,
         without_carrier: bool,
     ) -> None:
-        """Add a few depth planes to `total` (z, y, x), with or without the laser's carrier wave, of
-        the plane waves of the wall's field at all frequencies.
-        """
+        """Add depth planes to `total` (z, y, x), of plane waves, with or without the carrier."""
         wavenumber = 0.0 if without_carrier else source.centre_wavenumber
         grid, inverse = self.plan.grid, self.inverse
         carried = self._propagate_terms(spectrum, source, lights, depths)

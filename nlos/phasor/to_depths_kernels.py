@@ -30,17 +30,11 @@ FREQUENCY_STEPS = 8
 
 @compiled
 def sample_waves(radius, distance, first, step, delay, continued, leading_zeros, waves):
-    """Spherical waves of all frequencies at every radius about their source: ``exp(1j * (k * R + (k
-    - k_0) * delay))``.
-
-    They are divided by R; or, if `continued`, weighted as in the first Rayleigh-Sommerfeld
-    integral; at a negative distance they run backwards. Steps from one frequency to the next with
-    one complex product.
-
-    `radius` (n,); `distance`: along the axis, m; `first, step`: lowest wavenumber and distance of
-    neighbouring ones, rad/m; `delay` (2,): A path added to all, m, and the wavenumber k_0 whose
-    phase it leaves alone; `leading_zeros`: entries before the lowest frequency, left alone; `waves`
-    (n, 2, ahead + frequencies): real and imaginary parts, overwritten.
+    """Overwrite `waves` (n, 2, zeros + frequencies), but for the leading zeros, with real and
+    imaginary parts of ``exp(1j * (k * R + (k - k_0) * path)) / R``, R from a source to `radius`
+    (n,) at a distance along the axis, backwards if negative, or, if `continued`, as the first
+    Rayleigh-Sommerfeld integral has it. `delay` (2,): path, m, and k_0; `first, step`: of the
+    wavenumbers, rad/m.
     """
     direction = math.copysign(1.0, distance)
     for i in range(radius.size):
@@ -67,9 +61,8 @@ def sample_waves(radius, distance, first, step, delay, continued, leading_zeros,
 
 @compiled
 def find_interpolation_weights(place, node, share):
-    """Find the first of the `TAPS` nodes about every place, and their Lagrange weights (places,
-    taps). `place` (places,): in steps of the nodes; `node` (places,): overwritten with the first
-    node of each place; `share` (places, TAPS): overwritten with the weights.
+    """Overwrite `node` (places,) with the first of `TAPS` nodes about every place, in their steps,
+    and `share` (places, TAPS) with Lagrange weights.
     """
     for b in range(place.size):
         node[b] = int(place[b]) - TAPS // 2 + 1
@@ -84,18 +77,13 @@ def find_interpolation_weights(place, node, share):
 @compiled
 def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coefficients, terms):
     """``terms[m] = sum_k coefficients[m, k] * transfer_k * spectrum_k`` for all plane waves and
-    some depths.
+    some depths: the transfer function is interpolated between its nodes once for waves mirrored in
+    the axes, and a group goes to all depths while its spectrum is in cache.
 
-    The transfer function depends on a wave's lateral wavenumber alone and is interpolated between
-    its nodes, once for waves mirrored in the axes. A group is propagated to all depths while its
-    spectrum is in cache, and sums over frequencies stay in registers. Frequencies come in steps of
-    `FREQUENCY_STEPS`.
-
-    `spectrum` (groups, frequencies, 2, MIRROR_IMAGES, LANES): real and imaginary parts; `first`
-    (groups,): frequency that each group starts at; `nodes` (depths, n, 2, frequencies): transfer
-    functions; `begin` (groups,): first node that each group takes; `offset` (groups + 1,): where
-    its interpolation weights begin; `node_weights` (some, LANES): interpolation weights;
-    `coefficients` (depths, m, frequencies): an even number of terms; `terms` (depths, m, groups, 2,
+    `spectrum` (groups, frequencies, 2, MIRROR_IMAGES, LANES), real and imaginary parts, each group
+    from frequency `first` (groups,) on; `nodes` (depths, n, 2, frequencies), of which it takes
+    those from `begin` (groups,) on by `node_weights` (some, LANES) from `offset` (groups + 1,) on;
+    `coefficients` (depths, m, frequencies): m is even; `terms` (depths, m, groups, 2,
     MIRROR_IMAGES, LANES): overwritten.
     """
     groups, frequencies, count = spectrum.shape[0], spectrum.shape[1], coefficients.shape[1]
@@ -274,14 +262,11 @@ def _store_two_waves(terms, to, sums):
 
 @compiled
 def assemble_groups(parts, row, column, along_y, along_x, share, counts, first, spectrum):
-    """Put together the plane waves of some frequencies, as many as count there, and put them into
-    their groups. `parts` (4, columns, k, rows): sums with cosine and with sine along x, first with
-    cosine and then with sine along y; `row, column` (groups, LANES): indices of the waves, not
-    negative; `along_y, along_x` (n,): what waves of every index are multiplied by, those of
-    negative ones by its conjugate; `share` (groups, MIRROR_IMAGES, LANES): what they are multiplied
-    by besides; `counts` (k,): lanes of all groups that count at each frequency; `first`: where the
-    frequencies begin in `spectrum`; `spectrum` (groups, frequencies, 2, MIRROR_IMAGES, LANES):
-    written to.
+    """Put the plane waves of some frequencies, as many as `counts` (k,), into their groups of
+    `spectrum` (groups, frequencies, 2, MIRROR_IMAGES, LANES), from frequency `first` on. `parts`
+    (4, columns, k, rows): sums with cosine and sine along x, first with cosine, then with sine
+    along y; `row, column` (groups, LANES): indices; `along_y, along_x` (n,), conjugate for negative
+    indices, and `share` (groups, MIRROR_IMAGES, LANES) multiply them.
     """
     for k in range(counts.size):
         for lane in range(counts[k]):
@@ -315,9 +300,7 @@ def multiply_by_minus_i(number):
 
 @compiled
 def transpose(source, target):
-    """Copy ``target[i, j] = source[j, i]``, in squares that stay in cache; quickest for complex64
-    seen as float64. `source` (columns, rows); `target` (rows, columns): overwritten.
-    """
+    """Copy ``target[i, j] = source[j, i]`` in squares that stay in cache; complex64 as float64."""
     rows, columns = target.shape
     for top in range(0, rows, TILE_SIDE):
         for left in range(0, columns, TILE_SIDE):
@@ -338,9 +321,8 @@ def transpose(source, target):
 
 @compiled
 def scatter_terms(terms, cell, folded, spectra):
-    """Put the waves of some terms into their cells. `terms` (m, groups, 2, MIRROR_IMAGES, LANES):
-    real and imaginary parts; `cell` (groups, MIRROR_IMAGES, LANES); `folded`: waves may meet in one
-    cell, and then add up; `spectra` (m, cells).
+    """Put the waves of terms (m, groups, 2, MIRROR_IMAGES, LANES) into their cells of `spectra` (m,
+    cells); add up those that meet, if `folded`.
     """
     flat, cells, half = terms.reshape(-1), cell.reshape(-1), np.uint64(GROUP_FLOATS // 2)
     for m in range(terms.shape[0]):

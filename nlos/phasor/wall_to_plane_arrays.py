@@ -24,18 +24,12 @@ Propagator = Callable[[Array], Array]
 
 
 class PortablePropagation:
-    """``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, within a tolerance.
+    """``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, within a tolerance,
+    by Fourier matrices with the terms of `nlos.phasor.wall_to_plane`, chosen for the spectrum of
+    the first phasors that come, or by direct sums.
 
-    By Fourier matrices where the compiled loops take Fourier transforms, with the same terms of the
-    wall's relief (see `nlos.phasor.wall_to_plane`), else by direct sums. The terms are chosen for
-    the spectrum of the first phasors that come; they stay for later ones, so that a sequence of
-    like signals is planned once.
-
-    Memory beyond phasors and result: for the terms, some 8 bytes per wall point, term and six
-    frequencies (20 MB for 128 x 128 points and 120 frequencies); and four chunks
-    (`ArrayLibrary.chunk_bytes`) for what is treated together.
-
-    `waves`: from points; `tolerance`: relative error allowed.
+    Memory beyond phasors and result: some 8 bytes per wall point, term and six frequencies (20 MB
+    for 128 x 128 points and 120 frequencies), and four chunks (`ArrayLibrary.chunk_bytes`).
     """
 
     def __init__(

@@ -16,16 +16,11 @@ MIN_WIDTH_BINS = 1.0
 
 @compiled
 def _place_light(wall, laser, cell, start, per_metre, obliquity, voxels, bins, light):
-    """When and how strongly the light of some voxels arrives by way of one pair of spots.
-
-    A voxel's light is spread evenly over a time whose variance is that of the paths by way of its
-    whole volume.
-
-    `wall, laser` (3,): m; `cell` (3,): extent of a voxel along x, y and z, m; `start`: path at
-    which the first bin begins, m; `per_metre`: bins per metre of path; `obliquity`: power of the
-    cosines of both legs with z that light falls by: 0, 1 or 2; `voxels`: x, y and z (n,), m;
-    `light`: overwritten: when it begins and ends (n,), in bins from the record's beginning, cut to
-    it, and light per bin between the edges, of a voxel of albedo 1.
+    """Overwrite `light` with when the light of voxels, x, y and z (n,), m, begins and ends by way
+    of one pair of spots, bins cut to the record, and its rate per bin of albedo 1: spread evenly
+    over a time of the variance of paths by way of the whole voxel, of extent `cell` (3,), m.
+    `start`: path of the first bin's beginning; `obliquity`: power of both legs' cosines with z, 0
+    to 2.
     """
     nearest = np.float32(MIN_DISTANCE_M * MIN_DISTANCE_M)
     (x, y, z), (begins, ends, rates) = voxels, light
@@ -56,10 +51,8 @@ def _place_light(wall, laser, cell, start, per_metre, obliquity, voxels, bins, l
 
 @compiled
 def add_expected_light(walls, lasers, cell, start, per_metre, obliquity, voxels, albedo, changes):
-    """Add the light that voxels send to wall points, as changes from bin to bin. `walls` (points,
-    3); `lasers` (1, 3); `cell, start, per_metre, obliquity`: as of `_place_light`; `voxels` (3, n):
-    m; `albedo` (n,); `changes` (points, bins + 2): added to; its running sum is the light in every
-    bin.
+    """Add the light that voxels (3, n), m, of an albedo (n,) send to wall points, as changes from
+    bin to bin (points, bins + 2), whose running sum it is; other arguments as of `_place_light`.
     """
     bins = changes.shape[1] - 2
     begins = np.empty(VOXELS_PER_RUN, np.float32)
@@ -88,11 +81,9 @@ def add_expected_light(walls, lasers, cell, start, per_metre, obliquity, voxels,
 def add_backprojected_light(
     walls, lasers, cell, start, per_metre, obliquity, voxels, sums, squared, total
 ):
-    """Add to every voxel what the bins hold that its light arrives in: the adjoint of
-    `add_expected_light`. `walls` (points, 3); `lasers` (1, 3); `cell, start, per_metre, obliquity`:
-    as of `_place_light`; `voxels` (3, n): m; `sums` (points, bins + 2): of every bin and all later
-    ones; 0 behind the record; `squared`: whether every bin counts by the square of the light that a
-    voxel sends it; `total` (n,): added to.
+    """Add to `total` (n,) what the bins hold that a voxel's light arrives in: the adjoint of
+    `add_expected_light`. `sums` (points, bins + 2): of every bin and all later ones, 0 behind the
+    record; `squared`: bins count by the square of the light.
     """
     bins = sums.shape[1] - 2
     begins = np.empty(VOXELS_PER_RUN, np.float32)

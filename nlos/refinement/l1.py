@@ -40,12 +40,9 @@ PAIRS_PER_BLOCK = 1 << 20
 def propagate_spherical_waves(
     sources: FloatArray, values: Array, targets: FloatArray, wavenumbers: FloatArray
 ) -> Array:
-    """Return ``sum_s values_k(s) * exp(1j * k * |t - s|) / |t - s|`` at every target t.
-
-    With sources and targets exchanged it is its own transpose. In single precision good to 1e-5 and
-    quick; in double precision plain.
-
-    `sources, targets` (n, 3): m; `values` (n, frequencies); `wavenumbers`: evenly spaced, rad/m.
+    """Return ``sum_s values_k(s) * exp(1j * k * |t - s|) / |t - s|`` (n, frequencies) at targets t,
+    m; its own transpose with sources and targets exchanged. Single precision is good to 1e-5 and
+    quick, double plain.
     """
     if values.dtype == np.complex64:
         return sum_spherical_waves(targets, sources, values, wavenumbers)
@@ -58,18 +55,12 @@ def propagate_spherical_waves(
 
 
 class HiddenToWall(LinearOperator):
-    """From a hidden volume to the phasors that one exposure of a wall sees, by way of a virtual
-    plane.
+    """From a hidden volume to the phasors that one exposure of wall points (n, 3), m, sees by way
+    of a virtual plane, ``sqrt(G_k) * sum_r h(r) * exp(-1j * k * (|r_L - r| + |r - r_p|)) / |r -
+    r_p|``, so weighted that the adjoint of the phasors over ``sqrt(G_k)`` is the real part of the
+    hybrid's field; real and imaginary parts interleaved, by point and frequency.
 
-    ``P_k(r_p) = sqrt(G_k) * sum_r h(r) * exp(-1j * k * (|r_L - r| + |r - r_p|)) / |r - r_p|``: the
-    phasors of the conventions in `nlos`, weighted so that the adjoint of the phasors divided by
-    ``sqrt(G_k)`` is the real part of the hybrid's field. Result: real and imaginary parts interleaved,
-    point by point, each at all frequencies.
-
-    Memory beyond volume and phasors: some 40 bytes per plane wave and frequency and thread.
-
-    `points` (n, 3): wall points, m; `plan`: from a virtual plane to the voxels; `dtype`: float32 or
-    float64.
+    Memory beyond them: some 40 bytes per plane wave and frequency and thread.
     """
 
     def __init__(
@@ -140,17 +131,13 @@ class WallModel:
 
     @cached_property
     def laser_distance(self) -> FloatArray:
-        """Mean distance of every voxel from the laser spots, m, shape (z, y, x); 1 for a confocal
-        scan.
-        """
+        """Mean distance of voxels (z, y, x) from the laser spots, m; 1 of a confocal scan."""
         return np.asarray(
             np.mean([self._compute_laser_distance(one.group) for one in self.plan.groups], axis=0)
         )
 
     def operator(self, dtype: DTypeLike = np.float32) -> LinearOperator:
-        """Return the operator from volumes (z, y, x), albedo divided by `laser_distance`, to
-        `measurements`.
-        """
+        """Return the operator from albedo over `laser_distance` (z, y, x) to `measurements`."""
         parts = []
         for one in self.plan.groups:
             points = self.capture.points[one.group.indices]
@@ -160,9 +147,7 @@ class WallModel:
         return Stack(parts)
 
     def measurements(self) -> Array:
-        """Return the phasors divided by ``sqrt(G_k)``, as the operator gives them, shape (n, 1),
-        float32.
-        """
+        """Return the phasors over ``sqrt(G_k)``, as the operator gives them, (n, 1) float32."""
         strength = np.sqrt(self.plan.band.weights)
         parts = []
         traces = self.capture.traces()
@@ -193,9 +178,8 @@ MIN_VOXELS_PER_WAVELENGTH = 5.0
 def build_total_variation(
     grid: Grid, weight: float = 2e-2, iterations: int = 60
 ) -> LightFieldVariation:
-    """Return the prior of even surfaces with sharp borders: total variation along x, y and z alike.
-    `grid`: what will be imaged on; evenly spaced; `weight, iterations`: as of
-    `tofclip.solvers.TotalVariation`.
+    """Return the prior of even surfaces with sharp borders on an evenly spaced grid: total
+    variation along x, y and z alike; weights as of `tofclip.solvers.TotalVariation`.
     """
     across = axis_step(grid.x) if grid.x.size > 1 else 1.0
     along = axis_step(grid.z) if grid.z.size > 1 else across

@@ -51,11 +51,8 @@ POINTS_PER_BLOCK = 64
 
 @dataclass(frozen=True, eq=False)
 class TimeOfFlight:
-    """Light of hidden voxels in the bins of a capture's wall points.
-
-    A voxel of albedo a returns ``a / (d_L * d_p)^2`` after the path ``d_L + d_p``, spread over the
-    paths of its whole volume, the bin, and the instrument's response. Nothing is held per pair of
-    voxel and wall point.
+    """Light of hidden voxels in the bins of a capture's wall points: of albedo a, ``a / (d_L *
+    d_p)^2`` after the path ``d_L + d_p``, spread over the voxel's paths, the bin, and the response.
     """
 
     capture: Capture  # wall, lasers and time axis are what counts
@@ -67,9 +64,7 @@ class TimeOfFlight:
     obliquity: int = 0
 
     def compute_light(self, albedo: Array, voxels: Array, points: Array) -> Array:
-        """Return the light (m, bins) of some voxels (n,), flat indices into the grid, at some of
-        the capture's points (m,).
-        """
+        """Return the light (m, bins) of voxels (n,), flat indices, at points (m,)."""
         light = np.empty((len(points), self._bins), np.float32)
         places, albedo = np.take(self._places, voxels, axis=1), np.asarray(albedo, np.float32)
 
@@ -84,9 +79,8 @@ class TimeOfFlight:
     def backproject(
         self, values: Array, voxels: Array, points: Array, squared: bool = False
     ) -> Array:
-        """Return what some voxels (n,) see of values (m, bins): the adjoint of `compute_light`.
-        `squared`: weight by the square of the light instead: with the inverse of the expected
-        counts this is what they tell of a voxel, Fisher's information.
+        """Return what voxels (n,) see of values (m, bins): the adjoint of `compute_light`; of
+        `squared` light and the inverse of the counts it is Fisher's information.
         """
         # Running sums from the end on: a box of light is the difference of two, see the kernel. The
         # response is turned around, as the adjoint of a convolution asks for.
@@ -116,9 +110,7 @@ class TimeOfFlight:
 
     @cached_property
     def _scale(self) -> tuple[Array, np.float32, np.float32, int]:
-        """Extent of a voxel, path at which the record begins, bins per metre of path, and the
-        obliquity.
-        """
+        """Extent of a voxel, path of the record's beginning, bins per metre, obliquity."""
         axes = (self.grid.x, self.grid.y, self.grid.z)
         cell = [float(np.median(np.diff(axis))) if axis.size > 1 else 0.0 for axis in axes]
         axis = self.capture.axis
@@ -178,8 +170,8 @@ class CountedPhotons:
         return cls(capture, counted, observed)
 
     def hold_out(self, fraction: float, seed: int) -> tuple[CountedPhotons, NDArray[np.float32]]:
-        """Set some photons aside, (points, bins), each with the same chance: both parts follow
-        Poisson's law, and one says nothing of the other's noise.
+        """Set some photons aside (points, bins) by chance: Poisson's law makes both parts
+        independent.
         """
         lit, held = self.counts > 0, np.zeros_like(self.counts)
         counts = np.rint(self.counts[lit]).astype(np.int64)
@@ -194,18 +186,15 @@ class CountedPhotons:
 
 
 def improve_background(background: Array, mean: float, ratios: Array, seen: Array) -> Array:
-    """One step of expectation maximisation of some wall points' background (n,), photons per bin,
-    drawn to the mean of all wall points. `ratios` (n, bins): what was counted over what is
-    expected; `seen` (n,): bins that are taken into account.
+    """One step of expectation maximisation of the background (n,), photons per bin, drawn to the
+    `mean`; `ratios` (n, bins): counts over what is expected; `seen` (n,): bins that count.
     """
     drawn = background * ratios.sum(axis=1) + BACKGROUND_PHOTONS
     return np.asarray(np.maximum(drawn / (seen + BACKGROUND_PHOTONS / mean), MIN_BACKGROUND))
 
 
 def fit_brightness(photons: CountedPhotons, light: Array) -> Array:
-    """Expected photons (points, bins) by light of a given shape, as bright as suits them, and
-    background.
-    """
+    """Expected photons (points, bins) by the brightest likely light of a given shape."""
     counts, observed = photons.counts, photons.observed
     seen, lit = observed.sum(axis=1), float(light[observed].sum())
     half = 0.5 * float(counts.sum())
@@ -225,9 +214,8 @@ def fit_brightness(photons: CountedPhotons, light: Array) -> Array:
 def compare_likelihoods(
     photons: Array, expected: Array, other: Array, observed: Array
 ) -> tuple[float, float]:
-    """How much likelier photons are under one expectation than under another, all (points, bins),
-    where observed: the gain of the likelihood's logarithm, nats, and the standard deviation that
-    the photons' noise gives it.
+    """Gain of the logarithm of the likelihood of photons (points, bins) by one expectation over
+    another, where observed, nats, and the standard deviation that their noise gives it.
     """
     counted, first, second = (
         one[observed].astype(np.float64) for one in (photons, expected, other)
@@ -251,10 +239,8 @@ FINE_SUBSETS = (4, 4, 4, 2, 2)
 
 
 class PhotonFit:
-    """Albedo of some voxels, and background, fitted to photons. `voxels` (n,): flat indices into
-    the model's grid; `albedo` (n,): to begin with, on any scale; nowhere 0; `prior_weight`: see
-    `PhotonRefinement`. `albedo` (n,); `background` (points,): photons per bin; `likelihood`:
-    logarithm of the likelihood before the last pass.
+    """Albedo (n,) of voxels, flat indices into the model's grid, and background (points,), photons
+    per bin, fitted to photons; the albedo begins on any scale, nowhere 0.
     """
 
     def __init__(
@@ -347,16 +333,14 @@ class PhotonFit:
         self.background *= np.float32(more)
 
     def compute_sharpness(self) -> Array:
-        """Return the inverse of the standard deviation that photon noise gives each voxel's albedo,
-        were it alone, (n,): the root of Fisher's information.
-        """
+        """Return the root of Fisher's information (n,): over it, noise of a lone voxel's albedo."""
         known = np.where(self.photons.observed, 1 / self.expect(), 0)
         information = self.model.backproject(known, self.voxels, self._everyone, squared=True)
         return np.asarray(np.sqrt(np.maximum(information, 0)))
 
     def with_likeliest_model(self, sigmas: tuple[float, ...]) -> PhotonFit:
-        """Return the same fit with the response, of these standard deviations in bins, and the fall
-        with the angle under which the photons are likeliest.
+        """Return the same fit with the response, of `sigmas` in bins, and the obliquity that are
+        likeliest.
         """
         some = self._everyone[:: max(1, len(self._everyone) // 512)]
         found, best = self, -np.inf
@@ -383,9 +367,7 @@ class PhotonFit:
 
 
 def compute_beam(fit: PhotonFit) -> FloatArray:
-    """Return the standard deviations along z, y and x, m, to which arrival times tell the place of
-    a thing in the middle of the light.
-    """
+    """Return the standard deviations along z, y and x, m, to which arrival times tell a place."""
     capture, grid = fit.photons.capture, fit.model.grid
     volume = fit.place(fit.expected_photons).astype(np.float64)
     axes = (grid.z, grid.y, grid.x)
@@ -453,21 +435,17 @@ VOLUME_COPIES = 6
 class PhotonRefinement(Method):
     """The non-negative hidden albedo under which the photons that were counted are likeliest.
 
-    Every bin's count is drawn by Poisson's law about ``b_p + sum_r h(r) * a(r, p, t)``: a
-    background for each wall point, and light by its time of flight (`TimeOfFlight`), without a
-    virtual pulse. Expectation maximisation (Shepp and Vardi 1982) starts from the image of
-    `linear`, on coarse voxels and parts of the wall first (ordered subsets: Hudson and Larkin
-    1994), then on the voxels that hold light. Faint voxels pay for their light as much as noise
-    would bring them, less the more light their neighbours hold. A voxel's brightness is the number
-    of photons that it sent to the wall, whose noise is the same near and far; it is shown with the
-    sharpness that instrument and wall give it, as CLEAN's components are with its beam.
+    Counts are drawn by Poisson's law about ``b_p + sum_r h(r) * a(r, p, t)``: a background for each
+    wall point, and light by its time of flight (`TimeOfFlight`). Expectation maximisation (Shepp
+    and Vardi 1982) starts from the image of `linear`, on coarse voxels and parts of the wall first
+    (ordered subsets: Hudson and Larkin 1994), then on the voxels that hold light. Faint voxels pay
+    for their light as much as noise would bring them, less where neighbours are bright. Brightness
+    is the number of photons that a voxel sent to the wall, shown with the sharpness that instrument
+    and wall give it. Of responses and falls with the angle the likeliest are taken.
 
-    Of the instrument's responses and the falls with the angle that may be, the likeliest are taken.
-
-    A tenth of the photons is set aside first and judges the fit of the others: unless these are
-    likelier under it than under light as bright as in the linear image, and than under background
-    alone, the linear image is what comes back (`LINEAR_SHOWN`). Otherwise the last passes take all
-    photons.
+    A tenth of the photons is set aside and judges the fit of the others: unless these are likelier
+    under it than under light as bright as in the linear image, and than under background alone, the
+    linear image comes back (`LINEAR_SHOWN`). Otherwise the last passes take all photons.
     """
 
     linear: PhasorMethod  # gives the image to begin with
@@ -549,8 +527,8 @@ class PhotonPlan(Plan):
     def _look_over(
         self, photons: CountedPhotons, start: Array, report_pass: Callable[[], None]
     ) -> tuple[PhotonFit, Array]:
-        """Fit coarse voxels, choose response and fall of light by them, and return a fit of the
-        fine voxels that hold light, and the light (points, bins) of the linear image.
+        """Fit coarse voxels, choose the model by them, and return a fit of the fine voxels that
+        hold light, and the linear image's light (points, bins).
         """
         from scipy.ndimage import binary_dilation
 
@@ -593,9 +571,8 @@ class PhotonPlan(Plan):
 
 
 def judge(fit: PhotonFit, linear_light: Array, held: Array) -> tuple[float, float]:
-    """Compare a fit with light as bright as in the linear image (points, bins), and with background
-    alone, by the `HELD_OUT_FRACTION` of photons that neither has seen; return the gain over the
-    better of the two, and its standard deviation.
+    """Return the smaller gain of a fit, by photons held out, over light (points, bins) as bright as
+    in the linear image and over background alone, and its standard deviation.
     """
     ratio, photons = HELD_OUT_FRACTION / (1 - HELD_OUT_FRACTION), fit.photons
     expected = ratio * fit.expect()
@@ -604,8 +581,8 @@ def judge(fit: PhotonFit, linear_light: Array, held: Array) -> tuple[float, floa
 
 
 def show_with_beam(fit: PhotonFit, linear: Array) -> Array:
-    """Return the photons that every voxel sent to the wall, with the sharpness that response, wall
-    and voxels give them; where photons decide nothing, voxels stand in the order of `linear`.
+    """Return the photons that voxels sent, as sharp as response and wall tell; where they decide
+    nothing, voxels stand in the order of `linear`.
     """
     from scipy.ndimage import gaussian_filter
 

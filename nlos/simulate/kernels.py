@@ -15,9 +15,8 @@ CONTACT_FRACTION = 1e-4
 
 @compiled
 def is_occluded(start, end, triangles):
-    """Whether a triangle crosses the path between two points (T. Moller, B. Trumbore, J. Graph.
-    Tools 2, 21 (1997)). `start, end` (3,): metres; `triangles` (n, 3, 3): corners; first axis
-    triangles, last axis x, y, z.
+    """Whether one of the triangles (n, 3, 3) crosses the path between two points (3,) (T. Moller,
+    B. Trumbore, J. Graph. Tools 2, 21 (1997)).
     """
     dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     near, far = min(start[2], end[2]), max(start[2], end[2])
@@ -52,10 +51,7 @@ def is_occluded(start, end, triangles):
 
 @compiled
 def cosine_to_normal(normal, from_point, to_point, distance):
-    """Cosine of the angle between a normal and a path, 0 behind the surface. `normal` (3,): of
-    length 1; `from_point, to_point` (3,): metres; `distance`: between the points, m. Returns 0 to
-    1.
-    """
+    """Cosine of the angle between a unit normal and a path of some length; 0 behind the surface."""
     inner = 0.0
     for i in range(3):
         inner += normal[i] * (to_point[i] - from_point[i])
@@ -77,11 +73,9 @@ def add_facet_light(
     fine,
     bins,
 ):
-    """Add the light of all facets to fine bins, shared between the two that it falls between.
-    `wall, wall_normals` (points, 3); `lasers, laser_normals` (1 or points, 3); `positions, normals`
-    (facets, 3); `areas` (facets,); `material` (3,): diffuse share, retroreflected share, and spread
-    of the latter; `triangles` (m, 3, 3): what hides; `start, fine`: path of the middle of the first
-    bin and path per bin, m; `bins` (points, fine bins): added to.
+    """Add the light of facets to fine `bins` (points, n), `start` and `fine` their first path and
+    width, m, shared between two; `material` (3,): diffuse and retroreflected fraction, spread in
+    rad; `triangles` (m, 3, 3) hide.
     """
     outward = np.empty(positions.shape[0])
     lit = np.empty(positions.shape[0])
@@ -135,12 +129,7 @@ def distance_between(one, other):
 
 @compiled
 def evaluate_reflectance(material, position, laser, observer, to_laser, to_observer):
-    """Reflectance per steradian; see `nlos.simulate.scene.Material`. `material` (3,): diffuse
-    fraction, retroreflected fraction, and the latter's standard deviation in rad; see
-    `nlos.simulate.scene.Material`; `position` (3,): the facet, m; `laser, observer` (3,): wall
-    points that light comes from and goes to, m; `to_laser, to_observer`: their distances from the
-    facet, m. Returns per steradian.
-    """
+    """Reflectance per steradian of a material; see `nlos.simulate.scene.Material`."""
     # Lambert: even radiance, whose integral over the half space is the albedo
     value = material[0] / math.pi
     if material[1] > 0:

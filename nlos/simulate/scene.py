@@ -379,9 +379,7 @@ class Surface:
 def _subdivide_triangles(
     triangles: FloatArray, spacing: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Halve triangles at their longest side until none is longer than `spacing`: centres, normals,
-    areas.
-    """
+    """Halve triangles at their longest side down to `spacing`: centres, normals, areas."""
     finished: list[FloatArray] = []
     count, pending = 0, triangles
     while len(pending):

@@ -69,9 +69,7 @@ def build_relay_wall(name: str, points: int = 64, width: float = 2.0) -> FloatAr
 
 
 def compute_wall_normals(wall: FloatArray) -> FloatArray:
-    """Unit normals towards larger z of a wall (rows, columns, 3), by differences of neighbours; +z
-    where unknown.
-    """
+    """Unit normals to larger z of a wall (rows, columns, 3); +z where neighbours are unknown."""
     normals = np.zeros_like(wall)
     normals[..., 2] = 1.0
     if wall.ndim != 3 or min(wall.shape[:2]) < MIN_POINTS:
