@@ -76,11 +76,11 @@ def _next_random(state):
 
 
 @compiled
-def fill_poisson_words(state, now, scale, weights, last, words):
+def fill_poisson_words(state, now, scale, last, words):
     """Write the words of photons that arrive at random on four channels, one at most per tick, none
     later than tick `last`; return how many. `state` of the random numbers and `now`, tick of the
     last record, change in place; `scale`: of the exponential distribution of which the whole part
-    is the number of ticks between two photons; `weights` (4,): fractions of the channels, added up.
+    is the number of ticks between two photons.
     """
     written = 0
     while written < words.size // RECORD_BYTES:
@@ -89,17 +89,11 @@ def fill_poisson_words(state, now, scale, weights, last, words):
         gap = -math.log(((bits >> np.uint64(11)) + np.uint64(1)) * _DOUBLE_STEP) * scale
         tick = now[0] + 1 + np.int64(gap)
         after, bits = _next_random(after)
-        where = (bits >> np.uint64(11)) * _DOUBLE_STEP
         wrap = ((now[0] >> TIME_BITS) + 1) << TIME_BITS
         # The counter wraps unless the photon comes first.
-        lines, kind = 0, WRAP
-        if tick < wrap:
-            lines, kind = 1, 0
-            for channel in range(3):
-                if where >= weights[channel]:
-                    lines <<= 1
-        else:
-            tick, after = wrap, state[0]
+        lines, kind = np.int64(1) << np.int64(bits >> np.uint64(62)), 0
+        if tick >= wrap:
+            lines, kind, tick, after = np.int64(0), WRAP, wrap, state[0]
         # State is not advanced: the next call draws this record again.
         if tick > last:
             break

@@ -50,17 +50,11 @@ MAX_TICK = (1 << 62) - 1  # A tick that never comes
 
 
 class PoissonStream:
-    """Photons at random, at a constant rate per second, on all channels together, shared among
-    these by `weights`; one record at most for each tick of the clock.
+    """Photons at random, at a constant rate per second, evenly on four channels; one record at most
+    for each tick of the clock.
     """
 
-    def __init__(
-        self,
-        rate: float,
-        clock_hz: int,
-        seed: int,
-        weights: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0),
-    ) -> None:
+    def __init__(self, rate: float, clock_hz: int, seed: int) -> None:
         if not 0 < rate < clock_hz:
             raise InputError(
                 f"a rate must be above 0 and below the clock's {clock_hz} per second, got {rate:g}"
@@ -68,7 +62,6 @@ class PoissonStream:
         # The whole part of an exponential variable is geometric, here with mean (ticks per photon)
         # - 1.
         self._scale = 1 / math.log1p(1 / (clock_hz / rate - 1))
-        self._weights = np.cumsum(weights) / np.sum(weights)
         self._state = np.array([seed], np.uint64)
         self._now = np.zeros(1, np.int64)
 
@@ -79,9 +72,7 @@ class PoissonStream:
         from devices.timetag_kernels import fill_poisson_words
 
         words = np.empty(limit * RECORD_BYTES, np.uint8)
-        written = fill_poisson_words(
-            self._state, self._now, self._scale, self._weights, last, words
-        )
+        written = fill_poisson_words(self._state, self._now, self._scale, last, words)
         return words[: written * RECORD_BYTES]
 
 

@@ -90,13 +90,12 @@ def _inspect(recording: Recording, save: Callable[[Piece], None]) -> Findings:
             found.damaged_bytes += entry.length
             found.cut_bytes += entry.length if entry.is_cut else 0
         else:
-            header = entry.header
-            if not header.is_legacy:
+            if not entry.is_legacy:
                 # Whole blocks may be gone. Each damaged stretch stands for one at least, which must
                 # not be counted twice.
-                missing = max(0, header.number - next_number - holes)
+                missing = max(0, entry.number - next_number - holes)
                 found.damaged_blocks += missing
-                is_lost, next_number = missing > 0, header.number + 1
+                is_lost, next_number = missing > 0, entry.number + 1
             holes = 0
             try:
                 payload = blocks.read_payload(entry)
@@ -104,17 +103,17 @@ def _inspect(recording: Recording, save: Callable[[Piece], None]) -> Findings:
             except FileFormatError:
                 found.damaged_blocks += 1
                 found.damaged_bytes += entry.end - entry.position
-                is_lost |= header.kind is BlockKind.PIECE
+                is_lost |= entry.kind is BlockKind.PIECE
         if is_lost:
             gap, is_missing, found.complete = Gap.LOSS, True, False
         if isinstance(entry, Damage) or payload is None:
             continue
-        if entry.header.kind is BlockKind.END:
+        if entry.kind is BlockKind.END:
             ending = Ending.from_json(payload, blocks.path)
             found.complete = ending.is_complete and not is_missing
             found.stats, found.fault = ending.stats, ending.fault
-        elif entry.header.kind is BlockKind.PIECE:
-            piece = Piece(payload, entry.header.records, max(entry.header.gap, gap))
+        elif entry.kind is BlockKind.PIECE:
+            piece = Piece(payload, entry.records, max(entry.gap, gap))
             start = codec.start if piece.gap is Gap.RESTART else state
             decoded = codec.decode(as_bytes(payload), start, piece.gap is not Gap.NONE)
             state, gap = decoded.state, Gap.NONE

@@ -57,8 +57,8 @@ class BlockKind(enum.IntEnum):
 
 
 @dataclass(frozen=True)
-class BlockHeader:
-    """What stands before a payload."""
+class Block:
+    """What stands before a payload, and where that is."""
 
     kind: BlockKind
     gap: Gap  # what is missing before it
@@ -69,21 +69,7 @@ class BlockHeader:
     # number of the block in its recording, from 0; -1 in recordings of version 0.1.0
     number: int = 0
     recording: int = 0  # the random number that the blocks of a recording share
-
-    @classmethod
-    def of(
-        cls,
-        kind: BlockKind,
-        payload: bytes,
-        time_ns: int,
-        records: int = 0,
-        gap: Gap = Gap.NONE,
-        number: int = 0,
-        recording: int = 0,
-    ) -> BlockHeader:
-        """Describe a payload."""
-        checksum = zlib.crc32(payload)
-        return cls(kind, gap, time_ns, records, len(payload), checksum, number, recording)
+    position: int = 0  # of the header, in the file
 
     @property
     def is_legacy(self) -> bool:
@@ -91,9 +77,14 @@ class BlockHeader:
         return self.number < 0
 
     @property
-    def header_bytes(self) -> int:
-        """Bytes of the header itself."""
-        return LEGACY_HEADER_BYTES if self.is_legacy else HEADER_BYTES
+    def payload_position(self) -> int:
+        """Position of its payload."""
+        return self.position + (LEGACY_HEADER_BYTES if self.is_legacy else HEADER_BYTES)
+
+    @property
+    def end(self) -> int:
+        """Position behind it."""
+        return self.payload_position + self.length
 
     def pack(self) -> bytes:
         """Return the header as it lies in the file."""
@@ -102,7 +93,7 @@ class BlockHeader:
         return front + struct.pack("<I", zlib.crc32(front))
 
     @classmethod
-    def unpack(cls, data: bytes) -> BlockHeader | None:
+    def unpack(cls, data: bytes, position: int = 0) -> Block | None:
         """Read a header from the first bytes of `data`; None if they are not a sound one."""
         is_legacy = data[: len(LEGACY_MAGIC)] == LEGACY_MAGIC
         layout = _LEGACY_LAYOUT if is_legacy else _LAYOUT
@@ -117,11 +108,8 @@ class BlockHeader:
         recording, number = names or (0, -1)
         if kind not in set(BlockKind) or gap not in set(Gap) or length > MAX_PAYLOAD_BYTES:
             return None
-        return cls(BlockKind(kind), Gap(gap), time_ns, records, length, checksum, number, recording)
-
-    def matches(self, payload: bytes) -> bool:
-        """Whether a payload is the one that was described."""
-        return len(payload) == self.length and zlib.crc32(payload) == self.checksum
+        sizes = records, length, checksum
+        return cls(BlockKind(kind), Gap(gap), time_ns, *sizes, number, recording, position)
 
 
 RECORD_KIND = "recording"
@@ -140,24 +128,6 @@ class Damage:
     is_cut: bool = False
 
 
-@dataclass(frozen=True)
-class Block:
-    """A block with a sound header."""
-
-    position: int  # of its header, in the file
-    header: BlockHeader
-
-    @property
-    def payload_position(self) -> int:
-        """Position of its payload."""
-        return self.position + self.header.header_bytes
-
-    @property
-    def end(self) -> int:
-        """Position behind it."""
-        return self.payload_position + self.header.length
-
-
 class BlockReader:
     """Blocks in anything that holds bytes; damage between them is stepped over and reported. The
     first sound header decides which recording, and of which version, this is. Memory: one block.
@@ -167,7 +137,7 @@ class BlockReader:
         self.path = path
         self.length = length
         self._fetch = fetch
-        self._first: BlockHeader | None = None
+        self._first: Block | None = None
         begins = [(self._search(0, magic), magic) for magic in (MAGIC, LEGACY_MAGIC)]
         begin, self._magic = min(begins)
         self._first = self._read_header(begin)
@@ -178,9 +148,8 @@ class BlockReader:
         """Yield every block with a sound header, and the damage between; payloads are not read."""
         position = self._begin
         while position < self.length:
-            header = self._read_header(position) if self._first else None
-            if header is not None:
-                block = Block(position, header)
+            block = self._read_header(position) if self._first else None
+            if block is not None:
                 yield block
                 position = block.end
                 continue
@@ -192,8 +161,8 @@ class BlockReader:
 
     def read_payload(self, block: Block) -> bytes:
         """Return a block's payload."""
-        data = self._fetch(block.payload_position, block.header.length)
-        if not block.header.matches(data):
+        data = self._fetch(block.payload_position, block.length)
+        if len(data) != block.length or zlib.crc32(data) != block.checksum:
             raise FileFormatError(
                 self.path,
                 f"the block at byte {block.position} is damaged; tofclip devices repair leaves it out",
@@ -203,30 +172,28 @@ class BlockReader:
     def find_head(self) -> Block | None:
         """Return the first undamaged description of the instrument, None if there is none."""
         for entry in self:
-            if isinstance(entry, Block) and entry.header.kind is BlockKind.HEAD:
+            if isinstance(entry, Block) and entry.kind is BlockKind.HEAD:
                 with contextlib.suppress(FileFormatError):
                     self.read_payload(entry)
                     return entry
         return None
 
-    def _read_header(self, position: int) -> BlockHeader | None:
+    def _read_header(self, position: int) -> Block | None:
         """Read a header of this recording; None if its payload would not lie within the file."""
-        header = BlockHeader.unpack(self._fetch(position, HEADER_BYTES))
-        if header is None or position + header.header_bytes + header.length > self.length:
-            return None
-        return header if self._belongs(header) else None
+        block = Block.unpack(self._fetch(position, HEADER_BYTES), position)
+        return block if block and block.end <= self.length and self._belongs(block) else None
 
-    def _belongs(self, header: BlockHeader) -> bool:
-        first = self._first or header
-        return (header.recording, header.is_legacy) == (first.recording, first.is_legacy)
+    def _belongs(self, block: Block) -> bool:
+        first = self._first or block
+        return (block.recording, block.is_legacy) == (first.recording, first.is_legacy)
 
     def _is_cut(self, position: int) -> bool:
         """Whether what is left of the file is the beginning of a block."""
         data = self._fetch(position, HEADER_BYTES)
         if self.length - position < HEADER_BYTES:
             return data.startswith(MAGIC[: len(data)])
-        header = BlockHeader.unpack(data)
-        return header is not None and self._first is not None and self._belongs(header)
+        block = Block.unpack(data)
+        return block is not None and self._first is not None and self._belongs(block)
 
     def _search(self, position: int, magic: bytes) -> int:
         """Return where the next sound header of this recording begins, or the end."""
@@ -272,7 +239,7 @@ class Recording(Closing):
     def __init__(self, path: Path) -> None:
         self.path = path
         with translate_read_errors(path):
-            self._file = open(path, "rb", buffering=0)  # noqa: SIM115 - closed by `close`
+            self._file = open(path, "rb")  # noqa: SIM115 - closed by `close`
         self.blocks = BlockReader(path, self._read_bytes, os.fstat(self._file.fileno()).st_size)
         try:
             self.head = self._read_head()
@@ -315,18 +282,11 @@ class Recording(Closing):
 
     def _read_bytes(self, position: int, length: int) -> bytes:
         """Read `length` bytes from `position` on, fewer at the end of the file."""
-        pieces: list[bytes] = []
-        while length > 0:
-            try:
-                piece = os.pread(self._file.fileno(), length, position)
-            except OSError as fault:
-                raise StorageError(f"{self.path}: cannot be read: {fault.strerror}") from fault
-            if not piece:
-                break
-            pieces.append(piece)
-            position += len(piece)
-            length -= len(piece)
-        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+        try:
+            self._file.seek(position)
+            return self._file.read(length)
+        except OSError as fault:
+            raise StorageError(f"{self.path}: cannot be read: {fault.strerror}") from fault
 
 
 def read_head_if_recording(path: Path) -> Record | None:
@@ -369,7 +329,7 @@ class ReplaySource(SeekableSource):
         self.is_complete = False
         self._blocks = list(self._list_blocks())
         self._last_due: tuple[float, int] | None = None
-        records = sum(block.header.records for block in self._blocks)
+        records = sum(block.records for block in self._blocks)
         super().__init__(codec, path, len(self._blocks), records)
 
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
@@ -384,7 +344,7 @@ class ReplaySource(SeekableSource):
     def _read_piece(self, number: int) -> Piece:
         block = self._blocks[number]
         data = self._recording.blocks.read_payload(block)
-        return Piece(data, block.header.records, block.header.gap)
+        return Piece(data, block.records, block.gap)
 
     def _go_to(self, number: int) -> None:
         super()._go_to(number)
@@ -400,9 +360,9 @@ class ReplaySource(SeekableSource):
                     path,
                     f"is damaged at byte {entry.position}; tofclip devices repair makes a sound copy",
                 )
-            if entry.header.kind is BlockKind.PIECE:
+            if entry.kind is BlockKind.PIECE:
                 yield entry
-            elif entry.header.kind is BlockKind.END:
+            elif entry.kind is BlockKind.END:
                 ending = Ending.from_json(blocks.read_payload(entry), path)
                 self.is_complete = ending.is_complete
 
@@ -410,14 +370,14 @@ class ReplaySource(SeekableSource):
         """Wait until a block is due; DeviceTimeoutError where that is later than `timeout`."""
         due = now = monotonic()
         if self._last_due is not None:
-            pause = (block.header.time_ns - self._last_due[1]) / NS_PER_S
+            pause = (block.time_ns - self._last_due[1]) / NS_PER_S
             due = self._last_due[0] + min(max(pause, 0.0), MAX_PAUSE_S)
         sleep(max(0.0, min(due - now, timeout)))
         if due - now > timeout:
             raise DeviceTimeoutError(
                 f"the next piece of {self._name} is due in {due - now - timeout:.3g} s"
             )
-        self._last_due = due, block.header.time_ns
+        self._last_due = due, block.time_ns
 
 
 def open_recording(uri: Uri) -> ReplaySource:

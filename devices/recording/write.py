@@ -8,12 +8,13 @@ import json
 import os
 import secrets
 import tempfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from time import monotonic, monotonic_ns, time_ns
 from typing import Any
 
-from devices.recording.read import HEADER_BYTES, BlockHeader, BlockKind, Ending
+from devices.recording.read import HEADER_BYTES, Block, BlockKind, Ending
 from devices.source import Codec, Gap, Info, Piece, Stats
 from tofclip.errors import InputError, StorageError
 from tofclip.storage import Record
@@ -126,10 +127,11 @@ class RecordingWriter:
     ) -> None:
         """Append a block, whole or not at all."""
         now = monotonic_ns() + self._clock_offset_ns
-        header = BlockHeader.of(kind, payload, now, records, gap, self._number, self._recording)
+        sizes = records, len(payload), zlib.crc32(payload)
+        block = Block(kind, gap, now, *sizes, self._number, self._recording)
         end = self._end
         try:
-            for part in (header.pack(), payload):
+            for part in (block.pack(), payload):
                 rest = memoryview(part)
                 while rest:  # a signal, or a disk that is nearly full, makes short writes
                     written = os.pwrite(self._file, rest, end)

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 import tracemalloc
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +35,7 @@ from itex_files import encode_itex
 from devices.address import Uri
 from devices.frames import FrameCodec
 from devices.linospad2 import LinoSpad2Codec, read_sidecar
-from devices.recording.read import Block, BlockHeader, BlockKind, BlockReader
+from devices.recording.read import Block, BlockKind, BlockReader
 from devices.remoteex import (
     Answer,
     AnswerCode,
@@ -154,7 +155,8 @@ def answers() -> Target:
 
 def recording() -> Target:
     payload = time_tags().seeds[0]
-    blocks = [BlockHeader.of(BlockKind.PIECE, payload, 5, 200, gap).pack() + payload for gap in Gap]
+    sizes = 200, len(payload), zlib.crc32(payload)
+    blocks = [Block(BlockKind.PIECE, gap, 5, *sizes).pack() + payload for gap in Gap]
 
     def decode(data: bytes) -> None:
         fetch = lambda position, length: data[position : position + length]  # noqa: E731

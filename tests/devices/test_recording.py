@@ -97,7 +97,7 @@ def written(path: Path, finish: bool = True, stats: Stats = Stats(600, 600)) -> 
 def list_blocks(path: Path, *kinds: BlockKind) -> list[Block]:
     with Recording(path) as recording:
         blocks = [entry for entry in recording.blocks if isinstance(entry, Block)]
-    return [block for block in blocks if block.header.kind in (kinds or BlockKind)]
+    return [block for block in blocks if block.kind in (kinds or BlockKind)]
 
 
 def damage(path: Path, place: int, mask: int = 1) -> None:
@@ -401,7 +401,7 @@ def test_blocks_say_when_they_were_recorded(path: Path) -> None:
     """By this computer's clock, ns since 1970."""
     before = time.time_ns()
     written(path)
-    times = [block.header.time_ns for block in list_blocks(path)]
+    times = [block.time_ns for block in list_blocks(path)]
     # Both clocks are read one after the other, and the system may set one meanwhile.
     assert before - 10**9 < times[0] <= times[-1] < time.time_ns() + 10**9
     assert times == sorted(times)
@@ -415,7 +415,7 @@ def test_damage_is_found_and_the_rest_is_saved(
     folder = tmp_path_factory.mktemp("damage")
     path, out, again = folder / "run.h5", folder / "out.h5", folder / "again.h5"
     pieces, blocks = written(path), list_blocks(path)
-    assert [one.header.kind for one in blocks[:2]] == [BlockKind.HEAD] * 2
+    assert [one.kind for one in blocks[:2]] == [BlockKind.HEAD] * 2
     victim = data.draw(st.integers(1, PIECES))
     block = blocks[1 + victim]
     damage(
