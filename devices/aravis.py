@@ -8,8 +8,6 @@ virtual environment where that has the same version of Python.
 from __future__ import annotations
 
 import contextlib
-import importlib.machinery
-import importlib.util
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -297,10 +295,10 @@ class AravisFeed(FrameFeed):
 
 @lru_cache(maxsize=1)
 def load_aravis() -> Any:
-    """Import Aravis."""
+    """Import Aravis, from the system's packages where a virtual environment has none."""
+    places = list(sys.path)
+    sys.path.extend(SYSTEM_PACKAGES)
     try:
-        if importlib.util.find_spec("gi") is None:
-            _import_system_module("gi")
         import gi
 
         gi.require_version("Aravis", "0.8")
@@ -310,21 +308,9 @@ def load_aravis() -> Any:
             "aravis:// needs Aravis and its Python binding: apt install python3-gi gir1.2-aravis-0.8, with the "
             f"system's version of Python ({fault})"
         ) from fault
+    finally:
+        sys.path[:] = places
     return Aravis
-
-
-def _import_system_module(name: str) -> None:
-    """Import a module that the system installed, from outside a virtual environment."""
-    found = importlib.machinery.PathFinder.find_spec(name, SYSTEM_PACKAGES)
-    if found is None or found.loader is None:
-        raise ImportError(f"no module named {name}")
-    module = importlib.util.module_from_spec(found)
-    sys.modules[name] = module
-    try:
-        found.loader.exec_module(module)
-    except BaseException:
-        del sys.modules[name]
-        raise
 
 
 def find_cameras() -> list[DiscoveredInstrument]:

@@ -238,8 +238,7 @@ class Spad512Feed(FrameFeed):
                 if monotonic() > deadline:
                     raise DeviceTimeoutError("the SPAD array does not end its calibration")
                 text = self._read_text(BREAKDOWN_CALIBRATION_S)
-            self._link.send(INFORMATION_COMMAND, self._patience)
-            text = self._read_text(self._patience)
+            return self._ask_system()
         return [line.strip() for line in text.splitlines() if line.strip()]
 
     def _read_text(self, patience: float) -> str:

@@ -19,7 +19,7 @@ from devices.usb import INTERFACE_NUMBER, VENDOR_REQUEST, UsbIdentity
 BULK_TRANSFER = 2
 HIGH_SPEED = 3
 PACKET_BYTES = 512
-ENGLISH_LANGID = 0x0409
+ENGLISH_LANGID = b"\x09\x04"
 GET_DESCRIPTOR, STRING = 6, 3
 
 
@@ -124,7 +124,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         )  # fmt: skip
 
     def open_device(self, dev: VirtualDevice) -> VirtualDevice:
-        _require_plugged(dev)
+        _require_ready(dev)
         if not dev.is_accessible:
             raise make_usb_error(errno.EACCES)
         return dev
@@ -133,27 +133,27 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         """Nothing is held open."""
 
     def get_configuration(self, dev_handle: VirtualDevice) -> int:
-        _require_plugged(dev_handle)
+        _require_ready(dev_handle)
         return 1
 
     def is_kernel_driver_active(self, dev_handle: VirtualDevice, intf: int) -> bool:
         """Say that no kernel driver holds the interface."""
-        _require_plugged(dev_handle)
+        _require_ready(dev_handle)
         return False
 
     def claim_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
         """Claim the interface, which fails while another process has it."""
-        _require_plugged(dev_handle)
+        _require_ready(dev_handle)
         if dev_handle.is_claimed_elsewhere:
             raise make_usb_error(errno.EBUSY)
 
     def release_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
         """Give the interface back."""
-        _require_plugged(dev_handle)
+        _require_ready(dev_handle)
 
     def clear_halt(self, dev_handle: VirtualDevice, ep: int) -> None:
         """Let a stalled endpoint go on."""
-        _require_plugged(dev_handle)
+        _require_ready(dev_handle)
         dev_handle.clear_halt(ep)
 
     def ctrl_transfer(
@@ -161,18 +161,14 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         timeout: int,
     ) -> int:  # fmt: skip
         """Answer requests for string descriptors and those of the maker's own."""
-        _require_plugged(dev_handle)
+        _require_ready(dev_handle)
         if bmRequestType == VENDOR_REQUEST:
             dev_handle.control(bRequest, wValue)
             return 0
         number = wValue & 0xFF
         if (bRequest, wValue >> 8) != (GET_DESCRIPTOR, STRING) or number > len(dev_handle.strings):
             raise make_usb_error(errno.EPIPE)
-        text = (
-            dev_handle.strings[number - 1].encode("utf-16-le")
-            if number
-            else ENGLISH_LANGID.to_bytes(2, "little")
-        )
+        text = [ENGLISH_LANGID, *(one.encode("utf-16-le") for one in dev_handle.strings)][number]
         # String descriptors are UTF-16LE behind their length and type; number 0 lists the
         # languages.
         answer = bytes([2 + len(text), STRING]) + text
@@ -184,7 +180,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         self, dev_handle: VirtualDevice, ep: int, intf: int, data: array.array[int], timeout: int
     ) -> int:
         """Hand what the host sends to the device."""
-        self._require_ready(dev_handle, ep)
+        _require_ready(dev_handle, ep)
         dev_handle.receive(ep, data.tobytes())
         return len(data)
 
@@ -192,16 +188,12 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         self, dev_handle: VirtualDevice, ep: int, intf: int, buff: array.array[int], timeout: int
     ) -> int:
         """Have the device fill the host's buffer."""
-        self._require_ready(dev_handle, ep)
+        _require_ready(dev_handle, ep)
         return dev_handle.fill(ep, memoryview(buff), timeout / 1000)
 
-    @staticmethod
-    def _require_ready(device: VirtualDevice, endpoint: int) -> None:
-        _require_plugged(device)
-        if endpoint in device.halted:
-            raise make_usb_error(errno.EPIPE)
 
-
-def _require_plugged(device: VirtualDevice) -> None:
+def _require_ready(device: VirtualDevice, endpoint: int = 0) -> None:
     if not device.is_plugged:
         raise make_usb_error(errno.ENODEV)
+    if endpoint in device.halted:
+        raise make_usb_error(errno.EPIPE)

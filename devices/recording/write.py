@@ -92,10 +92,9 @@ class RecordingWriter:
         if monotonic() < self._checked_at + CHECK_INTERVAL_S:
             return
         self._checked_at = monotonic()
-        try:
+        inode = -1
+        with contextlib.suppress(OSError):
             inode = os.stat(self._path).st_ino
-        except OSError:
-            inode = -1
         if inode != self._inode:
             raise StorageError(
                 f"{self._path}: was removed or replaced while it was being recorded; record again"
