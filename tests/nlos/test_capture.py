@@ -27,7 +27,7 @@ from scenes import find_refusal, planar_wall
 
 from nlos import Backprojection, Capture, Grid
 from nlos.band import Band
-from nlos.capture import TimeAxis, remove_device_legs, unwarp_signal
+from nlos.capture import remove_device_legs, unwarp_signal
 from nlos.illumination import AliasingWarning, warn_of_aliasing
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.storage import Record
@@ -312,12 +312,3 @@ def test_unwarping_checks_what_it_is_given(
 ) -> None:
     with pytest.raises(InputError, match=message):
         unwarp_signal(np.ones(signal), np.zeros(wall), camera, laser, BIN_WIDTH)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [((1, 1e-12, 0.0), "at least 2 time bins"), ((9, 0.0, 0.0), "bin width must be a positive")],
-)
-def test_a_time_axis_refuses_nonsense(arguments: tuple[int, float, float], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        TimeAxis(*arguments)

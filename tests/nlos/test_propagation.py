@@ -20,7 +20,6 @@ from scenes import (
     see,
     see_shaped,
     shaped_wall,
-    voxels_of,
 )
 
 import nlos.phasor.wall_to_plane_compiled
@@ -29,19 +28,14 @@ from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
 from nlos.illumination import build_waves, group_by_illumination
 from nlos.phasor import wall_to_plane
-from nlos.phasor.transfer import Offsets, SphericalWaves, find_fast_length, find_min_periods
-from nlos.phasor.wall_to_plane import (
-    WallBeforePlane,
-    WallToPlanePlan,
-    find_common_period,
-    plan_transforms,
-)
+from nlos.phasor.transfer import Offsets, SphericalWaves, find_min_periods
+from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, plan_transforms
 from nlos.phasor.wall_to_plane_compiled import (
     estimate_strength,
     propagate_direct,
     propagate_low_rank,
 )
-from nlos.plane import Plane, StraightPaths, VirtualPlane, WallLattice, choose_virtual_plane
+from nlos.plane import Plane, VirtualPlane, choose_virtual_plane
 
 PULSE = VirtualPulse(0.25, 4.24)
 BAND = Band(PULSE, TimeAxis(512, 32e-12))
@@ -198,14 +192,6 @@ def test_few_depths_take_few_terms(always: None) -> None:
     assert set(counts(CLOUD * [1, 1, 0])) == {1}
 
 
-def test_it_is_linear(always: None) -> None:
-    points = points_of("cylinder")
-    plan, first = make_plan(points, FITTING, 1e-2), phasors(len(points))
-    second = np.random.default_rng(1).normal(size=first.shape).astype(np.complex64)
-    apart = 2 * propagate_low_rank(plan, first) - 3j * propagate_low_rank(plan, second)
-    assert relative_error(apart, propagate_low_rank(plan, 2 * first - 3j * second)) < 1e-5
-
-
 def test_silence_and_a_single_frequency_pass(always: None) -> None:
     points = points_of("relief")
     values = np.zeros_like(phasors(len(points)))
@@ -216,13 +202,6 @@ def test_silence_and_a_single_frequency_pass(always: None) -> None:
     plan = make_plan(points, FITTING, 1e-2, estimate_strength(values))
     exact = propagate_direct(points, values, FITTING, K)
     assert relative_error(propagate_low_rank(plan, values), exact) < 1e-2
-
-
-def test_scattered_points_stand_above_no_lattice(always: None) -> None:
-    cloud = np.random.default_rng(3).uniform([-1, -1, 0], [1, 1, 0.2], (100, 3))
-    for points in (cloud, np.concatenate([points_of("wavy", 5)] * 2)):
-        wall = WallBeforePlane.of(points, FITTING)
-        assert plan_transforms(wall, WAVES, BAND.weights, 1e-2) is None
 
 
 @pytest.mark.parametrize(
@@ -269,17 +248,6 @@ def test_scattered_points_take_it_where_it_is_faster_and_installed(
     assert errors[True, False] == errors[False, True] == 0
 
 
-def test_periods_suit_wall_and_plane() -> None:
-    assert [find_fast_length(n) for n in (3, 17, 100, 129, 145, 161, 300, 321, 385, 481, 641)] == [
-        16, 32, 128, 144, 160, 192, 320, 384, 400, 512, 1024,
-    ]  # fmt: skip
-    assert find_common_period(4.9, 0.1, 0.1, 30) == (64, 64.0)
-    assert find_common_period(4.9, 0.1, 0.2, 30) == (64, 32.0)
-    assert find_common_period(4.9, 0.1, 0.12, 30) == (64, pytest.approx(64 / 1.2))
-    assert find_common_period(3.9, 0.1, 0.12, 30) == (48, 40.0)
-    assert find_common_period(4.9, 0.1, 0.0777, 30) == (64, pytest.approx(6.4 / 0.0777))
-
-
 # --- the virtual plane
 
 
@@ -302,64 +270,6 @@ def test_the_virtual_plane_keeps_its_distance_and_samples_the_shortest_wave() ->
     depth = points[:, 2].max() + 0.07 + gap
     wide = choose_virtual_plane(points, Grid([-3, 3], [-0.5, 0.5], [depth]), waves, 0.0)
     assert wide.x[-1] == pytest.approx(2)  # half way to a voxel at 3 m
-
-
-@pytest.mark.parametrize("shortest", [0.09, 0.52, 2.1])
-def test_the_virtual_plane_suits_the_walls_lattice(shortest: float, always: None) -> None:
-    """Finer and coarser than its points, 0.25 m apart: Fourier transforms lead there and back."""
-    points, waves = points_of("relief", 9), waves_of(shortest)
-    lattice = WallLattice.find(points)
-    assert lattice is not None
-    plane = choose_virtual_plane(points, BOX, waves, 1.0, wall=lattice)
-    free = choose_virtual_plane(points, BOX, waves, 1.0)
-    for axis, unfitted in ((plane.x, free.x), (plane.y, free.y)):
-        step = axis[1] - axis[0]
-        ratio = max(0.25 / step, step / 0.25)
-        assert ratio == pytest.approx(round(ratio), abs=1e-9)
-        assert shortest / 4 < step <= shortest / 2
-        assert axis[0] <= unfitted[0] + 1e-9
-        assert axis[-1] >= unfitted[-1] - 1e-9
-        assert axis[0] + axis[-1] == pytest.approx(unfitted[0] + unfitted[-1], abs=1e-9)
-    plan = plan_transforms(WallBeforePlane(points, plane, lattice), waves, np.ones(1), 1e-2)
-    assert plan is not None
-    assert plan.plane_lattice == tuple(map(round, plan.plane_lattice))
-
-
-def test_the_field_fades_towards_the_rim_beside_the_straight_paths_only() -> None:
-    points, grid = points_of("planar", 9), Grid([-0.5, 1.5], [-0.5, 0.5], [0.5])
-    plane = choose_virtual_plane(points, grid, waves_of(0.07), 2.0)
-    weights = plane.weights / np.prod(plane.steps)
-    assert weights.shape == plane.shape
-    assert weights.max() == pytest.approx(1)
-    inside = weights[:, (plane.x > -1) & (plane.x < 1.07)][np.abs(plane.y) < 1]
-    np.testing.assert_allclose(inside, 1, rtol=1e-6)
-    assert weights[0].max() < 0.05  # half a step from where nothing is left
-    # Voxels beside the wall along x ask for more room there than along y.
-    assert plane.fade[1] > plane.fade[0] == pytest.approx(0.75 * 2 * 0.07 * np.sqrt(1.5))
-
-
-NEAR = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.8, 9), [0.6, 0.7, 0.9])
-
-
-def test_no_straight_path_leads_farther() -> None:
-    points = points_of("relief", 9)
-    plane = VirtualPlane(np.linspace(-1.4, 1.4, 30), np.linspace(-1.3, 1.3, 28), 0.35, (0.2, 0.3))
-    paths, strict = (StraightPaths.find(points, plane, NEAR, tol) for tol in (0.1, 1e-3))
-    assert paths is not None
-    assert strict is not None
-    voxels = voxels_of(NEAR).reshape(-1, 1, 3)
-    across = np.linalg.norm((voxels - points)[..., :2], axis=-1)
-    before = (plane.z - points[:, 2]) / (voxels - points)[..., 2]
-    for fraction, bound in ((before, paths.wall_to_plane), (1 - before, paths.plane_to_voxels)):
-        farthest = (fraction * across).max()
-        # points at the ends in depth need not stand in the corners
-        assert farthest <= bound < 1.35 * farthest
-    assert paths.rim == pytest.approx((0.14, 0.21))
-    assert paths.first_depth == 0.6
-    assert strict.wall_to_plane > paths.wall_to_plane
-    assert strict.rim < paths.rim
-    # Voxels before the plane leave no way out.
-    assert StraightPaths.find(points, replace(plane, z=0.65), NEAR, 1e-2) is None
 
 
 def test_a_period_holds_a_plane_that_is_wider_than_the_windows() -> None:

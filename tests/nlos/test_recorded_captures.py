@@ -21,11 +21,9 @@ from nlos import (
     Volume,
     settings_for,
 )
-from nlos.capture import unwarp_signal
 from nlos.imaging import complete_settings
 from nlos.io import read_capture
 from nlos.preparation import rebin_capture, remove_first_bounce
-from tofclip.units import SPEED_OF_LIGHT
 
 FIRST_BOUNCE_BINS = 600
 OUTDOOR = "nlos_native/otoole2018_outdoor_s.mat"
@@ -90,25 +88,6 @@ def test_the_letter_looks_as_by_backprojection(method: Any, letter: Capture) -> 
     pictures = (volume.maximum_projection().brightness.ravel() for volume in (found, expected))
     # Beyond the band that both share, only tolerance, interpolation and the record's ends differ.
     assert np.corrcoef(*pictures)[0, 1] > 0.99
-
-
-@pytest.mark.parametrize("name", ["LetterN", "LetterVI", "Circle_Square"])
-def test_a_flash_at_the_laser_spot_reaches_all_of_a_recorded_wall_at_once(
-    name: str, shared_data: Path
-) -> None:
-    """Legs to the camera, computed from the recorded geometry, are taken off by what
-    `unwarp_signal` does.
-    """
-    with np.load(shared_data / "lift" / f"nlos_{name}.npz") as stored:
-        wall = np.moveaxis(stored["wall_grid_m"], 0, -1)[::8, ::8]
-        camera, laser, width = stored["camera_pos_m"], stored["laser_pos_m"], float(stored["dt_s"])
-    legs = np.linalg.norm(wall - camera, axis=-1) - np.linalg.norm(laser - camera)
-    bins, late = np.arange(1016), legs / (SPEED_OF_LIGHT * width)
-    signal = np.exp(-0.5 * ((bins[:, None, None] - 500 - late) / 6) ** 2)
-    found = unwarp_signal(signal, wall, camera, laser, width)
-    expected = np.exp(-0.5 * ((bins - 500) / 6) ** 2)
-    # Linear interpolation of a Gaussian of 6 bins: at most 1 / (8 * 36).
-    assert np.max(np.abs(found - expected[:, None, None])) < 4e-3
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from scenes import (
 from nlos import Capture, Grid, Hybrid, Refinement, Volume
 from nlos.capture import TimeAxis
 from nlos.illumination import choose_unaliased_band
-from nlos.refinement.l1 import WallModel, build_total_variation, propagate_spherical_waves
+from nlos.refinement.l1 import WallModel, build_total_variation
 from nlos.simulate import HiddenScene, Surface, add_poisson_noise
 from tofclip.errors import InputError
 from tofclip.solvers import Sparse
@@ -123,20 +123,6 @@ def test_a_voxels_phasors_are_those_of_the_formula() -> None:
     # Cutting the virtual plane off costs single phasors, most at the band's weak edges, a few per
     # cent.
     assert relative_error(found, expected.ravel()) < 5e-2
-
-
-def test_spherical_waves_agree_in_both_precisions_and_both_directions() -> None:
-    random = np.random.default_rng(4)
-    one, other = random.uniform(-1, 1, (70, 3)), random.uniform([-1, -1, 2], [1, 1, 4], (131, 3))
-    wavenumbers = np.linspace(20, 60, 11)
-    values = random.normal(size=(70, 11)) + 1j * random.normal(size=(70, 11))
-    exact = propagate_spherical_waves(one, values, other, wavenumbers)
-    quick = propagate_spherical_waves(one, values.astype(np.complex64), other, wavenumbers)
-    assert quick.dtype == np.complex64
-    assert relative_error(quick, exact) < 3e-5
-    weights = random.normal(size=(131, 11)) + 0j
-    turned = propagate_spherical_waves(other, weights, one, wavenumbers)
-    assert np.sum(exact * weights) == pytest.approx(np.sum(values * turned), rel=1e-12)
 
 
 def test_progress_counts_every_voxel_in_every_iteration() -> None:
