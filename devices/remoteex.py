@@ -19,7 +19,7 @@ import contextlib
 import enum
 import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from sys import maxsize
 from time import monotonic, sleep
@@ -414,12 +414,12 @@ class RemoteExOptions(StreakOptions):
 class RemoteExFeed(FrameFeed):
     """Live pictures in the order of their numbers; see `devices.stream.Feed`. Pictures that fell
     out of the ring buffer before they were asked for are lost by the instrument. When the
-    connection breaks, so are those that had been announced.
+    connection breaks, so are those that had been announced. `ports`: of commands and of data.
     """
 
-    def __init__(self, connect: Callable[[], RemoteExClient], options: StreakOptions) -> None:
+    def __init__(self, host: str, ports: tuple[int, int], options: StreakOptions) -> None:
         super().__init__()
-        self._connect, self._options = connect, options
+        self._place, self._options = (host, *ports), options
         self._stamps: dict[int, float] = {}
         self._start_camera()
         try:
@@ -482,7 +482,7 @@ class RemoteExFeed(FrameFeed):
 
     def _start_camera(self) -> None:
         """Connect, start the camera and wait for its first picture."""
-        self._link = link = self._connect()
+        self._link = link = RemoteExClient(*self._place, self._options.timeout_s)
         self._stopped = False
         self._has_joined = False
         self._gain_before: str | None = None
@@ -642,8 +642,4 @@ def open_remoteex(uri: Uri) -> StreamSource:
     """
     options = RemoteExOptions.from_uri(uri)
     host, port = uri.host_and_port(COMMAND_PORT)
-    data_port = options.data_port or port + 1
-    return StreamSource(
-        RemoteExFeed(lambda: RemoteExClient(host, port, data_port, options.timeout_s), options),
-        options,
-    )
+    return StreamSource(RemoteExFeed(host, (port, options.data_port or port + 1), options), options)

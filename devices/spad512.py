@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any
@@ -173,9 +172,9 @@ class Spad512Feed(FrameFeed):
     was cut is never finished, and the next one's numbers begin behind it.
     """
 
-    def __init__(self, connect: Callable[[], TcpLink], options: SpadOptions) -> None:
+    def __init__(self, host: str, port: int, options: SpadOptions) -> None:
         super().__init__()
-        self._connect, self._options = connect, options
+        self._place, self._options = (host, port), options
         self._patience, self.codec = options.timeout_s, options.codec
         self.calibration = options.gate_record
         self._frames_due = 0
@@ -218,7 +217,7 @@ class Spad512Feed(FrameFeed):
         self._link.close()
 
     def _open_link(self) -> None:
-        self._link = link = self._connect()
+        self._link = link = TcpLink(*self._place, self._patience)
         try:
             self._greeting = self._read_text(self._patience)
             self._facts = self._ask_system()
@@ -303,6 +302,4 @@ def open_spad512(uri: Uri) -> StreamSource:
     """
     options = SpadOptions.from_uri(uri)
     host, port = uri.host_and_port(DEFAULT_PORT)
-    return StreamSource(
-        Spad512Feed(lambda: TcpLink(host, port, options.timeout_s), options), options
-    )
+    return StreamSource(Spad512Feed(host, port, options), options)

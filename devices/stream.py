@@ -142,14 +142,22 @@ class LiveOptions(StreamOptions):
 
 
 class StreamSource(DecodedSource):
-    """A live source. Memory: the buffer's capacity, one transfer and one decoded piece."""
+    """A live source. Memory: the buffer's capacity, one transfer and one decoded piece. `release`: called
+    once the feed has been closed.
+    """
 
     is_live = True
 
-    def __init__(self, feed: Feed, options: StreamOptions | None = None) -> None:
+    def __init__(
+        self,
+        feed: Feed,
+        options: StreamOptions | None = None,
+        release: Callable[[], None] = lambda: None,
+    ) -> None:
         options = options or StreamOptions()
         super().__init__(feed.codec, feed.ledger)
-        self._feed, self._rest, self._gap = feed, b"", Gap.NONE
+        self._feed, self._release = feed, release
+        self._rest, self._gap = b"", Gap.NONE
         capacity = int(options.buffer_mib * _MEBIBYTE)
         self._ring = RingBuffer(capacity, options.policy, feed.ledger)
         self._stopping, self._closed = threading.Event(), False
@@ -191,7 +199,7 @@ class StreamSource(DecodedSource):
         like an instrument in the dark.
         """
         # The feed is closed even if reading failed, and on the thread that used it.
-        for step in (self._pull_all, self._count_truncated, self._feed.close):
+        for step in (self._pull_all, self._count_truncated, self._feed.close, self._release):
             try:
                 step()
             except BaseException as fault:

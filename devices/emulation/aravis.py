@@ -10,7 +10,7 @@ from typing import Any
 
 from devices.address import Uri, option
 from devices.aravis import AravisFeed, CameraOptions, load_aravis
-from devices.emulation.harness import HOST, EmulatedFeed
+from devices.emulation.harness import HOST, open_on
 from devices.emulation.scenes import EmulatedLight, simulate_light
 from devices.frames import make_streak_calibration
 from devices.stream import StreamSource
@@ -109,9 +109,5 @@ def open_emulated(uri: Uri) -> StreamSource:
         light = EmulatedLight.of(seen, options.seed)
         known = make_streak_calibration(seen.row_times, seen.camera)
     camera = EmulatedCamera(library, serial, options.lost_per_thousand, light)
-    feed = EmulatedFeed(
-        camera,
-        lambda: AravisFeed(library, HOST, options, camera.prepare),
-        lambda said: known or said,
-    )
-    return StreamSource(feed, options)
+    connect = lambda: AravisFeed(library, HOST, options, camera.prepare)  # noqa: E731
+    return open_on(camera, connect, options, lambda said: known or said)

@@ -1,5 +1,5 @@
 """What emulated instruments share: faults to order, a TCP server that nothing but this computer can
-reach, and a driver's feed whose instrument is software.
+reach, and drivers' feeds on instruments of software.
 
 The drivers do not know the difference; all of their code runs.
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
-from devices.stream import Feed, Transfer
+from devices.stream import Feed, StreamOptions, StreamSource
 from tofclip.errors import InputError
 from tofclip.storage import Record
 
@@ -151,39 +151,20 @@ class LoopbackServer(socketserver.ThreadingTCPServer):
         self.close()
 
 
-class EmulatedFeed(Feed):
-    """A driver's feed whose instrument is software, which is switched off with it; see
-    `devices.stream.Feed`. `describe`: from the calibration that the driver knows to that of the
-    scene.
+def open_on(
+    instrument: Any,
+    connect: Callable[[], Feed],
+    options: StreamOptions,
+    describe: Callable[[Record | None], Record | None] = lambda known: known,
+) -> StreamSource:
+    """Open a driver's feed on an instrument of software, which is switched off with it. `describe`:
+    from the calibration that the driver knows to that of the scene.
     """
-
-    def __init__(
-        self,
-        instrument: Any,
-        connect: Callable[[], Feed],
-        describe: Callable[[Record | None], Record | None] = lambda known: known,
-    ) -> None:
-        self._instrument = instrument
-        try:
-            self._feed = feed = connect()
-        except BaseException:
-            instrument.close()
-            raise
-        self.codec, self.ledger = feed.codec, feed.ledger
-        self.info = replace(feed.info, instrument=f"emulated {feed.info.instrument}")
-        self.calibration = describe(feed.calibration)
-
-    def start(self) -> None:
-        self._feed.start()
-
-    def pull(self, timeout: float) -> Transfer | None:
-        return self._feed.pull(timeout)
-
-    def stop(self) -> None:
-        self._feed.stop()
-
-    def close(self) -> None:
-        try:
-            self._feed.close()
-        finally:
-            self._instrument.close()
+    try:
+        feed = connect()
+        feed.info = replace(feed.info, instrument=f"emulated {feed.info.instrument}")
+        feed.calibration = describe(feed.calibration)
+        return StreamSource(feed, options, instrument.close)
+    except BaseException:
+        instrument.close()
+        raise

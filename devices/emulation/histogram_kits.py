@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from devices.address import Options, Uri, option
-from devices.emulation.harness import EmulatedFeed
+from devices.emulation.harness import open_on
 from devices.histogram_kits import (
     TMF_BINS,
     TMF_CAPTURES,
@@ -181,4 +181,4 @@ def open_vl53l8(uri: Uri) -> StreamSource:
 
 def _open_emulated(options: EmulatedOptions) -> StreamSource:
     kit = EmulatedKit(options)
-    return StreamSource(EmulatedFeed(kit, lambda: KitFeed(kit.port, options)), options)
+    return open_on(kit, lambda: KitFeed(kit.port, options), options)

@@ -15,10 +15,10 @@ from devices.emulation.harness import (
     FOREVER,
     HOST,
     Connection,
-    EmulatedFeed,
     Fault,
     LoopbackServer,
     index_faults,
+    open_on,
 )
 from devices.emulation.scenes import EmulatedLight, simulate_light
 from devices.remoteex import (
@@ -31,7 +31,6 @@ from devices.remoteex import (
     Answer,
     AnswerCode,
     Command,
-    RemoteExClient,
     RemoteExFeed,
     StreakOptions,
 )
@@ -346,13 +345,8 @@ def open_emulated(uri: Uri) -> StreamSource:
     light = EmulatedLight.of(seen, options.seed)
     server = EmulatedStreakCamera(light, options.frame_rate, options.frames, options.faults)
 
-    def connect() -> RemoteExClient:
-        return RemoteExClient(HOST, *server.ports, options.timeout_s)
-
     def describe(known: Record | None) -> Record | None:
         """Add what the calibration of the lenslets before the camera would tell."""
         return known and replace(known, children={"camera": seen.camera.to_record()})
 
-    return StreamSource(
-        EmulatedFeed(server, lambda: RemoteExFeed(connect, options), describe), options
-    )
+    return open_on(server, lambda: RemoteExFeed(HOST, server.ports, options), options, describe)

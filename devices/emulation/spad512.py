@@ -16,10 +16,10 @@ from devices.emulation.harness import (
     FOREVER,
     HOST,
     Connection,
-    EmulatedFeed,
     Fault,
     LoopbackServer,
     index_faults,
+    open_on,
 )
 from devices.emulation.scenes import render_array_delays, render_array_light
 from devices.spad512 import (
@@ -32,7 +32,6 @@ from devices.spad512 import (
     SpadOptions,
 )
 from devices.stream import StreamSource
-from devices.tcp import TcpLink
 from tofclip.errors import ProtocolError, ShapeError
 
 SUPPORTED_FAULTS = ("timeout", "short", "unplug", "corrupt", "stall")
@@ -207,8 +206,4 @@ def open_emulated(uri: Uri) -> StreamSource:
         options.faults,
         render_array_delays() if options.is_gated else None,
     )
-
-    def connect() -> TcpLink:
-        return TcpLink(HOST, server.port, options.timeout_s)
-
-    return StreamSource(EmulatedFeed(server, lambda: Spad512Feed(connect, options)), options)
+    return open_on(server, lambda: Spad512Feed(HOST, server.port, options), options)

@@ -40,7 +40,6 @@ from devices.remoteex import (
     Answer,
     AnswerCode,
     Command,
-    RemoteExClient,
     RemoteExFeed,
     StreakOptions,
     parse_data_length,
@@ -225,9 +224,9 @@ def remoteex_session() -> Target:
 
     def decode(both: bytes) -> None:
         connect = connect_to(*(Replayed(part) for part in both.partition(border)[::2]))
-        client = lambda: RemoteExClient("replayed", 1, 2, 0.01)  # noqa: E731
+        options = StreakOptions(reconnect_s=0, timeout_s=0.01)
         with mock.patch("devices.remoteex.TcpLink", side_effect=connect):
-            converse(RemoteExFeed(client, StreakOptions(reconnect_s=0)), 2)
+            converse(RemoteExFeed("replayed", (1, 2), options), 2)
 
     return Target(decode, (said + border + data,), slowness=5)
 
@@ -247,8 +246,12 @@ def spad512_session() -> Target:
                     raise DeviceTimeoutError("it is quiet")
                 return text
 
-        with mock.patch("devices.spad512._SILENCE_S", 0):
-            converse(Spad512Feed(connect_to(Server(data)), options), 4)
+        connect = connect_to(Server(data))
+        with (
+            mock.patch("devices.spad512._SILENCE_S", 0),
+            mock.patch("devices.spad512.TcpLink", side_effect=connect),
+        ):
+            converse(Spad512Feed("replayed", 1, options), 4)
 
     return Target(decode, ((pictures + b"DONE") * 2,), slowness=5)
 

@@ -149,7 +149,7 @@ def test_every_frame_is_accounted_for() -> None:
 def test_a_kit_that_is_unplugged() -> None:
     with devices.open("sim+tmf8828://?seed=1&rate=100&reconnect_s=0.2") as source:
         take(source, 2)
-        source._feed._instrument.close()  # type: ignore[attr-defined]
+        source._release()  # type: ignore[attr-defined]
         with pytest.raises(DeviceDisconnectedError, match="no answer came"):
             take(source, 1000)
     assert source.stats.is_balanced
