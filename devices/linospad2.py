@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -49,7 +49,7 @@ from devices.source import (
 )
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
 from tofclip.files import guard, read_toml, suggest_name, translate_read_errors
-from tofclip.storage import Record, Scalar, Storable, stored_array
+from tofclip.storage import Record, Storable, stored_array
 from tofclip.threads import run_blocks
 
 PIXELS = PIXEL_CONVERTERS * ADDRESSES
@@ -97,11 +97,6 @@ class LinoSpad2Codec(Codec):
     def dtype(self) -> np.dtype[Any]:
         """Type of a time stamp."""
         return STAMP_WITH_COUNTER_DTYPE if self.counter else STAMP_DTYPE
-
-    @property
-    def settings(self) -> Mapping[str, Scalar]:
-        """Arguments that build this codec again."""
-        return {"firmware": self.firmware, "timestamps": self.timestamps, "counter": self.counter}
 
     @property
     def header(self) -> int:

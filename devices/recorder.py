@@ -23,16 +23,24 @@ from tofclip.errors import DeviceTimeoutError, InputError, TofclipError
 POLL_INTERVAL_S = 0.25
 END_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
-ProgressCallback = Callable[[float], None]
-
 
 @dataclass(frozen=True)
-class RecordingSummary:
-    """What a recording came to."""
+class Throughput:
+    """What came of recording a source, or of reading it for a while."""
 
-    seconds: float
-    bytes: int  # of the instrument, without the file's own
-    stats: Stats
+    seconds: float  # until the source was stopped, or at its end
+    # that were recorded, without the file's own, or decoded in this time: as they came from the
+    # instrument, or the records' where a source has no bytes
+    bytes: int
+    stats: Stats  # after everything that was left had been read and the source was closed
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Everything by name but the bytes, and the rate."""
+        known = self.stats.as_dict()
+        acquired = known.pop("acquired")
+        rate = {"bytes_per_second": self.bytes / self.seconds, "records": acquired}
+        return {"seconds": self.seconds, **rate, **known}
 
 
 def record_source(
@@ -40,9 +48,9 @@ def record_source(
     path: Path,
     seconds: float = float("inf"),
     provenance: Mapping[str, Any] | None = None,
-    watch: ProgressCallback | None = None,
+    watch: Callable[[float], None] | None = None,
     overwrite: bool = False,
-) -> RecordingSummary:
+) -> Throughput:
     """Read a source to its end, or for some time, and write everything that comes to `path`.
 
     However this ends (an exception, a signal, a killed program), the file holds what came until
@@ -87,7 +95,7 @@ def record_source(
                 writer.finish(source.stats, fault, source.is_complete)
         if interrupted.is_set():
             raise KeyboardInterrupt
-        return RecordingSummary(monotonic() - begin, writer.bytes_written, source.stats)
+        return Throughput(monotonic() - begin, writer.bytes_written, source.stats)
 
 
 def _read_until(
@@ -130,25 +138,6 @@ def _defer_end_signals() -> Iterator[threading.Event]:
     finally:
         for number in heeded:
             signal.signal(number, before[number] or signal.SIG_DFL)
-
-
-@dataclass(frozen=True)
-class Throughput:
-    """What came of reading a source for a while."""
-
-    seconds: float  # until the source was stopped, or at its end
-    # that were decoded in this time: as they came from the instrument, or the records' where a
-    # source has no bytes
-    bytes: int
-    stats: Stats  # after everything that was left had been read and the source was closed
-
-    @property
-    def figures(self) -> dict[str, float]:
-        """Everything by name, and the rate."""
-        known = self.stats.as_dict()
-        acquired = known.pop("acquired")
-        rate = {"bytes_per_second": self.bytes / self.seconds, "records": acquired}
-        return {"seconds": self.seconds, **rate, **known}
 
 
 def measure_throughput(

@@ -16,7 +16,7 @@ import threading
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
@@ -79,7 +79,7 @@ class Codec(abc.ABC):
     @property
     def settings(self) -> Mapping[str, Scalar]:
         """Arguments that build this codec again."""
-        return {}
+        return asdict(self) if is_dataclass(self) else {}
 
     def count_complete_bytes(self, data: ByteView) -> int:
         """Return how many bytes at the front of `data` form whole records."""

@@ -149,10 +149,4 @@ def record(
     limit = math.inf if seconds is None else seconds
     with show_share("recording", seconds) as watch:
         done = record_source(devices.open(uri), out, limit, past, watch, may_replace())
-    figures = done.stats.as_dict()
-    rate = {
-        "bytes": done.bytes,
-        "bytes_per_second": done.bytes / done.seconds,
-        "records": figures.pop("acquired"),
-    }
-    report({"seconds": done.seconds, **rate, **figures}, as_json, [out])
+    report({"seconds": done.seconds, "bytes": done.bytes, **done.figures}, as_json, [out])
