@@ -5,7 +5,7 @@ filtered with a virtual pulse, or of the signal itself, whose sum a Laplacian th
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -103,26 +103,18 @@ class Backprojection(PhasorMethod):
         return VirtualPulse(self.wavelength, self.cycles)
 
     def plan(self, capture: Capture, grid: Grid) -> BackprojectionPlan:
-        band = Band(self.pulse, capture.axis)
         require_imageable(capture, grid)
-        pulse = {"wavelength_m": self.wavelength, "cycles": self.cycles}
-        settings = {"method": "backprojection", **pulse}
-        return BackprojectionPlan(capture, grid, band, self.weighting, settings)
+        return BackprojectionPlan(capture, grid, self)
 
 
 class BackprojectionPlan(PhasorPlan):
     """Back-projection with a virtual pulse, ready for captures of one geometry."""
 
-    def __init__(
-        self,
-        capture: Capture,
-        grid: Grid,
-        band: Band,
-        weighting: Weighting,
-        settings: Mapping[str, Any],
-    ) -> None:
+    def __init__(self, capture: Capture, grid: Grid, method: Backprojection) -> None:
         super().__init__(capture, grid)
-        self.band, self.weighting, self.settings = band, weighting, dict(settings)
+        self.band, self.weighting = Band(method.pulse, capture.axis), method.weighting
+        pulse = {"wavelength_m": method.wavelength, "cycles": method.cycles}
+        self.settings: dict[str, Any] = {"method": "backprojection", **pulse}
         self.cost = len(capture.points) * grid.size  # look-ups
         self.memory_bytes += TABLE_COPIES * TABLE_BYTES
 
@@ -137,9 +129,8 @@ class BackprojectionPlan(PhasorPlan):
         def apply_filter(traces: NDArray[np.float32]) -> Waveforms:
             return band.waveforms(band.compute_phasors(traces))
 
-        total = backproject_signals(
-            capture, grid, apply_filter, band.sample_count, weighting, progress
-        )
+        samples = band.sample_count
+        total = backproject_signals(capture, grid, apply_filter, samples, weighting, progress)
         return Volume(total, grid, history)
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nlos.band import Band
 from nlos.capture import Capture
 from nlos.illumination import (
     choose_band_for_paths,
@@ -29,10 +28,10 @@ from nlos.method import (
     require_numpy_signal,
 )
 from nlos.phasor.arrays import ArrayLibrary
-from nlos.phasor.plan import GroupPlan, Hybrid, PlanarRSD, plan_groups, require_even_grid
+from nlos.phasor.plan import Hybrid, PlanarRSD, plan_groups, require_even_grid
 from nlos.phasor.propagate import choose_backend
 from nlos.phasor.to_depths import DepthPropagator
-from nlos.volume import Grid, Volume
+from nlos.volume import AXES, Grid, Volume
 from tofclip.arrays import Array, FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
@@ -122,21 +121,14 @@ class TransientVideo:
     def __post_init__(self) -> None:
         scene = self.grid.shape
         if self.values.shape not in ((self.times.size, *scene), (self.times.size, *scene[1:])):
-            raise ShapeError(
-                "a transient video",
-                f"(t, [z,] y, x) of {self.times.size} x {scene}",
-                self.values.shape,
-            )
+            wanted = f"(t, [z,] y, x) of {self.times.size} x {scene}"
+            raise ShapeError("a transient video", wanted, self.values.shape)
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
-        axes = {name: Field(getattr(self.grid, name), "m", (name,)) for name in ("z", "y", "x")}
-        names = ("time", "z", "y", "x") if self.values.ndim == 4 else ("time", "y", "x")
-        fields = {
-            "values": Field(self.values, "", names),
-            "time": Field(self.times, "s", ("time",)),
-            **axes,
-        }
+        axes = {name: Field(getattr(self.grid, name), "m", (name,)) for name in AXES}
+        values = Field(self.values, "", ("time", *AXES[-self.values.ndim + 1 :]))
+        fields = {"values": values, "time": Field(self.times, "s", ("time",)), **axes}
         return Record("transient video", fields, provenance=self.provenance)
 
     @classmethod
@@ -145,9 +137,8 @@ class TransientVideo:
         dimensions = record.fields["values"].values.ndim if "values" in record.fields else 4
         x, y, z = (record.array(name, np.float64, 1, "m") for name in "xyz")
         values = record.array("values", np.float32, dimensions)
-        return cls(
-            values, record.array("time", np.float64, 1, "s"), Grid(x, y, z), record.provenance
-        )
+        times = record.array("time", np.float64, 1, "s")
+        return cls(values, times, Grid(x, y, z), record.provenance)
 
     def save(self, path: str | Path) -> None:
         """Write the video to an HDF5 file ``path``, whole or not at all."""
@@ -186,19 +177,6 @@ class TransientImaging:
     """
 
     method: PlanarRSD | Hybrid
-
-    def _plan_group(self, capture: Capture, grid: Grid, band: Band) -> GroupPlan:
-        """Return the road of the one laser spot's light to the voxels; see `PlanarRSD.plan`."""
-        require_numpy_signal("imaging in time", capture)
-        spots = group_by_illumination(capture)
-        if len(spots) > 1 or spots[0].laser is None:
-            raise InputError(
-                "pictures in time need one laser spot, whose flash passes through the scene; a scan of spots has none"
-            )
-        require_imageable(capture, grid)
-        require_even_grid(grid)
-        (group,) = plan_groups(self.method, capture, grid, band, choose_backend(capture, band))
-        return group
 
     def video(
         self, capture: Capture, grid: Grid, times: ArrayLike, progress: Progress = ignore_progress
@@ -334,16 +312,22 @@ class TransientImaging:
         # A band in which no voxel sees an echo of the record at any of the instants.
         nearest, farthest = find_leg_bounds(capture.points, grid)
         earliest, latest = SPEED_OF_LIGHT * instants.min(), SPEED_OF_LIGHT * instants.max()
-        band = choose_band_for_paths(
-            capture.axis, self.method.pulse, earliest + nearest, latest + farthest
-        )
-        group = self._plan_group(capture, grid, band)
+        ends = earliest + nearest, latest + farthest
+        band = choose_band_for_paths(capture.axis, self.method.pulse, *ends)
+        require_numpy_signal("imaging in time", capture)
+        spots = group_by_illumination(capture)
+        if len(spots) > 1 or spots[0].laser is None:
+            raise InputError(
+                "pictures in time need one laser spot, whose flash passes through the scene; a scan of spots has none"
+            )
+        require_imageable(capture, grid)
+        require_even_grid(grid)
+        (group,) = plan_groups(self.method, capture, grid, band, choose_backend(capture, band))
         warn_of_aliasing(capture, band)
         depths = DepthPropagator(group.plane_to_depths, ArrayLibrary())
         spectrum = depths.to_waves(group.wall_to_plane(capture, ignore_progress, group.group))
-        turns = np.exp(1j * SPEED_OF_LIGHT * np.outer(band.wavenumbers, instants)).astype(
-            np.complex64
-        )
+        turns = np.exp(1j * SPEED_OF_LIGHT * np.outer(band.wavenumbers, instants))
+        turns = turns.astype(np.complex64)
 
         def process_block(planes: slice) -> None:
             for depth in range(planes.start, planes.stop):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,7 @@ class NamedArrays(Archive):
 
 def read_hdf5(path: str | Path) -> NamedArrays:
     """List all arrays of an HDF5 file; groups become names with dots."""
-    return NamedArrays(path, lambda opened: _list_hdf5_entries(opened, False))
+    return NamedArrays(path, partial(_list_hdf5_entries, matlab=False))
 
 
 def read_matlab(path: str | Path) -> NamedArrays:
@@ -67,7 +67,7 @@ def read_matlab(path: str | Path) -> NamedArrays:
     with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(MATLAB_HEADER_BYTES + len(HDF5_SIGNATURE))
     if start[MATLAB_HEADER_BYTES:] == HDF5_SIGNATURE:
-        return NamedArrays(path, lambda opened: _list_hdf5_entries(opened, True))
+        return NamedArrays(path, partial(_list_hdf5_entries, matlab=True))
     return NamedArrays(path, _list_mat_entries)
 
 
@@ -85,31 +85,26 @@ def _list_hdf5_entries(path: Path, matlab: bool) -> Entries:
         if not item.dtype.hasobject:
             require_bounded_dataset(item, path)
         shape = tuple(n for n in item.shape[::-1] if n != 1) if matlab else item.shape
-        load = _make_hdf5_loader(path, name, matlab)
-        entries[name.replace("/", ".")] = ArchiveEntry(shape, item.dtype, load)
+        entry = ArchiveEntry(shape, item.dtype, partial(_load_hdf5, path, name, matlab))
+        entries[name.replace("/", ".")] = entry
 
     with h5py.File(path, "r") as file:
         file.visititems(note)  # which follows no links
     return entries
 
 
-def _make_hdf5_loader(path: Path, name: str, matlab: bool) -> Callable[[], NDArray[Any]]:
-    def load() -> NDArray[Any]:
-        import h5py
+def _load_hdf5(path: Path, name: str, matlab: bool) -> NDArray[Any]:
+    import h5py
 
-        with h5py.File(path, "r") as file:
-            values = np.asarray(file[name][()])
-        return np.squeeze(values.T) if matlab else values
+    with h5py.File(path, "r") as file:
+        values = np.asarray(file[name][()])
+    return np.squeeze(values.T) if matlab else values
 
-    return load
+
+def _squeeze(entry: ArchiveEntry) -> ArchiveEntry:
+    shape = tuple(n for n in entry.shape if n != 1)
+    return ArchiveEntry(shape, entry.dtype, lambda: np.squeeze(entry.load()))
 
 
 def _list_mat_entries(path: Path) -> Entries:
-    return {
-        name: ArchiveEntry(
-            tuple(n for n in entry.shape if n != 1),
-            entry.dtype,
-            lambda load=entry.load: np.squeeze(load()),  # type: ignore[misc]
-        )
-        for name, entry in list_mat_entries(path).items()
-    }
+    return {name: _squeeze(entry) for name, entry in list_mat_entries(path).items()}

@@ -17,7 +17,6 @@ Graph. 33, 177 (2014).)
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +29,7 @@ from nlos.capture import Capture
 from nlos.io import labs
 from nlos.io.arrays import NamedArrays, read_hdf5, read_matlab
 from tofclip.errors import FileFormatError
-from tofclip.files import format_error_line
+from tofclip.files import read_toml
 from tofclip.io.light_fields import read_exr_parts
 from tofclip.plugins import Parts, Reader, read_by_signature
 from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance
@@ -122,13 +121,9 @@ def read_capture(path: str | Path) -> Capture:
 
 
 def _read_file(path: str | Path) -> Capture:
-    capture: Capture = read_by_signature(
-        READERS,
-        path,
-        lambda reader: reader.read(Path(path)),
-        "a capture of a known format (HDF5, .npz, .mat, or a folder of EXR files)",
-    )
-    return capture
+    kinds = "a capture of a known format (HDF5, .npz, .mat, or a folder of EXR files)"
+    found: Capture = read_by_signature(READERS, path, lambda one: one.read(Path(path)), kinds)
+    return found
 
 
 def _read_archive(path: Path) -> Capture:
@@ -181,20 +176,21 @@ def read_streak_folder(folder: str | Path) -> Capture:
     if not files:
         raise FileFormatError(folder, "is a folder without EXR files: no capture")
     rows = [_read_picture(file) for file in files]
+    size = rows[0].shape
     for file, row in zip(files, rows, strict=True):
-        if row.shape != rows[0].shape:
-            raise FileFormatError(
-                file, f"is {row.shape} pixels, but {files[0].name} is {rows[0].shape}"
-            )
+        if row.shape != size:
+            raise FileFormatError(file, f"is {row.shape} pixels, but {files[0].name} is {size}")
     geometry = _read_geometry(folder / GEOMETRY_FILE)
     signal = np.moveaxis(np.stack(rows), 2, 0)
-    corners = _read_numbers(folder, geometry, "wall_corners_m", (3, 3))
-    wall = _build_wall(corners, signal.shape[1:])
-    laser = (
-        wall
-        if geometry["laser_m"] == CONFOCAL_LASER
-        else _read_numbers(folder, geometry, "laser_m", (3,))
+    corner, *ends = _read_numbers(folder, geometry, "wall_corners_m", (3, 3))
+    right, down = (
+        np.linspace(0, 1, n)[:, np.newaxis] * (end - corner)
+        for n, end in zip(signal.shape[:0:-1], ends, strict=True)
     )
+    wall = corner + right + down[:, np.newaxis]
+    laser = wall
+    if geometry["laser_m"] != CONFOCAL_LASER:
+        laser = _read_numbers(folder, geometry, "laser_m", (3,))
     bin_width, start = (
         float(_read_numbers(folder, geometry, name, ())) for name in ("bin_width_ps", "start_m")
     )
@@ -208,33 +204,22 @@ def _parse_file_number(path: Path) -> tuple[list[int], str]:
 def _read_picture(path: Path) -> NDArray[np.float32]:
     """Brightness (column, t): mean of all channels but alpha and depth."""
     parts = read_exr_parts(path)
-    channels = {name: pixels.astype(np.float32) for name, pixels in parts[0][1].items()}
-    colours = [
-        pixels for name, pixels in channels.items() if name.split(".")[-1] in ("R", "G", "B", "Y")
-    ]
+    channels = parts[0][1]
+    colours = [channels[name] for name in channels if name.split(".")[-1] in ("R", "G", "B", "Y")]
     if not colours:
-        raise FileFormatError(
-            path, f"holds the channels {', '.join(channels)}, none of which is R, G, B or Y"
-        )
+        names = ", ".join(channels)
+        raise FileFormatError(path, f"holds the channels {names}, none of which is R, G, B or Y")
     return np.asarray(np.mean(colours, axis=0, dtype=np.float32))
 
 
 def _read_geometry(path: Path) -> Mapping[str, Any]:
+    known = ", ".join(sorted(GEOMETRY_KEYS))
     if not path.is_file():
-        raise FileFormatError(
-            path.parent,
-            f"has EXR files but no {GEOMETRY_FILE} with {', '.join(sorted(GEOMETRY_KEYS))}",
-        )
-    try:
-        geometry = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
-        raise FileFormatError(path, f"is not TOML ({format_error_line(fault)})") from fault
+        raise FileFormatError(path.parent, f"has EXR files but no {GEOMETRY_FILE} with {known}")
+    geometry = read_toml(path, "a wall's geometry")
     if set(geometry) != GEOMETRY_KEYS:
         wrong = ", ".join(sorted(set(geometry) ^ GEOMETRY_KEYS))
-        raise FileFormatError(
-            path,
-            f"must hold exactly {', '.join(sorted(GEOMETRY_KEYS))}; lacking or unknown: {wrong}",
-        )
+        raise FileFormatError(path, f"must hold exactly {known}; lacking or unknown: {wrong}")
     return geometry
 
 
@@ -251,12 +236,3 @@ def _read_numbers(
             f"{name} must be numbers of shape {shape}, found {geometry[name]}",
         )
     return values
-
-
-def _build_wall(corners: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    top_left, top_right, bottom_left = corners
-    down, right = (np.linspace(0, 1, n) for n in shape)
-    across = right[:, np.newaxis] * (top_right - top_left)
-    return np.asarray(
-        top_left + across + down[:, np.newaxis, np.newaxis] * (bottom_left - top_left)
-    )

@@ -8,6 +8,7 @@ in which order, is written once, in `nlos.phasor.plan`. `nlos.propagate` gives t
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -18,10 +19,8 @@ from nlos.capture import Capture
 from nlos.illumination import IlluminationGroup, build_waves, find_leg_bounds, group_by_illumination
 from nlos.method import Progress, ignore_progress, require_numpy_signal
 from nlos.phasor.arrays import ArrayLibrary, BandTransform, arrange_on_lattice, get_traces
-from nlos.phasor.depth_steps import DiffractionPlan
 from nlos.phasor.to_depths import PortableDiffraction
-from nlos.phasor.to_depths_compiled import CompiledDiffraction, LaserSource
-from nlos.phasor.transfer import SphericalWaves
+from nlos.phasor.to_depths_compiled import CompiledDiffraction
 from nlos.phasor.wall_kernels import shift_and_sum
 from nlos.phasor.wall_to_plane import WallBeforePlane
 from nlos.phasor.wall_to_plane_arrays import PortablePropagation
@@ -46,12 +45,11 @@ POINTS_PER_BLOCK = 64
 class CompiledBackend:
     """Compiled loops on NumPy's arrays."""
 
+    propagate_phasors, plane_to_depths = CompiledPropagation, CompiledDiffraction
+    zeros = staticmethod(partial(np.zeros, dtype=np.complex64))
+
     def __init__(self, band: Band) -> None:
         self.band = band
-
-    def zeros(self, shape: tuple[int, ...]) -> Array:
-        """Make complex64 zeros."""
-        return np.zeros(shape, np.complex64)
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
         """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
@@ -63,23 +61,15 @@ class CompiledBackend:
         """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
         return lattice.place(phasors)
 
-    def propagate_phasors(
-        self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float
-    ) -> CompiledPropagation:
-        """Return what carries phasors from wall points onto a plane."""
-        return CompiledPropagation(geometry, waves, tolerance)
-
-    def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> CompiledDiffraction:
-        """Return what carries fields from the plane of `plan` to all depths."""
-        return CompiledDiffraction(plan, source)
-
 
 class PortableBackend:
     """Matrix products on the arrays of any library, where a capture's signal lives."""
 
     def __init__(self, band: Band, capture: Capture) -> None:
-        self.library = ArrayLibrary(capture.device)
-        self.zeros = self.library.zeros
+        self.library = library = ArrayLibrary(capture.device)
+        self.zeros = library.zeros
+        self.propagate_phasors = partial(PortablePropagation, library=library)
+        self.plane_to_depths = partial(PortableDiffraction, library=library)
         self._transform = BandTransform(band, capture.axis.bins, self.library)
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
@@ -91,16 +81,6 @@ class PortableBackend:
         xp = self.library.xp
         placed = arrange_on_lattice(xp.permute_dims(phasors, (1, 0)), lattice, self.library)
         return xp.permute_dims(placed, (1, 2, 0))
-
-    def propagate_phasors(
-        self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float
-    ) -> PortablePropagation:
-        """Return what carries phasors from wall points onto a plane."""
-        return PortablePropagation(geometry, waves, tolerance, self.library)
-
-    def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> PortableDiffraction:
-        """Return what carries fields from the plane of `plan` to all depths."""
-        return PortableDiffraction(plan, source, self.library)
 
 
 Backend = CompiledBackend | PortableBackend

@@ -359,9 +359,8 @@ class LaserSource:
         if self.laser is not None:
             # beyond the spot all light goes forward
             cosines = (0.0 if plan.grid.z[0] >= self.laser[2] else -1.0, 1.0)
-        spectrum = AxialSpectrum.of(
-            plan.waves.wavenumbers, self.strength, self.centre_wavenumber, cosines
-        )
+        waves = plan.waves.wavenumbers, self.strength, self.centre_wavenumber
+        spectrum = AxialSpectrum.of(*waves, cosines)
         return choose_depths(plan.grid.z, spectrum, DEPTH_ERROR_FRACTION * plan.tolerance)
 
     def illuminate_plane(self, plan: DiffractionPlan, depth: float) -> Illumination:
@@ -398,7 +397,6 @@ class CompiledDiffraction:
     def __init__(self, plan: DiffractionPlan, source: LaserSource) -> None:
         self.plan, self.source = plan, source
         self.groups = WaveGroups(plan.plane_waves)
-        self.table_bytes = 0
         self._spare: list[_Workspace] = []
 
     def for_laser(self, laser: FloatArray | None) -> CompiledDiffraction:
@@ -425,7 +423,7 @@ class CompiledDiffraction:
                 values, plan.plane, (float(plan.grid.y[0]), float(plan.grid.x[0]))
             )
             # What threads share is made before they start.
-            self.table_bytes = self.table_bytes or plan.transfer.tabulate()
+            plan.transfer.tabulate()
             lights, interpolation = self._lights, self._interpolation
             nodes, blocks = self._depths.nodes, self._depths.blocks
             computed = np.zeros((nodes.size, *total.shape[1:]), np.complex64) if blocks else total

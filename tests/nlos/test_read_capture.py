@@ -476,7 +476,7 @@ def test_exr_streaks(tmp_path: Path) -> None:
         (GEOMETRY.replace("16.0", '"fast"'), "bin_width_ps must be numbers"),
         (GEOMETRY.replace("0.12, 0.05, 0.0", "0.12"), "laser_m must be numbers of shape"),
         (GEOMETRY.replace(", [-0.6, 0.5, 0]", ""), "wall_corners_m must be numbers"),
-        ("bin_width_ps = ", "is not TOML"),
+        ("bin_width_ps = ", "is not a TOML file"),
     ],
 )
 def test_exr_geometry_is_checked(geometry: str, problem: str, tmp_path: Path) -> None:
