@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import shutil
-import signal
-import subprocess
-import sys
-import time
-from functools import partial
 from pathlib import Path
 
 import pytest
 
 import devices
-import tofclip
 from devices import registry
 from devices.recorder import record_source
 from devices.recording.check import verify
 from tofclip.plugins import Parts
 
 SIM = "sim+timetag://?seed=1&pace=realtime&rate=1e6"
-ROOT = Path(tofclip.__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -109,22 +102,3 @@ def test_a_recording_is_not_overwritten_unless_asked(shell, recording):
     assert path.read_bytes() == before
     assert shell(f"{line} --overwrite").status == 0
     assert path.read_bytes() != before
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_leaves_a_whole_recording(tmp_path, number):
-    path = tmp_path / "run.h5"
-    command = [sys.executable, "-m", "tofclip", "record", SIM, "--out", str(path)]
-    # A shell that puts the tests into the background has them ignore Ctrl-C, and children inherit
-    # that.
-    heed = partial(signal.signal, number, signal.SIG_DFL)
-    recorder = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, preexec_fn=heed)
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and not (path.exists() and verify(path).records):
-        time.sleep(0.05)
-    recorder.send_signal(number)
-    _, said = recorder.communicate(timeout=60)
-    assert recorder.returncode == 130
-    assert b"interrupted" in said
-    found = verify(path)
-    assert (found.is_sound, found.complete, found.fault) == (True, True, "interrupted")

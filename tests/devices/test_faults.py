@@ -36,7 +36,6 @@ from tofclip.errors import (
     DeviceError,
     DeviceStalledError,
     DeviceTimeoutError,
-    InputError,
 )
 
 RECORDS, FRAMES = 8000, 25
@@ -245,14 +244,6 @@ def test_random_faults_of_cameras(seeds: range) -> None:
     assert sum(one.stats.lost_device > 0 for one in outcomes) > 3
 
 
-def test_without_faults_everything_arrives_as_it_was() -> None:
-    outcome = run_tagger((), 7)
-    assert outcome.fault is None
-    np.testing.assert_array_equal(joined(outcome.batches), true_records(7, RECORDS))
-    assert outcome.stats.acquired == outcome.stats.delivered == RECORDS
-    assert not any(batch.after_gap for batch in outcome.batches)
-
-
 def test_short_transfers_single_stalls_and_timeouts_lose_nothing() -> None:
     stats = run_tagger(Fault.parse("short@3:7,stall@5,timeout@8,short@9:1"), 1).stats
     assert (stats.delivered, stats.malformed, stats.lost_device) == (RECORDS, 0, 0)
@@ -301,13 +292,6 @@ def test_losses_are_told_apart() -> None:
     assert 50 + 85 <= stats.lost_device <= 50 + 87
     assert 9 <= stats.malformed <= 10
     assert [batch.after_gap for batch in outcome.batches].count(True) == 1
-
-
-def test_scripts_are_read_from_text() -> None:
-    assert Fault.parse("stall@3,unplug@10:2") == (Fault(3, "stall"), Fault(10, "unplug", 2))
-    for text in ("boom@3", "stall", "stall@x", "stall@3:-1"):
-        with pytest.raises(InputError, match="is not a fault"):
-            Fault.parse(text)
 
 
 PICTURES = 80

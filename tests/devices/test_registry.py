@@ -11,6 +11,7 @@ import devices
 from devices import registry
 from devices.address import Uri
 from devices.source import Batch, Info, Source, Stats
+from devices.transients import read_transient
 from tofclip.errors import InputError
 
 TABLE = (Path(__file__).parent / "refusals.txt").read_text(encoding="utf-8").splitlines()
@@ -39,23 +40,13 @@ def open_nothing(uri: Uri) -> Nothing:
 def test_an_address_that_opens_nothing_says_why(line: str) -> None:
     address, said = line.split(" -> ")
     with pytest.raises(InputError) as caught:
-        devices.open(address)
+        read_transient(address)
     message = str(caught.value)
     assert re.search(said, message)
     assert "\n" not in message
 
 
-def test_public_names_are_importable() -> None:
-    for name in devices.__all__:
-        assert getattr(devices, name) is not None
-    assert set(devices.__all__) <= set(dir(devices))
-    with pytest.raises(AttributeError):
-        _ = devices.absent
-
-
-def test_everything_in_the_tables_exists() -> None:
-    assert all(callable(part) for part in registry.SOURCES.values())
-    assert all(callable(finder) for finder in registry.FINDERS.values())
+def test_a_codec_has_the_name_by_which_a_recording_asks_for_it() -> None:
     assert all(codec.name == name for name, codec in registry.CODECS.items())
     with pytest.raises(InputError, match="unknown codec 'absent'"):
         registry.build_codec("absent", {})
