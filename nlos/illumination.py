@@ -6,7 +6,6 @@ finely enough for it.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,12 +17,9 @@ from nlos.phasor.to_depths_compiled import LaserSource
 from nlos.phasor.transfer import SphericalWaves
 from nlos.volume import Grid
 from tofclip.arrays import FloatArray
-from tofclip.errors import InputError
 
 # Of the wall's width: nearer to each other, a laser spot and a wall point are one.
 SAME_SPOT_FRACTION = 1e-6
-# With fewer wall points per laser spot, a wave from each spot is not worth its own field.
-MIN_POINTS_PER_SPOT = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,25 +81,6 @@ def group_by_illumination(capture: Capture) -> list[IlluminationGroup]:
         IlluminationGroup(sorted_spots[begin], np.sort(members))
         for begin, members in zip(begins, np.split(order, begins[1:]), strict=True)
     ]
-
-
-def gather_by_points(
-    capture: Capture, groups: Sequence[IlluminationGroup]
-) -> list[list[IlluminationGroup]]:
-    """Gather the groups that share their wall points: one plan serves them all."""
-    found: dict[bytes, list[IlluminationGroup]] = {}
-    for group in groups:
-        found.setdefault(capture.points[group.indices].tobytes(), []).append(group)
-    return list(found.values())
-
-
-def require_few_spots(capture: Capture, groups: Sequence[IlluminationGroup]) -> None:
-    """Refuse a capture whose laser spots each lit too few points for a field of their own."""
-    if len(groups) * MIN_POINTS_PER_SPOT > len(capture.points):
-        raise InputError(
-            f"{len(groups)} laser spots for {len(capture.points)} wall points: a field per spot needs at least "
-            f"{MIN_POINTS_PER_SPOT} points each; image such pairs by back-projection"
-        )
 
 
 def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> SphericalWaves:

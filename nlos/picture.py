@@ -65,9 +65,22 @@ def _draw_figure(volume: Volume) -> Figure:
         front, side, top, depth_map = panels.ravel()
         bar: dict[str, Any] = {"location": "bottom", "shrink": 0.8}
         views = [front, side, top] if len(rows) == 1 else [front, top]
-        drawn = _draw_views(volume, front, side, top)
+        x, y, z = volume.grid.x, volume.grid.y, volume.grid.z
+        seen, down = volume.magnitude, "y (m), down"
+        seen = seen / (seen.max() or 1.0)
+        _draw_picture(side, "side: wall left", seen.max(axis=2).T, (z, y), ("z (m)", down))
+        _draw_picture(top, "top: wall above", seen.max(axis=1), (x, z), ("x (m)", "z (m)"))
+        title, labels = "front: from the wall", ("x (m)", down)
+        drawn = _draw_picture(front, title, seen.max(axis=0), (x, y), labels)
         figure.colorbar(drawn, ax=views, label="relative brightness", aspect=30, **bar)
-        drawn = _draw_depth(volume, depth_map)
+        title = f"depth above {DEPTH_THRESHOLD:.0%} about it"
+        drawn = _draw_picture(depth_map, title, map_depths(volume), (x, y), labels, None)
+        drawn.set_cmap(DEPTH_COLOUR_MAP)
+        nearest, furthest = drawn.get_clim()
+        if nearest is not None and furthest is not None:
+            middle, voxel = (nearest + furthest) / 2, float(z[-1] - z[0]) / max(z.size - 1, 1)
+            reach = max(furthest - nearest, MIN_DEPTH_SPAN_VOXELS * voxel) / 2
+            drawn.set_clim(middle - reach, middle + reach)
         others = [depth_map] if len(rows) == 1 else [side, depth_map]
         figure.colorbar(drawn, ax=others, label="z (m)", ticks=MaxNLocator(4), **bar)
         figure.suptitle(_describe_imaging(volume))
@@ -92,18 +105,6 @@ def _describe_imaging(volume: Volume) -> str:
     return ", ".join(said)
 
 
-def _draw_views(volume: Volume, front: Axes, side: Axes, top: Axes) -> AxesImage:
-    x, y, z = volume.grid.x, volume.grid.y, volume.grid.z
-    magnitude = volume.magnitude
-    magnitude = magnitude / (magnitude.max() or 1.0)
-    front.set_title("front: from the wall")
-    side.set_title("side: wall left")
-    top.set_title("top: wall above")
-    _draw_picture(side, magnitude.max(axis=2).T, (z, y), ("z (m)", "y (m), down"))
-    _draw_picture(top, magnitude.max(axis=1), (x, z), ("x (m)", "z (m)"))
-    return _draw_picture(front, magnitude.max(axis=0), (x, y), ("x (m)", "y (m), down"))
-
-
 def map_depths(volume: Volume) -> NDArray[np.float64]:
     """Depth of every column's brightest voxel (y, x), m; NaN where that is weak at its depth."""
     from scipy.ndimage import maximum_filter1d
@@ -115,24 +116,9 @@ def map_depths(volume: Volume) -> NDArray[np.float64]:
     return np.where(projection.brightness < own, np.nan, projection.depth)
 
 
-def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
-    depth = map_depths(volume)
-    axes.set_title(f"depth above {DEPTH_THRESHOLD:.0%} about it")
-    drawn = _draw_picture(
-        axes, depth, (volume.grid.x, volume.grid.y), ("x (m)", "y (m), down"), None
-    )
-    drawn.set_cmap(DEPTH_COLOUR_MAP)
-    nearest, furthest = drawn.get_clim()
-    if nearest is not None and furthest is not None:
-        middle, z = (nearest + furthest) / 2, volume.grid.z
-        voxel = float(z[-1] - z[0]) / max(z.size - 1, 1)
-        reach = max(furthest - nearest, MIN_DEPTH_SPAN_VOXELS * voxel) / 2
-        drawn.set_clim(middle - reach, middle + reach)
-    return drawn
-
-
 def _draw_picture(
     axes: Axes,
+    title: str,
     picture: NDArray[Any],
     coordinates: tuple[NDArray[np.float64], NDArray[np.float64]],
     labels: tuple[str, str],
@@ -143,8 +129,7 @@ def _draw_picture(
     drawn = axes.imshow(
         picture, COLOUR_MAP, vmin=lowest, vmax=brightest, extent=edges, interpolation="nearest"
     )
-    axes.set_xlabel(labels[0])
-    axes.set_ylabel(labels[1])
+    axes.set(title=title, xlabel=labels[0], ylabel=labels[1])
     return drawn
 
 

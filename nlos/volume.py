@@ -381,24 +381,12 @@ class Volume:
         return plot_picture(picture, "seen from the wall", ax, unit="brightness", sides=sides)
 
     def to_xarray(self) -> Any:
-        """Return an `xarray.DataArray` (z, y, x) with places in m as coordinates.
-
-        Raises
-        ------
-        MissingDependencyError
-            xarray is not installed.
-        """
+        """Return an `xarray.DataArray` (z, y, x), places in m as coordinates; needs xarray."""
         axes = {name: (getattr(self.grid, name), "m") for name in AXES}
         return make_data_array(to_numpy(self.values), axes, "brightness", "")
 
     def to_pyvista(self) -> Any:
-        """Return a `pyvista.RectilinearGrid`, places in m, with the magnitude as ``brightness``.
-
-        Raises
-        ------
-        MissingDependencyError
-            PyVista is not installed.
-        """
+        """Return a `pyvista.RectilinearGrid`, places in m, with the magnitude as ``brightness``."""
         axes = self.grid.x, self.grid.y, self.grid.z
         shown = require_package("pyvista").RectilinearGrid(*axes)
         # VTK lists points with x fastest, as a (z, y, x) array lies in memory.
@@ -406,13 +394,7 @@ class Volume:
         return shown
 
     def to_torch(self) -> Any:
-        """Return the values as a PyTorch tensor (z, y, x), which shares NumPy's memory.
-
-        Raises
-        ------
-        MissingDependencyError
-            PyTorch is not installed.
-        """
+        """Return the values (z, y, x) as a PyTorch tensor, sharing memory; needs PyTorch."""
         return require_package("torch").as_tensor(to_numpy(self.values))
 
     def to_record(self) -> Record:

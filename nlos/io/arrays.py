@@ -21,6 +21,10 @@ MATLAB_HEADER_BYTES = 512
 class NamedArrays(Archive):
     """Named arrays of a file in the orders and units that captures come in."""
 
+    def fault(self, problem: str) -> FileFormatError:
+        """What is wrong with the file."""
+        return FileFormatError(self.path, problem)
+
     def read_numbers(self, name: str) -> NDArray[Any]:
         """Return entry `name`, numbers of any shape but an empty one."""
         return self.array(name, *[None] * self._count_axes(name))
@@ -29,10 +33,9 @@ class NamedArrays(Archive):
         """Return signals (rows, columns, t); refuse rows and columns, two equal axes, after time."""
         signal = self.array(name, None, None, None)
         if signal.shape[1] == signal.shape[2] < signal.shape[0]:
-            raise FileFormatError(
-                self.path,
+            raise self.fault(
                 f"{name} of shape {signal.shape} begins with time; put time last: "
-                f"permute({name}, [2 3 1])",
+                f"permute({name}, [2 3 1])"
             )
         return signal
 

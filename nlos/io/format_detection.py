@@ -157,10 +157,8 @@ def _read_fields(fields: NamedArrays, formats: Mapping[tuple[str, ...], FieldRea
             return read(fields)
     known = "; or ".join(", ".join(names) for names in formats)
     found = ", ".join(sorted(fields.names)[:8]) or "nothing"
-    raise FileFormatError(
-        fields.path,
-        f"holds {found}, but a capture needs the fields {known}; "
-        "docs/own_wall.md shows how to write one",
+    raise fields.fault(
+        f"holds {found}, but a capture needs the fields {known}; docs/own_wall.md shows how to write one"
     )
 
 

@@ -92,8 +92,7 @@ def read_curvelet_data(fields: NamedArrays) -> Capture:
         return Capture(counts.T, wall, laser, bin_width)
     whole = bool(np.all(wall == np.round(wall)))
     if whole and float(np.ptp(wall, axis=0).max()) >= MIN_LATTICE_EXTENT:
-        raise FileFormatError(
-            fields.path,
+        raise fields.fault(
             f"has pairs counted in steps of a lattice; it needs {SETUP_FILE} beside it or in the "
             "folder above, which sets c, delta_t, bx, by and bz; see docs/own_wall.md",
         )
@@ -137,8 +136,7 @@ def _read_points(fields: NamedArrays, name: str, pairs: int) -> NDArray[np.float
     """Points (pairs, 3), as they stand in the file of that name beside the signals."""
     path = fields.path.with_name(name)
     if not path.is_file():
-        raise FileFormatError(
-            fields.path,
+        raise fields.fault(
             f"holds sub_Sig of {pairs} pairs; it needs C_i.mat (laser spots) and C_d.mat (wall points) beside it, "
             "see docs/own_wall.md",
         )
@@ -237,7 +235,7 @@ def match_lasers_to_sensors(
     """Find out by the shapes which laser points belong to which sensor points, both (..., 3)."""
     sensors, lasers = sensor.shape[:-1], laser.shape[:-1]
     if not signal.ndim:
-        raise FileFormatError(fields.path, "holds a signal without a time axis")
+        raise fields.fault("holds a signal without a time axis")
     if signal.shape[1:] == sensors and laser.size == 3:
         return Capture(signal, sensor, laser.reshape(3), bin_width, start)
     if signal.shape[1:] == sensors == lasers:
@@ -245,8 +243,7 @@ def match_lasers_to_sensors(
         return Capture(signal, sensor, spots, bin_width, start)
     if signal.shape[1:] == (*lasers, *sensors):
         return Capture.exhaustive(signal, sensor, laser, bin_width, start)
-    raise FileFormatError(
-        fields.path,
+    raise fields.fault(
         f"a signal of shape {signal.shape} belongs neither to {sensors} wall points nor to {lasers} lasers",
     )
 
@@ -275,8 +272,7 @@ def read_numpy_archive(fields: NamedArrays) -> Capture:
     wall, laser = (fields.read_coordinates(f"{name}_xyz") for name in ("wall", "laser"))
     points = wall.shape[:-1]
     if signal.shape[:-1] == points and signal.shape[1:] != points:
-        raise FileFormatError(
-            fields.path,
+        raise fields.fault(
             f"H of shape {signal.shape} ends with time; put time first: np.moveaxis(H, -1, 0)",
         )
     times = next((name for name in ("t_m", "t_s") if name in fields), None)
@@ -299,7 +295,7 @@ def resample_evenly(
     """
     widths = np.diff(paths)
     if len(paths) < 2 or not widths.min() > 0:
-        raise FileFormatError(fields.path, "has times that do not grow from bin to bin")
+        raise fields.fault("has times that do not grow from bin to bin")
     spacing = float(widths.mean())
     if np.abs(widths - spacing).max() <= EVEN_BINS_TOLERANCE * spacing:
         return signal, float(paths[0]), spacing
@@ -308,9 +304,7 @@ def resample_evenly(
     edges = np.concatenate([[paths[0] - widths[0] / 2], middles, [paths[-1] + widths[-1] / 2]])
     bins = max(2, int(np.ceil((edges[-1] - edges[0]) / spacing)))
     if bins > MAX_EVEN_BINS_RATIO * len(paths):
-        raise FileFormatError(
-            fields.path, f"has time bins so uneven that {bins} even ones would be needed"
-        )
+        raise fields.fault(f"has time bins so uneven that {bins} even ones would be needed")
     even = edges[0] + spacing * np.arange(bins + 1)
     resampled = np.moveaxis(rebin(np.moveaxis(signal, 0, -1), edges, even), -1, 0)
     return resampled, float(even[0]) + spacing / 2, spacing
@@ -339,8 +333,7 @@ def read_general_data(fields: NamedArrays) -> Capture:
     own = fields.path.with_name(fields.path.name.replace("data", "setup", 1))
     setup = own if own != fields.path and own.is_file() else fields.path.with_name("setup.mat")
     if not setup.is_file():
-        raise FileFormatError(
-            fields.path,
+        raise fields.fault(
             "holds data; it needs setup.mat beside it, with laserpoints and detectpoints; see docs/own_wall.md",
         )
     beside = read_matlab(setup)
@@ -349,8 +342,7 @@ def read_general_data(fields: NamedArrays) -> Capture:
     )
     stated = next((one for one in (fields, beside) if "timeRes" in one), None)
     if stated is None:
-        raise FileFormatError(
-            fields.path,
+        raise fields.fault(
             "states no bin width; add it in seconds as timeRes to this file or to setup.mat, such as "
             "timeRes = 32e-12; see docs/own_wall.md",
         )
@@ -377,8 +369,7 @@ def read_phasor_field_data(fields: NamedArrays) -> Capture:
     wall, spots = (_read_spots(fields, f"dataset.{name}Pos") for name in ("laser", "camera"))
     data = fields.read_numbers("dataset.data").T
     if "dataset.t" in fields and data.shape[0] != fields.number("dataset.t"):
-        raise FileFormatError(
-            fields.path,
+        raise fields.fault(
             f"'dataset.data' must end with {fields.number('dataset.t'):g} bins, found {data.T.shape}",
         )
     signal = np.ascontiguousarray(data, np.float32)
@@ -406,8 +397,7 @@ def read_rectified_data(fields: NamedArrays) -> Capture:
     wall = np.stack([*np.meshgrid(x, y), np.zeros((rows, columns))], axis=-1)
     column, row = fields.finite_array("SPAD_index", 2).astype(int)
     if not (0 <= column < columns and 0 <= row < rows):
-        raise FileFormatError(
-            fields.path,
+        raise fields.fault(
             f"'SPAD_index' names column {column}, row {row} of {columns} x {rows} points",
         )
     return Capture(np.moveaxis(counts, 2, 0), wall, wall[row, column], fields.number("ts"))
@@ -418,8 +408,7 @@ def _read_spots(fields: NamedArrays, name: str) -> NDArray[np.float64]:
     points = np.atleast_2d(fields.read_numbers(name)).astype(np.float64)
     points = points.T if points.shape[0] == 3 and points.shape[1] != 3 else points
     if points.ndim != 2 or points.shape[1] != 3:
-        raise FileFormatError(
-            fields.path,
+        raise fields.fault(
             f"field '{name}' must hold points in three dimensions, found {points.shape}",
         )
     return points
@@ -464,9 +453,7 @@ def _add_up_bounces(fields: NamedArrays, first: bool) -> NDArray[np.float32]:
     """Signal (t, lasers..., points...) of all colours and bounces; a lone laser has no axes."""
     data = fields.read_numbers("data")
     if data.ndim not in (CONFOCAL_AXES, EXHAUSTIVE_AXES):
-        raise FileFormatError(
-            fields.path, f"field 'data' must have 5 or 7 axes, found shape {data.shape}"
-        )
+        raise fields.fault(f"field 'data' must have 5 or 7 axes, found shape {data.shape}")
     if first:
         # (colour, t, bounce, camera..., laser...)
         signal = data.sum(axis=(0, 2), dtype=np.float32)
@@ -483,7 +470,7 @@ def _read_point_grid(fields: NamedArrays, name: str, first: bool) -> NDArray[np.
     grid = fields.read_numbers(name).astype(np.float64)
     grid = np.moveaxis(grid, 0, -1) if first else grid
     if grid.shape[-1] != 3:
-        raise FileFormatError(
-            fields.path, f"field '{name}' must hold points in three dimensions, found {grid.shape}"
+        raise fields.fault(
+            f"field '{name}' must hold points in three dimensions, found {grid.shape}"
         )
     return grid

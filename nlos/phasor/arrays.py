@@ -23,25 +23,14 @@ CPU_CHUNK_BYTES, GPU_CHUNK_BYTES = 8 << 20, 256 << 20
 
 @dataclass(frozen=True)
 class ArrayLibrary:
-    """A library at one place, computing in single precision unless told otherwise."""
+    """A library at one place, computing in single precision."""
 
     device: ComputeDevice = field(default_factory=ComputeDevice)
-    double: bool = False
 
     @cached_property
     def xp(self) -> Any:
         """The functions of the array API standard."""
         return namespace(self.device.put(np.zeros(1, np.float32)))
-
-    @cached_property
-    def _dtypes(self) -> dict[str, type]:
-        """Of real and of complex numbers, by NumPy's letters."""
-        names = ("float64", "complex128") if self.double else ("float32", "complex64")
-        return {name[0]: getattr(np, name) for name in names}
-
-    @property
-    def _complex(self) -> Any:
-        return self.xp.complex128 if self.double else self.xp.complex64
 
     @property
     def chunk_bytes(self) -> int:
@@ -49,17 +38,18 @@ class ArrayLibrary:
         return CPU_CHUNK_BYTES if "cpu" in str(self.device.device).lower() else GPU_CHUNK_BYTES
 
     def put(self, values: NDArray[Any]) -> Array:
-        """Bring a NumPy array here, real and complex numbers in the library's precision."""
-        return self.device.put(np.asarray(values, self._dtypes.get(values.dtype.kind)))
+        """Bring a NumPy array here, real and complex numbers in single precision."""
+        single = {"f": np.float32, "c": np.complex64}.get(values.dtype.kind)
+        return self.device.put(np.asarray(values, single))
 
     def zeros(self, shape: tuple[int, ...]) -> Array:
         """Make complex zeros."""
-        return self.xp.zeros(shape, dtype=self._complex, device=self.device.device)
+        return self.xp.zeros(shape, dtype=self.xp.complex64, device=self.device.device)
 
     def exp_cycles(self, cycles: Array) -> Array:
         """Return ``exp(2j * pi * cycles)``, accurate however large the cycles are."""
         angle = 2 * np.pi * (cycles - self.xp.round(cycles))
-        return self.xp.exp(1j * self.xp.astype(angle, self._complex))
+        return self.xp.exp(1j * self.xp.astype(angle, self.xp.complex64))
 
 
 def remove_whole_cycles(cycles: Any) -> NDArray[np.float64]:

@@ -27,9 +27,7 @@ from nlos.illumination import (
     build_waves,
     choose_roles,
     choose_unaliased_band,
-    gather_by_points,
     group_by_illumination,
-    require_few_spots,
     swap_roles,
     warn_of_aliasing,
 )
@@ -64,6 +62,8 @@ from tofclip.errors import InputError
 SUM_BYTES, COMPUTED_BYTES, SIGNAL_BYTES = 8, 8, 4
 # Spectra are held before and after they are transformed.
 SPECTRUM_COPIES = 2
+# With fewer wall points per laser spot, a wave from each spot is not worth its own field.
+MIN_POINTS_PER_SPOT = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,14 +179,16 @@ class ReciprocalPlan(PhasorPlan):
             )
             own = self.swapped.zeros()
             self.swapped.add_to_depths(number, plane_field, own, progress)
-            total += own / device.put(_find_distance(one.group.laser, self.grid))
+            total += own / device.put(find_distance(one.group.laser, self.grid))
         history = {**capture.provenance, "imaging": self.swapped.settings}
         return Volume(total - without, self.grid, history)
 
 
-def _find_distance(spot: FloatArray | None, grid: Grid) -> NDArray[np.float32]:
-    """Distance of every voxel (z, y, x) from a spot, m."""
-    x, y, z = np.zeros(3) if spot is None else spot
+def find_distance(spot: FloatArray | None, grid: Grid) -> NDArray[np.float32]:
+    """Distance of every voxel (z, y, x) from a laser spot, m; 1 without one."""
+    if spot is None:
+        return np.ones(grid.shape, np.float32)
+    x, y, z = spot
     across = (grid.y[:, np.newaxis] - y) ** 2 + (grid.x - x) ** 2
     squared = (grid.z[:, np.newaxis, np.newaxis] - z) ** 2 + across
     return np.asarray(np.sqrt(np.maximum(squared, MIN_DISTANCE_M**2)), np.float32)
@@ -247,9 +249,17 @@ def plan_groups(
 ) -> list[GroupPlan]:
     """Plan the way of every illumination group to the voxels, at a band's frequencies."""
     groups = group_by_illumination(capture)
-    require_few_spots(capture, groups)
+    if len(groups) * MIN_POINTS_PER_SPOT > len(capture.points):
+        raise InputError(
+            f"{len(groups)} laser spots for {len(capture.points)} wall points: a field per spot needs at least "
+            f"{MIN_POINTS_PER_SPOT} points each; image such pairs by back-projection"
+        )
+    # One plan serves all groups that share their wall points.
+    gathered: dict[bytes, list[IlluminationGroup]] = {}
+    for group in groups:
+        gathered.setdefault(capture.points[group.indices].tobytes(), []).append(group)
     plans = []
-    for same in gather_by_points(capture, groups):
+    for same in gathered.values():
         depths, carry, fraction = method._plan_points(capture, same[0], grid, band, backend)
         depths.require_memory()
         plans += [GroupPlan(one, carry, depths, fraction) for one in same]

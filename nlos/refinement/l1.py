@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from nlos.band import Band
 from nlos.capture import Capture
@@ -18,7 +18,7 @@ from nlos.illumination import IlluminationGroup, build_source, choose_roles, war
 from nlos.method import MEMORY_LIMIT_BYTES, Method, Plan, Progress, require_numpy_signal
 from nlos.phasor.arrays import ArrayLibrary
 from nlos.phasor.depth_steps import DiffractionPlan
-from nlos.phasor.plan import Hybrid, WavePlan, plan_waves
+from nlos.phasor.plan import Hybrid, WavePlan, find_distance, plan_waves
 from nlos.phasor.to_depths import PortableDiffraction
 from nlos.phasor.wall_to_plane_compiled import sum_spherical_waves
 from nlos.plane import axis_step
@@ -29,29 +29,9 @@ from tofclip.operators import Diagonal, LinearOperator, Stack
 from tofclip.solvers import Method as Prior
 from tofclip.solvers import Sparse
 from tofclip.solvers.fista import LightFieldVariation
-from tofclip.threads import limit_blas_threads, split_blocks
+from tofclip.threads import limit_blas_threads
 
 Array = NDArray[Any]
-
-# Distances held at a time in double precision: 16 MB of waves.
-PAIRS_PER_BLOCK = 1 << 20
-
-
-def propagate_spherical_waves(
-    sources: FloatArray, values: Array, targets: FloatArray, wavenumbers: FloatArray
-) -> Array:
-    """Return ``sum_s values_k(s) * exp(1j * k * |t - s|) / |t - s|`` (n, frequencies) at targets t,
-    m; its own transpose with sources and targets exchanged. Single precision is good to 1e-5 and
-    quick, double plain.
-    """
-    if values.dtype == np.complex64:
-        return sum_spherical_waves(targets, sources, values, wavenumbers)
-    field = np.empty((len(targets), wavenumbers.size), np.complex128)
-    for some in split_blocks(len(targets), max(1, PAIRS_PER_BLOCK // len(sources))):
-        distance = np.linalg.norm(targets[some, np.newaxis] - sources, axis=-1)
-        for i, k in enumerate(wavenumbers):
-            field[some, i] = (np.exp(1j * k * distance) / distance) @ values[:, i]
-    return field
 
 
 class HiddenToWall(LinearOperator):
@@ -69,14 +49,11 @@ class HiddenToWall(LinearOperator):
         plan: DiffractionPlan,
         group: IlluminationGroup,
         band: Band,
-        dtype: DTypeLike = np.float32,
     ) -> None:
-        super().__init__(plan.grid.shape, (2 * len(points) * plan.waves.count,), dtype)
+        super().__init__(plan.grid.shape, (2 * len(points) * plan.waves.count,), np.float32)
         self.points, self.plane = points, plan.plane
         self.wavenumbers = group.legs * band.wavenumbers
-        self._complex_dtype = np.result_type(self.dtype, np.complex64)
-        library = ArrayLibrary(double=self.dtype == np.float64)
-        self._depths = PortableDiffraction(plan, build_source(group, band), library, True)
+        self._depths = PortableDiffraction(plan, build_source(group, band), ArrayLibrary(), True)
         area = float(np.prod(plan.plane.steps))
         # sqrt(G_k) of the class's formula, and the area that a point of the virtual plane stands
         # for
@@ -91,19 +68,15 @@ class HiddenToWall(LinearOperator):
     def _to_phasors(self, volume: Array) -> Array:
         # the adjoint of a wave that runs out is one that runs in: conjugate, propagate, conjugate
         waves = self._depths.to_plane(volume).reshape(-1, self.wavenumbers.size).conj()
-        phasors = propagate_spherical_waves(
-            self.plane.points.reshape(-1, 3), waves, self.points, self.wavenumbers
-        ).conj()
-        return np.asarray(phasors * self._strength).view(self.dtype).ravel()
+        plane = self.plane.points.reshape(-1, 3)
+        phasors = sum_spherical_waves(self.points, plane, waves, self.wavenumbers).conj()
+        return np.asarray(phasors * self._strength).view(np.float32).ravel()
 
     def _to_volume(self, measurements: Array) -> Array:
-        phasors = (
-            measurements.view(self._complex_dtype).reshape(len(self.points), -1) * self._strength
-        )
+        phasors = measurements.view(np.complex64).reshape(len(self.points), -1) * self._strength
         # the same sum with points and plane exchanged: a wave from r to s is one from s to r
-        waves = propagate_spherical_waves(
-            self.points, phasors, self.plane.points.reshape(-1, 3), self.wavenumbers
-        )
+        plane = self.plane.points.reshape(-1, 3)
+        waves = sum_spherical_waves(plane, self.points, phasors, self.wavenumbers)
         return np.asarray(self._depths.to_volume(waves.reshape(*self.plane.shape, -1)))
 
     def _apply_per_frame(self, work: Callable[[Array], Array], block: Array) -> Array:
@@ -130,20 +103,19 @@ class WallModel:
     capture: Capture  # of the plan's geometry
 
     @cached_property
-    def laser_distance(self) -> FloatArray:
+    def laser_distance(self) -> Array:
         """Mean distance of voxels (z, y, x) from the laser spots, m; 1 of a confocal scan."""
-        return np.asarray(
-            np.mean([self._compute_laser_distance(one.group) for one in self.plan.groups], axis=0)
-        )
+        distances = [find_distance(one.group.laser, self.plan.grid) for one in self.plan.groups]
+        return np.asarray(np.mean(distances, axis=0))
 
-    def operator(self, dtype: DTypeLike = np.float32) -> LinearOperator:
+    def operator(self) -> LinearOperator:
         """Return the operator from albedo over `laser_distance` (z, y, x) to `measurements`."""
         parts = []
         for one in self.plan.groups:
             points = self.capture.points[one.group.indices]
-            bare = HiddenToWall(points, one.plane_to_depths, one.group, self.plan.band, dtype)
-            relative = self.laser_distance / self._compute_laser_distance(one.group)
-            parts.append(bare @ Diagonal(relative, dtype))
+            bare = HiddenToWall(points, one.plane_to_depths, one.group, self.plan.band)
+            relative = self.laser_distance / find_distance(one.group.laser, self.plan.grid)
+            parts.append(bare @ Diagonal(relative))
         return Stack(parts)
 
     def measurements(self) -> Array:
@@ -159,13 +131,6 @@ class WallModel:
             )
             parts.append(phasors.view(np.float32).ravel())
         return np.concatenate(parts)[:, np.newaxis]
-
-    def _compute_laser_distance(self, group: IlluminationGroup) -> FloatArray:
-        if group.laser is None:
-            return np.ones(self.plan.grid.shape)
-        grid = self.plan.grid
-        z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
-        return np.asarray(np.linalg.norm(np.stack([x, y, z], axis=-1) - group.laser, axis=-1))
 
 
 # float32 volumes that the solver holds at once, with the duals of total variation.
