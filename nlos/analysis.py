@@ -174,12 +174,6 @@ class SignalSpectrum:
         return float(energy[~self.early].mean()) / before if before > 0 else np.inf
 
 
-def find_brightest_path(capture: Capture) -> float:
-    """Path, beyond that of the wall's own light, at which most light arrives, m."""
-    late, level = _compute_profile(capture)
-    return float(late[np.argmax(level)])
-
-
 def find_lit_end(capture: Capture) -> bool:
     """Whether light still comes when the record ends, so that its end shows as an edge."""
     traces, _ = _select_traces(capture)
@@ -217,9 +211,9 @@ def require_plausible(capture: Capture) -> None:
         raise InputError(f"signals of {largest:.3g} overflow in single precision; scale them down")
     if largest == 0:
         raise InputError("every signal is 0: there is nothing to image")
-    if float(capture.signal.max()) == float(capture.signal.min()):
-        raise InputError(f"every signal is {largest:.4g}, constant or saturated: nothing to image")
     brightest = float(capture.signal.max())
+    if brightest == float(capture.signal.min()):
+        raise InputError(f"every signal is {largest:.4g}, constant or saturated: nothing to image")
     saturated = float((capture.signal == brightest).sum()) / math.prod(capture.signal.shape)
     if brightest > 0 and saturated > MAX_SATURATED_FRACTION:
         raise InputError(
@@ -302,7 +296,9 @@ def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
     """Carrier of the shortest pulse, of so many cycles, whose whole band a capture carries, m:
     sampled twice along the record and the wall, there four times if both legs grow.
     """
-    return _band_reach(cycles) * max(_sampling_limit(capture), 2 * capture.axis.spacing)
+    pulse = VirtualPulse(1.0, cycles)
+    reach = 1 + pulse.half_band / pulse.wavenumber  # of the band, in wavenumbers of the carrier
+    return reach * max(_sampling_limit(capture), 2 * capture.axis.spacing)
 
 
 def find_longest_wavelength(capture: Capture) -> float:
@@ -322,12 +318,6 @@ def find_sampling_step(capture: Capture) -> float:
     return swapped if math.isfinite(swapped) else 0.0
 
 
-def _band_reach(cycles: float) -> float:
-    """Highest wavenumber of a virtual pulse's band, relative to its carrier."""
-    pulse = VirtualPulse(1.0, cycles)
-    return 1 + pulse.half_band / pulse.wavenumber
-
-
 def _sampling_limit(capture: Capture, sine: float = 1.0) -> float:
     """Shortest wave that the wall samples twice where it arrives under an angle of that sine, m."""
     return sine * find_sampling_step(capture) * (4 if is_confocal(capture) else 2)
@@ -336,7 +326,8 @@ def _sampling_limit(capture: Capture, sine: float = 1.0) -> float:
 def _steepest_angle(capture: Capture) -> float:
     """Sine of the angle at which what is brightest is seen from the far end of the wall."""
     extent = float(np.ptp(capture.points[:, :2], axis=0).max())
-    depth = max(find_brightest_path(capture) / 2, 0.0)
+    late, level = _compute_profile(capture)
+    depth = max(float(late[np.argmax(level)]) / 2, 0.0)
     return extent / math.hypot(extent, depth) if extent > 0 else 1.0
 
 

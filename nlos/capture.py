@@ -332,11 +332,9 @@ class Capture:
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
-        names = (
-            ("row", "column")
-            if self.wall.ndim == 3
-            else tuple(f"wall_{i}" for i in range(self.wall.ndim - 1))
-        )
+        names = tuple(f"wall_{i}" for i in range(self.wall.ndim - 1))
+        if self.wall.ndim == 3:
+            names = ("row", "column")
         fields = {
             "signal": Field(to_numpy(self.signal), "count", ("time", *names)),
             "wall": Field(self.wall, "m", (*names, "xyz")),

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import Capture
+from nlos.illumination import find_leg_bounds
 from nlos.kernels import migrate_row, rebin, shift_signals
 from nlos.method import Method, Plan, Progress, require_imageable, require_numpy_signal
 from nlos.plane import PlanarWall, Plane, axis_step
@@ -44,9 +45,12 @@ class ConfocalScan:
     @classmethod
     def of(cls, capture: Capture, grid: Grid) -> ConfocalScan:
         """Sort a capture onto its lattice, from distance 0, half the path, to the farthest voxel."""
-        wall = PlanarWall.of(capture.points, LATTICE_TOLERANCE)
-        traces = _shift_to_distance_zero(capture, _count_useful_bins(capture, wall.plane, grid))
-        return cls(wall.lattice.place(traces), wall.plane, capture.axis.spacing / 2)
+        wall, spacing = PlanarWall.of(capture.points, LATTICE_TOLERANCE), capture.axis.spacing
+        _, farthest = find_leg_bounds(capture.points, grid)
+        recorded = int(np.ceil(capture.axis.paths[-1] / spacing)) + 1
+        bins = max(2, min(recorded, int(np.ceil(2 * farthest / spacing)) + 2))
+        traces = _shift_to_distance_zero(capture, bins)
+        return cls(wall.lattice.place(traces), wall.plane, spacing / 2)
 
     def correct_falloff(self, falloff: float) -> NDArray[np.float32]:
         """Return the signal times d^falloff, relative to the farthest bin's distance d."""
@@ -70,7 +74,15 @@ class ConfocalPlan(Plan):
         require_imageable(capture, grid)
         super().__init__(capture, grid)
         plane = _require_lattice(capture, grid)
-        self.memory_bytes += _require_memory(capture, plane)
+        places = plane.x.size * plane.y.size
+        bins = capture.axis.bins + max(0, int(capture.start / capture.axis.spacing))
+        needed = 8 * places * bins * BYTES_PER_SAMPLE
+        if needed > MEMORY_LIMIT_BYTES:
+            raise InputError(
+                f"{places} wall points with {bins} bins need {needed / 2**30:.1f} GiB, more than the "
+                f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: put time bins together or leave wall points out"
+            )
+        self.memory_bytes += needed
         self._compute, self.settings = compute, dict(settings)
 
     def _image(self, capture: Capture, progress: Progress) -> Volume:
@@ -140,35 +152,10 @@ def _require_lattice(capture: Capture, grid: Grid) -> Plane:
     return plane
 
 
-def _require_memory(capture: Capture, plane: Plane) -> int:
-    """Return what the transforms take, bytes; refuse more than `MEMORY_LIMIT_BYTES`."""
-    places = plane.x.size * plane.y.size
-    bins = capture.axis.bins + max(0, int(capture.start / capture.axis.spacing))
-    needed = 8 * places * bins * BYTES_PER_SAMPLE
-    if needed > MEMORY_LIMIT_BYTES:
-        raise InputError(
-            f"{places} wall points with {bins} bins need {needed / 2**30:.1f} GiB, more than the "
-            f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: put time bins together or leave wall points out"
-        )
-    return needed
-
-
-def _count_useful_bins(capture: Capture, plane: Plane, grid: Grid) -> int:
-    """Bins from path 0 to the end of the record, or as far as light of the grid can come from."""
-    across = [
-        float(np.abs(wanted[[0, -1], np.newaxis] - axis[[0, -1]]).max())
-        for axis, wanted in ((plane.x, grid.x), (plane.y, grid.y))
-    ]
-    farthest = float(np.linalg.norm([*across, grid.z[-1] - plane.z]))
-    recorded = int(np.ceil(capture.axis.paths[-1] / capture.axis.spacing)) + 1
-    return max(2, min(recorded, int(np.ceil(2 * farthest / capture.axis.spacing)) + 2))
-
-
 def _shift_to_distance_zero(capture: Capture, bins: int) -> NDArray[np.float32]:
     """Signals (points, bins) from path 0 on, by whole bins if that suffices."""
-    delay = capture.start / capture.axis.spacing
+    delay, traces = capture.start / capture.axis.spacing, capture.traces()
     whole = round(delay)
-    traces = capture.traces()
     if abs(delay - whole) > WHOLE_BIN_TOLERANCE:
         by_bin = np.ascontiguousarray(traces.T)
         traces = np.ascontiguousarray(shift_signals(by_bin, np.full(len(traces), whole - delay)).T)

@@ -102,10 +102,8 @@ def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
         from tofclip.lidar.export import Column, write_table
 
         xyz, brightness = extract_points(volume, fraction)
-        places = [
-            Column(name, "m", np.ascontiguousarray(xyz[:, i])) for i, name in enumerate("xyz")
-        ]
-        write_table(path, [*places, Column("brightness", "", brightness)])
+        x, y, z = (Column(n, "m", np.ascontiguousarray(xyz[:, i])) for i, n in enumerate("xyz"))
+        write_table(path, [x, y, z, Column("brightness", "", brightness)])
         return
     require_suffix(path, *WRITERS, *POINT_SUFFIXES)
     with atomic_path(path) as temporary:

@@ -96,9 +96,8 @@ def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:
     axis = _choose_time_axis(wall, laser, truth.positions, settings)
     capture = scene.simulate_capture(wall, laser, axis, settings.jitter)
     if settings.peak_counts is not None:
-        capture = add_poisson_noise(
-            capture, settings.peak_counts, settings.background, settings.seed
-        )
+        noise = settings.peak_counts, settings.background, settings.seed
+        capture = add_poisson_noise(capture, *noise)
     return capture, truth
 
 
@@ -134,9 +133,7 @@ def _build_hidden_scene(settings: SceneSettings) -> tuple[HiddenScene | PointSce
 def _parse_points(text: str) -> list[list[float]]:
     """Read points written as X,Y,Z with semicolons between them."""
     try:
-        points = [
-            [float(number) for number in one.split(",")] for one in text.split(";") if one.strip()
-        ]
+        points = [[*map(float, one.split(","))] for one in text.split(";") if one.strip()]
     except ValueError:
         points = []
     if not points or any(len(point) != 3 or not all(map(math.isfinite, point)) for point in points):
@@ -241,13 +238,9 @@ def compare_with_truth(volume: Volume, truth: HiddenTruth) -> dict[str, float]:
     around, elsewhere = (
         float(magnitude[some].mean()) if some.any() else math.nan for some in (near, ~near)
     )
-    return {
-        "energy_near_truth": float(np.sum(magnitude[near] ** 2)) / energy
-        if energy > 0
-        else math.nan,
-        "contrast_to_truth": around / elsewhere if elsewhere > 0 else math.nan,
-        "truth_reach_m": reach,
-    }
+    share = float(np.sum(magnitude[near] ** 2)) / energy if energy > 0 else math.nan
+    contrast = around / elsewhere if elsewhere > 0 else math.nan
+    return {"energy_near_truth": share, "contrast_to_truth": contrast, "truth_reach_m": reach}
 
 
 def measure_sharpness(volume: Volume) -> float:

@@ -83,9 +83,8 @@ class HiddenToWall(LinearOperator):
         """Treat every frame alone: each is a volume, too large to gain from company."""
         # Depths and targets share the cores already: BLAS threads of its own would fight with ours.
         with limit_blas_threads():
-            return np.stack(
-                [work(np.ascontiguousarray(frame)) for frame in np.moveaxis(block, -1, 0)], axis=-1
-            )
+            frames = np.moveaxis(block, -1, 0)
+            return np.stack([work(np.ascontiguousarray(one)) for one in frames], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +123,9 @@ class WallModel:
         parts = []
         traces = self.capture.traces()
         for group in (one.group for one in self.plan.groups):
-            path_weight = (self.capture.axis.paths ** (group.legs + 1)).astype(np.float32)
-            phasors = np.ascontiguousarray(
-                self.plan.band.compute_phasors(traces[group.indices] * path_weight) / strength,
-                np.complex64,
-            )
-            parts.append(phasors.view(np.float32).ravel())
+            weight = (self.capture.axis.paths ** (group.legs + 1)).astype(np.float32)
+            phasors = self.plan.band.compute_phasors(traces[group.indices] * weight) / strength
+            parts.append(phasors.astype(np.complex64).view(np.float32).ravel())
         return np.concatenate(parts)[:, np.newaxis]
 
 
@@ -210,9 +206,8 @@ class RefinementPlan(Plan):
         warn_of_aliasing(capture, self.hybrid.band)
         model = WallModel(self.hybrid, choose_roles(capture))
         prior, size = self.method.prior, self.grid.size
-        result = prior.recover(
-            model.operator(), model.measurements(), progress=lambda done: progress(done * size)
-        )
+        operator, measured = model.operator(), model.measurements()
+        result = prior.recover(operator, measured, progress=lambda n: progress(n * size))
         settings = {
             "method": "refinement",
             "wavelength_m": self.method.hybrid.wavelength,

@@ -9,7 +9,7 @@ import pytest
 from scenes import planar_wall, see
 
 from nlos import Capture, Grid, Settings, Volume, reconstruct, settings_for
-from nlos.analysis import choose_wavelength, find_brightest_path, find_first_bounce
+from nlos.analysis import choose_wavelength, find_first_bounce
 from nlos.band import VirtualPulse
 from nlos.capture import TimeAxis
 from nlos.imaging import MIN_EVIDENCE, complete_settings, is_brightest_on_wall, prepare_imaging
@@ -74,13 +74,6 @@ def test_the_gate_ends_where_the_walls_light_is_a_tenth_of_what_follows(
         faded = fades * np.log(10 * peak)
         # In the middle of the first step of the profile at which it has.
         assert faded - ROUNDING < bounce.end < faded + PROFILE_STEP + ROUNDING
-
-
-@pytest.mark.parametrize("confocal", [True, False])
-def test_the_brightest_path_is_found_to_half_a_step(confocal: bool) -> None:
-    for hidden in 1.2 + PROFILE_STEP * np.arange(0, 1, 0.2):
-        found = find_brightest_path(lit_late(hidden, confocal))
-        assert found == pytest.approx(hidden, abs=PROFILE_STEP / 2 + ROUNDING)
 
 
 @pytest.mark.parametrize("depth", [0.5, 0.8, 1.3])
