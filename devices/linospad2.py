@@ -216,23 +216,11 @@ _ROUNDING_S = 1e-6 * CLOCK_PERIOD_S
 
 @dataclass(frozen=True)
 class BoardCalibration(Storable):
-    """Tables that turn a pixel's codes into seconds.
+    """Tables that turn a pixel's codes into seconds: `code_ends` (256, 140), the instant at which each
+    code of a pixel ends, s since the clock's tick, because the converters' steps are uneven; `offsets`
+    (256,), s, added to a pixel's times; and `hot_pixels` (k,), those that count without light.
 
-    Parameters
-    ----------
-    code_ends : (256, 140) array
-        Instant at which each code ends, s since the clock's tick, for each pixel; the converters'
-        steps are uneven.
-    offsets : (256,) array
-        Added to a pixel's times, s.
-    hot_pixels : (k,) int array
-        Pixels that count without light.
-
-    Raises
-    ------
-    ShapeError, InputError
-        A table has another shape, is not finite, goes back, or leaves the clock's period; or there
-        is no such pixel.
+    A table that has another shape, is not finite, goes back or leaves the clock's period is refused.
     """
 
     RECORD_KIND = "linospad2_calibration"
@@ -437,15 +425,10 @@ class LinoSpad2File(SeekableSource):
         total, rest = divmod(size, codec.unit_bytes)
         cycles = max(1, PIECE_BYTES // codec.unit_bytes)
         self._piece_bytes, self._whole_bytes = cycles * codec.unit_bytes, size - rest
-        pieces, marks = -(-total // cycles), [Checkpoint(0, 0, 0)]
-        for number in range(pieces):
-            good, malformed = codec.count_stamps(as_bytes(self._read_bytes(number)))
-            before = marks[-1]
-            marks.append(
-                Checkpoint(
-                    (number + 1) * cycles, before.delivered + good, before.malformed + malformed
-                )
-            )
+        pieces = -(-total // cycles)
+        counts = [codec.count_stamps(as_bytes(self._read_bytes(one))) for one in range(pieces)]
+        sums = np.cumsum([(0, 0), *counts], axis=0).tolist()
+        marks = [Checkpoint(number * cycles, *known) for number, known in enumerate(sums)]
         records = marks[-1].delivered + marks[-1].malformed
         super().__init__(codec, Path(path), pieces, records, int(rest > 0), marks)
         details = {"limits": LIMITATION, **codec.settings}

@@ -82,26 +82,26 @@ class Codec(abc.ABC):
         return asdict(self) if is_dataclass(self) else {}
 
     def count_complete_bytes(self, data: ByteView) -> int:
-        """Return how many bytes at the front of `data` form whole records."""
+        """Return how many bytes at the front of ``data`` form whole records."""
         return len(data) - len(data) % self.unit_bytes
 
     def count_records(self, data: ByteView) -> int:
-        """Return how many records, malformed ones included, are in `data`, of which
+        """Return how many records, malformed ones included, are in ``data``, of which
         `count_complete_bytes` is all.
         """
         return len(data) // self.unit_bytes
 
     @abc.abstractmethod
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
-        """Decode whole records; `state` is what the decoder remembers, from the call before or
-        `start`; `after_loss` says that some are missing right before them.
+        """Decode whole records from ``data``; ``state`` is what the decoder remembers, from the call
+        before or `start`; ``after_loss`` says that some are missing right before them.
 
         ``len(decoded.records) + decoded.malformed == count_records(data)``.
         """
 
     @abc.abstractmethod
     def encode(self, records: Records) -> bytes:
-        """Return the bytes that the instrument would have sent."""
+        """Return the bytes that the instrument would have sent for ``records`` (n,)."""
 
     def _view_units(self, data: ByteView, dtype: DTypeLike = np.uint8) -> NDArray[Any]:
         """Return whole units as rows of words, (units, words)."""
@@ -252,7 +252,6 @@ class RingBuffer:
         self._changed = threading.Condition()
         self._ended = False
         self._fault: BaseException | None = None
-        self._lost_before_next = Gap.NONE
 
     def put(self, piece: Piece) -> None:
         """Append a piece; with policy ``"block"``, once there is room or the ring has ended."""
@@ -267,12 +266,9 @@ class RingBuffer:
                     "read faster, or choose policy=block or policy=drop_oldest"
                 )
                 raise self._fault
-            while not self._has_room(piece) and self._policy == "drop_oldest":
-                self._drop_oldest()
-            # What was dropped while the ring was empty is marked at the next piece.
-            self._pieces.append(replace(piece, gap=max(piece.gap, self._lost_before_next)))
+            self._pieces.append(piece)
             self._bytes += len(piece.data)
-            self._lost_before_next = Gap.NONE
+            self._drop_oldest()
             self._changed.notify_all()
 
     def get(self, timeout: float) -> Piece | None:
@@ -296,10 +292,8 @@ class RingBuffer:
     def keep_newest(self) -> None:
         """From now on, keep only the newest piece, and count the others as dropped."""
         with self._changed:
-            self._policy = "drop_oldest"
-            self._capacity = 1
-            while len(self._pieces) > 1:
-                self._drop_oldest()
+            self._policy, self._capacity = "drop_oldest", 1
+            self._drop_oldest()
             self._changed.notify_all()
 
     def fail(self, fault: BaseException) -> None:
@@ -321,15 +315,17 @@ class RingBuffer:
         return not self._pieces or self._bytes + len(piece.data) <= self._capacity
 
     def _drop_oldest(self) -> None:
-        """Take out the oldest piece and remember, at the next one, that something is missing."""
-        oldest = self._pieces.popleft()
-        self._bytes -= len(oldest.data)
-        self._ledger.drop(oldest.records)
-        gap = max(oldest.gap, Gap.LOSS)
-        if self._pieces:
-            self._pieces[0] = replace(self._pieces[0], gap=max(self._pieces[0].gap, gap))
-        else:
-            self._lost_before_next = max(self._lost_before_next, gap)
+        """Where the policy says so, take out the oldest pieces while there are too many bytes, and mark
+        at the next one that something is missing.
+        """
+        if self._policy != "drop_oldest":
+            return
+        while len(self._pieces) > 1 and self._bytes > self._capacity:
+            oldest = self._pieces.popleft()
+            self._bytes -= len(oldest.data)
+            self._ledger.drop(oldest.records)
+            gap = max(oldest.gap, Gap.LOSS, self._pieces[0].gap)
+            self._pieces[0] = replace(self._pieces[0], gap=gap)
 
 
 READ_TIMEOUT_S = 5.0  # Seconds that an iteration waits for the next batch of a live instrument
@@ -451,7 +447,7 @@ class Source(Closing):
         """
 
     def seek(self, record: int) -> None:
-        """Go to record number `record`, so that the next batch begins with it.
+        """Go to record number ``record``, so that the next batch begins with it.
 
         Raises
         ------

@@ -259,7 +259,8 @@ class TimeTaggerFeed(Feed):
         self._window = SendWindow()
         self._gap = Gap.NONE
         self._capture_mode = Capture.COUNT | Capture.REGISTER
-        self._disconnected_at: float | None = None
+        # until which an unplugged instrument is waited for
+        self._deadline: float | None = None
         self._must_clear = False
         self._is_flushed = False
         self._records_received = 0
@@ -289,8 +290,8 @@ class TimeTaggerFeed(Feed):
     def pull(self, timeout: float) -> Transfer | None:
         while True:
             try:
-                if self._disconnected_at is not None:
-                    self._reconnect(timeout)
+                if self._deadline is not None:
+                    self._reconnect(timeout, self._deadline)
                 if self._must_clear:
                     self._clear_memory()
                 begin = self._window.clock()
@@ -299,9 +300,15 @@ class TimeTaggerFeed(Feed):
             except TransferOverflowError:
                 self._must_clear = True
             except DeviceDisconnectedError as fault:
-                self._note_disconnect(fault)
+                now, patience = monotonic(), self._options.reconnect_s
+                self._deadline = self._deadline or now + patience
+                if now >= self._deadline:
+                    raise DeviceDisconnectedError(
+                        f"the time tagger {self._link.serial} was unplugged and did not come back "
+                        f"within {patience:g} s"
+                    ) from fault
             except DeviceTimeoutError:
-                if self._disconnected_at is not None or not self._send_rest():
+                if self._deadline is not None or not self._send_rest():
                     raise
                 self.ledger.time_out()
             else:
@@ -361,12 +368,12 @@ class TimeTaggerFeed(Feed):
         self._tagger.write(Register.CAPTURE, self._capture_mode)
         self._must_clear = False
 
-    def _reconnect(self, timeout: float) -> None:
+    def _reconnect(self, timeout: float, deadline: float) -> None:
         """Look for the unplugged instrument, but return in time for a caller that wants to stop."""
         try:
-            self._link.reconnect(min(timeout, self._reconnect_time_left))
+            self._link.reconnect(min(timeout, deadline - monotonic()))
         except DeviceDisconnectedError as fault:
-            if self._reconnect_time_left > 0:
+            if monotonic() < deadline:
                 raise DeviceTimeoutError("the time tagger is unplugged") from fault
             raise
         self._tagger.synchronize()
@@ -376,23 +383,8 @@ class TimeTaggerFeed(Feed):
         else:
             self._gap = Gap.RESTART
             self.start()
-        self._disconnected_at = None
+        self._deadline = None
         self.ledger.reconnect()
-
-    def _note_disconnect(self, fault: DeviceDisconnectedError) -> None:
-        """Note that the instrument is gone; raise if it has been for too long."""
-        if self._disconnected_at is None:
-            self._disconnected_at = monotonic()
-        if self._reconnect_time_left <= 0:
-            raise DeviceDisconnectedError(
-                f"the time tagger {self._link.serial} was unplugged and did not come back within "
-                f"{self._options.reconnect_s:g} s"
-            ) from fault
-
-    @property
-    def _reconnect_time_left(self) -> float:
-        begin = monotonic() if self._disconnected_at is None else self._disconnected_at
-        return begin + self._options.reconnect_s - monotonic()
 
     def _end_segment(self) -> None:
         """Count what arrived without a gap, and a record of which only the beginning did."""
