@@ -175,14 +175,6 @@ def test_ten_gigabytes_are_refused_before_they_are_allocated(method: Transform) 
     assert "GiB allowed" in find_refusal(method, capture, grid)
 
 
-def test_a_retroreflective_point_needs_the_smaller_power() -> None:
-    point = (X[13], Y[11], 0.6)
-    capture, distance = confocal([point]), np.linalg.norm(wall_at() - point, axis=-1)
-    bright = replace(capture, signal=capture.signal * distance**2)
-    volume = LightCone(falloff=2).reconstruct(bright, near(point))
-    assert volume.find_brightest() == pytest.approx(point, abs=STEP)
-
-
 def test_rebinning_keeps_the_sum() -> None:
     edges, values = np.array([0.0, 1.0, 4.0, 9.0]), np.array([2.0, 9.0, 35.0])
     found = rebin(values, edges, np.linspace(0, 9, 7))

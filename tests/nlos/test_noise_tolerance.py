@@ -19,7 +19,6 @@ from scenes import (
 
 from nlos import Capture, Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
-from nlos.phasor.transfer import SphericalWaves, TransferFunction, Window, find_lateral_limits
 
 # As wide as the wall, so that voxels and points stand in opposite corners; so many depths that some
 # are interpolated.
@@ -93,26 +92,3 @@ def test_a_tolerance_is_kept_on_64_x_64_points(
     for background in (NOISE, POINTS_AND_COUNTS):
         capture = see_noise(shape, 64, LONG, background)
         assert max(list_errors(method, capture, grid, 0.125)) < 1
-
-
-def test_weak_waves_are_left_out_up_to_the_error() -> None:
-    """Narrower at the pulse's edges, wider for smaller errors and nearer voxels."""
-    waves = SphericalWaves(20.0, 2.0, 21, continued=False)
-    window = Window(2.0, 2.5, 1.6)
-    strength = np.exp(-(((waves.wavenumbers - 40) / 10) ** 2))
-    limits, strict, far = (
-        find_lateral_limits(waves, window, strength, distance, error)
-        for distance, error in ((0.6, 1e-2), (0.6, 1e-3), (3.0, 1e-2))
-    )
-    assert np.all(np.diff(limits) >= 0)
-    assert np.all(strict >= limits)
-    assert far.sum() < limits.sum()
-    assert limits[10] > 40
-    assert limits[-1] < 60
-    transfer = TransferFunction(waves, window.without_cut, 120.0, 0.6)
-    real, imaginary = np.moveaxis(transfer.evaluate(0.6, np.zeros(2)), 1, 0)
-    lateral = np.maximum(transfer.nodes, 0)[:, np.newaxis]
-    energy = (real**2 + imaginary**2) * strength**2 * lateral
-    assert energy[lateral[:, 0] > 0][lateral[lateral > 0][:, np.newaxis] > limits].sum() < (
-        1.1e-2**2 * energy.sum()
-    )
