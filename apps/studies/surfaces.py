@@ -192,7 +192,7 @@ def score_methods(scene: Scene, instrument: Instrument, seed: int, fit: bool) ->
         frames = plan.run()
         seconds = time.process_time() - began
         picture = frames.values.sum(axis=0)
-        returns = depth(frames) if frames.returns is None else frames.returns
+        returns = depth(frames)
         figures = {
             **score_returns(returns, shot.truth),
             "image_nmse": nmse(picture, truth),

@@ -57,7 +57,7 @@ def demo(
         compared = by_frames.run(advance)
     past = build_provenance({"verb": "demo", "seed": seed}, earlier=frames.provenance)
     frames = replace(frames, provenance=past)
-    returns = depth(frames) if frames.returns is None else frames.returns
+    returns = depth(frames)
     cloud = point_cloud(returns)
     streak.save(written[0])
     frames.save(written[1])

@@ -401,8 +401,7 @@ class TransientSource(RecoveredSource):
 
     @cached_property
     def _whole_view(self) -> View:
-        # Surfaces were found with their points; frames are searched for theirs.
-        return make_view(depth(self.frames) if self.frames.returns is None else self.frames.returns)
+        return make_view(depth(self.frames))
 
     @cached_property
     def _measured(self) -> Measured:

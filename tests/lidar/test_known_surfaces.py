@@ -32,6 +32,8 @@ def test_dim_and_small_things_are_seen_beside_bright_ones(scene, missed, false) 
     assert score["miss"] < missed
     assert score["false"] < false
     assert score["median_mm"] < 2.8
+    # a pixel of the steep plate spans 27 mm of range; 0.4 mm, and 2.2 if each had one time
+    assert score["medians_mm"].get("steep plate", 0) < 0.8
     returns = frames.returns
     # surfaces' points and frames' returns are one list: pixel by pixel, nearest first
     pixel = returns.y.astype(int) * 64 + returns.x

@@ -225,6 +225,9 @@ def depth(
     are judged by that (`tofclip.lidar.significance`). Those of other frames, or where `detection` is
     given, are judged by its fractions.
 
+    Frames that were made from surfaces carry their returns (``.returns``): where nothing else is given
+    these are the answer. Found again in frames that hold no noise they would seem far too exact.
+
     Counted photons, whole numbers that a camera of one view saw (`Camera.pinhole`), are no recovered
     frames: their returns are found pixel by pixel by `tofclip.lidar.photons.estimate_pixels`, and
     deviations are those of photons.
@@ -267,6 +270,9 @@ def depth(
     (3, 4, 0.06)
     """
     require_type(frames, Frames, "returns are found in Frames, see tofclip.recover")
+    if frames.returns is not None and camera is None and detection is None and pulse is None:
+        own = frames.returns
+        return own if false_alarm is None else own[~(own.false_alarm > false_alarm)]
     camera = frames.camera if camera is None else camera
     if camera.image_shape != frames.values.shape[1:]:
         raise ShapeError(

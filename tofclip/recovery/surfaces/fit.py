@@ -71,6 +71,8 @@ MAX_TAIL_SHARE = 0.3
 STEEP_BINS, MAX_STEEP_SHARE = 10.0, 0.3
 SLOPE_WINDOW_PX = 7
 
+# Of the greatest need for splines of all surfaces: those that need them more have them.
+CERTAINLY_BENT = 3.0
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 
 # Bins in range, and pixels, within which frames' returns and surfaces are the same.
@@ -370,26 +372,27 @@ def straighten_surfaces(
     ]
     if not bent:
         return solver, None
-    ahead, trial = copy.copy(model), model.straighten(bent, solver.amplitude)
-    before, after = (refine_state(one, solver.amplitude) for one in (ahead, trial))
+    ahead = copy.copy(model)
+    before, straight = refine_state(ahead, solver.amplitude), bent
     # whose light it is says to which surface a change of the misfit belongs
     light = np.maximum(model.render(solver.amplitude), np.float32(LEAST_COUNT))
-    change = ((after.rest**2 - before.rest**2) / light).astype(np.float32)
-    excess = solver.amplitude * model.gather(model.weights * change)
-    straight = []
-    for surface in bent:
-        basis, coefficients = ahead.bases[surface], ahead.state.coefficients[surface]
-        freedom = 2 * solver.variance * (coefficients.size - COEFFICIENTS)
-        needed = freedom + coefficients @ basis.bending @ coefficients
-        if excess[model.parts[surface]].sum() <= needed:
-            straight.append(surface)
-    if straight == bent:
-        return AmplitudeSolver(trial, after.amplitude, solver.weight, solver), after
-    if not straight:
-        return solver, replace(before, free=None)
-    straightened = model.straighten(straight, solver.amplitude)
-    kept = AmplitudeSolver(straightened, solver.amplitude, solver.weight, solver)
-    return kept, replace(after, free=None)
+    while straight:
+        trial = model.straighten(straight, solver.amplitude)
+        after = refine_state(trial, solver.amplitude)
+        change = ((after.rest**2 - before.rest**2) / light).astype(np.float32)
+        excess = solver.amplitude * model.gather(model.weights * change)
+        needed = []
+        for surface in straight:
+            basis, coefficients = ahead.bases[surface], ahead.state.coefficients[surface]
+            freedom = 2 * solver.variance * (coefficients.size - COEFFICIENTS)
+            bending = coefficients @ basis.bending @ coefficients
+            needed.append(excess[model.parts[surface]].sum() / (freedom + bending))
+        if max(needed) <= 1:
+            return AmplitudeSolver(trial, after.amplitude, solver.weight, solver), after
+        # one that is bent for certain takes light from others: these are tried again without it
+        least = max(1.0, max(needed) / CERTAINLY_BENT)
+        straight = [one for one, need in zip(straight, needed, strict=True) if need <= least]
+    return solver, replace(before, free=None)
 
 
 def find_sure_level(significance: Image) -> float:
@@ -482,7 +485,8 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
     `centre_error_px`: how far off the calibration had each slit centre, see `tofclip.recovery.Shot`.
     """
     model, amplitude = fit.model, fit.solver.amplitude
-    camera = model.camera.replace(gains=model.state.gains)
+    centres = model.camera.centres_px + model.state.centres
+    camera = model.camera.replace(gains=model.state.gains, centres_px=centres)
     distance, others = model.distance, fit.others
     # 6. Points.
     bright = choose_points(fit.solver, detection.signal_to_noise)

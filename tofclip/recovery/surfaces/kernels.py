@@ -22,6 +22,7 @@ Image = NDArray[np.float32]
 fast_loop = compile_loop(fastmath=True)
 
 SPLINE_SAMPLES = 3
+LEAST_SPREAD = 1e-3  # px, of a view whose lines are upright
 
 
 def split_between_rows(row: NDArray[np.float64]) -> tuple[NDArray[np.int32], Image]:
@@ -38,27 +39,25 @@ def split_between_rows(row: NDArray[np.float64]) -> tuple[NDArray[np.int32], Ima
 
 
 @fast_loop
-def split_over_slit(position, tangent, subrows, first, shares):
-    """Share of a picture pixel that falls on each slit pixel, (points, reach), from `first` on. A
-    pixel is a square of side 1: its width and the slit pixel's make a triangle, and its height
-    spreads it by the tangent of the line's angle, for which `subrows` lines stand.
+def split_over_slit(position, width, height, tangent, first, shares):
+    """Share of parts of picture pixels that falls on each slit pixel, (parts, reach), from `first` on.
+    A part is a rectangle, px: its height spreads it by the tangent of the line's angle, so that its
+    light on the slit is a trapezium, whose integral is made of four parabolas.
     """
     reach = shares.shape[1]
-    # a row of the picture is projected to tan(angle) slit pixels
-    spread = math.fabs(tangent)
-    for point in range(position.size):
-        start = math.floor(position[point] - 0.5 * spread)
-        first[point] = start
+    for part in range(position.size):
+        across, spread = width[part], max(math.fabs(tangent) * height[part], LEAST_SPREAD)
+        wide, narrow = 0.5 * (across + spread), 0.5 * math.fabs(across - spread)
+        start = math.floor(position[part] - wide + 0.5)
+        first[part] = start
+        before = 0.0
         for slit in range(reach):
-            shares[point, slit] = 0
-        for line in range(subrows):
-            place = position[point] + ((line + 0.5) / subrows - 0.5) * spread
-            column = math.floor(place)
-            weight = place - column
-            if column - start < reach:
-                shares[point, column - start] += (1 - weight) / subrows
-            if column + 1 - start < reach:
-                shares[point, column + 1 - start] += weight / subrows
+            edge = start + slit + 0.5 - position[part]
+            upto = max(edge + wide, 0.0) ** 2 - max(edge + narrow, 0.0) ** 2
+            upto += max(edge - wide, 0.0) ** 2 - max(edge - narrow, 0.0) ** 2
+            upto /= 2 * across * spread
+            shares[part, slit] = upto - before
+            before = upto
 
 
 @fast_loop

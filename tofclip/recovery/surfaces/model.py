@@ -45,7 +45,10 @@ Result = TypeVar("Result")
 
 MODEL_ERROR_FRACTION = 0.015  # of the brightest measurement: what the model leaves without noise
 SMOOTHING_PX = 2.0
-SLIT_PIXELS, SUBROWS = 4, 3
+SLIT_PIXELS = 4
+# Rows that a part of a pixel spans where a surface is turned far, and parts along a side at most:
+# a pulse of a row or more does not tell so narrow a ramp from an instant
+PART_ROWS, MAX_PARTS = 1.5, 6
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
 SWEEP_LEFT_FRACTION = (
@@ -67,6 +70,9 @@ class SurfaceState:
     delays: FloatArray
     stretches: FloatArray  # (views,), rows by which those delays grow over the streak image
     widths: FloatArray  # (views,), pulse widths, relative to the camera's
+    centres: (
+        FloatArray  # (views,), px by which the views lie farther along the slit than the camera's
+    )
     # (surfaces, views), logarithms of how bright each view sees what lies behind another surface,
     # relative to the mean over the views. Through gauze the view beside the lamp sees just what the
     # lamp lights, and the others see a part of it
@@ -77,7 +83,8 @@ class SurfaceState:
         """Return the state in which views are as the camera has them."""
         none = np.zeros(camera.views)
         even = np.zeros((len(coefficients), camera.views))
-        return cls(list(coefficients), camera.gains.copy(), none, none.copy(), none + 1, even)
+        apart = camera.gains.copy(), none, none.copy(), none + 1, none.copy()
+        return cls(list(coefficients), *apart, even)
 
     def copy(self) -> SurfaceState:
         """Return a state that can be changed without changing this one."""
@@ -142,20 +149,59 @@ def find_rows(times: FloatArray, time: FloatArray) -> FloatArray:
     return np.asarray(np.interp(time, times, np.arange(times.size)) + before + after)
 
 
+class Places(NamedTuple):
+    """Parts of the points' pixels, each so small that its light arrives at one instant: a pixel on
+    a surface that is turned far spans many bins of range.
+    """
+
+    point: NDArray[np.intp]  # (places,), the point of which each is a part; ascending
+    starts: NDArray[np.intp]  # (points + 1,), number of each point's first
+    offset: FloatArray  # (2, places), from the pixel's middle along columns and rows, px
+    size: FloatArray  # (2, places), along columns and rows, px
+    distance: FloatArray  # (places,), m
+    share: Image  # (places,), of the point's light
+    # (points,), sum of squares of what parts have in common, over that of the pulse alone
+    overlap: Image
+
+    @classmethod
+    def split(
+        cls, distance: FloatArray, slopes: FloatArray, pulse_rows: float, row_m: float
+    ) -> Places:
+        """Split points by the slopes of their surfaces, (2, points), m per pixel."""
+        counts = np.clip(np.ceil(np.abs(slopes) / row_m / PART_ROWS), 1, MAX_PARTS).astype(np.intp)
+        total = counts[0] * counts[1]
+        point = np.repeat(np.arange(distance.size), total)
+        starts = np.concatenate([[0], np.cumsum(total)])
+        right, down = np.divmod(np.arange(point.size) - starts[point], counts[1, point])
+        size = 1 / counts[:, point]
+        offset = (np.stack([right, down]) + 0.5) * size - 0.5
+        away = np.sum(offset * slopes[:, point], axis=0)
+        ramp = np.hypot(*slopes) / row_m / pulse_rows  # pulses that a pixel spans
+        overlap = (1 / np.sqrt(1 + ramp**2 / 6)).astype(np.float32)
+        share = (1 / total[point]).astype(np.float32)
+        return cls(point, starts, offset, size, distance[point] + away, share, overlap)
+
+    def find(self, part: slice) -> slice:
+        """Those of some points."""
+        first, last, _ = part.indices(self.starts.size - 1)
+        return slice(int(self.starts[first]), int(self.starts[last]))
+
+
 class Footprint(NamedTuple):
     """The rows and columns of a view on which points have light, and in which fractions. Rows count
     from the first whose afterglow reaches the streak image, columns from `first_column`.
     """
 
-    row: NDArray[np.int32]  # (points,), first of those that a point reaches
-    row_shares: Image  # (points, 3), before the pulse smooths them
-    column: NDArray[np.int32]  # (points,), first of those that a point reaches
-    slit_shares: Image  # (points, 4)
+    row: NDArray[np.int32]  # (places,), first of those that a part of a pixel reaches
+    row_shares: Image  # (places, 3), before the pulse smooths them
+    column: NDArray[np.int32]  # (places,), first of those that a part reaches
+    slit_shares: Image  # (places, 4)
     first_column: int  # of the slit, of which the view has a part
     columns: int
     lit_rows: NDArray[np.int64]  # (n,), which smoothed light reaches
     reached_rows: NDArray[np.int64]  # (n,), before it is smoothed; from `margin` above the first on
-    between: BetweenCentres
+    between: BetweenCentres  # of the points
+    height: FloatArray  # (points,), see `measure_height`
     rows_per_instant: float  # raw rows in the time of one, on average
 
 
@@ -179,7 +225,7 @@ class SurfaceModel:
     `camera`: with its sweep; `masks` (surfaces, rows, columns): where each surface may be; `bases`:
     of the surfaces' inverse depths; `pulse`: A Gaussian of the camera's width by default.
 
-    Memory: 40 bytes for each point and view, and the raw image some four times.
+    Memory: 40 bytes for each part of a point and view, and the raw image some four times.
     """
 
     def __init__(
@@ -211,6 +257,7 @@ class SurfaceModel:
         axis_row, axis_column = self.camera.optical_axis_px
         self._x, self._y = x - axis_column, y - axis_row
         self.ray_length = 1 / self._directions[:, 2]
+        self._beside = self._find_neighbours(masks, y, x)
         self.behind = np.zeros(self.surface.size, bool)
 
     def cover(self, masks: NDArray[np.bool_]) -> SurfaceModel:
@@ -244,7 +291,11 @@ class SurfaceModel:
     def place(self, state: SurfaceState) -> None:
         """Move the surfaces to where `state` has them."""
         self.state = state
-        self.distance = self._find_ranges(self.monomials, self.ray_length)
+        shapes = zip(self.monomials, state.coefficients, strict=True)
+        inverse = np.concatenate([m @ c for m, c in shapes])
+        self.distance = np.asarray(self.ray_length / np.maximum(inverse, MIN_INVERSE_DEPTH))
+        row_m = self.bin_width * SPEED_OF_LIGHT / 2
+        self.places = Places.split(self.distance, self.compute_slopes(), self.pulse.sigma, row_m)
         self.half = int(np.ceil(EXTENT_SIGMAS * MAX_LENGTHENING * self.pulse.sigma)) + 1
         self._margin = self.half + 3
         # rows before and behind the streak image whose light reaches it later or earlier
@@ -253,10 +304,24 @@ class SurfaceModel:
         self.footprints = self._map_views(self._spread_view)
         self.kernels = [self.make_kernel(view) for view in range(self.camera.views)]
 
-    def _find_ranges(self, monomials: list[FloatArray], ray_length: FloatArray) -> FloatArray:
-        shapes = zip(monomials, self.state.coefficients, strict=True)
-        inverse = np.concatenate([m @ c for m, c in shapes])
-        return np.asarray(ray_length / np.maximum(inverse, MIN_INVERSE_DEPTH))
+    def _find_neighbours(
+        self, masks: NDArray[np.bool_], y: NDArray[np.intp], x: NDArray[np.intp]
+    ) -> NDArray[np.intp]:
+        """Numbers of the points of the same surface beside each, (2, 2, points): along columns and
+        rows, before and behind; its own where there is none. What is only known at single pixels is
+        no surface.
+        """
+        number = np.full((len(masks), *(side + 2 for side in masks.shape[1:])), -1)
+        own = np.arange(y.size)
+        number[self.surface, y + 1, x + 1] = own
+        single = np.array([isinstance(basis, KnownBasis) for basis in self.bases], bool)
+        number[single] = -1
+        steps = [[(0, -1), (0, 1)], [(-1, 0), (1, 0)]]
+        found = [
+            [number[self.surface, y + 1 + down, x + 1 + right] for down, right in pair]
+            for pair in steps
+        ]
+        return np.where(np.array(found) < 0, own, found)
 
     def _spread_view(self, view: int) -> Footprint:
         """Return which rows and columns of a view the light of points reaches. Nothing of what
@@ -267,6 +332,9 @@ class SurfaceModel:
 
         rows, margin, samples = self._rows, self._margin, kernels.SPLINE_SAMPLES
         row, column, between, pace = self._locate(view)
+        first_parts = self.places.starts[:-1]
+        between = BetweenCentres(between.before[first_parts], between.fraction[first_parts])
+        height = self.measure_height(row[first_parts])
         row += self.before
         columns = self.image.shape[1]
         away, last = margin + samples, rows + margin - samples
@@ -277,7 +345,7 @@ class SurfaceModel:
         slit = np.empty((row.size, SLIT_PIXELS), np.float32)
         along = np.clip(column, -SLIT_PIXELS, columns + SLIT_PIXELS)
         tangent = float(np.tan(self.camera.angles[view]))
-        kernels.split_over_slit(along, tangent, SUBROWS, slit_first, slit)
+        kernels.split_over_slit(along, *self.places.size, tangent, slit_first, slit)
         slit[along != column] = 0
         left = int(slit_first.min(initial=columns))
         wide = max(int(slit_first.max(initial=-SLIT_PIXELS)) + SLIT_PIXELS - left, 0)
@@ -286,24 +354,33 @@ class SurfaceModel:
         lit = np.convolve(reached, np.ones(2 * self.half + 1), "same")[margin:-margin] > 0
         slit_first -= np.int32(left)
         lines = np.flatnonzero(lit), np.flatnonzero(reached)
-        return Footprint(first, shares, slit_first, slit, left, wide, *lines, between, pace)
+        light = first, shares, slit_first, slit, left, wide
+        return Footprint(*light, *lines, between, height, pace)
 
     def _locate(self, view: int) -> tuple[FloatArray, FloatArray, BetweenCentres, float]:
-        """Where points fall in a view, (points,): row and column of the raw streak image, between
-        which centres, and how many raw rows the time of one takes.
+        """Where parts of points fall in a view, (places,): row and column of the raw streak image,
+        between which centres, and how many raw rows the time of one takes.
         """
         camera, position = self.camera, self.camera.view_positions[view]
-        points = self._directions * self.distance[:, np.newaxis]
+        axis_row, axis_column = camera.optical_axis_px
+        parts = self.places
+        x, y = (
+            one[parts.point] + off
+            for one, off in zip((self._x, self._y), parts.offset, strict=True)
+        )
+        points = compute_ray_directions(camera, y + axis_row, x + axis_column)
+        points *= parts.distance[:, np.newaxis]
         viewpoint = np.array([camera.lenslet_pitch * position, 0.0, 0.0])
         back = np.linalg.norm(points - viewpoint, axis=1)
         column = (
             camera.centres_px[view]
-            + self._x
-            - self._y * np.tan(camera.angles[view])
+            + self.state.centres[view]
+            + x
+            - y * np.tan(camera.angles[view])
             + camera.shear_at(points[:, 2]) * position
         )
         between = BetweenCentres.find(camera.centres_px, column)
-        time = (self.distance + back) / SPEED_OF_LIGHT + camera.time_zero
+        time = (parts.distance + back) / SPEED_OF_LIGHT + camera.time_zero
         row, pace = find_rows(self.times, time), 1.0
         if camera.sweep is not None:
             later, _ = camera.sweep.raw_position(row + 0.5, column)
@@ -387,17 +464,10 @@ class SurfaceModel:
 
     def compute_slopes(self) -> FloatArray:
         """Return how steeply the ranges change along columns and rows, (2, points), m per pixel."""
-        rows, columns = self.camera.image_shape
-        y, x = np.divmod(self.pixel, columns)
-        steps = []
-        for down, right in ((0, 1), (1, 0)):
-            # at the picture's end the step goes back
-            sign = np.where((y + down < rows) & (x + right < columns), 1, -1)
-            below, beside = y + sign * down, x + sign * right
-            length = 1 / compute_ray_directions(self.camera, below, beside)[:, 2]
-            there = self._find_ranges(self._evaluate(below * columns + beside), length)
-            steps.append(sign * (there - self.distance))
-        return np.stack(steps)
+        before, behind = self._beside[:, 0], self._beside[:, 1]
+        own = np.arange(self.distance.size)
+        apart = np.maximum((before != own).astype(int) + (behind != own), 1)
+        return np.asarray((self.distance[behind] - self.distance[before]) / apart)
 
     def _map_views(self, work: Callable[[int], Result]) -> list[Result]:
         """Return ``work(view)`` of all views; each thread takes its share of them at once."""
@@ -433,6 +503,8 @@ class SurfaceModel:
 
         place, margin, samples = self.footprints[view], self._margin, 3
         amplitude = self.shade(view, amplitude, part)
+        start, part = part.indices(self.surface.size)[0], self.places.find(part)
+        amplitude = amplitude[self.places.point[part] - start] * self.places.share[part]
         row, column = place.row[part], place.column[part]
         if not row.size:
             return 0, np.zeros((0, 0), np.float32)
@@ -445,14 +517,17 @@ class SurfaceModel:
         down = row + np.int32(margin - first), place.row_shares[part]
         add_light(amplitude, *down, column - np.int32(left), place.slit_shares[part], light)
         image = np.zeros((last - first, light.shape[1]), np.float32)
-        lit = np.arange(last - first) if row.size < self.surface.size else place.lit_rows - first
+        lit = (
+            np.arange(last - first) if row.size < self.places.point.size else place.lit_rows - first
+        )
         smooth_rows(light, kernel, np.arange(-self.half, self.half + 1), lit, margin, image)
         return first, image
 
     def _cut_to_slit(self, view: int, part: slice, width: int) -> tuple[slice, slice]:
         """The part of some points' columns that lies on the slit, and where."""
         place = self.footprints[view]
-        first = place.first_column + int(place.column[part].min(initial=place.columns))
+        own = place.column[self.places.find(part)]
+        first = place.first_column + int(own.min(initial=place.columns))
         left = min(max(first, 0), self.image.shape[1])
         right = max(left, min(first + width, self.image.shape[1]))
         return slice(left - first, right - first), slice(left, right)
@@ -508,9 +583,12 @@ class SurfaceModel:
             part[:, own] = seen[:, slit]
             smooth = np.empty((self._rows + 2 * self._margin, place.columns), np.float32)
             smooth_rows(part, kernel, -lags, place.reached_rows, -self._margin, smooth)
-            found = np.zeros(self.surface.size, np.float32)
+            found = np.zeros(self.places.point.size, np.float32)
             row = place.row + np.int32(self._margin)
             gather_light(smooth, gain, row, place.row_shares, place.column, slit_shares, found)
+            found = np.add.reduceat(found * self.places.share, self.places.starts[:-1])
+            if squared:
+                found *= self.places.overlap
             found = self.shade(view, found)
             return self.shade(view, found) if squared else found
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
+from tofclip.camera import Camera
 from tofclip.recovery.surfaces.amplitudes import TINY, explain_by_amplitude, scale_amplitude
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, Window
 from tofclip.recovery.surfaces.patches import COEFFICIENTS
@@ -34,6 +35,9 @@ SMALLEST_STEP = 1 / 16  # of a Gauss-Newton step, halved until it lowers the mis
 # scenes by a forward model of their own (0.015 and 0.05 in the demonstration). Later views and farther
 # surfaces look alike, so that the mean over the views is what all ranges have in common.
 SWEEP_SIGMAS = {"delays": 0.1, "stretches": 0.3}
+# Pixels by which a centre that was found from frames is off, and by which all together may displace
+# the picture: no shot shows that, and it stays where the calibration has it.
+CENTRE_SIGMA_PX, DISPLACEMENT_SIGMA_PX = 0.3, 1e-3
 # Of the brightness behind another surface, between the views: less does not matter, or is noise.
 MIN_SHADING, SHADING_SIGMAS = 0.1, 3.0
 # Of conjugate gradients. Smooth changes of amplitude, which matter for a derivative, converge first,
@@ -127,7 +131,10 @@ def _differentiate_view(model: SurfaceModel, amplitude: Image, view: int) -> lis
     kernel, gain = model.kernels[view], np.float32(model.state.gains[view])
     wider = (model.make_kernel(view, 1 + WIDTH_STEP) - kernel) / np.float32(WIDTH_STEP)
     windows = [model.receive(view, amplitude, gain * one) for one in (kernel, wider)]
-    found = [*_join_windows(model, [("gains", 0, view), ("widths", 0, view)], [windows])]
+    beside = np.gradient(windows[0].image, axis=1) if windows[0].image.size else windows[0].image
+    windows.append(windows[0]._replace(image=-beside.astype(np.float32)))
+    names: list[Unknown] = [(name, 0, view) for name in ("gains", "widths", "centres")]
+    found = [*_join_windows(model, names, [windows])]
     for surface in np.unique(model.surface[model.behind]):
         part = model.parts[surface]
         hidden = model.receive(view, amplitude[part] * model.behind[part], gain * kernel, part)
@@ -144,10 +151,8 @@ def _differentiate_sweep(model: SurfaceModel, amplitude: Image, view: int) -> li
             continue
         slope = differentiate_pulse(model.kernels[other]) * np.float32(model.state.gains[other])
         light = amplitude * weight
-        height = model.measure_height(place.row - model.before)
-        windows.append(
-            [model.receive(other, one.astype(np.float32), slope) for one in (light, light * height)]
-        )
+        lights = light, light * place.height
+        windows.append([model.receive(other, one.astype(np.float32), slope) for one in lights])
     return [*_join_windows(model, [("delays", 0, view), ("stretches", 0, view)], windows)]
 
 
@@ -457,7 +462,19 @@ def compute_objective(model: SurfaceModel, rest: Image) -> float:
     swept = sum(
         float(np.sum(getattr(state, name) ** 2)) / sigma**2 for name, sigma in SWEEP_SIGMAS.items()
     )
-    return (float(np.sum(model.weights * rest**2, dtype=np.float64)) + bent + swept) / 2
+    moved = float(state.centres @ weigh_centres(model.camera) @ state.centres)
+    return (float(np.sum(model.weights * rest**2, dtype=np.float64)) + bent + swept + moved) / 2
+
+
+def weigh_centres(camera: Camera) -> FloatArray:
+    """Return what is known of the centres beforehand, (views, views), 1/px^2: the inverse of their
+    covariance.
+    """
+    looks = np.stack([np.ones(camera.views), -np.tan(camera.angles)], axis=1)
+    displaced = looks @ np.linalg.pinv(looks)
+    return np.asarray(
+        np.eye(camera.views) / CENTRE_SIGMA_PX**2 + displaced / DISPLACEMENT_SIGMA_PX**2
+    )
 
 
 def _differentiate_priors(
@@ -465,6 +482,10 @@ def _differentiate_priors(
 ) -> tuple[FloatArray, FloatArray]:
     """Second and first derivative of what is known of bending and sweep beforehand."""
     second, first = np.zeros((len(names), len(names))), np.zeros(len(names))
+    centres = [index for index, (name, _, _) in enumerate(names) if name == "centres"]
+    weights = weigh_centres(model.camera)
+    second[np.ix_(centres, centres)] = weights
+    first[centres] = weights @ model.state.centres
     for index, (name, surface, number) in enumerate(names):
         if name == "coefficients":
             bending = model.bases[surface].bending[number]
