@@ -5,42 +5,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from time import monotonic, time_ns
-from typing import Protocol, runtime_checkable
 
+from devices.transients import LiveShot, ShotStamp, TransientStream
 from tofclip.errors import TofclipError
-from tofclip.lidar.photons import PhotonCube
-from tofclip.shots import Streak
 
-LiveShot = Streak | PhotonCube
 MAX_STAMPS = 10_000  # Shots on their way whose stamps are kept
-
-
-@dataclass(frozen=True)
-class ShotStamp:
-    """As which shot, and when, a streak image was taken."""
-
-    # its number at the instrument, from 0: those that were lost on the way have been counted
-    number: int
-    # when the instrument took the last of it by its own clock, s of `time.monotonic`; 0 where it
-    # does not say
-    taken_at: float = 0.0
-    # when the last of it came, s of `time.monotonic`; 0 where it comes from a file
-    received_at: float = 0.0
-
-    @cached_property
-    def epoch_ns(self) -> int:
-        """When it was taken, or came, in nanoseconds since 1970 by this computer's clock; of a file, a
-        tenth of a second for each shot.
-        """
-        age = self.compute_age()
-        return self.number * 10**8 if age is None else time_ns() - round(age * 1e9)
-
-    def compute_age(self) -> float | None:
-        """Return the seconds since it was taken, or came; None for a file."""
-        began = self.taken_at or self.received_at
-        return monotonic() - began if began else None
 
 
 @dataclass(frozen=True)
@@ -61,17 +30,6 @@ class ShotAccounts:
         return self.dropped_device + self.dropped_host
 
 
-@runtime_checkable
-class NumberedShots(Protocol):
-    """Shots of a source that numbers and counts them; see `devices.transients.TransientStream`."""
-
-    stamp: ShotStamp | None
-    is_numbered: bool
-    is_live: bool
-    shots_acquired: int
-    shots_lost: int
-
-
 class TrackedShots(Iterator[LiveShot | TofclipError]):
     """Shots on their way into stages, each with its stamp, so that the consumer behind the stages
     can say how old a shot is and where the others went. `shots`: a `devices.transients.TransientStream`, or shots from
@@ -80,7 +38,7 @@ class TrackedShots(Iterator[LiveShot | TofclipError]):
 
     def __init__(self, shots: Iterator[LiveShot] | Iterator[LiveShot | TofclipError]) -> None:
         self._shots = shots
-        self._stream = shots if isinstance(shots, NumberedShots) else None
+        self._stream = shots if isinstance(shots, TransientStream) else None
         self._stamps: dict[int, ShotStamp] = {}
         self._count = self._first_number = 0
         self._peeked: deque[LiveShot | TofclipError] = deque()

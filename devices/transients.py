@@ -30,11 +30,12 @@ import itertools
 import math
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import inf
 from operator import itemgetter
 from pathlib import Path
 from sys import maxsize
-from time import monotonic
+from time import monotonic, time_ns
 from typing import Any
 from urllib.parse import quote, urlencode
 
@@ -48,7 +49,6 @@ from devices.linospad2 import BoardCalibration
 from devices.recording.read import read_head_if_recording
 from devices.source import READ_TIMEOUT_S, Batch, Source, Stats
 from devices.stream import InstrumentClock, StreamSource
-from devices.tracking import LiveShot, ShotStamp
 from tofclip.camera import Camera
 from tofclip.errors import DeviceTimeoutError, InputError
 from tofclip.lidar import Pulse
@@ -62,6 +62,33 @@ MAX_CUBE_BYTES = 1 << 32
 # Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s
 EDGE_S = 1e-10
 STAMPS_SUFFIX = ".dat"
+LiveShot = Streak | PhotonCube
+
+
+@dataclass(frozen=True)
+class ShotStamp:
+    """As which shot, and when, a streak image was taken."""
+
+    # its number at the instrument, from 0: those that were lost on the way have been counted
+    number: int
+    # when the instrument took the last of it by its own clock, s of `time.monotonic`; 0 where it
+    # does not say
+    taken_at: float = 0.0
+    # when the last of it came, s of `time.monotonic`; 0 where it comes from a file
+    received_at: float = 0.0
+
+    @cached_property
+    def epoch_ns(self) -> int:
+        """When it was taken, or came, in nanoseconds since 1970 by this computer's clock; of a file, a
+        tenth of a second for each shot.
+        """
+        age = self.compute_age()
+        return self.number * 10**8 if age is None else time_ns() - round(age * 1e9)
+
+    def compute_age(self) -> float | None:
+        """Return the seconds since it was taken, or came; None for a file."""
+        began = self.taken_at or self.received_at
+        return monotonic() - began if began else None
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,8 @@ from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
 
 if TYPE_CHECKING:
-    from devices.tracking import ShotStamp, TrackedShots
+    from devices.tracking import TrackedShots
+    from devices.transients import ShotStamp
     from tofclip.lidar import PointCloud
     from tofclip.sequences.pipelines import LiveShot
     from tofclip.sequences.streaming import StreamedCloud
