@@ -34,8 +34,10 @@ from devices.source import (
     as_bytes,
 )
 from tofclip.errors import (
+    DeviceBusyError,
     DeviceDisconnectedError,
     DeviceNotFoundError,
+    DevicePermissionError,
     DeviceTimeoutError,
 )
 from tofclip.storage import Record
@@ -88,6 +90,11 @@ DRAIN_TIMEOUT_S = 3.0
 STOP_TIMEOUT_S = 15.0
 RETRY_INTERVAL_S = 0.1  # Seconds between two attempts to reach an instrument that went away
 _MEBIBYTE = 1 << 20
+# Not there yet, or there before the system has given this user the right to it
+AWAY = (
+    *(DeviceNotFoundError, DeviceDisconnectedError, DeviceTimeoutError),
+    *(DeviceBusyError, DevicePermissionError),
+)
 _Connected = TypeVar("_Connected")
 
 
@@ -260,7 +267,7 @@ def retry_connect(connect: Callable[[], _Connected], seconds: float) -> _Connect
     while True:
         try:
             return connect()
-        except (DeviceNotFoundError, DeviceDisconnectedError, DeviceTimeoutError) as fault:
+        except AWAY as fault:
             # Looked at after the attempt, so that there is always one.
             if monotonic() > deadline:
                 raise DeviceDisconnectedError(

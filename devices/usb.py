@@ -6,9 +6,9 @@ import array
 import contextlib
 import errno
 from collections.abc import Callable, Iterator
-from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from devices.stream import retry_connect
 from tofclip.errors import (
     DeviceBusyError,
     DeviceDisconnectedError,
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 INTERFACE_NUMBER = 0
 VENDOR_REQUEST = 0x40  # Type of a control request of the maker's own, from host to device
-REPLUG_POLL_S = 0.05  # Seconds between two looks for an instrument that was unplugged
 _UNPLUGGED = (DeviceDisconnectedError, "was unplugged")
 # What a system error means, and what is said of it
 _FAULTS: dict[int, tuple[type[DeviceError], str]] = {
@@ -128,9 +127,8 @@ class UsbLink:
     """
 
     def __init__(self, identity: UsbIdentity, serial: str, backend: Any) -> None:
-        self.identity, self._backend = identity, backend
-        self._device, self.serial = self._find_device(serial)
-        self._claim()
+        self.identity, self.serial, self._backend = identity, serial, backend
+        self._open()
 
     def read(self, endpoint: int, buffer: array.array[int], timeout: float) -> int:
         """Fill `buffer` from a bulk endpoint and return how many bytes came; fewer than fit are no fault."""
@@ -157,18 +155,8 @@ class UsbLink:
 
     def reconnect(self, patience: float) -> None:
         """Wait until the instrument with this serial number is back, and claim it."""
-        deadline = monotonic() + patience
         self.close()
-        while monotonic() < deadline:
-            # Not there yet, or there before the system has given this user the right to it.
-            with contextlib.suppress(DeviceError):
-                self._device, self.serial = self._find_device(self.serial)
-                self._claim()
-                return
-            sleep(min(REPLUG_POLL_S, patience / 10))
-        raise DeviceDisconnectedError(
-            f"USB device {self.identity} {self.serial} was unplugged and did not come back within {patience:g} s"
-        )
+        retry_connect(self._open, patience)
 
     def close(self) -> None:
         """Let go of the instrument; that it is gone already is fine."""
@@ -178,8 +166,12 @@ class UsbLink:
         with contextlib.suppress(usb.core.USBError):
             usb.util.dispose_resources(self._device)
 
-    def _find_device(self, serial: str) -> tuple[usb.core.Device, str]:
-        """Find the one instrument that is meant, and its serial number."""
+    def _open(self) -> None:
+        """Find the one instrument that is meant, and claim it."""
+        import usb.core
+        import usb.util
+
+        serial = self.serial
         known = [
             (device, read_serial(device, self.identity))
             for device in find_devices(self.identity, self._backend)
@@ -199,12 +191,7 @@ class UsbLink:
             raise DeviceNotFoundError(
                 f"several USB devices {self.identity} are connected; {advice}"
             )
-        return fitting[0]
-
-    def _claim(self) -> None:
-        import usb.core
-        import usb.util
-
+        self._device, self.serial = fitting[0]
         with translate_errors(self.identity):
             # Only Linux and macOS have drivers to detach.
             with contextlib.suppress(NotImplementedError):

@@ -28,7 +28,7 @@ from devices.linospad2 import (
 from devices.linospad2_kernels import ADDRESSES
 from devices.source import Info, Ledger, Records
 from devices.stream import Feed, StreamOptions, StreamSource, Transfer
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError
 
 INSTRUMENT = "simulated LinoSPAD2"
 LASER_PERIOD_S = 25e-9
@@ -47,8 +47,6 @@ class SimulatedBoard:
     seed: int
 
     def __post_init__(self) -> None:
-        if self.light.photons.shape[1] != PIXELS:
-            raise ShapeError("LinoSPAD2's light", ("rows", PIXELS), self.light.photons.shape)
         most = PIXELS // ADDRESSES * self.codec.timestamps
         if not 0 < self.photons_per_cycle <= most:
             raise InputError(

@@ -32,7 +32,7 @@ from devices.spad512 import (
     SpadOptions,
 )
 from devices.stream import StreamSource
-from tofclip.errors import ProtocolError, ShapeError
+from tofclip.errors import ProtocolError
 
 SUPPORTED_FAULTS = ("timeout", "short", "unplug", "corrupt", "stall")
 GREETING = b"SPAD512S emulated server, ready\n"
@@ -74,8 +74,6 @@ class EmulatedSpadArray:
         faults: Sequence[Fault] = (),
         delays: NDArray[np.float64] | None = None,
     ) -> None:
-        if photons.shape != (ROWS, ROWS):
-            raise ShapeError("a SPAD512's light", (ROWS, ROWS), photons.shape)
         self._photons, self._seed, self._left = photons, seed, pictures
         self._faults = index_faults(faults, SUPPORTED_FAULTS)
         self._delays = np.full((ROWS, ROWS), np.nan) if delays is None else delays
