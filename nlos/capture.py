@@ -249,9 +249,8 @@ class Capture:
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
         """Wall points whose position, and whose own laser spot, is known; shape (...)."""
-        return np.asarray(
-            np.isfinite(self.wall).all(axis=-1) & np.isfinite(self.laser).all(axis=-1)
-        )
+        known = np.isfinite(self.wall) & np.isfinite(self.laser)
+        return np.asarray(known.all(axis=-1))
 
     @cached_property
     def points(self) -> FloatArray:

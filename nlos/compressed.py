@@ -39,10 +39,8 @@ class CompressedCapture:
 
     def __post_init__(self) -> None:
         require_numpy("imaging straight from compressed measurements", self.measurements)
-        measurements, wall = (
-            np.asarray(self.measurements, dtype=np.float32),
-            np.asarray(self.wall, dtype=np.float64),
-        )
+        measurements = np.asarray(self.measurements, dtype=np.float32)
+        wall = np.asarray(self.wall, dtype=np.float64)
         if measurements.ndim != 2 or measurements.shape[:1] != self.operator.shape_out:
             raise ShapeError("measurements", (*self.operator.shape_out, "t"), measurements.shape)
         if wall.shape != (*self.operator.shape_in, 3):
@@ -69,10 +67,8 @@ class CompressedCapture:
         """Recover the wall's transients by the adjoint, or by a method of `tofclip.solvers`."""
         method = method or Backprojection()
         frames = method.recover(self.operator, self.measurements).frames
-        history = {
-            **self.provenance,
-            "recovery": {"method": method.name, "readings": len(self.measurements)},
-        }
+        recovery = {"method": method.name, "readings": len(self.measurements)}
+        history = {**self.provenance, "recovery": recovery}
         return Capture(frames, self.wall, self.laser, self.bin_width, self.start, history)
 
 
@@ -99,9 +95,8 @@ class AdjointImaging:
     def plan(self, capture: CompressedCapture, grid: Grid) -> Plan:
         """Make the solver ready for transients recovered from such measurements."""
         blank = np.zeros((capture.measurements.shape[1], *capture.wall.shape[:-1]), np.float32)
-        return self.solver.plan(
-            Capture(blank, capture.wall, capture.laser, capture.bin_width, capture.start), grid
-        )
+        place = capture.wall, capture.laser, capture.bin_width, capture.start
+        return self.solver.plan(Capture(blank, *place), grid)
 
     def reconstruct(self, capture: CompressedCapture, grid: Grid) -> Volume:
         """Image the hidden scene. Returns weak voxels are zero."""

@@ -53,9 +53,8 @@ def shift_signals(signal, delay_bins):
                 # so that the record's last bin itself can be read
                 before = min(int(position), bins - 2)
                 weight = np.float32(position - before)
-                result[i, p] = signal[before, p] + weight * (
-                    signal[before + 1, p] - signal[before, p]
-                )
+                value = signal[before, p]
+                result[i, p] = value + weight * (signal[before + 1, p] - value)
     return result
 
 
@@ -83,11 +82,8 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers,
     # Of every voxel: real and imaginary part of the sample before its path, then of the one after.
     sums = np.zeros((z.size, y.size, 4 * x.size), np.float32)
     outward = np.empty((z.size, y.size, x.size), np.float32)
-    sample, before, after = (
-        np.empty(x.size, np.int32),
-        np.empty(x.size, np.float32),
-        np.empty(x.size, np.float32),
-    )
+    sample, weights = np.empty(x.size, np.int32), np.empty((2, x.size), np.float32)
+    before, after = weights[0], weights[1]
     weighted = powers[0] != 0 or powers[1] != 0
     for p in range(wall.shape[0]):
         # the outgoing leg is the same for all points that share a laser spot
@@ -101,15 +97,8 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers,
                     x, wall[p, 0], across, outward[iz, iy], per_metre, last, sample, before, after
                 )
                 if weighted:
-                    _apply_weights(
-                        x,
-                        wall[p, 0],
-                        across,
-                        max(z[iz] - wall[p, 2], np.float32(0)),
-                        powers,
-                        before,
-                        after,
-                    )
+                    ahead = max(z[iz] - wall[p, 2], np.float32(0))
+                    _apply_weights(x, wall[p, 0], across, ahead, powers, weights)
                 _add_samples(waveforms[p], sample, before, after, sums[iz, iy])
     for iz in range(z.size):
         for iy in range(y.size):
@@ -133,9 +122,8 @@ def _compute_outward_samples(laser, start, per_metre, x, y, z, outward):
         for iy in range(y.size):
             across = (y[iy] - laser[1]) ** 2 + (z[iz] - laser[2]) ** 2
             for ix in range(x.size):
-                outward[iz, iy, ix] = (
-                    math.sqrt((x[ix] - laser[0]) ** 2 + across) - start
-                ) * per_metre
+                distance = math.sqrt((x[ix] - laser[0]) ** 2 + across)
+                outward[iz, iy, ix] = (distance - start) * per_metre
 
 
 @compiled
@@ -165,14 +153,14 @@ def _raise_to_power(base, exponent):
 
 
 @compiled
-def _apply_weights(x, wall_x, across, ahead, powers, before, after):
+def _apply_weights(x, wall_x, across, ahead, powers, weights):
     """Multiply a row's weights by powers of their distance and of their direction's cosine."""
     across = max(across, np.float32(MIN_DISTANCE_M * MIN_DISTANCE_M))
     for ix in range(x.size):
         distance = math.sqrt((x[ix] - wall_x) ** 2 + across)
         factor = _raise_to_power(distance, powers[0]) * _raise_to_power(ahead / distance, powers[1])
-        before[ix] *= factor
-        after[ix] *= factor
+        weights[0, ix] *= factor
+        weights[1, ix] *= factor
 
 
 @compiled
@@ -192,12 +180,8 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
     spot, to a plane (y, x). Terms from `odd` on are multiplied by 1j; `table` (m, samples): f_m,
     evenly spaced from ``span[0]`` to ``span[1]``; `carrier` (x,) multiplies columns; m and rad/m.
     """
-    before, weight, sums = (
-        np.empty(x.size, np.uint32),
-        np.empty(x.size, np.float32),
-        np.empty((2, x.size), np.float32),
-    )
-    waves = np.empty((2, x.size), np.float32)
+    before, weight = np.empty(x.size, np.uint32), np.empty(x.size, np.float32)
+    sums, waves = np.empty((2, x.size), np.float32), np.empty((2, x.size), np.float32)
     # A plane of one voxel has a span of 0: any sample is right there.
     per_metre = (table.shape[1] - 1) / max(span[1] - span[0], 1e-12)
     cycles_per_metre = wavenumber / (2 * math.pi)
@@ -281,8 +265,5 @@ def migrate_row(spectrum, ky, kx, delay):
             fraction = np.float32(place - below)
             value = row[below] + fraction * (row[below + 1] - row[below])
             weight = depth / place
-            turned = complex(
-                np.float32(weight * math.cos(delay * place)),
-                np.float32(-weight * math.sin(delay * place)),
-            )
-            row[depth] = value * turned
+            along, aside = weight * math.cos(delay * place), -weight * math.sin(delay * place)
+            row[depth] = value * complex(np.float32(along), np.float32(aside))

@@ -229,11 +229,9 @@ def _separate(
 
 def find_imaged_surface(capture: Capture, volume: Volume, fraction: float = 0.3) -> FrontSurface:
     """Find the front surface of an imaged capture, by the directional transform if that takes it."""
-    here = volume.on(ComputeDevice())
+    here, light = volume.on(ComputeDevice()), capture.on(ComputeDevice())
     require_surface(here.magnitude, fraction)
     try:
-        return DirectionalLightCone().find_front_surface(
-            capture.on(ComputeDevice()), volume.grid, fraction
-        )
+        return DirectionalLightCone().find_front_surface(light, volume.grid, fraction)
     except InputError:
         return find_front_surface(here, fraction)

@@ -51,9 +51,8 @@ def rebin_capture(capture: Capture, factor: int) -> Capture:
             f"{capture.axis.bins} bins cannot be put together by {factor}; at least two must be left"
         )
     xp = namespace(capture.signal)
-    kept = xp.reshape(
-        capture.signal[: bins * factor, ...], (bins, factor, *capture.signal.shape[1:])
-    )
+    kept = capture.signal[: bins * factor, ...]
+    kept = xp.reshape(kept, (bins, factor, *kept.shape[1:]))
     # A bin stands for its middle.
     start = capture.start + (factor - 1) / 2 * capture.axis.spacing
     bin_width = factor * capture.bin_width
@@ -244,12 +243,9 @@ class _Moveout:
         self._axis, self._places = capture.axis, np.flatnonzero(capture.valid)
         _, self._squared, self._along = _find_offsets(capture, slice(None))
         self._blocks = list(split_blocks(len(self._places), PAIRS_PER_BLOCK))
-        values = len(self._places) * capture.axis.bins
-        self._kept = (
-            [self._find_bins(some) for some in self._blocks]
-            if values * BYTES_PER_READING <= MAX_KEPT_BYTES
-            else None
-        )
+        self._kept = None
+        if len(self._places) * capture.axis.bins * BYTES_PER_READING <= MAX_KEPT_BYTES:
+            self._kept = [self._find_bins(some) for some in self._blocks]
 
     def read(self, signal: NDArray[Any]) -> NDArray[np.float32]:
         """Return signals (t, ...) read at their pairs' paths, linear between bins; 0 outside."""

@@ -170,10 +170,7 @@ class Grid:
             )
         axes = zip((volume.grid.z, volume.grid.y, volume.grid.x), indices, strict=True)
         z, y, x = (
-            [
-                float(axis[i])
-                for i in (max(bright.min() - 1, 0), min(bright.max() + 1, axis.size - 1))
-            ]
+            axis[[max(bright.min() - 1, 0), min(bright.max() + 1, axis.size - 1)]].tolist()
             for axis, bright in axes
         )
         return cls.box(x, y, z, voxel)

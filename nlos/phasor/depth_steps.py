@@ -51,9 +51,8 @@ class Illumination:
 
 def build_constant_illumination(frequencies: int) -> Illumination:
     """No illumination wave: all frequencies simply add up."""
-    return Illumination(
-        np.ones((frequencies, 1), np.float32), 1, np.ones((2, 1), np.float32), np.zeros(2)
-    )
+    ones = np.ones((frequencies, 1), np.float32)
+    return Illumination(ones, 1, np.ones((2, 1), np.float32), np.zeros(2))
 
 
 def split_illumination(
@@ -141,9 +140,8 @@ class PlaneWaves:
             for side, index in zip(self.period, (rows, columns), strict=True)
         )
         # Rounded, so that waves mirrored in an axis or in the diagonal are equal.
-        lateral = (
-            LATERAL_ROUNDING * np.rint(np.hypot(qy[:, np.newaxis], qx) / LATERAL_ROUNDING).ravel()
-        )
+        lateral = np.hypot(qy[:, np.newaxis], qx).ravel()
+        lateral = LATERAL_ROUNDING * np.rint(lateral / LATERAL_ROUNDING)
         inside = np.flatnonzero(lateral <= self.lateral_limits[-1])
         order = inside[np.argsort(lateral[inside], kind="stable")]
         return rows[order // columns.size], columns[order % columns.size], lateral[order]
@@ -169,11 +167,9 @@ class DiffractionPlan:
     @cached_property
     def _offsets(self) -> Offsets:
         offsets = Offsets.between(self.plane, self.grid.y, self.grid.x)
-        return (
-            offsets
-            if self.paths is None
-            else offsets.limit(self.paths.plane_to_voxels, self.paths.rim)
-        )
+        if self.paths is None:
+            return offsets
+        return offsets.limit(self.paths.plane_to_voxels, self.paths.rim)
 
     @cached_property
     def lattice(self) -> tuple[int, int]:
@@ -203,13 +199,8 @@ class DiffractionPlan:
     def plane_waves(self) -> PlaneWaves:
         """The plane waves that carry the field."""
         # to the nearest voxels waves travel most aside
-        limits = find_lateral_limits(
-            self.waves,
-            self._window,
-            self.strength,
-            self._min_distance,
-            WAVES_ERROR_FRACTION * self.tolerance,
-        )
+        error, nearest = WAVES_ERROR_FRACTION * self.tolerance, self._min_distance
+        limits = find_lateral_limits(self.waves, self._window, self.strength, nearest, error)
         return PlaneWaves(self._periods, limits)
 
     @property
@@ -231,14 +222,10 @@ class DiffractionPlan:
     @cached_property
     def transfer(self) -> TransferFunction:
         """Transfer functions from the plane to any depth."""
-        fine = self.tolerance < FINE_NODES_TOLERANCE
-        return TransferFunction(
-            self.waves,
-            self._window,
-            float(self.plane_waves.lateral_limits[-1]),
-            self._min_distance,
-            FINE_NODE_OVERSAMPLING if fine else NODE_OVERSAMPLING,
-        )
+        fine, widest = self.tolerance < FINE_NODES_TOLERANCE, self.plane_waves.lateral_limits[-1]
+        density = FINE_NODE_OVERSAMPLING if fine else NODE_OVERSAMPLING
+        waves, window = self.waves, self._window
+        return TransferFunction(waves, window, float(widest), self._min_distance, density)
 
     @property
     def _min_distance(self) -> float:

@@ -76,7 +76,5 @@ def plan_transform(
         return FourierPlan(source, target, axis, inverse)
     direction = "FFTW_BACKWARD" if inverse else "FFTW_FORWARD"
     with PLANNING_LOCK:
-        plan: FourierPlan = pyfftw.FFTW(
-            source, target, direction=direction, axes=(axis,), flags=FFTW_FLAGS
-        )
-    return plan
+        made: FourierPlan = pyfftw.FFTW(source, target, (axis,), direction, FFTW_FLAGS)
+    return made

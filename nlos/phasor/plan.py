@@ -174,9 +174,8 @@ class ReciprocalPlan(PhasorPlan):
         for number, one in enumerate(self.swapped.groups):
             plane_field = self.swapped.propagate_to_plane(number, plain, progress)
             self.swapped.add_to_depths(number, plane_field, without, progress)
-            plane_field = self.swapped.propagate_to_plane(number, longer, progress) + (
-                plane_field * slopes
-            )
+            plane_field = plane_field * slopes
+            plane_field += self.swapped.propagate_to_plane(number, longer, progress)
             own = self.swapped.zeros()
             self.swapped.add_to_depths(number, plane_field, own, progress)
             total += own / device.put(find_distance(one.group.laser, self.grid))

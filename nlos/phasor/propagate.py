@@ -136,17 +136,11 @@ def propagate(
     require_tolerance(tolerance)
     require_propagation(propagation)
     group, band = groups[0], Band(pulse, capture.axis)
-    wall_to_plane = plan_wall_to_plane(
-        capture,
-        WallBeforePlane.of(capture.points[group.indices], plane),
-        group,
-        band,
-        choose_backend(capture, band),
-        propagation,
-        tolerance,
-    )
+    wall = WallBeforePlane.of(capture.points[group.indices], plane)
+    how = choose_backend(capture, band), propagation, tolerance
+    carry = plan_wall_to_plane(capture, wall, group, band, *how)
     wavenumbers = group.legs * band.wavenumbers
-    return PlaneField(wall_to_plane(capture, ignore_progress, group), plane, wavenumbers)
+    return PlaneField(carry(capture, ignore_progress, group), plane, wavenumbers)
 
 
 def plan_wall_to_plane(

@@ -241,12 +241,9 @@ class PortableDiffraction:
         before = xp.clip(xp.astype(position, xp.int64), None, samples - 2)
         weight = (position - xp.astype(before, position.dtype))[:, None, :, :]
         index = xp.reshape(before + block.first, (-1,))
-        here, there = (
-            xp.permute_dims(
-                xp.reshape(xp.take(block.table, some, axis=0), (*before.shape, -1)), (0, 3, 1, 2)
-            )
-            for some in (index, index + 1)
-        )
+        rows = (xp.take(block.table, some, axis=0) for some in (index, index + 1))
+        shaped = (xp.reshape(row, (*before.shape, -1)) for row in rows)
+        here, there = (xp.permute_dims(one, (0, 3, 1, 2)) for one in shaped)
         return here + weight * (there - here)
 
     def _extra_distance(self, axial: _Axial) -> Array:
@@ -306,9 +303,8 @@ class PortableDiffraction:
         ahead = self._measure_ahead(depths)[:, np.newaxis, np.newaxis]
         position = put((ahead - starts) * per_metre), put(per_metre)
         first = put(samples * np.arange(depths.size)[:, np.newaxis, np.newaxis])
-        return _DepthBlock(
-            axial, put(np.stack(nodes)), put(coefficients), put(table), first, position
-        )
+        tables = put(np.stack(nodes)), put(coefficients), put(table)
+        return _DepthBlock(axial, *tables, first, position)
 
     def _measure_ahead(self, depths: FloatArray) -> FloatArray:
         return np.abs(depths - (0.0 if self.source.laser is None else self.source.laser[2]))

@@ -75,10 +75,8 @@ class WaveGroups:
         self._row, self._column = row, column
         # Indices of all, and whether a wave stands there for the first time, (groups, MIRRORED,
         # LANES).
-        self.indices = (
-            np.stack([row, -row, row, -row], axis=1),
-            np.stack([column, column, -column, -column], axis=1),
-        )
+        rows = np.stack([row, -row, row, -row], axis=1)
+        self.indices = rows, np.stack([column, column, -column, -column], axis=1)
         once = places < self._count
         self.is_distinct = np.stack(
             [once, once & (row > 0), once & (column > 0), once & (row > 0) & (column > 0)], axis=1
@@ -122,15 +120,12 @@ class WaveGroups:
                 (plane.y, plane.x), origin, waves.period, waves.max_indices, strict=True
             )
         )
-        spectrum = np.zeros(
-            (len(row), self.leading_zeros + count, 2, MIRROR_IMAGES, LANES), np.float32
-        )
+        shape = (len(row), self.leading_zeros + count, 2, MIRROR_IMAGES, LANES)
+        spectrum = np.zeros(shape, np.float32)
 
         def analyse(some: slice) -> None:
-            high, wide = (
-                reach + 1
-                for reach in waves.max_indices_within(float(waves.lateral_limits[some][-1]))
-            )
+            widest = float(waves.lateral_limits[some][-1])
+            high, wide = (reach + 1 for reach in waves.max_indices_within(widest))
             lines = y.project(np.ascontiguousarray(np.swapaxes(values[..., some], 1, 2)), high)
             parts = [
                 part
@@ -165,11 +160,8 @@ class _AxisTransform:
         # sines of half the points suffice
         phases = np.outer(numbers, (axis[::-1] - axis)[:half] / 2)
         turns = np.exp(-1j * numbers * ((axis[0] + axis[-1]) / 2 - origin))
-        return cls(
-            np.cos(phases).astype(np.float32),
-            np.sin(phases).astype(np.float32),
-            turns.astype(np.complex64),
-        )
+        cosines, sines = (wave(phases).astype(np.float32) for wave in (np.cos, np.sin))
+        return cls(cosines, sines, turns.astype(np.complex64))
 
     def project(self, values: NDArray[np.complex64], count: int) -> list[NDArray[np.complex64]]:
         """Sums of values (points, ...) with the first cosines, and sines, (count, ...)."""
@@ -264,18 +256,15 @@ class InverseTransform:
         # Unfolded columns are shifted so that none is negative; `carrier` takes the shift back.
         shift = reach if 2 * reach + 1 < wide else 0
         self.spare = columns * _pad_to_vector(high)
-        self.cell_indices: NDArray[np.int64] = (waves[1] + shift) % wide * _pad_to_vector(
-            high
-        ) + waves[0] % high
-        self.carrier = np.exp(-2j * np.pi * shift / wide * np.arange(wanted[1])).astype(
-            np.complex64
-        )
+        tall = _pad_to_vector(high)
+        self.cell_indices: IntArray = (waves[1] + shift) % wide * tall + waves[0] % high
+        carrier = np.exp(-2j * np.pi * shift / wide * np.arange(wanted[1]))
+        self.carrier = carrier.astype(np.complex64)
         some = _count_per_batch(self.spare, terms)
         self.spectra: NDArray[np.complex64] = allocate_zeros((some, self.spare + VECTOR_LENGTH))
-        self._columns = self.spectra[:, : self.spare].reshape(some, columns, _pad_to_vector(high))[
-            ..., :high
-        ]
-        self._lines = allocate_zeros((some, columns, _pad_to_vector(high)))[..., :high]
+        cells = self.spectra[:, : self.spare].reshape(some, columns, tall)
+        self._columns = cells[..., :high]
+        self._lines = allocate_zeros((some, columns, tall))[..., :high]
         self._middle = allocate_zeros((some, wanted[0], _pad_to_vector(wide)))[..., :wide]
         self._rows = allocate_zeros((terms, wanted[0], _pad_to_vector(wide)))[..., :wide]
         self.images: NDArray[np.complex64] = self._rows[..., : wanted[1]]
@@ -419,9 +408,8 @@ class CompiledDiffraction:
         """
         plan = self.plan
         with limit_blas_threads():
-            spectrum = self.groups.to_plane_waves(
-                values, plan.plane, (float(plan.grid.y[0]), float(plan.grid.x[0]))
-            )
+            origin = float(plan.grid.y[0]), float(plan.grid.x[0])
+            spectrum = self.groups.to_plane_waves(values, plan.plane, origin)
             # What threads share is made before they start.
             plan.transfer.tabulate()
             lights, interpolation = self._lights, self._interpolation
@@ -493,14 +481,12 @@ class _Workspace:
         self.max_terms = terms
         self.inverse = choose_inverse(groups.indices, plan.lattice, plan.grid.shape[1:], terms)
         # repeated waves are sent to a spare cell that nothing reads
-        self.cell_indices = np.where(
-            groups.is_distinct, self.inverse.cell_indices, self.inverse.spare
-        )
+        cells, distinct = self.inverse.cell_indices, groups.is_distinct
+        self.cell_indices = np.where(distinct, cells, self.inverse.spare)
         # where several waves fall into one cell they have to be added, not written
-        self.folded = bool(np.bincount(self.inverse.cell_indices[groups.is_distinct]).max() > 1)
-        self._term_buffer = np.empty(
-            PLANES_PER_BLOCK * (terms + 1) * int(np.prod(groups.shape)), np.float32
-        )
+        self.folded = bool(np.bincount(cells[distinct]).max() > 1)
+        size = PLANES_PER_BLOCK * (terms + 1) * int(np.prod(groups.shape))
+        self._term_buffer = np.empty(size, np.float32)
 
     def image(
         self,

@@ -41,10 +41,8 @@ def sample_waves(radius, distance, first, step, delay, continued, leading_zeros,
         path = math.sqrt(radius[i] ** 2 + distance**2)
         phase = first * direction * path + (first - delay[1]) * delay[0]
         turn = step * (direction * path + delay[0])
-        wave, factor = (
-            complex(math.cos(phase), math.sin(phase)),
-            complex(math.cos(turn), math.sin(turn)),
-        )
+        wave = complex(math.cos(phase), math.sin(phase))
+        factor = complex(math.cos(turn), math.sin(turn))
         # the first Rayleigh-Sommerfeld integral: z / (2 pi R^2) * (1 / R - 1j * k)
         steady, rising = 1 / path, 0.0
         if continued:
@@ -98,17 +96,10 @@ def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coef
         of = (group * frequencies + lowest) * GROUP_FLOATS
         for depth in range(coefficients.shape[0]):
             node = (depth * nodes.shape[1] + begin[group]) * 2 * frequencies + lowest
-            share_begin, share_end = offset[group] * LANES, offset[group + 1] * LANES
-            _interpolate_transfer(
-                at_nodes,
-                np.uintp(node),
-                row,
-                weights,
-                np.uintp(share_begin),
-                np.uintp(share_end),
-                steps,
-                transfer,
-            )
+            share_begin = np.uintp(offset[group] * LANES)
+            share_end = np.uintp(offset[group + 1] * LANES)
+            of_nodes = at_nodes, np.uintp(node), row
+            _interpolate_transfer(of_nodes, weights, share_begin, share_end, steps, transfer)
             for part in range(2 * LANES // LENGTH):
                 # two mirrored waves, and half of their lanes
                 lane = part % 2 * LENGTH
@@ -130,8 +121,9 @@ def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coef
 
 
 @part_of_loop
-def _interpolate_transfer(nodes, start, row, weights, begin, end, steps, transfer):
+def _interpolate_transfer(of_nodes, weights, begin, end, steps, transfer):
     """Transfer function (frequencies, 2, `LANES`) of a group, `FREQUENCY_STEPS` at a time."""
+    nodes, start, row = of_nodes
     zero = fill_vector(np.float32(0))
     nothing = (zero, zero, zero, zero, zero, zero, zero, zero)
     for lane in range(np.uintp(0), WAVE_LANES, STEP):
@@ -272,12 +264,8 @@ def assemble_groups(parts, row, column, along_y, along_x, share, counts, first, 
         for lane in range(counts[k]):
             group, j = lane // LANES, lane % LANES
             r, c = row[group, j], column[group, j]
-            cosines, across, along, sines = (
-                parts[0, c, k, r],
-                parts[1, c, k, r],
-                parts[2, c, k, r],
-                parts[3, c, k, r],
-            )
+            cosines, across = parts[0, c, k, r], parts[1, c, k, r]
+            along, sines = parts[2, c, k, r], parts[3, c, k, r]
             same, other = along_y[r] * along_x[c], np.conj(along_y[r]) * along_x[c]
             sums = multiply_by_minus_i(along + across), multiply_by_minus_i(across - along)
             for mirrored, wave in enumerate(
@@ -305,10 +293,8 @@ def transpose(source, target):
     for top in range(0, rows, TILE_SIDE):
         for left in range(0, columns, TILE_SIDE):
             if top + TILE_SIDE <= rows and left + TILE_SIDE <= columns:
-                square, turned = (
-                    source[left : left + TILE_SIDE, top : top + TILE_SIDE],
-                    target[top:, left : left + TILE_SIDE],
-                )
+                square = source[left : left + TILE_SIDE, top : top + TILE_SIDE]
+                turned = target[top:, left : left + TILE_SIDE]
                 # A fixed number of steps becomes vector code.
                 for i in range(np.uint64(TILE_SIDE)):
                     for j in range(np.uint64(TILE_SIDE)):

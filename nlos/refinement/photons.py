@@ -119,10 +119,8 @@ class TimeOfFlight:
 
     def _pairs(self, points: Array) -> tuple[Array, Array]:
         lasers = self.capture.lasers
-        return (
-            self.capture.points[points].astype(np.float32),
-            (lasers if len(lasers) == 1 else lasers[points]).astype(np.float32),
-        )
+        lasers = lasers if len(lasers) == 1 else lasers[points]
+        return self.capture.points[points].astype(np.float32), lasers.astype(np.float32)
 
     def spread(self, values: Array, response: FloatArray) -> Array:
         """Convolve values (m, bins) with a response (n,) in time, whose middle is no delay."""
@@ -593,6 +591,5 @@ def show_with_beam(fit: PhotonFit, linear: Array) -> Array:
     ]
     shown = gaussian_filter(fit.place(fit.expected_photons), sigmas)
     undecided = (linear / max(float(linear.max()), 1e-30)) ** 2
-    return np.asarray(
-        np.maximum(shown, UNDECIDED_FRACTION * float(shown.max()) * undecided), np.float32
-    )
+    least = UNDECIDED_FRACTION * float(shown.max()) * undecided
+    return np.asarray(np.maximum(shown, least), np.float32)

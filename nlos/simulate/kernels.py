@@ -59,24 +59,13 @@ def cosine_to_normal(normal, from_point, to_point, distance):
 
 
 @compiled
-def add_facet_light(
-    wall,
-    wall_normals,
-    lasers,
-    laser_normals,
-    positions,
-    normals,
-    areas,
-    material,
-    triangles,
-    start,
-    fine,
-    bins,
-):
+def add_facet_light(walls, spots, facets, material, triangles, start, fine, bins):
     """Add the light of facets to fine `bins` (points, n), `start` and `fine` their first path and
     width, m, shared between two; `material` (3,): diffuse and retroreflected fraction, spread in
     rad; `triangles` (m, 3, 3) hide.
     """
+    (wall, wall_normals), (lasers, laser_normals) = walls, spots
+    positions, normals, areas = facets
     outward = np.empty(positions.shape[0])
     lit = np.empty(positions.shape[0])
     for p in range(wall.shape[0]):
@@ -86,9 +75,8 @@ def add_facet_light(
             for f in range(positions.shape[0]):
                 way = distance_between(lasers[p], positions[f])
                 outward[f] = way
-                arriving = cosine_to_normal(
-                    normals[f], positions[f], lasers[p], way
-                ) * cosine_to_normal(laser_normals[p], lasers[p], positions[f], way)
+                arriving = cosine_to_normal(normals[f], positions[f], lasers[p], way)
+                arriving *= cosine_to_normal(laser_normals[p], lasers[p], positions[f], way)
                 if arriving > 0 and is_occluded(positions[f], lasers[p], triangles):
                     arriving = 0.0
                 # Irradiance times area: cosines at both ends over the square of the distance.
@@ -98,23 +86,16 @@ def add_facet_light(
             if lit[f] <= 0:
                 continue
             way = distance_between(wall[p], positions[f])
-            leaving = cosine_to_normal(normals[f], positions[f], wall[p], way) * cosine_to_normal(
-                wall_normals[p], wall[p], positions[f], way
-            )
+            leaving = cosine_to_normal(normals[f], positions[f], wall[p], way)
+            leaving *= cosine_to_normal(wall_normals[p], wall[p], positions[f], way)
             place = (outward[f] + way - start) / fine
-            if (
-                leaving <= 0
-                or place < 0
-                or place >= bins.shape[1] - 1
-                or is_occluded(positions[f], wall[p], triangles)
-            ):
+            if leaving <= 0 or place < 0 or place >= bins.shape[1] - 1:
                 continue
-            brightness = (
-                lit[f]
-                * leaving
-                * evaluate_reflectance(material, positions[f], laser, wall[p], outward[f], way)
-                / (way * way)
-            )
+            if is_occluded(positions[f], wall[p], triangles):
+                continue
+            brightness = lit[f] * leaving / (way * way)
+            lengths = outward[f], way
+            brightness *= evaluate_reflectance(material, positions[f], laser, wall[p], lengths)
             index = int(place)
             weight = place - index
             bins[p, index] += brightness * (1 - weight)
@@ -128,7 +109,7 @@ def distance_between(one, other):
 
 
 @compiled
-def evaluate_reflectance(material, position, laser, observer, to_laser, to_observer):
+def evaluate_reflectance(material, position, laser, observer, lengths):
     """Reflectance per steradian of a material; see `nlos.simulate.scene.Material`."""
     # Lambert: even radiance, whose integral over the half space is the albedo
     value = material[0] / math.pi
@@ -136,7 +117,7 @@ def evaluate_reflectance(material, position, laser, observer, to_laser, to_obser
         inner = 0.0
         for i in range(3):
             inner += (laser[i] - position[i]) * (observer[i] - position[i])
-        angle = math.acos(min(max(inner / (to_laser * to_observer), -1.0), 1.0))
+        angle = math.acos(min(max(inner / (lengths[0] * lengths[1]), -1.0), 1.0))
         width = material[2]
         value += material[1] * math.exp(-0.5 * (angle / width) ** 2) / (2 * math.pi * width * width)
     return value

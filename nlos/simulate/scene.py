@@ -510,12 +510,12 @@ class HiddenScene:
         def process_block(some: slice) -> None:
             bins = np.zeros((some.stop - some.start, (axis.bins + 2 * margin) * BIN_OVERSAMPLING))
             own = slice(None) if len(dark.lasers) == 1 else some
-            spots = dark.points[some], normals[some], dark.lasers[own], laser_normals[own]
+            ends = (dark.points[some], normals[some]), (dark.lasers[own], laser_normals[own])
             for surface in self.surfaces:
                 stuff = surface.material
                 material = np.array([stuff.diffuse, stuff.retro, stuff.spread])
                 facets = surface.positions, surface.normals, surface.areas
-                add_facet_light(*spots, *facets, material, triangles, start, fine, bins)
+                add_facet_light(*ends, facets, material, triangles, start, fine, bins)
             seen = gaussian_filter1d(
                 bins, sigma / fine, axis=1, mode="constant", truncate=RESPONSE_SIGMAS
             )
