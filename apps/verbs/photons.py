@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 RANGE_IMAGE_SUFFIX = ".npz"
 DEFAULT_FIELD_OF_VIEW_DEG = 30.0
 MAX_RETURNS = 255  # of a pixel: clouds number them in a byte
+# Of the cycles that a photon ended: at 3 photons a cycle (.95) a learnt pulse is .4 mm late, at 5 (.993) 4 mm
+# early, of 300 ps.
+MAX_LEARNT_SHARE = 0.98
 
 AXES = opt(
     "ORDER", "Order of the axes of a cube of photons, e.g. tyx.", name="--axes", shown="recognised"
@@ -97,8 +100,7 @@ def photons(
     ),
     cycles: int | None = opt(
         "N",
-        "Laser cycles of each pixel, of a detector that counts the first photon of a cycle only: pile-up is corrected, "
-        "best with --pulse-ps.",
+        "Laser cycles of each pixel, of a detector that counts the first photon of a cycle only: pile-up is corrected.",
         shown="no pile-up",
     ),
     returns: int = opt(
@@ -189,13 +191,21 @@ def photons(
         "seconds": time.perf_counter() - started,
         "settings": settings,
     }
-    missed = found.settings.get("pile_up", 0.0)
+    missed, warning = found.settings.get("pile_up", 0.0), ""
     if missed:
-        print(
-            f"tofclip: warning: {missed:.0%} of the background is missing behind surfaces: the detector is blind after "
-            "a photon, and ranges are too short (pile-up); give --cycles N and --pulse-ps W",
-            file=sys.stderr,
+        warning = (
+            f"{missed:.0%} of the background is missing behind surfaces: the detector is blind after a photon, and "
+            "ranges are too short (pile-up); give --cycles N"
         )
+    elif cycles is not None and found.settings["response"] == "learnt":
+        ended = np.median(image.photons_per_pixel[image.photons_per_pixel > 0]) / cycles
+        if ended > MAX_LEARNT_SHARE:
+            warning = (
+                f"a photon ended {ended:.1%} of the cycles: nothing shows the late side of the pulse, and ranges may "
+                "be wrong by its width; give --pulse-ps W"
+            )
+    if warning:
+        print(f"tofclip: warning: {warning}", file=sys.stderr)
     report(figures, as_json, [out])
 
 

@@ -89,8 +89,14 @@ def test_first_photons_of_a_cycle_are_not_taken_for_all(photons, unaware):
     rates = scenes.make_rates(surface, light, 0.1 * photons * cycles / BINS)
     image = PhotonImage.from_cube(scenes.count_first_photons(rates, cycles, 0), scenes.BIN)
     pulse = Pulse.gaussian(scenes.FWHM)
-    missed, found = (estimate_surface(image, pulse, cycles=told) for told in (None, cycles))
+    missed = estimate_surface(image, pulse)
     assert np.median(missed.range - surface * scenes.BIN_M) < unaware
-    assert abs(np.median(found.range - surface * scenes.BIN_M)) < 1e-3
     assert missed.settings["pile_up"] > 0.3
-    assert found.settings["pile_up"] == 0
+    for known in (pulse, None):  # without it, the response of which few cycles see the late side
+        found = estimate_surface(image, known, cycles=cycles)
+        error = found.range - surface * scenes.BIN_M
+        assert abs(np.median(error)) < 0.6e-3  # three seeds, both kinds: up to 0.4 mm
+        for columns in (TILES > 1.3, TILES < 0.7):
+            assert abs(np.median(error[:, columns])) < 0.8e-3
+        assert 0.7 < compute_z(found, surface) < 1.4
+        assert found.settings["pile_up"] == 0

@@ -4,6 +4,7 @@ which response and which reach of planes explain them best, and how probable an 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable
 
@@ -15,7 +16,7 @@ from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.lidar.photons.image import PhotonImage
 from tofclip.lidar.photons.matching import PLANE_ROUNDS, TRIAL_ROUNDS, fit_surface
-from tofclip.lidar.photons.scene import LEARNT_SLOPE_FLOOR, BinnedResponse, Scene, learn_response
+from tofclip.lidar.photons.scene import BinnedResponse, Scene, learn_response
 
 REACHES_PX = (1, 2, 3, 4, 6, 8)
 RESPONSE_ROUNDS, RESPONSE_REACH_PX = 4, 3
@@ -74,41 +75,34 @@ def learn_scene(
     """Learn the response from the photons held back, around the surface that the others found.
     Returns None if the response known so far explains the photons as well and none is required.
     """
-    fitted = fit_surface(train, scene, surface, RESPONSE_REACH_PX)[..., 0]
-    before = weigh_evidence(test, train, scene, fitted)
+    fitted = fit_surface(train, scene, surface, RESPONSE_REACH_PX)
+    before = weigh_evidence(test, train, scene, fitted[..., 0])
     for _ in range(RESPONSE_ROUNDS):
-        residual = test.bin - fitted.ravel()[test.pixel]
-        pulse, later = learn_response(
-            residual, _count_arrived(test), scene.response.width, train.bin_width
-        )
-        scene = Scene(BinnedResponse(pulse, train.bin_width, LEARNT_SLOPE_FLOOR), scene.background)
-        fitted = fit_surface(train, scene, fitted + later, RESPONSE_REACH_PX, TRIAL_ROUNDS)[..., 0]
-    gain = weigh_evidence(test, train, scene, fitted) - before
+        scene, later = learn_response(test, train, scene, fitted)
+        begin = fitted[..., 0] + later
+        fitted = fit_surface(train, scene, begin, RESPONSE_REACH_PX, TRIAL_ROUNDS)
+    gain = weigh_evidence(test, train, scene, fitted[..., 0]) - before
     clear = MIN_LEARNT_SIGNIFICANCE * np.sqrt(gain.size) * gain.std() + MIN_LEARNT_GAIN
     return scene.response if required or gain.sum() > clear else None
-
-
-def _count_arrived(photons: PhotonImage) -> NDArray[np.float32]:
-    return photons.count if photons.arrived is None else photons.count * photons.arrived
 
 
 def choose_reach(
     train: PhotonImage, test: PhotonImage, scene: Scene, surface: FloatArray
 ) -> tuple[int, FloatArray]:
-    """Find the reach of planes, in pixels, that explains the photons held back best, and the surface
-    that it gives.
+    """Find the reach of planes, in pixels, that explains the photons held back best, and what
+    `fit_surface` gives with it.
     """
-    best, chosen, highest = REACHES_PX[0], surface, -np.inf
+    best, chosen, highest = REACHES_PX[0], np.zeros(0), -np.inf
     rounds = PLANE_ROUNDS
     for reach in REACHES_PX:
         if reach > REACHES_PX[0] and 2 * reach + 1 > min(surface.shape):
             break
-        surface = fit_surface(train, scene, surface, reach, rounds)[..., 0]
-        rounds = TRIAL_ROUNDS
+        fitted = fit_surface(train, scene, surface, reach, rounds)
+        surface, rounds = fitted[..., 0], TRIAL_ROUNDS
         value = float(weigh_evidence(test, train, scene, surface).mean())
         if value <= highest:
             break
-        best, chosen, highest = reach, surface, value
+        best, chosen, highest = reach, fitted, value
     return best, chosen
 
 
@@ -116,7 +110,7 @@ def calibrate_outliers(
     test: PhotonImage,
     train: PhotonImage,
     scene: Scene,
-    surface: FloatArray,
+    fitted: FloatArray,
     margin: NDArray[np.float32],
 ) -> Callable[[NDArray[np.float32]], FloatArray]:
     """Learn how to turn margins of labels into probabilities of an outlier.
@@ -130,10 +124,13 @@ def calibrate_outliers(
     # Noise of the assumed share of signal makes surfaces look surer than they are: it is taken from
     # as large a neighbourhood as explains the photons best.
     one, other = test.split(0.5, 0)
-    evidence = np.zeros(surface.size)
+    evidence = np.zeros(margin.size)
     for teacher, part in ((other, one), (one, other)):
-        learnt, moved = _learn_anew(teacher, scene, surface)
-        pooled = (weigh_evidence(part, train, learnt, moved, pool) for pool in WIDER_POOLS_PX)
+        learnt, later = scene, 0.0
+        with contextlib.suppress(InputError):  # too few photons to show one
+            learnt, later = learn_response(teacher, train, scene, fitted)
+        moved = fitted[..., 0] + later
+        pooled = [weigh_evidence(part, train, learnt, moved, pool) for pool in WIDER_POOLS_PX]
         evidence += max(pooled, key=np.sum)
     some = slice(None, None, -(-margin.size // MAX_JUDGED_PIXELS))
     for_surface = np.exp(np.clip(evidence[some], -30, 30))
@@ -150,18 +147,3 @@ def calibrate_outliers(
 
     weight, rivals = max(itertools.product(MARGIN_WEIGHTS, RIVALS), key=weigh)
     return lambda value: doubt(value, weight, rivals)
-
-
-def _learn_anew(
-    teacher: PhotonImage, scene: Scene, surface: FloatArray
-) -> tuple[Scene, FloatArray]:
-    """Return scene and surface with the response that these photons show, if they show one."""
-    residual = teacher.bin - surface.ravel()[teacher.pixel]
-    width = scene.response.width
-    try:
-        pulse, later = learn_response(residual, _count_arrived(teacher), width, teacher.bin_width)
-    except InputError:
-        return scene, surface
-    return Scene(
-        BinnedResponse(pulse, teacher.bin_width, LEARNT_SLOPE_FLOOR), scene.background
-    ), surface + later

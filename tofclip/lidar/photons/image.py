@@ -53,8 +53,6 @@ class PhotonImage:
     cycles : float
         Laser cycles of each pixel, of a detector that counts the first photon of a cycle only; by
         default so many that none is missed; see `correct_pile_up`.
-    arrived : (events,) float32 array, optional
-        Photons that arrived for each one that was counted; 1 by default.
 
     Raises
     ------
@@ -70,7 +68,6 @@ class PhotonImage:
     bin_width: float
     axes: str = ""
     cycles: float = np.inf
-    arrived: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         pixels = self.image_shape[0] * self.image_shape[1]
@@ -197,9 +194,8 @@ class PhotonImage:
         """Return the events with other counts, (events,); those with none are left out."""
         kept = count > 0
         offsets = np.concatenate([[0], np.cumsum(kept)])[self.offsets]
-        arrived = None if self.arrived is None else self.arrived[kept]
         own = self.bin[kept], count[kept]
-        return replace(self, offsets=offsets, bin=own[0], count=own[1], axes="", arrived=arrived)
+        return replace(self, offsets=offsets, bin=own[0], count=own[1], axes="")
 
     def join_bins(self, number: int) -> PhotonImage:
         """Return the same events, at the same instants, on a time axis of bins that are as many
@@ -215,38 +211,36 @@ class PhotonImage:
         """Divide the photons at random, a fraction of them into the second part, so that one part
         can judge what the other part says.
         """
-        noise = np.random.default_rng(seed)
-        # binomial thinning of Poisson counts gives two independent Poisson counts
-        second = noise.binomial(np.rint(self.count).astype(np.int64), fraction).astype(np.float32)
+        from tofclip.lidar.photons.kernels import choose_cycles
+
+        noise, second = np.random.default_rng(seed), np.zeros_like(self.count)
+        if np.isinf(self.cycles):
+            # binomial thinning of Poisson counts gives two independent Poisson counts
+            second[:] = noise.binomial(np.rint(self.count).astype(np.int64), fraction)
+        else:
+            choose_cycles(self.offsets, self.count, self.cycles, fraction, noise, second)
         if not (second.any() and np.any(self.count > second)):
             raise InputError(
                 f"{self.photons:g} photons are too few to find a surface and to hold some back "
                 "that judge it; each pixel may be judged alone (`single_pixel`)"
             )
-        # each part sees as much of the dead time as all photons do
-        first, other = self.select(self.count - second), self.select(second)
         return (
-            replace(first, cycles=self.cycles * (1 - fraction)),
-            replace(other, cycles=self.cycles * fraction),
+            replace(self.select(self.count - second), cycles=self.cycles * (1 - fraction)),
+            replace(self.select(second), cycles=self.cycles * fraction),
         )
 
     def correct_pile_up(self, cycles: int) -> PhotonImage:
-        """Return the same events, of a detector that counts the first photon of each of so many
-        cycles, with what it was blind to (Coates 1968).
+        """Return the same photons, in whole bins and in order, of a detector that counts the first one
+        of each of so many cycles: what it was blind to is taken into account from here on.
         """
         if self.photons_per_pixel.max() > cycles:
             raise InputError(
                 f"more photons than {cycles} cycles allow, of which each counts its first"
             )
-        order = np.lexsort((self.bin, self.pixel))
-        ordered = self.count[order].astype(np.float64)
-        until = np.concatenate([[0.0], np.cumsum(ordered)])
-        live = cycles - (until[:-1] - until[self.offsets[:-1]][self.pixel])
-        share = ordered / np.maximum(live, MIN_READY_SHARE * cycles)
-        arrived = np.empty_like(self.count)
-        share = np.clip(share, 1e-9, MAX_BLIND_SHARE)
-        arrived[order] = -np.log1p(-share) * cycles / ordered
-        return replace(self, cycles=float(cycles), arrived=arrived)
+        table = self.table.copy()
+        table.sum_duplicates()
+        own = table.indptr.astype(np.int64), table.indices.astype(np.float32), table.data
+        return replace(self, offsets=own[0], bin=own[1], count=own[2], cycles=float(cycles))
 
     def histograms(self, pixels: slice) -> FloatArray:
         """Return the histograms of some pixels in raster order, (n, bins)."""

@@ -27,7 +27,8 @@ vectorised = compile_and_keep(error_model="numpy", fastmath=True)
 per_histogram = compile_and_keep()
 
 MAX_ITERATIONS = 16  # the weights change with the estimate: some rounds more than the plain fit
-MIN_READY_SHARE = 0.02  # of the cycles: what fewer show is not worth its noise
+# Where a pixel's brightness has to be its own, that of its neighbours counts as so many photons.
+NEIGHBOURS_PHOTONS = 10.0
 MIN_PHOTONS = 0.5  # lets an empty histogram have a background
 MIN_PLANE_PIXELS = 6  # a plane through fewer pixels is taken as level
 MIN_DETERMINED_FRACTION = 1e-2  # of the information that must be left for the middle after slopes
@@ -347,44 +348,127 @@ def find_best_labels(score, total, extra_paths, apart, label, margin):
 
 
 @compiled
-def measure_events(offsets, bin_time, count, surface, table, start, step, brightness, dead, sums):
-    """What the photons of each pixel say about moving its surface, `sums` (pixels, 3): slope of the
-    log-likelihood, its Fisher information, photons of the signal. `table` (n, 4): of the response,
-    sampled from `start` by `step`: minus the slope of its logarithm, its density over that of the
-    background for one photon of signal, of which `brightness` (pixels,) are expected, then the
-    share of it that is later than the photon's bin, and how much it pushes. `dead`:
-    background of a bin, and one photon, over the cycles: where a cycle ends with its first photon,
-    each takes a share of the later signal away (0, 0: it does not). Coates 1968, Eq. 4.
+def measure_events(offsets, bin_time, count, surface, table, start, step, brightness, sums):
+    """What the photons of each pixel say about moving its surface, `sums` (pixels, 4): slope of the
+    log-likelihood, its Fisher information, photons of the signal, and the share of the light that
+    these would be of: all of it. `table` (n, 2): of the response,
+    sampled from `start` by `step`: minus the slope of its logarithm, and its density over that of
+    the background for one photon of signal, of which `brightness` (pixels,) are expected.
     """
     for pixel in range(surface.size):
         slope = information = photons = 0.0
-        ready = 1.0
         for event in range(offsets[pixel], offsets[pixel + 1]):
             position = (bin_time[event] - surface[pixel] - start) / step
-            if not 0 <= position < table.shape[0] - 1:
-                if position < 0:
-                    ready -= count[event] * dead[1]
-                continue
-            left = int(position)
-            part = position - left
-            push = table[left, 0] * (1 - part) + table[left + 1, 0] * part
-            odds = brightness[pixel] * (table[left, 1] * (1 - part) + table[left + 1, 1] * part)
-            # Probability that the photon is of the signal. The derivative of log(background +
-            # signal) is the signal's own, weighted by it.
-            belongs = odds / (1 + odds)
-            ready -= (
-                count[event] * dead[1] * (table[left, 2] * (1 - part) + table[left + 1, 2] * part)
-            )
-            missed = brightness[pixel] * (table[left, 3] * (1 - part) + table[left + 1, 3] * part)
-            # of several photons in one bin and cycle one is counted
-            rate = odds * dead[0]
-            belongs *= 1 + rate * (0.5 + rate / 12)
-            # what would have come later pushes no more: as much is added
-            slope += count[event] * (belongs * push + missed * dead[0])
-            information += count[event] * (belongs * push) ** 2
-            photons += count[event] * belongs
-        sums[pixel, 0], sums[pixel, 1] = slope, information
-        sums[pixel, 2] = photons / max(ready, MIN_READY_SHARE)
+            if 0 <= position < table.shape[0] - 1:
+                push, odds = interpolate_rows(table, position)
+                # Probability that the photon is of the signal. The derivative of log(background +
+                # signal) is the signal's own, weighted by it.
+                belongs = brightness[pixel] * odds / (1 + brightness[pixel] * odds)
+                slope += count[event] * belongs * push
+                information += count[event] * (belongs * push) ** 2
+                photons += count[event] * belongs
+        sums[pixel, 0], sums[pixel, 1], sums[pixel, 2] = slope, information, photons
+        sums[pixel, 3] = 1.0
+
+
+@compiled
+def interpolate_rows(table, position):
+    """Both columns of a table between two of its rows."""
+    left = int(position)
+    part = position - left
+    push = table[left, 0] * (1 - part) + table[left + 1, 0] * part
+    return push, table[left, 1] * (1 - part) + table[left + 1, 1] * part
+
+
+@compiled
+def measure_first_photons(
+    offsets, bin_time, count, surface, table, start, step, brightness, around, dark, cycles, sums
+):
+    """The same of a detector that counts the first photon of each of so many cycles, whose photons
+    come in whole bins, in order. A bin sees ``1 - exp(-rate)`` of the cycles that reach it (Coates
+    1968, Eq. 4), `dark` being the background's rate. Where the late side of a pulse is missing, its
+    instant is known as well as its brightness only (Schur complement), which is each pixel's own,
+    though that of its neighbours, `around` (pixels,), counts as `NEIGHBOURS_PHOTONS`.
+    """
+    for pixel in range(surface.size):
+        begin, bright = surface[pixel] + start, brightness[pixel]
+        event, end, live = offsets[pixel], offsets[pixel + 1], cycles
+        number = np.int64(np.ceil(begin))
+        while event < end and bin_time[event] < number:
+            live -= count[event]
+            event += 1
+        slope = information = mixed = seen = ready = 0.0
+        light = NEIGHBOURS_PHOTONS / bright**2
+        excess = NEIGHBOURS_PHOTONS * (1 / bright - 1 / around[pixel])
+        while number < begin + (table.shape[0] - 1) * step:
+            photons = 0.0
+            if event < end and bin_time[event] == number:
+                photons = count[event]
+                event += 1
+            push, odds = interpolate_rows(table, (number - begin) / step)
+            share = odds * dark  # of a photon of signal, in a cycle
+            chance = -np.expm1(-dark - bright * share)
+            live = max(live, photons)
+            told, known = photons / chance - live, live * (1 - chance) / chance
+            slope += told * bright * share * push
+            excess += told * share
+            information += known * (bright * share * push) ** 2
+            light += known * share**2
+            mixed += known * bright * push * share**2
+            seen += photons / chance * bright * share
+            ready += live * share
+            live -= photons
+            number += 1
+        sums[pixel, 0] = slope - mixed / light * excess
+        sums[pixel, 1] = information - mixed**2 / light
+        sums[pixel, 2], sums[pixel, 3] = seen, ready
+
+
+@compiled
+def tally_first_photons(
+    offsets, bin_time, count, surface, brightness, density, start, step, dark, cycles, slots, sums
+):
+    """Tell the response of a detector as of `measure_first_photons` by time after the surface, in
+    slots of ``slots[1]`` bins from ``slots[0]`` slots on: what was counted, as if no cycle had ended,
+    cycles that were open, and signal photons that these would have seen of a response of density
+    one; `brightness` (pixels,): signal photons of a cycle; `sums` (slots, 3) is added to.
+    """
+    for pixel in range(surface.size):
+        event, end, live = offsets[pixel], offsets[pixel + 1], cycles
+        number = np.int64(np.ceil(surface[pixel] + slots[0] * slots[1]))
+        while event < end and bin_time[event] < number:
+            live -= count[event]
+            event += 1
+        while number < surface[pixel] + (slots[0] + sums.shape[0] - 1) * slots[1]:
+            late, rate = number - surface[pixel], dark
+            position = (late - start) / step
+            if 0 <= position < density.size - 1:
+                left = int(position)
+                rising = (position - left) * (density[left + 1] - density[left])
+                rate += brightness[pixel] * (density[left] + rising)
+            own = sums[int(late / slots[1] - slots[0] + 0.5)]
+            own[1] += live
+            own[2] += live * brightness[pixel]
+            if event < end and bin_time[event] == number:
+                own[0] += count[event] * rate / -np.expm1(-rate)
+                live -= count[event]
+                event += 1
+            number += 1
+
+
+@compiled
+def choose_cycles(offsets, count, cycles, fraction, noise, chosen):
+    """Fill `chosen` (events,) with the photons of a fraction of the cycles, each of which counted one
+    or none.
+    """
+    for pixel in range(offsets.size - 1):
+        left, needed = cycles, np.floor(fraction * cycles + noise.random())
+        for event in range(offsets[pixel], offsets[pixel + 1]):
+            for _ in range(int(count[event])):
+                if noise.random() * left < needed:
+                    chosen[event] += 1
+                    needed -= 1
+                left -= 1
 
 
 @compiled
@@ -404,7 +488,7 @@ def fit_planes(surface, sums, reach, gate, slopes, rows, fitted):
         for x in range(width):
             slope_x, slope_y = slopes[y, x, 0], slopes[y, x, 1]
             here = surface[y, x]
-            w = wx = wy = wxx = wxy = wyy = b = bx = by = photons = 0.0
+            w = wx = wy = wxx = wxy = wyy = b = bx = by = photons = ready = 0.0
             pixels = 0
             for v in range(max(0, y - reach), min(height, y + reach + 1)):
                 dy = v - y
@@ -424,6 +508,7 @@ def fit_planes(surface, sums, reach, gate, slopes, rows, fitted):
                     row_b += moment
                     row_bx += moment * dx
                     photons += sums[v, u, 2]
+                    ready += sums[v, u, 3]
                     pixels += 1
                 w += row_w
                 wx += row_wx
@@ -435,7 +520,7 @@ def fit_planes(surface, sums, reach, gate, slopes, rows, fitted):
                 wyy += dy * dy * row_w
                 by += dy * row_b
             fitted[y, x, 0], fitted[y, x, 1] = surface[y, x], np.inf
-            fitted[y, x, 2] = photons / max(pixels, 1)
+            fitted[y, x, 2] = photons / max(ready, 1e-9)
             if w <= 0:
                 continue
             move, information = b / w, w

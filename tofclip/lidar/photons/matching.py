@@ -138,33 +138,29 @@ def fit_surface(
     photons: PhotonImage, scene: Scene, surface: FloatArray, reach: int, rounds: int = PLANE_ROUNDS
 ) -> FloatArray:
     """Move a surface, (rows, columns) in bins, to the likelihood's maximum, plane by plane. Pixels
-    up to `reach` away share a plane. Returns (rows, columns, 3): instant, deviation and mean
-    photons, as of `kernels.fit_planes`.
+    up to `reach` away share a plane. Returns (rows, columns, 3): instant, deviation, and mean
+    photons of these pixels, or the pixel's own where cycles end with their first photon.
     """
     from tofclip.lidar.photons import kernels
 
     response, now = scene.response, np.array(surface, dtype=np.float64)
-    odds = response.density / scene.background
-    # at the end of the bin in whose middle a photon is said to lie
-    half = 0.5 / response.step + np.arange(odds.size)
-    passed = (np.cumsum(response.density) - response.density / 2) * response.step
-    later = 1 - np.interp(half, np.arange(odds.size), passed)
-    pushes = response.log_slope * odds * response.step
-    pushed = pushes.sum() - np.cumsum(pushes) + pushes / 2
-    missed = np.interp(half, np.arange(odds.size), pushed)
-    table = np.stack([response.log_slope, odds, later, missed], axis=1)
-    dead = scene.background / photons.cycles, 1 / photons.cycles
-    brightness = np.full(now.size, scene.count_signal(photons))
+    table = np.stack([response.log_slope, response.density / scene.background], axis=1)
+    brightness = around = np.full(now.size, scene.count_signal(photons))
     slopes, gate = np.zeros((*now.shape, 2)), GATE_WIDTHS * response.width
-    sums, fitted = np.empty((now.size, 3)), np.empty((*now.shape, 3))
+    sums, fitted = np.empty((now.size, 4)), np.empty((*now.shape, 3))
 
     def measure(piece: slice) -> None:
         offsets, flat = photons.offsets[piece.start : piece.stop + 1], now.reshape(-1)[piece]
-        sampled = table, response.start, response.step, brightness[piece], dead
-        kernels.measure_events(offsets, photons.bin, photons.count, flat, *sampled, sums[piece])
+        sampled = table, response.start, response.step, brightness[piece]
+        seen = offsets, photons.bin, photons.count, flat, *sampled
+        if np.isinf(photons.cycles):
+            kernels.measure_events(*seen, sums[piece])
+        else:
+            dead = around[piece], scene.background / photons.cycles, photons.cycles
+            kernels.measure_first_photons(*seen, *dead, sums[piece])
 
     def fit(piece: slice) -> None:
-        around = sums.reshape(fitted.shape)
+        around = sums.reshape(*now.shape, -1)
         kernels.fit_planes(now, around, reach, gate, slopes, (piece.start, piece.stop), fitted)
 
     # signal and instant say something of each other where cycles end with the first photon
@@ -172,7 +168,12 @@ def fit_surface(
         run_blocks(measure, now.size, PIXELS_PER_BLOCK)
         run_blocks(fit, now.shape[0], ROWS_PER_BLOCK)
         now = fitted[..., 0].copy()
-        brightness = np.maximum(fitted[..., 2].ravel(), MIN_SIGNAL_PHOTONS)
+        brightness = around = np.maximum(fitted[..., 2].ravel(), MIN_SIGNAL_PHOTONS)
+        if not np.isinf(photons.cycles):
+            weight = kernels.NEIGHBOURS_PHOTONS / around
+            brightness = (sums[:, 2] + weight * around) / (sums[:, 3] + weight)
+    if not np.isinf(photons.cycles):
+        fitted[..., 2] = brightness.reshape(now.shape)
     return fitted
 
 

@@ -212,26 +212,46 @@ def measure_pulse_width(photons: PhotonImage) -> float:
 
 
 def learn_response(
-    residual_bins: NDArray[np.float64], count: NDArray[np.float32], width: float, bin_width: float
-) -> tuple[Pulse, float]:
-    """Estimate the response from the times of photons after their surface, which others found.
-    Times and rough full width are in bins, the bin width in s. Returns the response, whose arrival
-    is its highest point, and by how many bins later this is than the arrival was before.
+    test: PhotonImage, train: PhotonImage, scene: Scene, fitted: FloatArray
+) -> tuple[Scene, float]:
+    """Estimate the response from the photons `test` after a surface that others found, as of
+    `matching.fit_surface`. Returns the scene with the response, whose arrival is its highest point,
+    and by how many bins later this is than the arrival was before.
     """
+    from tofclip.lidar.photons import kernels
+
+    width, flat = scene.response.width, np.ascontiguousarray(fitted[..., 0]).ravel()
     step = width / SAMPLES_PER_WIDTH
     first, last = (round(edge * SAMPLES_PER_WIDTH) for edge in EXTENT_WIDTHS)
     early = [round(edge * SAMPLES_PER_WIDTH) for edge in BACKGROUND_WIDTHS]
-    number = np.rint(residual_bins / step).astype(np.int64)
-    known = (number >= early[0]) & (number <= last)
-    photons = np.bincount(number[known] - early[0], count[known], last - early[0] + 1)
+    # of each slot: photons, how often it was open to them, and to how much signal
+    sums = np.zeros((last - early[0] + 1, 3))
+    if np.isinf(test.cycles):
+        number = np.rint((test.bin - flat[test.pixel]) / step).astype(np.int64)
+        known = (number >= early[0]) & (number <= last)
+        sums[:, 0] = np.bincount(number[known] - early[0], test.count[known], len(sums))
+        sums[:, 1:] = 1
+    else:
+        events, response = (test.offsets, test.bin, test.count, flat), scene.response
+        density = response.density, response.start, response.step
+        light, dark = fitted[..., 2].ravel() / train.cycles, scene.background / train.cycles
+        dead = dark, test.cycles, (early[0], step)
+        kernels.tally_first_photons(*events, light, *density, *dead, sums)
     # Before the pulse there is only background; behind it its own tail would count as one.
-    level = float(np.mean(photons[: early[1] - early[0]]))
+    before = sums[: early[1] - early[0]].sum(axis=0)
+    sums[:, 0] -= sums[:, 1] * before[0] / max(before[1], 1e-9)
     start, width_seen = first - early[0], float(SAMPLES_PER_WIDTH) / 2
-    # As smooth as its own width allows, which is not known before it has been smoothed once.
+    response, slots = scene.response, step * np.arange(early[0], last + 1)
+    place = response.start + response.step * np.arange(response.density.size)
+    known = np.maximum(np.interp(slots, place, response.density, 0, 0), DENSITY_FLOOR / width)
+    sums[:, 2] *= known
+    # As smooth as its own width allows, which is not known before it has been smoothed once. What is
+    # smooth is the ratio to the response known before: the response gets no wider.
     for _ in range(2):
-        shape = scipy.ndimage.gaussian_filter1d(photons, SMOOTHING_WIDTHS * width_seen)[start:]
+        smooth = scipy.ndimage.gaussian_filter1d(sums, SMOOTHING_WIDTHS * width_seen, axis=0)
         # A density is not negative, whatever noise does to the tail.
-        shape = np.maximum(shape - level, 0.0)
+        change = np.maximum(smooth[:, 0], 0.0) / np.maximum(smooth[:, 2], 1e-9)
+        shape = (known * change)[start:]
         if not shape.any():
             raise InputError("there is no light around the surface to learn the pulse from")
         peak = int(np.argmax(shape))
@@ -248,7 +268,9 @@ def learn_response(
         bend, slope, _ = np.polyfit(near - peak, np.log(shape[near]), 2, w=weight)
         vertex = -slope / (2 * bend) if bend < 0 else 0.0
         part = float(np.clip(vertex, near[0] - peak, near[-1] - peak))
-    return Pulse(shape, step * bin_width, peak + part), (first + peak + part) * step
+    pulse = Pulse(shape, step * test.bin_width, peak + part)
+    learnt = BinnedResponse(pulse, test.bin_width, LEARNT_SLOPE_FLOOR)
+    return Scene(learnt, scene.background), (first + peak + part) * step
 
 
 WINDOW_WIDTHS = 2.0  # length of the windows in which clumps are looked for, in widths of the pulse

@@ -84,9 +84,7 @@ def estimate_surface(
     progress : callable, optional
         Called with the fraction of the work that is done.
     cycles : int, optional
-        Laser cycles of each pixel, of a detector that counts the first photon of a cycle only. Then
-        a `pulse` that is given is kept; ranges by one that is learnt are up to 0.3 bins late where
-        most cycles have a photon.
+        Laser cycles of each pixel, of a detector that counts the first photon of a cycle only.
 
     Returns
     -------
@@ -126,8 +124,7 @@ def estimate_surface(
     costs = slope_cost, slope_cost * JUMP_COST_RATIO
 
     learnt = None
-    # what is learnt behind many first photons is too late
-    if pulse is None or (learn and cycles is None):
+    if pulse is None or learn:
         learnt = learn_scene(train, test, training, surface, required=pulse is None)
     if learnt is not None:
         scene = Scene(learnt, scene.background)
@@ -139,8 +136,8 @@ def estimate_surface(
         surface = axis.to_bins(labels)
     del volume
     report(0.6)
-    reach, surface = choose_reach(train, test, training, surface)
-    to_probability = calibrate_outliers(test, train, training, surface, margin)
+    reach, fitted = choose_reach(train, test, training, surface)
+    to_probability = calibrate_outliers(test, train, training, fitted, margin)
     report(0.8)
 
     common = LEARNT_RESPONSE_SIGMA_WIDTHS * scene.response.width if learnt is not None else 0.0
