@@ -119,15 +119,19 @@ def open(uri: str) -> Source:  # noqa: A001 - the name users type: devices.open
     >>> len(batch.records) > 0
     True
     """
-    parsed = Uri.parse(uri)
-    is_file = parsed.scheme == "file"
-    name = Path(parsed.location).suffix.lower() if is_file else parsed.scheme
+    return open_parsed(Uri.parse(uri))
+
+
+def open_parsed(uri: Uri) -> Source:
+    """As `open`, of an address that was taken apart already."""
+    is_file = uri.scheme == "file"
+    name = Path(uri.location).suffix.lower() if is_file else uri.scheme
     if name not in SOURCES or name.startswith(".") != is_file:
-        endings, schemes = list_endings(), list_schemes()
+        said = f"no source is called '{name}'; known are {', '.join(list_schemes())}"
         if is_file:
-            raise InputError(f"'{uri}': the name must end in {', '.join(endings)}")
-        raise InputError(f"'{uri}': no source is called '{name}'; known are {', '.join(schemes)}")
-    source: Source = SOURCES[name](parsed)
+            said = f"the name must end in {', '.join(list_endings())}"
+        raise InputError(f"'{uri.text}': {said}")
+    source: Source = SOURCES[name](uri)
     return source
 
 

@@ -37,7 +37,6 @@ from pathlib import Path
 from sys import maxsize
 from time import monotonic, time_ns
 from typing import Any
-from urllib.parse import quote, urlencode
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,7 +185,7 @@ def find_address(file: str) -> str | None:
 
 def _read_shot(uri: Uri, bin_width: float | None, line: bool = False) -> LiveShot:
     gathering = replace(Accumulation.of(uri, bin_width), line=line)
-    with registry.open(strip_options(uri)) as source:
+    with _open_source(uri) as source:
         known = source.calibration
         if find_gate_steps(known):  # a scan lasts as long as it does
             shots = _read_scans(read_batches(source, inf), known, gathering)
@@ -391,15 +390,15 @@ def read_camera(calibration: Record | None) -> Camera | None:
     return None if known is None else Camera.from_record(known)
 
 
-def strip_options(uri: Uri) -> str:
-    """Return the address without what says how to gather."""
+def _open_source(uri: Uri) -> Source:
+    """Open an address, without what says how to gather."""
     # Files of photon counters need the channel of the laser's pulses themselves, and a kit is told its
     # bins.
     own = {"sync"} if Path(uri.location).suffix.lower() in (".ptu", ".ttbin") else set()
     own |= {"bins"} if uri.scheme.endswith("vl53l8") else set()
-    values = {k: v for k, v in uri.values.items() if k not in Accumulation.names() or k in own}
-    place = quote(uri.location, safe="/:@[]~ ")
-    return f"{uri.scheme}://{place}" + (f"?{urlencode(values)}" if values else "")
+    gathering = {*Accumulation.names()} - own
+    values = {name: value for name, value in uri.values.items() if name not in gathering}
+    return registry.open_parsed(replace(uri, values=values))
 
 
 def read_transients(address: str, bin_width: float | None = None) -> TransientStream:
@@ -462,7 +461,7 @@ class TransientStream(Iterator[LiveShot]):
 
     def _read(self) -> Generator[LiveShot]:
         gathering = self._gathering
-        with registry.open(strip_options(self._uri)) as source:
+        with _open_source(self._uri) as source:
             self._source = source
             known = source.calibration
             camera = read_camera(known)

@@ -39,7 +39,7 @@ def canned(monkeypatch: pytest.MonkeyPatch) -> type[Canned]:
     class Last(Canned):
         def __init__(self, batches: list[Batch], calibration: Record | None = None) -> None:
             super().__init__(batches, calibration)
-            monkeypatch.setattr(transients.registry, "open", lambda address: self)
+            monkeypatch.setattr(transients.registry, "open_parsed", lambda uri: self)
 
     return Last
 
