@@ -30,7 +30,7 @@ from nlos.phasor.arrays import ArrayLibrary, BandTransform, get_traces
 from nlos.plane import axis_step, is_evenly_spaced
 from nlos.volume import Grid, Volume
 from tofclip.arrays import Array, is_numpy
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_positive
 from tofclip.threads import run_blocks, split_blocks
 
 # Filtered signals held at a time; and how often, while they are filtered.
@@ -267,10 +267,7 @@ class FilteredBackprojection(Method):
     weighting: Weighting = UNIFORM_WEIGHTING
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.sigma) and self.sigma > 0):
-            raise InputError(
-                f"sigma of the Laplacian must be a positive number of metres, got {self.sigma}"
-            )
+        require_positive("sigma of the Laplacian", self.sigma, "number of metres")
 
     def plan(self, capture: Capture, grid: Grid) -> FilteredBackprojectionPlan:
         require_numpy_signal("filtered back-projection", capture)

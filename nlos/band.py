@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import TimeAxis
-from tofclip.errors import InputError, require_type
+from tofclip.errors import InputError, require_positive, require_type
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 
 # The pulse's cycles fill its envelope from -3 to +3 standard deviations.
@@ -65,10 +65,7 @@ class VirtualPulse:
         for name in ("wavelength", "cycles"):
             value = getattr(self, name)
             require_type(value, (int, float, np.number), f"{name} of the virtual pulse is a number")
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(
-                    f"{name} of the virtual pulse must be a positive number, got {value}"
-                )
+            require_positive(f"{name} of the virtual pulse", value)
 
     @property
     def wavenumber(self) -> float:

@@ -25,7 +25,7 @@ from tofclip.arrays import (
     require_numpy,
     to_numpy,
 )
-from tofclip.errors import InputError, ShapeError, require_type
+from tofclip.errors import InputError, ShapeError, require_positive, require_type
 from tofclip.notebook import render_html
 from tofclip.shots import Frames
 from tofclip.storage import Field, Record
@@ -60,10 +60,7 @@ class TimeAxis:
     def __post_init__(self) -> None:
         if self.bins < MIN_BINS:
             raise InputError(f"a transient needs at least {MIN_BINS} time bins, got {self.bins}")
-        if not (np.isfinite(self.bin_width) and self.bin_width > 0):
-            raise InputError(
-                f"bin width must be a positive number of seconds, got {self.bin_width}"
-            )
+        require_positive("bin width", self.bin_width, "number of seconds")
         if not np.isfinite(self.start):
             raise InputError(
                 f"the path length of bin 0 must be a finite number of metres, got {self.start}"

@@ -15,17 +15,24 @@ from numpy.typing import NDArray
 from nlos.capture import Capture
 from nlos.illumination import find_leg_bounds
 from nlos.kernels import migrate_row, rebin, shift_signals
-from nlos.method import Method, Plan, Progress, require_imageable, require_numpy_signal
+from nlos.method import (
+    Method,
+    Plan,
+    Progress,
+    require_imageable,
+    require_memory,
+    require_numpy_signal,
+)
 from nlos.plane import PlanarWall, Plane, axis_step
 from nlos.volume import Grid, Volume
 from tofclip.arrays import FloatArray
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_positive
 from tofclip.threads import run_blocks, thread_count
 
 # Points may be off the lattice by this fraction of its step.
 LATTICE_TOLERANCE = 0.02
 # Larger transforms are refused before anything is allocated.
-MEMORY_LIMIT_BYTES = 4 << 30
+LIMIT_BYTES = 4 << 30
 # Of the padded box (2 rows, 2 columns, 2 bins): two half spectra in complex64, and the signals and
 # what is cut out of the result besides.
 BYTES_PER_SAMPLE = 12
@@ -77,11 +84,8 @@ class ConfocalPlan(Plan):
         places = plane.x.size * plane.y.size
         bins = capture.axis.bins + max(0, int(capture.start / capture.axis.spacing))
         needed = 8 * places * bins * BYTES_PER_SAMPLE
-        if needed > MEMORY_LIMIT_BYTES:
-            raise InputError(
-                f"{places} wall points with {bins} bins need {needed / 2**30:.1f} GiB, more than the "
-                f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: put time bins together or leave wall points out"
-            )
+        remedy = "put time bins together or leave wall points out"
+        require_memory(needed, f"{places} wall points with {bins} bins", remedy, LIMIT_BYTES)
         self.memory_bytes += needed
         self._compute, self.settings = compute, dict(settings)
 
@@ -203,10 +207,7 @@ class LightCone(Method):
     falloff: float = 4.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.signal_to_noise) and self.signal_to_noise > 0):
-            raise InputError(
-                f"signal_to_noise must be a positive number, got {self.signal_to_noise}"
-            )
+        require_positive("signal_to_noise", self.signal_to_noise)
         _require_falloff(self.falloff)
 
     def plan(self, capture: Capture, grid: Grid) -> ConfocalPlan:

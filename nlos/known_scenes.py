@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlos.settings import declare_setting
-from tofclip.errors import FileFormatError, InputError
+from tofclip.errors import FileFormatError, InputError, require_positive
 from tofclip.units import SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
@@ -119,8 +119,7 @@ def _build_hidden_scene(settings: SceneSettings) -> tuple[HiddenScene | PointSce
             f"no material is called '{settings.material}'; choose {' or '.join(MATERIALS)}"
         )
     material, facet = materials[settings.material], settings.facet
-    if not (math.isfinite(facet) and facet > 0):
-        raise InputError(f"facets need a positive size, got {1e3 * facet:g} mm")
+    require_positive("the size of facets", 1e3 * facet, "number of millimetres")
     if settings.mesh is not None:
         surface = Surface.load(Path(settings.mesh), facet, material)
     else:
@@ -163,10 +162,7 @@ def _choose_time_axis(
     from nlos.capture import TimeAxis
 
     bin_width = settings.bin_width
-    if not (math.isfinite(bin_width) and bin_width > 0):
-        raise InputError(
-            f"the bin width must be a positive number of picoseconds, got {1e12 * bin_width:g}"
-        )
+    require_positive("the bin width", 1e12 * bin_width, "number of picoseconds")
     corners = itertools.product(*zip(hidden.min(axis=0), hidden.max(axis=0), strict=True))
     paths = [
         np.nanmax(np.linalg.norm(wall - corner, axis=-1) + np.linalg.norm(laser - corner, axis=-1))
@@ -216,8 +212,7 @@ class HiddenTruth:
         import numpy as np
         from scipy.spatial import cKDTree
 
-        if reach <= 0:
-            raise InputError(f"the reach about hidden things must be positive, got {reach} m")
+        require_positive("the reach about hidden things", reach, "number of metres")
         z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
         voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
         found, _ = cKDTree(self.positions).query(voxels, distance_upper_bound=reach)

@@ -26,6 +26,7 @@ interrupt.
 
 # Larger volumes are refused before anything is allocated.
 MEMORY_LIMIT_BYTES = 8 << 30
+FEWER_VOXELS = "use larger voxels or a smaller box"
 # A complex64 sum and its float32 magnitude.
 VOXEL_BYTES = 12
 
@@ -220,11 +221,15 @@ def require_imageable(capture: Capture, grid: Grid) -> None:
             f"the grid begins at z = {grid.z[0]:.4g} m, behind the hindmost wall point at {hindmost:.4g} m: the hidden "
             "scene lies at larger z than the wall (if yours faces -z, negate x and z of all coordinates)"
         )
-    if grid.size * VOXEL_BYTES > MEMORY_LIMIT_BYTES:
-        raise InputError(
-            f"{grid.size} voxels need {grid.size * VOXEL_BYTES / 2**30:.1f} GiB, more than the "
-            f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: use larger voxels or a smaller box"
-        )
+    require_memory(grid.size * VOXEL_BYTES, f"{grid.size} voxels", FEWER_VOXELS)
+
+
+def require_memory(needed: float, what: str, remedy: str, limit: int | None = None) -> None:
+    """Refuse what needs more bytes than a limit, by default `MEMORY_LIMIT_BYTES`."""
+    limit = limit or MEMORY_LIMIT_BYTES
+    if needed > limit:
+        size = f"{needed / 2**30:.1f} GiB, more than the {limit >> 30} GiB allowed"
+        raise InputError(f"{what} need {size}: {remedy}")
 
 
 def require_numpy_signal(what: str, capture: Capture) -> None:

@@ -21,10 +21,10 @@ from nlos.illumination import (
     warn_of_aliasing,
 )
 from nlos.method import (
-    MEMORY_LIMIT_BYTES,
     Progress,
     ignore_progress,
     require_imageable,
+    require_memory,
     require_numpy_signal,
 )
 from nlos.phasor.arrays import ArrayLibrary
@@ -203,11 +203,8 @@ class TransientImaging:
             The method cannot image such a capture on the grid, or the video is larger than 8 GiB.
         """
         instants = _validate_times(times)
-        if 4 * instants.size * grid.size > MEMORY_LIMIT_BYTES:
-            raise InputError(
-                f"{instants.size} instants of {grid.size} voxels need {instants.size * grid.size / 2**28:.1f} GiB, "
-                f"more than the {MEMORY_LIMIT_BYTES >> 30} GiB allowed: ask for fewer, or for front views"
-            )
+        what = f"{instants.size} instants of {grid.size} voxels"
+        require_memory(4 * instants.size * grid.size, what, "ask for fewer, or for front views")
         values = np.empty((instants.size, *grid.shape), np.float32)
 
         def accumulate(depth: int, some: slice, seen: NDArray[np.complex64]) -> None:

@@ -34,6 +34,7 @@ named as in Python, in backquotes (`bin_width`); the command line puts its optio
 
 from __future__ import annotations
 
+from math import inf
 from os import PathLike
 from pathlib import Path
 
@@ -138,6 +139,12 @@ def require_type(value: object, wanted: type | tuple[type, ...], use: str) -> No
     """
     if not isinstance(value, wanted):
         raise InputError(f"{use}, not a {type(value).__name__}")
+
+
+def require_positive(name: str, value: float, of: str = "number") -> None:
+    """Refuse a number that is not above 0, or not finite; `of`: what it is, with its unit."""
+    if not 0 < value < inf:
+        raise InputError(f"{name} must be a positive {of}, got {value}")
 
 
 def require_path(path: object) -> None:

@@ -11,7 +11,7 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.method import MEMORY_LIMIT_BYTES
+from nlos.method import require_memory
 from nlos.phasor.transfer import (
     FINE_NODE_OVERSAMPLING,
     FINE_NODES_TOLERANCE,
@@ -27,7 +27,6 @@ from nlos.phasor.transfer import (
 from nlos.plane import Plane, StraightPaths, axis_step
 from nlos.volume import Grid
 from tofclip.arrays import FloatArray
-from tofclip.errors import InputError
 from tofclip.threads import split_blocks
 
 # Chebyshev nodes over the distances on a plane; enough for a band that turns by 25 periods across
@@ -212,12 +211,9 @@ class DiffractionPlan:
     def require_memory(self) -> None:
         """Refuse a field whose plane waves do not fit into memory."""
         count = self.plane_wave_count
+        what = f"{count:.3g} plane waves at {self.waves.count} frequencies"
         size = count * self.waves.count * BYTES_PER_WAVE
-        if size > MEMORY_LIMIT_BYTES:
-            raise InputError(
-                f"{count:.3g} plane waves at {self.waves.count} frequencies need {size / 2**30:.1f} GiB, more than the "
-                f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: use a longer wavelength or a smaller grid"
-            )
+        require_memory(size, what, "use a longer wavelength or a smaller grid")
 
     @cached_property
     def transfer(self) -> TransferFunction:

@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from nlos.band import Band
 from nlos.capture import Capture
 from nlos.illumination import IlluminationGroup, build_source, choose_roles, warn_of_aliasing
-from nlos.method import MEMORY_LIMIT_BYTES, Method, Plan, Progress, require_numpy_signal
+from nlos.method import (
+    FEWER_VOXELS,
+    Method,
+    Plan,
+    Progress,
+    require_memory,
+    require_numpy_signal,
+)
 from nlos.phasor.arrays import ArrayLibrary
 from nlos.phasor.depth_steps import DiffractionPlan
 from nlos.phasor.plan import Hybrid, WavePlan, find_distance, plan_waves
@@ -184,12 +191,8 @@ class Refinement(Method):
                 f"voxels {coarsest:.3g} m apart in depth are too coarse to refine with waves of "
                 f"{self.hybrid.wavelength:.3g} m: use at most {allowed:.3g} m"
             )
-        needed = 4 * SOLVER_VOLUMES * grid.size
-        if needed > MEMORY_LIMIT_BYTES:
-            raise InputError(
-                f"{grid.size} voxels need {needed / 2**30:.1f} GiB to refine, more than the "
-                f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: use larger voxels or a smaller box"
-            )
+        what = f"{SOLVER_VOLUMES} volumes of {grid.size} voxels to refine"
+        require_memory(4 * SOLVER_VOLUMES * grid.size, what, FEWER_VOXELS)
         return RefinementPlan(capture, grid, self, hybrid)
 
 

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.method import (
-    MEMORY_LIMIT_BYTES,
+    FEWER_VOXELS,
     Method,
     PhasorMethod,
     Plan,
     Progress,
+    require_memory,
     require_numpy_signal,
 )
 from nlos.preparation import remove_first_bounce
@@ -460,12 +461,8 @@ class PhotonRefinement(Method):
     def plan(self, capture: Capture, grid: Grid) -> PhotonPlan:
         require_numpy_signal("refining by photons", capture)
         needed = 4 * VOLUME_COPIES * grid.size + 16 * capture.signal.size
-        if needed > MEMORY_LIMIT_BYTES:
-            raise InputError(
-                f"refining by photons needs {needed / 2**30:.1f} GiB for {grid.size} voxels and "
-                f"{capture.signal.size} bins, more than the {MEMORY_LIMIT_BYTES >> 30} GiB allowed: "
-                "use larger voxels, a smaller box, or put bins together"
-            )
+        what = f"{grid.size} voxels and {capture.signal.size} bins to refine by photons"
+        require_memory(needed, what, f"{FEWER_VOXELS}, or put bins together")
         return PhotonPlan(capture, grid, self, self.linear.plan(capture, grid))
 
 

@@ -16,7 +16,7 @@ from nlos.capture import Capture, TimeAxis
 from nlos.simulate.kernels import add_facet_light
 from nlos.simulate.walls import compute_wall_normals
 from tofclip.arrays import FloatArray, require_numpy
-from tofclip.errors import FileFormatError, InputError, ShapeError
+from tofclip.errors import FileFormatError, InputError, ShapeError, require_positive
 from tofclip.files import format_error_line, translate_read_errors
 from tofclip.threads import run_blocks
 from tofclip.units import SPEED_OF_LIGHT
@@ -135,8 +135,7 @@ class PointScene:
 
 
 def _make_dark_capture(wall: Any, laser: Any, axis: TimeAxis, jitter: float) -> Capture:
-    if not (np.isfinite(jitter) and jitter > 0):
-        raise InputError(f"jitter must be a positive number of seconds, got {jitter}")
+    require_positive("jitter", jitter, "number of seconds")
     wall = np.asarray(wall, dtype=np.float64)
     dark = np.zeros((axis.bins, *wall.shape[:-1]), np.float32)
     return Capture(dark, wall, laser, axis.bin_width, axis.start)
@@ -165,10 +164,7 @@ class Material:
         for albedo in (self.diffuse, self.retro):
             if not 0 <= albedo <= 1:
                 raise InputError(f"an albedo is a share between 0 and 1, got {albedo}")
-        if not (np.isfinite(self.spread) and self.spread > 0):
-            raise InputError(
-                f"the spread of a retroreflector must be a positive angle, got {self.spread}"
-            )
+        require_positive("the spread of a retroreflector", self.spread, "angle")
 
 
 class Lambert(Material):
@@ -362,8 +358,7 @@ class Surface:
             The letters have no facet at this spacing, or more than `MAX_FACETS`; or the height is
             not positive.
         """
-        if not 0 < height < np.inf:
-            raise InputError(f"letters need a positive height, got {height:g} m")
+        require_positive("the height of letters", height, "number of metres")
         x, y = _rasterize_letters(text, height, spacing)
         if x.size == 0:
             raise InputError(f"'{text}' has no ink at a spacing of {spacing} m")

@@ -31,6 +31,7 @@ from scenes import (
     shaped_wall,
 )
 
+import nlos.method
 import nlos.phasor.depth_steps
 import nlos.phasor.to_depths_compiled
 from nlos import Capture, Grid, Hybrid, PlanarRSD
@@ -134,7 +135,7 @@ def test_what_cannot_be_imaged_is_refused(
 
 
 def test_too_many_plane_waves_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nlos.phasor.depth_steps, "MEMORY_LIMIT_BYTES", 1 << 16)
+    monkeypatch.setattr(nlos.method, "MEMORY_LIMIT_BYTES", 1 << 16)
     assert "plane waves" in find_refusal(METHOD, scene(), GRID)
 
 
