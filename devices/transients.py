@@ -61,6 +61,7 @@ MAX_CUBE_BYTES = 1 << 32
 # Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s
 EDGE_S = 1e-10
 STAMPS_SUFFIX = ".dat"
+NOTHING_KNOWN = Record("none")
 LiveShot = Streak | PhotonCube
 
 
@@ -116,9 +117,9 @@ class Accumulation(Options):
         return self.frames * self.scans
 
     @classmethod
-    def of(cls, uri: Uri, bin_width: float | None) -> Accumulation:
+    def of(cls, uri: Uri, bin_width: float | None, line: bool = False) -> Accumulation:
         """Read the values of an address that say how to gather; the others are the source's."""
-        return replace(cls.from_uri(uri, *uri.values), bin_width=bin_width)
+        return replace(cls.from_uri(uri, *uri.values), bin_width=bin_width, line=line)
 
     def axis(self, known_period: float | None) -> BinAxis:
         """Return the bins of a histogram of photons."""
@@ -184,9 +185,9 @@ def find_address(file: str) -> str | None:
 
 
 def _read_shot(uri: Uri, bin_width: float | None, line: bool = False) -> LiveShot:
-    gathering = replace(Accumulation.of(uri, bin_width), line=line)
+    gathering = Accumulation.of(uri, bin_width, line)
     with _open_source(uri) as source:
-        known = source.calibration
+        known = source.calibration or NOTHING_KNOWN
         if find_gate_steps(known):  # a scan lasts as long as it does
             shots = _read_scans(read_batches(source, inf), known, gathering)
             shot: LiveShot = next(shots)[1]
@@ -198,16 +199,14 @@ def _read_shot(uri: Uri, bin_width: float | None, line: bool = False) -> LiveSho
     return replace(shot, camera=read_camera(known), source=uri.text, provenance=past)
 
 
-def _accumulate(
-    batches: Iterator[Batch], calibration: Record | None, gathering: Accumulation
-) -> LiveShot:
+def _accumulate(batches: Iterator[Batch], known: Record, gathering: Accumulation) -> LiveShot:
     """Make one shot of everything that comes. Histograms of a line are those of a picture where the
     address gives a shape; hot pixels count nothing there.
     """
     first = next(batches, None)
     if first is None:
         raise InputError("the source ended before it gave anything")
-    known, all_batches = calibration or Record("none"), itertools.chain([first], batches)
+    all_batches = itertools.chain([first], batches)
     names = first.records.dtype.names or ()
     if "counts" in names:
         return _sum_frames(first.records.dtype["counts"], all_batches, known, gathering)
@@ -261,12 +260,10 @@ def _make_histogram(names: tuple[str, ...], known: Record, gathering: Accumulati
     raise InputError(f"records of {', '.join(names)} are not photons of a line of pixels")
 
 
-def _stack_histograms(
-    batches: Iterator[Batch], calibration: Record, gathering: Accumulation
-) -> Streak:
+def _stack_histograms(batches: Iterator[Batch], known: Record, gathering: Accumulation) -> Streak:
     """Return histograms that the instrument has made itself, a channel in each column."""
     counts = np.concatenate([batch.records["histogram"] for batch in batches]).T
-    times = calibration.number("resolution_s") * (np.arange(len(counts), dtype=np.float64) + 0.5)
+    times = known.number("resolution_s") * (np.arange(len(counts), dtype=np.float64) + 0.5)
     streak = Streak(counts.astype(np.float32), times)
     return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
 
@@ -324,16 +321,15 @@ def _require_own_bins(gathering: Accumulation) -> None:
         raise InputError("an instrument that counts photons in bins knows their width")
 
 
-def find_gate_steps(known: Record | None) -> int:
+def find_gate_steps(known: Record) -> int:
     """Return the pictures of a gate's scan; 0 where no gate moves."""
-    return known.fields["gate_times"].values.size if known and "gate_times" in known.fields else 0
+    return known.fields["gate_times"].values.size if "gate_times" in known.fields else 0
 
 
 def _read_scans(
-    batches: Iterator[Batch], known: Record | None, gathering: Accumulation
+    batches: Iterator[Batch], known: Record, gathering: Accumulation
 ) -> Iterator[tuple[int, PhotonCube]]:
     """Yield sums of whole scans of a gate, each with its number; one that was cut is left out."""
-    assert known is not None
     _require_own_bins(gathering)
     times, binning = known.array("gate_times", np.float64, 1, "s"), gathering.binning
     pulse, steps = _make_gate_response(known, times), times.size
@@ -384,10 +380,9 @@ def _make_gate_response(known: Record, times: NDArray[np.float64]) -> Pulse:
     return Pulse(seen, spacing, (width + margin) / spacing)
 
 
-def read_camera(calibration: Record | None) -> Camera | None:
+def read_camera(known: Record) -> Camera | None:
     """Return the camera that a source knows, None where it knows none."""
-    known = None if calibration is None else calibration.children.get("camera")
-    return None if known is None else Camera.from_record(known)
+    return Camera.from_record(known.children["camera"]) if "camera" in known.children else None
 
 
 def _open_source(uri: Uri) -> Source:
@@ -463,9 +458,8 @@ class TransientStream(Iterator[LiveShot]):
         gathering = self._gathering
         with _open_source(self._uri) as source:
             self._source = source
-            known = source.calibration
-            camera = read_camera(known)
-            tick = None if known is None else known.attributes.get("tick_s")
+            known = source.calibration or NOTHING_KNOWN
+            camera, tick = read_camera(known), known.attributes.get("tick_s")
             self._records_per_shot = gathering.records
             steps = find_gate_steps(known)
             if isinstance(source, StreamSource) and source.codec.name == "frames":
@@ -493,7 +487,7 @@ class TransientStream(Iterator[LiveShot]):
 
 
 def _accumulate_shots(
-    batches: Iterator[Batch], known: Record | None, gathering: Accumulation
+    batches: Iterator[Batch], known: Record, gathering: Accumulation
 ) -> Iterator[tuple[int, LiveShot]]:
     """Yield shots of as many records as they have, each with its number."""
     for number, parts in itertools.groupby(_split_shots(batches, gathering), itemgetter(0)):
