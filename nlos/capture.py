@@ -202,10 +202,6 @@ class Capture:
         bin_width, start, provenance
             As of `Capture`.
 
-        Returns
-        -------
-        Capture
-
         Raises
         ------
         ShapeError

@@ -161,10 +161,6 @@ class Method(ABC):
             Wall, laser, time axis and device are what counts.
         grid : Grid
 
-        Returns
-        -------
-        Plan
-
         Raises
         ------
         InputError

@@ -171,10 +171,6 @@ class Settings:
         join : callable, optional
             Brings pairs to their midpoints; `nlos.preparation.MidpointJoin.join` for many captures of
             one geometry.
-
-        Returns
-        -------
-        Capture
         """
         from nlos import preparation
         from nlos.illumination import choose_roles

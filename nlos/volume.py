@@ -76,10 +76,6 @@ class Grid:
             where a side is not a multiple of it, the voxels are centred in the box and the outer ones
             lie inside.
 
-        Returns
-        -------
-        Grid
-
         Raises
         ------
         InputError
@@ -111,10 +107,6 @@ class Grid:
             First and last z, m. They default to one voxel in front of the middle of the wall's
             relief, and to the depth that light reaches and returns from within the record, at most
             two wall widths.
-
-        Returns
-        -------
-        Grid
 
         Raises
         ------
@@ -153,10 +145,6 @@ class Grid:
             Distance of neighbouring voxel centres, m.
         fraction : float
             What counts as bright, relative to the brightest voxel.
-
-        Returns
-        -------
-        Grid
 
         Raises
         ------

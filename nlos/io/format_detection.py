@@ -101,10 +101,6 @@ def read_capture(path: str | Path) -> Capture:
     path : path-like
         A file, or a folder of EXR files.
 
-    Returns
-    -------
-    Capture
-
     Raises
     ------
     StorageError

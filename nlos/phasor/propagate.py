@@ -119,10 +119,6 @@ def propagate(
         only. Walls of many points go by Fourier transforms, those of scattered points if finufft is
         installed (``tofclip[scattered]``), others by direct sums, good to 1e-5.
 
-    Returns
-    -------
-    PlaneField
-
     Raises
     ------
     InputError

@@ -110,10 +110,6 @@ class PointScene:
             Standard deviation of the instrument's Gaussian response, s; its integral over every
             time bin is exact.
 
-        Returns
-        -------
-        Capture
-
         Raises
         ------
         InputError
@@ -239,10 +235,6 @@ class Surface:
         material : Material, optional
             Defaults to white Lambert.
 
-        Returns
-        -------
-        Surface
-
         Raises
         ------
         ShapeError
@@ -276,10 +268,6 @@ class Surface:
         spacing : float
             Side of the facets, m.
         material : Material, optional
-
-        Returns
-        -------
-        Surface
 
         Raises
         ------
@@ -319,10 +307,6 @@ class Surface:
         spacing : float
             Side of the facets, m.
         material : Material, optional
-
-        Returns
-        -------
-        Surface
         """
         x, y = size[0] / 2, size[1] / 2
         # Counter-clockwise from the wall, which looks along +z with y down.
@@ -347,10 +331,6 @@ class Surface:
             Side of a facet, m.
         material : Material, optional
             Defaults to white Lambert.
-
-        Returns
-        -------
-        Surface
 
         Raises
         ------
@@ -475,10 +455,6 @@ class HiddenScene:
         axis : TimeAxis
         jitter : float
             Standard deviation of the instrument's Gaussian response, s.
-
-        Returns
-        -------
-        Capture
 
         Raises
         ------
