@@ -239,7 +239,7 @@ class Recording(Closing):
     def __init__(self, path: Path) -> None:
         self.path = path
         with translate_read_errors(path):
-            self._file = open(path, "rb")  # noqa: SIM115 - closed by `close`
+            self._file = open(path, "rb", buffering=0)  # noqa: SIM115 - closed by `close`
         self.blocks = BlockReader(path, self._read_bytes, os.fstat(self._file.fileno()).st_size)
         try:
             self.head = self._read_head()
@@ -281,7 +281,9 @@ class Recording(Closing):
         return replace(known, fields={}, origin=str(self.path))
 
     def _read_bytes(self, position: int, length: int) -> bytes:
-        """Read `length` bytes from `position` on, fewer at the end of the file."""
+        """Read `length` bytes from `position` on, fewer at the end of the file: what one reading gives,
+        because no block reaches the two gigabytes that the system reads at once.
+        """
         try:
             self._file.seek(position)
             return self._file.read(length)
