@@ -14,8 +14,9 @@ def recover(scene: str, photons: float) -> tuple[tofclip.Frames, dict]:
     shot = make_shot(scene, seed=2, photons=photons, size=64)
     streak = tofclip.Streak(shot.counts, shot.row_times)
     frames = tofclip.recover(streak, shot.true_camera, "surfaces")
-    cloud = tofclip.point_cloud(frames.returns)
-    return frames, shot.score(*shot.locate(cloud.xyz), cloud.range, cloud.range_sigma)
+    cloud = tofclip.point_cloud(tofclip.depth(frames))
+    place = shot.locate(cloud.xyz)
+    return frames, shot.score(*place, cloud.range, cloud.range_sigma, cloud.false_alarm)
 
 
 # Twice of what seeds 0 and 2 have: 0.016, 0.06 and 0.06 mm; 0.025, 0.0003 and 0.8 mm; seed 2 of the
@@ -41,10 +42,16 @@ def test_dim_and_small_things_are_seen_beside_bright_ones(scene, missed, false) 
     first = np.diff(pixel, prepend=-1) > 0
     assert np.array_equal(returns.return_number == 1, first)
     # no return of the frames is where a surface has its own
-    beside = ~np.isnan(returns.false_alarm)
-    for one in np.flatnonzero(beside):
-        near = ~beside & (pixel == pixel[one]) & (np.abs(returns.range - returns.range[one]) < 0.02)
-        assert not near.any()
+    near = (np.diff(pixel) == 0) & (np.diff(returns.range) < 0.02)
+    assert near.mean() < 0.02
+    # no surface is much farther off than it says: 13 before what is bent was told from the light left
+    assert max(score["z"].values()) < 2.5, score["z"]
+    # none is without a probability of being false, and few that seem sure are: 0.04 of wires, where
+    # light may lie anywhere along a level line, and 0 of the others
+    stated = {low: (true, count) for low, _, _, true, count in score["calibration"]}
+    assert sum(count for _, count in stated.values()) == score["counted"].sum()
+    assert stated[0.0][0] < 0.06
+    assert stated[0.0][1] > 0.8 * score["counted"].sum()
 
 
 def test_a_dark_shot_is_called_dark() -> None:

@@ -31,6 +31,7 @@ from tofclip.recovery.surfaces.ranges import (
     Refinement,
     compute_objective,
     iterate_derivatives,
+    measure_local_shifts,
     refine_state,
 )
 from tofclip.shots import Frames
@@ -173,6 +174,28 @@ def test_slopes_of_ranges_are_differences_of_neighbours(shot):
     down, right = np.gradient(distance)
     expected = np.stack([right, down]).reshape(2, -1)
     np.testing.assert_allclose(model.compute_slopes(), expected, atol=1e-12)
+
+
+def test_light_that_arrives_elsewhere_than_its_surface_shows_by_how_much():
+    """Of two plates one is rendered 0.6 mm farther, a fifth of a row; a part of that goes into places
+    where it lies before or behind the other one's light.
+    """
+    model = make_model(simulate_shot(SCENE, INSTRUMENT, seed=0).streak)
+    amplitude = np.full(model.surface.size, 500, np.float32)
+    away, state = 0.6e-3, model.state
+    model.place(replace_farther(state, away))
+    image = model.render(amplitude)
+    model.place(state)
+    shifts = measure_local_shifts(model, amplitude, image - model.render(amplitude))
+    moved, still = shifts[model.parts[0]], shifts[model.parts[1]]
+    assert np.median(moved) == pytest.approx(away, rel=0.2)
+    assert np.median(still) < 0.1 * away
+
+
+def replace_farther(state: SurfaceState, away: float) -> SurfaceState:
+    other = state.copy()
+    other.coefficients[0] = state.coefficients[0] * (1 - away * state.coefficients[0][0])
+    return other
 
 
 def test_a_pulse_between_rows_is_the_pulse_over_each_row():
@@ -449,6 +472,9 @@ def test_a_deviation_is_that_of_the_fit_of_further_steps_and_of_the_centres():
     """
     model = make_model(simulate_shot(SCENE, INSTRUMENT, seed=0).streak)
     amplitude = np.full(model.surface.size, 500, np.float32)
+    model.image = model.render(
+        amplitude
+    )  # nothing is left that would show a surface to be elsewhere
     one, along = 4e-4, 3e-4
     covariance = np.diag([one**2, along**2, 0, 0, 0, 0])
     remainder, centre_error = np.array([0.7e-3, 0.2e-3]), 0.4
