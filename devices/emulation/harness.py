@@ -7,22 +7,24 @@ The drivers do not know the difference; all of their code runs.
 from __future__ import annotations
 
 import contextlib
+import re
 import socket
 import socketserver
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any
 
 from devices.stream import Feed, StreamOptions, StreamSource
 from tofclip.errors import InputError
 from tofclip.storage import Record
 
-LinkFault = Literal["timeout", "stall", "unplug", "powerloss", "short", "overflow"]
-ReplyFault = Literal["reply_late", "reply_lost", "reply_stall"]
-FaultKind = LinkFault | Literal["corrupt", "lost"] | ReplyFault
-REPLY_FAULTS: tuple[FaultKind, ...] = get_args(ReplyFault)
-FAULT_KINDS: tuple[FaultKind, ...] = (*get_args(LinkFault), "corrupt", "lost", *REPLY_FAULTS)
+REPLY_FAULTS = ("reply_late", "reply_lost", "reply_stall")
+FAULT_KINDS = (
+    *("timeout", "stall", "unplug", "powerloss", "short", "overflow", "corrupt", "lost"),
+    *REPLY_FAULTS,
+)
+_FAULT = re.compile(r"(\w+)@(\d+)(?::(\d*))?", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Fault:
     # ``corrupt``: `amount` records cannot be. ``lost``: `amount` records find the instrument's
     # memory full. ``reply_late``: a reply comes only after the host has given up. ``reply_lost``:
     # it never comes. ``reply_stall``: its endpoint halts once
-    kind: FaultKind
+    kind: str
     amount: int = 1
 
     @classmethod
@@ -47,14 +49,12 @@ class Fault:
         """Read ``kind@transfer`` or ``kind@transfer:amount``, joined by commas."""
         faults = []
         for word in filter(None, text.split(",")):
-            kind, _, rest = word.partition("@")
-            transfer, _, amount = rest.partition(":")
-            known = next((known for known in FAULT_KINDS if known == kind), None)
-            if known is None or not transfer.isdecimal() or not (amount or "1").isdecimal():
+            found = _FAULT.fullmatch(word)
+            if found is None or found[1] not in FAULT_KINDS:
                 raise InputError(
                     f"'{word}' is not a fault; write KIND@TRANSFER:AMOUNT with one of {', '.join(FAULT_KINDS)}"
                 )
-            faults.append(cls(int(transfer), known, int(amount or 1)))
+            faults.append(cls(int(found[2]), found[1], int(found[3] or 1)))
         return tuple(faults)
 
 

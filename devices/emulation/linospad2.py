@@ -26,7 +26,7 @@ from devices.linospad2 import (
     make_calibration_record,
 )
 from devices.linospad2_kernels import ADDRESSES
-from devices.source import Info, Ledger, Records
+from devices.source import Info, Ledger
 from devices.stream import Feed, StreamOptions, StreamSource, Transfer
 from tofclip.errors import InputError
 
@@ -59,54 +59,36 @@ class SimulatedBoard:
         return np.cumsum(self.light.photons)
 
     @cached_property
-    def _table_offsets(self) -> NDArray[np.float64]:
-        """Where each pixel's codes begin in `_code_ends`: a little more than a period apart, s."""
-        return 2 * CLOCK_PERIOD_S * np.arange(PIXELS, dtype=np.float64)
-
-    @cached_property
     def _code_ends(self) -> NDArray[np.float64]:
-        """Ends of all pixels' codes in one table that rises throughout, s."""
-        return (self.calibration.code_ends + self._table_offsets[:, np.newaxis]).ravel()
+        """Ends of all pixels' codes in one table that rises throughout, s: two periods apart."""
+        begins = 2 * CLOCK_PERIOD_S * np.arange(PIXELS)
+        return (self.calibration.code_ends + begins[:, np.newaxis]).ravel()
 
     def encode_cycle(self, number: int) -> bytes:
         """Return a cycle's words; photons that find their converter's memory full are left out."""
         random = np.random.default_rng([self.seed, number])
-        pixel, time = self._draw_photons(random)
-        records = np.zeros(len(pixel), self.codec.dtype)
-        records["pixel"], records["code"] = pixel, self._encode_times(pixel, time)
-        if self.codec.counter:
-            records["counter"] = round(number * CYCLE_TIME_S / COUNTER_TICK_S)
-        cycle = self.codec.encode(self._drop_overflow(records))
-        return cycle or bytes(self.codec.unit_bytes)
-
-    def _draw_photons(
-        self, random: np.random.Generator
-    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """Draw pixel and time since the cycle began of each photon of a cycle."""
         total = random.poisson(self.photons_per_cycle)
         row, pixel = draw_cells(random, self._cumulative_photons, total, PIXELS)
         # The last pulses of a cycle are left out, so that the board's offsets cannot carry a photon
         # beyond it.
         pulse = random.integers(1, round(CYCLE_TIME_S / LASER_PERIOD_S) - 1, total) * LASER_PERIOD_S
         width = self.light.row_times[1] - self.light.row_times[0]
-        return pixel, pulse + self.light.row_times[row] + (random.uniform(-0.5, 0.5, total) * width)
-
-    def _encode_times(
-        self, pixel: NDArray[np.intp], time: NDArray[np.float64]
-    ) -> NDArray[np.int64]:
-        """Return the code in which each time lies, for its own pixel's converter."""
+        time = pulse + self.light.row_times[row] + (random.uniform(-0.5, 0.5, total) * width)
+        # The code in which each time lies, for its own pixel's converter
         periods, phase = np.divmod(time - self.calibration.offsets[pixel], CLOCK_PERIOD_S)
-        place = np.searchsorted(self._code_ends, phase + self._table_offsets[pixel], side="right")
+        place = np.searchsorted(self._code_ends, phase + 2 * CLOCK_PERIOD_S * pixel, side="right")
         code = np.clip(place - pixel * CODES_PER_PERIOD, 0, CODES_PER_PERIOD - 1)
-        return np.asarray(periods.astype(np.int64) * CODES_PER_PERIOD + code)
-
-    def _drop_overflow(self, records: Records) -> Records:
+        records = np.zeros(total, self.codec.dtype)
+        records["pixel"] = pixel
+        records["code"] = periods.astype(np.int64) * CODES_PER_PERIOD + code
+        if self.codec.counter:
+            records["counter"] = round(number * CYCLE_TIME_S / COUNTER_TICK_S)
         # A converter keeps its first photons in time; later ones find its memory full.
         records = self.codec.sort_stamps(records[np.argsort(records["code"], kind="stable")])
         converter = self.codec.address_of[records["pixel"]] // ADDRESSES
-        place_in_queue = np.arange(len(records)) - np.searchsorted(converter, converter)
-        fitting: Records = records[place_in_queue < self.codec.timestamps]
-        return fitting
+        place_in_queue = np.arange(total) - np.searchsorted(converter, converter)
+        cycle = self.codec.encode(records[place_in_queue < self.codec.timestamps])
+        return cycle or bytes(self.codec.unit_bytes)
 
 
 def draw_uneven_calibration(seed: int) -> BoardCalibration:
