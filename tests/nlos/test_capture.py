@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes
 from relay_frames import (
@@ -145,14 +144,6 @@ def test_files_give_back_what_was_saved(
     assert (loaded.bin_width, loaded.start, loaded.provenance) == (bin_width, start, made)
 
 
-def test_a_file_without_a_wall_says_so(tmp_path: Path) -> None:
-    record = Capture(SIGNAL, WALL, WALL, 1e-12).to_record()
-    del record.fields["wall"]
-    record.save(tmp_path / "broken.h5")
-    with pytest.raises(FileFormatError, match="no field 'wall'"):
-        Capture.load(tmp_path / "broken.h5")
-
-
 # --- how fine a wall is
 
 
@@ -227,31 +218,17 @@ def test_frames_become_a_capture_that_shows_the_hidden_point_where_it_is() -> No
     assert moved.start == pytest.approx(SPEED_OF_LIGHT * (late + DELAY_BINS * BIN_WIDTH))
 
 
-@settings(max_examples=30, deadline=None)
-@given(shift=st.floats(-30, 30))
-def test_a_shifted_pulse_matches_the_analytic_one(shift: float) -> None:
-    bins, width = np.arange(200), 6.0
-    # A camera on the axis behind the laser: a wall point further along the axis is late by its
-    # distance.
-    wall = np.array([[0.0, 0.0, shift * SPACING]])
-    signal = np.exp(-0.5 * ((bins - 100.0 - shift) / width) ** 2)[:, None]
-    found = unwarp_signal(signal, wall, np.array([0.0, 0, -1]), np.zeros(3), BIN_WIDTH)[:, 0]
-    # Linear interpolation errs by at most 1/8 of the second derivative, 1 / (8 * 36); the rest is
-    # float32.
-    expected = np.exp(-0.5 * ((bins - 100.0) / width) ** 2)
-    assert np.max(np.abs(found - expected)) < 1 / (8 * width**2) + 1e-5
-
-
 def test_whole_bins_are_moved_exactly_and_what_lies_outside_is_zero() -> None:
     wall = np.zeros((5, 3))
     wall[:, 2] = np.array([0, 2, -3, np.nan, 100]) * SPACING
-    signal = np.tile(np.arange(1.0, 9.0)[:, None], (1, 5))
+    values = np.arange(1.0, 9.0) ** 2
+    signal = np.tile(values[:, None], (1, 5))
     found = unwarp_signal(signal, wall, np.array([0.0, 0, -1]), np.zeros(3), BIN_WIDTH)
     # Distances of 1 m in float64 place a sample to 1e-10 bins; at a record's edge that may fall
     # outside.
-    assert found[:, 0] == pytest.approx(np.arange(1, 9))
-    assert found[:5, 1] == pytest.approx([3, 4, 5, 6, 7])
-    assert found[4:, 2] == pytest.approx([2, 3, 4, 5])
+    assert found[:, 0] == pytest.approx(values)
+    assert found[:5, 1] == pytest.approx(values[2:7])
+    assert found[4:, 2] == pytest.approx(values[1:5])
     for dark in (found[6:, 1], found[:3, 2], found[:, 3:]):
         assert np.all(dark == 0)
 
