@@ -211,7 +211,12 @@ def _accumulate(batches: Iterator[Batch], known: Record, gathering: Accumulation
     if "counts" in names:
         return _sum_frames(first.records.dtype["counts"], all_batches, known, gathering)
     if "histogram" in names:
-        streak = _stack_histograms(all_batches, known, gathering)
+        # which the instrument has made itself, a channel in each column
+        made = np.concatenate([batch.records["histogram"] for batch in all_batches]).T
+        times = known.number("resolution_s") * (np.arange(len(made), dtype=np.float64) + 0.5)
+        streak = Streak(made.astype(np.float32), times)
+        if gathering.bin_width is not None:
+            streak = streak.with_bin_width(gathering.bin_width)
     else:
         histogram = _make_histogram(names, known, gathering)
         for batch in all_batches:
@@ -258,14 +263,6 @@ def _make_histogram(names: tuple[str, ...], known: Record, gathering: Accumulati
         axis = gathering.axis(known.number("laser_period_s", 0.0) or None)
         return BinHistogram(int(known.number("channels")), axis, known.number("resolution_s"))
     raise InputError(f"records of {', '.join(names)} are not photons of a line of pixels")
-
-
-def _stack_histograms(batches: Iterator[Batch], known: Record, gathering: Accumulation) -> Streak:
-    """Return histograms that the instrument has made itself, a channel in each column."""
-    counts = np.concatenate([batch.records["histogram"] for batch in batches]).T
-    times = known.number("resolution_s") * (np.arange(len(counts), dtype=np.float64) + 0.5)
-    streak = Streak(counts.astype(np.float32), times)
-    return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
 
 
 def _sum_frames(

@@ -169,15 +169,6 @@ class BlockReader:
             )
         return data
 
-    def find_head(self) -> Block | None:
-        """Return the first undamaged description of the instrument, None if there is none."""
-        for entry in self:
-            if isinstance(entry, Block) and entry.kind is BlockKind.HEAD:
-                with contextlib.suppress(FileFormatError):
-                    self.read_payload(entry)
-                    return entry
-        return None
-
     def _read_header(self, position: int) -> Block | None:
         """Read a header of this recording; None if its payload would not lie within the file."""
         block = Block.unpack(self._fetch(position, HEADER_BYTES), position)
@@ -269,14 +260,19 @@ class Recording(Closing):
         self._file.close()
 
     def _read_head(self) -> Record:
-        head = self.blocks.find_head()
-        if head is None:
+        """Return the first undamaged description of the instrument."""
+        for entry in self.blocks:
+            if isinstance(entry, Block) and entry.kind is BlockKind.HEAD:
+                with contextlib.suppress(FileFormatError):
+                    payload = self.blocks.read_payload(entry)
+                    break
+        else:
             raise FileFormatError(
                 self.path, "is not a recording, or every copy of its head is damaged"
             )
         with tempfile.TemporaryDirectory() as folder:
             copy = Path(folder, self.path.name)
-            copy.write_bytes(self.blocks.read_payload(head))  # HDF5 reads files, not bytes
+            copy.write_bytes(payload)  # HDF5 reads files, not bytes
             known = Record.load(copy, RECORD_KIND)
         return replace(known, fields={}, origin=str(self.path))
 
