@@ -156,8 +156,7 @@ def backproject_signals(
 
     def process_brick(waveforms: Sequence[Any], turn: slice) -> None:
         own = bricks[turn.start]
-        # A brick of its own, because a contiguous array lets one compiled version serve every piece
-        # of a volume.
+        # A brick of its own: a contiguous array lets one compiled version serve every piece.
         brick = np.zeros(total[own].shape, np.complex64)
         add_backprojection(*waveforms, x[own[2]], y[own[1]], z[own[0]], powers, brick)
         total[own] += brick
@@ -197,8 +196,7 @@ def backproject_on_device(
     pairs = library.chunk_bytes // BYTES_PER_PAIR
     size = min(DEVICE_TABLE_BYTES // (8 * samples), max(1, pairs // grid.x.size))
     for points in split_blocks(len(capture.points), max(1, size)):
-        # Waveforms of some wall points, one after the other in one flat array; the first and the
-        # last two samples of each are 0.
+        # Waveforms of some wall points in one flat array, 0 at the first and the last two samples.
         waveforms = xp.reshape(transform.of(get_traces(capture, points)) @ carriers, (-1,))
         count = points.stop - points.start
         first, wall = library.put(samples * np.arange(count)), library.put(capture.points[points].T)
@@ -230,8 +228,7 @@ def backproject_on_device(
 
 # Zeros before and after every signal, where look-ups outside the record end.
 PADDING_SAMPLES = (1, 2)
-# Standard deviations at which the Laplacian is cut off: at 4, a thousandth of the haze would pass
-# it.
+# Standard deviations where the Laplacian is cut off: at 4, a thousandth of the haze would pass.
 FILTER_TRUNCATION_SIGMAS = 6.0
 # Volumes in float32 that are held beside the sum while it is sharpened.
 LAPLACIAN_COPIES = 4

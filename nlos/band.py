@@ -35,8 +35,7 @@ POINTS_PER_BLOCK = 1024
 # normal numbers, which takes processors ten times as long (tails of simulated pulses are like
 # that).
 NEGLIGIBLE_FRACTION = 1e-20
-# Samples of a filtered signal per carrier wavelength: linear interpolation then errs by 1e-3 rms
-# for 3 cycles.
+# Samples of a signal per carrier wavelength: linear interpolation errs by 1e-3 rms for 3 cycles.
 SAMPLES_PER_WAVELENGTH = 64
 
 
@@ -112,8 +111,7 @@ class VirtualPulse:
 class Waveforms:
     """Band-limited complex signals, finely sampled over path length."""
 
-    # (points, samples), the first and the last two samples are 0, so that holding them means
-    # silence outside
+    # (points, samples), 0 at the first and the last two: holding them means silence outside
     values: NDArray[Any]
     start: float  # path length of sample 0, m
     spacing: float  # path between samples, m
@@ -228,8 +226,7 @@ class Band:
 
     def waveforms(self, phasors: NDArray[Any]) -> Waveforms:
         """Return ``sum_k P_k * exp(1j * k * L)``, sampled for linear interpolation."""
-        # So few frequencies are summed faster by one matrix product than by a Fourier transform
-        # padded with zeros.
+        # So few frequencies are summed faster by a matrix product than by a padded transform.
         carriers, start, spacing = self.carriers
         return Waveforms(phasors @ carriers.astype(phasors.dtype), start, spacing)
 

@@ -390,8 +390,7 @@ def _to_real_array(values: Any, dtype: type, name: str) -> NDArray[Any]:
 
 
 ATTACHMENT_NAME = "relay_wall"
-# Steps of a time axis may differ from their mean by this fraction; over 1000 bins that stays below
-# one bin.
+# Of its mean, what steps of a time axis may differ by: less than a bin over 1000.
 STEP_TOLERANCE = 1e-3
 
 

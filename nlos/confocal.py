@@ -33,8 +33,7 @@ from tofclip.threads import run_blocks, thread_count
 LATTICE_TOLERANCE = 0.02
 # Larger transforms are refused before anything is allocated.
 LIMIT_BYTES = 4 << 30
-# Of the padded box (2 rows, 2 columns, 2 bins): two half spectra in complex64, and the signals and
-# what is cut out of the result besides.
+# Of the box padded to twice its sides: two half spectra in complex64, the signals, and the result.
 BYTES_PER_SAMPLE = 12
 # A start that lies this close to a whole bin, in bins, is taken for one.
 WHOLE_BIN_TOLERANCE = 1e-3
@@ -144,8 +143,7 @@ def _require_lattice(capture: Capture, grid: Grid) -> Plane:
             "use another method"
         )
     for name, axis, wanted in (("x", plane.x, grid.x), ("y", plane.y, grid.y)):
-        # The transforms pad the wall to twice its width: what lies farther out would come in again
-        # on the other side.
+        # Transforms pad the wall to twice its width: what lies farther out would come in again.
         margin = (axis[-1] - axis[0]) / 2
         low, high = axis[0] - margin, axis[-1] + margin
         if wanted[0] < low or wanted[-1] > high:
@@ -282,8 +280,7 @@ def transform_paraboloid(
     weight = (late - whole)[..., np.newaxis]
     frequencies = np.arange(some.start, some.stop)
     turn = np.exp(-2j * np.pi / shape[2] * frequencies)
-    # A delay of whole samples is a power of one phase; from a table of one whole turn it is quicker
-    # than an exponential, and as exact.
+    # A delay is a power of one phase; a table of one turn is quicker than exponentials, and exact.
     table = np.exp(-2j * np.pi / shape[2] * np.arange(shape[2])).astype(np.complex64)
     delayed = table[whole[..., np.newaxis] * frequencies % shape[2]]
     # Impulses beyond the padded record would wrap around into it.
@@ -336,8 +333,7 @@ class FKMigration(Method):
         wave = np.copysign(np.sqrt(np.abs(brightness)), brightness)
         period, workers = find_padded_length(bins), thread_count()
         spectrum = rfft(wave, period, workers=workers)
-        # the record's middle becomes time zero, about which a spectrum varies slowest from
-        # frequency to frequency
+        # the record's middle becomes time zero, about which a spectrum varies slowest
         delay = 2 * np.pi * (bins // 2) / period
         spectrum *= np.exp(1j * delay * np.arange(spectrum.shape[2])).astype(np.complex64)
         padded = (find_padded_length(rows), find_padded_length(columns))

@@ -8,8 +8,7 @@ import numpy as np
 
 from tofclip.compiling import compile_and_keep, inlined
 
-# Only the fusing of multiply and add is let loose: exact zeros at the ends of the waveforms have to
-# stay exact.
+# Only multiply and add are fused: exact zeros at the ends of the waveforms have to stay exact.
 compiled = compile_and_keep(fastmath={"contract"}, error_model="numpy")
 
 # Distance in m below which the weight 1 / distance stops growing, for voxels that touch the wall.
@@ -188,8 +187,7 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
     for iy in range(y.size):
         across = (y[iy] - laser[1]) ** 2 + (depth - laser[2]) ** 2
         for ix in range(x.size):
-            # The wave oscillates many times across the plane and is computed; what multiplies it, f_m,
-            # is smooth enough for linear interpolation.
+            # The wave oscillates across the plane and is computed; f_m is smooth and interpolated.
             distance = math.sqrt((x[ix] - laser[0]) ** 2 + across)
             place = max((distance - span[0]) * per_metre, 0.0)
             # So that the last sample has a neighbour behind it; the weight is then 1.
@@ -254,8 +252,7 @@ def migrate_row(spectrum, ky, kx, delay):
     for column in range(spectrum.shape[0]):
         lateral = kx[column] * kx[column] + ky * ky
         row = spectrum[column]
-        # Every sample is read at or beyond where it is written, so that going upwards nothing is
-        # overwritten too soon.
+        # Samples are read at or beyond where they are written: upwards nothing is lost.
         for depth in range(count):
             place = math.sqrt(depth * depth + lateral)
             below = int(place)

@@ -218,8 +218,7 @@ def _separate(
     def process_block(some: slice) -> None:
         column = transform_paraboloid(y, x, squares, shape, some)
         kernels = fft2(sides[..., np.newaxis] * column, axes=(1, 2)).astype(np.complex64)
-        # Wiener: the floor is the noise over the signal; the three components are what explains the
-        # signal with the least power.
+        # Wiener: the three components are what explains the signal with the least power.
         gain = spectrum[..., some] / (np.sum(np.abs(kernels) ** 2, axis=0) + np.float32(floor))
         parts[..., some] = kernels.conj() * gain
 

@@ -84,8 +84,7 @@ class DepthAverage:
 
 # Instants of one depth in memory at once.
 INSTANTS_PER_BLOCK = 32
-# Instants of a time gate per standard deviation of the pulse's envelope: its sum is then exact to
-# single precision.
+# Instants of a time gate per sigma of the envelope: exact to single precision.
 SAMPLES_PER_SIGMA = 2
 NO_DELAY = np.zeros(2)
 

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
 # Deeper than this a wall is too narrow an aperture to resolve much.
 MAX_DEPTH_WALL_WIDTHS = 2.0
-# No computer holds an image of more; the axes themselves would fill its memory before any plan
-# could say so.
+# No computer holds an image of more; the axes themselves would fill its memory.
 MAX_VOXELS_PER_AXIS = 1 << 20
 
 

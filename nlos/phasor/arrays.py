@@ -16,8 +16,7 @@ from nlos.capture import Capture
 from nlos.plane import WallLattice
 from tofclip.arrays import Array, ComputeDevice, namespace
 
-# Bytes of the largest array that is made at a time: on a processor, with its caches, and on a GPU,
-# with its thousands of lanes.
+# Bytes of the largest array made at a time: on a processor, with its caches, and on a GPU.
 CPU_CHUNK_BYTES, GPU_CHUNK_BYTES = 8 << 20, 256 << 20
 
 

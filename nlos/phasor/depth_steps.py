@@ -29,8 +29,7 @@ from nlos.volume import Grid
 from tofclip.arrays import FloatArray
 from tofclip.threads import split_blocks
 
-# Chebyshev nodes over the distances on a plane; enough for a band that turns by 25 periods across
-# them.
+# Chebyshev nodes over the distances on a plane: for a band that turns by 25 periods across.
 CHEBYSHEV_NODES = 64
 # Samples of a distance function; linear interpolation between them errs by 1e-4 at 6 periods.
 TABLE_SAMPLES = 512
@@ -80,8 +79,7 @@ def _find_leading_functions(
     """Fewest orthonormal functions (nodes, m), and coefficients (frequencies, m), of `wave`."""
     weighted = wave * strength
     values, vectors = np.linalg.eigh(weighted @ weighted.T)
-    # eigh sorts upwards; of both parts together, half the squared strength times the nodes is the
-    # whole.
+    # eigh sorts upwards; of both parts, half the squared strength times the nodes is all.
     allowed = tolerance**2 * np.sum(strength**2) * len(wave) / 2
     dropped = int(np.count_nonzero(np.cumsum(np.maximum(values, 0)) < allowed))
     functions = vectors[:, dropped:]
@@ -242,8 +240,7 @@ NEIGHBOURS = 6
 DEPTHS_PER_BLOCK = 16
 # Cosines of each angle, and bins of f, that stand for the spectrum along z.
 ANGLES, AXIAL_BINS = 24, 128
-# Independent errors that computed depths may have, relative to the error allowed: interpolation
-# does not enlarge them.
+# Errors that computed depths may have, in the error allowed: interpolation enlarges none.
 NOISE_FRACTION = 0.03
 
 
@@ -317,8 +314,7 @@ def choose_depths(z: FloatArray, spectrum: AxialSpectrum, error: float) -> Depth
         return everything
     count = int(np.ceil((z.size - 1) / ratio)) + 1
     nodes = np.unique(np.rint(np.linspace(0, z.size - 1, count)).astype(np.int64))
-    # Towards the ends depths have neighbours on one side only, and uneven ones may be far apart:
-    # what cannot be interpolated is computed.
+    # Ends have neighbours on one side, uneven depths far ones: these are computed.
     while nodes.size < z.size:
         blocks, failed = _interpolate_all(z, nodes, spectrum, error)
         if not failed.size:

@@ -37,8 +37,7 @@ ComplexArray = NDArray[np.complex64]
 
 # FFTW plans one transform at a time.
 PLANNING_LOCK = threading.Lock()
-# Plans that are measured are no faster here, and differ from run to run, as the last bits of an
-# image would.
+# Plans that are measured are no faster here, and differ from run to run in the last bits.
 FFTW_FLAGS = ("FFTW_ESTIMATE",)
 
 

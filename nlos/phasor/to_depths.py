@@ -23,8 +23,7 @@ from nlos.phasor.to_depths_kernels import TAPS
 from tofclip.arrays import Array, FloatArray
 from tofclip.threads import run_blocks, split_blocks, thread_count
 
-# Transfer functions and illuminations of all depths are kept for the next field if they take no
-# more.
+# Transfer functions and illuminations are kept for the next field if they take no more.
 MAX_CACHE_BYTES = 1 << 30
 # Spectra of the depths that a thread of a solver treats together: few calls, and still in cache.
 SOLVER_BLOCK_BYTES = 2 << 20
@@ -40,8 +39,7 @@ class DepthPropagator:
         cell = (row + reach[0]) * (2 * reach[1] + 1) + column + reach[1]
         wave = np.full((2 * reach[0] + 1) * (2 * reach[1] + 1), cell.size)
         wave[cell] = np.arange(cell.size)
-        # Cell of every wave in a full rectangle of them, and number of the wave in every cell, one
-        # too many where there is none.
+        # Cell of every wave in a full rectangle, and wave in every cell, one too many for none.
         self._cells = library.put(cell), library.put(wave)
         counted = lateral[:, np.newaxis] <= plan.plane_waves.lateral_limits
         # 1 / area of a period, or 0 where a wave is left out, (waves, frequencies).
@@ -311,8 +309,7 @@ class PortableDiffraction:
 
     def _measure_axially(self, depths: FloatArray) -> _Axial:
         ahead = self._measure_ahead(depths)[:, np.newaxis, np.newaxis]
-        # whole cycles are taken off in double precision, before single precision would lose the
-        # fraction
+        # whole cycles are taken off before single precision would lose the fraction
         cycles = remove_whole_cycles(self.source.centre_wavenumber / (2 * np.pi) * ahead)
         return _Axial(self.library.put(ahead), self.library.put(cycles))
 

@@ -53,8 +53,7 @@ class Interpolation(NamedTuple):
     """How every group finds a transfer function between its nodes."""
 
     begin: IntArray  # (groups,), first node
-    # (groups + 1,), where a group's weights begin, one row of `weights` for each node from `begin`
-    # on
+    # (groups + 1,), where a group's weights begin: a row of `weights` for each node
     offset: IntArray
     weights: NDArray[np.float32]  # (some, LANES)
 
@@ -73,8 +72,7 @@ class WaveGroups:
         # Of the waves without a negative index, (groups, LANES).
         row, column, self._lateral = row[filled], column[filled], lateral[filled]
         self._row, self._column = row, column
-        # Indices of all, and whether a wave stands there for the first time, (groups, MIRRORED,
-        # LANES).
+        # Indices of all, and whether a wave stands there first, (groups, MIRRORED, LANES).
         rows = np.stack([row, -row, row, -row], axis=1)
         self.indices = rows, np.stack([column, column, -column, -column], axis=1)
         once = places < self._count
@@ -83,8 +81,7 @@ class WaveGroups:
         )
         # Zeros before the lowest frequency that make their number a multiple of `FREQUENCY_STEPS`.
         self.leading_zeros = -waves.lateral_limits.size % FREQUENCY_STEPS
-        # Where every group's frequencies begin, zeros included, in whole steps as the kernel takes
-        # them.
+        # Where every group's frequencies begin, zeros included, in whole steps of the kernel.
         frequency = np.searchsorted(waves.lateral_limits, self._lateral[:, 0]) + self.leading_zeros
         self.first_frequency: IntArray = frequency // FREQUENCY_STEPS * FREQUENCY_STEPS
         # Of the real and imaginary parts of all waves.
@@ -156,8 +153,7 @@ class _AxisTransform:
         """
         numbers = step * np.arange(reach + 1)
         half = (axis.size + 1) // 2
-        # about the middle a real point's wave and its mirror point's are conjugate: cosines and
-        # sines of half the points suffice
+        # mirror points' waves about the middle are conjugate: half the points suffice
         phases = np.outer(numbers, (axis[::-1] - axis)[:half] / 2)
         turns = np.exp(-1j * numbers * ((axis[0] + axis[-1]) / 2 - origin))
         cosines, sines = (wave(phases).astype(np.float32) for wave in (np.cos, np.sin))
@@ -181,8 +177,7 @@ class _AxisTransform:
 
 # Spectra that are transformed at a time: they stay in a core's second cache, and calls stay few.
 CACHE_BYTES = 1 << 19
-# How many operations of a matrix product take as long as one of a pruned Fourier transform;
-# measured.
+# Operations of a matrix product that take as long as one of a pruned Fourier transform; measured.
 PRODUCT_SPEEDUP = 3
 
 
@@ -308,11 +303,9 @@ FloatParts = NDArray[np.float32]
 
 # Depths that a group of plane waves is propagated to while its spectrum is in cache.
 PLANES_PER_BLOCK = 2
-# Half the range of distances from the laser spot to a plane is rounded up to a power of the first,
-# and at least the second, m.
+# Half the range of distances is rounded up to a power of the first, at least the second, m.
 HALF_RANGE_RATIO, MIN_HALF_RANGE_M = 1.05, 1e-3
-# Of the error allowed, what splitting the illumination may take; where little is hidden it weighs
-# more.
+# Of the error allowed, what splitting the illumination may take.
 ILLUMINATION_ERROR_FRACTION = 0.25
 # Of the error allowed, what interpolation between depths may take.
 DEPTH_ERROR_FRACTION = 0.35
@@ -361,8 +354,7 @@ class LaserSource:
             for axis, spot in ((plan.grid.y, self.laser[1]), (plan.grid.x, self.laser[0]))
         )
         span = np.sqrt(np.array(y) ** 2 + np.array(x) ** 2 + (depth - self.laser[2]) ** 2)
-        # Rounded up to a geometric series of half ranges, so that one split, which takes as long as
-        # a small image, serves many depths.
+        # Rounded up to a geometric series, so that one split serves many depths.
         half = HALF_RANGE_RATIO ** np.ceil(
             np.log(max(np.ptp(span) / 2, MIN_HALF_RANGE_M)) / np.log(HALF_RANGE_RATIO)
         )

@@ -17,8 +17,7 @@ part_of_loop = compile_as_part(_nrt=False)
 TILE_SIDE = 16
 # Nodes that the interpolation along the radius takes.
 TAPS = 6
-# Plane waves treated together: neighbours in lateral wavenumber, two full vectors of 512 bits, and
-# their mirror images in the axes.
+# Neighbours in lateral wavenumber, two vectors of 512 bits, and their images in the axes.
 LANES, MIRROR_IMAGES = 32, 4
 # Real numbers of such a group at one frequency.
 GROUP_FLOATS = 2 * MIRROR_IMAGES * LANES

@@ -193,8 +193,7 @@ class TransferFunction:
     @cached_property
     def nodes(self) -> FloatArray:
         """Lateral wavenumbers of the nodes, rad/m."""
-        # The transfer function is even in q: nodes on both sides of 0 serve the interpolation
-        # there.
+        # even in q: nodes on both sides of 0 serve the interpolation there
         return self.node_step * np.arange(
             -(TAPS // 2), np.ceil(self.max_lateral_wavenumber / self.node_step) + TAPS // 2 + 1
         )

@@ -68,8 +68,7 @@ def add_expected_light(walls, lasers, cell, start, per_metre, obliquity, voxels,
                 sent = np.float64(albedo[first + i] * rates[i])
                 begin, end = np.int32(begins[i]), np.int32(ends[i])
                 after = np.float64(begins[i] - np.float32(begin)) * sent
-                # Only the two edges of the box are written, each shared between two bins; the
-                # running sum afterwards fills what lies between, however wide.
+                # Only the box's edges are written, shared between bins; the running sum fills it.
                 changes[p, begin] += sent - after
                 changes[p, begin + 1] += after
                 after = np.float64(ends[i] - np.float32(end)) * sent

@@ -62,8 +62,7 @@ class HiddenToWall(LinearOperator):
         self.wavenumbers = group.legs * band.wavenumbers
         self._depths = PortableDiffraction(plan, build_source(group, band), ArrayLibrary(), True)
         area = float(np.prod(plan.plane.steps))
-        # sqrt(G_k) of the class's formula, and the area that a point of the virtual plane stands
-        # for
+        # sqrt(G_k), and the area that a point of the virtual plane stands for
         self._strength = (np.sqrt(band.weights) * area).astype(self.dtype)
 
     def _forward(self, block: Array) -> Array:
@@ -138,8 +137,7 @@ class WallModel:
 
 # float32 volumes that the solver holds at once, with the duals of total variation.
 SOLVER_VOLUMES = 12
-# Voxels per carrier wavelength in depth: a point between two of them is then off by less than 1.3
-# rad.
+# Voxels per carrier wavelength in depth: a point between two is off by less than 1.3 rad.
 MIN_VOXELS_PER_WAVELENGTH = 5.0
 
 

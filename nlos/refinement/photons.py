@@ -230,8 +230,7 @@ MIN_POINTS_PER_SUBSET = 16
 MIN_GAIN = 1e-5
 # Falls of light with the angle, of which the likeliest is taken.
 OBLIQUITIES = (0, 1, 2)
-# A voxel whose neighbourhood is brighter than noise by this number of standard deviations pays
-# little.
+# A voxel whose neighbourhood is brighter than noise by so many standard deviations pays little.
 NOISE_SIGMAS = 3.0
 # Subsets of the first passes on fine voxels; later ones treat all of the wall at once.
 FINE_SUBSETS = (4, 4, 4, 2, 2)
@@ -292,8 +291,7 @@ class PhotonFit:
         subsets = max(1, min(subsets, len(self._everyone) // MIN_POINTS_PER_SUBSET))
         weight = self.prior_weight if prior_weight is None else prior_weight
         if weight > 0:
-            # One standard deviation of what noise brings a voxel, less where its neighbours are
-            # bright.
+            # Noise's standard deviation, less where neighbours are bright.
             sharpness = self.compute_sharpness()
             around = gaussian_filter(self.place(self.albedo), 1.0).ravel()[self.voxels]
             self._penalty = weight * sharpness / (1 + around * sharpness / NOISE_SIGMAS)
@@ -379,8 +377,7 @@ def compute_beam(fit: PhotonFit) -> FloatArray:
     gradients = back / far + out / near
     light = ((far * near) ** -2.0).ravel()
     spacing = capture.axis.spacing
-    # Response and the even spread over a bin, whose standard deviation is 1 / sqrt(12), add in
-    # squares.
+    # Response and even spread over a bin, of 1 / sqrt(12), add in squares.
     path = spacing * np.hypot(fit.response_sigma, 12**-0.5)
     slopes = np.sqrt(np.average(gradients**2, axis=0, weights=np.broadcast_to(light, len(back))))
     return np.asarray(path / np.maximum(slopes[::-1], 1e-3))
@@ -403,8 +400,7 @@ SUBSETS = 16
 COARSE_PASSES = 2
 # Along every axis; smaller grids are not made coarser.
 MIN_COARSE_VOXELS = 8
-# Coarse voxels fainter than this, of the brightest voxel's photons or in standard deviations of the
-# noise, are not looked at more closely.
+# Coarse voxels fainter than this, of the brightest's photons or of noise, are left at that.
 FAINT_FRACTION, FAINT_SIGMAS = 2e-3, 1.0
 # Of the brightest voxel, the least that the albedo starts from: 0 would stay 0.
 START_FRACTION = 1e-3
@@ -412,15 +408,13 @@ START_FRACTION = 1e-3
 RESPONSE_SIGMAS_BINS: tuple[float, ...] = (0.0, 0.6, 1.2, 2.5, 5.0)
 # Of the photons, what is set aside to judge the refinement by, and the seed that chooses them.
 HELD_OUT_FRACTION, HELD_OUT_SEED = 0.1, 0
-# Gain of likelihood of the photons set aside, in standard deviations, with which the refined image
-# is shown and not the linear one.
+# Gain of the held-out photons' likelihood, in its noise, that shows the refined image.
 MIN_GAIN_SIGMAS = 3.0
 # Passes over all photons, those that were set aside included.
 FINAL_PASSES = 2
 # Standard deviation of the least sharpness that is shown, voxels.
 MIN_BEAM_VOXELS = 0.5
-# Of the brightest voxel: below, where photons decide little, voxels stand in the order of the
-# linear image.
+# Of the brightest voxel: below, voxels stand in the order of the linear image.
 UNDECIDED_FRACTION = 1e-2
 LINEAR_SHOWN = (
     "photons set aside are no likelier under the refined image: the linear image is shown"
@@ -449,8 +443,7 @@ class PhotonRefinement(Method):
 
     linear: PhasorMethod  # gives the image to begin with
     iterations: int = 12  # passes over all photons at the end, at most
-    # what faint voxels pay, relative to one standard deviation of what noise brings them; 0: the
-    # likelihood alone
+    # what faint voxels pay, in standard deviations of noise; 0: the likelihood alone
     prior_weight: float = 1.0
     # m of path after the wall's own light that are left out of account; they may hold anything
     blank: float = 0.0

@@ -8,8 +8,7 @@ import numpy as np
 
 from nlos.kernels import compiled
 
-# Share of a way at either end where a triangle hides nothing: the facet's own triangle begins
-# there.
+# Share of a path at either end where nothing hides: the facet's own triangle begins there.
 CONTACT_FRACTION = 1e-4
 
 
@@ -23,8 +22,7 @@ def is_occluded(start, end, triangles):
     for i in range(triangles.shape[0]):
         ax, ay, az = triangles[i, 0, 0], triangles[i, 0, 1], triangles[i, 0, 2]
         bz, cz = triangles[i, 1, 2], triangles[i, 2, 2]
-        # Most triangles lie wholly behind the facet: this asks three numbers of them instead of
-        # nine.
+        # Most triangles lie behind the facet: this asks three numbers of them, not nine.
         if (az >= far and bz >= far and cz >= far) or (az <= near and bz <= near and cz <= near):
             continue
         ux, uy, uz = triangles[i, 1, 0] - ax, triangles[i, 1, 1] - ay, triangles[i, 1, 2] - az
@@ -69,8 +67,7 @@ def add_facet_light(walls, spots, facets, material, triangles, start, fine, bins
     outward = np.empty(positions.shape[0])
     lit = np.empty(positions.shape[0])
     for p in range(wall.shape[0]):
-        # One spot lights the scene for all points, or each point has its own: what is lit, and the
-        # shadows, are found once per spot.
+        # What is lit, and the shadows, are found once per spot.
         if p < lasers.shape[0]:
             for f in range(positions.shape[0]):
                 way = distance_between(lasers[p], positions[f])

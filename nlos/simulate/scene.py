@@ -367,8 +367,7 @@ def _subdivide_triangles(
             raise InputError(
                 f"the mesh needs more than {MAX_FACETS} facets at a spacing of {spacing} m; use a larger one"
             )
-        # Corners are renamed so that the longest side is from a to b, in the same sense of turning:
-        # normals keep their side.
+        # Corners are renamed in the same sense, the longest side from a to b.
         turn = (longest[~small, np.newaxis] + np.arange(3)) % 3
         a, b, c = np.take_along_axis(pending[~small], turn[..., np.newaxis], 1).swapaxes(0, 1)
         middle = (a + b) / 2
@@ -403,8 +402,7 @@ def _rasterize_letters(text: str, height: float, spacing: float) -> tuple[FloatA
     columns, rows = (np.arange(-n, n + 1) * spacing for n in halves)
     x, y = (grid.ravel() for grid in np.meshgrid(columns, rows))
     middle = (box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2
-    # Fonts have y up. Holes run the other way round, which the even-odd rule of a polygon test
-    # needs no word of.
+    # Fonts have y up. Holes run the other way round, as the even-odd rule needs.
     inside = np.zeros(x.size, dtype=bool)
     for polygon in outline.to_polygons():
         inside ^= Outline(polygon).contains_points(np.stack([x + middle[0], middle[1] - y], axis=1))
