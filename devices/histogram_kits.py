@@ -96,10 +96,10 @@ class Tmf8828Parser:
         self._seen = np.zeros((self._halves, TMF_LANES), bool)
 
     def _add_lane(self, line: bytes) -> None:
-        numbers = _parse_integers(line.split(b",")[2:])
-        if numbers is None or len(numbers) != TMF_BINS + 1:
+        numbers = _parse_integers(line.split(b",")[2:], TMF_BINS + 1)
+        if not numbers:
             return
-        half, lane = divmod(int(numbers[0]), TMF_LANES)
+        half, lane = divmod(numbers[0], TMF_LANES)
         # Some versions number both halves from 0.
         if half == 0 and self._halves == 2 and self._seen[0, lane]:
             half = 1
@@ -108,10 +108,10 @@ class Tmf8828Parser:
             self._seen[half, lane] = True
 
     def _end_capture(self, line: bytes) -> KitFrame | None:
-        numbers = _parse_integers(line.split(b",")[2:6])
-        if numbers is None or len(numbers) != 4:
+        numbers = _parse_integers(line.split(b",")[2:6], 4)
+        if not numbers:
             return None
-        number, tick = int(numbers[0]) % TMF_NUMBERS, int(numbers[3])
+        number, tick = numbers[0] % TMF_NUMBERS, numbers[3]
         place = number % self._captures
         if self._seen.all():
             lanes = self._lanes.reshape(self._halves, 3, TMF_CHANNELS, TMF_BINS)
@@ -145,13 +145,12 @@ class Vl53l8Parser:
         if not line.startswith(b"Aggregate "):
             return None
         head, _, tail = line.partition(b"Bins:")
-        zone = _parse_integers([head.removeprefix(b"Aggregate ").split(b",")[0]])
-        values = np.empty(0)
+        zone = _parse_integers([head.removeprefix(b"Aggregate ").split(b",")[0]], 1)
+        if not zone:
+            return None
+        place, values = zone[0], np.empty(0)
         with contextlib.suppress(ValueError):
             values = np.array([float(word) for word in tail.split(b",") if word.strip()])
-        if zone is None:
-            return None
-        place = int(zone[0])
         if place == 0:
             self._next = 0
         # Behind every value stands a comma: without the last one it may have lost digits.
@@ -170,10 +169,10 @@ class Vl53l8Parser:
         return KitFrame(self._counts.copy() if is_complete else None)
 
 
-def _parse_integers(words: list[bytes]) -> NDArray[np.int64] | None:
-    if not all(word.strip().isdigit() and len(word) < 12 for word in words):
-        return None
-    return np.array([int(word) for word in words], np.int64)
+def _parse_integers(words: list[bytes], count: int) -> list[int]:
+    """Return so many whole numbers, none where the words are others."""
+    is_whole = all(word.strip().isdigit() and len(word) < 12 for word in words)
+    return [int(word) for word in words] if is_whole and len(words) == count else []
 
 
 READ_BYTES = 1 << 16
