@@ -88,7 +88,7 @@ POLL_INTERVAL_S = 0.1
 DRAIN_TIMEOUT_S = 3.0
 # Seconds that `StreamSource.close` waits for the thread, which never takes so long
 STOP_TIMEOUT_S = 15.0
-RETRY_INTERVAL_S = 0.1  # Seconds between two attempts to reach an instrument that went away
+RETRY_INTERVAL_S = 0.1  # Most seconds between two attempts to reach an instrument that went away
 _MEBIBYTE = 1 << 20
 # Not there yet, or there before the system has given this user the right to it
 AWAY = (
@@ -273,4 +273,4 @@ def retry_connect(connect: Callable[[], _Connected], seconds: float) -> _Connect
                 raise DeviceDisconnectedError(
                     f"the connection broke and no answer came for {seconds:g} s ({fault})"
                 ) from fault
-            sleep(RETRY_INTERVAL_S)
+            sleep(min(RETRY_INTERVAL_S, seconds / 10))
