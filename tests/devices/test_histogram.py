@@ -134,23 +134,6 @@ def test_even_light_gives_even_bins_whatever_the_codes(board: BoardCalibration) 
     assert corrected.counts[:, 40].sum() == pytest.approx(photons, rel=1e-6)
 
 
-def test_a_pulse_comes_back_in_all_pixels_at_once(board: BoardCalibration) -> None:
-    """Pixels out of step by nanoseconds, and a laser whose period is not a multiple of the clock's."""
-    random = np.random.default_rng(8)
-    pixels = np.arange(256).repeat(300)
-    pulse = 4.21e-9
-    times = pulse + 7.77e-9 * random.integers(2, 500, len(pixels))
-    histogram = StampHistogram(BinAxis(2 * PS, 3880, 0.0, 7.77e-9), board)
-    histogram.add(stamps_at(times, pixels, board))
-    counts, times = histogram.counts, histogram.axis.times[:, None]
-    centre = (counts * times).sum(axis=0) / counts.sum(axis=0)
-    # A code is 18 ps wide on average and up to 45 ps here; 300 photons in 250 places on the codes
-    # average that out. Bins are narrow, because the centre of wide ones is not that of the photons
-    # in them.
-    assert np.abs(centre - pulse).max() < 5 * PS
-    assert np.median(np.abs(centre - pulse)) < 1 * PS
-
-
 def test_stamps_with_a_counter_and_in_pieces(
     board: BoardCalibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -262,34 +262,6 @@ def test_a_simulations_cycles_are_what_was_asked_for() -> None:
     assert np.unique(found["counter"]).tolist() == [0, 533333, 1066667]
 
 
-def test_the_light_comes_back_out_of_the_words(light: LineLight) -> None:
-    """Through uneven codes and pixels out of step, the histogram is the scene's own streak image,
-    up to its noise.
-    """
-    with devices.open("sim+linospad2://?seed=2&cycles=60") as source:
-        known = source.calibration
-        assert known is not None
-        axis = BinAxis(20e-12, len(light.row_times), 0.0, 25e-9)
-        histogram = StampHistogram(axis, BoardCalibration.from_record(known))
-        for batch in source:
-            histogram.add(batch.records)
-    counts = histogram.counts
-    expected = light.photons * (counts.sum() / light.photons.sum())
-    assert counts.sum() == pytest.approx(60 * 6000, rel=0.01)
-    # A photon's place is known to about a code, 18 ps: edges are softer than the light's own, sums
-    # over 3 rows are not.
-    rows = len(expected) // 3
-    coarse, wanted = (
-        values[: rows * 3].reshape(rows, 3, 256).sum(axis=1) for values in (counts, expected)
-    )
-    bright = wanted > 20
-    assert np.corrcoef(coarse[bright], wanted[bright])[0, 1] > 0.98
-    centre = (coarse * np.arange(rows)[:, None]).sum(axis=0) / coarse.sum(axis=0)
-    truth = (wanted * np.arange(rows)[:, None]).sum(axis=0) / wanted.sum(axis=0)
-    # Some 1400 photons in each pixel, spread over a few hundred rows by the background.
-    assert np.median(np.abs(centre - truth)) < 3
-
-
 def test_a_cycle_that_is_full_keeps_the_first_stamps(light: LineLight) -> None:
     codec, board = LinoSpad2Codec(timestamps=4), draw_uneven_calibration(0)
     data = np.frombuffer(SimulatedBoard(light, board, codec, 256, 1).encode_cycle(0), np.uint8)
