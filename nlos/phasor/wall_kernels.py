@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from nlos.kernels import cosine_of_cycles, sine_of_cycles
+from nlos.kernels import MIN_DISTANCE_M, cosine_of_cycles, sine_of_cycles
 from nlos.phasor.to_depths_kernels import TAPS
 from tofclip.compiling import SUMS_IN_ANY_ORDER, compile_and_keep
 
@@ -20,8 +20,6 @@ TARGET_LANES = 64
 FREQUENCY_STEPS = 8
 # float32 factors in a vector of 512 bits.
 VECTOR_FLOATS = 16
-# Distance in m below which 1 / distance stops growing.
-MIN_DISTANCE_M = 1e-3
 
 
 @compiled

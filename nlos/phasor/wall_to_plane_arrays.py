@@ -9,11 +9,11 @@ from functools import partial
 
 import numpy as np
 
+from nlos.kernels import MIN_DISTANCE_M
 from nlos.method import Progress, ignore_progress
 from nlos.phasor.arrays import ArrayLibrary, arrange_on_lattice
 from nlos.phasor.to_depths_kernels import TAPS
 from nlos.phasor.transfer import SphericalWaves
-from nlos.phasor.wall_kernels import MIN_DISTANCE_M
 from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, plan_transforms
 from nlos.phasor.wall_to_plane_compiled import STRENGTH_POINTS, estimate_strength
 from tofclip.arrays import Array, to_numpy
