@@ -40,9 +40,9 @@ ComplexArray = NDArray[np.complex64]
 
 # Neighbouring frequencies that share their functions of depth.
 FREQUENCIES_PER_GROUP = 6
-# Of the error allowed, what interpolation between depths and leaving out terms may take; they are
-# independent, and their squares add up.
-INTERPOLATION_ERROR_FRACTION, TERMS_ERROR_FRACTION = 0.2, 0.6
+# Of the error allowed, what interpolation between depths and leaving out terms may take: on average,
+# which photons on a curved wall of many points exceed up to six times.
+INTERPOLATION_ERROR_FRACTION, TERMS_ERROR_FRACTION = 0.2, 0.1
 # Depths closer than this are one, m.
 MIN_DEPTH_RANGE_M = 1e-5
 # Wavenumber along z, relative to the band's highest, about which the waves vary least with depth.

@@ -84,11 +84,13 @@ def test_a_tolerance_is_kept_where_many_depths_are_interpolated(
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("shape", "method"), [("planar", PlanarRSD), ("relief", Hybrid)])
+@pytest.mark.parametrize("scan", WAVELENGTHS)
+@pytest.mark.parametrize(("shape", "method"), [*WALLS, ("relief", Hybrid)])
 def test_a_tolerance_is_kept_on_64_x_64_points(
-    shape: str, method: type[PlanarRSD] | type[Hybrid]
+    shape: str, method: type[PlanarRSD] | type[Hybrid], scan: str
 ) -> None:
     grid = Grid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 7), [0.6, 0.75, 1.6])
+    wavelength = {"single": 0.125, "confocal": 0.25}[scan]
     for background in (NOISE, POINTS_AND_COUNTS):
-        capture = see_noise(shape, 64, LONG, background)
-        assert max(list_errors(method, capture, grid, 0.125)) < 1
+        capture = see_noise(shape, 64, LONG, background, scan)
+        assert max(list_errors(method, capture, grid, wavelength)) < 1
