@@ -19,6 +19,7 @@ from apps.figures.style import (
     make_figure,
 )
 from tofclip.designs import find_inactive_region, list_footprints
+from tofclip.notebook import letter_panels
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ def make_design_figure(reports: Mapping[str, DesignReport]) -> Figure:
     """Draw instruments below each other, by their names."""
     figure = make_figure(WIDTH_INCHES, HEIGHT_INCHES * len(reports))
     parts: Any = figure.subfigures(len(reports), 1, squeeze=False)
+    lettered: list[Axes] = []
     for part, (name, report) in zip(parts[:, 0], reports.items(), strict=True):
         part.suptitle(f"{name}: {_describe(report)}", fontsize=SMALL_FONT_PT + 2)
         panels = part.subplots(2, 4)
@@ -53,6 +55,8 @@ def make_design_figure(reports: Mapping[str, DesignReport]) -> Figure:
         _draw_field(panels[1, 0], report)
         _draw_ranges(part, panels[1, 1:3], report)
         _draw_accuracy(panels[1, 3], report)
+        lettered += panels.flat
+    letter_panels(lettered)
     return figure
 
 

@@ -179,6 +179,7 @@ def _draw_plan(axes: Axes, experiment: Experiment, probes: Sequence[ProbeResult]
         axes.plot(place, 0, mark, color=colour, mec="black", ms=10, zorder=5)
         said = f"at {one.factor:g} l: correlation {one.correlation:.2f}"
         line = {"arrowstyle": "-", "color": colour, "lw": 0.8, "shrinkB": 5}
+        line["relpos"] = (1, 0.5)  # from the end, or the lines cross the labels of nearer ones
         below = (16, -34 - 14 * number)
         axes.annotate(
             said, (place, 0), below, arrowprops=line, fontsize=SMALL_FONT_PT, color=colour, **note
