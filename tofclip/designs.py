@@ -329,30 +329,15 @@ def make_scene(name: str, design: Design) -> Scene:
 
 @dataclass(frozen=True)
 class Sight:
-    """What the views determine of a picture at one shear.
+    """What the views determine of a picture at one shear; maps are (rows, columns)."""
 
-    Parameters
-    ----------
-    singular_values : (readings,) array
-        Of W A, falling.
-    least : float
-        The one of which the linear inverse returns half, sqrt(mu).
-    undetermined : float
-        Share of the picture's dimensions of which less is returned.
-    by_pixel : (rows, columns) array
-        Part of a point's energy there that is undetermined.
-    by_frequency : (rows, columns) array
-        The same of waves, frequency 0 in the middle: what is undetermined there shows as rays.
-    points : (rows, columns) array
-        What the linear inverse makes of points.
-    """
-
-    singular_values: FloatArray
-    least: float
-    undetermined: float
-    by_pixel: FloatArray
+    singular_values: FloatArray  #: (readings,), of W A, falling
+    least: float  #: the one of which the linear inverse returns half, sqrt(mu)
+    undetermined: float  #: share of the picture's dimensions of which less is returned
+    by_pixel: FloatArray  #: part of a point's energy there that is undetermined
+    #: the same of waves, frequency 0 in the middle: what is undetermined there shows as rays
     by_frequency: FloatArray
-    points: FloatArray
+    points: FloatArray  #: what the linear inverse makes of points
 
 
 def analyse_sight(design: Design, shear: float = 0.0) -> Sight:
@@ -386,29 +371,16 @@ def analyse_sight(design: Design, shear: float = 0.0) -> Sight:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How well a scene is measured, predicted or found in simulated shots.
-
-    Parameters
-    ----------
-    picture_bias, picture_noise : float
-        Squared error of the picture of all light, over the variance of the truth: what noiseless
-        shots err by, and what the noise adds.
-    range_deviation : (rows, columns) array
-        From shot to shot, m; NaN where no surface is asked for.
-    range_offset : (rows, columns) array
-        Mean error, m: the rays of other pixels.
-    picture : (rows, columns) array
-        The mean picture, photons.
-    seconds : float
-        Of one shot on this machine, from readings to ranges; NaN of a prediction.
+    """How well a scene is measured, predicted or found in simulated shots; maps are (rows, columns).
+    Errors of the picture of all light are squared, over the variance of the truth.
     """
 
-    picture_bias: float
-    picture_noise: float
-    range_deviation: FloatArray
-    range_offset: FloatArray
-    picture: FloatArray
-    seconds: float = float("nan")
+    picture_bias: float  #: what noiseless shots err by
+    picture_noise: float  #: what the noise adds
+    range_deviation: FloatArray  #: from shot to shot, m; NaN where no surface is asked for
+    range_offset: FloatArray  #: mean error, m: the rays of other pixels
+    picture: FloatArray  #: the mean, photons
+    seconds: float = float("nan")  #: of one shot on this machine, from readings to ranges
 
     @property
     def picture_error(self) -> float:
@@ -738,12 +710,8 @@ MAX_ROUNDS = 4
 def optimise_angles(known: Design) -> Design:
     """Return a design whose angles, up to `max_angle_deg`, leave the least error that a random
     picture is expected to have, at the near and the far end of the range: bias and noise of the
-    linear inverse, for pictures of exponential correlation. Scenes take no part.
-
-    Raises
-    ------
-    InputError
-        The sensor has no lines.
+    linear inverse, for pictures of exponential correlation. Scenes take no part; `InputError` for a
+    sensor without lines.
     """
     if known.encoder is not None:
         raise InputError(f"a {known.sensor} sensor has no lines whose angles could be better")

@@ -35,16 +35,8 @@ TYPES: dict[str, Callable[[str], Any]] = {
 
 
 class Parts(Mapping[str, Any]):
-    """The parts of one kind by name: ours, those that were registered, and those of packages.
-
-    Parameters
-    ----------
-    group : str
-        Of the entry points by which packages offer theirs.
-    kind : str
-        What messages call one of them.
-    own : mapping of str to str
-        Ours, each as ``"module:name"``. Nobody else can take their names.
+    """The parts of one kind by name: ours, each as ``"module:name"``, whose names nobody else can take;
+    those that were registered; and those that packages offer in a group of entry points.
     """
 
     def __init__(self, group: str, kind: str, own: Mapping[str, str]) -> None:
@@ -122,12 +114,8 @@ class Parts(Mapping[str, Any]):
         return _name_package(self.offered[name])
 
     def make(self, name: str, settings: Mapping[str, Any]) -> Any:
-        """Make a part with settings of its own; texts become what it takes.
-
-        Raises
-        ------
-        InputError
-            There is no such part, it has no such setting, or a text is not what it takes.
+        """Make a part with settings of its own, texts becoming what it takes; `InputError` where there
+        is no such part or setting, or a text is not what it takes.
         """
         part, what = self[name], f"{self.kind} '{name}'"
         known = list_settings(part)
