@@ -35,6 +35,7 @@ from tofclip.lidar.pulse import Pulse
 from tofclip.units import PICOSECOND
 
 MAX_LAG_FRACTION = 0.25  # of the time axis: photons further apart than this are not of one pulse
+MAX_TAIL_RATIO = 4.0  # of a pulse with its tails over one without: beyond, the background is uneven
 MIN_LAG_SIGNIFICANCE = 8.0  # standard deviations of pairs beyond those that meet by chance
 SAMPLES_PER_WIDTH = 24
 SMOOTHING_WIDTHS = 1 / 6
@@ -190,22 +191,41 @@ def measure_pulse_width(photons: PhotonImage) -> float:
     lags[0] *= 2  # the others come with both signs
     # Photons that meet by chance: the further apart, the fewer bins there are for both.
     open_bins = photons.bins - np.arange(number)
-    chance = np.median((lags / open_bins)[number // 2 :]) * open_bins
-    group = 1
-    while number // group >= 8:
+    middle = np.median((lags / open_bins)[number // 2 :])
+    group, found = 1, dict[bool, float]()
+    while number // group >= 8 and True not in found:
         pieces = number // group
-        pairs = lags[: pieces * group].reshape(pieces, group).sum(axis=1)
-        expected = chance[: pieces * group].reshape(pieces, group).sum(axis=1)
-        excess = pairs - expected
-        # counts below one make negative pairs: a photon is none with itself
-        if excess[0] > MIN_LAG_SIGNIFICANCE * np.sqrt(max(expected[0] + pairs[0], 0.0) + 1):
-            below = np.flatnonzero(excess < excess[0] / 2)
-            if below.size:
-                last = int(below[0])
-                part = (excess[last - 1] - excess[0] / 2) / (excess[last - 1] - excess[last])
-                half = (last - 1 + part + (0.5 if group > 1 else 0.0)) * group
-                return float(np.sqrt(2) * max(half, 0.5) * photons.bin_width)
+        pairs, rest = (
+            part[: pieces * group].reshape(pieces, group).sum(axis=1) for part in (lags, open_bins)
+        )
+        reach = 1
+        while True:
+            # Where a background changes slowly, they are as many as a parabola through the lags
+            # beyond the pulse says.
+            outside, alone = slice(4 * reach, 8 * reach), 8 * reach > pieces
+            level = np.full(pieces, middle)
+            if not alone:
+                squared, weight = (np.arange(pieces) + 0.5) ** 2, np.sqrt(rest[outside])
+                fit = np.polyfit(squared[outside], (pairs / rest)[outside], 1, w=weight)
+                level = np.polyval(fit, squared)
+            expected = np.maximum(level * rest, 0)
+            excess = pairs - expected
+            # counts below one make negative pairs: a photon is none with itself
+            if excess[0] > MIN_LAG_SIGNIFICANCE * np.sqrt(max(expected[0] + pairs[0], 0.0) + 1):
+                below = np.flatnonzero(excess < excess[0] / 2)
+                if below.size and (alone or below[0] <= 1.5 * reach):
+                    last = int(below[0])
+                    part = (excess[last - 1] - excess[0] / 2) / (excess[last - 1] - excess[last])
+                    half = (last - 1 + part + (0.5 if group > 1 else 0.0)) * group
+                    found.setdefault(alone, np.sqrt(2) * max(half, 0.5) * photons.bin_width)
+            if alone:
+                break
+            reach *= 2
         group *= 2
+    if found:
+        # beyond the even background there are the pulse's own tails, unless they are much wider
+        wide, narrow = found.get(True, np.inf), found.get(False, np.inf)
+        return float(narrow if wide > MAX_TAIL_RATIO * narrow else wide)
     raise InputError(
         "no pulse stands out from the background in these photons; give its width (`pulse`)"
     )
