@@ -147,15 +147,9 @@ def require_numpy(what: str, *arrays: Array) -> None:
 
 @dataclass(frozen=True)
 class ComputeDevice:
-    """Where arrays live: a library and one of its devices.
-
-    Parameters
-    ----------
-    library : str
-        ``numpy``, ``cupy``, ``torch`` or another that follows the standard, by the name it is
-        imported by.
-    device : object, optional
-        As the library has it; by default its own choice.
+    """Where arrays live: a `library` (``numpy``, ``cupy``, ``torch`` or another that follows the
+    standard, by the name it is imported by) and one of its devices, as the library has it; by
+    default its own choice.
     """
 
     library: str = "numpy"

@@ -28,7 +28,7 @@ from tofclip.camera import Camera, Measurement, SkewSweep, measure
 from tofclip.errors import InputError
 from tofclip.files import atomic_path, read_toml, suggest_name
 from tofclip.lidar import Pulse, depth
-from tofclip.light_field.measurement import CameraSetup, ClipMeasurement
+from tofclip.light_field.views import CameraSetup, ClipMeasurement
 from tofclip.notebook import plot_picture
 from tofclip.occlusion import InactiveRegion
 from tofclip.operators import LinearOperator, LineProjection

@@ -126,16 +126,8 @@ class ProtocolError(DeviceError):
 
 
 def require_type(value: object, wanted: type | tuple[type, ...], use: str) -> None:
-    """Refuse an argument of another type than the one that is needed.
-
-    `use`: what needs it and how one comes by it, such as ``"recover takes a Streak, see
-    read_streak"``.
-
-    Examples
-    --------
-    >>> require_type("shot.tif", float, "a bin lasts a number of seconds")
-    Traceback (most recent call last):
-    tofclip.errors.InputError: a bin lasts a number of seconds, not a str
+    """Refuse an argument of another type than the one that is needed. `use`: what needs it and how
+    one comes by it, such as ``"recover takes a Streak, see read_streak"``.
     """
     if not isinstance(value, wanted):
         raise InputError(f"{use}, not a {type(value).__name__}")

@@ -51,13 +51,7 @@ DISTRIBUTIONS = {
 
 
 def describe_missing_package(fault: ImportError) -> str | None:
-    """Return which package is missing and what to install, None where a module of ours is missing.
-
-    Examples
-    --------
-    >>> describe_missing_package(ModuleNotFoundError("No module named 'usb'", name="usb.core"))
-    "the package 'pyusb' is missing: pip install pyusb"
-    """
+    """Return which package is missing and what to install, None where a module of ours is missing."""
     module = (fault.name or "").partition(".")[0]
     if not module or module in OWN_PACKAGES:
         return None

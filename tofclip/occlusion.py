@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.errors import InputError, ShapeError
-from tofclip.light_field.measurement import CameraSetup, ClipMeasurement
+from tofclip.light_field.views import CameraSetup, ClipMeasurement
 from tofclip.operators import Diagonal, LinearOperator, LinearShear, Stack
 from tofclip.operators.cameras import LightFieldCamera
 from tofclip.operators.shear import View

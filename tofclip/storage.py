@@ -75,29 +75,15 @@ class Field:
 
 @dataclass(frozen=True)
 class Record:
-    """A tree of arrays and scalars, as it lies in an HDF5 file.
+    """A tree of arrays and scalars, as it lies in an HDF5 file."""
 
-    Parameters
-    ----------
-    kind : str
-        What the record describes: ``"camera"``, ``"streak"``, ``"frames"``, ``"cloud"``,
-        ``"capture"``, ``"volume"``.
-    fields : mapping of str to Field
-    attributes : mapping of str to str, int, float or bool
-    children : mapping of str to Record
-        Records that travel inside this one, such as a streak image's camera.
-    provenance : mapping
-        How it came about; any JSON-serialisable tree.
-    origin : str
-        The file it was read from, for error messages.
-    """
-
-    kind: str
+    kind: str  # what it describes, such as ``"camera"`` or ``"streak"``
     fields: Mapping[str, Field] = field(default_factory=dict)
     attributes: Mapping[str, Scalar] = field(default_factory=dict)
+    # records that travel inside this one, such as a streak image's camera
     children: Mapping[str, Record] = field(default_factory=dict)
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    origin: str = ""
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # any tree that JSON can hold
+    origin: str = ""  # the file it was read from, for error messages
 
     def array(self, name: str, dtype: DTypeLike, dimensions: int, units: str = "") -> NDArray[Any]:
         """Return field `name`, contiguous; `FileFormatError` where it is absent, of another number
@@ -142,19 +128,9 @@ class Record:
         return child
 
     def save(self, path: str | Path, compressed: bool = True) -> None:
-        """Write the record to `path`, whole or not at all.
-
-        Parameters
-        ----------
-        path : str or Path
-        compressed : bool
-            Whether large arrays are made smaller, which takes ten times as long as writing them.
-
-        Raises
-        ------
-        StorageError
-            The disk is full, the folder is missing or writing is not allowed; `path` is left as it
-            was.
+        """Write the record to `path`, whole or not at all, large arrays `compressed`, which takes
+        ten times as long as writing them. `StorageError` where that fails; `path` is left as it
+        was.
         """
         import h5py
 

@@ -83,11 +83,6 @@ def map_parallel(
     on its thread, and BLAS products too. Jobs are taken as they are needed; `lookahead` of them, by
     default one per thread, may be under way or done before their turn, which bounds the results in
     memory. The first exception is raised in its result's place, and no further job is started.
-
-    Examples
-    --------
-    >>> list(map_parallel(abs, [-1, 2, -3]))
-    [1, 2, 3]
     """
     threads = count_block_threads()
     if threads == 1:

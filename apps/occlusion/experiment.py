@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from apps.occlusion.scenes import OcclusionScene
 from tofclip.errors import InputError
 from tofclip.light_field import LightField
-from tofclip.light_field.measurement import CameraSetup
+from tofclip.light_field.views import CameraSetup
 from tofclip.occlusion import (
     InactiveRegion,
     Rig,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.occlusion.experiment import VIEW_COUNT, make_rig
-from tofclip.light_field.measurement import CameraSetup
+from tofclip.light_field.views import CameraSetup
 from tofclip.metrics import correlation_coefficient
 from tofclip.occlusion import (
     TV_WEIGHT,

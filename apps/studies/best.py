@@ -14,11 +14,15 @@ from typing import Any
 from numpy.typing import NDArray
 
 from apps.studies.cases import BORDER_PX, Advance, Case, Library, measure_case, read_cases
-from tofclip.light_field.measurement import ClipMeasurement
+from tofclip.light_field.views import ClipMeasurement
 from tofclip.metrics import nmse
 from tofclip.operators.cameras import EvenAngleLineCamera
-from tofclip.recovery.all_in_focus import make_shear_range, recover_all_in_focus
-from tofclip.recovery.light_field import PRESETS, ClipRecovery
+from tofclip.recovery.light_field import (
+    PRESETS,
+    ClipRecovery,
+    make_shear_range,
+    recover_all_in_focus,
+)
 from tofclip.threads import map_parallel
 
 SHEAR_RANGE = (-1.4, 1.4)  # that surfaces are looked for in, for all scenes alike

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field import LightField
-from tofclip.light_field.measurement import (
+from tofclip.light_field.views import (
     CameraSetup,
     ClipMeasurement,
     corrupt_measurement,

@@ -17,7 +17,7 @@ from tofclip.light_field import LightField
 from tofclip.operators import LinearShear, SliceConvolution, SparseMatrix
 from tofclip.operators.convolution import make_coded_line
 from tofclip.solvers import TotalVariation
-from tofclip.solvers.cross_validation import choose_weight
+from tofclip.solvers.fista import choose_weight
 from tofclip.threads import map_parallel
 
 MAX_ANGLE_RAD = np.pi / 4

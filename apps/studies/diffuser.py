@@ -14,7 +14,7 @@ from tofclip.errors import InputError, ShapeError
 from tofclip.io.archive import Archive
 from tofclip.operators import LinearOperator, PitchedSensor
 from tofclip.operators.cameras import MeasuredCamera
-from tofclip.operators.point_spreads import MeasuredPointSpreads
+from tofclip.operators.convolution import MeasuredPointSpreads
 from tofclip.solvers import TotalVariation, relative_residual
 
 TV_WEIGHT = 1e-4  # relative to the largest A'f; ten times less lowers the residual by a tenth

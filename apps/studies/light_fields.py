@@ -31,7 +31,7 @@ from apps.studies.cases import (
     study,
 )
 from tofclip.light_field import FocalStack, LightField, estimate_depth_from_focus, make_focal_stack
-from tofclip.light_field.measurement import CameraSetup, measure
+from tofclip.light_field.views import CameraSetup, measure
 from tofclip.metrics import nmse
 from tofclip.operators import LinearShear
 from tofclip.recovery.light_field import ClipRecovery

@@ -15,9 +15,8 @@ from tofclip.errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tofclip.light_field.measurement import ClipMeasurement
-    from tofclip.recovery.all_in_focus import AllInFocus
-    from tofclip.recovery.light_field import ClipRecovery
+    from tofclip.light_field.views import ClipMeasurement
+    from tofclip.recovery.light_field import AllInFocus, ClipRecovery
 
 SCORED_BORDER_PX = 12  # views leave the picture there, so that the rim is not scored
 ENCODERS = (
@@ -52,7 +51,7 @@ def simulate(
     measurements.h5
     """
     from tofclip.io.light_fields import read_light_field
-    from tofclip.light_field.measurement import CameraSetup, corrupt_measurement, measure
+    from tofclip.light_field.views import CameraSetup, corrupt_measurement, measure
 
     require_writable(out, *RECORD_SUFFIXES, inputs=(light_field,))
     known = read_light_field(light_field)
@@ -113,7 +112,7 @@ def recover(
     import numpy as np
 
     from tofclip.io.light_fields import read_light_field
-    from tofclip.light_field.measurement import ClipMeasurement
+    from tofclip.light_field.views import ClipMeasurement
     from tofclip.metrics import nmse, nmse_energy
     from tofclip.recovery.light_field import ClipRecovery
 
@@ -180,17 +179,17 @@ def _find_surfaces(
 ) -> AllInFocus:
     """Recover one picture with a depth for each pixel, known or found."""
     from tofclip.io.light_fields import read_depth_map
-    from tofclip.recovery import all_in_focus
+    from tofclip.recovery import light_field as recovery
 
     if depth_map is not None:
         known = read_depth_map(depth_map)
         with show_progress("recovering at known depths", 1) as advance:
-            found = all_in_focus.recover_on_depth_map(measurements, known, weight, settings)
+            found = recovery.recover_on_depth_map(measurements, known, weight, settings)
             advance(1)
         return found
     tried = all_in_focus.make_shear_range(*shears, measurements.views)
     with show_progress("looking for depths", all_in_focus.count_recoveries(tried)) as advance:
-        return all_in_focus.recover_all_in_focus(measurements, tried, weight, settings, advance)
+        return recovery.recover_all_in_focus(measurements, tried, weight, settings, advance)
 
 
 def _parse_weight(text: str) -> float | None:

@@ -255,7 +255,7 @@ def cloud(
     """
     from tofclip.lidar.cloud import ORGANISED_SUFFIXES
     from tofclip.sequences import CloudSettings, is_sequence, list_files
-    from tofclip.sequences.clouds import save_cloud
+    from tofclip.sequences.recovering import save_cloud
     from tofclip.shots import Frames
 
     if organised and returns == "all":

@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from devices.tracking import TrackedShots
     from devices.transients import ShotStamp
     from tofclip.lidar import PointCloud
-    from tofclip.sequences.pipelines import LiveShot
-    from tofclip.sequences.streaming import StreamedCloud
+    from tofclip.sequences.streaming import LiveShot, StreamedCloud
 
 MAX_LATENCY_SAMPLES = 10_000  # over which medians are taken: a stream may run for days
 

@@ -19,8 +19,7 @@ from devices.tracking import TrackedShots
 from tofclip.errors import InputError
 from tofclip.files import format_error_line
 from tofclip.lidar import PointCloud, Returns, point_cloud
-from tofclip.sequences.pipelines import CloudPipeline, LiveShot
-from tofclip.sequences.streaming import stream_clouds
+from tofclip.sequences.streaming import CloudPipeline, LiveShot, stream_clouds
 from tofclip.shots import Streak
 
 MAX_CACHED_SHOTS = 32

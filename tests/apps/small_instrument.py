@@ -21,7 +21,7 @@ from tofclip.io.light_fields import write_light_field
 from tofclip.lidar import compute_ray_directions
 from tofclip.lidar.photons import make_pinhole
 from tofclip.light_field import LightField
-from tofclip.light_field.measurement import CameraSetup, measure
+from tofclip.light_field.views import CameraSetup, measure
 from tofclip.shots import Streak
 from tofclip.storage import Field, Record
 from tofclip.units import SPEED_OF_LIGHT

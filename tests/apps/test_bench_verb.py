@@ -29,7 +29,7 @@ from apps.benchmarks.harness import (
 )
 from apps.benchmarks.light_fields import render_scene
 from tofclip.errors import InputError
-from tofclip.solvers.cross_validation import WeightChoice
+from tofclip.solvers.fista import WeightChoice
 
 CASES = find_cases("all")
 # Sizes at which a case, or a study that needs nothing but this program, is over at once; 16 where

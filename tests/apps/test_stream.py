@@ -18,7 +18,7 @@ from devices.transients import read_transient, read_transients
 from tofclip.camera import Camera, SkewSweep
 from tofclip.io.streaks import save_stack
 from tofclip.lidar import PointCloud, depth
-from tofclip.sequences.following import SurfacePipeline
+from tofclip.sequences.ranger import SurfacePipeline
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Frames
 from tofclip.simulate import (

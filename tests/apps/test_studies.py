@@ -35,12 +35,12 @@ from apps.studies.report import (
 from apps.studies.surfaces import SCENES, make_scene_instrument, score_methods
 from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
-from tofclip.light_field.measurement import CameraSetup, measure
+from tofclip.light_field.views import CameraSetup, measure
 from tofclip.metrics import nmse
 from tofclip.recovery import all_in_focus
 from tofclip.recovery.light_field import ClipRecovery
 from tofclip.simulate.light_fields import CameraArray
-from tofclip.solvers.cross_validation import WeightChoice
+from tofclip.solvers.fista import WeightChoice
 
 ARRAY = CameraArray((40, 40), 4, focal_length_px=50.0, view_step=0.04, samples=1)
 

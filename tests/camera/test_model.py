@@ -17,13 +17,13 @@ from tofclip.camera import (
     SkewSweep,
     Sweep,
 )
+from tofclip.camera.model import sweep_from_record
 from tofclip.camera.parallax import (
     find_sharpest_shears,
     fit_parallax_to_centres,
     fit_parallax_to_shears,
     measure_sharpness,
 )
-from tofclip.camera.sweep import sweep_from_record
 from tofclip.errors import CalibrationError, FileFormatError, InputError
 from tofclip.storage import Record
 

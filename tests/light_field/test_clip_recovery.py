@@ -11,21 +11,23 @@ import pytest
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import LightField
-from tofclip.light_field.measurement import (
+from tofclip.light_field.views import (
     CameraSetup,
     ClipMeasurement,
     corrupt_measurement,
+    find_view_labels,
+    make_view_warp,
     measure,
 )
-from tofclip.light_field.views import find_view_labels, make_view_warp
 from tofclip.metrics import nmse
-from tofclip.recovery.all_in_focus import (
+from tofclip.recovery.light_field import (
+    ClipRecovery,
     count_recoveries,
     make_shear_range,
     recover_all_in_focus,
+    recover_light_field,
     recover_on_depth_map,
 )
-from tofclip.recovery.light_field import ClipRecovery, recover_light_field
 
 SHEAR = -0.5
 SIDE = 48

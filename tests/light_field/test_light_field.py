@@ -21,7 +21,7 @@ from tofclip.light_field import (
     find_smooth_labels,
     make_focal_stack,
 )
-from tofclip.light_field.measurement import (
+from tofclip.light_field.views import (
     CameraSetup,
     ClipMeasurement,
     corrupt_measurement,

@@ -32,7 +32,7 @@ from tofclip.occlusion import (
     measure_views,
     separate_occluder,
 )
-from tofclip.simulate.bodies import Body, Lambertian, Rectangle
+from tofclip.simulate.bodies import Body, Lambertian, Rectangle, cast_rays, compute_irradiance
 from tofclip.simulate.light_fields import (
     CameraArray,
     PulsedScene,
@@ -41,7 +41,6 @@ from tofclip.simulate.light_fields import (
     render_flash_view,
 )
 from tofclip.simulate.patterns import make_plain_pattern
-from tofclip.simulate.rays import cast_rays, compute_irradiance
 from tofclip.units import SPEED_OF_LIGHT
 
 

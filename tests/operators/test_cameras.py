@@ -32,7 +32,7 @@ from tofclip.operators.cameras import (
     count_lines,
 )
 from tofclip.operators.codes import make_sheared_mask
-from tofclip.operators.point_spreads import (
+from tofclip.operators.convolution import (
     CodedAperture,
     CubicPhasePlate,
     Diffuser,

@@ -11,7 +11,7 @@ from devices.transients import _make_gate_response
 from tofclip.lidar import Pulse
 from tofclip.lidar.photons import PhotonCube
 from tofclip.sequences import make_pipeline
-from tofclip.sequences.pipelines import CloudPipeline
+from tofclip.sequences.streaming import CloudPipeline
 from tofclip.shots import Returns
 from tofclip.units import SPEED_OF_LIGHT
 

@@ -14,8 +14,7 @@ from tofclip.errors import InputError
 from tofclip.lidar import depth, point_cloud
 from tofclip.lidar.pulse_tables import TraceBins
 from tofclip.recovery import DepthLockedFocus, recover
-from tofclip.sequences.following import SurfacePipeline, WarmStartedRecovery
-from tofclip.sequences.ranger import RangingPipeline
+from tofclip.sequences.ranger import RangingPipeline, SurfacePipeline, WarmStartedRecovery
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot

@@ -21,7 +21,7 @@ from tofclip.simulate import (
     render_true_frames,
     simulate_shot,
 )
-from tofclip.simulate.bodies import Body
+from tofclip.simulate.bodies import NO_BODY, Body, cast_rays, look_up_reflectance
 from tofclip.simulate.patterns import (
     cut_pattern,
     make_letter,
@@ -29,7 +29,6 @@ from tofclip.simulate.patterns import (
     make_rings,
     make_stripes,
 )
-from tofclip.simulate.rays import NO_BODY, cast_rays, look_up_reflectance
 from tofclip.simulate.streak import cast_view_rays, render_streak
 from tofclip.units import SPEED_OF_LIGHT
 

@@ -29,7 +29,9 @@ from tofclip.solvers import (
     TotalVariation,
     relative_residual,
 )
-from tofclip.solvers.cross_validation import (
+from tofclip.solvers.data_terms import estimate_robust_deviation
+from tofclip.solvers.direct import PATCH_COLUMNS, PATCH_ROWS, InverseTraces, order_by_patch
+from tofclip.solvers.fista import (
     FOLD_COUNT,
     INITIAL_WEIGHT,
     MAX_WEIGHT_WORK,
@@ -39,8 +41,6 @@ from tofclip.solvers.cross_validation import (
     assign_folds,
     choose_weight,
 )
-from tofclip.solvers.data_terms import estimate_robust_deviation
-from tofclip.solvers.direct import PATCH_COLUMNS, PATCH_ROWS, InverseTraces, order_by_patch
 from tofclip.threads import LANES
 
 COUNTS = np.array([0.0, 1, 3, 20, 400, 1e4])

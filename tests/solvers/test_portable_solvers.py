@@ -33,8 +33,7 @@ from tofclip.solvers import (
     methods,
     relative_residual,
 )
-from tofclip.solvers.cross_validation import choose_weight
-from tofclip.solvers.fista import LightFieldVariation
+from tofclip.solvers.fista import LightFieldVariation, choose_weight
 
 METHODS = [Sparse(iterations=40), TotalVariation(iterations=40), LinearInverse(), Backprojection()]
 # What is promised is 1e-4. Float32 sums in another order differ by 1e-6 or so, which the linear

@@ -3,6 +3,10 @@
 from .focus_pictures import FocusCalibration as FocusCalibration
 from .focus_pictures import calibrate_views as calibrate_views
 from .model import Camera as Camera
+from .model import PolynomialSweep as PolynomialSweep
+from .model import ProjectiveSweep as ProjectiveSweep
+from .model import SkewSweep as SkewSweep
+from .model import Sweep as Sweep
 from .parallax import FocusCurve as FocusCurve
 from .parallax import Parallax as Parallax
 from .parallax import find_sharpest_shears as find_sharpest_shears
@@ -19,7 +23,3 @@ from .registration import Registration as Registration
 from .registration import SkewEstimate as SkewEstimate
 from .registration import estimate_skew as estimate_skew
 from .registration import register_views as register_views
-from .sweep import PolynomialSweep as PolynomialSweep
-from .sweep import ProjectiveSweep as ProjectiveSweep
-from .sweep import SkewSweep as SkewSweep
-from .sweep import Sweep as Sweep

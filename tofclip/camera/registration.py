@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.camera.model import Camera
+from tofclip.camera.model import Camera, SkewSweep
 from tofclip.camera.rectifier import Measurement, estimate_dark_level, measure, require_width
-from tofclip.camera.sweep import SkewSweep
 from tofclip.errors import CalibrationError
 from tofclip.solvers import Progress, Sparse, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT

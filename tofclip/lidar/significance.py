@@ -364,7 +364,7 @@ def join_candidates(
     if pixel.size == 0:
         return pixel, found
     # the compiler takes as long to import as all else
-    from tofclip.lidar.spread_kernels import join_spread
+    from tofclip.lidar.peak_kernels import join_spread
 
     times, (time, signal, deviation) = frames.times, found
     values = to_numpy(frames.values).reshape(times.size, -1)

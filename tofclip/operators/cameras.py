@@ -37,13 +37,15 @@ from tofclip.operators.codes import (
     WeightedViews,
     make_sheared_mask,
 )
-from tofclip.operators.convolution import PointSpreadConvolution, SliceConvolution, make_coded_line
-from tofclip.operators.point_spreads import (
+from tofclip.operators.convolution import (
     ApertureElement,
     CodedAperture,
     CubicPhasePlate,
     Diffuser,
     MeasuredPointSpreads,
+    PointSpreadConvolution,
+    SliceConvolution,
+    make_coded_line,
     shear_point_spreads,
     trace_view_point_spreads,
 )

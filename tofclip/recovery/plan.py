@@ -306,7 +306,7 @@ def recover(
     --------
     >>> import numpy as np
     >>> import tofclip
-    >>> from tofclip.camera.sweep import SkewSweep
+    >>> from tofclip.camera.model import SkewSweep
     >>> centres, angles = np.array([20.0, 60.0, 100.0]), np.array([-0.4, 0.0, 0.4])
     >>> sweep = SkewSweep(centres, np.zeros(3), np.zeros(3))
     >>> camera = tofclip.Camera(centres, angles, (16, 16), 121, sweep=sweep)

@@ -5,11 +5,10 @@ What is done to one of them stands here once; one file, a sequence here and a se
 take the same way.
 """
 
-from tofclip.sequences.clouds import CloudSettings
 from tofclip.sequences.inputs import FileShot, Shot, StackShot, is_sequence, list_files, list_shots
-from tofclip.sequences.pipelines import CloudPipeline, make_pipeline
 from tofclip.sequences.ranging import RangingPlan, RangingSettings
-from tofclip.sequences.recovering import RecoverySettings, expand_sweep
+from tofclip.sequences.recovering import CloudSettings, RecoverySettings, expand_sweep
+from tofclip.sequences.streaming import CloudPipeline, make_pipeline
 
 __all__ = [
     "CloudPipeline",

@@ -18,10 +18,9 @@ from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import LightField
 from tofclip.operators.shear import View
-from tofclip.simulate.bodies import Body
-from tofclip.simulate.rays import (
-    FWHM_PER_SIGMA,
+from tofclip.simulate.bodies import (
     NO_BODY,
+    Body,
     bin_by_time,
     cast_rays,
     compute_irradiance,
@@ -29,7 +28,7 @@ from tofclip.simulate.rays import (
     number_ray_pixels,
 )
 from tofclip.threads import limit_blas_threads, run_blocks
-from tofclip.units import SPEED_OF_LIGHT
+from tofclip.units import FWHM_PER_SIGMA, SPEED_OF_LIGHT
 
 Array = NDArray[Any]
 
@@ -39,37 +38,16 @@ LIGHT_DIRECTION = (-0.35, -0.45, -0.82)  # towards the lamp: over the viewer's l
 @dataclass(frozen=True)
 class CameraArray:
     """Cameras at ``(u, v) * view_step`` metres in the plane z = 0, looking along z; x points right
-    and y down.
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns of each picture.
-    view_count : int
-        Cameras on a side; they are numbered ``-(n // 2), ...``.
-    focal_length_px : float
-    view_step : float
-        Distance between neighbours, m.
-    focus : float
-        Distance at which all pictures agree (s = 0), m.
-    samples : int
-        Rays on a side of each pixel.
-    view_rows : int, optional
-        Rows of cameras, numbered alike; as many as `view_count` if not given.
-
-    Raises
-    ------
-    InputError
-        A count or length is not positive.
+    and y down. All counts and lengths are positive.
     """
 
     image_shape: tuple[int, int] = (128, 128)
-    view_count: int = 8
+    view_count: int = 8  # on a side; they are numbered ``-(n // 2), ...``
     focal_length_px: float = 160.0
-    view_step: float = 0.0125
-    focus: float = 1.0
-    samples: int = 2
-    view_rows: int | None = None
+    view_step: float = 0.0125  # between neighbours, m
+    focus: float = 1.0  # distance at which all pictures agree (s = 0), m
+    samples: int = 2  # rays on a side of each pixel
+    view_rows: int | None = None  # as many as `view_count` if not given
 
     def __post_init__(self) -> None:
         counts = (*self.image_shape, *self._view_counts, self.samples)
@@ -136,14 +114,7 @@ class CameraArray:
 
 @dataclass(frozen=True)
 class Scene:
-    """Bodies under one distant lamp.
-
-    Parameters
-    ----------
-    bodies : tuple of Body
-    light : (float, float, float)
-        Towards the lamp; any length.
-    """
+    """Bodies under one distant lamp; `light` points towards it, with any length."""
 
     bodies: tuple[Body, ...]
     light: tuple[float, float, float] = LIGHT_DIRECTION
@@ -157,17 +128,11 @@ class Scene:
 
 @dataclass(frozen=True)
 class RenderedLightField:
-    """A light field and the truth about it.
-
-    Parameters
-    ----------
-    light_field : LightField
-    shears : (rows, columns) float32 array
-        Shear of what the reference view (0, 0) sees in the middle of each pixel; infinite where it
-        sees nothing.
-    """
+    """A light field and the truth about it."""
 
     light_field: LightField
+    # (rows, columns) float32, of what the reference view (0, 0) sees in the middle of each pixel;
+    # infinite where it sees nothing
     shears: Array
 
 
@@ -231,23 +196,12 @@ def _shade_rays(scene: Scene, origin: Array, directions: Array) -> tuple[Array, 
 
 @dataclass(frozen=True)
 class PulsedScene:
-    """Bodies and the lamps that flash at time zero, all with the same power.
-
-    Parameters
-    ----------
-    bodies : tuple of Body
-        Matt: of a glossy one only the matt part sends light back.
-    lamps : (lamps, 3) array
-        Where they stand, m; all before the bodies.
-
-    Raises
-    ------
-    InputError, ShapeError
-        There is no body, or the lamps are not a list of places.
+    """Bodies and the lamps that flash at time zero, all with the same power: of a glossy body only
+    the matt part sends light back.
     """
 
     bodies: tuple[Body, ...]
-    lamps: FloatArray
+    lamps: FloatArray  # (lamps, 3), where they stand, m; all before the bodies
 
     def __post_init__(self) -> None:
         if not self.bodies:
@@ -258,28 +212,12 @@ class PulsedScene:
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """Bins of time, and how long the instrument's answer to an instant is.
+    """Bins of time, and how long the instrument's answer to an instant is."""
 
-    Parameters
-    ----------
-    start : float
-        Middle of the first bin, s after the lamps' flash.
-    bin_width : float
-        s.
-    bins : int
-    pulse_fwhm : float
-        Full width at half maximum of lamp and detector together, a Gaussian, s.
-
-    Raises
-    ------
-    InputError
-        A duration is not positive.
-    """
-
-    start: float
-    bin_width: float
+    start: float  # middle of the first bin, s after the lamps' flash
+    bin_width: float  # s
     bins: int
-    pulse_fwhm: float
+    pulse_fwhm: float  # of lamp and detector together, a Gaussian, s
 
     def __post_init__(self) -> None:
         durations = (self.bin_width, self.bins, self.pulse_fwhm)

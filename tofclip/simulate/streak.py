@@ -20,10 +20,12 @@ from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Returns
 from tofclip.shots import Frames, Streak
-from tofclip.simulate.bodies import Body, Lambertian, Rectangle, Vector
-from tofclip.simulate.rays import (
-    FWHM_PER_SIGMA,
+from tofclip.simulate.bodies import (
     NO_BODY,
+    Body,
+    Lambertian,
+    Rectangle,
+    Vector,
     accumulate_cells,
     bin_by_time,
     cast_rays,
@@ -33,7 +35,7 @@ from tofclip.simulate.rays import (
     spread_pulse,
 )
 from tofclip.storage import collect_provenance
-from tofclip.units import SPEED_OF_LIGHT
+from tofclip.units import FWHM_PER_SIGMA, SPEED_OF_LIGHT
 
 
 def make_plate(

@@ -59,14 +59,8 @@ class DataTerm(ABC):
 
     def dual_value(self, slope: Array, scale: Array) -> Array | None:
         """Return the value of the dual point ``-scale * slope``, (frames,) float64, where the
-        conjugate is known.
-
-        Parameters
-        ----------
-        slope : (measurements, frames) array
-            Of `gradient`.
-        scale : (frames,) float64 array
-            From 0 to 1.
+        conjugate is known: of the `slope` (measurements, frames) that `gradient` returned and a
+        `scale` (frames,) from 0 to 1.
         """
         return None
 

@@ -1,4 +1,5 @@
-"""Recovery with a prior by FISTA: the algorithm, and the methods that apply it to a batch of frames.
+"""Recovery with a prior by FISTA: the algorithm, the methods that apply it to a batch of frames, and the
+weight of a prior, chosen by how well measurements are predicted that the recovery has not seen.
 
 Minimises ``data(A h) + weight * R(h)`` over h >= 0 for each frame, R being a prior of
 `tofclip.solvers.priors`.
@@ -7,10 +8,11 @@ Minimises ``data(A h) + weight * R(h)`` over h >= 0 for each frame, R being a pr
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from math import log
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +48,7 @@ from tofclip.solvers.priors import (
     NonnegativeWavelets,
     Regulariser,
 )
-from tofclip.threads import LANES, limit_blas_threads
+from tofclip.threads import LANES, limit_blas_threads, map_parallel
 
 STEP_GROWTH = 1.1  # from one iteration to the next a step grows at most by this factor
 STEP_MARGIN = 0.97  # of the longest step that the last iteration would have allowed
@@ -113,13 +115,7 @@ class Fista:
         self.rejected = self._age < 1
 
     def start_from(self, pictures: Array) -> None:
-        """Begin at these pictures instead of at darkness.
-
-        Parameters
-        ----------
-        pictures : (rows, columns, frames) array
-            Not negative.
-        """
+        """Begin at these `pictures`, (rows, columns, frames), not negative, instead of at darkness."""
         xp = namespace(pictures)
         self.seen = self.operator(pictures)
         self._seen_before = self.seen * 1
@@ -209,7 +205,7 @@ NORM_MARGIN = 1.02  # 15 Lanczos iterations may lack so much of the norm; a test
 
 
 @dataclass(frozen=True)
-class ProximalMethod(Method, ABC):
+class ProximalMethod(Method):
     """FISTA with a prior; what the prior is, subclasses say.
 
     Parameters
@@ -242,9 +238,11 @@ class ProximalMethod(Method, ABC):
     further: int = 0
     noise_fall: float = 0.0
 
-    @abstractmethod
+    prior: ClassVar[Callable[[float], Regulariser]]
+
     def _make_regulariser(self, weight: float) -> Regulariser:
         """Make the prior for one block with an absolute weight."""
+        return type(self).prior(weight)
 
     @property
     def has_prior(self) -> bool:
@@ -269,14 +267,9 @@ class ProximalMethod(Method, ABC):
         progress: Progress = ignore_progress,
         start: Array | None = None,
     ) -> Result:
-        """Recover one picture per column of `measurements`; see `Method.recover`.
-
-        Parameters
-        ----------
-        operator, measurements, valid, progress
-            As there.
-        start : (frames, rows, columns) array, optional
-            Pictures to begin at, such as those of the shot before; dark ones by default.
+        """Recover one picture per column of `measurements`, see `Method.recover`; `start` are
+        pictures to begin at, (frames, rows, columns), such as those of the shot before: dark ones
+        by default.
         """
         expected = (measurements.shape[1], *operator.shape_in)
         if start is not None and start.shape != expected:
@@ -373,9 +366,7 @@ class Sparse(ProximalMethod):
     iterations: int = 40
     name = "l1"
     portable = True
-
-    def _make_regulariser(self, weight: float) -> Regulariser:
-        return NonnegativeSparsity(weight)
+    prior = NonnegativeSparsity
 
 
 @dataclass(frozen=True)
@@ -386,9 +377,7 @@ class TotalVariation(ProximalMethod):
     iterations: int = 60
     name = "tv"
     portable = True
-
-    def _make_regulariser(self, weight: float) -> Regulariser:
-        return NonnegativeTotalVariation(weight)
+    prior = NonnegativeTotalVariation
 
 
 @dataclass(frozen=True)
@@ -416,6 +405,113 @@ class Wavelets(ProximalMethod):
     weight: float = 2e-3
     iterations: int = 60
     name = "wavelet"
+    prior = NonnegativeWavelets
 
-    def _make_regulariser(self, weight: float) -> Regulariser:
-        return NonnegativeWavelets(weight)
+
+INITIAL_WEIGHT = 10**-1.75  # relative weight that is tried first
+WEIGHT_RATIO = 10**0.375  # between one trial and the next
+MAX_TRIALS = 10  # from the first weight this reaches three decades up or down
+FOLD_COUNT = 8  # parts of the measurements; each is predicted from the other seven
+# Runs of measurements of which one fold alone is a fair sample: the others are not tried.
+SINGLE_FOLD_RUNS = 4096
+# Recoveries that a choice of a weight takes at most, and that it reports when it is done.
+MAX_WEIGHT_WORK = MAX_TRIALS * FOLD_COUNT
+
+
+@dataclass(frozen=True)
+class WeightChoice:
+    """The weights tried and what their recoveries failed to predict."""
+
+    weight: float  # the best, between those tried
+    trial_weights: NDArray[np.float64]  # (trials,), ascending
+    # (trials,), value of the data term on the measurements held out, all folds together
+    errors: NDArray[np.float64]
+
+
+def choose_weight(
+    method: ProximalMethod,
+    operator: LinearOperator,
+    measurements: Array,
+    run: int,
+    seed: int = 0,
+    progress: Progress = ignore_progress,
+    first: float = INITIAL_WEIGHT,
+    max_folds: int = FOLD_COUNT,
+) -> WeightChoice:
+    """Choose the weight at which measurements left out of the recovery are predicted best
+    (eight-fold cross-validation).
+
+    No noise level and no true picture are needed, which is why this is taken instead of the
+    discrepancy principle or SURE: what F(d) cannot explain (surfaces out of focus) is not noise of
+    a known strength, and generalised cross-validation takes it for signal. Trials go downhill from
+    the first weight until the minimum is bracketed; a parabola in the weight's logarithm refines
+    it.
+
+    `measurements` (measurements,) are of one picture; `run` consecutive ones are left out together:
+    neighbours on a detector hardly differ, so that single ones would be predicted by their neighbours'
+    errors. The method's own weight does not matter. `progress` is called with the number of recoveries
+    just done, of `MAX_WEIGHT_WORK`; those that are not needed count as done at the end. With fewer than
+    eight folds it takes less time and knows the error less well.
+    """
+    require_numpy("the choice of a prior's weight", measurements)
+    held = assign_folds(measurements.size, run, seed)[:, :max_folds]
+    parts = np.split(held, held.shape[1], axis=1)
+    column = measurements[:, np.newaxis]
+
+    def unpredicted(trial: ProximalMethod, out: NDArray[np.bool_]) -> float:
+        # Recovered without the measurements of this fold, judged by them alone.
+        picture = trial.recover(operator, column, ~out).frames[0]
+        progress(FOLD_COUNT // len(parts))
+        return float(trial.data_term(column, out).value(operator(picture)[:, np.newaxis])[0])
+
+    def error(weight: float) -> float:
+        # the compiled loops of one picture keep one core busy and release the interpreter
+        return sum(map_parallel(partial(unpredicted, replace(method, weight=weight)), parts))
+
+    choice = _search_downhill(error, first)
+    done = choice.errors.size * (FOLD_COUNT // len(parts)) * len(parts)
+    progress(MAX_WEIGHT_WORK - done)
+    return choice
+
+
+def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
+    """Assign runs of consecutive measurements to folds at random: (count, folds), True where a
+    measurement is left out of a fold that is tried.
+    """
+    # Too few runs for the folds: shorter ones, although neighbours then know more of each other.
+    if -(-count // run) < FOLD_COUNT:
+        run = max(1, count // FOLD_COUNT)
+    runs = -(-count // run)
+    if runs < 2:
+        raise InputError(
+            "one measurement alone cannot choose its own prior's weight; give the weight as a number"
+        )
+    dealt = np.random.default_rng(seed).permutation(runs) % min(FOLD_COUNT, runs)
+    # This many runs in one fold already give the error to a few percent.
+    used = 1 if runs >= SINGLE_FOLD_RUNS else min(FOLD_COUNT, runs)
+    out: NDArray[np.bool_] = np.repeat(dealt, run)[:count, np.newaxis] == np.arange(used)
+    return out
+
+
+def _search_downhill(
+    error: Callable[[float], float], first: float = INITIAL_WEIGHT
+) -> WeightChoice:
+    """Try weights up or down from `first`, whichever lowers the error, until it rises again."""
+    # On a logarithmic axis the error has one valley: two trials say which way it goes down.
+    errors = {step: error(first * WEIGHT_RATIO**step) for step in (0, 1)}
+    direction = 1 if errors[1] < errors[0] else -1
+    while len(errors) < MAX_TRIALS:
+        best = min(errors, key=errors.__getitem__)
+        if best + direction in errors:
+            break
+        errors[best + direction] = error(first * WEIGHT_RATIO ** (best + direction))
+    steps = np.array(sorted(errors), float)
+    values = np.array([errors[step] for step in sorted(errors)])
+    number = int(np.argmin(values))
+    lowest = steps[number]
+    if 0 < number < steps.size - 1:
+        # The minimum of the parabola through three trials lies between the tried weights.
+        left, middle, right = values[number - 1 : number + 2]
+        lowest += 0.5 * (left - right) / (left - 2 * middle + right)
+    weights = first * WEIGHT_RATIO**steps
+    return WeightChoice(float(first * WEIGHT_RATIO**lowest), weights, values)

@@ -139,26 +139,12 @@ class IterationHistory:
 def iterate(
     solver: IterativeSolver, stopping: StoppingRule, progress: Progress, frames: int
 ) -> IterationHistory:
-    """Run `solver` until `stopping` says that it is done.
+    """Run `solver` until `stopping` says that it is done; it is advanced in place. `progress` is
+    called with the number of frame iterations just done, each of them so many `frames`; those that
+    are saved are reported too.
 
-    A device is waited for once in an iteration if there is a tolerance or `noise_fall`, and not at all
-    if there is neither.
-
-    Parameters
-    ----------
-    solver : IterativeSolver
-        Advanced in place.
-    stopping : StoppingRule
-        Maximum number of iterations, what may follow them, and the tolerance.
-    progress : callable
-        Called with the number of frame iterations just done; those that are saved are reported too.
-    frames : int
-        Number of frames that an iteration counts for.
-
-    Returns
-    -------
-    IterationHistory
-        Objective of the whole block before the first iteration and after each.
+    A device is waited for once in an iteration if there is a tolerance or `noise_fall`, and not at
+    all if there is neither.
     """
     xp = namespace(solver.objective)
     # Sums stay where the arrays are: reading one back from a GPU would make every iteration wait.
@@ -285,12 +271,7 @@ class Method(Protocol):
         """
 
     def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most.
-
-        Parameters
-        ----------
-        frames : int
-        """
+        """Return how many frame iterations `recover` reports at most for so many `frames`."""
         return frames
 
     @property

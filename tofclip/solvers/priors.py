@@ -51,32 +51,17 @@ class Regulariser(Protocol):
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
     ) -> ProximalStep:
-        """Return ``prox_{step R}(z - step * gradient)``, a proximal gradient step.
-
-        Parameters
-        ----------
-        current, previous : (rows, columns, lanes) array
-            The last two solutions; `previous` may be overwritten, and the result lie there.
-        momentum : (lanes,) array
-        gradient : (rows, columns, lanes) array
-            Of the data term at z; may be overwritten.
-        step : (lanes,) array
-            Step sizes, of the pictures' dtype.
-
-        Returns
-        -------
-        ProximalStep
+        """Return ``prox_{step R}(z - step * gradient)``, a proximal gradient step. The last two
+        solutions, `current` and `previous`, and the data term's `gradient` at z are (rows, columns,
+        lanes), `momentum` and `step`, of the pictures' dtype, (lanes,). `previous` and `gradient`
+        may be overwritten, and the result lie in the former.
         """
         ...
 
     def scale_dual(self, pull: Array) -> Array | None:
         """Return by how much each frame's dual point must shrink to be feasible, (lanes,) float64,
-        or None where that is not known.
-
-        Parameters
-        ----------
-        pull : (rows, columns, lanes) array
-            Negative gradient of the data term.
+        or None where that is not known; `pull` is the negative gradient of the data term, (rows,
+        columns, lanes).
         """
         ...
 
@@ -111,12 +96,8 @@ def _sum_lanes(row: Array, lanes: int) -> Array:
 
 
 class NonnegativeSparsity(_Prior):
-    """``weight * sum(h)`` for h >= 0, infinite otherwise: the l1 norm of a nonnegative picture.
-
-    Parameters
-    ----------
-    weight : float
-        In the unit of ``A'f``.
+    """``weight * sum(h)`` for h >= 0, infinite otherwise: the l1 norm of a nonnegative picture;
+    `weight` is in the unit of ``A'f``.
     """
 
     def __init__(self, weight: float) -> None:
