@@ -51,7 +51,7 @@ DISTRIBUTIONS = {
 
 
 def describe_missing_package(fault: ImportError) -> str | None:
-    """Return which package is missing and what to install, None where a module of ours is missing."""
+    """Return which package is missing and what to install, None where a module of ours is."""
     module = (fault.name or "").partition(".")[0]
     if not module or module in OWN_PACKAGES:
         return None

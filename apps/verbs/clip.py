@@ -187,8 +187,8 @@ def _find_surfaces(
             found = recovery.recover_on_depth_map(measurements, known, weight, settings)
             advance(1)
         return found
-    tried = all_in_focus.make_shear_range(*shears, measurements.views)
-    with show_progress("looking for depths", all_in_focus.count_recoveries(tried)) as advance:
+    tried = recovery.make_shear_range(*shears, measurements.views)
+    with show_progress("looking for depths", recovery.count_recoveries(tried)) as advance:
         return recovery.recover_all_in_focus(measurements, tried, weight, settings, advance)
 
 

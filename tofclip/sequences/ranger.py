@@ -42,6 +42,8 @@ from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse, ProximalMethod
 from tofclip.solvers.direct import InverseTraces, order_by_patch
 
+__all__ = ["RangingPipeline", "SummedShot", "build_cloud_path"]
+
 # Of each shot but the first, which has the method's own number. Of a moving scene's points, with 300
 # photons in the brightest pixel, 17 % are false after 4, 9 % after 8, 5 % after 12 (the linear
 # inverse: 27 %), and 3 % after 16, in half as much time again.

@@ -115,7 +115,7 @@ class Fista:
         self.rejected = self._age < 1
 
     def start_from(self, pictures: Array) -> None:
-        """Begin at these `pictures`, (rows, columns, frames), not negative, instead of at darkness."""
+        """Begin at these `pictures`, (rows, columns, frames), not negative, not at darkness."""
         xp = namespace(pictures)
         self.seen = self.operator(pictures)
         self._seen_before = self.seen * 1
@@ -238,7 +238,7 @@ class ProximalMethod(Method):
     further: int = 0
     noise_fall: float = 0.0
 
-    prior: ClassVar[Callable[[float], Regulariser]]
+    prior: ClassVar[Callable[..., Regulariser]]
 
     def _make_regulariser(self, weight: float) -> Regulariser:
         """Make the prior for one block with an absolute weight."""
