@@ -175,15 +175,10 @@ register_reader = READERS.register
 class Reader(NamedTuple):
     """What reads the files that begin with certain bytes: suffixes get lost and lie.
 
-    Attributes
-    ----------
-    signatures : tuple of bytes
-        Of at most 16 bytes.
-    read : callable
-        From the path to a `tofclip.Streak`, or among ``nlos.readers`` to a `nlos.Capture`. It raises
-        `tofclip.errors.FileFormatError` where the file is damaged or of another kind after all.
-    describe : callable, optional
-        From the path to the outline that ``tofclip info`` shows, without reading pixels.
+    `signatures`: of at most 16 bytes each; `read`: from the path to a `tofclip.Streak`, or among
+    ``nlos.readers`` to a `nlos.Capture`, raising `tofclip.errors.FileFormatError` where the file is
+    damaged or of another kind after all; `describe`: from the path to the outline that ``tofclip info``
+    shows, without reading pixels.
     """
 
     signatures: tuple[bytes, ...]

@@ -488,7 +488,7 @@ class Frames(Storable):
         return SPEED_OF_LIGHT * self.times / 2
 
     def max(self, axis: int | tuple[int, ...] | None = None, **options: Any) -> Any:
-        """Return the largest value, or the largest along some of the axes (time, y, x), counts."""
+        """Return the largest value, or along each `axis` of (time, y, x), counts; `options` as NumPy's."""
         return np.asarray(self).max(axis, **options)
 
     @property

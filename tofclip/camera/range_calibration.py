@@ -126,7 +126,7 @@ class RangeCalibration(Storable):
     def compute_excess(
         self, signal: ArrayLike, y: NDArray[np.integer], x: NDArray[np.integer]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what returns of so many counts at pixels (y, x), (n,) each, are measured too long, m, by
+        """Return what returns of so many counts, `signal`, at pixels (y, x), (n,) each, are measured too long, m, by
         walk and pixel, and its deviation: with that of time zero, which all returns share.
         """
         excess, sigma = self.compute_walk(signal)
@@ -139,8 +139,8 @@ class RangeCalibration(Storable):
     def compute_reflectance(
         self, intensity: ArrayLike, y: NDArray[np.integer], x: NDArray[np.integer]
     ) -> FloatArray:
-        """Return the reflectance of surfaces as if they faced the camera, percent, (n,): of counts referred
-        to a range of 1 m, at pixels (y, x). NaN where no target of known reflectance was seen.
+        """Return the reflectance of surfaces as if they faced the camera, percent, (n,): of `intensity`,
+        counts referred to a range of 1 m, at pixels (y, x). NaN where no target of known reflectance was seen.
         """
         gain = self.response[y, x] if self.response.size else 1.0
         counts = np.asarray(intensity, dtype=np.float64)

@@ -206,7 +206,9 @@ class Rectifier:
     def rectify_rows(
         self, counts: FloatImage, dark: float, numbers: NDArray[np.int64]
     ) -> FloatImage:
-        """Return the measurements of the rows `numbers`, (columns, n), as `rectify` does."""
+        """Return the measurements of the rows `numbers` of `counts` above `dark`, (columns, n), as
+        `rectify` does.
+        """
         return self._sample(counts, dark, 0.0, numbers).T
 
     def _sample(

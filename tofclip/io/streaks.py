@@ -181,7 +181,7 @@ class StreakStack:
 
 
 def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
-    """Write shots to one file, whole or not at all; return how many. All have the first one's shape
+    """Write shots to one file, `path`, whole or not at all; return how many. All have the first one's shape
     and time axis; `ShapeError` where one has not, `InputError` where there is no shot. They are taken one at a time.
     """
     import h5py

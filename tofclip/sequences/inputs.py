@@ -118,7 +118,7 @@ def _may_be_shot(path: Path) -> bool:
 def list_files(
     source: str | Path, accept: Callable[[Path], bool] = lambda path: True
 ) -> dict[str, Path]:
-    """Return the files of a folder or a glob pattern by name, in the order of their names. `accept`:
+    """Return the files of a `source`, a folder or a glob pattern, by name, in the order of their names. `accept`:
     which files of a folder count; those of a pattern all do.
 
     A file's name is its path from the folder that they have in common, without the ending. Paths

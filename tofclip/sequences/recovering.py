@@ -87,7 +87,7 @@ class RecoverySettings:
         return plan_recovery(shot, self.build_solver(), self.focus, self.device)
 
     def jobs(self, shots: Mapping[str, Shot], folder: Path) -> list[Job]:
-        """Return one job for each shot, which writes its frames into `folder`.
+        """Return one job for each of the shots, which writes its frames into `folder`.
 
         The folder is made, and locked for these settings (`lock_output_folder`); `InputError` where
         it belongs to others, or a shot bears the name of a result.

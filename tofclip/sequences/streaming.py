@@ -52,7 +52,7 @@ class CloudPipeline(Protocol):
         """Do what can be done before anything is recovered; what comes out is for `recover_shot`."""
 
     def recover_shot(self, shot: Any, rectified: Any) -> Any:
-        """Do what a shot needs as a whole; what comes out is for `search`."""
+        """Do what a shot, `rectified` already, needs as a whole; what comes out is for `search`."""
 
     def search(self, found: Any) -> Returns:
         """Find the returns in what `recover_shot` returned."""

@@ -176,7 +176,7 @@ class Lambertian:
         return np.isfinite(self.reflectance(place))
 
     def radiance(self, place: Array, normal: Array, directions: Array, light: Array) -> Array:
-        """Return the light that goes back along rays, (points,).
+        """Return the light that goes back along rays, (points,), from each `place` on the surface.
 
         `normal` of the surface and `light` towards the lamp have length 1, `directions` towards the
         surface any.
@@ -245,8 +245,8 @@ class Body:
         )
 
     def select_candidate_rays(self, origin: Array, directions: Array) -> Array:
-        """Return the numbers of those rays, all with positive z, that may meet the body; most of a
-        picture's do not.
+        """Return the numbers of those rays, all with positive z, that may meet the body, as for
+        `Shape.intersect`; most of a picture's do not.
         """
         x, y, z = self.centre - origin
         width, height, thickness = np.abs(self.axes) @ self.shape.half_extent
@@ -263,7 +263,7 @@ class Body:
         )
 
     def shift(self, x: float, y: float, z: float = 0.0) -> Body:
-        """Return the body moved by metres to the right, down and away."""
+        """Return the body moved by metres to the right, `x`, down, `y`, and away, `z`."""
         return replace(self, centre=self.centre + np.array([x, y, z]))
 
     def flip(self) -> Body:

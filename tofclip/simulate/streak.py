@@ -193,8 +193,8 @@ class StreakDetector:
     def expose(
         self, signal: FloatArray, noise: np.random.Generator
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Draw one shot of an expected signal, (rows, columns): measurements in photons, none above
-        full scale, and which of them saturated.
+        """Draw one shot of an expected signal, (rows, columns), by `noise`, a generator:
+        measurements in photons, none above full scale, and which of them saturated.
         """
         # Background is light as well, so that it brings photon noise of its own.
         photons = noise.poisson(signal + self.background_photons)
@@ -242,7 +242,7 @@ class Instrument:
         return x.ravel(), y.ravel()
 
     def look_at(self, scene: Scene, position: float = 0.0) -> RayCast:
-        """Return what all rays of the view at `position` view steps see, in `pixel_grid`'s order."""
+        """Return what all rays of the view at `position` view steps see of a `scene`, in `pixel_grid`'s order."""
         return scene.trace(self.viewpoint(position), self.directions(*self.pixel_grid(), position))
 
     def directions(self, x: FloatArray, y: FloatArray, position: float = 0.0) -> FloatArray:

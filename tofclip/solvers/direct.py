@@ -144,7 +144,9 @@ class PreparedInverse:
         return PerDevice(partial(ComputeDevice.put, values=self.inverse_gram))
 
     def recover(self, measurements: Array, progress: Progress = ignore_progress) -> Result:
-        """Recover one picture per column of `measurements` (measurements, frames), where they are."""
+        """Recover one picture per column of `measurements` (measurements, frames), where they are;
+        see `Method.recover`.
+        """
         measurements = validate_measurements(self.operator, measurements, None)
         blocks = Blocks(self.operator, measurements)
         weights = self.weights(measurements) if is_numpy(measurements) else None

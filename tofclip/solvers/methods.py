@@ -213,7 +213,9 @@ class Result:
     def from_blocks(
         cls, frames: Array, histories: list[IterationHistory], setup_seconds: float = 0.0
     ) -> Result:
-        """Join the histories of all blocks: a block that ended early keeps its last objective."""
+        """Join the histories of all blocks of the `frames`, recovered after `setup_seconds`: a block
+        that ended early keeps its last objective.
+        """
         longest = max(history.iterations for history in histories)
         padded = [np.pad(one.objective, (0, longest - one.iterations), "edge") for one in histories]
         total = np.sum(padded, axis=0)

@@ -107,6 +107,7 @@ class NonnegativeSparsity(_Prior):
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
     ) -> ProximalStep:
+        """As `Regulariser.proximal_step`."""
         if is_numpy(current):
             from tofclip.solvers.kernels import STRETCH_NUMBERS, shrink_nonnegative
 
@@ -169,6 +170,7 @@ class NonnegativeTotalVariation(_Prior):
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
     ) -> ProximalStep:
+        """As `Regulariser.proximal_step`."""
         if self._dual is None:
             self._dual = zeros((2, *current.shape), current)
         if is_numpy(current):
@@ -251,6 +253,7 @@ class NonnegativeLightFieldVariation(_Prior):
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
     ) -> ProximalStep:
+        """As `Regulariser.proximal_step`."""
         """Take a step of one size for all lanes."""
         from tofclip.solvers import kernels
 
@@ -315,6 +318,7 @@ class NonnegativeWavelets(_Prior):
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
     ) -> ProximalStep:
+        """As `Regulariser.proximal_step`."""
         """Take a step of one size for all lanes."""
         _descend(current, previous, momentum, gradient, step)
         previous[:] = 0

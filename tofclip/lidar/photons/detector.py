@@ -318,9 +318,9 @@ class PhotonDetector:
     def locate_pixels(
         self, read: Callable[[slice], NDArray[np.floating]], pixels: int, cycles: int | None = None
     ) -> FloatArray:
-        """Find the returns of all pixels of a picture whose histograms are read piece by piece: range
-        and its deviation, m, photons, and the probability of a false alarm, (most returns, pixels, 4);
-        NaN where there is none.
+        """Find the returns of all pixels of a picture whose histograms, of so many `cycles`, are read
+        piece by piece: range and its deviation, m, photons, and the probability of a false alarm,
+        (most returns, pixels, 4); NaN where there is none.
         """
         found = np.full((self.max_returns, pixels, 4), np.nan)
         for piece in split_blocks(pixels, DETECTED_PIXELS_PER_BLOCK):

@@ -208,7 +208,7 @@ class PhotonImage:
         return replace(self, bin=when, bins=bins, bin_width=self.bin_width * number, axes="")
 
     def split(self, fraction: float, seed: int) -> tuple[PhotonImage, PhotonImage]:
-        """Divide the photons at random, a fraction of them into the second part, so that one part
+        """Divide the photons at random, by a `seed`, a fraction of them into the second part, so that one part
         can judge what the other part says.
         """
         from tofclip.lidar.photons.kernels import choose_cycles
@@ -383,7 +383,8 @@ class SurfaceImage:
         hot: NDArray[np.bool_],
     ) -> SurfaceImage:
         """Make one of range, deviation, photons and outlier probability of each pixel's returns, the
-        strongest first, (layers, rows, columns, 4).
+        strongest first, `layers` (layers, rows, columns, 4); `pulse` and `settings` are those that found
+        them, and `hot` pixels, (rows, columns), those without.
         """
         first, *further = (
             cls(one[..., 0], one[..., 1], one[..., 2], one[..., 3], pulse, settings)
