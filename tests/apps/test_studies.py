@@ -37,8 +37,7 @@ from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field.views import CameraSetup, measure
 from tofclip.metrics import nmse
-from tofclip.recovery import all_in_focus
-from tofclip.recovery.light_field import ClipRecovery
+from tofclip.recovery.light_field import ClipRecovery, recover_on_depth_map
 from tofclip.simulate.light_fields import CameraArray
 from tofclip.solvers.fista import WeightChoice
 
@@ -284,7 +283,7 @@ class TestBest:
         def solve(measurement, shears, recovery):
             runs.append(measurement)
             depths = np.full(measurement.image_shape, -0.4)
-            return all_in_focus.recover_on_depth_map(measurement, depths, 1e-3, recovery)
+            return recover_on_depth_map(measurement, depths, 1e-3, recovery)
 
         monkeypatch.setattr("apps.studies.best.recover_all_in_focus", solve)
         monkeypatch.setattr("apps.studies.best.PRESETS", ("fast",))
