@@ -38,7 +38,7 @@ def test_deviations_and_outliers_are_as_stated(signal, background, least):
     found = estimate(scenes.make_rates(surface, signal * TILES + 0 * surface, background / BINS))
     wrong = np.abs(found.range / scenes.BIN_M - surface) > 3
     assert 1 - wrong.mean() >= least
-    assert 0.6 < compute_z(found, surface) < 1.3
+    assert 0.7 < compute_z(found, surface) < 1.3
     said = float(found.outlier_probability.mean())
     # a share of a hundredth, which either may be off, is as good as none
     assert (wrong.mean() - 0.005) / 2 < said < 2 * wrong.mean() + 0.005
@@ -56,7 +56,7 @@ def test_a_response_learnt_from_few_photons_places_them_well(shape):
     found = estimate(scenes.make_rates(surface, np.full(shape, 60.0), 0.02, bins))
     error = found.range / scenes.BIN_M - surface
     assert 1.4826 * np.median(np.abs(error)) < 0.18
-    assert 0.6 < compute_z(found, surface) < 1.3
+    assert 0.7 < compute_z(found, surface) < 1.3
 
 
 @pytest.mark.parametrize("seed", [7, 8])
@@ -102,11 +102,30 @@ def test_first_photons_of_a_cycle_are_not_taken_for_all(photons, unaware):
         assert found.settings["pile_up"] == 0
 
 
-def test_a_background_that_moves_over_picture_and_time_is_not_taken_for_the_pulse():
-    """Its width was found as 4 ns in place of 300 ps, and no surface with it."""
+@pytest.mark.parametrize(("decay", "least"), [(0.15, 0.99), (0.3, 0.98), (0.0, 0.96)])
+def test_a_background_that_changes_over_picture_and_time_is_no_surface(decay, least):
+    """A wave that moves over the picture, or what decays over the record: the surface was found where
+    it is brightest, in all pixels, and none was said to be wrong.
+    """
     surface, (y, x) = scenes.make_surface(), np.mgrid[:80, :80][..., np.newaxis] / 80
-    wave = 1 + 0.5 * np.sin(2 * np.pi * (2 * np.arange(BINS) / BINS + x + y))
-    level = 300 / BINS * wave * (1 + 0.5 * np.sin(7 * x + 5 * y))
-    found = estimate(scenes.make_rates(surface, np.full(surface.shape, 10.0), level))
+    late = np.arange(BINS) / BINS
+    course = np.exp(-late / decay) if decay else 1 + 0.5 * np.sin(2 * np.pi * (2 * late + x + y))
+    level = 90 / BINS * course / course.mean() * (1 + 0.5 * np.sin(7 * x + 5 * y))
+    found = estimate(scenes.make_rates(surface, 4 * TILES + 0 * surface, level))
     assert 0.25e-9 < found.pulse.fwhm < 0.36e-9
-    assert np.mean(np.abs(found.range / scenes.BIN_M - surface) <= 3) >= 0.99
+    wrong = np.abs(found.range / scenes.BIN_M - surface) > 3
+    assert 1 - wrong.mean() >= least
+    assert 0.7 < compute_z(found, surface) < 1.3
+    assert abs(found.outlier_probability.mean() - wrong.mean()) < 0.02
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("pulse", [None, Pulse.gaussian(60e-12)])
+def test_a_pulse_shorter_than_a_bin_is_known_to_a_part_of_it(pulse, seed):
+    """Bins of 400 ps show no shape of 60 ps: what was learnt became ever narrower, z 1.6 to 56."""
+    surface, bin_width = scenes.make_surface(bins=128), 400e-12
+    rates = scenes.make_rates(surface, 20 * TILES + 0 * surface, 0.08, 128, 60 / 400)
+    counts = np.random.default_rng(seed).poisson(rates)
+    found = estimate_surface(PhotonImage.from_cube(counts, bin_width), pulse)
+    ratio = (found.range - surface * 4 * scenes.BIN_M) / found.range_sigma
+    assert 0.7 < 1.4826 * np.median(np.abs(ratio)) < 1.3

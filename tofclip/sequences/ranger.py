@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
@@ -40,7 +39,7 @@ from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces, list_returns
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.shots import Returns, Streak
-from tofclip.solvers import LinearInverse, ProximalMethod, Sparse
+from tofclip.solvers import LinearInverse, ProximalMethod
 from tofclip.solvers.direct import InverseTraces, order_by_patch
 
 __all__ = ["RangingPipeline", "SummedShot", "build_cloud_path"]
@@ -113,10 +112,10 @@ class SurfacePipeline:
 
     The first shot has its surfaces found. Each further one begins at the surfaces, brightnesses and
     state of the instrument of the shot before, and needs a step on them and twenty iterations. Where
-    they no longer explain the shot, as when something moves, it begins at what `RangingPipeline` shows
-    by method l1, which follows pictures. Shots are taken in order.
+    they no longer explain the shot, as when something has come in, surfaces are found anew. Shots
+    are taken in order.
 
-    Memory: as `SurfaceRecovery` and `RangingPipeline`.
+    Memory: as `SurfaceRecovery`; nothing is kept of the shots before but the last fit.
     """
 
     in_order, method_name = True, SurfaceRecovery.name
@@ -124,11 +123,9 @@ class SurfacePipeline:
     def __init__(self, shot: Shot, method: SurfaceRecovery | None = None) -> None:
         self.method = SurfaceRecovery() if method is None else method
         self.camera, self._centre_error_px = shot.camera, shot.centre_error_px
-        self.searches = 0  # for surfaces, in a shot that those of the one before do not explain
+        self.searches = 0
         self._fit: SurfaceFit | None = None
         self._lock = Lock()
-        self._focus = DepthLockedFocus() if self.camera.lenslet_pitch > 0 else DEFAULT_FOCUS
-        self._quick: RangingPipeline | None = None
 
     @classmethod
     def for_shot(
@@ -148,25 +145,15 @@ class SurfacePipeline:
         """Fit the surfaces of a shot."""
         with self._lock:
             if self._fit is not None:
-                look = partial(self._look, shot)
-                self._fit = follow_surfaces(self._fit, shot, self.method.weight, look)
+                self._fit = follow_surfaces(self._fit, shot, self.method.weight)
             if self._fit is None:
                 self.searches += 1
                 opened = Shot(shot, self.camera, self._centre_error_px)
-                start = plan_recovery(opened, self.method.start, self._focus).run()
+                focus = DepthLockedFocus() if self.camera.lenslet_pitch > 0 else DEFAULT_FOCUS
+                start = plan_recovery(opened, self.method.start, focus).run()
                 weight, iterations = self.method.weight, self.method.iterations
                 self._fit = fit_surfaces(shot, start, weight, iterations)
             return self._fit
-
-    def _look(self, shot: Streak) -> tuple[Returns, NDArray[np.float32]]:
-        """Return what l1 shows of a shot: its returns, and the light of each pixel."""
-        self.searches += 1
-        if self._quick is None:
-            camera = self.camera.replace(range_calibration=None)
-            self._quick = RangingPipeline(camera, shot.times, Sparse(), self._focus)
-        seen = self._quick.recover_shot(shot, self._quick.rectify(shot))
-        assert isinstance(seen, PictureTraces)
-        return self._quick.search(seen), seen.pictures.sum(axis=0)
 
     def search(self, found: SurfaceFit) -> Returns:
         """List the returns of what `recover_shot` returned."""

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.photons.image import PhotonImage, SurfaceImage
-from tofclip.lidar.photons.scene import learn_background, prepare_photons
+from tofclip.lidar.photons.scene import group_shades, learn_background, prepare_photons
 from tofclip.lidar.pulse import Pulse, Table
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
@@ -30,7 +30,6 @@ THRESHOLD_RATIO = 1.2  # beyond, of the numbers for which there is one: others l
 PHOTON_LEVEL_RATIO = 1.03  # numbers that differ by less share a filter
 PULSE_CUTOFF = 1e-4  # of its peak: what a pulse brings beyond it is not worth the bins
 HISTOGRAMS_PER_BLOCK = 256
-SHADE_RATIO = 1.1  # backgrounds that differ by less share a filter; thresholds hold for any filter
 MIN_RELATIVE_BACKGROUND = 1e-3  # of a usual bin; no bin is so dark that one photon decides
 NO_PILE_UP = 1e15  # cycles: the rate of any bin is as good as zero
 MAX_THRESHOLDS = 4096  # that are remembered, a number each
@@ -142,9 +141,7 @@ class LogMatchedFilter:
     @cached_property
     def shades(self) -> tuple[FloatArray, NDArray[np.int64]]:
         """Backgrounds for which there are weights, and which of them each bin has."""
-        step = np.rint(np.log(self.background) / np.log(SHADE_RATIO)).astype(np.int64)
-        known, shade = np.unique(step, return_inverse=True)
-        return SHADE_RATIO ** known.astype(np.float64), shade.ravel()
+        return group_shades(np.array(self.background))
 
     def weigh(self, photons: int) -> FloatArray:
         """Weights of each shade, (shades, width), where a histogram has so many photons."""

@@ -16,7 +16,7 @@ from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.lidar.photons.image import PhotonImage
 from tofclip.lidar.photons.matching import PLANE_ROUNDS, TRIAL_ROUNDS, fit_surface
-from tofclip.lidar.photons.scene import BinnedResponse, Scene, learn_response
+from tofclip.lidar.photons.scene import MIN_SHAPE_BINS, BinnedResponse, Scene, learn_response
 
 REACHES_PX = (1, 2, 3, 4, 6, 8)
 RESPONSE_ROUNDS, RESPONSE_REACH_PX = 4, 3
@@ -49,7 +49,8 @@ def weigh_evidence(
     from tofclip.lidar.photons import kernels
 
     response = scene.response
-    flat = np.ascontiguousarray(surface, dtype=np.float64).ravel()
+    flat, shading = np.ascontiguousarray(surface, dtype=np.float64).ravel(), train.shading
+    pixels = np.arange(flat.size)
     late = train.bin - flat[train.pixel]
     inside = (late >= response.start) & (late <= response.width - response.start)
     length = response.width - 2 * response.start
@@ -58,14 +59,19 @@ def weigh_evidence(
         scipy.ndimage.uniform_filter(part, signal_pool, mode="nearest")
         for part in (seen, train.photons_per_pixel)
     )
-    # Background within the response's length, as dense as outside of it.
-    outside = np.maximum(total - pooled, 0) * length / max(train.bins - length, 1)
+    # Background within the response's length, as dense as outside of it where it is as bright.
+    even = np.bincount(train.pixel, train.count * ~inside / train.relative, flat.size)
+    even = scipy.ndimage.uniform_filter(even.reshape(surface.shape), signal_pool, mode="nearest")
+    here = 1.0 if shading is None else shading.at(pixels, flat).reshape(surface.shape)
+    outside = even * here * length / max(train.bins - length, 1)
     # That all is signal is never claimed: one photon against it would decide for the pixel. More
     # than there is would count against every surface in a hundred times as much background.
     signal = np.clip((pooled - outside) / np.maximum(total, 1e-9), MIN_SIGNAL_SHARE, 0.98)
-    evidence = np.empty(flat.size)
+    evidence, course = np.empty(flat.size), test.relative
+    if shading is not None:
+        course = course / shading.average().at(pixels, flat)[test.pixel]
     sampled = response.density * train.bins, response.start, response.step, signal.ravel()
-    kernels.sum_evidence(test.offsets, test.bin, test.count, flat, *sampled, evidence)
+    kernels.sum_evidence(test.offsets, test.bin, test.count, course, flat, *sampled, evidence)
     return evidence
 
 
@@ -75,12 +81,15 @@ def learn_scene(
     """Learn the response from the photons held back, around the surface that the others found.
     Returns None if the response known so far explains the photons as well and none is required.
     """
+    known = scene.response
     fitted = fit_surface(train, scene, surface, RESPONSE_REACH_PX)
     before = weigh_evidence(test, train, scene, fitted[..., 0])
     for _ in range(RESPONSE_ROUNDS):
         scene, later = learn_response(test, train, scene, fitted)
         begin = fitted[..., 0] + later
         fitted = fit_surface(train, scene, begin, RESPONSE_REACH_PX, TRIAL_ROUNDS)
+        if scene.response.width < MIN_SHAPE_BINS and not np.any(test.bin % 1):
+            return known if required else None  # whole bins show no shape
     gain = weigh_evidence(test, train, scene, fitted[..., 0]) - before
     clear = MIN_LEARNT_SIGNIFICANCE * np.sqrt(gain.size) * gain.std() + MIN_LEARNT_GAIN
     return scene.response if required or gain.sum() > clear else None

@@ -30,6 +30,33 @@ MIN_BIN_WIDTH_S = 1e-13  # half of the finest channel of time-correlated counter
 
 
 @dataclass(frozen=True)
+class Shading:
+    """How bright the background is over its mean, smooth from cell to cell of picture and time:
+    `level` (rows, columns, stretches) of cells that the picture's axes and time are divided into.
+    """
+
+    level: FloatArray
+    image_shape: tuple[int, int]
+    bins: int
+    mean: float  # photons of a pixel in a bin
+
+    def at(self, pixel: NDArray[np.int64], instant: ArrayLike) -> NDArray[np.float32]:
+        """Return the level at instants, in bins, of pixels by their raster numbers."""
+        sides = *self.image_shape, self.bins
+        place = (*np.divmod(pixel, self.image_shape[1]), np.asarray(instant))
+        cells = [
+            (axis + 0.5) * (number / side) - 0.5
+            for axis, number, side in zip(place, self.level.shape, sides, strict=True)
+        ]
+        found = scipy.ndimage.map_coordinates(self.level, cells, np.float32, 1, mode="nearest")
+        return np.asarray(found)
+
+    def average(self) -> Shading:
+        """Return the same of all times."""
+        return replace(self, level=self.level.mean(axis=2, keepdims=True))
+
+
+@dataclass(frozen=True)
 class PhotonImage:
     """Photon events sorted by pixel.
 
@@ -53,6 +80,8 @@ class PhotonImage:
     cycles : float
         Laser cycles of each pixel, of a detector that counts the first photon of a cycle only; by
         default so many that none is missed; see `correct_pile_up`.
+    shading : Shading, optional
+        Course of the background over picture and time; even by default.
 
     Raises
     ------
@@ -68,6 +97,7 @@ class PhotonImage:
     bin_width: float
     axes: str = ""
     cycles: float = np.inf
+    shading: Shading | None = None
 
     def __post_init__(self) -> None:
         pixels = self.image_shape[0] * self.image_shape[1]
@@ -167,6 +197,13 @@ class PhotonImage:
     def pixel(self) -> NDArray[np.int64]:
         """Raster number of the pixel of each event."""
         return np.repeat(np.arange(self.offsets.size - 1), np.diff(self.offsets))
+
+    @cached_property
+    def relative(self) -> NDArray[np.float32]:
+        """Background at each event over its mean, (events,)."""
+        if self.shading is None:
+            return np.ones(self.bin.size, np.float32)
+        return self.shading.at(self.pixel, self.bin)
 
     @cached_property
     def table(self) -> csr_array:

@@ -242,19 +242,19 @@ def weigh_shifts(histograms, arrival, photons, level, relative, curve, scale, ti
 
 
 @compiled
-def score_labels(offsets, coarse_bin, count, place, weights, first, score):
+def score_labels(offsets, coarse_bin, count, place, weights, shade, first, score):
     """Log-likelihood ratio of a surface at each label against none, `score` (pixels, labels).
-    `place` (coarse bins,): label of each, or -1; `weights` (width,): log-likelihood ratio of a
-    photon ``first + w`` coarse bins after the surface.
+    `place` (coarse bins,): label of each, or -1; `weights` (shades, width): log-likelihood ratio of a
+    photon ``first + w`` coarse bins after the surface, where the background is as `shade` (events,).
     """
     for pixel in range(score.shape[0]):
         own = score[pixel]
         own[:] = 0
         for event in range(offsets[pixel], offsets[pixel + 1]):
-            for w in range(weights.size):
+            for w in range(weights.shape[1]):
                 label_bin = coarse_bin[event] - first - w
                 if 0 <= label_bin < place.size and place[label_bin] >= 0:
-                    own[place[label_bin]] += weights[w] * count[event]
+                    own[place[label_bin]] += weights[shade[event], w] * count[event]
 
 
 @vectorised
@@ -348,12 +348,15 @@ def find_best_labels(score, total, extra_paths, apart, label, margin):
 
 
 @compiled
-def measure_events(offsets, bin_time, count, surface, table, start, step, brightness, sums):
+def measure_events(
+    offsets, bin_time, count, surface, table, start, step, brightness, relative, sums
+):
     """What the photons of each pixel say about moving its surface, `sums` (pixels, 4): slope of the
     log-likelihood, its Fisher information, photons of the signal, and the share of the light that
     these would be of: all of it. `table` (n, 2): of the response,
     sampled from `start` by `step`: minus the slope of its logarithm, and its density over that of
-    the background for one photon of signal, of which `brightness` (pixels,) are expected.
+    the background for one photon of signal, of which `brightness` (pixels,) are expected; `relative`
+    (events,): the background over its mean.
     """
     for pixel in range(surface.size):
         slope = information = photons = 0.0
@@ -361,6 +364,7 @@ def measure_events(offsets, bin_time, count, surface, table, start, step, bright
             position = (bin_time[event] - surface[pixel] - start) / step
             if 0 <= position < table.shape[0] - 1:
                 push, odds = interpolate_rows(table, position)
+                odds /= relative[event]
                 # Probability that the photon is of the signal. The derivative of log(background +
                 # signal) is the signal's own, weighted by it.
                 belongs = brightness[pixel] * odds / (1 + brightness[pixel] * odds)
@@ -556,10 +560,13 @@ def sum_pair_lags(offsets, bin_time, count, lags):
 
 
 @compiled
-def sum_evidence(offsets, bin_time, count, surface, density, start, step, signal, evidence):
+def sum_evidence(
+    offsets, bin_time, count, relative, surface, density, start, step, signal, evidence
+):
     """Log-likelihood ratio of the photons of each pixel: its surface against light at any instant.
     `density` (n,): of the response over that of light spread over the whole axis, sampled from
-    `start` by `step`; `signal` (pixels,): share of the pixel's photons that are signal.
+    `start` by `step`; `relative` (events,): that light's course over the axis; `signal` (pixels,):
+    share of the pixel's photons that are signal.
     """
     for pixel in range(surface.size):
         total = 0.0
@@ -570,5 +577,6 @@ def sum_evidence(offsets, bin_time, count, surface, density, start, step, signal
                 left = int(position)
                 part = position - left
                 ratio = density[left] * (1 - part) + density[left + 1] * part
+                ratio /= relative[event]
             total += count[event] * np.log(1 + signal[pixel] * (ratio - 1))
         evidence[pixel] = total

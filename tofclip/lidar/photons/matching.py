@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.lidar.photons.image import PhotonImage
-from tofclip.lidar.photons.scene import MIN_SIGNAL_PHOTONS, Scene
+from tofclip.lidar.photons.scene import MIN_SIGNAL_PHOTONS, Scene, group_shades
 from tofclip.threads import run_blocks
 
 LABELS_PER_WIDTH = 2  # coarse bins in the full width of the response
@@ -35,6 +35,9 @@ TRIAL_ROUNDS = 3  # of a reach that is tried, from the fit of the reach before
 # A curved surface pulls a plane by the square of its reach: what a plane of half the reach differs by is
 # three quarters of what both miss.
 NESTED_BIAS_RATIO = 4 / 3
+# Of a variance, between what a square of chance alone has as median (.455) and as mean (1), as the bias of a
+# neighbourhood is neither everywhere nor nowhere.
+CHANCE_SHARE = 0.7
 GATE_WIDTHS = 1.0  # of the response: a neighbour whose surface is further off is another's
 
 
@@ -78,7 +81,9 @@ def _find_occupied_bins(
     y, x = np.divmod(photons.pixel, photons.image_shape[1])
     tile = (y // TILE_PX) * -(-photons.image_shape[1] // TILE_PX) + x // TILE_PX
     number = tile * axis.coarse_bins + axis.number_events(photons)
-    counts = np.bincount(number, photons.count, tiles * axis.coarse_bins).reshape(tiles, -1)
+    counts = np.bincount(
+        number, photons.count / photons.relative, tiles * axis.coarse_bins
+    ).reshape(tiles, -1)
     length = max(1, round(scene.response.width / axis.coarse))
     pooled = scipy.ndimage.uniform_filter1d(counts, length, axis=1, mode="constant") * length
     # A tile may be brighter or darker than the others throughout.
@@ -96,14 +101,17 @@ def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArr
 
     shares, first = scene.response.coarse_shares(axis.coarse)
     odds = scene.count_signal(photons) * shares / (scene.background * axis.coarse)
-    weights = np.log1p(odds).astype(np.float32)
+    level, shade = group_shades(photons.relative)
+    weights = np.log1p(odds / level[:, np.newaxis]).astype(np.float32)
     score = np.empty((photons.offsets.size - 1, axis.numbers.size), np.float32)
     number, label = axis.number_events(photons), np.full(axis.coarse_bins, -1)
     label[axis.numbers] = np.arange(axis.numbers.size)
 
     def work(piece: slice) -> None:
         offsets = photons.offsets[piece.start : piece.stop + 1]
-        kernels.score_labels(offsets, number, photons.count, label, weights, first, score[piece])
+        kernels.score_labels(
+            offsets, number, photons.count, label, weights, shade, first, score[piece]
+        )
 
     run_blocks(work, score.shape[0], PIXELS_PER_BLOCK)
     return score
@@ -154,7 +162,7 @@ def fit_surface(
         sampled = table, response.start, response.step, brightness[piece]
         seen = offsets, photons.bin, photons.count, flat, *sampled
         if np.isinf(photons.cycles):
-            kernels.measure_events(*seen, sums[piece])
+            kernels.measure_events(*seen, photons.relative, sums[piece])
         else:
             dead = around[piece], scene.background / photons.cycles, photons.cycles
             kernels.measure_first_photons(*seen, *dead, sums[piece])
@@ -182,16 +190,13 @@ def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int, width: flo
 
     Two estimates, here with a reach and with half of it, of which one uses a part of the other's
     photons differ by the difference of their variances if neither is biased; what they differ by
-    beyond that is bias. Where a fit is less sure than the response's width nothing is known.
+    beyond that is bias. Of a neighbourhood the median counts: a mean is ruled by its borders.
     """
     apart = (fitted[..., 0] - nested[..., 0]) ** 2
     wide, narrow = fitted[..., 1] ** 2, nested[..., 1] ** 2
-    # A border that moved is not a bend.
-    known = (np.maximum(wide, narrow) < width**2) & (apart < 16 * narrow)
+    # Where a fit is less sure than the response's width nothing is known.
+    known = np.maximum(wide, narrow) < width**2
     excess = np.zeros(apart.shape)
-    excess[known] = (apart - narrow)[known] + wide[known]
-    number, total = (
-        scipy.ndimage.uniform_filter(one, 2 * reach + 1, mode="nearest")
-        for one in (known.astype(float), excess)
-    )
-    return np.asarray(NESTED_BIAS_RATIO**2 * np.maximum(total / np.maximum(number, 1e-9), 0))
+    excess[known] = apart[known] - CHANCE_SHARE * (narrow[known] - wide[known])
+    usual = scipy.ndimage.median_filter(excess, 2 * reach + 1, mode="nearest")
+    return np.asarray(NESTED_BIAS_RATIO**2 * np.maximum(usual, 0))

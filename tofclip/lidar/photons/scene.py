@@ -21,6 +21,7 @@ The mean is noisy; `segment_counts` joins neighbouring bins that do not differ.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
-from tofclip.lidar.photons.image import PhotonImage, find_hot_pixels, leave_out_pixels
+from tofclip.lidar.photons.image import PhotonImage, Shading, find_hot_pixels, leave_out_pixels
 from tofclip.lidar.pulse import Pulse
 from tofclip.units import PICOSECOND
 
@@ -47,11 +48,19 @@ MIN_PULSE_S = 1e-12  # superconducting counters, the quickest there are, spread 
 # Of the gaps between bins with photons, the one that is taken for the counter's step; and how many
 # such bins with how many photons each say that the bins between them stay empty for a reason.
 STEP_QUANTILE, MIN_STEP_BINS, MIN_PHOTONS_PER_STEP = 0.05, 64, 4.0
+SAMPLED_PIXELS = 1024  # whose background stands for that of all around surfaces
 MAX_CELLS = 1 << 26  # bins of all pixels; longer time axes are put together, for memory's sake
 DENSITY_FLOOR = 1e-4  # of the peak: no instant is impossible, so that no single photon decides
 LEARNT_SLOPE_FLOOR = 0.03
 MIN_SIGNAL_PHOTONS = 0.05
 BACKGROUND_QUANTILE, BACKGROUND_GROUPS = 0.2, 64
+SHADE_RATIO = 1.1  # backgrounds that differ by less share a filter; thresholds hold for any filter
+# Cells of picture and time that show the background's course: pixels of a side; at most and at least so many
+# stretches, none shorter than two pulses; photons of the background in a cell; and the stretches of which
+# the median counts, as a surface fills less than half of them. What differs by less than the ratio is even.
+MIN_CELL_PX, MAX_CELL_PX, MIN_CELL_PHOTONS = 8, 32, 16.0
+STRETCHES, MIN_STRETCHES, STRETCH_WIDTHS, CELLS_AROUND = 64, 32, 2.0, 9
+MIN_SHADING_RATIO, MIN_SHADE = 1.5, 1e-3
 MIN_BACKGROUND_PHOTONS = 1.0  # of the whole picture: no background is exactly zero
 
 
@@ -124,6 +133,8 @@ class Scene:
         # a low quantile: bins with a surface in them are brighter than the background
         quiet = float(np.quantile(level, BACKGROUND_QUANTILE))
         background = max(quiet, MIN_BACKGROUND_PHOTONS / photons.bins) / (photons.offsets.size - 1)
+        if photons.shading is not None:
+            background = photons.shading.mean
         shape = pulse.integrate_bins(photons.bin_width)
         return cls(BinnedResponse(shape, photons.bin_width), background)
 
@@ -231,6 +242,40 @@ def measure_pulse_width(photons: PhotonImage) -> float:
     )
 
 
+def group_shades(relative: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return backgrounds over their mean that stand for the given ones, and which of them each has."""
+    step = np.rint(np.log(relative) / np.log(SHADE_RATIO)).astype(np.int64)
+    first = int(step.min())
+    return SHADE_RATIO ** np.arange(first, int(step.max()) + 1.0), step - first
+
+
+def learn_shading(photons: PhotonImage, width: float) -> Shading | None:
+    """Find the course of the background over picture and time, of a pulse of `width` bins: the median
+    of the cells around each, of which a surface fills few. None where it is even, or where too few
+    photons say otherwise.
+    """
+    number, cell = int(min(STRETCHES, photons.bins / (STRETCH_WIDTHS * width))), MIN_CELL_PX
+    while number >= MIN_STRETCHES:
+        sides = *(-(-side // cell) for side in photons.image_shape), number
+        y, x = (np.arange(n) * m // n for n, m in zip(photons.image_shape, sides[:2], strict=True))
+        place = (y[:, np.newaxis] * sides[1] + x).ravel()
+        late = ((photons.bin + 0.5) * (number / photons.bins)).astype(np.int64)
+        own = place[photons.pixel] * number + np.clip(late, 0, number - 1)
+        light = np.bincount(own, photons.count, math.prod(sides)).reshape(-1, number)
+        density = light / (np.bincount(place)[:, np.newaxis] * photons.bins / number)
+        usual = scipy.ndimage.median_filter(
+            density.reshape(sides), (3, 3, CELLS_AROUND), mode="mirror"
+        )
+        mean = float(usual.mean())
+        if mean * place.size * photons.bins >= MIN_CELL_PHOTONS * usual.size:
+            level = np.maximum(usual / mean, MIN_SHADE)
+            low, high = np.quantile(level, (0.05, 0.95))
+            even = high < MIN_SHADING_RATIO * low
+            return None if even else Shading(level, photons.image_shape, photons.bins, mean)
+        cell, number = (2 * cell, number) if cell < MAX_CELL_PX else (cell, number // 2)
+    return None
+
+
 def learn_response(
     test: PhotonImage, train: PhotonImage, scene: Scene, fitted: FloatArray
 ) -> tuple[Scene, float]:
@@ -257,6 +302,10 @@ def learn_response(
         light, dark = fitted[..., 2].ravel() / train.cycles, scene.background / train.cycles
         dead = dark, test.cycles, (early[0], step)
         kernels.tally_first_photons(*events, light, *density, *dead, sums)
+    if test.shading is not None:
+        some = np.arange(0, flat.size, -(-flat.size // SAMPLED_PIXELS))
+        slot = step * np.arange(early[0], last + 1)[:, np.newaxis]
+        sums[:, 1] = test.shading.at(*np.broadcast_arrays(some, flat[some] + slot)).mean(axis=1)
     # Before the pulse there is only background; behind it its own tail would count as one.
     before = sums[: early[1] - early[0]].sum(axis=0)
     sums[:, 0] -= sums[:, 1] * before[0] / max(before[1], 1e-9)

@@ -12,7 +12,7 @@ outlier come from the data: a part of the photons is held back, and what explain
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,12 @@ from tofclip.lidar.photons.matching import (
     fit_surface,
     match_labels,
 )
-from tofclip.lidar.photons.scene import Scene, prepare_photons, require_plausible_pulse
+from tofclip.lidar.photons.scene import (
+    Scene,
+    learn_shading,
+    prepare_photons,
+    require_plausible_pulse,
+)
 from tofclip.lidar.pulse import Pulse
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -48,6 +53,7 @@ JUMP_COST_RATIO = 9.0  # any larger change costs this many times as much
 # How well it is known where in a response that was learnt from the scene its surface lies: one offset
 # for the whole picture, which `settings` state and no pixel's deviation holds.
 LEARNT_RESPONSE_SIGMA_WIDTHS = 1 / 30
+LABEL_SIGMA_WIDTHS = 1 / np.sqrt(6)  # of a triangle that falls to nothing a width to either side
 MIN_EXPLAINED_DENSITY = 0.003  # of the response's peak: where it is brighter photons are explained
 # Of the time axis, and pixels that have to show a stretch before their surfaces; photons expected behind
 # surfaces, and the share of them that has to be missing before a detector is said to be blind there.
@@ -104,7 +110,9 @@ def estimate_surface(
     report = (lambda _: None) if progress is None else progress
     dim = find_dim_pixels(photons)
     photons, start, hot = prepare_photons(photons, pulse)
-    if cycles is not None:
+    if cycles is None:
+        photons = replace(photons, shading=learn_shading(photons, start.fwhm / photons.bin_width))
+    else:
         photons = photons.correct_pile_up(cycles)
     scene = Scene.start(photons, start)
     axis = choose_label_axis(photons, scene)
@@ -193,8 +201,8 @@ class SurfacePlan:
         del volume
         nested = fit_surface(photons, scene, self.axis.to_bins(labels), max(self.reach // 2, 1))
         fitted = fit_surface(photons, scene, nested[..., 0], self.reach)
-        # Where no photon is near, the label is all there is.
-        counted = np.minimum(fitted[..., 1], scene.response.width)
+        # Where no photon is near, or none on a slope of the response, the label is all there is.
+        counted = np.minimum(fitted[..., 1], scene.response.width * LABEL_SIGMA_WIDTHS)
         bias = estimate_bias(fitted, nested, self.reach, scene.response.width)
         sigma = np.sqrt(counted**2 + bias)
         return np.stack([fitted[..., 0], sigma, fitted[..., 2], self.to_probability(margin)], -1)
@@ -240,14 +248,17 @@ def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> F
     late = photons.bin - layer[..., 0].ravel()[photons.pixel]
     near = photons.count * (np.abs(late) <= reach)
     seen = np.bincount(photons.pixel, near, layer[..., 0].size).reshape(layer.shape[:2])
-    expected = scene.background * (2 * reach + 1)
+    expected = np.full(seen.shape, scene.background * (2 * reach + 1))
+    if photons.shading is not None:
+        instant = layer[..., 0].ravel()
+        expected *= photons.shading.at(np.arange(instant.size), instant).reshape(seen.shape)
     pooled = scipy.ndimage.uniform_filter(seen, 3, mode="nearest") * 9
     own = _find_chance(seen, expected) < MAX_OWN_CHANCE
     around = _find_chance(np.rint(pooled), 9 * expected) < MAX_POOLED_CHANCE
     return np.where((own & around)[..., np.newaxis], layer, np.nan)
 
 
-def _find_chance(seen: NDArray[Any], expected: float) -> FloatArray:
+def _find_chance(seen: NDArray[Any], expected: FloatArray) -> FloatArray:
     """Chance of that many photons or more where a Poisson law with that mean holds."""
     found = scipy.special.gammainc(np.maximum(seen, 1), expected)  # scipy.stats loads for a second
     return np.where(seen > 0, found, 1.0)
