@@ -52,15 +52,15 @@ class PictureTraces:
     """Traces of pictures, (bins, rows, columns), that are there already."""
 
     def __init__(self, pictures: NDArray[np.float32], bins: TraceBins) -> None:
-        self._pictures = pictures.reshape(len(pictures), -1).astype(np.float32, copy=False)
-        self.pixels, self.bins = np.arange(self._pictures.shape[1]), bins
+        self.pictures = pictures.reshape(len(pictures), -1).astype(np.float32, copy=False)
+        self.pixels, self.bins = np.arange(self.pictures.shape[1]), bins
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         """Write traces of neighbours in raster order."""
         from tofclip.solvers.kernels import copy_lanes_to_frames
 
         # contiguous: the loop is compiled for solvers' blocks, and copying short runs costs little
-        copy_lanes_to_frames(np.ascontiguousarray(self._pictures[:, piece]), 0, traces)
+        copy_lanes_to_frames(np.ascontiguousarray(self.pictures[:, piece]), 0, traces)
 
 
 class FrameTraces(PictureTraces):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
@@ -39,7 +40,7 @@ from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces, list_returns
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.shots import Returns, Streak
-from tofclip.solvers import LinearInverse, ProximalMethod
+from tofclip.solvers import LinearInverse, ProximalMethod, Sparse
 from tofclip.solvers.direct import InverseTraces, order_by_patch
 
 __all__ = ["RangingPipeline", "SummedShot", "build_cloud_path"]
@@ -112,10 +113,10 @@ class SurfacePipeline:
 
     The first shot has its surfaces found. Each further one begins at the surfaces, brightnesses and
     state of the instrument of the shot before, and needs a step on them and twenty iterations. Where
-    they no longer explain the shot, as when something has come in, surfaces are found anew. Shots
-    are taken in order.
+    they no longer explain the shot, as when something moves, it begins at what `RangingPipeline` shows
+    by method l1, which follows pictures. Shots are taken in order.
 
-    Memory: as `SurfaceRecovery`; nothing is kept of the shots before but the last fit.
+    Memory: as `SurfaceRecovery` and `RangingPipeline`.
     """
 
     in_order, method_name = True, SurfaceRecovery.name
@@ -123,9 +124,11 @@ class SurfacePipeline:
     def __init__(self, shot: Shot, method: SurfaceRecovery | None = None) -> None:
         self.method = SurfaceRecovery() if method is None else method
         self.camera, self._centre_error_px = shot.camera, shot.centre_error_px
-        self.searches = 0
+        self.searches = 0  # for surfaces, in a shot that those of the one before do not explain
         self._fit: SurfaceFit | None = None
         self._lock = Lock()
+        self._focus = DepthLockedFocus() if self.camera.lenslet_pitch > 0 else DEFAULT_FOCUS
+        self._quick: RangingPipeline | None = None
 
     @classmethod
     def for_shot(
@@ -145,15 +148,25 @@ class SurfacePipeline:
         """Fit the surfaces of a shot."""
         with self._lock:
             if self._fit is not None:
-                self._fit = follow_surfaces(self._fit, shot, self.method.weight)
+                look = partial(self._look, shot)
+                self._fit = follow_surfaces(self._fit, shot, self.method.weight, look)
             if self._fit is None:
                 self.searches += 1
                 opened = Shot(shot, self.camera, self._centre_error_px)
-                focus = DepthLockedFocus() if self.camera.lenslet_pitch > 0 else DEFAULT_FOCUS
-                start = plan_recovery(opened, self.method.start, focus).run()
+                start = plan_recovery(opened, self.method.start, self._focus).run()
                 weight, iterations = self.method.weight, self.method.iterations
                 self._fit = fit_surfaces(shot, start, weight, iterations)
             return self._fit
+
+    def _look(self, shot: Streak) -> tuple[Returns, NDArray[np.float32]]:
+        """Return what l1 shows of a shot: its returns, and the light of each pixel."""
+        self.searches += 1
+        if self._quick is None:
+            camera = self.camera.replace(range_calibration=None)
+            self._quick = RangingPipeline(camera, shot.times, Sparse(), self._focus)
+        seen = self._quick.recover_shot(shot, self._quick.rectify(shot))
+        assert isinstance(seen, PictureTraces)
+        return self._quick.search(seen), seen.pictures.sum(axis=0)
 
     def search(self, found: SurfaceFit) -> Returns:
         """List the returns of what `recover_shot` returned."""

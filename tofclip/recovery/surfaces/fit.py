@@ -6,6 +6,7 @@ What is no shot of surfaces (smoke, light in flight, relay walls) is refused on 
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -38,7 +39,7 @@ from tofclip.recovery.surfaces.patches import (
     rank_within_pixels,
     reach_further,
 )
-from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, Image, measure_pulse
+from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, Image, ShotPulse, measure_pulse
 from tofclip.recovery.surfaces.ranges import Refinement, measure_local_shifts, refine_state
 from tofclip.shots import Frames, Returns, Streak
 from tofclip.solvers import Method, Progress, Sparse, ignore_progress
@@ -51,7 +52,9 @@ START_ITERATIONS = 25
 MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 4, 10
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
 LAST_STEP_SIGMAS = 0.3
-FOLLOWING_ITERATIONS = 10  # before and after the ranges' step, where the last shot's fit begins
+# Where the last shot's fit begins: before and after the ranges' step, and how far beyond the returns
+# of quick frames surfaces may reach.
+FOLLOWING_ITERATIONS, FOLLOWING_MARGIN_PX = 10, 4
 # Of what surfaces leave unexplained, and beyond: from there on they are not the next shot's.
 CHANGED_RATIO, CHANGED_EXCESS = 1.25, 0.02
 
@@ -161,8 +164,7 @@ def _fit_returns(
     """Fit the surfaces that returns show."""
     camera, count = frames.camera, frames.times.size
     bin_m = SPEED_OF_LIGHT * frames.bin_width / 2
-    directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
-    ray_length = (1 / directions[:, 2]).reshape(camera.image_shape)
+    ray_length = measure_rays(camera)
     require_gentle_slopes(found, bin_m)
 
     # 2. Patches.
@@ -183,18 +185,12 @@ def _fit_returns(
         raise _refuse(f"{late} comes long after its peak")
 
     # 3. A surface may reach beyond its returns: measurements decide where it ends.
-    masks = np.zeros((len(patches), *camera.image_shape), bool)
-    pictures = np.zeros(masks.shape, np.float32)
-    brightness = frames.values.sum(axis=0).ravel()
-    for patch, mask, picture in zip(patches, masks, pictures, strict=True):
-        picture.ravel()[patch.pixels] = brightness[patch.pixels]
-        reached = reach_further(patch, shown, bin_m)
-        mask[...] = scipy.ndimage.binary_dilation(reached, np.ones((3, 3)), MARGIN_PX)
+    light = frames.values.sum(axis=0)
     state = SurfaceState.start([patch.coefficients for patch in patches], camera)
-    model = SurfaceModel(streak, camera, masks, [patch.basis for patch in patches], state, pulse)
+    solver = lay_out(patches, shown, light, streak, camera, state, pulse, weight)
+    model = solver.model
 
     # 4. Amplitudes.
-    solver = AmplitudeSolver(model, pictures[masks], weight)
     solver.run(START_ITERATIONS, progress, count)
     limit = float(np.hypot(MAX_UNEXPLAINED, estimate_darkness(streak, frames)))
     if model.unexplained(solver.amplitude) > limit:
@@ -212,6 +208,37 @@ def _fit_returns(
     reference = solver.model.unexplained(solver.amplitude)
     others, whole = find_others(solver, found, bin_m, progress, count)
     return SurfaceFit(solver.model, solver, refinement, remainder, reference, others, whole)
+
+
+def measure_rays(camera: Camera) -> FloatArray:
+    """Return range over depth of each pixel, (rows, columns)."""
+    directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
+    return np.asarray(1 / directions[:, 2]).reshape(camera.image_shape)
+
+
+def lay_out(
+    patches: list[Patch],
+    shown: Returns,
+    light: Image,
+    streak: Streak,
+    camera: Camera,
+    state: SurfaceState,
+    pulse: ShotPulse,
+    weight: float,
+    margin_px: int = MARGIN_PX,
+) -> AmplitudeSolver:
+    """Have points where patches and the returns of their surfaces are, and about them, each patch as
+    bright as its pixels; `light`: of these, (rows, columns).
+    """
+    bin_m = SPEED_OF_LIGHT * float(np.mean(np.diff(streak.times))) / 2
+    masks = np.zeros((len(patches), *camera.image_shape), bool)
+    pictures = np.zeros(masks.shape, np.float32)
+    for patch, mask, picture in zip(patches, masks, pictures, strict=True):
+        picture.ravel()[patch.pixels] = light.ravel()[patch.pixels]
+        reached = reach_further(patch, shown, bin_m)
+        mask[...] = scipy.ndimage.binary_dilation(reached, np.ones((3, 3)), margin_px)
+    model = SurfaceModel(streak, camera, masks, [patch.basis for patch in patches], state, pulse)
+    return AmplitudeSolver(model, pictures[masks], weight)
 
 
 def _find_brightest_patches(returns: Returns, ray_length: FloatArray, bin_m: float) -> list[Patch]:
@@ -459,22 +486,51 @@ def extrapolate_steps(lengths: FloatArray) -> FloatArray:
 
 
 @limit_blas_threads()
-def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFit | None:
-    """Fit the surfaces of the shot before to the next one of the same camera; None where they no
-    longer explain what they did: the scene has changed, and surfaces have to be found anew.
+def follow_surfaces(
+    fit: SurfaceFit,
+    streak: Streak,
+    weight: float,
+    look: Callable[[], tuple[Returns, Image]],
+) -> SurfaceFit | None:
+    """Fit the surfaces of the shot before to the next one of the same camera; where they no longer
+    explain what they did, those that quick frames show, with the instrument as it was; None where
+    these do not explain the shot either: surfaces have to be found with more care.
+
+    `look`: makes such frames; their returns, and the light of each pixel, (rows, columns).
     """
-    model = fit.model.see(streak)
+    model, begun = fit.model.see(streak), replace(fit.refinement, free=None)
     solver = AmplitudeSolver(model, fit.solver.amplitude, weight, fit.solver)
+    remainder, limit = fit.remainder, CHANGED_RATIO * fit.reference + CHANGED_EXCESS
+    changed = model.unexplained(solver.amplitude) > limit
+    if changed:
+        found, light = look()
+        camera, bin_m = model.camera, SPEED_OF_LIGHT * model.bin_width / 2
+        ray_length = measure_rays(camera)
+        shown = found[~(found.false_alarm > SURE_FALSE_ALARM)]
+        patches = _find_brightest_patches(shown, ray_length, bin_m)
+        patches += find_dimmer_patches(patches, shown, ray_length, bin_m)
+        if not patches:
+            return None
+        shapes = [patch.coefficients for patch in patches]
+        even = np.zeros((len(patches), camera.views))
+        state = replace(model.state, coefficients=shapes, shading=even)
+        solver = lay_out(
+            patches, shown, light, streak, camera, state, model.pulse, weight, FOLLOWING_MARGIN_PX
+        )
+        model, limit = solver.model, MAX_UNEXPLAINED
+        remainder = np.zeros(len(patches))
+        begun = replace(begun, explained=np.zeros((COEFFICIENTS, model.surface.size), np.float32))
     solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
     # what explains the last shot best without the prior has that shot's noise
-    refinement = refine_state(model, solver.amplitude, replace(fit.refinement, free=None), True)
+    refinement = refine_state(model, solver.amplitude, begun, True)
     solver.amplitude = refinement.amplitude
     solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
     unexplained = model.unexplained(solver.amplitude)
-    if unexplained > CHANGED_RATIO * fit.reference + CHANGED_EXCESS:
+    if unexplained > limit:
         return None
     none = fit.others[np.zeros(0, np.intp)]
-    return SurfaceFit(model, solver, refinement, fit.remainder, fit.reference, none, solver)
+    reference = unexplained if changed else fit.reference
+    return SurfaceFit(model, solver, refinement, remainder, reference, none, solver)
 
 
 def choose_points(
