@@ -258,7 +258,7 @@ def sequence(
     camera: Path | None = CAMERA,
     bin_width: float | None = BIN_WIDTH,
     time_zero: float | None = TIME_ZERO,
-    average: int = opt("N", "Shots averaged for each cloud.", 1),
+    average: int = opt("N", "Shots averaged for each cloud, as far as nothing changes.", 1),
     focus: str = FOCUS,
     suffix: str = SUFFIX,
     keep_jitter: bool = flag(

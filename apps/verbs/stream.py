@@ -61,6 +61,9 @@ def stream(
         "slowest, which follow those of the last shot.",
         shown="l1",
     ),
+    average: int = opt(
+        "N", "Streak images averaged at most, as far as nothing changes; histograms always are.", 1
+    ),
     shots: int | None = opt("N", "Stop after this number of clouds.", shown="at the source's end"),
     held: int = opt("N", "Shots that may wait for their turn.", 1),
     drop: bool = flag(
@@ -109,7 +112,7 @@ def stream(
         if isinstance(fault, TofclipError):
             raise fault
         raise InputError(f"{source}: the source ended before it gave a shot")
-    pipeline = make_pipeline(first, camera, time_zero, parse_focus(focus), method)
+    pipeline = make_pipeline(first, camera, time_zero, parse_focus(focus), method, average)
     if out is not None and not is_file:  # only now: what cannot be streamed leaves no empty folder
         make_folder(out)
     failed = 0

@@ -14,6 +14,7 @@ from tofclip.errors import InputError
 from tofclip.lidar import depth, point_cloud
 from tofclip.lidar.pulse_tables import TraceBins
 from tofclip.recovery import DepthLockedFocus, recover
+from tofclip.sequences import make_pipeline
 from tofclip.sequences.ranger import RangingPipeline, SurfacePipeline, WarmStartedRecovery
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Streak
@@ -54,6 +55,25 @@ def test_a_stream_gives_the_clouds_of_its_shots():
         assert sum(one.seconds.values()) == pytest.approx(one.latency + one.seconds["read"])
     medians = [np.median(one.cloud.range) for one in streamed]
     np.testing.assert_allclose(np.diff(medians), -0.05, atol=2e-3)
+
+
+def test_measurements_are_averaged_as_far_as_nothing_changes():
+    first, last = shots(2)
+    random, dim = np.random.default_rng(0), 3e-3  # 150 photons at the peak
+    seen = [
+        replace(first, counts=random.poisson(dim * expected + 1.0).astype(np.float32))
+        for expected in [first.counts] * 7 + [last.counts]
+    ]
+    pipeline = make_pipeline(seen[0], average=4)
+    made = [pipeline.rectify(shot)[0].counts for shot in seen]
+    moved = dim * abs(last.counts - first.counts)
+    lit = dim * first.counts > 5
+    noise = [np.mean((one - dim * first.counts - 1)[lit] ** 2) for one in (seen[6].counts, made[6])]
+    # three or four shots: two hundred lit measurements know a variance to a tenth
+    assert noise[1] == pytest.approx(noise[0] / 3.5, rel=0.3)
+    # the plate is seven rows nearer: where it was and where it is, the last shot alone counts
+    off, photons = made[7] - dim * last.counts - 1, dim * last.counts + 1
+    assert np.mean(off[moved > 10] ** 2) == pytest.approx(np.mean(photons[moved > 10]), rel=0.3)
 
 
 def test_a_ranger_of_ones_own_is_used():

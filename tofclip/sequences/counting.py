@@ -22,7 +22,7 @@ from tofclip.units import SPEED_OF_LIGHT
 FloatArray = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
-BLOCK_SHOTS = 8  # a pixel is summed over this block of shots and the block before
+SUMMED_SHOTS = 16  # of a pixel at most: a block of shots and the block before
 # Standard deviations by which a window of a pixel's light has to differ, in a shot from all before it
 # and in a block from the block before. Chance drops 4 pixels of 10 000 in a shot of 64 windows, and
 # leaves out the older half of every sixth pixel.
@@ -41,10 +41,11 @@ class StillSum:
     other, and forgets both where a shot shows something else.
 
     Numbers are compared in windows as long as a pulse, by their square roots, whose deviation is a
-    half at any mean. Memory: two cubes.
+    half at any mean. `most`: shots at most. Memory: two cubes.
     """
 
-    def __init__(self, pixels: int, bins: int, window: int) -> None:
+    def __init__(self, pixels: int, bins: int, window: int, most: int = SUMMED_SHOTS) -> None:
+        self._block_shots = -(-most // 2)
         self._starts = np.arange(0, bins, min(max(window, 1), bins))
         # the older block and the newer one, with and without windows, and their shots
         self.blocks = np.zeros((2, pixels, bins), np.float32)
@@ -56,7 +57,7 @@ class StillSum:
         seen = np.add.reduceat(histograms, self._starts, axis=1)
         moved = _differ(seen, 1, self._windows.sum(axis=0), self.shots.sum(axis=0), SHOT_SIGMAS)
         full = self.shots[1] >= self.shots[0]
-        grown = full & (self.shots[0] < BLOCK_SHOTS)
+        grown = full & (self.shots[0] < self._block_shots)
         for held in (self.blocks, self._windows, self.shots):
             if moved.any():
                 held[:, moved] = 0
@@ -72,6 +73,13 @@ class StillSum:
         older, newer = zip(self._windows, self.shots, strict=True)
         return ~_differ(*newer, *older, BLOCK_SIGMAS)
 
+    def average(self, still: NDArray[np.bool_]) -> FloatArray:
+        """Return the mean of a shot (pixels, bins), of both blocks where that is `still` the same."""
+        older, newer = self.blocks
+        before, shots = self.shots
+        sums = newer + older * still[:, np.newaxis]
+        return np.asarray(sums / (shots + before * still)[:, np.newaxis], np.float32)
+
 
 def _differ(
     one: FloatArray,
@@ -83,7 +91,9 @@ def _differ(
     """Say of which pixels, seen in some shots, a window differs from what it was in others."""
     first = np.asarray(shots, np.float32).reshape(-1, 1)
     second = np.maximum(others, 1).astype(np.float32).reshape(-1, 1)
-    change = np.sqrt((one + 0.375) / first) - np.sqrt((other + 0.375) / second)
+    change = np.sqrt((np.maximum(one, 0) + 0.375) / first) - np.sqrt(
+        (np.maximum(other, 0) + 0.375) / second
+    )
     # of a square root the variance is a quarter, whatever the mean
     most = (np.abs(change) / np.sqrt(0.25 / first + 0.25 / second)).max(axis=1)
     return np.asarray((most > limit) & (others > 0))

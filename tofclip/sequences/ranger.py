@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +36,11 @@ from tofclip.recovery import (
     open_shot,
     plan_recovery,
 )
+from tofclip.recovery.defects import estimate_noise
 from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces, list_returns
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
+from tofclip.sequences.counting import StillSum
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse, ProximalMethod, Sparse
 from tofclip.solvers.direct import InverseTraces, order_by_patch
@@ -49,6 +51,9 @@ __all__ = ["RangingPipeline", "SummedShot", "build_cloud_path"]
 # photons in the brightest pixel, 17 % are false after 4, 9 % after 8, 5 % after 12 (the linear
 # inverse: 27 %), and 3 % after 16, in half as much time again.
 WARM_ITERATIONS = 12
+# Of a piece of the streak image that is averaged as far as nothing changes in it: rows in widths of
+# the pulse, and columns. Smaller ones have too few photons to show a change.
+STILL_WIDTHS, STILL_COLUMNS = 2.0, 4
 
 
 class WarmStartedRecovery:
@@ -171,6 +176,66 @@ class SurfacePipeline:
     def search(self, found: SurfaceFit) -> Returns:
         """List the returns of what `recover_shot` returned."""
         return list_returns(found, self.method.detection, self._centre_error_px)
+
+
+class StillAverage:
+    """Averages streak images with those before, piece by piece, as far as nothing changes there: a shot
+    of few photons sees as far as one of many, and what moves stays sharp.
+
+    `first`: counts (rows, columns), which know the noise; `pulse_rows`: rows of a pulse's width;
+    `most`: shots that are averaged at most. Memory: three such images.
+    """
+
+    def __init__(self, first: NDArray[np.float32], pulse_rows: float, most: int) -> None:
+        self._dark, floor, self._gain = estimate_noise(first)
+        # photons, and as many besides as would scatter like a dark measurement
+        self._offset = (floor / self._gain) ** 2
+        height, width = self._sides = max(round(STILL_WIDTHS * pulse_rows), 1), STILL_COLUMNS
+        down, across = (-(-n // side) for n, side in zip(first.shape, self._sides, strict=True))
+        self._sum = StillSum(down * across, height * width, height * width, most)
+
+    def add(self, counts: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the average of the newest image with those before."""
+        (rows, columns), (height, width) = counts.shape, self._sides
+        padded = np.pad(
+            (counts - self._dark) / self._gain + self._offset,
+            [(0, -rows % height), (0, -columns % width)],
+        )
+        pieces = padded.reshape(-(-rows // height), height, -(-columns // width), width)
+        pieces = pieces.swapaxes(1, 2)
+        still = self._sum.add(pieces.reshape(-1, height * width).astype(np.float32))
+        mean = self._sum.average(still).reshape(pieces.shape).swapaxes(1, 2).reshape(padded.shape)
+        inside = mean[:rows, :columns]
+        return np.asarray((inside - self._offset) * self._gain + self._dark, np.float32)
+
+
+class AveragedPipeline:
+    """Makes clouds of streak images averaged by `StillAverage`, of `most` shots. Shots are taken in
+    order.
+    """
+
+    in_order = True
+
+    def __init__(
+        self, pipeline: RangingPipeline | SurfacePipeline, most: int, first: Streak
+    ) -> None:
+        self._pipeline, self.camera = pipeline, pipeline.camera
+        self.method_name = pipeline.method_name
+        pulse_rows = self.camera.pulse_fwhm / float(np.mean(np.diff(first.times)))
+        self._average = StillAverage(first.counts, pulse_rows, most)
+
+    def rectify(self, shot: Streak) -> tuple[Streak, Any]:
+        """Average a shot with those before, and do what can be done before anything is recovered."""
+        averaged = replace(shot, counts=self._average.add(shot.counts))
+        return averaged, self._pipeline.rectify(averaged)
+
+    def recover_shot(self, shot: Streak, rectified: tuple[Streak, Any]) -> Any:
+        """Do what the pipeline does with the average."""
+        return self._pipeline.recover_shot(*rectified)
+
+    def search(self, found: Any) -> Returns:
+        """Find the returns in what `recover_shot` returned."""
+        return self._pipeline.search(found)
 
 
 class SummedShot(NamedTuple):

@@ -21,7 +21,7 @@ from tofclip.lidar import PointCloud
 from tofclip.recovery import SharpestFocus, open_shot, parse_focus
 from tofclip.sequences.inputs import Shot
 from tofclip.sequences.jobs import Job, lock_output_folder
-from tofclip.sequences.ranger import RangingPipeline
+from tofclip.sequences.ranger import RangingPipeline, StillAverage
 from tofclip.shots import Streak
 from tofclip.storage import Storable, stored_array, stored_child, stored_value
 
@@ -211,12 +211,15 @@ def make_average_cloud(
             late[place] = jitter.late_bin(compute_light_curve(streak, pipeline.camera))
         return pipeline.rectifier.rectify(streak.counts, delay=float(late[place]))
 
-    total = measurements(0)
-    for place in range(1, len(shots)):
-        # rectified before they are averaged, because every shot has a delay of its own
-        total += measurements(place)
-    total /= len(shots)
-    return pipeline.cloud(total), late
+    # rectified before they are averaged, because every shot has a delay of its own
+    seen = measurements(0)
+    if len(shots) > 1:
+        pulse_rows = pipeline.camera.pulse_fwhm / float(np.mean(np.diff(pipeline.times)))
+        average = StillAverage(seen.T, pulse_rows, len(shots))
+        seen = average.add(seen.T).T
+        for place in range(1, len(shots)):
+            seen = average.add(measurements(place).T).T
+    return pipeline.cloud(np.ascontiguousarray(seen)), late
 
 
 def _differentiate_root(light: FloatArray) -> FloatArray:

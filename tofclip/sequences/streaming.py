@@ -28,7 +28,7 @@ from tofclip.plugins import METHODS
 from tofclip.recovery import Focus, SharpestFocus, SurfaceRecovery
 from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.sequences.counting import PhotonPipeline
-from tofclip.sequences.ranger import RangingPipeline, SurfacePipeline
+from tofclip.sequences.ranger import AveragedPipeline, RangingPipeline, SurfacePipeline
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse, ProximalMethod
 from tofclip.threads import open_worker_pool, thread_count
@@ -64,6 +64,7 @@ def make_pipeline(
     time_zero: float | None = None,
     focus: Focus = DEFAULT_FOCUS,
     method: str | LinearInverse | ProximalMethod | None = None,
+    average: int = 1,
 ) -> CloudPipeline:
     """Prepare for shots like this one: `PhotonPipeline` for histograms of a picture; of streak images
     `SurfacePipeline` by method "surfaces", else `RangingPipeline`.
@@ -81,15 +82,23 @@ def make_pipeline(
     method : str, LinearInverse or ProximalMethod, optional
         Of streak images alone: ``"l1"``, the default, ``"tv"``, ``"linear"``, ``"surfaces"``, or another name of
         `tofclip.plugins.METHODS` that stands for one with a prior.
+    average : int
+        Streak images averaged at most, as far as nothing changes between them; histograms always are.
 
     Raises
     ------
     InputError
         No such method or focus, a method for histograms, or a streak image without a camera.
     """
+    if average < 1:
+        raise InputError(f"a stream averages 1 shot or more, not {average}")
     if isinstance(focus, SharpestFocus):
         raise InputError("a stream has one focus for all shots: depth-locked or fixed:S")
     if isinstance(shot, PhotonCube):
+        if average != 1:
+            raise InputError(
+                "photons of histograms are summed wherever nothing moves: leave out the average"
+            )
         if method is not None:
             raise InputError(
                 "histograms of a picture are ranged by their photons alone: leave out the method"
@@ -102,9 +111,12 @@ def make_pipeline(
             "a stream's method is linear, surfaces or one with a prior such as l1 or tv, "
             f"not '{method}'"
         )
+    pipeline: RangingPipeline | SurfacePipeline
     if isinstance(chosen, SurfaceRecovery):  # each surface is recovered at the shear of its range
-        return SurfacePipeline.for_shot(shot, camera, time_zero)
-    return RangingPipeline.for_shot(shot, camera, focus, time_zero, chosen)
+        pipeline = SurfacePipeline.for_shot(shot, camera, time_zero)
+    else:
+        pipeline = RangingPipeline.for_shot(shot, camera, focus, time_zero, chosen)
+    return pipeline if average == 1 else AveragedPipeline(pipeline, average, shot)
 
 
 Policy = Literal["block", "drop_oldest"]
