@@ -401,11 +401,13 @@ def make_shot(
     haze: float = 0.0,
     pulse: float = PULSE_S,
     rays_per_side: int = 4,
+    bend: float = 0.0,
 ) -> Shot:
     """Simulate a shot whose brightest streak pixel expects `photons`. `scene`: one of `SCENES`, "moving",
     of which `frame` is the number of the shot, or surfaces; `background`: photons a pixel; `afterglow`:
     fraction of the light that comes late, by 400 ps in the mean; `haze`: fraction that is scattered
-    along the slit, 10 columns far in the mean; `pulse`: the response, s, for which the camera takes 60 ps.
+    along the slit, 10 columns far in the mean; `pulse`: the response, s, for which the camera takes 60 ps;
+    `bend`: rows by which the outer views come later than a straight delay has them.
     """
     random = np.random.default_rng([seed, frame])
     if isinstance(scene, str):
@@ -420,7 +422,7 @@ def make_shot(
 
     def delay(column):  # rows
         way = (column - centres[3]) / (3 * 1.36 * size)
-        return 12.0 * way + 0.6 * way**2
+        return 12.0 * way + (0.6 + bend) * way**2
 
     gathered = np.zeros((ROWS * FINE, width))
     for view in range(7):
