@@ -51,7 +51,7 @@ app.command()(photons)
 def bag(
     clouds: Path = arg(
         "CLOUDS",
-        "A folder or quoted pattern of point clouds; or a bag or MCAP file with them.",
+        "Point clouds: a file, a folder or a quoted pattern; or a bag or MCAP file with them.",
         read=True,
     ),
     out: Path = opt(
@@ -96,7 +96,7 @@ def bag(
         return
     files = [
         file
-        for file in list_files(clouds).values()
+        for file in ([clouds] if clouds.is_file() else list_files(clouds).values())
         if file.suffix.lower() in CLOUD_SUFFIXES and file.name != PLAN_NAME
     ]
     if not files:

@@ -266,7 +266,7 @@ def test_what_has_no_suitable_layout_is_told_which_would_do(tmp_path):
     (tmp_path / "empty.npy").touch()
     for name, problem in {
         "line.npy": "holds no photons",
-        "flat.npy": "give `axes`, e.g. xt of a line",
+        "flat.npy": "give `axes`, e.g. xyt of events",
         "two.npz": "several cubes",
         "objects.npy": "cube of counts",
         "text.txt": "cube of counts",

@@ -202,6 +202,8 @@ def _find_layout(
     if not cubes and len(numbers) == 1:
         fitting = {1: "t of one histogram", 2: "xt of a line", 3: "yxt of a picture of one row"}
         shape = next(iter(numbers.values())).shape
+        if len(shape) == 2 and shape[0] == 3:
+            fitting[2] = "xyt of events"
         remedy = f"give `axes`, e.g. {fitting[len(shape)]}" if len(shape) in fitting else SUITABLE
     raise FileFormatError(path, f"holds {problem} ({held}); {remedy}")
 
