@@ -262,10 +262,13 @@ def learn_shading(photons: PhotonImage, width: float) -> Shading | None:
         late = ((photons.bin + 0.5) * (number / photons.bins)).astype(np.int64)
         own = place[photons.pixel] * number + np.clip(late, 0, number - 1)
         light = np.bincount(own, photons.count, math.prod(sides)).reshape(-1, number)
-        density = light / (np.bincount(place)[:, np.newaxis] * photons.bins / number)
-        usual = scipy.ndimage.median_filter(
-            density.reshape(sides), (3, 3, CELLS_AROUND), mode="mirror"
-        )
+        # a third of a photon, by which the median of few lies below their mean
+        density = (light + 1 / 3) / (np.bincount(place)[:, np.newaxis] * photons.bins / number)
+        # A course that rises or falls goes on beyond the record.
+        beyond = (0, 0), (0, 0), 2 * (CELLS_AROUND // 2,)
+        padded = np.pad(np.log(density.reshape(sides)), beyond, "reflect", reflect_type="odd")
+        usual = np.exp(scipy.ndimage.median_filter(padded, (3, 3, CELLS_AROUND)))
+        usual = usual[..., CELLS_AROUND // 2 : -(CELLS_AROUND // 2)]
         mean = float(usual.mean())
         if mean * place.size * photons.bins >= MIN_CELL_PHOTONS * usual.size:
             level = np.maximum(usual / mean, MIN_SHADE)
