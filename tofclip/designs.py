@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, Measurement, SkewSweep, measure
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require, require_known
 from tofclip.files import atomic_path, read_toml, suggest_name
 from tofclip.lidar import Pulse, depth
 from tofclip.light_field.views import CameraSetup, ClipMeasurement
@@ -150,19 +150,20 @@ class Design:
                 least = 0 if item.default == 0 or item.name == "background_photons" else 1e-300
                 good, wanted = number and value >= least, "a positive number"
                 good = good and (np.isfinite(value) or item.name == "focus_distance_m")
-            if not good:
-                raise InputError(f"{item.name} must be {wanted}, got {value!r}")
+            require(good, f"{item.name} must be {wanted}, got {value!r}")
             if isinstance(value, list):
                 object.__setattr__(self, item.name, tuple(map(float, value)))
-        if not self.near_m < self.far_m:
-            raise InputError(f"far_m must be more than near_m, {self.near_m:g}; got {self.far_m:g}")
+        require(
+            self.near_m < self.far_m,
+            f"far_m must be more than near_m, {self.near_m:g}; got {self.far_m:g}",
+        )
         span = 2 * (self.far_m - self.near_m) * self._secant / SPEED_OF_LIGHT
         needed = int(np.ceil((span + 2 * self._margin) / (self.bin_width_ps * PICOSECOND)))
-        if self.bins < needed:
-            raise InputError(
-                f"{self.bins} bins of {self.bin_width_ps:g} ps do not cover {self.near_m:g} to {self.far_m:g} m: "
-                f"set bins to {needed} or more"
-            )
+        require(
+            self.bins >= needed,
+            f"{self.bins} bins of {self.bin_width_ps:g} ps do not cover {self.near_m:g} to {self.far_m:g} m: "
+            f"set bins to {needed} or more",
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> Design:
@@ -314,8 +315,7 @@ SCENES: dict[str, tuple[Plate, ...]] = {
 
 def make_scene(name: str, design: Design) -> Scene:
     """Return one of `SCENES` in an instrument's field, from its near to its far end."""
-    if name not in SCENES:
-        raise InputError(f"no scene is called '{name}'; take one of {', '.join(SCENES)}")
+    require_known("scene", name, SCENES)
     bodies = []
     for pattern, (x, y), sides, part, yaw in SCENES[name]:
         z = design.near_m + (0.05 + 0.85 * part) * (design.far_m - design.near_m)
@@ -638,8 +638,10 @@ def design(
         known = settings
     else:
         known = Design.of(settings) if isinstance(settings, Mapping) else Design.load(settings)
-    if shots == 1 or shots < 0:
-        raise InputError(f"a deviation takes two shots or more, or 0 for none; got {shots}")
+    require(
+        shots != 1 and shots >= 0,
+        f"a deviation takes two shots or more, or 0 for none; got {shots}",
+    )
     scenes = {name: make_scene(name, known) for name in SCENES}
     sight = analyse_sight(known, float(known.camera.shear_at((known.near_m + known.far_m) / 2)))
     return DesignReport(

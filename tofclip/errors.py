@@ -34,6 +34,7 @@ named as in Python, in backquotes (`bin_width`); the command line puts its optio
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from math import inf
 from os import PathLike
 from pathlib import Path
@@ -123,6 +124,23 @@ class BufferOverflowError(DeviceError):
 
 class ProtocolError(DeviceError):
     """The instrument said something that its protocol does not allow."""
+
+
+def require(holds: object, problem: str) -> None:
+    """Refuse what the caller passed, with a `problem`, unless a condition holds."""
+    if not holds:
+        raise InputError(problem)
+
+
+def require_known(what: str, name: str, known: Collection[str]) -> None:
+    """Refuse a name that is none of those known."""
+    require(name in known, f"unknown {what} '{name}'; take one of {', '.join(known)}")
+
+
+def require_shape(what: str, expected: tuple[object, ...], got: tuple[int, ...]) -> None:
+    """Refuse an array of another shape than the one that is needed."""
+    if got != expected:
+        raise ShapeError(what, expected, tuple(got))
 
 
 def require_type(value: object, wanted: type | tuple[type, ...], use: str) -> None:

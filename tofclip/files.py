@@ -30,6 +30,7 @@ from tofclip.errors import (
     MissingDependencyError,
     StorageError,
     TofclipError,
+    require,
 )
 
 if TYPE_CHECKING:
@@ -204,8 +205,10 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 def require_suffix(path: str | Path, *suffixes: str) -> None:
     """Refuse to write to a name that says another format than the file will have."""
-    if Path(path).suffix.lower() not in suffixes:
-        raise InputError(f"{path}: the name must end in {' or '.join(suffixes)}")
+    require(
+        Path(path).suffix.lower() in suffixes,
+        f"{path}: the name must end in {' or '.join(suffixes)}",
+    )
 
 
 def compute_sha256(path: str | Path) -> str:

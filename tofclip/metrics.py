@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require
 
 
 def nmse(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
@@ -37,10 +37,10 @@ def nmse(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
     """
     h, g = _crop_borders(estimate, truth, border_px)
     spread = float(np.sum((g - g.mean()) ** 2))
-    if spread == 0:
-        raise InputError(
-            "the truth is constant: its variance cannot normalise an error; use nmse_energy"
-        )
+    require(
+        spread != 0,
+        "the truth is constant: its variance cannot normalise an error; use nmse_energy",
+    )
     return float(np.sum((h - g) ** 2)) / spread
 
 
@@ -50,8 +50,7 @@ def nmse_energy(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> fl
     """
     h, g = _crop_borders(estimate, truth, border_px)
     energy = float(np.sum(g**2))
-    if energy == 0:
-        raise InputError("the truth is zero everywhere: its energy cannot normalise an error")
+    require(energy != 0, "the truth is zero everywhere: its energy cannot normalise an error")
     return float(np.sum((h - g) ** 2)) / energy
 
 
@@ -61,8 +60,7 @@ def correlation_coefficient(estimate: ArrayLike, truth: ArrayLike, border_px: in
     """
     h, g = _crop_borders(estimate, truth, border_px)
     h, g = h - h.mean(), g - g.mean()
-    if not g.any():
-        raise InputError("the truth is constant: nothing can correlate with it")
+    require(g.any(), "the truth is constant: nothing can correlate with it")
     spread = float(np.linalg.norm(h) * np.linalg.norm(g))
     return float(np.sum(h * g)) / spread if spread > 0 else 0.0
 
@@ -76,8 +74,8 @@ def _crop_borders(
     if border_px:
         inner = (..., slice(border_px, -border_px), slice(border_px, -border_px))
         h, g = h[inner], g[inner]
-    if g.size == 0:
-        raise InputError(f"a border of {border_px} px leaves nothing of the picture")
-    if not (np.all(np.isfinite(h)) and np.all(np.isfinite(g))):
-        raise InputError("pictures must not hold NaN or infinity")
+    require(g.size != 0, f"a border of {border_px} px leaves nothing of the picture")
+    require(
+        np.all(np.isfinite(h)) and np.all(np.isfinite(g)), "pictures must not hold NaN or infinity"
+    )
     return h, g

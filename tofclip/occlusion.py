@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import require, require_positive, require_shape
 from tofclip.light_field.views import CameraSetup, ClipMeasurement
 from tofclip.operators import Diagonal, LinearOperator, LinearShear, Stack
 from tofclip.operators.cameras import LightFieldCamera
@@ -48,10 +48,7 @@ class InactiveRegion:
 
     def __post_init__(self) -> None:
         for name in ("baseline", "width", "distance"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(
-                    f"the {name} must be a positive length, got {getattr(self, name)} m"
-                )
+            require_positive(f"the {name}", getattr(self, name), "length in metres")
 
     @property
     def is_bounded(self) -> bool:
@@ -139,8 +136,7 @@ class TimedMeasurements:
 
     def __post_init__(self) -> None:
         expected = (self.rig.camera.measurements, self.time_axis.bins)
-        if self.values.shape != expected:
-            raise ShapeError("the measurements of this rig", expected, self.values.shape)
+        require_shape("the measurements of this rig", expected, self.values.shape)
 
     @property
     def history(self) -> Array:
@@ -283,8 +279,7 @@ def separate_occluder(
     single one the target's pictures are zero. `weight` is that of total variation.
     """
     returns = measurements.find_returns() if returns is None else returns
-    if not returns:
-        raise InputError("no light comes back; is the clock set to the scene's distances?")
+    require(returns, "no light comes back; is the clock set to the scene's distances?")
     distances = tuple(one.distance for one in returns)
     shears = [float(measurements.rig.array.shear(distance)) for distance in distances]
     usual = ClipRecovery(weight=weight)

@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from tofclip.errors import FileFormatError, InputError
+from tofclip.errors import FileFormatError, InputError, require
 from tofclip.files import translate_read_errors
 
 if TYPE_CHECKING:
@@ -58,8 +58,9 @@ class Parts(Mapping[str, Any]):
         InputError
             We have a part of that name ourselves.
         """
-        if name in self.own:
-            raise InputError(f"the {self.kind} '{name}' is tofclip's own; take another name")
+        require(
+            name not in self.own, f"the {self.kind} '{name}' is tofclip's own; take another name"
+        )
         self.registered[name] = part
 
     @cached_property
@@ -252,6 +253,5 @@ def split_assignments(texts: Sequence[str]) -> dict[str, str]:
         name.strip(): value.strip() for name, _, value in (one.partition("=") for one in texts)
     }
     for name, value in found.items():
-        if not (name and value):
-            raise InputError(f"a setting is given as NAME=VALUE, not as '{name}{value}'")
+        require(name and value, f"a setting is given as NAME=VALUE, not as '{name}{value}'")
     return found

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
-from tofclip.errors import InputError, MissingTimeAxisError, ShapeError, require_type
+from tofclip.errors import (
+    InputError,
+    MissingTimeAxisError,
+    ShapeError,
+    require,
+    require_known,
+    require_positive,
+    require_shape,
+    require_type,
+)
 from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
 from tofclip.storage import (
     Field,
@@ -92,22 +101,20 @@ class Streak(Storable):
         if counts.ndim != 2 or counts.size == 0:
             raise ShapeError(f"{self.source}: a streak image", "(rows, columns)", counts.shape)
         bad = counts.size - int(np.count_nonzero(np.isfinite(counts)))
-        if bad:
-            raise InputError(
-                f"{self.source}: {bad} pixels are NaN or infinite; replace them or mark them as saturated"
-            )
-        if not np.any(counts):
-            raise InputError(f"{self.source}: every pixel is zero; was the shutter closed?")
+        require(
+            not bad,
+            f"{self.source}: {bad} pixels are NaN or infinite; replace them or mark them as saturated",
+        )
+        require(np.any(counts), f"{self.source}: every pixel is zero; was the shutter closed?")
         if self.saturated is not None and self.saturated.shape != counts.shape:
             raise ShapeError("saturated", counts.shape, self.saturated.shape)
         if self.row_times is not None:
             times = np.asarray(self.row_times, dtype=np.float64)
-            if times.shape != counts.shape[:1]:
-                raise ShapeError(f"{self.source}: the time axis", counts.shape[:1], times.shape)
-            if not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
-                raise InputError(
-                    f"{self.source}: the time axis must be finite and increase row by row"
-                )
+            require_shape(f"{self.source}: the time axis", counts.shape[:1], times.shape)
+            require(
+                np.all(np.isfinite(times)) and not np.any(np.diff(times) <= 0),
+                f"{self.source}: the time axis must be finite and increase row by row",
+            )
             if times.size > 1:
                 require_credible_bin_width(float(np.diff(times).mean()), longest=MAX_ROW_S)
             object.__setattr__(self, "row_times", times)
@@ -164,8 +171,7 @@ class Streak(Storable):
 
     def with_bin_width(self, bin_width: float) -> Streak:
         """Return the same picture with evenly spaced rows of `bin_width` seconds, the first at 0."""
-        if not (np.isfinite(bin_width) and bin_width > 0):
-            raise InputError(f"bin width must be a positive number of seconds, got {bin_width}")
+        require_positive("bin width", bin_width, "number of seconds")
         require_credible_bin_width(bin_width, longest=MAX_ROW_S)
         return replace(self, row_times=np.arange(len(self.counts), dtype=np.float64) * bin_width)
 
@@ -247,8 +253,7 @@ class Returns(Storable):
             if getattr(self, name).size == 0:
                 object.__setattr__(self, name, np.full(self.y.shape, unknown))
         for name, column in self._columns.items():
-            if column.shape != self.y.shape:
-                raise ShapeError(f"{name} of the returns", self.y.shape, column.shape)
+            require_shape(f"{name} of the returns", self.y.shape, column.shape)
 
     @property
     def _columns(self) -> dict[str, NDArray[Any]]:
@@ -309,10 +314,7 @@ class Returns(Storable):
         InputError
             There is no such choice.
         """
-        if which not in RETURN_CHOICES:
-            raise InputError(
-                f"no return is called '{which}'; choose one of {', '.join(RETURN_CHOICES)}"
-            )
+        require_known("return", which, RETURN_CHOICES)
         if which == "all":
             return self
         ranks: dict[str, NDArray[Any]] = {
@@ -329,8 +331,7 @@ class Returns(Storable):
         """Picture (y, x) of one of `PICTURE_COLUMNS` of each pixel's most intense return; NaN where
         nothing came back.
         """
-        if name not in PICTURE_COLUMNS:
-            raise InputError(f"returns have no property '{name}' to show as a picture")
+        require(name in PICTURE_COLUMNS, f"returns have no property '{name}' to show as a picture")
         picture = np.full(self.camera.image_shape, np.nan, dtype=np.float32)
         upwards = np.argsort(self.intensity, kind="stable")  # the last one written wins
         picture[self.y[upwards], self.x[upwards]] = getattr(self, name)[upwards]
@@ -396,8 +397,10 @@ class Frames(Storable):
         expected = (times.size, *self.camera.image_shape)
         if self.values.shape != expected:
             raise ShapeError("frames", f"(time, y, x) = {expected}", tuple(self.values.shape))
-        if times.size == 0 or not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
-            raise InputError("frame times must be finite and increase")
+        require(
+            times.size != 0 and np.all(np.isfinite(times)) and not np.any(np.diff(times) <= 0),
+            "frame times must be finite and increase",
+        )
         if times.size > 1:
             require_credible_bin_width(self.bin_width)
         shears = np.asarray(self.shears, dtype=np.float64)
@@ -408,8 +411,7 @@ class Frames(Storable):
         if self.measured.size and self.measured.shape != slit:
             raise ShapeError("the frames' measurements", slit, self.measured.shape)
         xp = namespace(self.values)
-        if not xp.all(xp.isfinite(self.values)):
-            raise InputError("frames must not hold NaN or infinity")
+        require(xp.all(xp.isfinite(self.values)), "frames must not hold NaN or infinity")
 
     def __len__(self) -> int:
         return int(self.times.size)
@@ -427,10 +429,10 @@ class Frames(Storable):
                 return self.values[frames]
             except (IndexError, TypeError) as fault:
                 raise InputError(f"frames are (time, y, x) = {self.shape}: {fault}") from fault
-        if self.times[frames].size == 0:
-            raise InputError(f"no frame is selected of {len(self)}")
-        if (frames.step or 1) < 0:
-            raise InputError("frames stay in the order of time; a step cannot be negative")
+        require(self.times[frames].size != 0, f"no frame is selected of {len(self)}")
+        require(
+            (frames.step or 1) > 0, "frames stay in the order of time; a step cannot be negative"
+        )
         returns = self.returns
         if returns is not None:
             # A return belongs to the frame nearest in time.
@@ -461,8 +463,10 @@ class Frames(Storable):
         InputError
             Neither is given, or both are, or no frame lies between.
         """
-        if (range is None) == (time is None):
-            raise InputError("sel takes either range=(near, far) in m or time=(first, last) in s")
+        require(
+            (range is None) != (time is None),
+            "sel takes either range=(near, far) in m or time=(first, last) in s",
+        )
         try:
             limits = np.asarray(time if range is None else range, dtype=np.float64)
         except (TypeError, ValueError) as fault:
@@ -471,8 +475,7 @@ class Frames(Storable):
             raise ShapeError("the limits of sel", "(lower, upper)", limits.shape)
         at = self.times if range is None else self.ranges
         first, stop = np.searchsorted(at, limits[0]), np.searchsorted(at, limits[1], side="right")
-        if first >= stop:
-            raise InputError(f"no frame lies between {limits[0]:g} and {limits[1]:g}")
+        require(first < stop, f"no frame lies between {limits[0]:g} and {limits[1]:g}")
         chosen: Frames = self[int(first) : int(stop)]
         return chosen
 
@@ -538,6 +541,5 @@ class Frames(Storable):
     @property
     def bin_width(self) -> float:
         """Mean time between frames, s."""
-        if self.times.size == 1:
-            raise InputError("a single frame has no bin width")
+        require(self.times.size != 1, "a single frame has no bin width")
         return float((self.times[-1] - self.times[0]) / (self.times.size - 1))

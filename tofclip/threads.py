@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from functools import lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
-from tofclip.errors import InputError
+from tofclip.errors import require
 
 if TYPE_CHECKING:
     from threadpoolctl import LibController
@@ -42,8 +42,10 @@ def thread_count() -> int:
     if not wanted:
         affinity = getattr(os, "sched_getaffinity", None)
         return len(affinity(0)) if affinity else os.cpu_count() or 1
-    if not wanted.isdecimal() or int(wanted) < 1:
-        raise InputError(f"{THREADS_VARIABLE} must be a positive whole number, got '{wanted}'")
+    require(
+        wanted.isdecimal() and int(wanted) >= 1,
+        f"{THREADS_VARIABLE} must be a positive whole number, got '{wanted}'",
+    )
     return int(wanted)
 
 

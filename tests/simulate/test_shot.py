@@ -331,7 +331,7 @@ PLAIN = make_plain_pattern(0.5)
         (lambda: make_plate((0, 0, 1), (0, 1), PLAIN), "positive size"),
         (lambda: make_plate((0, 0, np.inf), (1, 1), PLAIN), "finite position"),
         (lambda: Scene(()), "at least one body"),
-        (lambda: make_letter("Q"), "no outline is known for 'Q'"),
+        (lambda: make_letter("Q"), "unknown letter 'Q'"),
         (
             lambda: simulate_shot(plate(PLAIN, (1, 1), -2.0), instrument(), 0),
             "no light of the scene",

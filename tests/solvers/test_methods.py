@@ -144,7 +144,7 @@ def test_the_robust_deviation_is_that_of_gaussian_errors():
     [
         (lambda: Huber(SCALED, threshold=0), "threshold"),
         (lambda: Poisson(-SCALED, deviation=DEVIATION), "negative"),
-        (lambda: ClippedSquares(SCALED, limit=0.0), "must be positive"),
+        (lambda: ClippedSquares(SCALED, limit=0.0), "must be a positive number"),
         (lambda: LeastSquares(SCALED, np.ones((2, 1), bool)), "must have shape"),
         (lambda: estimate_robust_deviation(np.zeros(5)), "met exactly"),
         (lambda: StoppingRule(0), "iteration"),

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import FileFormatError, InputError
+from tofclip.errors import FileFormatError, InputError, require
 from tofclip.files import MAX_COMPRESSION, BoundedFile, guard, translate_read_errors
 from tofclip.shots import Streak, outline_streak
 from tofclip.storage import Record
@@ -159,10 +159,10 @@ def _make_streak(
         # A 12-bit converter in 16-bit pixels saturates long before the pixel type does.
         limit = min(np.iinfo(pixels.dtype).max, parse_full_scale(metadata))
         saturated = pixels >= limit
-        if saturated.all():
-            raise InputError(
-                f"{path}: every pixel is saturated at {limit} counts; lower the gain or the exposure"
-            )
+        require(
+            not saturated.all(),
+            f"{path}: every pixel is saturated at {limit} counts; lower the gain or the exposure",
+        )
     return Streak(pixels, times, saturated, metadata, source=str(path))
 
 

@@ -13,7 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import FileFormatError, InputError, ShapeError, require_path
+from tofclip.errors import (
+    FileFormatError,
+    require,
+    require_path,
+    require_shape,
+)
 from tofclip.files import atomic_path, guard, require_bounded_dataset, translate_read_errors
 from tofclip.io.hamamatsu import SIGNATURE as ITEX_SIGNATURE
 from tofclip.io.hamamatsu import StreakFile, open_itex, open_tiff
@@ -169,8 +174,9 @@ class StreakStack:
         """Read one shot, counted from 0; `InputError` where there is none of that number."""
         import h5py
 
-        if not 0 <= number < len(self):
-            raise InputError(f"{self.path} holds shots 0..{len(self) - 1}, not {number}")
+        require(
+            0 <= number < len(self), f"{self.path} holds shots 0..{len(self) - 1}, not {number}"
+        )
         with guard(self.path, f"shot {number} is damaged"), h5py.File(self.path, "r") as file:
             counts = np.asarray(file["counts"][number], dtype=np.float32)
         return Streak(counts, self.row_times, source=f"{self.path} shot {number}")
@@ -196,11 +202,9 @@ def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
                 stored = file.create_dataset("counts", (0, *shape), np.float32, **options)
                 if shot.row_times is not None:
                     file.create_dataset("row_times", data=shot.row_times).attrs["units"] = "s"
-            if shot.counts.shape != shape:
-                raise ShapeError(f"shot {number} of a stack", shape, shot.counts.shape)
+            require_shape(f"shot {number} of a stack", shape, shot.counts.shape)
             stored.resize(number + 1, axis=0)
             stored[number] = shot.counts
             number += 1
-        if number == 0:
-            raise InputError(f"{path}: there is no shot to write")
+        require(number != 0, f"{path}: there is no shot to write")
     return number

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require, require_shape
 from tofclip.light_field.views import LightField
 
 Array = NDArray[Any]
@@ -54,8 +54,10 @@ def find_smooth_labels(
     """
     if costs.ndim != 3:
         raise ShapeError("costs", "(labels, rows, columns)", costs.shape)
-    if not (np.all(np.isfinite(costs)) and smoothness >= 0):
-        raise InputError("costs must be finite and the smoothness zero or more")
+    require(
+        np.all(np.isfinite(costs)) and smoothness >= 0,
+        "costs must be finite and the smoothness zero or more",
+    )
     own = costs.astype(np.float32)
     messages = np.zeros((4, *own.shape), np.float32)  # from above, below, left, right
     for _ in range(iterations if smoothness > 0 else 0):
@@ -115,15 +117,16 @@ class FocalStack:
             raise ShapeError(
                 "the pictures of a focal stack", "(shears, rows, columns)", self.pictures.shape
             )
-        if not (np.all(np.isfinite(self.pictures)) and np.all(np.diff(self.shears) > 0)):
-            raise InputError("a focal stack needs finite pictures and ascending shears")
+        require(
+            np.all(np.isfinite(self.pictures)) and np.all(np.diff(self.shears) > 0),
+            "a focal stack needs finite pictures and ascending shears",
+        )
 
     def all_in_focus(self, depths: NDArray[np.int64]) -> Array:
         """Return the all-in-focus picture: each pixel from the picture whose number is in (rows,
         columns) `depths`.
         """
-        if depths.shape != self.pictures.shape[1:]:
-            raise ShapeError("the map of depths", self.pictures.shape[1:], depths.shape)
+        require_shape("the map of depths", self.pictures.shape[1:], depths.shape)
         found: Array = np.take_along_axis(self.pictures, depths[np.newaxis], axis=0)[0]
         return found
 
@@ -222,10 +225,9 @@ def estimate_depth_from_focus(
     )
     best = sharpness.max(axis=0)
     typical = float(np.quantile(best, TYPICAL_QUANTILE))
-    if typical == 0:
-        raise InputError(
-            "these pictures are even nearly everywhere; depth from focus needs texture"
-        )
+    require(
+        typical != 0, "these pictures are even nearly everywhere; depth from focus needs texture"
+    )
     # in units of a textured pixel's sharpness, so that the smoothness suits pictures of any
     # contrast
     return find_smooth_labels((best - sharpness) / typical, smoothness)

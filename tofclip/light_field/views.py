@@ -17,7 +17,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require, require_known, require_positive, require_shape
 from tofclip.operators import LinearShear
 from tofclip.operators.cameras import CAMERAS, EvenAngleLineCamera, LightFieldCamera
 from tofclip.operators.shear import View
@@ -56,14 +56,12 @@ class LightField(Storable):
         shape, expected = self.pictures.shape, (len(self.pictures), 2)
         if len(shape) != 3:
             raise ShapeError("the pictures of a light field", "(views, rows, columns)", shape)
-        if self.views.shape != expected:
-            raise ShapeError("the views of a light field", expected, self.views.shape)
-        if not np.all(np.isfinite(self.pictures)):
-            raise InputError("a light field must not hold NaN or infinity")
-        if np.ptp(self.pictures) == 0:
-            raise InputError(
-                "a light field whose pictures are all one even tone shows nothing to recover"
-            )
+        require_shape("the views of a light field", expected, self.views.shape)
+        require(np.all(np.isfinite(self.pictures)), "a light field must not hold NaN or infinity")
+        require(
+            np.ptp(self.pictures) != 0,
+            "a light field whose pictures are all one even tone shows nothing to recover",
+        )
 
     def refocus(self, shear: float, reference: tuple[float, float] = (0.0, 0.0)) -> NDArray[Any]:
         """Shift and add: each view is shifted back and the mean taken of those that see the pixel.
@@ -105,8 +103,10 @@ def make_view_warp(labels: Labels, shears: FloatArray, views: list[View]) -> Spa
     """
     if labels.ndim != 2 or min(labels.shape) < 2:
         raise ShapeError("a map of depths", "(rows, columns), two or more of either", labels.shape)
-    if not (np.all(np.diff(shears) > 0) and labels.min() >= 0 and labels.max() < shears.size):
-        raise InputError("a map of depths needs ascending shears and a number for each pixel")
+    require(
+        np.all(np.diff(shears) > 0) and labels.min() >= 0 and labels.max() < shears.size,
+        "a map of depths needs ascending shears and a number for each pixel",
+    )
     reach = max(float(np.max(np.abs(views))), 1.0)
     same = SAME_SURFACE_PX / reach
     nearest = {
@@ -194,8 +194,7 @@ class CameraSetup:
 
     def camera(self, image_shape: tuple[int, int], views: NDArray[np.float64]) -> LightFieldCamera:
         """Build the camera of views (v, u), (views, 2); the same setup builds the same one again."""
-        if self.encoder not in CAMERAS:
-            raise InputError(f"unknown encoder '{self.encoder}'; take one of {', '.join(CAMERAS)}")
+        require_known("encoder", self.encoder, CAMERAS)
         return CAMERAS[self.encoder](
             image_shape, [(v, u) for v, u in views.tolist()], self.sampling_ratio, self.seed
         )
@@ -220,26 +219,21 @@ class ClipMeasurement(Storable):
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
 
     def __post_init__(self) -> None:
-        if not np.all(np.isfinite(self.values)):
-            raise InputError("the measurements hold NaN or infinity")
-        if not self.values.any():
-            raise InputError("every reading is zero; there is nothing to recover")
+        require(np.all(np.isfinite(self.values)), "the measurements hold NaN or infinity")
+        require(self.values.any(), "every reading is zero; there is nothing to recover")
 
     def camera(self) -> LightFieldCamera:
         """Build the camera that made the measurements."""
         camera = self.setup.camera(self.image_shape, self.views)
-        if self.values.shape != (camera.measurements,):
-            raise ShapeError(
-                "the measurements of this camera", (camera.measurements,), self.values.shape
-            )
+        require_shape("the measurements of this camera", (camera.measurements,), self.values.shape)
         return camera
 
     def counts(self) -> NDArray[Any]:
         """Return the measurements in photons, (measurements,) float32."""
-        if self.photons_per_unit <= 0:
-            raise InputError(
-                "these measurements do not say how many photons they stand for; take squares or huber"
-            )
+        require(
+            self.photons_per_unit > 0,
+            "these measurements do not say how many photons they stand for; take squares or huber",
+        )
         counted: NDArray[Any] = self.values * np.float32(self.photons_per_unit)
         return counted
 
@@ -258,12 +252,12 @@ def corrupt_measurement(
     """Add the noise of so many photons of the largest measurement, None: no noise; then set a fraction
     of all measurements to 0 or to the largest, at random.
     """
-    if not 0 <= bad_fraction <= 1:
-        raise InputError(
-            f"the share of bad measurements must lie between 0 and 1, got {bad_fraction}"
-        )
-    if photons is not None and not (np.isfinite(photons) and photons > 0):
-        raise InputError(f"the number of photons must be positive, got {photons}")
+    require(
+        0 <= bad_fraction <= 1,
+        f"the share of bad measurements must lie between 0 and 1, got {bad_fraction}",
+    )
+    if photons is not None:
+        require_positive("the number of photons", photons)
     random = np.random.default_rng([measurement.setup.seed, 1])
     measurements = measurement.values.copy()
     largest = measurements.max()

@@ -29,7 +29,7 @@ from tofclip.arrays import (
     require_numpy,
     zeros,
 )
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError, ShapeError, require, require_shape
 
 Shape = tuple[int, ...]
 
@@ -67,8 +67,7 @@ class LinearOperator(ABC):
         self.shape_in = tuple(int(n) for n in shape_in)
         self.shape_out = tuple(int(n) for n in shape_out)
         self.dtype = np.dtype(dtype)
-        if self.dtype not in REAL_TYPES:
-            raise InputError(f"operators work in float32 or float64, not {self.dtype}")
+        require(self.dtype in REAL_TYPES, f"operators work in float32 or float64, not {self.dtype}")
         if min((*self.shape_in, *self.shape_out)) < 1:
             raise ShapeError(
                 "an operator", "at least one element on both sides", (shape_in, shape_out)
@@ -156,12 +155,11 @@ class Composition(LinearOperator):
     """``outer(inner(x))``."""
 
     def __init__(self, outer: LinearOperator, inner: LinearOperator) -> None:
-        if outer.shape_in != inner.shape_out:
-            raise ShapeError("the inner operator's result", outer.shape_in, inner.shape_out)
-        if outer.dtype != inner.dtype:
-            raise InputError(
-                f"cannot compose {outer.dtype} with {inner.dtype}; build both in one type"
-            )
+        require_shape("the inner operator's result", outer.shape_in, inner.shape_out)
+        require(
+            outer.dtype == inner.dtype,
+            f"cannot compose {outer.dtype} with {inner.dtype}; build both in one type",
+        )
         super().__init__(inner.shape_in, outer.shape_out, outer.dtype)
         self._set_parts(outer, inner)
 
@@ -220,8 +218,7 @@ class Diagonal(LinearOperator):
 
     def __init__(self, weights: ArrayLike, dtype: DTypeLike = np.float32) -> None:
         array = np.asarray(weights, dtype=dtype)
-        if not np.all(np.isfinite(array)):
-            raise InputError("weights must be finite")
+        require(np.all(np.isfinite(array)), "weights must be finite")
         super().__init__(array.shape, array.shape, dtype)
         self.weights = array
         self._weights = PerDevice(partial(ComputeDevice.put, values=array[..., np.newaxis]))
@@ -272,8 +269,7 @@ def estimate_squared_norm(operator: LinearOperator, iterations: int = 30, seed: 
         if beside[-1] <= np.finfo(operator.dtype).eps * max(diagonal):
             break  # x spans all that A'A makes of it: the value is exact
         before, x = x, y / number(beside[-1])
-    if max(diagonal) <= 0:
-        raise InputError(f"{operator!r} maps everything to zero")
+    require(max(diagonal) > 0, f"{operator!r} maps everything to zero")
     # Without orthogonalising anew, values come twice, but the largest one is right.
     values = scipy.linalg.eigvalsh_tridiagonal(diagonal, beside[1 : len(diagonal)])
     return float(values[-1])
@@ -283,17 +279,16 @@ def _require_alike(what: str, operators: Sequence[LinearOperator], joined: int) 
     """Return the first of operators whose shapes, but for the first `joined` axes of the result, and
     types are one.
     """
-    if not operators:
-        raise InputError(f"{what} needs at least one operator")
+    require(operators, f"{what} needs at least one operator")
     first = operators[0]
     for other in operators[1:]:
         if (other.shape_in, other.shape_out[joined:]) != (first.shape_in, first.shape_out[joined:]):
             shapes = (f"{one.shape_in} -> {one.shape_out}" for one in (first, other))
             raise ShapeError(f"every operator of {what}", *shapes)
-        if other.dtype != first.dtype:
-            raise InputError(
-                f"{what} cannot join {first.dtype} with {other.dtype}; build both in one type"
-            )
+        require(
+            other.dtype == first.dtype,
+            f"{what} cannot join {first.dtype} with {other.dtype}; build both in one type",
+        )
     return first
 
 
@@ -420,12 +415,11 @@ class ViewSelection(Selection):
         dtype: DTypeLike = np.float32,
     ) -> None:
         self.view_indices = np.asarray(kept, np.intp)
-        if np.unique(self.view_indices).size != self.view_indices.size or not np.all(
-            (self.view_indices >= 0) & (self.view_indices < light_field_shape[0])
-        ):
-            raise InputError(
-                f"views to keep must be different numbers from 0 to {light_field_shape[0] - 1}"
-            )
+        require(
+            np.unique(self.view_indices).size == self.view_indices.size
+            and np.all((self.view_indices >= 0) & (self.view_indices < light_field_shape[0])),
+            f"views to keep must be different numbers from 0 to {light_field_shape[0] - 1}",
+        )
         shape = (self.view_indices.size, *light_field_shape[1:])
         super().__init__(light_field_shape, shape, self.view_indices, dtype)
 
@@ -450,10 +444,8 @@ class MeanWeighting(LinearOperator):
     def __init__(
         self, counts: Sequence[int], weight: float = 0.02, dtype: DTypeLike = np.float32
     ) -> None:
-        if not counts or min(counts) < 1:
-            raise InputError("every view needs at least one reading")
-        if not 0 <= weight <= 1:
-            raise InputError(f"the weight of the mean must lie between 0 and 1, got {weight}")
+        require(counts and min(counts) >= 1, "every view needs at least one reading")
+        require(0 <= weight <= 1, f"the weight of the mean must lie between 0 and 1, got {weight}")
         super().__init__((sum(counts),), (sum(counts),), dtype)
         self._counts = np.asarray(counts)
         self._starts = np.cumsum(self._counts) - self._counts

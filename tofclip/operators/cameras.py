@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.errors import InputError
+from tofclip.errors import require, require_positive
 from tofclip.operators.base import (
     BlockDiagonal,
     Diagonal,
@@ -74,8 +74,7 @@ class LightFieldCamera(ABC):
     def __init__(
         self, image_shape: tuple[int, int], views: Sequence[View], sampling_ratio: float, seed: int
     ) -> None:
-        if not (np.isfinite(sampling_ratio) and sampling_ratio > 0):
-            raise InputError(f"the sampling ratio must be positive, got {sampling_ratio}")
+        require_positive("the sampling ratio", sampling_ratio)
         self.image_shape, self.views = image_shape, tuple(views)
         self.sampling_ratio, self.seed = sampling_ratio, seed
         self.used_views = self._assign_measurements()
@@ -117,10 +116,10 @@ AngleAssignment = tuple[tuple[int, ...], list[FloatArray]]
 def count_lines(image_shape: tuple[int, int], detector_px: int, sampling_ratio: float) -> int:
     """Return how many line detectors of `detector_px` make up the sampling ratio, at least 1."""
     count = round(sampling_ratio * image_shape[0] * image_shape[1] / detector_px)
-    if count < 1:
-        raise InputError(
-            f"a sampling ratio of {sampling_ratio} gives no view a projection; take a larger one"
-        )
+    require(
+        count >= 1,
+        f"a sampling ratio of {sampling_ratio} gives no view a projection; take a larger one",
+    )
     return count
 
 
@@ -210,10 +209,10 @@ class LineCamera(LightFieldCamera):
         for view, angles in zip(self.used_views, self.angles, strict=True):
             (v, u), (v_ref, u_ref) = self.views[view], reference
             down, right = shear * (v - v_ref), shear * (u - u_ref)
-            if not max(abs(down), abs(right)) < self.detector_px:
-                raise InputError(
-                    f"shear {shear} moves view {self.views[view]} out of the field; take a smaller one"
-                )
+            require(
+                max(abs(down), abs(right)) < self.detector_px,
+                f"shear {shear} moves view {self.views[view]} out of the field; take a smaller one",
+            )
             # the shift's component along the line's direction (cos, sin); the other one moves along
             # the integral
             offsets.append(right * np.cos(angles) + down * np.sin(angles))
@@ -285,11 +284,11 @@ class CompressiveCamera(LightFieldCamera):
 
     def _assign_measurements(self) -> tuple[int, ...]:
         self.exposures = round(self.sampling_ratio)
-        if self.exposures < 1 or self.exposures != self.sampling_ratio:
-            raise InputError(
-                "every exposure of this camera reads all pixels: its sampling ratio is their number, a whole one, "
-                f"not {self.sampling_ratio}"
-            )
+        require(
+            self.exposures >= 1 and self.exposures == self.sampling_ratio,
+            "every exposure of this camera reads all pixels: its sampling ratio is their number, a whole one, "
+            f"not {self.sampling_ratio}",
+        )
         self.measurements = self.exposures * self.image_shape[0] * self.image_shape[1]
         return tuple(range(len(self.views)))
 
@@ -331,10 +330,10 @@ class AshokCamera(ApertureMaskCamera):
     def _assign_measurements(self) -> tuple[int, ...]:
         used = super()._assign_measurements()
         self._order = 1 << (len(self.views) - 1).bit_length()
-        if self.exposures > self._order:
-            raise InputError(
-                f"{len(used)} views have at most {self._order} different masks, not {self.exposures}"
-            )
+        require(
+            self.exposures <= self._order,
+            f"{len(used)} views have at most {self._order} different masks, not {self.exposures}",
+        )
         return used
 
     def weights(self) -> FloatArray:
@@ -370,10 +369,10 @@ class MarwahCamera(CompressiveCamera):
 
     def _assign_measurements(self) -> tuple[int, ...]:
         used = super()._assign_measurements()
-        if self.exposures != 1:
-            raise InputError(
-                f"this camera takes one exposure, not {self.exposures}; set the sampling ratio to 1"
-            )
+        require(
+            self.exposures == 1,
+            f"this camera takes one exposure, not {self.exposures}; set the sampling ratio to 1",
+        )
         return used
 
     def codes(self) -> FloatArray:
@@ -398,11 +397,11 @@ class SinglePixelCamera(LightFieldCamera):
     def _assign_measurements(self) -> tuple[int, ...]:
         rows, columns = self.image_shape
         self.codes = round(self.sampling_ratio * rows * columns / len(self.views))
-        if self.codes < 1:
-            raise InputError(
-                f"a sampling ratio of {self.sampling_ratio} gives {len(self.views)} views less than one code each; "
-                "take a larger one"
-            )
+        require(
+            self.codes >= 1,
+            f"a sampling ratio of {self.sampling_ratio} gives {len(self.views)} views less than one code each; "
+            "take a larger one",
+        )
         self.measurements = self.codes * len(self.views)
         return tuple(range(len(self.views)))
 
@@ -438,8 +437,7 @@ class PointSpreadCamera(LightFieldCamera):
         spreads = trace_view_point_spreads(self.make_element(), self.views, self.image_shape)
         # Views behind closed cells are seen by no measurement; they are left out of the model.
         used = np.flatnonzero(spreads.any(axis=(1, 2)))
-        if used.size == 0:
-            raise InputError("the aperture lets no light through; take another seed")
+        require(used.size != 0, "the aperture lets no light through; take another seed")
         self._spreads = spreads[used]
         return tuple(int(view) for view in used)
 
@@ -522,17 +520,17 @@ class MeasuredCamera:
 def make_sparse_sensor(image_shape: tuple[int, int], sampling_ratio: float) -> PitchedSensor:
     """Spread as many pixels evenly over the picture as the sampling ratio, up to 1, asks for."""
     rows, columns = image_shape
-    if not 0 < sampling_ratio <= 1:
-        raise InputError(
-            f"one area sensor gives sampling ratios above 0 up to 1, not {sampling_ratio}"
-        )
+    require(
+        0 < sampling_ratio <= 1,
+        f"one area sensor gives sampling ratios above 0 up to 1, not {sampling_ratio}",
+    )
     # the same pitch on both axes, as far as whole numbers of pixels allow
     kept_rows = min(max(round(rows * np.sqrt(sampling_ratio)), 1), rows)
     kept_columns = min(round(sampling_ratio * rows * columns / kept_rows), columns)
-    if kept_columns < 1:
-        raise InputError(
-            f"a sampling ratio of {sampling_ratio} gives no sensor pixel; take a larger one"
-        )
+    require(
+        kept_columns >= 1,
+        f"a sampling ratio of {sampling_ratio} gives no sensor pixel; take a larger one",
+    )
     return PitchedSensor(image_shape, (rows / kept_rows, columns / kept_columns))
 
 

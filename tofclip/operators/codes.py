@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.arrays import Array
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require
 from tofclip.operators.base import (
     Adjoint,
     Composition,
@@ -43,10 +43,10 @@ class _Sensor(Selection):
     def __init__(
         self, plane_shape: tuple[int, int], pixels: NDArray[np.intp], dtype: DTypeLike
     ) -> None:
-        if pixels.size == 0:
-            raise InputError(
-                f"no pixel of the {tuple(plane_shape)} plane is read; check the sensor's mask and offset"
-            )
+        require(
+            pixels.size != 0,
+            f"no pixel of the {tuple(plane_shape)} plane is read; check the sensor's mask and offset",
+        )
         super().__init__(plane_shape, (pixels.size,), pixels, dtype)
         self.pixels = pixels
 
@@ -76,12 +76,14 @@ class PitchedSensor(_Sensor):
     ) -> None:
         axes = []
         for size, pitch, offset in zip(plane_shape, pitch_px, offset_px, strict=True):
-            if not (np.isfinite(pitch) and pitch >= 1):
-                raise InputError(f"a sensor's pitch must be at least one pixel, got {pitch}")
-            if not 0 <= offset < size:
-                raise InputError(
-                    f"a sensor's offset must lie on the plane of {size} px, got {offset}"
-                )
+            require(
+                np.isfinite(pitch) and pitch >= 1,
+                f"a sensor's pitch must be at least one pixel, got {pitch}",
+            )
+            require(
+                0 <= offset < size,
+                f"a sensor's offset must lie on the plane of {size} px, got {offset}",
+            )
             # The sum of many pitches must not fall short of a whole number by rounding.
             axes.append(np.floor(np.arange(offset, size, pitch) + 1e-9).astype(np.intp))
         rows, columns = axes
@@ -136,8 +138,7 @@ class HadamardCodes(LinearOperator):
         super().__init__(image_shape, (codes,), dtype)
         self._padded = tuple(1 << (size - 1).bit_length() for size in image_shape)
         cells = self._padded[0] * self._padded[1]
-        if codes > cells:
-            raise InputError(f"a {image_shape} picture has at most {cells} codes, not {codes}")
+        require(codes <= cells, f"a {image_shape} picture has at most {cells} codes, not {codes}")
         random = np.random.default_rng(seed)
         self._signs = random.choice(np.array([-1, 1], self.dtype), image_shape)[..., np.newaxis]
         rows, columns = np.unravel_index(random.choice(cells, codes, replace=False), self._padded)
@@ -198,8 +199,7 @@ class WeightedViews(LinearOperator):
         self.weights = np.asarray(weights, dtype=dtype)
         if self.weights.ndim != 2:
             raise ShapeError("mask weights", "(exposures, views)", self.weights.shape)
-        if not np.all(np.isfinite(self.weights)):
-            raise InputError("mask weights must be finite")
+        require(np.all(np.isfinite(self.weights)), "mask weights must be finite")
         exposures, views = self.weights.shape
         super().__init__(
             (views, *image_shape), (exposures * image_shape[0] * image_shape[1],), dtype

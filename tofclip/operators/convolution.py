@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.arrays import Array, FloatArray
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require
 from tofclip.operators.base import LinearOperator
 from tofclip.operators.shear import LinearShear, View
 
@@ -117,17 +117,16 @@ def validate_point_spread(point_spread: ArrayLike, image_shape: tuple[int, int])
     spread = np.asarray(point_spread, dtype=np.float64)
     if spread.ndim != 2 or 0 in spread.shape:
         raise ShapeError("a point-spread function", "(rows, columns)", spread.shape)
-    if any(size > limit for size, limit in zip(spread.shape, image_shape, strict=True)):
-        raise InputError(
-            f"a point-spread function of {spread.shape} px is larger than the picture of {tuple(image_shape)} px; "
-            "crop it or bin it to the picture's pixels"
-        )
-    if not np.all(np.isfinite(spread)):
-        raise InputError("a point-spread function must not hold NaN or infinity")
-    if not spread.any():
-        raise InputError(
-            "a point-spread function that is dark everywhere shows nothing; check its background"
-        )
+    require(
+        not any(size > limit for size, limit in zip(spread.shape, image_shape, strict=True)),
+        f"a point-spread function of {spread.shape} px is larger than the picture of {tuple(image_shape)} px; "
+        "crop it or bin it to the picture's pixels",
+    )
+    require(np.all(np.isfinite(spread)), "a point-spread function must not hold NaN or infinity")
+    require(
+        spread.any(),
+        "a point-spread function that is dark everywhere shows nothing; check its background",
+    )
     return spread
 
 
@@ -234,12 +233,13 @@ def make_coded_line(
     from the vertical, and shared between two columns where that is not a whole number.
     """
     rows, columns = shape
-    if not 1 <= width_px <= columns:
-        raise InputError(f"a coded line must be 1 to {columns} px wide, got {width_px}")
-    if not abs(angle) < np.pi / 2:
-        raise InputError(
-            f"a line's angle from the vertical must lie between -90 and 90 degrees, got {angle} rad"
-        )
+    require(
+        1 <= width_px <= columns, f"a coded line must be 1 to {columns} px wide, got {width_px}"
+    )
+    require(
+        abs(angle) < np.pi / 2,
+        f"a line's angle from the vertical must lie between -90 and 90 degrees, got {angle} rad",
+    )
     code = random.integers(0, 2, (rows, width_px))
     code[rows // 2, width_px // 2] = 1  # never dark altogether
     first = columns // 2 - width_px // 2
@@ -323,10 +323,10 @@ class Diffuser:
         from scipy.interpolate import RectBivariateSpline
         from scipy.ndimage import gaussian_filter
 
-        if not (self.grain > 0 and np.isfinite(self.spread_px)):
-            raise InputError(
-                f"a diffuser's grain must be positive and its spread finite, got {self}"
-            )
+        require(
+            self.grain > 0 and np.isfinite(self.spread_px),
+            f"a diffuser's grain must be positive and its spread finite, got {self}",
+        )
         # four cells a grain, so that the spline adds no wiggles
         cells = max(16, round(8 / self.grain))
         noise = np.random.default_rng(self.seed).standard_normal((cells, cells))
@@ -400,12 +400,14 @@ class MeasuredPointSpreads:
             expected = "(depths, rows, columns) and (depths,)"
             raise ShapeError("PSFs and their shears", expected, (spreads.shape, depths.shape))
         light = spreads.sum(axis=(1, 2))
-        if not (np.all(np.isfinite(depths)) and np.all(np.isfinite(light)) and np.all(light > 0)):
-            raise InputError(
-                "every measured PSF must be finite and hold light; check its background"
-            )
-        if np.unique(depths).size != depths.size:
-            raise InputError("two measured PSFs belong to the same shear; take the mean of both")
+        require(
+            np.all(np.isfinite(depths)) and np.all(np.isfinite(light)) and np.all(light > 0),
+            "every measured PSF must be finite and hold light; check its background",
+        )
+        require(
+            np.unique(depths).size == depths.size,
+            "two measured PSFs belong to the same shear; take the mean of both",
+        )
         order = np.argsort(depths)
         self.shears = depths[order]
         # the same light at every depth, whatever the exposures were
@@ -415,11 +417,11 @@ class MeasuredPointSpreads:
         """Return the PSF at one depth, (rows, columns), linearly between the two nearest that were
         measured.
         """
-        if not self.shears[0] <= shear <= self.shears[-1]:
-            raise InputError(
-                f"shear {shear} lies beyond the measured {self.shears[0]:g} ... {self.shears[-1]:g}; "
-                "measure a PSF there or refocus nearer"
-            )
+        require(
+            self.shears[0] <= shear <= self.shears[-1],
+            f"shear {shear} lies beyond the measured {self.shears[0]:g} ... {self.shears[-1]:g}; "
+            "measure a PSF there or refocus nearer",
+        )
         # Between two depths the PSFs are mixed: the shape changes slowly from one to the next.
         weights = [np.interp(shear, self.shears, own) for own in np.eye(self.shears.size)]
         return np.tensordot(weights, self.stack, 1)

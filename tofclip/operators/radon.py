@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.arrays import Array
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require
 from tofclip.operators.base import LinearOperator
 from tofclip.operators.sparse import SparseMatrix
 
@@ -64,8 +64,9 @@ class RadonProjection(SparseMatrix):
             raise ShapeError(
                 "angles and offsets", "(angles,) each", (self.angles.shape, self.offsets_px.shape)
             )
-        if not np.all(np.isfinite([self.angles, self.offsets_px])):
-            raise InputError("angles and offsets must be finite")
+        require(
+            np.all(np.isfinite([self.angles, self.offsets_px])), "angles and offsets must be finite"
+        )
         self.detector_px = detector_px
         # Not by way of SparseMatrix: the matrix is made if a block of frames or a caller asks for
         # it.

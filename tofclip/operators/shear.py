@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from tofclip.arrays import Array
-from tofclip.errors import InputError
+from tofclip.errors import require
 from tofclip.operators.base import LinearOperator
 
 View = tuple[float, float]
@@ -34,11 +34,11 @@ class _Shear(LinearOperator):
     ) -> None:
         super().__init__(image_shape, image_shape, dtype)
         self.shift_px = tuple(float(shear * (a - b)) for a, b in zip(view, reference, strict=True))
-        if not np.all(np.abs(self.shift_px) < np.asarray(image_shape)):
-            raise InputError(
-                f"shear {shear} moves view {view} by {self.shift_px} px, out of a {image_shape} picture; "
-                "take a shear nearer to zero"
-            )
+        require(
+            np.all(np.abs(self.shift_px) < np.asarray(image_shape)),
+            f"shear {shear} moves view {view} by {self.shift_px} px, out of a {image_shape} picture; "
+            "take a shear nearer to zero",
+        )
 
     def _forward(self, block: Array) -> Array:
         return self._shift(block, self.shift_px[0], self.shift_px[1])

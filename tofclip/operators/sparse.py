@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.arrays import Array, ComputeDevice, PerDevice, is_numpy, namespace
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require, require_shape
 from tofclip.operators.base import LinearOperator, Shape
 from tofclip.threads import LANES, run_blocks, split_blocks
 
@@ -137,10 +137,8 @@ class SparseMatrix(LinearOperator):
         super().__init__(shape_in, shape_out, matrix.dtype)
         matrix = matrix.tocsr()
         expected = (int(np.prod(shape_out)), int(np.prod(shape_in)))
-        if matrix.shape != expected:
-            raise ShapeError("the sparse matrix", expected, matrix.shape)
-        if not np.all(np.isfinite(matrix.data)):
-            raise InputError("the sparse matrix must be finite")
+        require_shape("the sparse matrix", expected, matrix.shape)
+        require(np.all(np.isfinite(matrix.data)), "the sparse matrix must be finite")
         # Products wait for memory: half as long an index is a third less to read.
         starts = matrix.indptr.astype(np.int32 if matrix.nnz < 1 << 31 else np.int64)
         parts = (matrix.data, matrix.indices.astype(np.int32), starts)

@@ -25,7 +25,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import ArrayLike, NDArray
 
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import require, require_known, require_positive, require_shape
 from tofclip.light_field import FocalStack, LightField, estimate_depth_from_focus
 from tofclip.light_field.views import ClipMeasurement, make_view_warp
 from tofclip.operators import Diagonal, Identity, LinearOperator, ViewSelection
@@ -111,11 +111,11 @@ class ClipRecovery:
 
     def __post_init__(self) -> None:
         if not (_is_variational(self.prior) or self.prior in DENOISERS):
-            _require_known("prior", self.prior, [*VARIATIONAL_PRIORS, *DENOISERS])
-        _require_known("preset", self.preset, list(PRESETS))
-        _require_known("data term", self.data_term, list(DATA_TERMS))
-        if self.weight is not None and not (np.isfinite(self.weight) and self.weight > 0):
-            raise InputError(f"the prior's weight must be positive, got {self.weight}")
+            require_known("prior", self.prior, [*VARIATIONAL_PRIORS, *DENOISERS])
+        require_known("preset", self.preset, PRESETS)
+        require_known("data term", self.data_term, DATA_TERMS)
+        if self.weight is not None:
+            require_positive("the prior's weight", self.weight)
 
     @property
     def work(self) -> int:
@@ -166,10 +166,10 @@ class ClipRecovery:
         if self.data_term != "poisson":
             seen = weighting(measurement.values)[:, np.newaxis]
             return _InverseProblem(weighting @ model, seen, near, LeastSquares)
-        if not isinstance(weighting, Identity):
-            raise InputError(
-                f"measurements of a {camera.name} camera all have about the same photon noise; take squares"
-            )
+        require(
+            isinstance(weighting, Identity),
+            f"measurements of a {camera.name} camera all have about the same photon noise; take squares",
+        )
         counts = measurement.counts()
         # dark measurements count no more than a quarter of the mean: they would hold up the convergence
         # of all others
@@ -225,10 +225,10 @@ def recover_light_field(
     camera, views = measurement.camera(), measurement.views
     down, across = (np.unique(views[:, axis]) for axis in (0, 1))
     complete = np.stack(np.meshgrid(down, across, indexing="ij"), axis=-1).reshape(-1, 2)
-    if complete.shape != views.shape or not np.array_equal(complete, views):
-        raise InputError(
-            "a light field is recovered from a complete grid of views, row by row; some are missing"
-        )
+    require(
+        complete.shape == views.shape and np.array_equal(complete, views),
+        "a light field is recovered from a complete grid of views, row by row; some are missing",
+    )
     weighting = camera.weighting()
     used = ViewSelection((len(views), *measurement.image_shape), camera.used_views)
     model = weighting @ camera.light_field_model() @ used
@@ -274,11 +274,6 @@ def _is_variational(prior: str) -> bool:
     return own and ProximalMethod in getattr(METHODS[prior], "__mro__", ())
 
 
-def _require_known(what: str, name: str, known: list[str]) -> None:
-    if name not in known:
-        raise InputError(f"unknown {what} '{name}'; take one of {', '.join(known)}")
-
-
 # The weight is relative to the largest A'f, and far below that of refocusing, as nothing is out of
 # focus: 3e-5 to 3e-3 on rendered scenes without noise. One fold of eight, stopped early, finds it;
 # eight folds would take longer than all the rest.
@@ -322,10 +317,10 @@ def make_shear_range(
     """Return shears, (depths,), to look for surfaces at between two of them, pixels per view step, as
     close as the views, (views, 2) of (v, u) in view steps, can tell them apart.
     """
-    if not (np.isfinite([nearest, farthest]).all() and nearest < farthest):
-        raise InputError(
-            f"surfaces are looked for from a smaller shear to a larger one, not from {nearest} to {farthest}"
-        )
+    require(
+        np.isfinite([nearest, farthest]).all() and nearest < farthest,
+        f"surfaces are looked for from a smaller shear to a larger one, not from {nearest} to {farthest}",
+    )
     step = SHEAR_STEP_PX / max(float(np.abs(views).max()), 1.0)
     return np.linspace(nearest, farthest, 1 + int(np.ceil((farthest - nearest) / step - 1e-9)))
 
@@ -345,8 +340,10 @@ def recover_all_in_focus(
     """
     began = perf_counter()
     depths = np.asarray(shears, np.float64)
-    if depths.ndim != 1 or depths.size < 2 or not np.all(np.diff(depths) > 0):
-        raise InputError("depths are looked for among two or more ascending shears")
+    require(
+        depths.ndim == 1 and depths.size >= 2 and np.all(np.diff(depths) > 0),
+        "depths are looked for among two or more ascending shears",
+    )
     refocusing = recovery or ClipRecovery()
     # the weight found in the middle serves all depths
     camera = measurement.camera()
@@ -385,11 +382,9 @@ def recover_on_depth_map(
     cross-validation if not given.
     """
     began = perf_counter()
-    if shears.shape != measurement.image_shape:
-        raise ShapeError("the map of shears", measurement.image_shape, shears.shape)
+    require_shape("the map of shears", measurement.image_shape, shears.shape)
     known = np.isfinite(shears)
-    if not known.any():
-        raise InputError("the map of shears is nowhere finite")
+    require(known.any(), "the map of shears is nowhere finite")
     step = 2 * MAP_ERROR_PX / max(float(np.abs(measurement.views).max()), 1.0)
     # where there is nothing it is dark, at whatever depth: the farthest hides nothing
     filled = np.where(known, shears, shears[known].max())

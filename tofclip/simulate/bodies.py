@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require
 
 Array = NDArray[Any]
 Vector = tuple[float, float, float]
@@ -159,10 +159,10 @@ class Lambertian:
         known = self.pattern[np.isfinite(self.pattern)]
         if self.pattern.ndim != 2:
             raise ShapeError("a pattern of reflectances", "(rows, columns)", self.pattern.shape)
-        if known.size == 0 or known.min() < 0 or known.max() > 1:
-            raise InputError(
-                "a pattern's reflectances must lie within 0..1 where they are not NaN, and some must be"
-            )
+        require(
+            known.size != 0 and known.min() >= 0 and known.max() <= 1,
+            "a pattern's reflectances must lie within 0..1 where they are not NaN, and some must be",
+        )
 
     def reflectance(self, place: Array) -> Array:
         """Return the pattern's values at (points, 2) places from 0 to 1, right and down."""

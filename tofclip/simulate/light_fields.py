@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require
 from tofclip.light_field import LightField
 from tofclip.operators.shear import View
 from tofclip.simulate.bodies import (
@@ -52,8 +52,10 @@ class CameraArray:
     def __post_init__(self) -> None:
         counts = (*self.image_shape, *self._view_counts, self.samples)
         lengths = (*counts, self.focal_length_px, self.view_step, self.focus)
-        if not all(np.isfinite(length) and length > 0 for length in lengths):
-            raise InputError("every count and length of a camera array must be positive")
+        require(
+            all(np.isfinite(length) and length > 0 for length in lengths),
+            "every count and length of a camera array must be positive",
+        )
 
     @property
     def _view_counts(self) -> tuple[int, int]:
@@ -82,10 +84,10 @@ class CameraArray:
     def depth(self, shear: float) -> float:
         """Distance along z, m, of points with a shear; `InputError` where it lies beyond infinity."""
         inverse = 1 / self.focus - shear / (self.focal_length_px * self.view_step)
-        if not inverse > 0:
-            raise InputError(
-                f"shear {shear} lies beyond infinity for this camera array; take a smaller one"
-            )
+        require(
+            inverse > 0,
+            f"shear {shear} lies beyond infinity for this camera array; take a smaller one",
+        )
         return 1 / inverse
 
     def point(self, x: float, y: float, shear: float) -> FloatArray:
@@ -120,10 +122,8 @@ class Scene:
     light: tuple[float, float, float] = LIGHT_DIRECTION
 
     def __post_init__(self) -> None:
-        if not self.bodies:
-            raise InputError("a scene needs at least one body")
-        if not np.linalg.norm(self.light) > 0:
-            raise InputError("the direction towards the lamp must not be zero")
+        require(self.bodies, "a scene needs at least one body")
+        require(np.linalg.norm(self.light) > 0, "the direction towards the lamp must not be zero")
 
 
 @dataclass(frozen=True)
@@ -204,8 +204,7 @@ class PulsedScene:
     lamps: FloatArray  # (lamps, 3), where they stand, m; all before the bodies
 
     def __post_init__(self) -> None:
-        if not self.bodies:
-            raise InputError("a scene needs at least one body")
+        require(self.bodies, "a scene needs at least one body")
         if self.lamps.ndim != 2 or self.lamps.shape[1] != 3 or not len(self.lamps):
             raise ShapeError("the lamps' places", "(lamps, 3)", self.lamps.shape)
 
@@ -221,8 +220,10 @@ class TimeAxis:
 
     def __post_init__(self) -> None:
         durations = (self.bin_width, self.bins, self.pulse_fwhm)
-        if not (np.isfinite(self.start) and all(np.isfinite(one) and one > 0 for one in durations)):
-            raise InputError("bins, their width and the pulse must be positive, the start finite")
+        require(
+            np.isfinite(self.start) and all(np.isfinite(one) and one > 0 for one in durations),
+            "bins, their width and the pulse must be positive, the start finite",
+        )
 
     @property
     def times(self) -> FloatArray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import InputError
+from tofclip.errors import require, require_known
 
 Outline = NDArray[np.float64]
 Pattern = NDArray[np.float32]
@@ -56,8 +56,7 @@ LETTERS: dict[str, list[Outline]] = {
 
 def make_letter(name: str) -> list[Outline]:
     """Outlines of a capital letter of `LETTERS`."""
-    if name not in LETTERS:
-        raise InputError(f"no outline is known for '{name}'; known are {', '.join(LETTERS)}")
+    require_known("letter", name, LETTERS)
     return LETTERS[name]
 
 
@@ -114,8 +113,9 @@ def make_text_pattern(
     from matplotlib.textpath import TextPath
 
     lines = text.split("\n")
-    if not all(line.strip() for line in lines):
-        raise InputError("every line of a writing needs at least one letter")
+    require(
+        all(line.strip() for line in lines), "every line of a writing needs at least one letter"
+    )
     font = FontProperties(family="DejaVu Sans", weight="bold")
     step = (1 - 2 * margin) / (len(lines) * LINE_SPACING - LINE_SPACING + 1)
     middle = (np.arange(TEXT_TEXELS) + 0.5) / TEXT_TEXELS
@@ -134,10 +134,10 @@ def make_mottled_pattern(dark: float, bright: float, grains: int, seed: int) -> 
     """Smooth random blotches, about `grains` across the pattern, with every brightness from dark to
     bright: white noise through a Gaussian low-pass whose width is the number of grains.
     """
-    if not 0 < grains < TEXT_TEXELS:
-        raise InputError(
-            f"a mottled pattern has from 1 to {TEXT_TEXELS - 1} grains across, not {grains}"
-        )
+    require(
+        0 < grains < TEXT_TEXELS,
+        f"a mottled pattern has from 1 to {TEXT_TEXELS - 1} grains across, not {grains}",
+    )
     shape = (TEXT_TEXELS, TEXT_TEXELS)
     spectrum = np.fft.rfft2(np.random.default_rng(seed).standard_normal(shape))
     down, across = np.fft.fftfreq(TEXT_TEXELS)[:, np.newaxis], np.fft.rfftfreq(TEXT_TEXELS)

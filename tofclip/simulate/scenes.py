@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from tofclip.errors import InputError
+from tofclip.errors import require_known
 from tofclip.simulate.bodies import (
     Body,
     Box,
@@ -73,8 +73,7 @@ class _SceneBuilder:
 
 def make_scene(name: str, array: CameraArray) -> Scene:
     """Return a scene of `SCENES`, sized for a camera array."""
-    if name not in SCENES:
-        raise InputError(f"unknown scene '{name}'; take one of {', '.join(SCENES)}")
+    require_known("scene", name, SCENES)
     return SCENES[name](_SceneBuilder(array))
 
 
@@ -82,8 +81,7 @@ def edit_scene(scene: Scene, edit: str) -> Scene:
     """Change what stands before the backdrop, in 3D (generalised flip test, supplement Note 6).
     `edit`: ``original``, ``shift``, ``flip`` or ``rotate``.
     """
-    if edit not in EDITS:
-        raise InputError(f"unknown edit '{edit}'; take one of {', '.join(EDITS)}")
+    require_known("edit", edit, EDITS)
     backdrop, *others = scene.bodies
     return replace(scene, bodies=(backdrop, *(EDITS[edit](body) for body in others)))
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import require, require_shape
 from tofclip.lidar import Returns
 from tofclip.shots import Frames, Streak
 from tofclip.simulate.bodies import (
@@ -77,8 +77,10 @@ def make_plate(
     array([2.])
     """
     material = Lambertian(np.array(reflectance, dtype=np.float32))
-    if min(size) <= 0 or not np.all(np.isfinite([*centre, *size, yaw, pitch])):
-        raise InputError("a plate needs a finite position and a positive size")
+    require(
+        min(size) > 0 and np.all(np.isfinite([*centre, *size, yaw, pitch])),
+        "a plate needs a finite position and a positive size",
+    )
     right = np.array([np.cos(yaw), 0.0, np.sin(yaw)])
     # The plate is turned about the vertical first, so that its own horizontal axis stays level.
     ahead = np.array([-np.sin(yaw), 0.0, np.cos(yaw)])
@@ -119,8 +121,7 @@ class Scene:
     lamp: Vector = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not self.bodies:
-            raise InputError("a scene needs at least one body")
+        require(self.bodies, "a scene needs at least one body")
 
     def trace(self, viewpoint: FloatArray, directions: FloatArray) -> RayCast:
         """Follow rays from (3,) `viewpoint`, m, along (n, 3) `directions`, all with z > 0, to the
@@ -176,14 +177,14 @@ class StreakDetector:
     full_scale_photons: float = 65535.0
 
     def __post_init__(self) -> None:
-        if not (self.rows >= 1 and self.bin_width > 0):
-            raise InputError(
-                f"a detector needs rows and a positive bin width, got {self.rows} and {self.bin_width}"
-            )
-        if not (self.peak_photons > 0 <= self.background_photons and self.full_scale_photons > 0):
-            raise InputError(
-                "peak and full scale must be positive numbers of photons, the background not negative"
-            )
+        require(
+            self.rows >= 1 and self.bin_width > 0,
+            f"a detector needs rows and a positive bin width, got {self.rows} and {self.bin_width}",
+        )
+        require(
+            self.peak_photons > 0 <= self.background_photons and self.full_scale_photons > 0,
+            "peak and full scale must be positive numbers of photons, the background not negative",
+        )
 
     @property
     def row_times(self) -> FloatArray:
@@ -221,8 +222,10 @@ class Instrument:
     rays_per_pixel_side: int = 4
 
     def __post_init__(self) -> None:
-        if not self.rays_per_pixel_side >= 1:
-            raise InputError(f"the number of rays must be positive, got {self.rays_per_pixel_side}")
+        require(
+            self.rays_per_pixel_side >= 1,
+            f"the number of rays must be positive, got {self.rays_per_pixel_side}",
+        )
 
     def viewpoint(self, position: float) -> FloatArray:
         """Where the view at `position` view steps stands, m."""
@@ -455,12 +458,10 @@ def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
         Another picture size, or no target pixel with a return.
     """
     distance = returns.image("range")
-    if distance.shape != truth.range.shape:
-        raise ShapeError("the returns' picture", truth.range.shape, distance.shape)
+    require_shape("the returns' picture", truth.range.shape, distance.shape)
     error = np.abs(distance - truth.range)[truth.target]
     found = np.isfinite(error)
-    if not found.any():
-        raise InputError("no target pixel of the truth has a return")
+    require(found.any(), "no target pixel of the truth has a return")
     sigma = returns.image("confidence")[truth.target]
     ratio = error[found] / np.maximum(sigma[found], np.finfo(np.float32).tiny)
     bin_m = SPEED_OF_LIGHT * truth.bin_width / 2
@@ -526,10 +527,10 @@ def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedS
     light = np.zeros((detector.rows, camera.slit_width_px))
     for view, position in enumerate(camera.view_positions):
         light += render_streak(cast_view_rays(scene, instrument, float(position)), view, instrument)
-    if not light.any():
-        raise InputError(
-            "no light of the scene reaches the streak image: check positions, number of rows and time zero"
-        )
+    require(
+        light.any(),
+        "no light of the scene reaches the streak image: check positions, number of rows and time zero",
+    )
     # Scaled by the brightest pixel, as one opens the iris of a real camera until it almost
     # saturates.
     exposure = detector.peak_photons / float(light.max())

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, scalar_like
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require, require_positive
 
 Mask = Array | None
 
@@ -116,8 +116,7 @@ class ClippedSquares(DataTerm):
     """
 
     def __init__(self, measurements: Array, valid: Mask = None, *, limit: float) -> None:
-        if not (np.isfinite(limit) and limit > 0):
-            raise InputError(f"the limit of measurements must be positive, got {limit}")
+        require_positive("the limit of measurements", limit)
         super().__init__(measurements, valid)
         self._clipped = measurements >= scalar_like(limit, measurements)
 
@@ -145,8 +144,7 @@ class Huber(_SquaredNearZero):
     """
 
     def __init__(self, measurements: Array, valid: Mask = None, *, threshold: float) -> None:
-        if not (np.isfinite(threshold) and threshold > 0):
-            raise InputError(f"Huber's threshold must be positive, got {threshold}")
+        require_positive("Huber's threshold", threshold)
         super().__init__(measurements, valid)
         self.threshold = scalar_like(threshold, measurements)
 
@@ -182,8 +180,10 @@ class Poisson(DataTerm):
     CURVATURE = 4.0  # at the knee, where it is largest
 
     def __init__(self, measurements: Array, valid: Mask = None, *, deviation: Array) -> None:
-        if namespace(measurements).min(measurements) < 0:
-            raise InputError("photon counts must not be negative; take the data term of squares")
+        require(
+            namespace(measurements).min(measurements) >= 0,
+            "photon counts must not be negative; take the data term of squares",
+        )
         super().__init__(measurements, valid)
         beside = ComputeDevice.of(measurements).put(deviation)
         self.deviation = namespace(measurements).astype(beside, measurements.dtype)[:, None]
@@ -220,6 +220,7 @@ def estimate_robust_deviation(residual: Array) -> float:
     """Return the standard deviation that Gaussian errors with the median size of `residual` have."""
     # the median size of Gaussian numbers is 1 / 1.4826 of their standard deviation
     deviation = 1.4826 * float(np.median(np.abs(residual)))
-    if not deviation > 0:
-        raise InputError("most measurements are met exactly; there is nothing to be robust against")
+    require(
+        deviation > 0, "most measurements are met exactly; there is nothing to be robust against"
+    )
     return deviation

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import Array, require_numpy
-from tofclip.errors import InputError, MissingDependencyError, ShapeError
+from tofclip.errors import MissingDependencyError, require, require_shape
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm, DataTermMaker, Mask
 from tofclip.solvers.fista import ProximalMethod, TotalVariation
@@ -95,12 +95,11 @@ class CollaborativeWiener:
         """Return the picture without its noise."""
         from tofclip.solvers.denoiser_kernels import filter_patch_groups
 
-        if pilot.shape != noisy.shape:
-            raise ShapeError("the pilot picture", noisy.shape, pilot.shape)
-        if min(noisy.shape) < self.patch_px:
-            raise InputError(
-                f"a picture of {noisy.shape} is smaller than a patch of {self.patch_px} px"
-            )
+        require_shape("the pilot picture", noisy.shape, pilot.shape)
+        require(
+            min(noisy.shape) >= self.patch_px,
+            f"a picture of {noisy.shape} is smaller than a patch of {self.patch_px} px",
+        )
         settings = (self.patch_px, self.stride_px, self.reach_px, self.group)
         pictures = (np.ascontiguousarray(one, np.float32) for one in (noisy, pilot))
         clean = filter_patch_groups(*pictures, np.float32(deviation), settings)
@@ -144,10 +143,11 @@ class PlugAndPlay(Method):
     _returns_fitted = False
 
     def __post_init__(self) -> None:
-        if self.calls < 1:
-            raise InputError(f"at least one call of the denoiser is needed, got {self.calls}")
-        if not (self.strength > 0 and self.coupling > 0):
-            raise InputError("strength and coupling of a denoiser must be positive")
+        require(self.calls >= 1, f"at least one call of the denoiser is needed, got {self.calls}")
+        require(
+            self.strength > 0 and self.coupling > 0,
+            "strength and coupling of a denoiser must be positive",
+        )
 
     def recover(
         self,

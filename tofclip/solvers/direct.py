@@ -25,7 +25,7 @@ from tofclip.arrays import (
     namespace,
     to_numpy,
 )
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_positive
 from tofclip.operators import LinearOperator, SparseMatrix
 from tofclip.operators.sparse import Tiles
 from tofclip.solvers.data_terms import Mask
@@ -91,8 +91,7 @@ class LinearInverse(Method):
             raise InputError(
                 f"the linear inverse needs a sparse matrix, not {operator!r}; use l1 or tv"
             )
-        if not (np.isfinite(self.damping) and self.damping > 0):
-            raise InputError(f"damping must be positive, got {self.damping}")
+        require_positive("damping", self.damping)
         if alive is None:
             alive = np.ones(operator.shape_out, bool)
         mu = self.damping * operator.squared_norm

@@ -26,7 +26,7 @@ from tofclip.arrays import (
     to_numpy,
     zeros,
 )
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm, DataTermMaker, LeastSquares, Mask
 from tofclip.solvers.methods import (
@@ -293,10 +293,9 @@ class ProximalMethod(Method):
             blocks.write(first.current, slice(0, 1))
         setup_seconds = time.perf_counter() - started
         peaks, pulls, values = self._look_at_zero(operator, blocks, measurements, valid)
-        if not peaks.max() > 0:
-            raise InputError(
-                "no view sees anything positive; was too high a background subtracted?"
-            )
+        require(
+            peaks.max() > 0, "no view sees anything positive; was too high a background subtracted?"
+        )
         # With max(A'f) as weight the l1 solution is zero: relative weights suit shots of any
         # brightness.
         weight = self.weight * float(peaks.max())
@@ -482,10 +481,10 @@ def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
     if -(-count // run) < FOLD_COUNT:
         run = max(1, count // FOLD_COUNT)
     runs = -(-count // run)
-    if runs < 2:
-        raise InputError(
-            "one measurement alone cannot choose its own prior's weight; give the weight as a number"
-        )
+    require(
+        runs >= 2,
+        "one measurement alone cannot choose its own prior's weight; give the weight as a number",
+    )
     dealt = np.random.default_rng(seed).permutation(runs) % min(FOLD_COUNT, runs)
     # This many runs in one fold already give the error to a few percent.
     used = 1 if runs >= SINGLE_FOLD_RUNS else min(FOLD_COUNT, runs)

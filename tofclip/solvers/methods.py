@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import Array, as_type, is_numpy, namespace, to_numpy, zeros
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError, require
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTermMaker, Mask
 from tofclip.threads import LANES, run_blocks, split_blocks
@@ -69,14 +69,14 @@ class StoppingRule:
     noise_fall: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise InputError(f"at least one iteration is needed, got {self.iterations}")
+        require(self.iterations >= 1, f"at least one iteration is needed, got {self.iterations}")
         for name in ("tolerance", "gap", "noise_fall"):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"{name} must be finite and not negative, got {value}")
-        if self.further < 0:
-            raise InputError(f"further iterations must not be negative, got {self.further}")
+            require(
+                np.isfinite(value) and value >= 0,
+                f"{name} must be finite and not negative, got {value}",
+            )
+        require(self.further >= 0, f"further iterations must not be negative, got {self.further}")
 
     def _follows_noise(self, objective: Sequence[Array]) -> bool:
         """Whether a block of little more than noise has come as near to it as it should, given its
@@ -320,8 +320,7 @@ def relative_residual(
         residual = (operator(xp.moveaxis(frames[piece, ...], 0, -1)) - seen) * mask
         misfit += float(xp.sum(residual**2, dtype=xp.float64))
         energy += float(xp.sum((seen * mask) ** 2, dtype=xp.float64))
-    if energy == 0:
-        raise InputError("every valid measurement is zero; there is nothing to compare with")
+    require(energy != 0, "every valid measurement is zero; there is nothing to compare with")
     return float(np.sqrt(misfit / energy))
 
 
@@ -336,8 +335,10 @@ def validate_measurements(operator: LinearOperator, measurements: Array, valid: 
     if valid is not None and valid.shape != measurements.shape:
         shapes = tuple(measurements.shape), tuple(valid.shape)
         raise ShapeError("the mask of valid measurements", *shapes)
-    if not xp.all(xp.isfinite(measurements)):
-        raise InputError("measurements must not hold NaN or infinity; mark bad ones in `valid`")
+    require(
+        xp.all(xp.isfinite(measurements)),
+        "measurements must not hold NaN or infinity; mark bad ones in `valid`",
+    )
     return as_type(measurements, operator.dtype)
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from tofclip.arrays import Array, clip_values, is_numpy, namespace, zeros
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import require, require_shape
 
 TINY = 1e-300
 
@@ -72,10 +72,10 @@ class _Prior:
     zero_bound = 0.0
 
     def __init__(self, weight: float) -> None:
-        if not (np.isfinite(weight) and weight >= 0):
-            raise InputError(
-                f"a regularisation weight must be finite and not negative, got {weight}"
-            )
+        require(
+            np.isfinite(weight) and weight >= 0,
+            f"a regularisation weight must be finite and not negative, got {weight}",
+        )
         self.weight = float(weight)
 
     def scale_dual(self, pull: Array) -> Array | None:
@@ -245,21 +245,21 @@ class NonnegativeLightFieldVariation(_Prior):
 
     def __init__(self, weight: float, grid: tuple[int, int], angular: float) -> None:
         super().__init__(weight)
-        if not (np.isfinite(angular) and angular >= 0):
-            raise InputError(f"the angular weight must be finite and not negative, got {angular}")
+        require(
+            np.isfinite(angular) and angular >= 0,
+            f"the angular weight must be finite and not negative, got {angular}",
+        )
         self.grid, self.angular = grid, angular
         self._dual: Array | None = None
 
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
     ) -> ProximalStep:
-        """As `Regulariser.proximal_step`."""
-        """Take a step of one size for all lanes."""
+        """As `Regulariser.proximal_step`, of one size for all lanes."""
         from tofclip.solvers import kernels
 
         views, rows, columns, lanes = current.shape
-        if views != self.grid[0] * self.grid[1]:
-            raise ShapeError("the light field's views", self.grid[0] * self.grid[1], views)
+        require_shape("the light field's views", (self.grid[0] * self.grid[1],), (views,))
         _descend(current, previous, momentum, gradient, step)
         number = current.dtype.type
         weight, angular = number(step[0] * self.weight), number(self.angular)
@@ -318,8 +318,7 @@ class NonnegativeWavelets(_Prior):
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
     ) -> ProximalStep:
-        """As `Regulariser.proximal_step`."""
-        """Take a step of one size for all lanes."""
+        """As `Regulariser.proximal_step`, of one size for all lanes."""
         _descend(current, previous, momentum, gradient, step)
         previous[:] = 0
         penalty = np.zeros(current.shape[-1])
