@@ -216,12 +216,14 @@ class PhotonPipeline:
 
     def _pool(self, terms: Float64Array, ranges: Float64Array, near: float) -> Float64Array:
         """Add up what the pixels around each one say, (terms, pixels), that are as near as that, m."""
-        stack = np.concatenate([ranges[np.newaxis], terms]).reshape(-1, *self.camera.image_shape)
-        edge, square = POOL_PX // 2, (POOL_PX, POOL_PX)
+        rows, columns = self.camera.image_shape
+        stack = np.concatenate([ranges[np.newaxis], terms]).reshape(-1, rows, columns)
+        edge, total = POOL_PX // 2, np.zeros_like(stack[1:])
         padded = np.pad(stack, ((0, 0), (edge, edge), (edge, edge)), constant_values=np.nan)
-        around, *further = np.lib.stride_tricks.sliding_window_view(padded, square, (1, 2))
-        same = np.abs(around - stack[0][..., np.newaxis, np.newaxis]) < near
-        return np.stack([np.sum(one, axis=(2, 3), where=same).ravel() for one in further])
+        for down, right in np.ndindex(POOL_PX, POOL_PX):
+            around = padded[:, down : down + rows, right : right + columns]
+            total += np.where(np.abs(around[0] - stack[0]) < near, around[1:], 0)
+        return total.reshape(len(terms), -1)
 
 
 def list_step_errors(detector: PhotonDetector) -> Float64Array:
