@@ -232,12 +232,10 @@ def _load_bins(path: Path, what: str) -> np.ndarray[Any, Any]:
     """Read one number for each bin."""
     import numpy as np
 
-    try:
+    from tofclip.files import guard
+
+    with guard(path, f"is not a NumPy file with {what}"):
         samples = np.load(path, mmap_mode="r", allow_pickle=False)
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror or fault}") from fault
-    except Exception as fault:  # whatever the decoder stumbles over
-        raise InputError(f"{path}: is not a NumPy file with {what}") from fault
     if samples.ndim != 1 or samples.dtype.kind not in "uif" or not 3 <= samples.size <= 1 << 20:
         raise InputError(f"{path}: must hold one number for each bin, found {samples.shape}")
     return np.asarray(samples, dtype=np.float64)

@@ -22,7 +22,6 @@ from tofclip.lidar.photons import (
     locate_with_smoothness,
     measure_accuracy,
 )
-from tofclip.lidar.photons.scene import remove_bumps
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN = 20e-12
@@ -370,13 +369,3 @@ def test_without_costs_every_pixel_stands_alone(detector):
     # wherever its light is, and whatever its neighbours see
     moved = other.range - metres(30 * BIN)
     assert np.roll(moved, -5, axis=0) == pytest.approx(one.range, abs=1e-9)
-
-
-def test_a_bump_is_taken_off_a_background_that_rises():
-    """A surface's light, without noise, on a slope: what is left beneath it is the slope."""
-    bins = np.arange(400)
-    slope = 1000.0 + 10 * bins
-    bump = 3000 * np.exp2(-((2 * (bins - 200) / 12) ** 2))
-    left = remove_bumps(slope + bump, slope + bump, 12.0)
-    # The bump's own tails lie in the flanks, a hundredth of its height at their inner ends.
-    np.testing.assert_allclose(left, slope, rtol=0.005)

@@ -227,6 +227,13 @@ class PhotonImage:
         """Photons of all pixels in each bin, (bins,)."""
         return np.bincount(self.table.indices, self.count, self.bins).astype(np.float64)
 
+    def count_stretches(self, number: int) -> FloatArray:
+        """Photons of each pixel in equal parts of the time axis, at most its bins, (pixels, parts)."""
+        number, pixels = min(number, self.bins), self.offsets.size - 1
+        part = np.clip(self.bin * (number / self.bins), 0, number - 1).astype(np.int64)
+        counts = np.bincount(self.pixel * number + part, self.count, pixels * number)
+        return np.asarray(counts.reshape(pixels, number), np.float64)
+
     def select(self, count: NDArray[np.float32]) -> PhotonImage:
         """Return the events with other counts, (events,); those with none are left out."""
         kept = count > 0
@@ -314,11 +321,8 @@ def find_dim_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
 
 
 def _find_pixels_hot_throughout(photons: PhotonImage) -> NDArray[np.bool_]:
-    number = min(STRETCHES, photons.bins)
-    stretch = np.clip(photons.bin * (number / photons.bins), 0, number - 1).astype(np.int64)
-    pixels = photons.offsets.size - 1
-    light = np.bincount(photons.pixel * number + stretch, photons.count, pixels * number)
-    quiet = np.sort(light.reshape(pixels, number), axis=1)[:, : number - number // 4].sum(axis=1)
+    light = np.sort(photons.count_stretches(STRETCHES), axis=1)
+    quiet = light[:, : light.shape[1] - light.shape[1] // 4].sum(axis=1)
     quiet = quiet.reshape(photons.image_shape)
     around = _rank_neighbours(quiet, -1 - NEIGHBOUR_RANK)
     return np.asarray(quiet > FAULT_RATIO * around + FAULT_SIGMAS * np.sqrt(around + 4))

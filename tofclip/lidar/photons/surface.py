@@ -224,10 +224,9 @@ def find_missed_share(photons: PhotonImage, scene: Scene, surface: FloatArray) -
     blind; 0 where nothing says so. What is expected there is a pixel's own background before its
     surface, with the course over time that pixels show whose surfaces come later.
     """
-    number, pixels = min(BLIND_STRETCHES, photons.bins), surface.size
-    stretch = np.clip(photons.bin * (number / photons.bins), 0, number - 1).astype(np.int64)
-    seen = np.bincount(photons.pixel * number + stretch, photons.count, pixels * number)
-    seen, length = seen.reshape(pixels, number), photons.bins / number
+    seen = photons.count_stretches(BLIND_STRETCHES)
+    pixels, number = seen.shape
+    length = photons.bins / number
     late = (np.arange(number) + 0.5) * length - surface.reshape(-1, 1)
     before = late < -2 * scene.response.width - length
     known = (late > 12 * scene.response.width + length) & (before.sum(axis=0) >= MIN_WITNESSES)
