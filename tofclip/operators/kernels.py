@@ -232,27 +232,6 @@ def fill_line_nonzeros(starts, rightward, downward, before, shape, places, colum
 
 
 @fast_loop
-def count_tile_nonzeros(row_starts, indices, width, counts):
-    """Count a CSR matrix's nonzeros in each tile of `width` columns and row, (tiles, rows) zeros."""
-    for row in range(row_starts.size - 1):
-        for entry in range(row_starts[row], row_starts[row + 1]):
-            counts[indices[entry] // width, row] += 1
-
-
-@fast_loop
-def sort_into_tiles(row_starts, indices, data, width, places, columns, values):
-    """Write a CSR matrix's nonzeros in the order of tile, row and column; `places` as in
-    `fill_line_nonzeros`.
-    """
-    for row in range(row_starts.size - 1):
-        for entry in range(row_starts[row], row_starts[row + 1]):
-            tile = indices[entry] // width
-            place = places[tile, row]
-            columns[place], values[place] = indices[entry], data[entry]
-            places[tile, row] = place + 1
-
-
-@fast_loop
 def transform_walsh_hadamard(values):
     """Multiply (n, columns) values by Sylvester's Hadamard matrix of n = 2^k rows, in place."""
     count, columns = values.shape

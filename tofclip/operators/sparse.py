@@ -40,17 +40,14 @@ class Tiles(NamedTuple):
     @classmethod
     def from_csr(cls, matrix: scipy.sparse.csr_array) -> Tiles:
         """Cut so that the rows of `LANES` frames that belong to a tile's columns stay in cache."""
-        from tofclip.operators.kernels import count_tile_nonzeros, sort_into_tiles
-
         width = max(1, TILE_BYTES // (LANES * matrix.dtype.itemsize))
-        per_row = np.zeros((-(-matrix.shape[1] // width), matrix.shape[0]), np.int64)
-        count_tile_nonzeros(matrix.indptr, matrix.indices, width, per_row)
-        ends = np.cumsum(per_row).reshape(per_row.shape)
-        starts = np.concatenate([ends - per_row, ends[:, -1:]], axis=1)
-        columns, values = np.empty(matrix.nnz, np.uint32), np.empty(matrix.nnz, matrix.dtype)
-        source = matrix.indptr, matrix.indices, matrix.data, width
-        sort_into_tiles(*source, starts[:, :-1].copy(), columns, values)
-        return cls(starts, columns, values)
+        firsts = range(0, matrix.shape[1], width)
+        parts = [matrix[:, first : first + width] for first in firsts]
+        before = np.cumsum([0, *(part.nnz for part in parts[:-1])])
+        starts = np.stack([part.indptr for part in parts]) + before[:, np.newaxis]
+        columns = [part.indices + first for part, first in zip(parts, firsts, strict=True)]
+        values = np.concatenate([part.data for part in parts])
+        return cls(starts, np.concatenate(columns).astype(np.uint32), values)
 
 
 def make_product(matrix: scipy.sparse.csr_array, device: ComputeDevice) -> Product:
