@@ -80,8 +80,8 @@ class PhotonImage:
     cycles : float
         Laser cycles of each pixel, of a detector that counts the first photon of a cycle only; by
         default so many that none is missed; see `correct_pile_up`.
-    shading : Shading, optional
-        Course of the background over picture and time; even by default.
+    shading : object, optional
+        Course of the background over picture and time, as `estimate_surface` finds it; even by default.
 
     Raises
     ------
@@ -97,7 +97,7 @@ class PhotonImage:
     bin_width: float
     axes: str = ""
     cycles: float = np.inf
-    shading: Shading | None = None
+    shading: Any = None
 
     def __post_init__(self) -> None:
         pixels = self.image_shape[0] * self.image_shape[1]
@@ -203,7 +203,7 @@ class PhotonImage:
         """Background at each event over its mean, (events,)."""
         if self.shading is None:
             return np.ones(self.bin.size, np.float32)
-        return self.shading.at(self.pixel, self.bin)
+        return np.asarray(self.shading.at(self.pixel, self.bin))
 
     @cached_property
     def table(self) -> csr_array:
