@@ -292,10 +292,14 @@ class Capture:
         Raises
         ------
         InputError
-            The frames carry no relay wall, the wall does not fit into the picture, or the frames
-            are not evenly spaced in time.
+            The frames carry no relay wall, or are a rendering of surfaces, the wall does not fit into
+            the picture, or the frames are not evenly spaced in time.
         """
         require_type(frames, Frames, "a capture is made of Frames, see tofclip.recover")
+        if frames.figures.get("method") == "surfaces":
+            raise InputError(
+                "these frames are a rendering of surfaces, without a wall's third bounce: recover by another method"
+            )
         record = frames.attachments.get(ATTACHMENT_NAME)
         if record is None or record.kind != ATTACHMENT_NAME:
             raise InputError(

@@ -55,8 +55,9 @@ def recover(
     method: str = opt(
         "NAME",
         f"{', '.join(METHODS.own)}, or another of tofclip plugins. surfaces: range and brightness of each pixel from "
-        "the whole shot; pnp, red: a denoiser plugged in.",
-        "tv",
+        "the whole shot; auto: these, or tv where the shot is not of surfaces or iterations, weight or focus are "
+        "given; pnp, red: a denoiser plugged in.",
+        "auto",
         choices=METHODS,
     ),
     iterations: int | None = opt(
@@ -190,7 +191,7 @@ def recover(
     known = frames.figures
     names = ("method", "iterations", "relative_residual", "seconds", "frames_per_second")
     # methods that know how far they are from the best there is say so, and shots that are not clean
-    further = ("duality_gap", "defective_readings", "clipped_readings")
+    further = ("why_no_surfaces", "duality_gap", "defective_readings", "clipped_readings")
     figures = {
         "frames": frames.values.shape[0],
         "image_shape": frames.camera.image_shape,

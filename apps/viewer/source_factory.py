@@ -12,7 +12,7 @@ from apps.viewer.shots import LiveShots, StoredShots
 from apps.viewer.sources import (
     LOOK_ITERATIONS,
     LOOK_METHOD,
-    SURFACES,
+    UNFOCUSED,
     CloudSource,
     PhotonSource,
     StreakSource,
@@ -50,10 +50,10 @@ Announce = Callable[[str], None]
 
 def check_method(name: str | None) -> str:
     """Return the name of a method to look by."""
-    if name == SURFACES:
+    if name in UNFOCUSED:
         raise InputError(
             "surfaces take too long for shots one after the other, and need a shot; choose one of "
-            f"{', '.join(one for one in METHODS if one != SURFACES)}, or make frames by tofclip recover"
+            f"{', '.join(one for one in METHODS if one not in UNFOCUSED)}, or make frames by tofclip recover"
         )
     make_look_method(name or LOOK_METHOD)  # refuses what is unknown
     return name or LOOK_METHOD
@@ -153,10 +153,10 @@ def _open_shots(
         camera = _find_camera(title, first, options, announce)
         return StreakSource(title, StoredShots(shots), camera, first.times, name)
     name = options.method or LOOK_METHOD
-    method: Any = name if name == SURFACES else make_look_method(name)
+    method: Any = name if name in UNFOCUSED else make_look_method(name)
     opened = open_shot(first, options.camera, options.time_zero)
     announce(f"recovering {title}")
-    if name != SURFACES:
+    if name not in UNFOCUSED:
         opened = opened.fit_camera(max_rounds=FIRST_LOOK_ROUNDS)
     source = TransientSource(title, plan_recovery(opened, method).run())
     if options.method is None:

@@ -196,7 +196,8 @@ class VolumeStreamSource(Source):
 NO_TIME_ZERO_NOTE = "no time zero: ranges are right up to a constant (--time-zero-ns)"
 LINEAR_NOTE = "linear inverse, which leaves rays: methods tv and l1 do not"
 METHOD_HINT = "recovers what is shown once more, with few iterations; at first, as it was recovered"
-SURFACES = "surfaces"  # takes some ten seconds, for which a single shot has the time
+# methods that cannot refocus; they take some ten seconds, for which a single shot has the time
+UNFOCUSED = ("surfaces", "auto")
 # enough to read what is written on a surface; `tofclip recover` takes 40
 LOOK_METHOD, LOOK_ITERATIONS = "l1", 25
 
@@ -243,7 +244,7 @@ class RecoveredSource(Source):
         self.camera, self.measured_times = camera, measured_times
         self._first_method, self._weight = method, weight
         self._cached_camera = get_cached_camera(camera)
-        options = (method, *(one for one in METHODS if one not in (method, SURFACES)))
+        options = (method, *(one for one in METHODS if one not in (method, *UNFOCUSED)))
         self.method_choice = Choice("method", options, method, METHOD_HINT)
         self.refocus = Setting("refocus", *SHEAR_LIMITS, 0.1, 0.0, SHEAR_HINT)
         self.settings = self.method_choice, *((self.refocus,) if camera.views > 1 else ())
@@ -257,7 +258,7 @@ class RecoveredSource(Source):
     def method(self) -> Method:
         """The method that is chosen."""
         name = self.method_choice.value
-        if name not in METHODS or name == SURFACES:  # which cannot be refocused
+        if name not in METHODS or name in UNFOCUSED:
             name = LOOK_METHOD
         return make_look_method(name, self._weight if name == self._first_method else None)
 

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tofclip import depth
+from tofclip import depth, recover
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
-from tofclip.recovery import SurfaceRecovery, open_shot, plan_recovery
+from tofclip.recovery import (
+    FixedFocus,
+    SurfaceRecovery,
+    make_method,
+    open_shot,
+    plan_recovery,
+)
 from tofclip.recovery.surfaces.fit import measure_slopes
 from tofclip.recovery.surfaces.pulse import measure_pulse
 from tofclip.shots import Streak
@@ -174,6 +181,29 @@ def test_a_pulse_with_a_tail_is_measured_and_explained() -> None:
     assert frames.figures["relative_residual"] < 0.1
     error = frames.returns.image("range") - time * SPEED_OF_LIGHT / 2
     assert abs(np.nanmedian(error)) < 1e-3
+
+
+def test_what_is_not_of_surfaces_is_recovered_as_frames_unless_asked_otherwise() -> None:
+    """By default: the same frames as by tv, and the reason; a surface's frames are its rendering."""
+    dark = expose(relay_wall(0), 200, 0)
+    found, frames = recover(dark), recover(dark, method="tv")
+    assert (found.figures["method"], found.returns) == ("tv", None)
+    assert str(found.figures["why_no_surfaces"]).endswith("long after its peak")
+    assert np.array_equal(found.values, frames.values)
+    focused = recover(dark, focus=FixedFocus(0.5))
+    assert "focus" in str(focused.figures["why_no_surfaces"])
+    assert make_method("auto", iterations=7) == make_method("tv", iterations=7)
+    plate = recover(expose([(8.2e-9, np.ones(SHAPE))], 500, 0))
+    assert plate.figures["method"] == "surfaces"
+    assert "why_no_surfaces" not in plate.figures
+
+
+@pytest.mark.parametrize("name", ["LetterN", "LetterVI", "Circle_Square"])
+def test_recorded_relay_walls_stay_frames(shared_data: Path, name: str) -> None:
+    """Their records say that they are walls, so that nothing is tried on them."""
+    plan = plan_recovery(open_shot(shared_data / "lift" / f"nlos_{name}.npz"))
+    few = replace(plan, method=replace(plan.method, otherwise=Sparse(iterations=2)))
+    assert few.run().figures["why_no_surfaces"] == "the light is that of a relay wall"
 
 
 @pytest.mark.parametrize("name", ["LetterN", "LetterVI", "Circle_Square"])

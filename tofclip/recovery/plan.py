@@ -22,7 +22,7 @@ from tofclip.arrays import CPU, Array, ComputeDevice, namespace, parse_device, t
 from tofclip.camera import Camera, Measurement, measure
 from tofclip.camera.noise import MeasurementNoise, find_dazzled, find_glints
 from tofclip.camera.registration import count_registration_iterations
-from tofclip.errors import require_type
+from tofclip.errors import InputError, require_type
 from tofclip.plugins import DENOISERS, METHODS, list_settings
 from tofclip.recovery.defects import (
     clip_from_below,
@@ -49,6 +49,8 @@ from tofclip.storage import Scalar, collect_provenance
 from tofclip.threads import split_blocks
 
 AnyMethod = Method | SurfaceRecovery
+DEFAULT_METHOD = "auto"
+RELAY_WALL = "relay_wall"  # the attachment of shots whose light is a wall's, not that of surfaces
 
 # Of `l1` where iterations are not given: a bright shot needs more of them than a dark one. In shots with
 # 20 photons in the brightest pixel the solution without negative values turns the noise into single
@@ -63,8 +65,10 @@ def make_method(name: str, **settings: Any) -> AnyMethod:
     Parameters
     ----------
     name : str
-        ``"tv"``, ``"l1"``, ``"wavelet"``, ``"linear"``, ``"adjoint"``, ``"surfaces"``, ``"pnp"``,
-        ``"red"``, or one of another package (`tofclip.plugins.METHODS`).
+        ``"auto"`` (``"surfaces"`` where a shot is of surfaces, otherwise ``"tv"``; with settings
+        always ``"tv"``, whose they are), ``"tv"``, ``"l1"``, ``"wavelet"``, ``"linear"``,
+        ``"adjoint"``, ``"surfaces"``, ``"pnp"``, ``"red"``, or one of another package
+        (`tofclip.plugins.METHODS`).
     **settings
         Passed on, such as ``iterations`` and ``weight`` of the iterative methods, or ``denoiser``, by
         name too, together with its own; None stands for the method's own, and texts are read.
@@ -83,8 +87,10 @@ def make_method(name: str, **settings: Any) -> AnyMethod:
     >>> make_method("pnp", denoiser="nlm", patch_px=7, iterations=20).denoiser.patch_px
     7
     """
-    known = list_settings(METHODS[name])
     given = {setting: value for setting, value in settings.items() if value is not None}
+    if name == DEFAULT_METHOD and given:
+        name = "tv"
+    known = list_settings(METHODS[name])
     if name == "l1" and "iterations" not in given:
         given = {**SPARSE_SETTINGS, **given}
     further = {one: given.pop(one) for one in [*given] if one not in known}
@@ -188,13 +194,31 @@ class RecoveryPlan:
     def _recover_surfaces(
         self, shot: Shot, method: SurfaceRecovery, progress: Progress, started: float
     ) -> Frames:
-        """Recover frames, quickly, and then the surfaces in them."""
-        focus = DepthLockedFocus() if shot.camera.lenslet_pitch > 0 else self.focus
-        start = replace(self, shot=shot, method=method.start, focus=focus).run(progress)
-        found = method.recover_surfaces(shot.streak, start, progress, shot.centre_error_px)
+        """Recover frames, quickly, and then the surfaces in them; or better frames where there are none."""
+        why = None if method.otherwise is None else self._find_reason_for_frames()
+        if why is None:
+            focus = DepthLockedFocus() if shot.camera.lenslet_pitch > 0 else self.focus
+            start = replace(self, shot=shot, method=method.start, focus=focus).run(progress)
+            try:
+                found = method.recover_surfaces(shot.streak, start, progress, shot.centre_error_px)
+            except InputError as fault:
+                if method.otherwise is None:
+                    raise
+                # without what a message advises whoever asked for surfaces
+                why = re.split("[:;] (?:this shot|choose)", str(fault))[0]
+        if why is not None:
+            assert method.otherwise is not None
+            found = replace(self, shot=shot, method=method.otherwise).run(progress)
+            found = replace(found, figures={**found.figures, "why_no_surfaces": why})
         seconds = time.perf_counter() - started
         pace = {"seconds": seconds, "frames_per_second": found.times.size / seconds}
         return replace(found, figures={**found.figures, **pace})
+
+    def _find_reason_for_frames(self) -> str | None:
+        """Say why frames are wanted, whatever the light is on; None if they are not."""
+        if RELAY_WALL in self.shot.streak.attachments:
+            return "the light is that of a relay wall"
+        return None if self.focus == DEFAULT_FOCUS else "frames at a given focus are asked for"
 
     def add_provenance(self, frames: Frames, *inputs: str | Path) -> Frames:
         """Return frames that say how they came about.
@@ -206,10 +230,14 @@ class RecoveryPlan:
         *inputs : path-like
             Files that the result depends on; their hashes are noted.
         """
+        used = self.method
+        if isinstance(used, SurfaceRecovery) and used.otherwise is not None:
+            found = "why_no_surfaces" not in frames.figures
+            used = replace(used, otherwise=None) if found else used.otherwise
         settings = {
             "verb": "recover",
             # a class by its name, not by where the code has it today
-            "method": re.sub(r"<class '[\w.]*?(\w+)'>", r"\1", repr(self.method)),
+            "method": re.sub(r"<class '[\w.]*?(\w+)'>", r"\1", repr(used)),
             "focus": str(self.focus),
             "time_zero_s": self.shot.camera.time_zero,
         }
@@ -219,7 +247,7 @@ class RecoveryPlan:
 
 def plan_recovery(
     shot: Shot,
-    method: str | AnyMethod = "tv",
+    method: str | AnyMethod = DEFAULT_METHOD,
     focus: str | Focus = DEFAULT_FOCUS,
     device: str = "cpu",
 ) -> RecoveryPlan:
@@ -258,7 +286,7 @@ def plan_recovery(
 def recover(
     streak: Streak,
     camera: Camera | None = None,
-    method: str | AnyMethod = "tv",
+    method: str | AnyMethod = DEFAULT_METHOD,
     progress: Progress = ignore_progress,
     focus: Focus | None = None,
     device: str = "cpu",
@@ -275,8 +303,10 @@ def recover(
     camera : Camera, optional
         Defaults to the one that the streak image carries.
     method : str or Method
-        ``"tv"`` (default) or another name that `tofclip.recovery.make_method` knows, or a configured
-        method of `tofclip.solvers`, or a `SurfaceRecovery`.
+        A name that `tofclip.recovery.make_method` knows, a configured method of `tofclip.solvers`,
+        or a `SurfaceRecovery`. By default ``"auto"``: surfaces where the shot is of surfaces, whose
+        frames are a rendering of them; otherwise frames by total variation. Figure ``"method"`` of
+        the frames says which, and ``"why_no_surfaces"`` why.
     progress : callable
         Called with the number of frame iterations just done.
     focus : Focus, optional

@@ -24,6 +24,7 @@ from tofclip.recovery import (
     parse_focus,
     plan_recovery,
 )
+from tofclip.recovery.plan import DEFAULT_METHOD
 from tofclip.sequences.cache import CachedInverse, get_cached_camera
 from tofclip.sequences.inputs import Shot
 from tofclip.sequences.jobs import Job, list_jobs
@@ -62,7 +63,7 @@ class RecoverySettings:
         No such method or focus, or the method has no such settings.
     """
 
-    method: str = "tv"
+    method: str = DEFAULT_METHOD
     iterations: int | None = None
     weight: float | None = None
     focus: str = "fixed:0"

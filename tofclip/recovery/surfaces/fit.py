@@ -42,7 +42,7 @@ from tofclip.recovery.surfaces.patches import (
 from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, Image, ShotPulse, measure_pulse
 from tofclip.recovery.surfaces.ranges import Refinement, measure_local_shifts, refine_state
 from tofclip.shots import Frames, Returns, Streak
-from tofclip.solvers import Method, Progress, Sparse, ignore_progress
+from tofclip.solvers import Method, Progress, Sparse, TotalVariation, ignore_progress
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -647,6 +647,8 @@ class SurfaceRecovery:
         Recovers the frames in whose returns the surfaces are looked for.
     detection : Detection
         Which points of the surfaces are returned.
+    otherwise : Method, optional
+        Recovers the frames of a shot that is not of surfaces; without one it is refused.
 
     Notes
     -----
@@ -658,6 +660,7 @@ class SurfaceRecovery:
     iterations: int = 60
     start: Method = field(default_factory=lambda: Sparse(iterations=40))
     detection: Detection = field(default_factory=lambda: NO_SHARES)
+    otherwise: Method | None = None
     name = "surfaces"
 
     def __post_init__(self) -> None:
@@ -670,8 +673,11 @@ class SurfaceRecovery:
         return 2 * START_ITERATIONS + MAX_REFINEMENTS * REFINEMENT_ITERATIONS + self.iterations
 
     def work(self, frames: int) -> int:
-        """Frame iterations that are reported at most: the start's, and one per frame and iteration."""
-        return self.start.work(frames) + self.steps * frames
+        """Frame iterations that are reported at most: the start's, one per frame and iteration, and
+        those of the frames in place of surfaces.
+        """
+        instead = 0 if self.otherwise is None else self.otherwise.work(frames)
+        return self.start.work(frames) + self.steps * frames + instead
 
     def recover_surfaces(
         self,
@@ -735,6 +741,11 @@ class SurfaceRecovery:
             shears=np.asarray(camera.shear_at(distance)),
             returns=returns,
         )
+
+
+def recover_automatically() -> SurfaceRecovery:
+    """Surfaces where a shot is of surfaces, otherwise frames by total variation."""
+    return SurfaceRecovery(otherwise=TotalVariation())
 
 
 def _render_frames(start: Frames, model: SurfaceModel, amplitude: Image) -> Image:
