@@ -69,6 +69,7 @@ DEFAULTS: dict[str, dict[Any, dict[str, Any]]] = {
             "iterations": 60,
             "start": Sparse(),
             "detection": Detection(5.0, 0.0, 0.0, 0.0),
+            "otherwise": None,
         }
     },
     SHEARS: {DepthLockedFocus: {"tolerance_px": 0.25}, FixedFocus: {"shear": 0.0}},

@@ -337,7 +337,7 @@ def test_what_is_missing_or_unknown_is_said_before_anything_runs(streak):
 def test_a_method_can_be_named():
     assert make_method("l1", iterations=7) == Sparse(iterations=7)
     assert make_method("tv") == TotalVariation()
-    with pytest.raises(InputError, match="choose one of tv, l1, linear, adjoint"):
+    with pytest.raises(InputError, match="choose one of auto, tv, l1, linear, adjoint"):
         make_method("magic")
     with pytest.raises(InputError, match="does not take iterations"):
         make_method("linear", iterations=7)

@@ -31,17 +31,18 @@ MIN_BIN_WIDTH_S = 1e-13  # half of the finest channel of time-correlated counter
 
 @dataclass(frozen=True)
 class Shading:
-    """How bright the background is over its mean, smooth from cell to cell of picture and time:
-    `level` (rows, columns, stretches) of cells that the picture's axes and time are divided into.
+    """How bright the background is over its `mean`, photons of a pixel in a bin, smooth from cell to
+    cell of picture and time: `level` (rows, columns, stretches) of cells that the picture's axes,
+    `image_shape`, and its `bins` are divided into.
     """
 
     level: FloatArray
     image_shape: tuple[int, int]
     bins: int
-    mean: float  # photons of a pixel in a bin
+    mean: float
 
     def at(self, pixel: NDArray[np.int64], instant: ArrayLike) -> NDArray[np.float32]:
-        """Return the level at instants, in bins, of pixels by their raster numbers."""
+        """Return the level at each `instant`, in bins, of each `pixel`, a raster number."""
         sides = *self.image_shape, self.bins
         place = (*np.divmod(pixel, self.image_shape[1]), np.asarray(instant))
         cells = [

@@ -17,6 +17,6 @@ a by FISTA, `ranges` for the state by Gauss-Newton steps; `fit` has the order of
 that `tofclip recover` runs. docs/recovery_algorithm.md derives it.
 """
 
-from tofclip.recovery.surfaces.fit import SurfaceRecovery, recover_automatically
+from tofclip.recovery.surfaces.fit import SurfaceRecovery
 
-__all__ = ["SurfaceRecovery", "recover_automatically"]
+__all__ = ["SurfaceRecovery"]
