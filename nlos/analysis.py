@@ -45,9 +45,9 @@ MIN_BAND_OVER_EARLY = 3.0
 # Of a pulse's signal, what may be of waves finer than the wall samples.
 MAX_ALIASED_FRACTION = 0.2
 # From one wavelength that is tried to the next.
-WAVELENGTH_STEP_RATIO = 1.05
-# Of the default wavelength in mm, rounded up.
-WAVELENGTH_DIGITS = 2
+WAVELENGTH_STEP_RATIO = 1.02
+# A default wavelength is rounded up by less than one part in this number.
+ROUNDED_PARTS = 30
 # A laser spot farther from the wall than this number of its widths is a mistake.
 MAX_LASER_WALL_WIDTHS = 5.0
 # A laser spot may stand so far before the foremost or behind the hindmost wall point, and farther
@@ -284,12 +284,10 @@ def find_finest_wavelength(capture: Capture, cycles: float) -> float:
 
 
 def round_wavelength_up(wavelength: float) -> float:
-    """Round a wavelength in m up to two digits in mm."""
-    value = wavelength * 1e3
-    step = math.floor(math.log10(value)) - WAVELENGTH_DIGITS + 1
+    """Round a wavelength in m up to a power of ten that is at most a thirtieth of it."""
+    scale = 10.0 ** -math.floor(math.log10(wavelength / ROUNDED_PARTS))
     # A value that is round already stays, whatever its last bit.
-    rounded = math.ceil(value / 10**step - 1e-9) * 10**step
-    return float(round(rounded, max(0, -step))) * 1e-3
+    return math.ceil(wavelength * scale - 1e-9) / scale
 
 
 def find_shortest_wavelength(capture: Capture, cycles: float) -> float:

@@ -7,6 +7,7 @@ Where there is a GPU, ``TOFCLIP_TEST_DEVICES=cuda pytest tests/nlos -k portable`
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -146,3 +147,13 @@ def find_device(library: str) -> ComputeDevice:
     # Waking other threads up takes longer than what there is to do.
     pytest.importorskip(library).set_num_threads(1)
     return parse_device("torch:cpu")
+
+
+def reorder(capture: Capture, kept: Any, earlier: float = 0.0) -> Capture:
+    """Some of a capture's points in another order, of a record that begins so much path earlier."""
+    bins = round(earlier / capture.axis.spacing)
+    signal = np.pad(capture.signal.reshape(capture.axis.bins, -1)[:, kept], ((bins, 0), (0, 0)))
+    wall, laser = capture.wall.reshape(-1, 3)[kept], capture.laser
+    laser = laser if laser.ndim == 1 else laser.reshape(-1, 3)[kept]
+    start = capture.start - bins * capture.axis.spacing
+    return replace(capture, signal=signal, wall=wall, laser=laser, start=start)
