@@ -23,6 +23,8 @@ class Uri:
     scheme: str  # lower case, e.g. ``"sim+timetag"``
     location: str  # all between ``://`` and ``?``: a serial number, ``HOST:PORT`` or a path
     values: Mapping[str, str] = field(default_factory=dict)  # the query
+    # names that it may hold besides those of its source, which takes its own out of them
+    others: set[str] = field(default_factory=set)
 
     @classmethod
     def parse(cls, text: str) -> Uri:
@@ -44,9 +46,10 @@ class Uri:
         return cls(text, scheme.lower(), unquote(place), dict(pairs))
 
     def reject_unknown(self, *names: str) -> None:
-        """Refuse values of other names than these."""
+        """Refuse values of other names than these and `others`."""
+        self.others.difference_update(names)
         for name in self.values:
-            if name not in names:
+            if name not in (*names, *self.others):
                 known = ", ".join(names) or "nothing"
                 raise InputError(f"'{self.text}': '{name}' is unknown; {self.scheme} takes {known}")
 
@@ -129,9 +132,9 @@ class Options:
         return tuple(one.name for one in cls.declared())
 
     @classmethod
-    def from_uri(cls, uri: Uri, *others: str) -> Self:
-        """Read an address, which has no values but these and `others`."""
-        uri.reject_unknown(*cls.names(), *others)
+    def from_uri(cls, uri: Uri) -> Self:
+        """Read an address, which has no values but these and `Uri.others`."""
+        uri.reject_unknown(*cls.names())
         found: dict[str, Any] = {}
         for one in cls.declared():
             kind, choices = one.metadata["kind"], one.metadata["choices"]

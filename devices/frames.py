@@ -59,8 +59,8 @@ class GatedOptions(LiveOptions):
         return Record("gate_scan", times, width) if self.is_gated else None
 
     @classmethod
-    def from_uri(cls, uri: Uri, *others: str) -> Self:
-        found = super().from_uri(uri, *others)
+    def from_uri(cls, uri: Uri) -> Self:
+        found = super().from_uri(uri)
         if not found.is_gated and any(name.startswith("gate_") for name in uri.values):
             raise InputError(f"'{uri.text}': a gate needs mode=gated")
         return found

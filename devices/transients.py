@@ -15,6 +15,8 @@ Besides what a source itself takes, its address may say how to gather (`Accumula
 * ``sync``, ``pixels``: channel of the laser's pulses and channels of the line's pixels of a time
   tagger, ``0`` and ``1,2,3`` by default.
 
+Where a source itself takes one of these names, the value is the source's and says nothing here.
+
 A source of which the calibration says, besides ``bin_times`` (s, of each bin) and ``count_scale``, the
 ``image_shape`` of a picture whose pixels look at the scene themselves gives `PhotonCube`s, as do a
 gate's scans; ``axes`` there is the order of what comes, ``tyx`` by default. A ``camera`` beside it says
@@ -26,6 +28,7 @@ that make clouds of them, `devices.tracking.TrackedShots` knows the age of each 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from collections.abc import Generator, Iterator
@@ -56,6 +59,7 @@ from tofclip.shots import Streak
 from tofclip.storage import Record, collect_provenance
 
 BIN_WIDTH_S = 20e-12  # Width of a histogram's bins where no other is given, s
+READING_S = 10.0  # Of a single shot where the address does not say how long, s
 PICOSECOND_S = 1e-12
 MAX_CUBE_BYTES = 1 << 32
 # Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s
@@ -95,7 +99,7 @@ class ShotStamp:
 class Accumulation(Options):
     """How records become a streak image."""
 
-    seconds: float = option(10.0, above=0)
+    seconds: float | None = option(None, float, above=0)
     frames: int = option(1, above=0)
     scans: int = option(1, above=0)
     binning: int = option(1, above=0)
@@ -115,11 +119,6 @@ class Accumulation(Options):
     def pictures(self) -> int:
         """Pictures, scans or histograms of a shot."""
         return self.frames * self.scans
-
-    @classmethod
-    def of(cls, uri: Uri, bin_width: float | None, line: bool = False) -> Accumulation:
-        """Read the values of an address that say how to gather; the others are the source's."""
-        return replace(cls.from_uri(uri, *uri.values), bin_width=bin_width, line=line)
 
     def axis(self, known_period: float | None) -> BinAxis:
         """Return the bins of a histogram of photons."""
@@ -185,14 +184,15 @@ def find_address(file: str) -> str | None:
 
 
 def _read_shot(uri: Uri, bin_width: float | None, line: bool = False) -> LiveShot:
-    gathering = Accumulation.of(uri, bin_width, line)
-    with _open_source(uri) as source:
+    with _open_source(uri, bin_width, line) as (source, gathering):
         known = source.calibration or NOTHING_KNOWN
         if find_gate_steps(known):  # a scan lasts as long as it does
             shots = _read_scans(read_batches(source, inf), known, gathering)
             shot: LiveShot = next(shots)[1]
         else:
-            shot = _accumulate(read_batches(source, gathering.seconds), known, gathering)
+            shot = _accumulate(
+                read_batches(source, gathering.seconds or READING_S), known, gathering
+            )
         past = collect_provenance({"address": uri.text, "bin_width_s": bin_width})
         source.drain()
     past |= {"source": source.info.as_dict(), "stats": source.stats.as_dict()}
@@ -382,15 +382,15 @@ def read_camera(known: Record) -> Camera | None:
     return Camera.from_record(known.children["camera"]) if "camera" in known.children else None
 
 
-def _open_source(uri: Uri) -> Source:
-    """Open an address, without what says how to gather."""
-    # Files of photon counters need the channel of the laser's pulses themselves, and a kit is told its
-    # bins.
-    own = {"sync"} if Path(uri.location).suffix.lower() in (".ptu", ".ttbin") else set()
-    own |= {"bins"} if uri.scheme.endswith("vl53l8") else set()
-    gathering = {*Accumulation.names()} - own
-    values = {name: value for name, value in uri.values.items() if name not in gathering}
-    return registry.open_parsed(replace(uri, values=values))
+@contextlib.contextmanager
+def _open_source(
+    uri: Uri, bin_width: float | None, line: bool = False
+) -> Iterator[tuple[Source, Accumulation]]:
+    """Open an address; what its source does not take of it says how to gather."""
+    others = {*Accumulation.names()}
+    with registry.open_parsed(replace(uri, others=others)) as source:
+        left = replace(uri, values={name: uri.values[name] for name in others & uri.values.keys()})
+        yield source, replace(Accumulation.from_uri(left), bin_width=bin_width, line=line)
 
 
 def read_transients(address: str, bin_width: float | None = None) -> TransientStream:
@@ -412,8 +412,7 @@ class TransientStream(Iterator[LiveShot]):
     """
 
     def __init__(self, address: str, bin_width: float | None = None) -> None:
-        self._uri = Uri.parse(address)
-        self._gathering = Accumulation.of(self._uri, bin_width)
+        self._uri, self._bin_width = Uri.parse(address), bin_width
         self._source: Source | None = None
         self._shots = self._read()
         self._records_per_shot = 1
@@ -452,8 +451,7 @@ class TransientStream(Iterator[LiveShot]):
         self._shots.close()
 
     def _read(self) -> Generator[LiveShot]:
-        gathering = self._gathering
-        with _open_source(self._uri) as source:
+        with _open_source(self._uri, self._bin_width) as (source, gathering):
             self._source = source
             known = source.calibration or NOTHING_KNOWN
             camera, tick = read_camera(known), known.attributes.get("tick_s")
@@ -464,8 +462,7 @@ class TransientStream(Iterator[LiveShot]):
                 self.is_numbered = True
                 if self._records_per_shot == 1 and "policy" not in self._uri.values:
                     source.keep_newest()
-            seconds = gathering.seconds if "seconds" in self._uri.values else inf
-            batches = self._note_times(read_batches(source, seconds), tick)
+            batches = self._note_times(read_batches(source, gathering.seconds or inf), tick)
             shots = _read_scans if steps else _accumulate_shots
             for number, shot in shots(batches, known, gathering):
                 self.stamp = ShotStamp(number, self._taken_at, self._received_at)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from devices import transients
+from devices.address import Options, Uri, option
 from devices.source import Batch, Info, Records, Source, Stats
 from devices.timetag_codec import RECORD_DTYPE
 from devices.transients import read_transient, read_transients
@@ -91,6 +93,28 @@ def test_frames_are_added_up(canned: type[Canned]) -> None:
         2e-12,
         4e-12,
     ]
+
+
+def test_a_source_s_own_values_are_not_taken_for_how_to_gather(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    @dataclass(frozen=True)
+    class OwnOptions(Options):
+        frames: int = option(1)
+
+    own: list[int] = []
+
+    def open_own(uri: Uri) -> Canned:
+        own.append(OwnOptions.from_uri(uri).frames)
+        return Canned([Batch(frames(1, 2))])
+
+    monkeypatch.setattr(transients.registry.SOURCES, "registered", {"own": open_own})
+    streak = read_transient("own://?frames=30&seconds=5")
+    assert (own, streak.counts.max()) == ([30], 1)  # of the first frame alone
+    shots = read_transients("own://?frames=30")
+    assert [shot.counts.max() for shot in shots] == [1, 2]
+    with pytest.raises(InputError, match="'second' is unknown; own takes frames"):
+        read_transient("own://?second=5")
 
 
 def test_where_it_came_from_is_told() -> None:
