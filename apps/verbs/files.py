@@ -109,7 +109,7 @@ def _describe_record(record: Record) -> dict[str, Any]:
 
 
 def _describe_field(entry: Field) -> dict[str, Any]:
-    from tofclip.storage import is_stand_in
+    from tofclip.storage import MAX_OUTLINE_VALUES, is_stand_in
 
     values = entry.values
     known = {
@@ -118,8 +118,9 @@ def _describe_field(entry: Field) -> dict[str, Any]:
         "units": entry.units,
         "axes": entry.axes,
     }
-    is_number = values.dtype.kind in "uif" and not is_stand_in(values)
-    return known | {"values": values} if is_number else known
+    # another package's reader may give all of them
+    is_listed = values.size <= MAX_OUTLINE_VALUES and values.dtype.kind in "uif"
+    return known | {"values": values} if is_listed and not is_stand_in(values) else known
 
 
 def _format_tree(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:

@@ -173,12 +173,13 @@ def test_nothing_is_looked_for_before_it_is_needed() -> None:
     assert "importlib.metadata" not in done.stdout.split()
 
 
-def test_parts_of_a_package_are_used(package: Path, tmp_path: Path) -> None:
+def test_parts_of_a_package_are_used(package: Path, tmp_path: Path, shell: Any) -> None:
     made = make_method("pnp", denoiser="half", share="0.25", strength="0.2", iterations=7)
     assert (made.denoiser.share, made.strength, made.start.iterations) == (0.25, 0.2, 7)
     (tmp_path / "shot.txt").write_text("MINE 3")
     assert tofclip.read_streak(tmp_path / "shot.txt").counts[0, 0] == 3
     assert outline(tmp_path / "shot.txt").fields["counts"].values.shape == (4, 5)
+    assert "values" not in shell.figures(f"info {tmp_path}/shot.txt")["fields"]["counts"]
     (tmp_path / "other.txt").write_text("OTHER")
     with pytest.raises(
         FileFormatError, match=r"is not a TIFF.*; reader 'broken' of mine 1\.0 does"
