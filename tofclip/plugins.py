@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -114,15 +114,19 @@ class Parts(Mapping[str, Any]):
             return "registered"
         return _name_package(self.offered[name])
 
-    def make(self, name: str, settings: Mapping[str, Any]) -> Any:
+    def make(self, name: str, settings: Mapping[str, Any], others: Iterable[str] = ()) -> Any:
         """Make a part with settings of its own, texts becoming what it takes; `InputError` where there
-        is no such part or setting, or a text is not what it takes.
+        is no such part or setting, which names `others` as well, or a text is not what it takes.
         """
         part, what = self[name], f"{self.kind} '{name}'"
         known = list_settings(part)
         unknown = [one for one in settings if one not in known]
         if unknown:
-            takes = f"its settings are {', '.join(known)}" if known else "it has no settings"
+            takes = (
+                f"its settings are {', '.join((*known, *others))}"
+                if known
+                else "it has no settings"
+            )
             raise InputError(f"{what} does not take {', '.join(unknown)}; {takes}")
         return part(
             **{

@@ -225,6 +225,7 @@ def test_a_notebook_registers_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ({"denoiser": "absent"}, "unknown denoiser 'absent'; choose one of collaborative"),
         ({"gamma": "2"}, "'pnp' does not take gamma; its settings are start, denoiser, calls"),
+        ({"denoiser": "nlm", "sigma": "3"}, "coupling, patch_px, reach_px, filtering"),
         ({"calls": "2.5"}, "calls must be a whole number, got '2.5'"),
         ({"strength": "x"}, "strength must be a number, got 'x'"),
         ({"start": "tv"}, "start can be given in Python only"),

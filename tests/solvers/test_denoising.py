@@ -160,7 +160,9 @@ def test_it_improves_on_its_start(truth):
     measurements += 0.04 * measurements.max() * noise
     start = TotalVariation(0.004, 200, 1e-4)  # too small a weight: the start is noisy
     result = PlugAndPlay(start).recover(OPERATOR, measurements)
-    assert nmse(result.frames[0], truth) < 0.8 * nmse(recover(start, measurements)[0], truth)
+    started = start.recover(OPERATOR, measurements)
+    assert nmse(result.frames[0], truth) < 0.8 * nmse(started.frames[0], truth)
+    assert result.iterations == started.iterations  # as asked for; calls are counted beside them
     assert result.frames.min() >= 0
     assert result.stop_reason == "8 calls of the denoiser done"
 

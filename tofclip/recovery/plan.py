@@ -94,13 +94,14 @@ def make_method(name: str, **settings: Any) -> AnyMethod:
     if name == "l1" and "iterations" not in given:
         given = {**SPARSE_SETTINGS, **given}
     further = {one: given.pop(one) for one in [*given] if one not in known}
-    denoiser = given.get("denoiser")
+    denoiser, others = given.get("denoiser"), dict[str, Any]()
     if isinstance(denoiser, str):
-        own = [one for one in list_settings(DENOISERS[denoiser]) if one in further]
-        given["denoiser"] = DENOISERS.make(denoiser, {one: further.pop(one) for one in own})
+        others = list_settings(DENOISERS[denoiser])
+        own = {one: further.pop(one) for one in others if one in further}
+        given["denoiser"] = DENOISERS.make(denoiser, own)
     if "start" in known and further and further.keys() <= {"iterations", "weight"}:
         given["start"], further = METHODS.make("tv", further), {}
-    made: AnyMethod = METHODS.make(name, given | further)
+    made: AnyMethod = METHODS.make(name, given | further, others)
     return made
 
 

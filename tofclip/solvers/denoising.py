@@ -171,7 +171,6 @@ class PlugAndPlay(Method):
         return replace(
             started,
             frames=frames,
-            iterations=started.iterations + self.calls,
             stop_reason=f"{self.calls} calls of the denoiser done",
         )
 
