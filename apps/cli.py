@@ -115,7 +115,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   nlos film         the flash passing through the hidden scene, as a film
   nlos compare      several methods on one capture, with time and memory
   nlos simulate     the capture of a known hidden scene
-  nlos demo         a hidden 3D before a curved wall, imaged quickly and slowly
+  nlos demo         a hidden 3D, imaged around a curved wall by a fast and a slow method
   occlusion         what stands behind an occluder: inactive region, demo
   clip              light fields from few measurements: simulate, recover
   reproduce         the paper's tables and figures, made again

@@ -106,7 +106,7 @@ def calibrate_range(
     ),
     out: Path = opt("H5", "The camera file to write.", ...),
     camera: Path | None = opt(
-        "H5", "That is calibrated.", shown="the one inside the first shot; of photons a pinhole"
+        "H5", "Camera to calibrate.", shown="the one inside the first shot; of photons a pinhole"
     ),
     reflectance_percent: list[float] | None = opt(
         "PERCENT",
@@ -148,7 +148,7 @@ def calibrate_range(
     """Find time zero, range walk, offsets, response and reflectance from shots of a target.
 
     The target is flat, faces the camera and fills most of the picture. One shot gives time zero,
-    two give what each pixel measures too long and how bright it is, three of different brightness
+    two give each pixel's range offset and brightness, three of different brightness
     (other distances, or grey filters) how ranges depend on intensity. All of it goes into the camera
     file, with standard deviations, and is used wherever that camera is: recover, cloud, stream, view,
     lidar sequence and lidar photons. A shot of anything but a plate is refused.

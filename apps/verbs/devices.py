@@ -135,7 +135,7 @@ def record(
     """Record an instrument: its bytes as they come, with clock, accounts and calibration.
 
     However this ends, by Ctrl-C, a signal or a crash, the file holds what came until then and opens
-    as file://H5. Its content is tofclip's own format, not HDF5, whatever its name ends in.
+    as file://H5. Its content is tofclip's own format, not HDF5, regardless of its extension.
 
     Example: tofclip record 'sim+timetag://?seed=1' --out run.h5 --seconds 1
     """

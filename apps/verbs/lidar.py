@@ -174,10 +174,10 @@ def parallax(
 
     Example: tofclip lidar parallax shot.tif --camera camera.h5 --out camera_locked.h5
     """
-    from tofclip.recovery import count_parallax_work, fit_parallax_to_shot, open_shot
-
     require_writable(out, *RECORD_SUFFIXES, inputs=(streak, camera))
     with show_activity(f"reading {streak}"):
+        from tofclip.recovery import count_parallax_work, fit_parallax_to_shot, open_shot
+
         shot = open_shot(streak, camera, time_zero)
     with show_progress("focusing", count_parallax_work(shot, shears)) as advance:
         found = fit_parallax_to_shot(shot, gates, shears, advance)
@@ -270,7 +270,7 @@ def sequence(
     """Make a cloud of each shot by the linear inverse, one shot in memory at a time.
 
     Started again after an interruption, it makes the clouds that are missing in the folder. Shots
-    of which none can be made are listed at the end, and the exit status is 1.
+    that fail are listed at the end, and the exit status is 1.
 
     Example: tofclip lidar sequence shots/ --camera camera.h5 --out clouds/
     """

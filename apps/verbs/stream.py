@@ -82,7 +82,7 @@ def stream(
     + dropped_host + failed counts every shot that it took, and clouds bear its numbers. Shots of
     which no cloud can be made are listed as they come, and the exit status is 1. latency_median_s is
     the time from the instrument's own stamp until the cloud is there (latency_from says so;
-    "arrival" where it sends no time), with the least delay of its messages taken for none.
+    "arrival" where it sends no time), taking the shortest message delay as zero.
 
     Example: tofclip stream 'sim+remoteex://?seed=1' --shots 20 --out clouds/
     """

@@ -46,7 +46,7 @@ class RangeCalibration(Storable):
         Weakest and strongest return of the calibration, counts; beyond, the walk is that of the
         nearer one.
     offsets, offset_sigma : (rows, columns) array
-        What each pixel measures too long, and its standard deviation, m. Empty where not known.
+        Range offset of each pixel and its standard deviation, m. Empty where not known.
     response : (rows, columns) array
         Relative brightness of each pixel, 1 on average. Empty where not known.
     reflectance_scale : float
