@@ -56,7 +56,7 @@ def info(uri: str = ADDRESS, as_json: bool = JSON) -> None:
     """
     import devices
 
-    with devices.open(uri) as source:
+    with devices.open(f"file://{uri}" if Path(uri).is_file() else uri) as source:
         figures: dict[str, Any] = {
             **source.info.as_dict(),
             "is_live": source.is_live,

@@ -9,6 +9,7 @@ from typing import Any
 
 from apps.options import JSON, arg
 from apps.report import report
+from devices.address import Options
 from tofclip.errors import InputError
 from tofclip.plugins import DENOISERS, METHODS, READERS, Parts, Reader, find_type, list_settings
 
@@ -39,7 +40,8 @@ def plugins(
         text = one["fault"] or (one["meaning"] if name else shorten(one["meaning"], TEXT_WIDTH))
         print(f"{one['group']:<18}{one['name']:<{width}}  {one['origin']:<12}  {text}")
         for setting in one["settings"] if name else ():
-            print(f"    --set {setting['name']}={setting['default']}")
+            lead = "?" if one["group"] == "tofclip.sources" else "--set "
+            print(f"    {lead}{setting['name']}={setting['default']}")
 
 
 def list_parts() -> Iterator[dict[str, Any]]:
@@ -71,7 +73,16 @@ def _describe(parts: Parts, name: str) -> dict[str, Any]:
         for one, value in known.items()
         if find_type(value)
     ]
-    meaning = "" if isinstance(part, Reader) else (inspect.getdoc(part) or "").split("\n\n")[0]
+    if inspect.isfunction(part):  # an opener: the options that it reads an address by
+        used = inspect.getclosurevars(part).globals.values()
+        settings += [
+            {"name": entry.name, "default": str(entry.default)}
+            for one in used
+            if inspect.isclass(one) and issubclass(one, Options)
+            for entry in one.declared()
+        ]
+    explained = part.read if isinstance(part, Reader) else part
+    meaning = (inspect.getdoc(explained) or "").split("\n\n")[0]
     return _make_entry(parts, name, origin, "", " ".join(meaning.split()), settings)
 
 

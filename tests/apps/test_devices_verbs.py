@@ -44,6 +44,7 @@ def test_information(shell):
     assert (live["instrument"], live["is_live"]) == ("FX2 time tagger", True)
     assert live["clock_hz"] == 1 / live["calibration_tick_s"] == 128e6
     replayed = shell.figures("devices info file://{recording}")
+    assert shell.figures("devices info {recording}") == replayed
     assert replayed == {**live, "is_live": False, "is_seekable": True}
     # info does not read the bytes
     found = shell.figures("info {recording}")

@@ -64,6 +64,7 @@ class Half:
     def __call__(self, noisy, pilot, deviation): return noisy * self.share
 
 def read(path):
+    "Read ``MINE`` and a number."
     return Streak(np.full((4, 5), float(path.read_text().split()[1]), np.float32))
 
 TEXTS = Reader((b"MINE",), read)
@@ -209,6 +210,8 @@ def test_what_is_wrong_with_a_package_is_a_line(package: Path, shell: Any) -> No
         make_method("pnp", denoiser="broken")
     assert "--set share=0.5" in shell("plugins half").out
     assert main(["plugins", "absent"]) == 2
+    assert "?zones=16" in shell("plugins vl53l8").out
+    assert "Read ``MINE``" in shell("plugins texts").out
 
 
 def test_a_notebook_registers_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
