@@ -275,7 +275,7 @@ def test_a_quick_look_is_called_one_and_another_method_can_be_asked_for(folder: 
         session.frame_at(0.0)
         assert session.notes == notes
     for method in ("surfaces", "best"):
-        with pytest.raises(InputError, match="choose one of .*tv, l1, linear, adjoint"):
+        with pytest.raises(InputError, match=r"choose one of .*tv, l1, linear, adjoint"):
             open_source(stack, replace(with_camera, method=method))
 
 

@@ -15,7 +15,7 @@ from tofclip.lidar.photons.detector import (
     correct_pile_up,
     estimate_pixels,
 )
-from tofclip.lidar.photons.image import PhotonImage, Shading, SurfaceImage, make_pinhole
+from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, make_pinhole
 from tofclip.lidar.photons.limits import Accuracy, compute_range_bound, measure_accuracy
 from tofclip.lidar.photons.scene import learn_background
 from tofclip.lidar.photons.surface import (
@@ -30,7 +30,6 @@ __all__ = [
     "PhotonCube",
     "PhotonDetector",
     "PhotonImage",
-    "Shading",
     "Smoothness",
     "SurfaceImage",
     "compute_range_bound",
