@@ -80,6 +80,8 @@ LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 
 # Bins in range, and pixels, within which frames' returns and surfaces are the same.
 NEAR_BINS, NEAR_PX = 7.0, 1.5
+# A band apart from its surface: rows, and of the points of the surface's largest part.
+MAX_BAND_ROWS, MAX_BAND_FRACTION = 3, 0.2
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
 MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
@@ -550,9 +552,26 @@ def choose_points(
     significance = solver.measure_significance()
     usual = [find_usual_brightness(amplitude[p], significance[p], limit) for p in model.parts]
     brightness = amplitude / np.array(usual)[model.surface]
-    chosen = np.flatnonzero((significance > limit) & (brightness > MIN_BRIGHTNESS_FRACTION))
+    shown = (significance > limit) & (brightness > MIN_BRIGHTNESS_FRACTION)
+    for part, mask in zip(model.parts, model.masks, strict=True):
+        shown[part] &= ~find_level_bands(mask, shown[part])[mask]
+    chosen = np.flatnonzero(shown)
     known = np.log(np.stack([significance[chosen] / SURE_SIGMAS, brightness[chosen]]))
     return chosen, scipy.special.expit(FALSE_ODDS[0] + FALSE_ODDS[1:] @ known)
+
+
+def find_level_bands(mask: NDArray[np.bool_], shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Say where a surface's points, `shown` (pixels of its `mask`,), are a level band apart from it. What
+    no surface explains gathers so at a surface's upper or lower end: lines of equal range that run level
+    are what the views tell least.
+    """
+    picture = np.zeros(mask.shape, bool)
+    picture[mask] = shown
+    label, _ = scipy.ndimage.label(picture, np.ones((3, 3)))
+    sizes = np.bincount(label.ravel())[1:]
+    high = [rows.stop - rows.start for rows, _ in scipy.ndimage.find_objects(label)]
+    band = (np.array(high) <= MAX_BAND_ROWS) & (sizes < MAX_BAND_FRACTION * sizes.max(initial=0))
+    return np.asarray(np.append(False, band)[label], dtype=bool)
 
 
 @limit_blas_threads()
