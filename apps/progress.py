@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 Advance = Callable[[int], None]
-STEPS = 1000  # of a bar that is told fractions
+STEPS = 1000  # of a bar for a share
 
 _screen_lock = threading.Lock()
 
@@ -48,7 +48,7 @@ def show_activity(title: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def show_share(title: str, whole: float | None) -> Iterator[Callable[[float], None]]:
-    """Show a bar for what is told as so much of a whole, such as seconds that have passed; none
+    """Show a bar for a part of a whole, such as seconds that have passed; none
     where the whole is not known.
     """
     if whole is None or not math.isfinite(whole):

@@ -55,7 +55,7 @@ def calibrate(
     """Find every view's slit centre and line angle, and draw the fits over the data.
 
     The uncertainty of every parameter is written as well. `tofclip calibrate range` adds what a
-    target at known distances tells of ranges.
+    target at known distances shows of ranges.
 
     Example: tofclip calibrate --line line.tif --line-background line_background.tif --dot dot.tif
     --dot-background dot_background.tif --out camera.h5

@@ -41,7 +41,7 @@ def design(
     seed: int = SEED,
     as_json: bool = JSON,
 ) -> None:
-    """Tell what a CLIP instrument will see before it is built, by theory and by simulated shots.
+    """Say what a CLIP instrument will see before it is built, by theory and by simulated shots.
 
     Picture errors (NMSE) and range deviations are those of the linear inverse, bias and noise apart;
     methods with a prior do better. They are computed from the camera's operator and, beside them, found

@@ -110,22 +110,21 @@ def recover(
 
     Example: tofclip recover shot.tif --camera camera.h5 --out frames.h5 --time-zero-ns -10.784
     """
-    from apps.figures.shot import make_preview_figure
-    from tofclip.notebook import save_figure
-    from tofclip.recovery import (
-        compute_view_delays_bins,
-        make_method,
-        open_shot,
-        parse_focus,
-        plan_recovery,
-    )
-    from tofclip.sequences import (
-        CloudSettings,
-        RecoverySettings,
-        expand_sweep,
-        is_sequence,
-        list_shots,
-    )
+    with show_activity("starting"):  # a second or more of imports
+        from tofclip.recovery import (
+            compute_view_delays_bins,
+            make_method,
+            open_shot,
+            parse_focus,
+            plan_recovery,
+        )
+        from tofclip.sequences import (
+            CloudSettings,
+            RecoverySettings,
+            expand_sweep,
+            is_sequence,
+            list_shots,
+        )
 
     own = {"denoiser": denoiser} if denoiser else {}
     own |= split_assignments(settings or ())
@@ -181,6 +180,9 @@ def recover(
     with show_progress("recovering", plan.work) as advance:
         frames = plan.add_provenance(plan.run(advance), *inputs)
     with show_activity("writing"):
+        from apps.figures.shot import make_preview_figure
+        from tofclip.notebook import save_figure
+
         frames.save(out)
         seconds = time.perf_counter() - started
         save_figure(make_preview_figure(shot.streak, frames), preview)
@@ -245,7 +247,7 @@ def cloud(
     pixel, time of flight; where known the probability that it is false (false_alarm) and the
     surface's reflectance in percent (see calibrate range).
 
-    Of a sequence, clouds that are in the folder already are kept; frames of which none can be made
+    Of a sequence, clouds that are in the folder already are kept; inputs that fail
     are listed at the end, and the exit status is 1.
 
     Example: tofclip cloud frames.h5 --out scene.ply

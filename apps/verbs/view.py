@@ -59,7 +59,7 @@ def view(
 ) -> None:
     """Look at a source: on a page of the browser, in a window, as a picture or as a film.
 
-    The page is for this computer, and for whoever has its address with the token. Through ssh:
+    The page is for this computer, and for anyone who has its address with the token. Through ssh:
     ssh -L 8080:localhost:8080 HOST, then tofclip view SOURCE --port 8080 --no-browser there, and
     the address that it prints here. On the page, K shows the keys.
 
@@ -174,7 +174,7 @@ class PageDoor:
         sys.stdout.flush()  # a program that reads the address waits for it
         if not is_local(parse_host(self.host)):
             print(
-                "tofclip: other computers can reach this page, unencrypted: whoever has its address, "
+                "tofclip: other computers can reach this page, unencrypted: anyone who has its address, "
                 "with the token, can see and control it",
                 file=sys.stderr,
             )

@@ -1,4 +1,4 @@
-"""The server of the page, for whoever has its address with the token, and none of the browser's other
+"""The server of the page, for anyone who has its address with the token, and none of the browser's other
 pages.
 """
 
@@ -34,7 +34,7 @@ ANSWER_HEADERS = {
 
 
 def start_server(port: int | None = None, host: str = LOOPBACK) -> tuple[viser.ViserServer, str]:
-    """Start a server that lets in whoever knows the token in its address, which is returned too.
+    """Start a server that lets in anyone who knows the token in its address, which is returned too.
 
     `port`: by default the first free one from 8080 on; `host`: an IP address of this computer;
     0.0.0.0 or :: for all of them.

@@ -346,7 +346,7 @@ class TransientSource(RecoveredSource):
         self.times, self.frames = frames.times, frames
         modes = (GATE_UP_TO_FRAME, GATE_AROUND_FRAME, GATE_ALL_TIMES)
         self.gate = Choice("time gate", modes, GATE_UP_TO_FRAME, GATE_HINT)
-        self.half_gate = Setting("half gate", 1, 200, 1, 12, HALF_GATE_HINT)
+        self.half_gate = Setting("gate half-width", 1, 200, 1, 12, HALF_GATE_HINT)
         self.settings = (self.gate, self.half_gate, *self.settings)
 
     def __len__(self) -> int:

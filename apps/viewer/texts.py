@@ -74,7 +74,7 @@ def render_status_html(
     lines.append(f"<span id='points'>{shown.points}</span> points{part}")
     if frames > 1 or is_live:
         coming = f"data {inflow.data_rate:.1f}/s, " if inflow.data_rate > 0 else ""
-        rate = f"shown {frame_rate:.1f}/s" if frame_rate > 0 else "standing still"
+        rate = f"shown {frame_rate:.1f}/s" if frame_rate > 0 else "paused"
         lines.append(f"<span id='rates'>{coming}{rate}</span>")
     is_known = np.isfinite(inflow.latency)
     if is_live or is_known:
