@@ -297,8 +297,8 @@ def _colour_brightness(picture: Picture, scale: Scale) -> Image:
 
 
 def _colour_depth(picture: Picture, scale: Scale) -> Image:
-    """Colour a picture of distances, m, by the scale where it is one of ranges, else from the 1st to
-    the 99th percentile; NaN becomes a dark grey.
+    """Colour a picture of distances, m, by the scale where it is one of ranges, else by the palette of
+    ranges from the 1st to the 99th percentile; NaN becomes a dark grey.
     """
     image = np.full((*picture.shape, 3), EMPTY_COLOUR, np.uint8)
     there = np.isfinite(picture)
@@ -306,7 +306,7 @@ def _colour_depth(picture: Picture, scale: Scale) -> Image:
         if scale.quantity != "range":
             low, high = np.percentile(picture[there], LIMIT_PERCENTILES)
             values = np.linspace(low, max(high, low + 1e-9), PALETTE_SIZE)
-            scale = Scale("range", "m", scale.palette, values)
+            scale = Scale("range", "m", Colouring.palette, values)
         image[there] = scale.colours(picture[there])
     return image
 
