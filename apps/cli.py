@@ -39,29 +39,10 @@ from apps.help import (
     make_verb_group,
 )
 from apps.progress import silence
-from apps.report import replace_results
+from apps.report import name_options, replace_results
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import describe_missing_package
 from tofclip.version import __version__
-
-ARGUMENT_IN_MESSAGE = re.compile(r"`(?P<name>[a-z_]+)(?:=\"?(?P<value>[^`\"]*)\"?)?`")
-OPTIONS_OF_ARGUMENTS = {
-    "axes": "--axes",
-    "bin_width": "--bin-width-ps",
-    "camera": "--camera camera.h5",
-    "device": "--device",
-    "focus": "--focus",
-    "gate": "--gate-m",
-    "method": "--method",
-    "overwrite": "--overwrite",
-    "pulse": "--pulse-ps",
-    "region": "--region",
-    "set": "--set",
-    "single_pixel": "--single-pixel",
-    "target": "--target-m",
-    "time_zero": "--time-zero-ns",
-}
-"""The command line's option for an argument that the libraries' messages name."""
 
 QUANTITIES = {
     **{
@@ -349,21 +330,3 @@ def _describe_unusable_input(fault: Exception) -> str | None:
     if isinstance(fault, OSError) and fault.errno in UNUSABLE_NAMES:
         return f"a name cannot be used: {fault.strerror} ({fault.filename})"
     return describe_missing_package(fault) if isinstance(fault, ImportError) else None
-
-
-def name_options(message: str) -> str:
-    """Put the options of the command line in the place of arguments that a message of the libraries
-    names as in Python.
-
-    Examples
-    --------
-    >>> name_options('give `bin_width`, or use `device="cpu"`')
-    'give --bin-width-ps, or use --device cpu'
-    """
-
-    def name_option(found: re.Match[str]) -> str:
-        option = OPTIONS_OF_ARGUMENTS.get(found["name"], found[0])
-        is_named = option != found[0] and found["value"] not in (None, "True")
-        return f"{option} {found['value']}" if is_named else option
-
-    return ARGUMENT_IN_MESSAGE.sub(name_option, message)

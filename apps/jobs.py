@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from apps.progress import show_progress
-from apps.report import may_replace, report
+from apps.report import may_replace, name_options, report
 from tofclip.errors import MissingDependencyError
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def report_summary(
     """Print the figures of a sequence and its failures. `total`: its jobs, those included that were
     done by an earlier run; `figures`: further ones.
     """
-    failed = {one.name: one.problem for one in summary.failures}
+    failed = {one.name: name_options(one.problem) for one in summary.failures}
     figures = {
         "results": summary.done,
         "kept_from_before": total - summary.done - len(failed),

@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
@@ -22,6 +23,24 @@ RECORD_SUFFIXES = (".h5", ".hdf5")
 MAX_LISTED_VALUES = 12  # of a list that are printed one by one
 MAX_TABLE_WIDTH = 100  # columns of a terminal for several things side by side
 UNITS = {"m", "mm", "s", "ns", "ps", "px"}
+ARGUMENT_IN_MESSAGE = re.compile(r"`(?P<name>[a-z_]+)(?:=\"?(?P<value>[^`\"]*)\"?)?`")
+OPTIONS_OF_ARGUMENTS = {
+    "axes": "--axes",
+    "bin_width": "--bin-width-ps",
+    "camera": "--camera camera.h5",
+    "device": "--device",
+    "focus": "--focus",
+    "gate": "--gate-m",
+    "method": "--method",
+    "overwrite": "--overwrite",
+    "pulse": "--pulse-ps",
+    "region": "--region",
+    "set": "--set",
+    "single_pixel": "--single-pixel",
+    "target": "--target-m",
+    "time_zero": "--time-zero-ns",
+}
+"""The command line's option for an argument that the libraries' messages name."""
 
 
 # From Python results are replaced, as any library does; see `replace_results`.
@@ -260,3 +279,21 @@ def _format_value(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return "-" if value in (None, "") else str(value)
+
+
+def name_options(message: str) -> str:
+    """Put the options of the command line in the place of arguments that a message of the libraries
+    names as in Python.
+
+    Examples
+    --------
+    >>> name_options('give `bin_width`, or use `device="cpu"`')
+    'give --bin-width-ps, or use --device cpu'
+    """
+
+    def name_option(found: re.Match[str]) -> str:
+        option = OPTIONS_OF_ARGUMENTS.get(found["name"], found[0])
+        is_named = option != found[0] and found["value"] not in (None, "True")
+        return f"{option} {found['value']}" if is_named else option
+
+    return ARGUMENT_IN_MESSAGE.sub(name_option, message)

@@ -25,7 +25,7 @@ from apps.options import (
     flag,
     opt,
 )
-from apps.report import make_folder, report, require_new, require_writable
+from apps.report import make_folder, name_options, report, require_new, require_writable
 from apps.verbs.recover import require_format
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
@@ -120,7 +120,7 @@ def stream(
     def note_failure(number: int, fault: TofclipError) -> None:
         nonlocal failed
         failed += 1
-        print(f"tofclip: failed: shot {number}: {fault}", file=sys.stderr)
+        print(f"tofclip: failed: shot {number}: {name_options(str(fault))}", file=sys.stderr)
 
     # Instruments do not wait: the newest shot counts. Files do, and lose nothing.
     made = stream_clouds(

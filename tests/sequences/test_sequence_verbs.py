@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from apps.cli import main
 from nlos import Volume
 from nlos.capture import TimeAxis
 from nlos.simulate import PointScene
-from tofclip import Frames
+from tofclip import Frames, Streak
 
 pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them
 
@@ -38,12 +39,12 @@ def run(capsys: pytest.CaptureFixture[str]):
 
 @pytest.fixture
 def few(recorded: Path, tmp_path: Path) -> Path:
-    """Two good shots and a broken one."""
+    """Two good shots, and one between them that carries no camera."""
     folder = tmp_path / "shots"
     folder.mkdir()
     for number in (0, 2):
         shutil.copy(recorded / "shots" / f"shot{number}.h5", folder)
-    (folder / "shot1.h5").write_text("no picture")
+    replace(Streak.load(folder / "shot0.h5"), camera=None).save(folder / "shot1.h5")
     return folder
 
 
@@ -54,6 +55,7 @@ def test_shots_to_frames_to_clouds_on_a_cluster(run, scheduler, few, tmp_path):
     assert status == 1
     assert "results                      2" in out
     assert err.splitlines()[-1].startswith("failed: shot1: ")
+    assert "give one (--camera camera.h5, made by" in err
     assert sorted(path.name for path in frames.glob("*.h5")) == ["shot0.h5", "shot2.h5"]
     shutil.copy(few / "shot0.h5", few / "shot1.h5")
     status, out, _ = run(f"{line} --json")
