@@ -31,7 +31,7 @@ from tofclip.recovery import make_method
 from tofclip.solvers import PlugAndPlay, RegularisationByDenoising, TotalVariation
 
 KEPT = {
-    "tofclip.methods": "tv l1 linear adjoint surfaces wavelet pnp red",
+    "tofclip.methods": "auto tv l1 linear adjoint surfaces wavelet pnp red",
     "tofclip.denoisers": "collaborative bm3d nlm",
     "tofclip.readers": "tiff lift hdf5 itex",
     "tofclip.codecs": "frames linospad2 timetag",
