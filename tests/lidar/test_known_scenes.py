@@ -13,7 +13,8 @@ from tofclip.camera import Camera
 
 
 def recover(shot: Shot, camera: Camera | None = None) -> tofclip.Frames:
-    return tofclip.recover(tofclip.Streak(shot.counts, shot.row_times), camera or shot.true_camera)
+    streak = tofclip.Streak(shot.counts, shot.row_times)
+    return tofclip.recover(streak, camera or shot.true_camera, "tv")
 
 
 def find_points(shot: Shot) -> tofclip.PointCloud:
