@@ -27,7 +27,7 @@ from tofclip.arrays import (
 )
 from tofclip.errors import InputError, ShapeError, require_positive, require_type
 from tofclip.notebook import render_html
-from tofclip.shots import Frames
+from tofclip.shots import RELAY_WALL, Frames
 from tofclip.storage import Field, Record
 from tofclip.units import PICOSECOND, SPEED_OF_LIGHT, require_credible_bin_width
 
@@ -300,8 +300,8 @@ class Capture:
             raise InputError(
                 "these frames are a rendering of surfaces, without a wall's third bounce: recover by another method"
             )
-        record = frames.attachments.get(ATTACHMENT_NAME)
-        if record is None or record.kind != ATTACHMENT_NAME:
+        record = frames.attachments.get(RELAY_WALL)
+        if record is None or record.kind != RELAY_WALL:
             raise InputError(
                 "these frames carry no relay wall: recover them from a streak image converted with its wall's geometry"
             )
@@ -393,7 +393,6 @@ def _to_real_array(values: Any, dtype: type, name: str) -> NDArray[Any]:
     return np.ascontiguousarray(array, dtype=dtype)
 
 
-ATTACHMENT_NAME = "relay_wall"
 # Of its mean, what steps of a time axis may differ by: less than a bin over 1000.
 STEP_TOLERANCE = 1e-3
 

@@ -39,6 +39,7 @@ from tofclip.storage import (
 from tofclip.units import SPEED_OF_LIGHT, require_credible_bin_width
 
 RETURN_CHOICES = ("first", "strongest", "last", "all")  # which return of a pixel counts
+RELAY_WALL = "relay_wall"  # the attachment of shots whose light is a wall's, not that of surfaces
 MAX_ROW_S = 1e-3  # the slowest sweeps of streak cameras last milliseconds in all
 PICTURE_COLUMNS = ("range", "intensity", "confidence", "return_number", "time")
 

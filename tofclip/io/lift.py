@@ -26,7 +26,7 @@ from tofclip.camera import Camera, PolynomialSweep, ProjectiveSweep, SkewSweep, 
 from tofclip.errors import CalibrationError, FileFormatError, InputError
 from tofclip.io.archive import Archive
 from tofclip.io.hamamatsu import StreakFile
-from tofclip.shots import Streak, outline_streak
+from tofclip.shots import RELAY_WALL, Streak, outline_streak
 from tofclip.storage import Field, Record
 
 # Flags of the archive and the only value whose meaning is known.
@@ -56,7 +56,7 @@ class RelayWall:
         row, column = self.offset_px
         delay = self.receive_delay_bins
         attributes = {"row_offset": row, "column_offset": column, "receive_delay_bins": delay}
-        return Record("relay_wall", fields, attributes)
+        return Record(RELAY_WALL, fields, attributes)
 
     def fit_focal_length(self) -> tuple[float, float]:
         """Fit a pinhole camera, free to turn, to the directions in which the pixels see the wall;
@@ -144,7 +144,7 @@ def open_lift(path: str | Path) -> Iterator[StreakFile]:
     metadata, attachments = archive.scalars(), {}
     if "wall_grid_m" in archive:
         wall = read_relay_wall(archive, camera.image_shape)
-        attachments["relay_wall"] = wall.to_record()
+        attachments[RELAY_WALL] = wall.to_record()
         focal_length_px, residual_px = wall.fit_focal_length()
         camera = camera.replace(focal_length_px=focal_length_px)
         metadata["focal_length_residual_px"] = f"{residual_px:.3g}"

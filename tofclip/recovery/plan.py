@@ -34,7 +34,7 @@ from tofclip.recovery.defects import (
 from tofclip.recovery.focus import DEFAULT_FOCUS, DepthLockedFocus, Focus, FrameSegment, parse_focus
 from tofclip.recovery.shot import Shot, open_shot
 from tofclip.recovery.surfaces import SurfaceRecovery
-from tofclip.shots import Frames, Streak
+from tofclip.shots import RELAY_WALL, Frames, Streak
 from tofclip.solvers import (
     DataTermMaker,
     LeastSquares,
@@ -50,7 +50,6 @@ from tofclip.threads import split_blocks
 
 AnyMethod = Method | SurfaceRecovery
 DEFAULT_METHOD = "auto"
-RELAY_WALL = "relay_wall"  # the attachment of shots whose light is a wall's, not that of surfaces
 
 # Of `l1` where iterations are not given: a bright shot needs more of them than a dark one. In shots with
 # 20 photons in the brightest pixel the solution without negative values turns the noise into single
