@@ -31,7 +31,7 @@ from tofclip.arrays import (
     zeros,
 )
 from tofclip.camera import Camera
-from tofclip.errors import InputError, MissingDependencyError
+from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.lidar import Detection, depth, pulse_tables
 from tofclip.operators import (
     BlockDiagonal,
@@ -179,6 +179,22 @@ class TestDevice:
             assert all(one.ctypes.data % 64 == 0 for one in made)
             assert all(one.shape == shape and one.dtype == dtype for one in made)
             assert all(one.flags.c_contiguous and one.flags.writeable for one in made)
+
+
+def test_frames_of_other_libraries_are_checked_and_saved(device, tmp_path):
+    camera = Camera([20.0], [0.1], (4, 5), 41, pulse_fwhm=60e-12)
+    values = np.random.default_rng(0).normal(10, 2, (10, 4, 5)).astype(np.float32)
+    there = Frames(device.put(values), 20e-12 * np.arange(10), camera)
+    there.save(tmp_path / "frames.h5")
+    np.testing.assert_array_equal(Frames.load(tmp_path / "frames.h5").values, values)
+    assert ComputeDevice.of(there.values).library == device.library
+    np.testing.assert_array_equal(to_numpy(there.values), values)
+    with pytest.raises(ShapeError):
+        replace(there, values=device.put(values[1:]))
+    with pytest.raises(InputError, match="NaN"):
+        replace(there, values=device.put(np.full_like(values, np.nan)))
+    with pytest.raises(InputError, match="at least three frames"):
+        depth(Frames(device.put(values[:2]), there.times[:2], camera))
 
 
 OTHER_DEVICE = ComputeDevice("array_api_strict", strict.Device("device1"))

@@ -51,6 +51,7 @@ NPZ_BOMBS = {
     "light field": {"lf": (8, 8, HUGE, 8), "u": (8,), "v": (8,), "scale": ()},
     "capture": {"H": (HUGE, 8), **dict.fromkeys(("wall_xyz", "laser_xyz", "delta_t_s"), (3,))},
     "cloud": {"x_m": (HUGE,)},
+    "photons": {"counts": (1 << 14, 1 << 14, 1 << 12)},
 }
 
 
@@ -135,6 +136,17 @@ def write_stack_bomb(folder):
     return folder / "stack.h5"
 
 
+def write_cube_bomb(folder, rows):
+    with h5py.File(folder / "a.h5", "w") as file:
+        file.create_dataset("counts", (rows, rows, 4096), "u2", chunks=(64, 64, 64))
+    return folder / "a.h5"
+
+
+def write_npy_bomb(folder):
+    (folder / "a.npy").write_bytes(make_npy_header((1 << 14, 1 << 14, 1 << 12)))
+    return folder / "a.npy"
+
+
 def write_linked_stack(folder):
     with h5py.File(folder / "other.h5", "w") as file:
         file["counts"] = np.ones((2, 3, 4), np.float32)
@@ -166,6 +178,7 @@ BOMBS = {
             ("capture", read_capture),
             ("cloud", PointCloud.load),
             ("cloud", load),
+            ("photons", read_photons),
         ]
     },
     "lzma": (write_lzma_bomb, read_streak),
@@ -180,6 +193,9 @@ BOMBS = {
     "png": (write_png_bomb, read_light_field),
     "stack": (write_stack_bomb, StreakStack),
     "linked stack": (write_linked_stack, StreakStack),
+    "photons": (write_npy_bomb, read_photons),
+    "photons, sparse": (partial(write_cube_bomb, rows=64), read_photons),
+    "photons, sparse and large": (partial(write_cube_bomb, rows=1 << 14), read_photons),
     "las": (write_las_bomb, PointCloud.load),
 }
 

@@ -1,24 +1,18 @@
-"""Walls, hidden points and devices that the tests of imaging around corners share, and how alike two
-fields are.
-
-Where there is a GPU, ``TOFCLIP_TEST_DEVICES=cuda pytest tests/nlos -k portable`` tests it as well.
-"""
+"""Walls and hidden points that the tests of imaging around corners share, and how alike fields are."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from nlos import Capture, Grid
 from nlos.capture import TimeAxis
 from nlos.simulate import PointScene
-from tofclip.arrays import ComputeDevice, parse_device, to_numpy
+from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
 
 AXIS = TimeAxis(bins=256, bin_width=16e-12, start=0.4)
@@ -34,8 +28,6 @@ SHAPES = ("planar", "cylinder", "wavy", "relief", "plates")
 SHAPED_SPOT = np.array([0.1, 0.05, 0.02])
 SHAPED_POINTS = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4], [-0.6, -0.6, 1.1]])
 SHAPED_JITTER, SHAPED_AXIS = 60e-12, TimeAxis(512, 32e-12)
-
-LIBRARIES = ("torch", "array_api_strict", *os.environ.get("TOFCLIP_TEST_DEVICES", "").split())
 
 
 def planar_wall(rows: int = 17, columns: int = 21) -> NDArray[np.float64]:
@@ -134,19 +126,6 @@ def find_refusal(method: Any, capture: Capture, grid: Grid) -> str:
     except InputError as refused:
         return str(refused)
     return ""
-
-
-def find_device(library: str) -> ComputeDevice:
-    """Return a library's processor, or the device of that name; skip the test where the library is
-    not installed.
-    """
-    if library == "array_api_strict":
-        return ComputeDevice.of(pytest.importorskip(library).asarray([0.0]))
-    if library != "torch":
-        return parse_device(library)
-    # Waking other threads up takes longer than what there is to do.
-    pytest.importorskip(library).set_num_threads(1)
-    return parse_device("torch:cpu")
 
 
 def reorder(capture: Capture, kept: Any, earlier: float = 0.0) -> Capture:

@@ -101,7 +101,7 @@ def test_the_study_on_a_small_office_reaches_the_papers_finding(
     capture = build_office(0.15).simulate_capture(
         wall, [0.0, 0.0, 0.0], TimeAxis(256, 64e-12), 60e-12
     )
-    rows = run_study(capture, Grid.box((-1, 1), (-1, 1), (0.9, 2.1), 0.06), PlanarRSD(0.24, 5.0))
+    rows = run_study(capture, Grid.box((-1, 1), (-1, 1), (0.9, 2.1), 0.1), PlanarRSD(0.24, 5.0))
     by_setting = {(row.exposure, row.sampling_ratio): row for row in rows}
     assert len(by_setting) == 4
     # Note 13: very close to the truth at 20 ms and SR 0.1.

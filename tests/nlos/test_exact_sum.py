@@ -122,12 +122,9 @@ def list_cases() -> Iterator[Any]:
 
 
 CASES = dict(list_cases())
-NIGHTLY = {"hybrid, planar, 64 x 64 points", "hybrid, relief, 64 x 64 points"}
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in NIGHTLY)) for n in CASES]
-)
+@pytest.mark.parametrize("name", CASES)
 def test_the_field_is_the_exact_sum_within_the_tolerance(name: str) -> None:
     case = CASES[name]
     capture = case.see()

@@ -149,8 +149,7 @@ def test_a_bright_wall_is_noticed() -> None:
         assert is_brightest_on_wall(Volume(values, grid), clean(), 0.1) == on_wall
 
 
-@pytest.mark.parametrize("confocal", [True, False])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("confocal", "seed"), [(True, 1), (False, 2)])
 def test_evidence_separates_a_scene_from_noise_and_from_a_shuffled_record(
     confocal: bool, seed: int
 ) -> None:

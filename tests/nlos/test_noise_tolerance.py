@@ -63,19 +63,30 @@ def list_errors(
     ]
 
 
+NARROWEST = (PlanarRSD, "planar", "confocal"), (Hybrid, "wavy", "confocal")
+"""Where errors are the largest part of what is allowed: 0.75 and 0.89 of it."""
+
+
 @pytest.mark.parametrize("bins", [LONG, SHORT])
-@pytest.mark.parametrize("scan", WAVELENGTHS)
-@pytest.mark.parametrize(("shape", "method"), WALLS)
+@pytest.mark.parametrize(
+    ("method", "shape", "scan"),
+    [
+        pytest.param(*one, marks=[pytest.mark.nightly] * (one not in NARROWEST))
+        for one in ((method, shape, scan) for shape, method in WALLS for scan in WAVELENGTHS)
+    ],
+)
 def test_a_tolerance_is_kept(
-    shape: str, method: type[PlanarRSD] | type[Hybrid], scan: str, bins: int
+    method: type[PlanarRSD] | type[Hybrid], shape: str, scan: str, bins: int
 ) -> None:
-    for background in (NOISE, COUNTS, POINTS_AND_COUNTS):
+    for background in (NOISE, COUNTS, POINTS_AND_COUNTS) if bins == LONG else (NOISE,):
         capture = see_noise(shape, 24, bins, background, scan)
         errors = list_errors(method, capture, GRID, WAVELENGTHS[scan])
         assert max(errors) < 1, (background, errors)
 
 
-@pytest.mark.parametrize(("shape", "method"), [WALLS[0], ("cylinder", Hybrid)])
+@pytest.mark.parametrize(
+    ("shape", "method"), [pytest.param(*WALLS[0], marks=pytest.mark.nightly), ("cylinder", Hybrid)]
+)
 def test_a_tolerance_is_kept_where_many_depths_are_interpolated(
     shape: str, method: type[PlanarRSD] | type[Hybrid]
 ) -> None:

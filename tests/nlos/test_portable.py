@@ -11,15 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from array_places import DEVICE_NAMES, find_device
 from scenes import (
     HIDDEN,
     JITTER,
-    LIBRARIES,
     LONG,
     SPOTS,
     THREE_POINTS,
     curved_wall,
-    find_device,
     find_refusal,
     planar_wall,
     relative_error,
@@ -54,7 +53,7 @@ from nlos.simulate import add_poisson_noise
 from tofclip.arrays import ComputeDevice, to_numpy
 from tofclip.errors import InputError
 
-libraries = pytest.mark.parametrize("library", LIBRARIES)
+libraries = pytest.mark.parametrize("library", DEVICE_NAMES)
 # Odd and even sizes, off the wall's middle, depths unevenly spaced.
 GRID = Grid(np.arange(-0.3, 0.42, 0.05), np.arange(-0.4, 0.25, 0.06), [0.45, 0.5, 0.56, 0.65, 0.8])
 FINE = Grid(GRID.x[:4], GRID.y[:3], 0.4 + np.arange(32) / 64)
@@ -240,14 +239,14 @@ PREPARATIONS: tuple[Callable[[Capture], Capture], ...] = (
 # --- plans and memory
 
 
-@pytest.mark.parametrize("library", [*LIBRARIES, "numpy"])
+@pytest.mark.parametrize("library", [*DEVICE_NAMES, "numpy"])
 @pytest.mark.parametrize(
     "case", ["rsd, single", "hybrid, spots, True", "hybrid, spots, False"], indirect=True
 )
 def test_what_is_planned_images_many_captures(library: str, case: Case) -> None:
     first = case.capture
     other = replace(first, signal=0.7 * first.signal[:, ::-1])
-    device = ComputeDevice() if library == "numpy" else find_device(library)
+    device = find_device(library)
     plan = case.method.plan(first.on(device), case.grid)
     for one in (first, other, first):
         found = plan.image(one.on(device))
@@ -280,7 +279,7 @@ def test_little_memory_means_smaller_pieces(
     capture = case.capture.on(find_device("array_api_strict"))
     plan = case.method.plan(capture, case.grid)
     whole = to_numpy(plan.field(capture).values)
-    monkeypatch.setattr(ArrayLibrary, "chunk_bytes", 1 if name == "rsd, single" else 1 << 16)
+    monkeypatch.setattr(ArrayLibrary, "chunk_bytes", 1 if name == "rsd, single" else 1 << 19)
     monkeypatch.setattr(nlos.phasor.to_depths, "MAX_CACHE_BYTES", kept)
     plan = case.method.plan(capture, case.grid)
     for _ in range(2):

@@ -103,7 +103,10 @@ def test_settings_of_recorded_captures(
         assert settings.gate == pytest.approx(0.72, abs=0.1)
 
 
-@pytest.mark.parametrize("name", [OUTDOOR, DIFFUSE, MANNEQUIN])
+@pytest.mark.parametrize(
+    "name",
+    [DIFFUSE, *(pytest.param(one, marks=pytest.mark.nightly) for one in (OUTDOOR, MANNEQUIN))],
+)
 def test_settings_of_a_capture_do_not_hang_on_how_it_is_handed_over(
     name: str, shared_data: Path, tmp_path: Path
 ) -> None:

@@ -54,7 +54,7 @@ def likeness(volume: Volume) -> float:
     return float(np.corrcoef(volume.values.ravel(), truth.ravel())[0, 1])
 
 
-@pytest.mark.parametrize("laser", ["single", "confocal", "two spots"])
+@pytest.mark.parametrize("laser", ["single", "confocal"])
 def test_refinement_beats_the_single_shot(laser: str) -> None:
     shot = HYBRID.reconstruct(seen(laser), GRID)
     refined = Refinement(HYBRID, Sparse(weight=2e-2, iterations=30)).reconstruct(seen(laser), GRID)

@@ -1,6 +1,4 @@
-"""The definition of the phasor-field image, summed term by term in float64: slow, and what other
-methods answer to.
-"""
+"""The definition of the phasor-field image, summed term by term in float64: what methods answer to."""
 
 from __future__ import annotations
 
@@ -12,31 +10,16 @@ from nlos.capture import Capture, TimeAxis
 from nlos.method import require_imageable
 from nlos.volume import Grid, Volume
 
-TERMS_PER_BLOCK = 1 << 20
-"""Distances held at a time, 8 MB of each kind, whatever the sizes of wall and volume."""
+TERMS_PER_BLOCK = 1 << 15
+"""Distances held at a time, so that what is computed of them stays in the processor's cache."""
 
 
 def compute_exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Volume:
     """Sum ``P_k(r_p) * exp(1j * k * (|r_L - r| + |r - r_p|)) / |r - r_p|`` over the band and the
     wall.
 
-    The record is followed by silence. Costs one complex exponential per voxel, wall point and frequency, plus one each.
-
-    Parameters
-    ----------
-    capture : Capture
-    grid : Grid
-    pulse : VirtualPulse
-
-    Returns
-    -------
-    Volume
-        The complex field, complex128.
-
-    Raises
-    ------
-    InputError
-        An empty band, a single wall point, a grid behind the wall, or one that is too large.
+    The record is followed by silence. Frequencies are evenly spaced, so that each one's waves are
+    the last one's turned by the same angle: in float64 a thousand turns leave 1e-13.
     """
     require_imageable(capture, grid)
     band = Band(pulse, follow_by_silence(capture, grid))
@@ -68,16 +51,13 @@ def _sum_over_wall(
     wavenumbers: NDArray[np.float64],
     phasors: NDArray[np.complex128],
 ) -> NDArray[np.complex128]:
-    last_leg = _compute_distances(voxels, capture.points)
-    path = last_leg + _compute_distances(voxels, capture.lasers)
+    last_leg = np.linalg.norm(voxels[:, np.newaxis] - capture.points, axis=-1)
+    path = last_leg + np.linalg.norm(voxels[:, np.newaxis] - capture.lasers, axis=-1)
+    step = np.diff(wavenumbers).mean()
+    np.testing.assert_allclose(np.diff(wavenumbers), step, rtol=1e-9)
+    waves, turn = np.exp(1j * wavenumbers[0] * path) / last_leg, np.exp(1j * step * path)
     field = np.zeros(len(voxels), np.complex128)
-    for k, at_k in zip(wavenumbers, phasors.T, strict=True):
-        field += (np.exp(1j * k * path) / last_leg) @ at_k
+    for at_k in phasors.T:
+        field += waves @ at_k
+        waves *= turn
     return field
-
-
-def _compute_distances(
-    voxels: NDArray[np.float64], points: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    distances: NDArray[np.float64] = np.linalg.norm(voxels[:, np.newaxis] - points, axis=-1)
-    return distances

@@ -57,7 +57,7 @@ def uncalibrated(shot) -> Camera:
 
 @pytest.fixture(scope="module")
 def frames(shot, uncalibrated) -> Frames:
-    return recover(shot.streak, uncalibrated, "tv")
+    return recover(shot.streak, uncalibrated, "l1")
 
 
 def test_the_scene_is_where_the_instrument_looks(shot):
@@ -211,7 +211,7 @@ def test_ranges_are_true_and_fitting_the_camera_costs_no_accuracy(shot, frames):
     # Errors are what each return says of its own, on its surface: 0.6 to 1.6 is what is promised.
     assert 0.6 < figures["range_z"] < 1.6
     # The fitted camera explains the measurements as well as the true one, to within photon noise.
-    with_truth = recover(shot.streak, shot.camera, "tv")
+    with_truth = recover(shot.streak, shot.camera, "l1")
     assert frames.figures["relative_residual"] < 1.05 * with_truth.figures["relative_residual"]
 
 
@@ -219,7 +219,7 @@ def test_frames_say_what_they_are(shot, frames):
     assert frames.values.shape == (shot.streak.counts.shape[0], 128, 128)
     assert frames.values.dtype == np.float32
     np.testing.assert_allclose(frames.times, shot.streak.times - shot.camera.time_zero)
-    assert frames.figures["method"] == "tv"
+    assert frames.figures["method"] == "l1"
     assert frames.figures["stopped_because"] == "iterations done"
     objective = frames.provenance["objective"]
     assert len(objective) == frames.figures["iterations"] + 1
