@@ -207,6 +207,8 @@ def test_what_cannot_be_measured_is_refused():
         measure(streak(), np.ones((ROWS, WIDTH), bool), camera())
     with pytest.raises(InputError, match="dark level"):
         measure(np.full((ROWS, WIDTH), 7, np.float32), None, camera())
+    with pytest.raises(ShapeError):
+        Rectifier(camera(), ROWS).measure(streak()[:-1])
     adder = RowSums(make_rectifier(), np.arange(LANES), LENGTH)
     sums = np.empty((SUM_WIDTH, LANES), np.float32)
     with pytest.raises(InputError, match="dark level"):

@@ -93,6 +93,28 @@ def write_bytes(name, content=b"no picture"):
     return lambda folder: (folder / name).write_bytes(content) and folder / name
 
 
+ARCHIVE = {
+    "lf": np.random.default_rng(0).integers(0, 99, (2, 3, 5, 7)).astype(np.uint16),
+    "scale": 0.5,
+    "v": [-1, 0],
+    "u": [-1, 0, 1],
+}
+
+
+def write_archive(**changes):
+    def write(folder):
+        np.savez(folder / "field.npz", **{**ARCHIVE, **changes})
+        return folder / "field.npz"
+
+    return write
+
+
+def test_an_archive_is_read_view_by_view(tmp_path):
+    found = read_light_field(write_archive()(tmp_path))
+    np.testing.assert_array_equal(found.pictures[4], ARCHIVE["lf"][1, 1] * np.float32(0.5))
+    np.testing.assert_array_equal(found.views[4], [0, 0])
+
+
 def write_half(folder):
     write_light_field(light_field(), folder / "cut.exr")
     whole = (folder / "cut.exr").read_bytes()
@@ -115,6 +137,8 @@ def write_half(folder):
         (write_exr(**{"v=0,u=0": ("Y", np.full((4, 4), np.nan))}), None),
         (write_exr(**{"v=0,u=0": ("Y", np.zeros((4, 4)))}), None),
         (write_half, "EXR"),
+        (write_archive(v=[-1]), "field.npz"),
+        (write_archive(lf=np.ones((2, 3, 5, 7))), None),
         (write_bytes("noise.exr"), "EXR"),
         (lambda folder: write_bytes("noise_0_0.png")(folder).parent, "damaged picture"),
         (write_bytes("text.txt"), "is not a light field"),

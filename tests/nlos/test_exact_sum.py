@@ -85,6 +85,9 @@ def list_cases() -> Iterator[Any]:
     for name, laser in (("on the wall", SPOTS[0]), ("ahead", [0.1, 0.0, 0.3])):
         fine = Case(RSD, lambda laser=laser: see_planar(laser, THREE_POINTS[:2]), FINE)
         yield f"rsd, fine depths, laser {name}", fine
+    row = Grid(GRID.x, GRID.y[3:4], GRID.z[3:4])
+    for name, grid in (("a row", row), ("a voxel", Grid(GRID.x[9:10], row.y, row.z))):
+        yield f"rsd, {name}", Case(RSD, lambda: see_planar(SPOTS[0]), grid, (1e-2,))
     for shape in SHAPES:
         shaped = Case(HYBRID, lambda shape=shape: see_shaped(shape, 25), SHAPED)
         yield f"hybrid, {shape}", shaped

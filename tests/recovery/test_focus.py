@@ -274,8 +274,7 @@ def test_shadows_are_recovered_as_holes_in_the_wall():
     assert lit.sum() > 1500
     assert shadow.sum() > 150
     shot = simulate_shot(make_shadow_scene(), make_default_instrument(), seed=0)
-    method = TotalVariation(iterations=40)
-    frames = recover(shot.streak, shot.camera, method, focus=DepthLockedFocus())
+    frames = recover(shot.streak, shot.camera, METHOD, focus=DepthLockedFocus())
     at_wall = np.abs(frames.times * SPEED_OF_LIGHT / 2 - WALL_DEPTH_M) < 0.06
     bright = np.tensordot(frames.times[at_wall] ** 2, frames.values[at_wall], 1)
     # light of the lit wall leaks into the shadows, a few pixels wide, through the seven views' blur

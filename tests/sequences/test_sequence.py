@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from tofclip import Streak
-from tofclip.camera import Rectifier, measure
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
 from tofclip.io.streaks import StreakStack, save_stack
 from tofclip.recovery import DepthLockedFocus
@@ -105,30 +104,6 @@ def test_memory_does_not_grow_with_the_sequence(shot, pipeline, tmp_path):
     # 28 shots more; threads overlap differently from run to run, which moves the peak by the size
     # of a shot or two
     assert peaks[2] - peaks[1] < 5 * shot().counts.nbytes
-
-
-def test_a_rectifier_does_what_interpolation_does(shot, camera):
-    streak = shot(0.0, 3)
-    rectifier = Rectifier(camera, ROWS)
-    found = rectifier.measure(streak.counts, streak.saturated, dark=0.0, delay=0.25)
-    row = camera.sweep.raw_position(*np.ogrid[:ROWS, :320])[0] + 0.25
-    inside = (row >= 0) & (row <= ROWS - 1)
-    top = np.clip(np.floor(row).astype(int), 0, ROWS - 2)
-    share = row - top
-    columns = np.broadcast_to(np.arange(320), row.shape)
-    expected = (1 - share) * streak.counts[top, columns] + share * streak.counts[top + 1, columns]
-    # positions are float32: 1e-5 rows at the end of the picture, times the steepest slope
-    np.testing.assert_allclose(
-        found.values.T, np.where(inside, expected, 0), atol=2e-5 * streak.counts.max()
-    )
-    np.testing.assert_array_equal(found.valid.T, inside)
-    with pytest.raises(ShapeError):
-        rectifier.measure(streak.counts[:-1])
-    marked = np.zeros(streak.counts.shape, bool)
-    marked[50, 160] = True
-    bad = ~measure(streak.counts, marked, camera.replace(sweep=None)).valid
-    assert bad.sum() == 1
-    assert bad[160, 50]
 
 
 def test_jitter_beyond_reach_stays_at_its_end(shot, camera):
