@@ -86,7 +86,7 @@ def test_an_even_surface_is_smooth_with_sharp_borders_under_total_variation() ->
     truth = front * (np.abs(GRID.z - 0.7) < 0.03)[:, None, None]
     shot = HYBRID.reconstruct(capture, GRID).values
     refined = (
-        Refinement(HYBRID, build_total_variation(GRID, 3e-3, 60)).reconstruct(capture, GRID).values
+        Refinement(HYBRID, build_total_variation(GRID, 3e-3, 25)).reconstruct(capture, GRID).values
     )
     found, before = (float(np.corrcoef(v.ravel(), truth.ravel())[0, 1]) for v in (refined, shot))
     assert found > before + 0.1
