@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,8 +108,9 @@ def choose_renderer() -> Renderer:
     return PyvistaRenderer() if has_working_graphics() else RasterRenderer()
 
 
+@cache
 def has_working_graphics(probe: str = PROBE_SCRIPT) -> bool:
-    """Whether VTK can draw here. Where it cannot it ends its process, so another one tries."""
+    """Whether VTK can draw here. Where it cannot it ends its process, so another one tries, once."""
     quietly: Any = {"capture_output": True, "stdin": subprocess.DEVNULL, "check": False}
     try:
         done = subprocess.run([sys.executable, "-c", probe], timeout=PROBE_TIMEOUT_S, **quietly)
