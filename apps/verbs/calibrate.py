@@ -239,7 +239,7 @@ class _ShotReader:
                 "range calibration"
             )
         bare = frames.camera.replace(range_calibration=None)
-        returns = depth(frames, bare) if frames.returns is None else frames.returns
+        returns = depth(frames, bare if frames.returns is None else None)
         record = float(frames.times[0]), float(frames.times[-1])
         return TargetShot(replace(returns, camera=bare), distance, record, shot)
 

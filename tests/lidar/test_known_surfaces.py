@@ -24,7 +24,7 @@ def recover(scene: str, photons: float) -> tuple[tofclip.Frames, dict]:
 @pytest.mark.parametrize(
     ("scene", "missed", "false", "too_small", "too_large"),
     [
-        ("wires", 0.03, 0.12, 1.3, 0.07),
+        ("wires", 0.03, 0.06, 1.3, 0.07),
         ("room", 0.05, 0.01, 1.9, 0.33),
         ("table", 0.08, 0.01, 2.5, 0.2),
     ],

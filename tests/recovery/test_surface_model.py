@@ -485,7 +485,7 @@ def test_a_deviation_is_that_of_the_fit_of_further_steps_and_of_the_centres():
         AmplitudeSolver(model, amplitude, 2.0),
         depth(Frames(np.zeros((9, *SHAPE), np.float32), BIN * np.arange(9), CAMERA)),
     )
-    fit = SurfaceFit(model, solver, refinement, remainder, 0.0, nothing, solver)
+    fit = SurfaceFit(model, solver, refinement, remainder, 0.0, nothing, solver, nothing)
     found = list_returns(fit, Detection(), centre_error)
     assert len(found) == model.surface.size
     for surface, (first, slope) in enumerate([(1 / 1.4, 0.02), (1 / 1.7, -0.03)]):
@@ -523,3 +523,23 @@ def test_usual_brightness_is_that_of_the_surest_points():
     # in little light none is twenty deviations out, and half of the upper ones' counts
     assert find_usual_brightness(amplitude, amplitude, 5.0) == 10
     assert find_usual_brightness(amplitude, amplitude / 10, 5.0) == np.inf
+
+
+def test_a_border_that_the_shot_does_not_need_is_told_from_one_that_it_does():
+    """Of a plate as it is, and of one where points beyond it may have light as well."""
+    model = make_model(simulate_shot(SCENE, INSTRUMENT, seed=0).streak)
+    lit = np.zeros(model.masks.shape, bool)
+    lit[0, 12:26, 9:21] = lit[1, 24:36, 22:40] = True
+    expected = model.render(np.where(lit[model.masks], 20, 0).astype(np.float32)) + 2
+    model.image = np.random.default_rng(0).poisson(expected).astype(np.float32) - 2
+    model.weights = 1 / (expected + 0.015 * expected.max())
+    spread = lit.copy()
+    spread[1, 22:38, 22:40] = True
+    light = np.full(model.surface.size, 15, np.float32)
+    solver = AmplitudeSolver(model, light, 2.0).cover(spread)
+    solver.run(40, lambda _: None, 0)
+    need, inside = solver.weigh_borders(np.ones(light.size, bool)[spread[model.masks]])
+    beyond, own = (spread & ~lit)[spread], (inside == 0) & (solver.model.surface == 0)
+    assert inside.max() >= 5
+    assert np.median(need[own]) > 15
+    assert np.median(need[beyond]) < 0.7 * np.median(need[own])

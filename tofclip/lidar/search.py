@@ -117,8 +117,6 @@ class ReturnSearch:
             false_alarm = doubt[kept]
         chosen = np.flatnonzero(kept)
         pixel, time = pixel.take(chosen), time.take(chosen)
-        first = np.flatnonzero(np.diff(pixel, prepend=-1))  # of each pixel
-        rank = np.arange(pixel.size) - np.repeat(first, np.diff(first, append=pixel.size))
         y, x = np.divmod(pixel.astype(np.int32), np.int32(self.camera.image_shape[1]))
         distance = SPEED_OF_LIGHT / 2 * time
         sigma = add_recovery_error(
@@ -138,7 +136,7 @@ class ReturnSearch:
                 range=distance,
                 intensity=intensity.take(chosen).astype(np.float32),
                 confidence=sigma.astype(np.float32),
-                return_number=(rank + 1).astype(np.uint8),
+                return_number=number_returns(pixel),
                 time=time,
                 camera=self.camera,
                 shear=np.interp(time, self.times, self.shears)
@@ -226,7 +224,8 @@ def depth(
     given, are judged by its fractions.
 
     Frames that were made from surfaces carry their returns (``.returns``): where nothing else is given
-    these are the answer. Found again in frames that hold no noise they would seem far too exact.
+    these are the answer, up to `false_alarm` as well. Found again in frames that hold no noise they
+    would seem far too exact.
 
     Counted photons, whole numbers that a camera of one view saw (`Camera.pinhole`), are no recovered
     frames: their returns are found pixel by pixel by `tofclip.lidar.photons.estimate_pixels`, and
@@ -271,8 +270,7 @@ def depth(
     """
     require_type(frames, Frames, "returns are found in Frames, see tofclip.recover")
     if frames.returns is not None and camera is None and detection is None and pulse is None:
-        own = frames.returns
-        return own if false_alarm is None else own[~(own.false_alarm > false_alarm)]
+        return keep_probable(frames.returns, false_alarm)
     camera = frames.camera if camera is None else camera
     if camera.image_shape != frames.values.shape[1:]:
         raise ShapeError(
@@ -296,6 +294,21 @@ def depth(
         limit = DEFAULT_FALSE_ALARM if false_alarm is None else false_alarm
         judge = EvidenceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
     return search.find_returns(FrameTraces(frames), frames.provenance, judge)
+
+
+def number_returns(pixel: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Return the number of each return in its pixel, from 1; `pixel` (n,) does not decrease."""
+    first = np.flatnonzero(np.diff(pixel, prepend=-1))
+    rank = np.arange(pixel.size) - np.repeat(first, np.diff(first, append=pixel.size))
+    return np.asarray(rank + 1, dtype=np.uint8)
+
+
+def keep_probable(returns: Returns, false_alarm: float | None = None) -> Returns:
+    """Return those that are false with a probability of `false_alarm`, 0.1 by default, at most."""
+    limit = DEFAULT_FALSE_ALARM if false_alarm is None else false_alarm
+    kept = returns[~(returns.false_alarm > limit)]
+    pixel = kept.y.astype(np.int64) * kept.camera.image_shape[1] + kept.x
+    return replace(kept, return_number=number_returns(pixel))
 
 
 def _holds_counts(frames: Frames, pulse: Pulse) -> bool:

@@ -25,7 +25,7 @@ from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.errors import ShapeError
 from tofclip.lidar import Detection, PointCloud, point_cloud
 from tofclip.lidar.pulse_tables import PictureTraces, TraceBins, Traces
-from tofclip.lidar.search import ReturnSearch
+from tofclip.lidar.search import ReturnSearch, keep_probable
 from tofclip.lidar.signal_rows import RowBlock, SignalRowFinder
 from tofclip.operators import LinearOperator
 from tofclip.recovery import (
@@ -175,7 +175,7 @@ class SurfacePipeline:
 
     def search(self, found: SurfaceFit) -> Returns:
         """List the returns of what `recover_shot` returned."""
-        return list_returns(found, self.method.detection, self._centre_error_px)
+        return keep_probable(list_returns(found, self.method.detection, self._centre_error_px))
 
 
 class StillAverage:

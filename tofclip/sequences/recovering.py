@@ -229,12 +229,12 @@ class CloudSettings:
         """
         from tofclip.lidar.processing import downsample_cloud, find_outliers
 
-        returns = frames.returns
-        if returns is None:
-            device = parse_device(self.device)
-            with device.activate():
+        device = parse_device(self.device)
+        with device.activate():
+            there = frames
+            if frames.returns is None:
                 there = replace(frames, values=device.put(frames.values))
-                returns = depth(there, false_alarm=self.false_alarm)
+            returns = depth(there, false_alarm=self.false_alarm)
         if len(returns) == 0:
             raise InputError(f"{origin}: {_explain_empty_cloud(frames)}")
         returns = returns.select(self.returns)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -9,7 +11,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import Image
-from tofclip.solvers import Progress
+from tofclip.solvers import Progress, ignore_progress
 from tofclip.threads import run_blocks
 
 PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
@@ -17,7 +19,11 @@ NORM_ITERATIONS, FURTHER_NORM_ITERATIONS = 10, 2
 NORM_MARGIN = 1.1
 EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
+# Of a surface's border: rounds of taking it off, steps of FISTA before and after, deviations of what is
+# needed, and the part of the points of which as few are not that no further round is worth it
+BORDER_ROUNDS, BORDER_STEPS, NEEDED_SIGMAS, FEW_POINTS = 4, 5, 4.0, 0.002
 MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
+LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 TINY = float(np.finfo(np.float32).tiny)
 
 
@@ -87,6 +93,66 @@ class AmplitudeSolver:
             found[part] = pool_information(*pictures)[lit]
         # running sums may leave a rounding error below nothing
         return np.asarray(self.amplitude * np.sqrt(np.maximum(found, 0)))
+
+    def weigh_borders(self, shown: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+        """Return by how many deviations the whole shot is explained worse without the border of its
+        surface that is nearest to each of the points `shown`, (points,), those inside free to take over
+        the light; and how far inside each point is, px. Borders that are not needed are taken off, and
+        those behind them weighed: the light of a level line may lie anywhere in a lens about it.
+        """
+        model, left = self.model, shown.copy()
+        precision = model.weights / self.estimate_local_variance()
+        need, amplitude = np.full(shown.size, np.nan), self.amplitude
+        for _ in range(BORDER_ROUNDS):
+            inner = np.zeros_like(model.masks)
+            inner[model.masks] = left
+            inner &= [scipy.ndimage.binary_erosion(one, border_value=1) for one in inner]
+            border = left & ~inner[model.masks]
+            amplitude, rest = self._explain(left, amplitude)
+            _, without = self._explain(left & ~border, amplitude)
+            light = np.where(border, amplitude, np.float32(0))
+            worse = precision * (without**2 - rest**2)
+            worse /= np.maximum(model.render(light), LEAST_COUNT)
+            # whose light it is says to which border a change of the misfit belongs
+            change = light * model.gather(worse.astype(np.float32))
+            for mask, part in zip(model.masks, model.parts, strict=True):
+                picture = np.zeros(mask.shape)
+                picture[mask] = change[part]
+                near = scipy.ndimage.uniform_filter(picture, NEIGHBOURHOOD_PX, mode="constant")
+                around = np.sign(near[mask]) * NEIGHBOURHOOD_PX * np.sqrt(np.abs(near[mask]))
+                need[part] = np.where(border[part], around, need[part])
+            idle = border & (need < NEEDED_SIGMAS)
+            left &= ~idle
+            if idle.sum() < FEW_POINTS * max(left.sum(), 1):
+                break
+        return self._spread_from_borders(need)
+
+    def _explain(self, kept: NDArray[np.bool_], amplitude: Image) -> tuple[Image, Image]:
+        """Amplitudes, (points,), of which only some are kept and solved for anew, and what they leave
+        of the image.
+        """
+        found, masks = np.zeros_like(amplitude), np.zeros_like(self.model.masks)
+        if not kept.any():
+            return found, self.model.image
+        masks[self.model.masks] = kept
+        begun = copy.copy(self)
+        begun.amplitude = amplitude
+        solver = begun.cover(masks)
+        solver.run(BORDER_STEPS, ignore_progress, 0)
+        found[kept] = solver.amplitude
+        return found, self.model.image - solver.model.render(solver.amplitude)
+
+    def _spread_from_borders(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the nearest point of the surface with a value has, and how far that is, px."""
+        nearest, away = np.zeros((2, values.size))
+        for mask, part in zip(self.model.masks, self.model.parts, strict=True):
+            picture = np.full(mask.shape, np.nan)
+            picture[mask] = values[part]
+            known = np.isfinite(picture)
+            if known.any():
+                far, place = scipy.ndimage.distance_transform_edt(~known, return_indices=True)
+                nearest[part], away[part] = picture[tuple(place)][mask], far[mask]
+        return nearest, away
 
     def run(self, iterations: int, progress: Progress, frames: int) -> None:
         """Take some steps; `progress` hears of `frames` after each."""

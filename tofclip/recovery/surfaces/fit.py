@@ -20,7 +20,7 @@ from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar import Detection, compute_ray_directions, depth
 from tofclip.lidar.range_calibration import correct_returns
-from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
+from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver
 from tofclip.recovery.surfaces.model import (
     SMOOTHING_PX,
     SurfaceModel,
@@ -76,23 +76,22 @@ SLOPE_WINDOW_PX = 7
 
 # Of the greatest need for splines of all surfaces: those that need them more have them.
 CERTAINLY_BENT = 3.0
-LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 
 # Bins in range, and pixels, within which frames' returns and surfaces are the same.
 NEAR_BINS, NEAR_PX = 7.0, 1.5
-# A band apart from its surface: rows, and of the points of the surface's largest part.
-MAX_BAND_ROWS, MAX_BAND_FRACTION = 3, 0.2
+MIN_BRIGHTNESS_FRACTION = 0.1  # of the surface's usual brightness: fainter is not looked at
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
-MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
 # Of what certainly is a surface, and beyond: points that are fainter are looked at no further.
 LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 3.5, 0.05, 3
 
 
-# Logarithm of the odds that a surface's point is false: nothing known, and for each e-fold of its
-# significance over 20 and of its brightness over its surface's usual one. From five scenes of known
-# returns (tests/lidar/physics_scenes.py, 64 px, 26,000 points, 1.8 % false); docs tell what it misses.
-FALSE_ODDS = np.array([-4.44, -0.32, -2.53])
+# Logarithm of the odds that a surface's point is false: nothing known, for each e-fold of its
+# significance over 20, for each deviation by which the border beside it is needed, within limits, for
+# each e-fold of 1 and its way to that border, px, and where the frames have a return. From scenes of
+# known returns (tests/lidar/physics_scenes.py); docs tell what they miss.
+FALSE_ODDS = np.array([1.79, -0.29, -0.28, -0.82, -3.24])
+BORDER_LIMITS = -5.0, 10.0
 
 # Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
 # the rest. Medians over ten kinds of bent surfaces of known range are 0.13 to 0.75.
@@ -119,6 +118,7 @@ class SurfaceFit:
     # of the frames, where the shot shows light that no surface explains; ranges as measured
     others: Returns
     whole: AmplitudeSolver  # with the light of these
+    seen: Returns  # of the frames, all
 
 
 @limit_blas_threads()  # products of a few dozen columns are too small to share
@@ -214,7 +214,7 @@ def _fit_returns(
     solver.run(iterations, progress, count)
     reference = solver.model.unexplained(solver.amplitude)
     others, whole = find_others(solver, found, bin_m, progress, count)
-    return SurfaceFit(solver.model, solver, refinement, remainder, reference, others, whole)
+    return SurfaceFit(solver.model, solver, refinement, remainder, reference, others, whole, found)
 
 
 def measure_rays(camera: Camera) -> FloatArray:
@@ -280,15 +280,10 @@ def find_others(
     surfaces and all other returns free to take over their light; and the light of all.
     """
     model = solver.model
-    chosen, _ = choose_points(solver)
+    chosen = find_candidates(solver, Detection.signal_to_noise)[0]
     y, x = np.divmod(model.pixel[chosen], model.camera.image_shape[1])
-    # a return in a neighbouring pixel may be a bin further off for each that it is aside
-    reach = NEAR_BINS * bin_m
-    aside = reach / NEAR_PX
-    tree = scipy.spatial.cKDTree(np.stack([aside * y, aside * x, model.distance[chosen]], axis=1))
-    places = np.stack([aside * found.y, aside * found.x, found.range], axis=1)
-    apart, _ = tree.query(places, p=np.inf, distance_upper_bound=reach)
-    others = found[np.isinf(apart)]
+    near = find_near((found.y, found.x, found.range), (y, x, model.distance[chosen]), bin_m)
+    others = found[~near]
     if not len(others):
         return others, solver
     least = max(LIT_SIGMAS, find_sure_level(solver.measure_significance()) / 2)
@@ -298,6 +293,22 @@ def find_others(
     others = others[together.amplitude[own] * np.sqrt(information) > least]
     # light of those that are left out goes to the others
     return others, add_returns(solver, others, progress, count)[0]
+
+
+Places = tuple[NDArray[Any], NDArray[Any], FloatArray]
+
+
+def find_near(places: Places, others: Places, bin_m: float) -> NDArray[np.bool_]:
+    """Say which places, rows, columns and ranges, have one of some others near. One in a neighbouring
+    pixel may be a bin further off for each that it is aside.
+    """
+    reach = NEAR_BINS * bin_m
+    those, these = (
+        np.stack([reach / NEAR_PX * y, reach / NEAR_PX * x, distance], axis=1)
+        for y, x, distance in (others, places)
+    )
+    away, _ = scipy.spatial.cKDTree(those).query(these, p=np.inf, distance_upper_bound=reach)
+    return np.asarray(np.isfinite(away))
 
 
 def add_returns(
@@ -509,13 +520,13 @@ def follow_surfaces(
     """
     model, begun = fit.model.see(streak), replace(fit.refinement, free=None)
     solver = AmplitudeSolver(model, fit.solver.amplitude, weight, fit.solver)
-    remainder, limit = fit.remainder, CHANGED_RATIO * fit.reference + CHANGED_EXCESS
+    seen, remainder, limit = fit.seen, fit.remainder, CHANGED_RATIO * fit.reference + CHANGED_EXCESS
     changed = model.unexplained(solver.amplitude) > limit
     if changed:
-        found, light = look()
+        seen, light = look()
         camera, bin_m = model.camera, SPEED_OF_LIGHT * model.bin_width / 2
         ray_length = measure_rays(camera)
-        shown = found[~(found.false_alarm > SURE_FALSE_ALARM)]
+        shown = seen[~(seen.false_alarm > SURE_FALSE_ALARM)]
         patches = _find_brightest_patches(shown, ray_length, bin_m)
         patches += find_dimmer_patches(patches, shown, ray_length, bin_m)
         if not patches:
@@ -539,39 +550,36 @@ def follow_surfaces(
         return None
     none = fit.others[np.zeros(0, np.intp)]
     reference = unexplained if changed else fit.reference
-    return SurfaceFit(model, solver, refinement, remainder, reference, none, solver)
+    return SurfaceFit(model, solver, refinement, remainder, reference, none, solver, seen)
 
 
-def choose_points(
-    solver: AmplitudeSolver, limit: float = Detection.signal_to_noise
-) -> tuple[Pixels, FloatArray]:
-    """Numbers of the points that stand out of the noise and of their surface's fringe, and how probable
-    it is that each is false.
+def find_candidates(solver: AmplitudeSolver, limit: float) -> tuple[NDArray[np.bool_], Image]:
+    """Say which points stand out of the noise and are not far fainter than their surface; and by how
+    many standard deviations all do.
     """
     model, amplitude = solver.model, solver.amplitude
     significance = solver.measure_significance()
     usual = [find_usual_brightness(amplitude[p], significance[p], limit) for p in model.parts]
-    brightness = amplitude / np.array(usual)[model.surface]
-    shown = (significance > limit) & (brightness > MIN_BRIGHTNESS_FRACTION)
-    for part, mask in zip(model.parts, model.masks, strict=True):
-        shown[part] &= ~find_level_bands(mask, shown[part])[mask]
-    chosen = np.flatnonzero(shown)
-    known = np.log(np.stack([significance[chosen] / SURE_SIGMAS, brightness[chosen]]))
-    return chosen, scipy.special.expit(FALSE_ODDS[0] + FALSE_ODDS[1:] @ known)
+    faint = amplitude <= MIN_BRIGHTNESS_FRACTION * np.array(usual)[model.surface]
+    return (significance > limit) & ~faint, significance
 
 
-def find_level_bands(mask: NDArray[np.bool_], shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Say where a surface's points, `shown` (pixels of its `mask`,), are a level band apart from it. What
-    no surface explains gathers so at a surface's upper or lower end: lines of equal range that run level
-    are what the views tell least.
-    """
-    picture = np.zeros(mask.shape, bool)
-    picture[mask] = shown
-    label, _ = scipy.ndimage.label(picture, np.ones((3, 3)))
-    sizes = np.bincount(label.ravel())[1:]
-    high = [rows.stop - rows.start for rows, _ in scipy.ndimage.find_objects(label)]
-    band = (np.array(high) <= MAX_BAND_ROWS) & (sizes < MAX_BAND_FRACTION * sizes.max(initial=0))
-    return np.asarray(np.append(False, band)[label], dtype=bool)
+def judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
+    """Numbers of the candidates among the points, and how probable it is that each is false."""
+    model, seen = fit.solver.model, fit.seen
+    shown, significance = find_candidates(fit.solver, limit)
+    need, inside = fit.solver.weigh_borders(shown)
+    y, x = np.divmod(model.pixel[shown], model.camera.image_shape[1])
+    bin_m = SPEED_OF_LIGHT * model.bin_width / 2
+    known = [
+        np.log(significance[shown] / SURE_SIGMAS),
+        np.clip(need[shown], *BORDER_LIMITS),
+        np.log1p(inside[shown]),
+        find_near((y, x, model.distance[shown]), (seen.y, seen.x, seen.range), bin_m),
+    ]
+    return np.flatnonzero(shown), scipy.special.expit(
+        FALSE_ODDS[0] + FALSE_ODDS[1:] @ np.array(known)
+    )
 
 
 @limit_blas_threads()
@@ -586,7 +594,7 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
     camera = model.camera.replace(gains=model.state.gains, centres_px=centres)
     distance, others = model.distance, fit.others
     # 6. Points.
-    bright, doubt = choose_points(fit.solver, detection.signal_to_noise)
+    bright, doubt = judge_points(fit, detection.signal_to_noise)
     # brightness is told as the reference view sees it
     intensity = model.shade(model.reference, amplitude) * distance**2
     time = 2 * distance / SPEED_OF_LIGHT

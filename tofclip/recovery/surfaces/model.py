@@ -263,7 +263,10 @@ class SurfaceModel:
     def cover(self, masks: NDArray[np.bool_]) -> SurfaceModel:
         """Return the same surfaces, each where its mask is; those without any are left out."""
         other, left = copy.copy(self), np.flatnonzero(masks.any(axis=(1, 2)))
+        behind = np.zeros(masks.shape, bool)
+        behind[self.masks] = self.behind
         other._cover(masks[left], [self.bases[surface] for surface in left])
+        other.behind = behind[left][other.masks]
         state = self.state.copy()
         state.coefficients = [state.coefficients[surface] for surface in left]
         state.shading = state.shading[left]
