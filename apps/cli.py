@@ -55,9 +55,7 @@ QUANTITIES = {
     },
 }
 """Units that a value may carry, such as 20ps, and that options' names end in: kind, and in SI units."""
-QUANTITY = re.compile(
-    rf"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?) ?(?P<unit>{'|'.join(QUANTITIES)})"
-)
+QUANTITY = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?) ?(?P<unit>[^\W\d_]+)")
 
 COMPILING = "tofclip.compiling"  # its logger; the module itself would import the compiler
 
@@ -232,10 +230,13 @@ def convert_quantities(words: Sequence[str]) -> list[str]:
             option, value = (converted or [""])[-1], word
         wanted, found = option.rpartition("-")[2], QUANTITY.fullmatch(value)
         if option.startswith("--") and wanted in QUANTITIES and found:
-            (kind, unit), (given, factor) = QUANTITIES[wanted], QUANTITIES[found["unit"]]
+            (kind, unit), (given, factor) = (
+                QUANTITIES.get(name, ("", 1.0)) for name in (wanted, found["unit"])
+            )
             if kind != given:
+                known = ", ".join(name for name, (of, _) in QUANTITIES.items() if of == kind)
                 raise InputError(
-                    f"{option} {value}: give a {kind}, such as {found['number']}{wanted}"
+                    f"{option} {value}: give a {kind}, such as {found['number']}{wanted} (units: {known})"
                 )
             value = f"{float(found['number']) * factor / unit:.15g}"
             word = f"{option}={value}" if equals else value

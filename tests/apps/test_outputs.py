@@ -354,8 +354,11 @@ def test_quantities_may_carry_a_unit(shell, given):
     line = f"{figures} --bin-width-ps '{given}'"
     assert shell.figures(line) == shell.figures(f"{figures} --bin-width-ps=20ps")
     shell.refuses(line.replace(given, "3mm"), "give a time, such as 3ps")
-    for wrong in ("20PS", "1.2.3ps"):
-        shell.refuses(f"{figures} --bin-width-ps '{wrong}'", "valid number")
+    for wrong, said in (
+        ("20PS", "20ps (units: fs, ps, ns, us, ms, s)"),
+        ("1.2.3ps", "valid number"),
+    ):
+        shell.refuses(f"{figures} --bin-width-ps '{wrong}'", said)
 
 
 def test_common_words_of_every_verb(shell, here):
