@@ -5,7 +5,6 @@ how fast a surface moves its newer photons and its older ones say, with those of
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +29,6 @@ SHOT_SIGMAS, BLOCK_SIGMAS = 4.5, 3.0
 POOL_PX = 5  # along the square in which pixels of one surface move alike
 MIN_BACKGROUND_PHOTONS = 0.1  # of a shot in all bins of a pixel
 TINY = 1e-12  # in the place of nothing that is known
-# Returns between two steps of a gate of which the error is found: photons of a picture in which a
-# return is seen, background as a share of them, and how well noise lets their place in a step be known
-STEP_PHASES, STEP_PHOTONS, STEP_BACKGROUND, STEP_BLUR = 64, 200.0, 0.02, 0.05
 DRIFT_ROUNDS = 2  # a shift that is as far as the pulse is long is underestimated by the first one
 
 
@@ -117,10 +113,10 @@ class PhotonPipeline:
         times: NDArray[np.float64],
         detector: PhotonDetector,
         hot: NDArray[np.bool_],
-        step_errors: Float64Array | None = None,
+        sampled: bool = False,
     ) -> None:
         self.camera, self.times, self.detector, self.hot = camera, times, detector, hot
-        self.step_errors = np.zeros(1) if step_errors is None else step_errors
+        self.sampled = sampled
         window = round(detector.shape.fwhm / detector.bin_width)
         self._sum = StillSum(hot.size, times.size, window)
 
@@ -147,11 +143,7 @@ class PhotonPipeline:
         if time_zero is not None:
             seen_by = seen_by.replace(time_zero=time_zero)
         detector = PhotonDetector(pulse, photons.bin_width, photons.bins)
-        if not shot.sampled:
-            return cls(seen_by, shot.times, detector.learn(photons), hot)
-        # A gate is open as long at every step: what looks uneven are returns, which last as long.
-        detector = replace(detector, background=np.ones(photons.bins))
-        return cls(seen_by, shot.times, detector, hot, list_step_errors(detector))
+        return cls(seen_by, shot.times, detector.learn(photons), hot, shot.sampled)
 
     def rectify(self, shot: PhotonCube) -> FloatArray:
         """Put the bins of a pixel side by side, (pixels, bins)."""
@@ -174,11 +166,10 @@ class PhotonPipeline:
         layers[:, self.hot.ravel()] = np.nan
         age = (used * (shots + (used - 1) / 2) + shots * (shots - 1) / 2) / (used + shots)
         speed, speed_sigma = self._measure_speed(layers[0], sums.sum(axis=1) / (used + shots), age)
-        step = SPEED_OF_LIGHT / 2 * self.detector.bin_width
-        places = np.nan_to_num(layers[0, :, 0] / step % 1 * self.step_errors.size).astype(np.int64)
-        missing = np.hypot(speed_sigma * age, self.step_errors[places % self.step_errors.size])
+        if self.sampled:
+            layers = self.detector.add_step_errors(layers)
         layers[0, :, 0] += speed * age
-        layers[0, :, 1] = np.hypot(layers[0, :, 1], missing)
+        layers[0, :, 1] = np.hypot(layers[0, :, 1], speed_sigma * age)
         picture = layers.reshape(-1, *self.camera.image_shape, 4)
         image = SurfaceImage.from_layers(picture, self.detector.shape, {}, self.hot)
         return image.calibrate(self.camera, float(self.times[0])).to_returns(self.camera)
@@ -224,21 +215,3 @@ class PhotonPipeline:
             around = padded[:, down : down + rows, right : right + columns]
             total += np.where(np.abs(around[0] - stack[0]) < near, around[1:], 0)
         return total.reshape(len(terms), -1)
-
-
-def list_step_errors(detector: PhotonDetector) -> Float64Array:
-    """List by how far two thirds of the returns between two steps of a gate err, m, however many
-    photons there are, by where in the step they seem to be, (places,): a picture shows the gate at
-    one instant, not its mean over a step.
-    """
-    phase = (np.arange(STEP_PHASES) + 0.5) / STEP_PHASES
-    truth = (detector.bins // 2 + phase) * detector.bin_width
-    light = detector.pulse(detector.times - truth[:, np.newaxis])
-    seen = STEP_PHOTONS * (light + STEP_BACKGROUND * detector.relative_background)
-    found = detector.locate(seen).range[:, 0]
-    step = SPEED_OF_LIGHT / 2 * detector.bin_width
-    apart = (found / step - phase[:, np.newaxis] + 0.5) % 1 - 0.5
-    weight = np.exp(-((apart / STEP_BLUR) ** 2) / 2)
-    error = (found - SPEED_OF_LIGHT / 2 * truth) ** 2
-    # two thirds of what is spread evenly lie within 2 / sqrt(3) of its root mean square
-    return np.asarray(np.sqrt(4 / 3 * (weight @ error) / weight.sum(axis=1)))

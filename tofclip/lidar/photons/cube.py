@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -80,4 +80,5 @@ class PhotonCube:
 
     def to_image(self) -> PhotonImage:
         """Return the photons as events, sorted by pixel."""
-        return PhotonImage.from_cube(np.moveaxis(self.counts, 0, -1), self.bin_width)
+        image = PhotonImage.from_cube(np.moveaxis(self.counts, 0, -1), self.bin_width)
+        return replace(image, sampled=self.sampled)

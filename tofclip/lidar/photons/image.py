@@ -83,6 +83,8 @@ class PhotonImage:
         default so many that none is missed; see `correct_pile_up`.
     shading : object, optional
         Course of the background over picture and time, as `estimate_surface` finds it; even by default.
+    sampled : bool
+        Whether a bin shows one instant, see `PhotonCube`: where in a step a return lies leaves no trace.
 
     Raises
     ------
@@ -99,6 +101,7 @@ class PhotonImage:
     axes: str = ""
     cycles: float = np.inf
     shading: Any = None
+    sampled: bool = False
 
     def __post_init__(self) -> None:
         pixels = self.image_shape[0] * self.image_shape[1]

@@ -110,9 +110,9 @@ def estimate_surface(
     report = (lambda _: None) if progress is None else progress
     dim = find_dim_pixels(photons)
     photons, start, hot = prepare_photons(photons, pulse)
-    if cycles is None:
+    if cycles is None and not photons.sampled:
         photons = replace(photons, shading=learn_shading(photons, start.fwhm / photons.bin_width))
-    else:
+    elif cycles is not None:
         photons = photons.correct_pile_up(cycles)
     scene = Scene.start(photons, start)
     axis = choose_label_axis(photons, scene)
@@ -132,7 +132,7 @@ def estimate_surface(
     costs = slope_cost, slope_cost * JUMP_COST_RATIO
 
     learnt = None
-    if pulse is None or learn:
+    if pulse is None or (learn and not photons.sampled):  # an instrument knows its gate
         learnt = learn_scene(train, test, training, surface, required=pulse is None)
     if learnt is not None:
         scene = Scene(learnt, scene.background)
@@ -180,6 +180,9 @@ def estimate_surface(
         "pile_up": missed,
     }
     stack = stack * [bin_m, bin_m, 1, 1]
+    if photons.sampled:
+        detector = PhotonDetector(start, photons.bin_width, photons.bins).learn(photons)
+        stack = detector.add_step_errors(stack)
     return SurfaceImage.from_layers(stack, scene.response.pulse, settings, hot)
 
 
