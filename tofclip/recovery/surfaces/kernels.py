@@ -61,34 +61,35 @@ def split_over_slit(position, width, height, tangent, first, shares):
 
 
 @fast_loop
-def add_light(amplitude, row, row_shares, column, slit_shares, image):
-    """Add the light of surface points to the image of a view; all of it must fall inside. `row,
-    column` (points,): first of those that a point reaches; shares: (points, 3) and (points, 4).
+def add_light(amplitude, point, share, row, row_shares, column, slit_shares, image):
+    """Add the light of surface points to the image of a view; all of it must fall inside. `point, share`
+    (places,): of which point each place has which part; `row, column`: first of those that a place
+    reaches, shares there (places, 3) and (places, 4).
     """
-    for point in range(amplitude.size):
+    for place in range(point.size):
         # most points of a volume are dark
-        light = amplitude[point]
+        light = amplitude[point[place] - point[0]] * share[place]
         if light == 0:
             continue
-        top, left = row[point], column[point]
+        top, left = row[place], column[place]
         for i in range(3):
-            instant = light * row_shares[point, i]
+            instant = light * row_shares[place, i]
             for j in range(4):
-                image[top + i, left + j] += instant * slit_shares[point, j]
+                image[top + i, left + j] += instant * slit_shares[place, j]
 
 
 @fast_loop
-def gather_light(image, gain, row, row_shares, column, slit_shares, amplitude):
+def gather_light(image, gain, point, share, row, row_shares, column, slit_shares, amplitude):
     """The adjoint of `add_light`: what each point's light would find in an image."""
-    for point in range(amplitude.size):
-        top, left = row[point], column[point]
+    for place in range(point.size):
+        top, left = row[place], column[place]
         total = 0.0
         for i in range(3):
             instant = 0.0
             for j in range(4):
-                instant += slit_shares[point, j] * image[top + i, left + j]
-            total += row_shares[point, i] * instant
-        amplitude[point] += gain * total
+                instant += slit_shares[place, j] * image[top + i, left + j]
+            total += row_shares[place, i] * instant
+        amplitude[point[place]] += gain * share[place] * total
 
 
 @fast_loop

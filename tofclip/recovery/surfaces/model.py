@@ -506,8 +506,8 @@ class SurfaceModel:
 
         place, margin, samples = self.footprints[view], self._margin, 3
         amplitude = self.shade(view, amplitude, part)
-        start, part = part.indices(self.surface.size)[0], self.places.find(part)
-        amplitude = amplitude[self.places.point[part] - start] * self.places.share[part]
+        part = self.places.find(part)
+        parts = self.places.point[part], self.places.share[part]
         row, column = place.row[part], place.column[part]
         if not row.size:
             return 0, np.zeros((0, 0), np.float32)
@@ -518,7 +518,7 @@ class SurfaceModel:
             (last - first + 2 * margin, int(column.max()) + SLIT_PIXELS - left), np.float32
         )
         down = row + np.int32(margin - first), place.row_shares[part]
-        add_light(amplitude, *down, column - np.int32(left), place.slit_shares[part], light)
+        add_light(amplitude, *parts, *down, column - np.int32(left), place.slit_shares[part], light)
         image = np.zeros((last - first, light.shape[1]), np.float32)
         lit = (
             np.arange(last - first) if row.size < self.places.point.size else place.lit_rows - first
@@ -586,10 +586,10 @@ class SurfaceModel:
             part[:, own] = seen[:, slit]
             smooth = np.empty((self._rows + 2 * self._margin, place.columns), np.float32)
             smooth_rows(part, kernel, -lags, place.reached_rows, -self._margin, smooth)
-            found = np.zeros(self.places.point.size, np.float32)
-            row = place.row + np.int32(self._margin)
-            gather_light(smooth, gain, row, place.row_shares, place.column, slit_shares, found)
-            found = np.add.reduceat(found * self.places.share, self.places.starts[:-1])
+            found, parts = np.zeros(self.surface.size, np.float32), self.places
+            down = place.row + np.int32(self._margin), place.row_shares
+            light = parts.point, parts.share, *down, place.column, slit_shares
+            gather_light(smooth, gain, *light, found)
             if squared:
                 found *= self.places.overlap
             found = self.shade(view, found)
