@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -159,28 +160,42 @@ class RecoveryPlan:
         """
         started = time.perf_counter()
         shot = self.shot.fit_camera(progress)
-        if isinstance(self.method, SurfaceRecovery):
-            return self._recover_surfaces(shot, self.method, progress, started)
-        streak, camera = shot.streak, shot.camera
-        measurement = measure(streak.counts, streak.saturated, camera)
-        noise = describe_noise(streak, measurement) if self.method.has_prior else None
-        clipping = find_clipping_level(streak.counts)
-        data_term = clip_from_below(streak, clipping)
+        streak, method = shot.streak, self.method
+        measurement = measure(streak.counts, streak.saturated, shot.camera)
+        recover_frames = partial(self._recover_frames, shot, measurement, progress)
+        if isinstance(method, SurfaceRecovery):
+            found = self._recover_surfaces(shot, method, recover_frames, progress)
+            seconds = time.perf_counter() - started
+            pace = {"seconds": seconds, "frames_per_second": found.times.size / seconds}
+        else:
+            found = recover_frames(method, self.focus)
+            pace = {"seconds": time.perf_counter() - started}
+        return replace(found, figures={**found.figures, **pace})
+
+    def _recover_frames(
+        self,
+        shot: Shot,
+        measurement: Measurement,
+        progress: Progress,
+        method: Method,
+        focus: Focus,
+    ) -> Frames:
+        """Recover every frame from its measurements alone."""
+        streak, clipping = shot.streak, find_clipping_level(shot.streak.counts)
         found = recover_measurement(
-            self.method,
-            camera,
+            method,
+            shot.camera,
             shot.times,
             measurement,
-            noise,
-            self.focus,
+            describe_noise(streak, measurement) if method.has_prior else None,
+            focus,
             self.device,
-            data_term,
+            clip_from_below(streak, clipping),
             progress,
         )
         of_shot = {
-            "method": self.method.name,
-            "focus": str(self.focus),
-            "seconds": time.perf_counter() - started,
+            "method": method.name,
+            "focus": str(focus),
             "device": str(self.device),
             **count_defects(streak, clipping),
         }
@@ -192,27 +207,27 @@ class RecoveryPlan:
         )
 
     def _recover_surfaces(
-        self, shot: Shot, method: SurfaceRecovery, progress: Progress, started: float
+        self,
+        shot: Shot,
+        method: SurfaceRecovery,
+        recover_frames: Callable[[Method, Focus], Frames],
+        progress: Progress,
     ) -> Frames:
         """Recover frames, quickly, and then the surfaces in them; or better frames where there are none."""
         why = None if method.otherwise is None else self._find_reason_for_frames()
         if why is None:
             focus = DepthLockedFocus() if shot.camera.lenslet_pitch > 0 else self.focus
-            start = replace(self, shot=shot, method=method.start, focus=focus).run(progress)
+            start = recover_frames(method.start, focus)
             try:
-                found = method.recover_surfaces(shot.streak, start, progress, shot.centre_error_px)
+                return method.recover_surfaces(shot.streak, start, progress, shot.centre_error_px)
             except InputError as fault:
                 if method.otherwise is None:
                     raise
                 # without what a message advises whoever asked for surfaces
                 why = re.split("[:;] (?:this shot|choose)", str(fault))[0]
-        if why is not None:
-            assert method.otherwise is not None
-            found = replace(self, shot=shot, method=method.otherwise).run(progress)
-            found = replace(found, figures={**found.figures, "why_no_surfaces": why})
-        seconds = time.perf_counter() - started
-        pace = {"seconds": seconds, "frames_per_second": found.times.size / seconds}
-        return replace(found, figures={**found.figures, **pace})
+        assert method.otherwise is not None
+        found = recover_frames(method.otherwise, self.focus)
+        return replace(found, figures={**found.figures, "why_no_surfaces": why})
 
     def _find_reason_for_frames(self) -> str | None:
         """Say why frames are wanted, whatever the light is on; None if they are not."""
