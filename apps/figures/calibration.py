@@ -144,9 +144,9 @@ def make_range_calibration_figure(found: RangeFit, distances: Sequence[float]) -
     walk.plot(signal, fitted, color=LINE_COLOUR)
     walk.set_xscale("log")
     walk.minorticks_off()
-    if strongest < 10 * weakest:  # no two powers of ten to number
-        ticks = np.geomspace(weakest, strongest, 4)
-        walk.set_xticks(ticks, [f"{tick:.3g}" for tick in ticks])
+    # There may be no two powers of ten to number.
+    ticks = [float(f"{tick:.3g}") for tick in np.geomspace(weakest, strongest, 4)]
+    walk.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     zero, spread = found.camera.time_zero / NANOSECOND, known.time_zero_sigma / PICOSECOND
     targets = ", ".join(f"{distance:g}" for distance in distances)
     figure.suptitle(
