@@ -90,7 +90,7 @@ class Page:
         self._show_bar: Callable[[Any], None] = lambda _: None
         if len(first.cloud):
             self._show_bar = draw_furniture(server, Box.around(first.cloud.xyz))
-        add_selection(server, session, self.post, left)
+        self._show_picks = add_selection(server, session, self.post, left)
         self._framed_cloud = first.cloud.xyz
         list_views = partial(make_presets, first.cloud.xyz)
         add_export(server, session, self.post, list_views, self.points.drawn_whole)
@@ -132,6 +132,7 @@ class Page:
                 self._drawn = shown
                 self._pace.record_sent(now, len(shown.cloud))
             self.points.update(now)
+            self._show_picks()
             if shown is not None:
                 self._describe(shown, now)
         except TofclipError as fault:

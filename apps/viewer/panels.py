@@ -398,9 +398,9 @@ PLOT_LOOK: Any = {
 
 def add_selection(
     server: viser.ViserServer, session: Session, post: Post, above: viser.PanelHandle
-) -> None:
-    """Listen to clicks on points, and say what they hit in a panel that stays in sight below the
-    docked panel `above`.
+) -> Callable[[], None]:
+    """Listen to clicks on points. Returns what says which points are picked, in a panel that stays in
+    sight below the docked panel `above`.
     """
     scene, panel = server.scene, server.gui.add_panel()
     with panel.add_tab("picked point"):
@@ -411,20 +411,21 @@ def add_selection(
     plots: list[Any] = []
     markers: list[Any] = []
 
-    def take_click(origin: Any, direction: Any) -> None:
-        pick = session.pick(origin, direction)
-        words = "nothing there; click a point"
-        if pick is not None:
-            distance = session.distance
-            words = pick.description + ("" if distance is None else f"\ndistance {distance:.4f} m")
-            draw_waveform(pick)
-        text.content = render_text_html("picked", words)
-        draw_markers()
+    shown = session.picks
 
-    def draw_markers() -> None:
+    def follow() -> None:
+        nonlocal shown
+        if shown is session.picks:
+            return
+        shown, words, distance = session.picks, hint, session.distance
+        if shown:
+            words = shown[-1].description
+            words += "" if distance is None else f"\ndistance {distance:.4f} m"
+            draw_waveform(shown[-1])
+        text.content = render_text_html("picked", words)
         while markers:
             markers.pop().remove()
-        positions = np.array([pick.position for pick in session.picks])
+        positions = np.array([pick.position for pick in shown])
         for number, position in enumerate(positions):
             radius = MARKER_RADIUS_FRACTION * max(float(np.linalg.norm(position)), 0.1)
             look: Any = {"color": MARKER_COLOURS[number], "position": position, **NO_SHADOWS}
@@ -448,8 +449,9 @@ def add_selection(
             plots.append(server.gui.add_uplot(data, **PLOT_LOOK))
 
     server.scene.on_click()(
-        lambda event: post(lambda: take_click(event.ray_origin, event.ray_direction))
+        lambda event: post(lambda: session.pick(event.ray_origin, event.ray_direction))
     )
+    return follow
 
 
 CHOOSE_VIEW = "..."

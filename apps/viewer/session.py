@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -232,6 +233,10 @@ class Session:
         key = (frame, self.colouring, self.filters, set_by_user, limit)
         if self.latest is None or key != self._key:
             self.latest = render_frame(self.source, frame, self.colouring, self.filters, limit)
+            if self.picks and set_by_user != self._key[3]:  # it may have been recovered once more
+                points = self.latest.whole.cloud.xyz
+                there = [(points == pick.point.xyz).all(axis=1).any() for pick in self.picks]
+                self.picks = [*compress(self.picks, there)]
             self._key = key
         return self.latest
 

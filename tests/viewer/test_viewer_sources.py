@@ -166,7 +166,9 @@ def test_refocusing_moves_the_squares_along_the_slit_and_back(transient: Transie
     """
     session = Session(transient)
     transient.gate.value = GATE_AROUND_FRAME
-    show_cloud(session, NEAR_FRAME)
+    assert session.pick((0, 0, 0), show_cloud(session, NEAR_FRAME).xyz[0]) is not None
+    show_cloud(session, NEAR_FRAME - 6)  # not shown for a while
+    assert len(session.picks) == 1
 
     def find_pixels(shear: float) -> tuple[np.ndarray, np.ndarray]:
         transient.refocus.value = shear
@@ -176,6 +178,7 @@ def test_refocusing_moves_the_squares_along_the_slit_and_back(transient: Transie
 
     (sharp, _), (again, light) = find_pixels(0.0), find_pixels(1e-9)  # recovered once more
     moved, moved_light = find_pixels(1.0)
+    assert session.picks == []  # no longer a point
     bright = again[light > 0.5 * light.max()]
     assert np.allclose(bright.mean(axis=0), sharp.mean(axis=0), atol=0.7)
     shift = np.average(moved, axis=0, weights=moved_light) - np.average(again, 0, light)
