@@ -144,7 +144,7 @@ METHODS = Parts(
     "tofclip.methods",
     "method",
     {
-        "auto": "tofclip.recovery.surfaces.fit:recover_automatically",
+        "auto": "tofclip.recovery.surfaces.recovery:recover_automatically",
         "tv": "tofclip.solvers:TotalVariation",
         "l1": "tofclip.solvers:Sparse",
         "linear": "tofclip.solvers:LinearInverse",

@@ -14,10 +14,8 @@ from tofclip.lidar import Detection, depth
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.fit import (
     SurfaceFit,
-    estimate_displacement,
     extrapolate_steps,
     find_usual_brightness,
-    list_returns,
     straighten_surfaces,
 )
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, weigh_measurements
@@ -34,6 +32,7 @@ from tofclip.recovery.surfaces.ranges import (
     measure_local_shifts,
     refine_state,
 )
+from tofclip.recovery.surfaces.returns import estimate_displacement, list_returns
 from tofclip.shots import Frames
 from tofclip.simulate import simulate_shot
 
@@ -485,7 +484,7 @@ def test_a_deviation_is_that_of_the_fit_of_further_steps_and_of_the_centres():
         AmplitudeSolver(model, amplitude, 2.0),
         depth(Frames(np.zeros((9, *SHAPE), np.float32), BIN * np.arange(9), CAMERA)),
     )
-    fit = SurfaceFit(model, solver, refinement, remainder, 0.0, nothing, solver, nothing)
+    fit = SurfaceFit(solver, refinement, remainder, 0.0, nothing, solver, nothing)
     found = list_returns(fit, Detection(), centre_error)
     assert len(found) == model.surface.size
     for surface, (first, slope) in enumerate([(1 / 1.4, 0.02), (1 / 1.7, -0.03)]):
@@ -537,7 +536,7 @@ def test_a_border_that_the_shot_does_not_need_is_told_from_one_that_it_does():
     spread[1, 22:38, 22:40] = True
     light = np.full(model.surface.size, 15, np.float32)
     solver = AmplitudeSolver(model, light, 2.0).cover(spread)
-    solver.run(40, lambda _: None, 0)
+    solver.run(40)
     need, inside = solver.weigh_borders(np.ones(light.size, bool)[spread[model.masks]])
     beyond, own = (spread & ~lit)[spread], (inside == 0) & (solver.model.surface == 0)
     assert inside.max() >= 5

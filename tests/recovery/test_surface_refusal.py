@@ -18,8 +18,8 @@ from tofclip.recovery import (
     open_shot,
     plan_recovery,
 )
-from tofclip.recovery.surfaces.fit import measure_slopes
 from tofclip.recovery.surfaces.pulse import measure_pulse
+from tofclip.recovery.surfaces.start import measure_slopes
 from tofclip.shots import Streak
 from tofclip.solvers import Sparse
 from tofclip.units import SPEED_OF_LIGHT

@@ -38,7 +38,8 @@ from tofclip.recovery import (
 )
 from tofclip.recovery.defects import estimate_noise
 from tofclip.recovery.focus import DEFAULT_FOCUS
-from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces, list_returns
+from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces
+from tofclip.recovery.surfaces.returns import list_returns
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.sequences.counting import StillSum
 from tofclip.shots import Returns, Streak

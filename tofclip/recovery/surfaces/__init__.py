@@ -13,10 +13,11 @@ and the pulse h. With photon weights w the objective is
 
 `patches` finds surfaces in the returns of a fast recovery of frames, `pulse` the shot's pulse;
 `model` is A(r) at a state of surfaces and camera, with its loops in `kernels`; `amplitudes` solves for
-a by FISTA, `ranges` for the state by Gauss-Newton steps; `fit` has the order of these and is the method
-that `tofclip recover` runs. docs/recovery_algorithm.md derives it.
+a by FISTA, `ranges` for the state by Gauss-Newton steps. `recovery` is the method that `tofclip recover`
+runs: `start` lays surfaces out or refuses the shot, `fit` has the order of all steps, `returns` lists
+what was found. docs/recovery_algorithm.md derives it.
 """
 
-from tofclip.recovery.surfaces.fit import SurfaceRecovery
+from tofclip.recovery.surfaces.recovery import SurfaceRecovery
 
 __all__ = ["SurfaceRecovery"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import numpy as np
 import scipy
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import Image
-from tofclip.solvers import Progress, ignore_progress
 from tofclip.threads import run_blocks
 
 PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
@@ -25,6 +25,8 @@ BORDER_ROUNDS, BORDER_STEPS, NEEDED_SIGMAS, FEW_POINTS = 4, 5, 4.0, 0.002
 MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 TINY = float(np.finfo(np.float32).tiny)
+
+Tick = Callable[[], object]
 
 
 class AmplitudeSolver:
@@ -138,7 +140,7 @@ class AmplitudeSolver:
         begun = copy.copy(self)
         begun.amplitude = amplitude
         solver = begun.cover(masks)
-        solver.run(BORDER_STEPS, ignore_progress, 0)
+        solver.run(BORDER_STEPS)
         found[kept] = solver.amplitude
         return found, self.model.image - solver.model.render(solver.amplitude)
 
@@ -154,8 +156,8 @@ class AmplitudeSolver:
                 nearest[part], away[part] = picture[tuple(place)][mask], far[mask]
         return nearest, away
 
-    def run(self, iterations: int, progress: Progress, frames: int) -> None:
-        """Take some steps; `progress` hears of `frames` after each."""
+    def run(self, iterations: int, tick: Tick = lambda: None) -> None:
+        """Take some steps, with a call of `tick` after each."""
         model = self.model
         steps = 1 / (NORM_MARGIN * self._estimate_norms())
         # The gradient A'W(A a - y) has the covariance A'WA times a weighted measurement's variance.
@@ -179,7 +181,7 @@ class AmplitudeSolver:
             older = (1 + np.sqrt(1 + 4 * age**2)) / 2
             ahead = moved + np.float32((age - 1) / older) * (moved - self.amplitude)
             self.amplitude, age = moved, older
-            progress(frames)
+            tick()
         self.variance = estimate_excess_variance(model, self.amplitude)
 
     def _estimate_norms(self) -> FloatArray:

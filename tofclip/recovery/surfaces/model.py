@@ -240,6 +240,7 @@ class SurfaceModel:
         self.camera = camera
         self.times, self.bin_width = streak.times, float(np.mean(np.diff(streak.times)))
         self.reference = int(np.argmin(np.abs(camera.view_positions)))
+        self.row_m = self.bin_width * SPEED_OF_LIGHT / 2
         self.pulse = pulse or ShotPulse(camera.pulse_fwhm / FWHM_PER_SIGMA / self.bin_width)
         self.image, self.weights = weigh_measurements(streak, camera)
         self._cover(masks, bases)
@@ -248,16 +249,16 @@ class SurfaceModel:
     def _cover(self, masks: NDArray[np.bool_], bases: Sequence[SmoothBasis]) -> None:
         """Have points where surfaces may be."""
         self.masks, self.bases = masks, list(bases)
-        self.surface, y, x = np.nonzero(masks)
-        self.pixel = y * masks.shape[2] + x
+        self.surface, self.row, self.column = np.nonzero(masks)
+        self.pixel = self.row * masks.shape[2] + self.column
         ends = np.searchsorted(self.surface, np.arange(len(masks) + 1))
         self.parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
         self.monomials = self._evaluate(self.pixel)
-        self._directions = compute_ray_directions(self.camera, y, x)
+        self._directions = compute_ray_directions(self.camera, self.row, self.column)
         axis_row, axis_column = self.camera.optical_axis_px
-        self._x, self._y = x - axis_column, y - axis_row
+        self._x, self._y = self.column - axis_column, self.row - axis_row
         self.ray_length = 1 / self._directions[:, 2]
-        self._beside = self._find_neighbours(masks, y, x)
+        self._beside = self._find_neighbours()
         self.behind = np.zeros(self.surface.size, bool)
 
     def cover(self, masks: NDArray[np.bool_]) -> SurfaceModel:
@@ -297,8 +298,9 @@ class SurfaceModel:
         shapes = zip(self.monomials, state.coefficients, strict=True)
         inverse = np.concatenate([m @ c for m, c in shapes])
         self.distance = np.asarray(self.ray_length / np.maximum(inverse, MIN_INVERSE_DEPTH))
-        row_m = self.bin_width * SPEED_OF_LIGHT / 2
-        self.places = Places.split(self.distance, self.compute_slopes(), self.pulse.sigma, row_m)
+        self.places = Places.split(
+            self.distance, self.compute_slopes(), self.pulse.sigma, self.row_m
+        )
         self.half = int(np.ceil(EXTENT_SIGMAS * MAX_LENGTHENING * self.pulse.sigma)) + 1
         self._margin = self.half + 3
         # rows before and behind the streak image whose light reaches it later or earlier
@@ -307,22 +309,21 @@ class SurfaceModel:
         self.footprints = self._map_views(self._spread_view)
         self.kernels = [self.make_kernel(view) for view in range(self.camera.views)]
 
-    def _find_neighbours(
-        self, masks: NDArray[np.bool_], y: NDArray[np.intp], x: NDArray[np.intp]
-    ) -> NDArray[np.intp]:
+    def _find_neighbours(self) -> NDArray[np.intp]:
         """Numbers of the points of the same surface beside each, (2, 2, points): along columns and
         rows, before and behind; its own where there is none. What is only known at single pixels is
         no surface.
         """
-        number = np.full((len(masks), *(side + 2 for side in masks.shape[1:])), -1)
-        own = np.arange(y.size)
-        number[self.surface, y + 1, x + 1] = own
+        surfaces, rows, columns = self.masks.shape
+        number = np.full((surfaces, rows + 2, columns + 2), -1)
+        own = np.arange(self.surface.size)
+        y, x = self.row + 1, self.column + 1
+        number[self.surface, y, x] = own
         single = np.array([isinstance(basis, KnownBasis) for basis in self.bases], bool)
         number[single] = -1
         steps = [[(0, -1), (0, 1)], [(-1, 0), (1, 0)]]
         found = [
-            [number[self.surface, y + 1 + down, x + 1 + right] for down, right in pair]
-            for pair in steps
+            [number[self.surface, y + down, x + right] for down, right in pair] for pair in steps
         ]
         return np.where(np.array(found) < 0, own, found)
 
@@ -463,7 +464,7 @@ class SurfaceModel:
         # a height is even between -1/2 and 1/2
         corrected = np.mean(self.state.delays**2 + self.state.stretches**2 / 12)
         rows = SWEEP_LEFT_FRACTION * float(np.sqrt(corrected))
-        return rows * self.bin_width * SPEED_OF_LIGHT / 2
+        return rows * self.row_m
 
     def compute_slopes(self) -> FloatArray:
         """Return how steeply the ranges change along columns and rows, (2, points), m per pixel."""

@@ -397,12 +397,12 @@ def measure_local_shifts(model: SurfaceModel, amplitude: Image, rest: Image) -> 
         (differentiate_pulse(kernel) * place.rows_per_instant).astype(np.float32)
         for kernel, place in pairs
     ]
-    moved = amplitude * np.float32(2 / SPEED_OF_LIGHT / model.bin_width)  # rows for a metre
+    moved = amplitude * np.float32(1 / model.row_m)  # rows for a metre
     pull = moved * apart.gather(model.weights * rest)
     known = moved * apart.gather(model.weights * apart.render(moved))
     # of a pulse's slope are the squares 1 / (2 sigma^2) of its own
     alone = moved**2 * model.gather(model.weights, squared=True) / (2 * model.pulse.sigma**2)
-    most = model.pulse.sigma * model.bin_width * SPEED_OF_LIGHT / 2
+    most = model.pulse.sigma * model.row_m
     shifts = np.zeros(amplitude.size)
     for part, mask in zip(model.parts, model.masks, strict=True):
         pictures = np.zeros((3, *mask.shape))

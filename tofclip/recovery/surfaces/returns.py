@@ -1,0 +1,122 @@
+"""The points of fitted surfaces, and beside them the frames' returns, as the returns of a shot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy
+
+from tofclip.arrays import FloatArray
+from tofclip.camera import Camera
+from tofclip.lidar import Detection
+from tofclip.lidar.range_calibration import correct_returns
+from tofclip.recovery.surfaces.fit import SURE_SIGMAS, SurfaceFit, find_candidates, find_near
+from tofclip.recovery.surfaces.patches import Pixels, rank_within_pixels
+from tofclip.recovery.surfaces.ranges import measure_local_shifts
+from tofclip.shots import Returns
+from tofclip.threads import limit_blas_threads
+from tofclip.units import SPEED_OF_LIGHT
+
+# Logarithm of the odds that a surface's point is false: nothing known, for each e-fold of its
+# significance over 20, for each deviation by which the border beside it is needed, within limits, for
+# each e-fold of 1 and its way to that border, px, and where the frames have a return. From scenes of
+# known returns (tests/lidar/physics_scenes.py); docs tell what they miss.
+FALSE_ODDS = np.array([1.79, -0.29, -0.28, -0.82, -3.24])
+BORDER_LIMITS = -5.0, 10.0
+
+# Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
+# the rest. Medians over ten kinds of bent surfaces of known range are 0.13 to 0.75.
+SHIFT_SHOWN = 1 / 3
+
+# A surface that fills as little of the square over its length is a rod, whose roundness no pixel
+# resolves; and by how much of a pixel's width, root mean square, its points are off for that: those
+# of rods of 10 and 12 mm are off by 0.07 to 0.17.
+ROD_FRACTION, ROD_PX = 0.1, 0.12
+
+
+@limit_blas_threads()
+def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float = 0.0) -> Returns:
+    """List the points of surfaces that stand out of the noise, and beside them the frames' returns where
+    no surface is, pixel by pixel.
+
+    `centre_error_px`: how far off the calibration had each slit centre, see `tofclip.recovery.Shot`.
+    """
+    model, amplitude = fit.solver.model, fit.solver.amplitude
+    centres = model.camera.centres_px + model.state.centres
+    camera = model.camera.replace(gains=model.state.gains, centres_px=centres)
+    distance, others = model.distance, fit.others
+    # 6. Points.
+    bright, doubt = _judge_points(fit, detection.signal_to_noise)
+    # brightness is told as the reference view sees it
+    intensity = model.shade(model.reference, amplitude) * distance**2
+    time = 2 * distance / SPEED_OF_LIGHT
+    strong = detection.find_significant(
+        model.pixel[bright], time[bright], intensity[bright], camera.pulse_fwhm
+    )
+    chosen = bright[strong]
+
+    fitted = model.estimate_deviation(fit.refinement.covariances)
+    moved = estimate_displacement(camera, centre_error_px)[:, np.newaxis] * model.compute_slopes()
+    rest = model.image - fit.whole.model.render(fit.whole.amplitude)
+    bent = measure_local_shifts(model, amplitude, rest) / SHIFT_SHOWN
+    y, x = model.row[chosen], model.column[chosen]
+    rounded = np.zeros(distance.size)
+    for surface in np.unique(model.surface[chosen]):
+        own = model.surface[chosen] == surface
+        if own.sum() < ROD_FRACTION * (np.ptp(y[own]) ** 2 + np.ptp(x[own]) ** 2):
+            rounded[chosen[own]] = ROD_PX * distance[chosen[own]] / camera.focal_length_px
+    parts = np.stack([fitted, fit.remainder[model.surface], *moved, bent, rounded])
+    deviation = np.sqrt(np.sum(parts**2, axis=0) + model.estimate_sweep_error() ** 2)
+    columns: dict[str, Any] = {
+        "y": y,
+        "x": x,
+        "range": distance[chosen],
+        "intensity": intensity[chosen],
+        "confidence": deviation[chosen],
+        "time": time[chosen],
+        "false_alarm": doubt[strong],
+    }
+    for name, column in columns.items():
+        beside = getattr(others, name)
+        columns[name] = np.concatenate([column.astype(beside.dtype), beside])
+    pixel = columns["y"].astype(np.intp) * camera.image_shape[1] + columns["x"]
+    order, rank = rank_within_pixels(pixel, columns["range"])
+    columns = {name: column[order] for name, column in columns.items()}
+    return correct_returns(
+        Returns(
+            **columns,
+            return_number=(rank + 1).astype(np.uint8),
+            camera=camera,
+            shear=np.asarray(camera.shear_at(columns["range"])),
+        )
+    )
+
+
+def _judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
+    """Numbers of the candidates among the points, and how probable it is that each is false."""
+    model, seen = fit.solver.model, fit.seen
+    shown, significance = find_candidates(fit.solver, limit)
+    need, inside = fit.solver.weigh_borders(shown)
+    points = model.row[shown], model.column[shown], model.distance[shown]
+    known = [
+        np.log(significance[shown] / SURE_SIGMAS),
+        np.clip(need[shown], *BORDER_LIMITS),
+        np.log1p(inside[shown]),
+        find_near(points, (seen.y, seen.x, seen.range), model.row_m),
+    ]
+    return np.flatnonzero(shown), scipy.special.expit(
+        FALSE_ODDS[0] + FALSE_ODDS[1:] @ np.array(known)
+    )
+
+
+def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
+    """Return how far errors of the slit centres displace the picture to the right and down, px.
+
+    Of errors e_v a shot shows all but what looks like a displaced picture, ``e_v = dx - dy
+    tan(angle_v)``. That part is taken to be that of errors which alternate, as of neighbouring
+    lenslets measured in turns; independent ones would leave sqrt(views) as much.
+    """
+    in_turns = (-1.0) ** np.arange(camera.views)
+    looks = np.stack([np.ones(camera.views), -np.tan(camera.angles)], axis=1)
+    return np.asarray(np.abs(np.linalg.pinv(looks) @ in_turns) * centre_error_px)
