@@ -152,14 +152,18 @@ def report(
 ) -> None:
     """Print the figures of a run: numbers, strings, and lists or mappings of these by name.
     `as_json`: one object on one line (NaN becomes null) instead of a table; `written`: files to
-    name in the table; `note`: what has to be known about its figures; `json_only`: figures that are
-    for programs.
+    name in the table, which leaves out what is not known; `note`: what has to be known about its
+    figures; `json_only`: figures that are for programs.
     """
     plain = to_json_value(figures)
     if as_json:
         print(json.dumps(plain, allow_nan=False))
         return
-    plain = {name: value for name, value in plain.items() if name not in json_only}
+    plain = {
+        name: value
+        for name, value in plain.items()
+        if value not in (None, "") and name not in json_only
+    }
     width = max(map(len, plain), default=0)
     compared = _find_compared(plain)
     for name, value in plain.items():

@@ -273,6 +273,9 @@ class Volume:
 
     def _repr_html_(self) -> str:
         rows = {"voxels (z, y, x)": " x ".join(map(str, self.grid.shape))}
+        for name in AXES:
+            first, last = getattr(self.grid, name)[[0, -1]]
+            rows[name] = f"{first:.3g} to {last:.3g} m"
         picture = np.abs(to_numpy(self.values)).max(axis=0)
         return render_html("Volume, seen from the wall", rows, picture)
 
