@@ -139,7 +139,7 @@ class TestLetters:
 
     @pytest.fixture(scope="class")
     def frames(self, clip: Path, scene5_camera: Camera) -> Frames:
-        return recover(read_streak(clip / "scene5.tif"), scene5_camera, Sparse(iterations=60))
+        return recover(read_streak(clip / "scene5.tif"), scene5_camera, Sparse(iterations=25))
 
     @pytest.mark.nightly
     def test_the_pictures_explain_the_readings(self, frames: Frames) -> None:
