@@ -138,7 +138,9 @@ class RecoveryPlan:
         frames.
 
         The operator (16 bytes for each of ``views * rows * columns * 2`` entries) and a few blocks
-        of frames for each thread come on top.
+        of frames for each thread come on top. So do, measured on shots of 128 x 128 pixels, about
+        twice the frames for surfaces, 130 to 170 MiB of compiled code in a process's first run, and
+        some 200 MiB where the camera is fitted to the shot.
         """
         rows, columns = self.shot.streak.counts.shape
         height, width = self.shot.camera.image_shape
