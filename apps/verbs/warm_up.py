@@ -42,20 +42,19 @@ def warm_up(as_json: bool = JSON) -> None:
         _save_shots(Path(folder))
         with show_progress("compiling", len(steps)) as advance:
             for step in steps:
-                _run_quietly([word.replace("@", f"{folder}/") for word in step.split()])
+                words = [word.replace("@", f"{folder}/") for word in step.split()]
+                _run_quietly([*words, "--overwrite"])  # steps write under the same names
                 advance(1)
     report({"steps": len(steps), "seconds": time.perf_counter() - started}, as_json)
 
 
 def list_steps() -> list[str]:
     """Commands that between them call every compiled function; ``@`` stands for a folder."""
-    steps = [
-        f"recover @shots/first.h5 --out @frames.h5 --method {method} --iterations 2"
-        for method in ("tv", "l1", "surfaces")
-    ]
+    recovery = "recover @shots/first.h5 --out @frames.h5 --method"
+    steps = [f"{recovery} {method} --iterations 2" for method in ("tv", "l1", "surfaces")]
     steps += [
-        "recover @shots/first.h5 --out @frames.h5 --method linear",
-        "recover @shots/first.h5 --out @frames.h5 --method adjoint",
+        f"{recovery} linear",
+        f"{recovery} adjoint",
         "cloud @frames.h5 --out @cloud.ply",
         "lidar accuracy --trials 10",
         "lidar sequence @shots --out @clouds",

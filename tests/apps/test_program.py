@@ -341,11 +341,11 @@ class TestWarmUp:
         assert named >= {"tv", "l1", "linear", "adjoint", *METHODS}
 
     def test_it_runs_its_steps(self, shell, monkeypatch):
-        recover = "recover @shots/first.h5 --out @frames.h5 --method linear"
-        steps = [recover, "cloud @frames.h5 --out @cloud.ply"]
+        quick = ("linear", "adjoint", "cloud @frames")
+        steps = [one for one in warm_up.list_steps() if any(word in one for word in quick)]
         monkeypatch.setattr(warm_up, "list_steps", lambda: steps)
         found = shell.figures("warm-up")
-        assert found["steps"] == 2
+        assert found["steps"] == 3
         assert found["seconds"] > 0
 
     def test_a_step_that_fails_is_named(self, shell, monkeypatch):

@@ -65,7 +65,10 @@ def test_a_delay_that_is_curved_along_the_slit_is_found_from_the_shot() -> None:
     assert found["z"]["wall"] < 2
 
 
-@pytest.mark.parametrize(("scene", "missed", "false"), [("room", 0.1, 0.02), ("wires", 0.06, 0.09)])
+@pytest.mark.parametrize(
+    ("scene", "missed", "false"),
+    [pytest.param("room", 0.1, 0.02, marks=pytest.mark.nightly), ("wires", 0.06, 0.09)],
+)
 def test_rays_are_left_out_and_marked_where_all_points_are_asked_for(scene, missed, false) -> None:
     """All points have hardly a return missing; hardly any is false of those that are said to be sure, and
     most of those that are said to be false.

@@ -25,7 +25,7 @@ def recover(scene: str, photons: float) -> tuple[tofclip.Frames, dict]:
     ("scene", "missed", "false", "too_small", "too_large"),
     [
         ("wires", 0.03, 0.06, 1.3, 0.07),
-        ("room", 0.05, 0.01, 1.9, 0.33),
+        pytest.param("room", 0.05, 0.01, 1.9, 0.33, marks=pytest.mark.nightly),
         pytest.param("table", 0.08, 0.01, 2.5, 0.2, marks=pytest.mark.nightly),
     ],
 )

@@ -136,6 +136,7 @@ def test_ranging_on_a_cluster(run, scheduler, recorded, tmp_path):
     assert reported["jitter_rms_bins"] < 0.15
 
 
+@pytest.mark.nightly
 def test_studies_on_a_cluster(run, scheduler, tmp_path):
     line = f"reproduce table1 --out {tmp_path}/made --seeds 1 --cluster {scheduler} --json"
     folder = tmp_path / "made" / "reproduction"
