@@ -110,6 +110,7 @@ sys.exit(main([*words.split(), "--out", sys.argv[1]]))
         assert line.startswith(f"tofclip: warning: {warning}")
         assert "NUMBA_CACHE_DIR" in line
 
+    @pytest.mark.nightly
     def test_without_a_place_for_compiled_loops_they_are_compiled_for_the_run(self, tmp_path):
         """As in an installation that is read-only, for a user without a home."""
         (tmp_path / "file").touch()  # a folder below it cannot be made by anybody
@@ -118,6 +119,7 @@ sys.exit(main([*words.split(), "--out", sys.argv[1]]))
         below = tmp_path / "file" / "cache"
         self.assert_not_kept(self.simulate(tmp_path / "file", below, forbid, nowhere))
 
+    @pytest.mark.nightly
     def test_a_full_disk_of_the_cache_keeps_no_result(self, tmp_path):
         fill = "from numba.core.caching import IndexDataCacheFile as file"
         full = "file._save_data = lambda *_: open('/dev/full', 'w', 1).write('loop\\n')"

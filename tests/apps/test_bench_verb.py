@@ -53,6 +53,7 @@ def weight_searches(monkeypatch):
 
 @pytest.mark.usefixtures("weight_searches")
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.nightly
 def test_every_case_runs(case):
     ready = case.prepare(SMALL.get(case.name, SMALL.get(case.group, 16)))
     ready.action()

@@ -31,6 +31,7 @@ def test_letters_are_recovered(shell, shared_data, encoder, worst):
     assert pixels.min() >= 0
 
 
+@pytest.mark.nightly
 def test_choices_are_made_by_name(shell, shared_data):
     simulate(shell, "line", 0.25)
     choices = "--prior collaborative --preset quality --weight 0.03 --data-term huber"

@@ -32,6 +32,7 @@ def difference(found, expected):
 
 
 @pytest.mark.parametrize("method", ["tv", "linear"])
+@pytest.mark.nightly
 def test_frames_and_cloud_are_those_of_the_compiled_loops(shell, method):
     frames, points = {}, {}
     for name, device in DEVICES.items():
@@ -94,6 +95,7 @@ def test_a_folder_belongs_to_one_device(shell, files):
 @pytest.mark.parametrize(
     ("wall", "method"), [("confocal", "rsd"), ("curved", "hybrid"), ("curved", "backprojection")]
 )
+@pytest.mark.nightly
 def test_hidden_scenes_are_the_same_elsewhere(shell, wall, method):
     line = f"nlos reconstruct {{{wall}}} --voxel-mm 40 --method {method}"
     here, there = (

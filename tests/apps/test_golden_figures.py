@@ -96,6 +96,7 @@ def measure_wall(path: Path) -> dict[str, float]:
     }
 
 
+@pytest.mark.nightly
 def test_the_recorded_letter_n(shared_data: Path) -> None:
     compare("LetterN", measure_wall(require(shared_data / "lift" / "nlos_LetterN.npz")))
 

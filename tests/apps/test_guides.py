@@ -51,13 +51,14 @@ OWN = {name: name for name in RECORDED.values() if name.endswith("tif")}
     ("page", "provided", "made"),
     [
         ("tutorial", RECORDED, "camera.h5 frames.h5 look.h5 scene.ply"),
-        (
+        pytest.param(
             "own_camera",
             OWN | {"my_picture.tif": "streak.tif"},
             "shot.h5 frames.h5 scene.ply fitted.h5 photons.ply",
+            marks=pytest.mark.nightly,
         ),
-        ("own_wall", {}, "capture.h5 volume.h5"),
-        ("own_light_field", {}, "field.h5 corrupted.png"),
+        pytest.param("own_wall", {}, "capture.h5 volume.h5", marks=pytest.mark.nightly),
+        pytest.param("own_light_field", {}, "field.h5 corrupted.png", marks=pytest.mark.nightly),
         ("gpu", {"shot.h5": "streak.h5"}, "frames.h5 scene.ply"),
     ],
 )
@@ -80,18 +81,21 @@ def test_what_a_guide_shows_and_cannot_run(guide, tmp_path, monkeypatch):
     shell_lines = [text for language, text in read_steps(guide) if language == "sh"]
     assert all(text.startswith("tofclip ") for text in shell_lines)
     monkeypatch.chdir(tmp_path)
-    known = collect_verbs()
     for command in find_hardware_commands(guide):
-        words = shlex.split(command)[1:]
-        # Files that are named have to be there.
-        for word in words:
-            if not word.startswith("-") and "/" not in word:
-                Path(word).touch()
-            elif word.endswith("/"):
-                Path(word).mkdir(exist_ok=True)
-        name = " ".join(words[:2]) if " ".join(words[:2]) in known else words[0]
-        with known[name].make_context(name, words[len(name.split()) :]) as context:
-            assert context.params
+        read_command(command)
+
+
+def read_command(command: str) -> None:
+    """Whether a command is one of this program; what it names is made, as it has to be there."""
+    known, words = collect_verbs(), shlex.split(command)[1:]
+    for word in words:
+        if not word.startswith("-") and "/" not in word:
+            Path(word).touch()
+        elif word.endswith("/"):
+            Path(word).mkdir(exist_ok=True)
+    name = " ".join(words[:2]) if " ".join(words[:2]) in known else words[0]
+    with known[name].make_context(name, words[len(name.split()) :]) as context:
+        assert context.params
 
 
 class TestPictures:
@@ -211,6 +215,12 @@ class TestReadme:
         blocks = re.findall(r"```sh\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
         return [line for block in blocks for line in block.splitlines() if line.startswith(start)]
 
+    def test_its_commands_are_those_of_the_program(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        for command in self.commands("tofclip "):
+            read_command(command)
+
+    @pytest.mark.nightly
     def test_the_walk_through(self, shell, files, tmp_path):
         # A shot whose file has a time axis, under the README's names: files are known by content,
         # not by suffix.

@@ -264,6 +264,7 @@ def test_surfaces_are_traced_with_normals(shell, capture, source):
     np.testing.assert_allclose(np.linalg.norm(vertices[:, 3:6], axis=1), 1, atol=1e-5)
 
 
+@pytest.mark.nightly
 def test_the_examples_run_one_after_the_other(shell):
     verbs = collect_verbs()
     for verb in ("simulate", "info", "reconstruct", "film", "compare"):

@@ -142,6 +142,7 @@ def install(guide: Path, place: Path) -> None:
 LENGTHS = {"denoiser": 25, "prior": 40, "method": 50, "hidden": 50, "reader": 40, "instrument": 120}
 
 
+@pytest.mark.nightly
 def test_the_page_makes_a_package_whose_parts_are_used(tmp_path: Path) -> None:
     install(PAGE, tmp_path / "installed")
     found = {one.stem: len(one.read_text().splitlines()) for one in tmp_path.rglob("my_parts/*.py")}

@@ -60,6 +60,7 @@ def counts(figures):
     "address",
     ["sim+linospad2://?seed=1&bins=576", "sim+remoteex://?seed=1&scene=small&frame_rate=50"],
 )
+@pytest.mark.nightly
 def test_a_point_cloud_from_a_source(shell, light, address):
     found = shell.figures(f"recover '{address}' --out frames.h5 --cloud cloud.ply")
     assert found["frames"] == 576

@@ -64,6 +64,7 @@ def test_times_follow_the_formula(uneven: BoardCalibration) -> None:
 
 
 @pytest.mark.parametrize(("board", "hot"), [("NL11_#33_2212b", 66), ("B7d_#28_2212s", 37)])
+@pytest.mark.nightly
 def test_recorded_boards(shared_data: Path, light: LineLight, board: str, hot: int) -> None:
     """Measured unevenness of two boards: codes up to 112 ps wide, pixels out of step by 11 ns, ten
     of them hot. They see the scene with their own tables only.

@@ -56,6 +56,7 @@ def test_a_plane_is_found_with_a_millimetre_s_error() -> None:
     assert found["miss"] < 0.05
 
 
+@pytest.mark.nightly
 def test_a_delay_that_is_curved_along_the_slit_is_found_from_the_shot() -> None:
     """Three rows are 9 mm. All but the reference view's own delay is found, which is time zero."""
     shot = make_shot("bush", seed=2, size=64, bend=3.0)

@@ -74,6 +74,7 @@ def test_events_and_cubes_are_the_same_photons() -> None:
     )
 
 
+@pytest.mark.nightly
 def test_a_recorded_face_is_as_its_long_exposure_shows(shared_data) -> None:
     """With the pulse that its authors name; with the one that is learnt it is a golden figure."""
     folder = shared_data / "photons"

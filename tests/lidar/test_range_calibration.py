@@ -79,6 +79,7 @@ def find_lateness(fit) -> float:
 
 
 @pytest.mark.parametrize("jitter_m", [0.0, 1e-3])
+@pytest.mark.nightly
 def test_deviations_are_true_over_seeds(jitter_m: float):
     """Time zero off by 300 ps, 2 mm of walk a decade, offsets of 1 mm, with and without jitter of
     1 mm: what a thousand of a thousand and one runs of 64 seeds would give.

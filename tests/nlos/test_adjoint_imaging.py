@@ -93,6 +93,7 @@ def test_what_does_not_fit_is_refused(attempt: Any, message: str) -> None:
     assert "behind" in find_refusal(AdjointImaging(SOLVER), FITTING, BEHIND)
 
 
+@pytest.mark.nightly
 def test_the_study_on_a_small_office_reaches_the_papers_finding(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

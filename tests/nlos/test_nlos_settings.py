@@ -114,6 +114,7 @@ def test_background_is_not_the_walls_own_light() -> None:
         assert settings_for(counts).gate is None
 
 
+@pytest.mark.nightly
 def test_noise_makes_the_wave_longer_and_nothing_makes_it_jump() -> None:
     """From photons whose spectrum tells the wave to so few that pictures have to."""
     random, light = np.random.default_rng(1), clean().signal / clean().signal.max()

@@ -77,6 +77,7 @@ def test_refinement_beats_the_single_shot(laser: str) -> None:
     assert refined.provenance["imaging"]["iterations"] == 30
 
 
+@pytest.mark.nightly
 def test_an_even_surface_is_smooth_with_sharp_borders_under_total_variation() -> None:
     """A square of 36 cm, parallel to the wall, against the voxels that it fills."""
     scene = HiddenScene([Surface.rectangle([-0.05, 0.0, 0.7], (0.36, 0.36), 0.03)])
@@ -144,6 +145,7 @@ def test_what_cannot_be_refined_is_refused() -> None:
             refinement.reconstruct(capture, grid)
 
 
+@pytest.mark.nightly
 def test_equal_points_near_the_laser_and_far_from_it_are_equally_bright() -> None:
     """Light that reaches one of them has gone 1.8 times as far as that to the other."""
     grid = Grid.box((-0.4, 0.4), (-0.32, 0.32), (0.48, 0.92), (0.05, 0.05, 0.04))

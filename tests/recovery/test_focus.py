@@ -157,6 +157,7 @@ def test_frames_remember_their_shears(locked, shot, tmp_path):
 
 
 @pytest.mark.parametrize("focus", [FixedFocus(), DepthLockedFocus()])
+@pytest.mark.nightly
 def test_heights_come_out_true_in_the_depth_of_field_arrangement(focus):
     shot = simulate_shot(SCENE, instrument(camera(order=(0, 1, 2, 3, 4, 5, 6))), seed=0)
     frames = recover(shot.streak, shot.camera, METHOD, focus=focus)

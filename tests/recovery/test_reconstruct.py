@@ -164,6 +164,7 @@ def test_skew_and_gains_are_found_from_the_shot(shot, frames):
     np.testing.assert_allclose(found.centres_px, true.centres_px, atol=0.5)
 
 
+@pytest.mark.nightly
 def test_energy_curves_give_the_skew_to_a_row_and_registration_lowers_the_residual(
     shot, uncalibrated
 ):

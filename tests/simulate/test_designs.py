@@ -55,6 +55,7 @@ def test_singular_values_are_those_of_the_dense_matrix(further):
 
 
 @pytest.mark.parametrize("further", [{"views": 7}, CODES], ids=["slit", "0d"])
+@pytest.mark.nightly
 def test_prediction_and_simulated_shots_agree(further):
     """Within 30 %; the deviation of ranges from 20 shots scatters by 5 % over seeds 0 to 4."""
     known = Design(**SMALL | further)

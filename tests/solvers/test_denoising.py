@@ -60,6 +60,7 @@ def test_most_of_the_noise_is_removed(clean, noisy, kind):
     assert left_over(kind()(noisy, noisy, DEVIATION), clean) < 0.25
 
 
+@pytest.mark.nightly
 def test_the_collaborative_filter_gets_better_with_its_pilot(clean, noisy):
     """From a blurred pilot onwards, each result the pilot of the next; the truth as pilot is the
     bound.

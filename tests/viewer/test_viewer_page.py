@@ -519,6 +519,7 @@ def test_the_pages_of_other_servers_see_nothing(browser: Any) -> None:
         until(lambda: tab.frames[1].url == "chrome-error://chromewebdata/", "no frame shows it")
 
 
+@pytest.mark.nightly
 def test_a_volume_as_a_surface(browser: Any) -> None:
     with serve(VolumeSource("ball", volume())) as page:
         seen = Seen(browser, page)
