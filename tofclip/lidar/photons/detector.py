@@ -448,9 +448,21 @@ class PhotonDetector:
         return Arrivals(SPEED_OF_LIGHT / 2 * arrival, photons, SPEED_OF_LIGHT / 2 * deviation)
 
     def add_step_errors(self, layers: FloatArray) -> FloatArray:
-        """Add to the deviations of layers, (..., 4) as of `locate_pixels`, by how far two thirds of the
-        returns between two steps of a gate err, however many photons there are, by where in the step
-        they seem to be: a picture shows the gate at one instant, not its mean over a step.
+        """Add to the deviations of layers, (..., 4) as of `locate_pixels`, what a gate's steps leave
+        unknown of ranges, however many photons there are.
+        """
+        step = SPEED_OF_LIGHT / 2 * self.bin_width
+        place = (
+            np.nan_to_num(layers[..., 0] / step % 1 * STEP_PHASES).astype(np.int64) % STEP_PHASES
+        )
+        ranges, sigma, *others = np.moveaxis(layers, -1, 0)
+        return np.stack([ranges, np.hypot(sigma, self._step_errors[place]), *others], axis=-1)
+
+    @cached_property
+    def _step_errors(self) -> FloatArray:
+        """By how far two thirds of the returns between two steps of a gate err, m, by where in the step
+        they seem to be, (STEP_PHASES,): a picture shows the gate at one instant, not its mean over a
+        step.
         """
         phase = (np.arange(STEP_PHASES) + 0.5) / STEP_PHASES
         truth = (self.bins // 2 + phase) * self.bin_width
@@ -461,12 +473,7 @@ class PhotonDetector:
         weight = np.exp(-((apart / STEP_BLUR) ** 2) / 2)
         error = (found - SPEED_OF_LIGHT / 2 * truth) ** 2
         # two thirds of what is spread evenly lie within 2 / sqrt(3) of its root mean square
-        errors = np.sqrt(4 / 3 * (weight @ error) / weight.sum(axis=1))
-        place = (
-            np.nan_to_num(layers[..., 0] / step % 1 * STEP_PHASES).astype(np.int64) % STEP_PHASES
-        )
-        ranges, sigma, *others = np.moveaxis(layers, -1, 0)
-        return np.stack([ranges, np.hypot(sigma, errors[place]), *others], axis=-1)
+        return np.asarray(np.sqrt(4 / 3 * (weight @ error) / weight.sum(axis=1)))
 
 
 def _quantise_photons(photons: FloatArray) -> NDArray[np.int64]:
