@@ -191,22 +191,35 @@ def photons(
         "seconds": time.perf_counter() - started,
         "settings": settings,
     }
-    missed, warning = found.settings.get("pile_up", 0.0), ""
-    if missed:
-        warning = (
+    if doubt := find_doubt(image, found.settings, cycles):
+        print(f"tofclip: warning: {doubt}", file=sys.stderr)
+    report(figures, as_json, [out])
+
+
+def find_doubt(
+    image: PhotonImage, settings: dict[str, float | str], cycles: int | None
+) -> str | None:
+    """Say what the photons themselves show of the ranges' faults."""
+    import numpy as np
+
+    if missed := settings.get("pile_up"):
+        return (
             f"{missed:.0%} of the background is missing behind surfaces: the detector is blind after a photon, and "
             "ranges are too short (pile-up); give --cycles N"
         )
-    elif cycles is not None and found.settings["response"] == "learnt":
+    if cycles is not None and settings["response"] == "learnt":
         ended = np.median(image.photons_per_pixel[image.photons_per_pixel > 0]) / cycles
         if ended > MAX_LEARNT_SHARE:
-            warning = (
+            return (
                 f"a photon ended {ended:.1%} of the cycles: nothing shows the late side of the pulse, and ranges may "
                 "be wrong by its width; give --pulse-ps W"
             )
-    if warning:
-        print(f"tofclip: warning: {warning}", file=sys.stderr)
-    report(figures, as_json, [out])
+    if uneven := float(settings["uneven_bins_sigma_m"]):
+        return (
+            "bins are of uneven length, as the background shows: ranges are those of an even time axis, which is "
+            f"known to {uneven * 1e3:.2g} mm"
+        )
+    return None
 
 
 def read_any_photons(

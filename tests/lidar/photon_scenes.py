@@ -80,6 +80,17 @@ def make_rates(
     return np.asarray(signal)[..., np.newaxis] * np.diff(passed, axis=-1) + background
 
 
+def make_uneven_rates(
+    surface: np.ndarray, signal: np.ndarray, background: float, lengths: np.ndarray
+) -> np.ndarray:
+    """Expected photons, (rows, columns, bins), of a converter whose bins have `lengths`, of 1 in the
+    mean; `background`: of an even bin.
+    """
+    edges = np.concatenate([[0], np.cumsum(lengths)]) - 0.5 - surface[..., np.newaxis]
+    passed = ndtr(edges / (FWHM / BIN / np.sqrt(8 * np.log(2))))
+    return signal[..., np.newaxis] * np.diff(passed, axis=-1) + background * lengths
+
+
 def count_first_photons(rates: np.ndarray, cycles: int, seed: int) -> np.ndarray:
     """Histograms of a detector that counts the first photon of a cycle; `rates` of all cycles."""
     missed = np.exp(-np.cumsum(rates, axis=-1) / cycles)

@@ -156,6 +156,39 @@ def test_a_background_that_changes_over_picture_and_time_is_no_surface(decay, le
     assert abs(found.outlier_probability.mean() - wrong.mean()) < 0.02
 
 
+@pytest.mark.parametrize("find", [estimate_surface, estimate_pixels])
+def test_uneven_bins_of_a_converter_are_found_in_the_background(find):
+    """Bins by chance 0.7 to 1.3 as long and of a period besides put half of the pixels three bins off,
+    and z was 36, without a word.
+    """
+    surface, signal = scenes.make_surface(), 20 * TILES + np.zeros((80, 80))
+    lengths = np.random.default_rng(5).uniform(0.7, 1.3, BINS)
+    lengths *= 1 + 0.2 * np.sin(2 * np.pi * np.arange(BINS) / 64)
+    rates = scenes.make_uneven_rates(surface, signal, 0.1, lengths / lengths.mean())
+    counts = np.random.default_rng(3).poisson(rates)
+    found = find(PhotonImage.from_cube(counts, scenes.BIN))
+    error = found.range - surface * scenes.BIN_M
+    assert np.nanmean(np.abs(error) <= 3 * scenes.BIN_M) >= 0.97
+    # 100 photons in a bin are its length to a tenth: of the sum of 256 that is a bin at most
+    assert 0.2 < found.settings["uneven_bins_sigma_m"] / scenes.BIN_M < 1
+    # what is left is a course that all pixels have in common: one deviation as of chance, at most 2.5
+    assert np.nanmedian(np.abs(error / found.range_sigma)) < 2.5
+
+
+@pytest.mark.parametrize("what", ["even", "fog", "ramp", "reflection"])
+def test_light_that_is_uneven_moves_no_bins(what):
+    late = np.arange(BINS) / BINS
+    course = {
+        "even": np.ones(BINS),
+        "fog": 1 + 0.4 * np.exp(-late / 0.1),
+        "ramp": 1 - 0.3 * late,
+        "reflection": 1 + 3 * np.exp(-((late * BINS - 30) ** 2) / 8),
+    }[what]
+    surface = scenes.make_surface()
+    found = estimate(scenes.make_rates(surface, 20 * TILES + 0 * surface, 0.1 * course))
+    assert found.settings["uneven_bins_sigma_m"] == 0
+
+
 @pytest.mark.parametrize(("seed", "pulse"), [(0, None), (1, Pulse.gaussian(60e-12))])
 def test_a_pulse_shorter_than_a_bin_is_known_to_a_part_of_it(pulse, seed):
     """Bins of 400 ps show no shape of 60 ps: what was learnt became ever narrower, z 1.6 to 56."""

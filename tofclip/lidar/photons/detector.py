@@ -14,7 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.photons.image import PhotonImage, SurfaceImage
-from tofclip.lidar.photons.scene import group_shades, learn_background, prepare_photons
+from tofclip.lidar.photons.scene import (
+    group_shades,
+    learn_background,
+    measure_bins,
+    prepare_photons,
+)
 from tofclip.lidar.pulse import Pulse, Table
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
@@ -520,10 +525,17 @@ def estimate_pixels(
         No pulse is given and none can be recognised, or the time axis is shorter than two pulses.
     """
     # a background that is given has the photons' own bins
+    counted = photons
     photons, shape, hot = prepare_photons(photons, pulse, join=background is None)
     settings = shape, photons.bin_width, photons.bins, false_alarm_rate, max_returns
     detector = PhotonDetector(*settings, background=background).learn(photons)
     found = detector.locate_pixels(photons.histograms, photons.offsets.size - 1, cycles)
+    if background is None and cycles is None and photons.bins == counted.bins:
+        places = found[..., 0] / (SPEED_OF_LIGHT / 2 * photons.bin_width)
+        uneven = measure_bins(photons, places, shape.fwhm / photons.bin_width)
+        if uneven is not None:
+            even = counted.even_out(*uneven)
+            return estimate_pixels(even, pulse, false_alarm_rate, max_returns=max_returns)
     learnt = "learnt" if np.ptp(detector.relative_background) else "even"
     chosen: dict[str, float | str] = {
         "response": "learnt" if pulse is None else "given",
@@ -531,8 +543,9 @@ def estimate_pixels(
         "false_alarm_rate": false_alarm_rate,
         "background": learnt if background is None else "given",
         "hot_pixels": int(hot.sum()),
+        "uneven_bins_sigma_m": photons.bins_sigma_m,
     }
-    layers = found.reshape(max_returns, *photons.image_shape, 4)
+    layers = photons.add_bin_errors(found.reshape(max_returns, *photons.image_shape, 4))
     if photons.sampled:
         layers = detector.add_step_errors(layers)
     return SurfaceImage.from_layers(layers, detector.shape, chosen, hot)

@@ -85,6 +85,9 @@ class PhotonImage:
         Course of the background over picture and time, as `estimate_surface` finds it; even by default.
     sampled : bool
         Whether a bin shows one instant, see `PhotonCube`: where in a step a return lies leaves no trace.
+    bin_sigma : (bins,) array, optional
+        How well the instant of each bin is known, in bins, of a converter whose bins are uneven; see
+        `even_out`.
 
     Raises
     ------
@@ -102,6 +105,7 @@ class PhotonImage:
     cycles: float = np.inf
     shading: Any = None
     sampled: bool = False
+    bin_sigma: FloatArray | None = None
 
     def __post_init__(self) -> None:
         pixels = self.image_shape[0] * self.image_shape[1]
@@ -289,6 +293,42 @@ class PhotonImage:
         table.sum_duplicates()
         own = table.indptr.astype(np.int64), table.indices.astype(np.float32), table.data
         return replace(self, offsets=own[0], bin=own[1], count=own[2], cycles=float(cycles))
+
+    def even_out(self, edges: FloatArray, sigma: FloatArray, seed: int = 0) -> PhotonImage:
+        """Return the same photons, in whole bins, on an even time axis, on which bins begin and end at
+        `edges` (bins + 1,), none of them longer than two; `sigma`: see `bin_sigma`. Which of two or
+        three even bins a photon came in is left to chance, by a `seed`: counts stay Poisson's.
+        """
+        code = self.bin.astype(np.int64)
+        begin, length = edges[code], edges[code + 1] - edges[code]
+        first = np.minimum(np.floor(begin), self.bins - 1)
+        one, two = (np.clip((first + n - begin) / length, 0, 1) for n in (1, 2))
+        noise, number = np.random.default_rng(seed), np.rint(self.count).astype(np.int64)
+        late = number - noise.binomial(number, one)
+        last = noise.binomial(late, np.clip((1 - two) / np.maximum(1 - one, 1e-12), 0, 1))
+        count = np.stack([number - late, late - last, last], axis=1).astype(np.float32).ravel()
+        when = (
+            np.minimum(first[:, np.newaxis] + (0, 1, 2), self.bins - 1).astype(np.float32).ravel()
+        )
+        spread = replace(self, offsets=3 * self.offsets, bin=when, count=count, bin_sigma=sigma)
+        return replace(spread.select(count), axes=self.axes)
+
+    @property
+    def bins_sigma_m(self) -> float:
+        """Deviation of the usual bin's range, m; 0 where bins are even."""
+        usual = 0.0 if self.bin_sigma is None else float(np.median(self.bin_sigma))
+        return SPEED_OF_LIGHT / 2 * self.bin_width * usual
+
+    def add_bin_errors(self, layers: FloatArray) -> FloatArray:
+        """Add what is not known of the bins' instants to the deviations of layers, (..., 4) as of
+        `SurfaceImage.from_layers`.
+        """
+        if self.bin_sigma is None:
+            return layers
+        bin_m = SPEED_OF_LIGHT / 2 * self.bin_width
+        ranges, sigma, *others = np.moveaxis(layers, -1, 0)
+        known = bin_m * np.interp(ranges / bin_m, np.arange(self.bins), self.bin_sigma)
+        return np.stack([ranges, np.hypot(sigma, known), *others], axis=-1)
 
     def histograms(self, pixels: slice) -> FloatArray:
         """Return the histograms of some pixels in raster order, (n, bins)."""

@@ -61,6 +61,12 @@ SHADE_RATIO = 1.1  # backgrounds that differ by less share a filter; thresholds 
 MIN_CELL_PX, MAX_CELL_PX, MIN_CELL_PHOTONS = 8, 32, 16.0
 STRETCHES, MIN_STRETCHES, STRETCH_WIDTHS, CELLS_AROUND = 64, 32, 2.0, 9
 MIN_SHADING_RATIO, MIN_SHADE = 1.5, 1e-3
+# Parts of the record in most of which bins have to be uneven; in so many widths of the pulse to either side no
+# light varies as they do; and by how many standard deviations, and by how much, they have to.
+UNEVEN_PARTS, UNEVEN_WIDTHS, UNEVEN_SIGMAS, MIN_UNEVEN_BINS = 16, 4.0, 5.0, 0.03
+# of parts' variance over that around a cubic: one in a hundred of chance alone is beyond
+MIN_SLOW_RATIO = 2.5
+MIN_BIN, MAX_BIN = 0.05, 2.0  # lengths of bins that are believed, over their mean
 MIN_BACKGROUND_PHOTONS = 1.0  # of the whole picture: no background is exactly zero
 
 
@@ -277,6 +283,67 @@ def learn_shading(photons: PhotonImage, width: float) -> Shading | None:
             return None if even else Shading(level, photons.image_shape, photons.bins, mean)
         cell, number = (2 * cell, number) if cell < MAX_CELL_PX else (cell, number // 2)
     return None
+
+
+def measure_bins(
+    photons: PhotonImage, layers: FloatArray, width: float
+) -> tuple[FloatArray, FloatArray] | None:
+    """Find where the bins of an uneven converter lie by the background that they count away from surfaces
+    at `layers` (layers, rows, columns), in bins, of a pulse of `width` bins: their edges and the
+    deviation of their instants, as of `PhotonImage.even_out`. None where they are even as far as
+    the photons say, where the background is not, or where times are not in whole bins.
+    """
+    bins, whole = photons.bins, photons.bin.astype(np.int64)
+    if photons.sampled or photons.bin_sigma is not None or np.any(photons.bin != whole):
+        return None
+    windows = [layers.reshape(len(layers), -1) + edge * width for edge in EXTENT_WIDTHS]
+    free = np.ones(whole.size, np.bool_)
+    for early, late in zip(*windows, strict=True):
+        free &= ~((whole >= early[photons.pixel]) & (whole < late[photons.pixel]))
+    light = photons.count * free
+    level = np.bincount(photons.pixel, light, photons.offsets.size - 1) / bins
+    hidden = np.zeros(
+        bins + 1
+    )  # of the background, by surfaces: first bins and ends of their windows
+    for ends, sign in zip(windows, (1, -1), strict=True):
+        known = np.isfinite(ends)
+        place = np.clip(np.ceil(ends[known]), 0, bins).astype(np.int64)
+        hidden += sign * np.bincount(place, np.broadcast_to(level, ends.shape)[known], bins + 1)
+    expected = np.maximum(level.sum() - np.cumsum(hidden[:-1]), MIN_BACKGROUND_PHOTONS / bins)
+    seen = np.bincount(whole, light, bins)
+    parts = np.array_split(np.arange(bins), UNEVEN_PARTS)
+    counted, bright = np.array([[seen[p].sum(), expected[p].sum()] for p in parts]).T
+    if counted.min() <= 0 or np.ptp(np.log(counted / bright)) > np.log(MIN_SHADING_RATIO):
+        return None
+    # What changes slowly is light, unless parts differ as much from a cubic as they do from each other.
+    ratio = counted / bright - counted.sum() / bright.sum()
+    course = np.polyfit(np.arange(UNEVEN_PARTS), ratio, 3)
+    misfit = np.sum((ratio - np.polyval(course, np.arange(UNEVEN_PARTS))) ** 2)
+    slow = np.sum(ratio**2) > MIN_SLOW_RATIO * misfit
+    if slow:
+        place = (np.arange(bins) + 0.5) * UNEVEN_PARTS / bins - 0.5
+        expected *= 1 + np.polyval(course, place) * bright.sum() / counted.sum()
+    expected *= seen.sum() / expected.sum()
+    noise, excess = 1 / expected, seen / expected - 1
+    window = min(2 * round(UNEVEN_WIDTHS * width) + 1, bins // UNEVEN_PARTS)
+    quick = excess - scipy.ndimage.uniform_filter1d(excess, window)
+
+    def vary(values: FloatArray) -> float:
+        # light that returns from one place in all pixels is uneven in one part
+        return float(np.median([np.mean(values[part]) for part in parts]))
+
+    chance = UNEVEN_SIGMAS * 1.25 * np.sqrt(2 / bins)
+    if vary(quick**2 / noise) < 1 + chance or vary(quick**2 - noise) < MIN_UNEVEN_BINS**2:
+        return None
+    usual = max(vary(excess**2 - noise), MIN_UNEVEN_BINS**2)
+    # Wiener's estimate, and what it leaves: of a slow course no share is known to be the bins'.
+    trusted = usual / (usual + noise)
+    edges = np.concatenate([[0], np.cumsum(np.clip(1 + excess * trusted, MIN_BIN, MAX_BIN))])
+    left = np.concatenate([[0], np.cumsum(usual * (1 - trusted * (not slow)))])
+    part = np.arange(bins + 1) / bins
+    # of a sum of lengths whose total is known
+    sigma = np.sqrt(left * (1 - part) ** 2 + (left[-1] - left) * part**2)
+    return edges * (bins / edges[-1]), (sigma[1:] + sigma[:-1]) / 2
 
 
 def learn_response(

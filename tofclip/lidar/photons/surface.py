@@ -40,6 +40,7 @@ from tofclip.lidar.photons.matching import (
 from tofclip.lidar.photons.scene import (
     Scene,
     learn_shading,
+    measure_bins,
     prepare_photons,
     require_plausible_pulse,
 )
@@ -108,7 +109,7 @@ def estimate_surface(
     Memory: at most 2 GiB beside the photons.
     """
     report = (lambda _: None) if progress is None else progress
-    dim = find_dim_pixels(photons)
+    counted, dim = photons, find_dim_pixels(photons)
     photons, start, hot = prepare_photons(photons, pulse)
     if cycles is None and not photons.sampled:
         photons = replace(photons, shading=learn_shading(photons, start.fwhm / photons.bin_width))
@@ -144,6 +145,11 @@ def estimate_surface(
         surface = axis.to_bins(labels)
     del volume
     report(0.6)
+    if cycles is None and photons.shading is None and photons.bins == counted.bins:
+        uneven = measure_bins(photons, surface[np.newaxis], scene.response.width)
+        if uneven is not None:
+            even = counted.even_out(*uneven)
+            return estimate_surface(even, pulse, learn, max_returns, seed, progress)
     reach, fitted = choose_reach(train, test, training, surface)
     to_probability = calibrate_outliers(test, train, training, fitted, margin)
     report(0.8)
@@ -178,8 +184,9 @@ def estimate_surface(
         "hot_pixels": int(hot.sum()),
         "dim_pixels": int(dim.sum()),
         "pile_up": missed,
+        "uneven_bins_sigma_m": photons.bins_sigma_m,
     }
-    stack = stack * [bin_m, bin_m, 1, 1]
+    stack = photons.add_bin_errors(stack * [bin_m, bin_m, 1, 1])
     if photons.sampled:
         detector = PhotonDetector(start, photons.bin_width, photons.bins).learn(photons)
         stack = detector.add_step_errors(stack)
