@@ -251,3 +251,11 @@ def measure_sharpness(volume: Volume) -> float:
     front = volume.maximum_projection().brightness.astype(np.float64)
     total = float(front.sum())
     return front.size * float(np.sum(front**2)) / total**2 if total > 0 else math.nan
+
+
+def correlate_views(one: Volume, other: Volume) -> float:
+    """Pearson correlation of two volumes' front views, on grids of the same lateral shape."""
+    import numpy as np
+
+    first, second = (volume.maximum_projection().brightness.ravel() for volume in (one, other))
+    return float(np.corrcoef(first, second)[0, 1])

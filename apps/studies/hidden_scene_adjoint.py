@@ -1,27 +1,22 @@
 """The adjoint's images of an office at three exposures and two sampling ratios (supplement Note 13,
 Fig. 20 d-f).
-
-``python -m apps.studies.hidden_scene_adjoint`` prints the table; ``--write docs/nlos.md`` puts it
-there, between the marks.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 
+from apps.studies.cases import Advance, Library, Outcome, Panel, Row, study
 from nlos.capture import Capture, TimeAxis
 from nlos.compressed import AdjointImaging, CompressedCapture
+from nlos.known_scenes import correlate_views
 from nlos.method import Method
 from nlos.phasor.plan import PlanarRSD
 from nlos.simulate import HiddenScene, Lambert, Surface, add_poisson_noise, build_relay_wall
 from nlos.volume import Grid, Volume
 from tofclip.errors import InputError
-from tofclip.files import atomic_path, translate_read_errors
 from tofclip.operators import RadonProjection
 from tofclip.solvers import Backprojection, LinearInverse
 
@@ -32,21 +27,6 @@ WAVELENGTH_M, CYCLES = 0.12, 5.0
 THRESHOLD = 0.15
 PEAK_FRACTION = 0.1  # of the brightest: what is expected to be weaker is never the largest
 BISECTION_STEPS = 12
-DOCUMENT_MARK = "<!-- adjoint study -->"
-
-
-@dataclass(frozen=True)
-class StudyRow:
-    """What one exposure and sampling ratio give."""
-
-    exposure: str
-    largest_count: float
-    sampling_ratio: float
-    # correlation of the front view with that of all wall points at the same exposure
-    adjoint: float  # recovered by the adjoint
-    cut: float  # the same, both volumes cut off at the threshold
-    linear: float  # recovered by the linear inverse
-    full: float  # correlation of that reference itself with the noiseless one
 
 
 def build_office(spacing: float = 0.06) -> HiddenScene:
@@ -110,87 +90,76 @@ def find_expected_peak(capture: Capture, largest_count: float, seed: int) -> flo
     return high
 
 
-def correlate_views(one: Volume, other: Volume) -> float:
-    """Pearson correlation of two volumes' front views, on grids of the same lateral shape."""
-    first, second = (volume.maximum_projection().brightness.ravel() for volume in (one, other))
-    return float(np.corrcoef(first, second)[0, 1])
+@study(
+    "fig20",
+    "note13",
+    title="A hidden office straight from compressed measurements",
+    note="The paper's office was measured; this one is simulated. Correlations are of front views: of what SR * 96 "
+    "line projections give with that of all wall points at the same exposure, and of that with no noise's.",
+    weight="none: the adjoint and the linear inverse have no prior",
+    seconds=20,
+    steps=len(EXPOSURES) * len(SAMPLING_RATIOS),
+)
+def run_adjoint_imaging(library: Library, seeds: int, advance: Advance) -> Outcome:
+    """Image the office at every exposure and sampling ratio."""
+    capture, grid = simulate_office(), build_office_grid()
+    return measure_agreement(capture, grid, PlanarRSD(WAVELENGTH_M, CYCLES), seeds, advance)
 
 
-def run_study(capture: Capture, grid: Grid, solver: Method, seed: int = 0) -> list[StudyRow]:
-    """Image a noiseless capture, of as many rows as columns, at every exposure and sampling ratio.
-    The photons of the reference and of the compressed measurements are independent.
+def measure_agreement(
+    capture: Capture, grid: Grid, solver: Method, seeds: int, advance: Advance
+) -> Outcome:
+    """Image a noiseless capture, of as many rows as columns, at every exposure and sampling ratio."""
+    clean = solver.reconstruct(capture, grid)  # what more light could reach at best
+    found: dict[tuple[str, ...], list[float]] = {}
+    panels = [[Panel("no noise", clean.maximum_projection().brightness)]]
+    for seed in range(seeds):
+        for labels, volumes in _image_compressed(capture, grid, solver, seed):
+            adjoint, linear, full = volumes
+            pairs = {
+                "adjoint": (adjoint, full),
+                f"adjoint, cut at {THRESHOLD:g}": (
+                    adjoint.threshold(THRESHOLD),
+                    full.threshold(THRESHOLD),
+                ),
+                "linear inverse": (linear, full),
+                "all points": (full, clean),
+            }
+            for name, pair in pairs.items():
+                found.setdefault((*labels, name), []).append(correlate_views(*pair))
+            if seed == 0:
+                titles = ("adjoint", "linear inverse", "all points")
+                where = f"{labels[0]}, SR = {labels[2]}"
+                panels.append(
+                    [
+                        Panel(f"{where}\n{title}", one.maximum_projection().brightness)
+                        for title, one in zip(titles, volumes, strict=True)
+                    ]
+                )
+            advance(1)
+    rows = [Row(labels, tuple(values)) for labels, values in found.items()]
+    columns = ("exposure", "largest count", "SR", "image")
+    return Outcome(columns, "correlation", rows, panels)
+
+
+def _image_compressed(
+    capture: Capture, grid: Grid, solver: Method, seed: int
+) -> Iterator[tuple[tuple[str, str, str], tuple[Volume, Volume, Volume]]]:
+    """Yield exposure, largest count and sampling ratio, and the images by adjoint, linear inverse and
+    all wall points.
     """
-    # Without noise: what more light could reach at best.
-    clean = solver.reconstruct(capture, grid)
-    rows = []
     for exposure, largest_count in EXPOSURES.items():
         peak = find_expected_peak(capture, largest_count, seed)
         # Two exposures of one scene: noise that both shared would correlate the images by itself.
         reference, compressible = (
             add_poisson_noise(capture, peak, seed=2 * seed + number) for number in range(2)
         )
-        # All points at the same exposure: what compression is measured against.
         full = solver.reconstruct(reference, grid)
         for ratio in SAMPLING_RATIOS:
-            compressed = CompressedCapture.of(
-                compressible, build_tomography(capture.signal.shape[1], ratio)
-            )
+            tomography = build_tomography(capture.signal.shape[1], ratio)
+            compressed = CompressedCapture.of(compressible, tomography)
             adjoint, linear = (
                 AdjointImaging(solver, method, 0.0).reconstruct(compressed, grid)
                 for method in (Backprojection(), LinearInverse())
             )
-            pairs = (
-                (adjoint, full),
-                (adjoint.threshold(THRESHOLD), full.threshold(THRESHOLD)),
-                (linear, full),
-                (full, clean),
-            )
-            agreements = (correlate_views(*pair) for pair in pairs)
-            rows.append(StudyRow(exposure, largest_count, ratio, *agreements))
-    return rows
-
-
-def format_table(rows: Sequence[StudyRow]) -> str:
-    """Set the rows in Markdown."""
-    lines = [
-        f"| exposure | largest count | SR | adjoint | adjoint, cut at {THRESHOLD} | linear inverse | all points |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {r.exposure} | {r.largest_count:.0f} | {r.sampling_ratio} "
-        f"| {r.adjoint:.2f} | {r.cut:.2f} | {r.linear:.2f} | {r.full:.2f} |"
-        for r in rows
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def replace_between_marks(text: str, document: Path) -> None:
-    """Replace what stands between the two marks of a document."""
-    with translate_read_errors(document):
-        parts = document.read_text().split(DOCUMENT_MARK)
-    # Two marks cut the text into three parts.
-    if len(parts) != 3:
-        raise InputError(f"{document} must hold the mark {DOCUMENT_MARK} twice")
-    with atomic_path(document) as temporary:
-        temporary.write_text(f"{parts[0]}{DOCUMENT_MARK}\n{text}{DOCUMENT_MARK}{parts[2]}")
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the study from the command line."""
-    parser = argparse.ArgumentParser(
-        description="Images of an office by the adjoint, over exposures and SR."
-    )
-    parser.add_argument(
-        "--write", type=Path, metavar="MARKDOWN", help="put the table between this document's marks"
-    )
-    document = parser.parse_args(arguments).write
-    result = format_table(
-        run_study(simulate_office(), build_office_grid(), PlanarRSD(WAVELENGTH_M, CYCLES))
-    )
-    print(result)
-    if document is not None:
-        replace_between_marks(result, document)
-
-
-if __name__ == "__main__":
-    main()
+            yield (exposure, f"{largest_count:g}", f"{ratio:g}"), (adjoint, linear, full)

@@ -19,6 +19,7 @@ from apps.figures.style import DEPTH_COLOURMAP, SMALL_FONT_PT, draw_image, make_
 from apps.studies import (  # noqa: F401 - each registers its studies
     coded_line,
     diffuser,
+    hidden_scene_adjoint,
     iteration_costs,
     light_fields,
     occlusion,
@@ -32,7 +33,7 @@ from tofclip.files import atomic_path
 
 ORDER = (
     *(f"table{number}" for number in range(1, 8)),
-    *("table7-flash", "fig14", "table8", "table9", "table10", "fig4", "fig4d", "fig5"),
+    *("table7-flash", "fig14", "table8", "table9", "table10", "fig4", "fig4d", "fig5", "fig20"),
     *("note1", "note2", "dealing", "surfaces", "surface-scenes"),
 )
 STUDIES = tuple(sorted(REGISTERED, key=lambda one: ORDER.index(one.name)))

@@ -98,9 +98,13 @@ def compare(
     Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
     """
     from apps.figures.nlos import make_comparison_figure
-    from apps.studies.hidden_scene_adjoint import correlate_views
     from nlos.io import read_capture
-    from nlos.known_scenes import HiddenTruth, compare_with_truth, measure_sharpness
+    from nlos.known_scenes import (
+        HiddenTruth,
+        compare_with_truth,
+        correlate_views,
+        measure_sharpness,
+    )
     from tofclip.notebook import save_figure
 
     wanted = load_settings(CompareSettings, settings, flags)
@@ -244,8 +248,7 @@ def demo(
     Example: tofclip nlos demo --out nlos-demo-output
     """
     from apps.figures.nlos import make_demo_figure
-    from apps.studies.hidden_scene_adjoint import correlate_views
-    from nlos.known_scenes import compare_with_truth
+    from nlos.known_scenes import compare_with_truth, correlate_views
     from tofclip.notebook import save_figure
 
     started = time.perf_counter()
