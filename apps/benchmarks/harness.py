@@ -6,6 +6,7 @@ the same, all sizes of many cases, and the page of their figures.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import importlib
 import importlib.metadata
@@ -13,12 +14,13 @@ import json
 import math
 import os
 import platform
+import re
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -107,27 +109,22 @@ def find_cases(name: str) -> tuple[Case, ...]:
         rows = list(csv.DictReader(file))
     cases = []
     for row in rows:
-        group = row["name"].partition("-")[0]
-        if name in (row["name"], group) or (name == "all" and group in PAGE_GROUPS):
-            sizes = tuple(map(int, row["sizes"].split()))
-            text = (row["name"], row["title"], row["size"])
-            prepare = _load_prepare(row["module"], row["name"])
-            cases.append(Case(*text, sizes, row["unit"], row["floor"], prepare))
+        own, group = row["name"], row["name"].partition("-")[0]
+        if name not in (own, group) and not (name == "all" and group in PAGE_GROUPS):
+            continue
+        sizes, module = tuple(map(int, row.pop("sizes").split())), row.pop("module")
+        try:
+            prepare = importlib.import_module(f"apps.benchmarks.{module}").PREPARE[own]
+        except ImportError as absence:
+            missing = f"the benchmark '{own}' needs {absence.name}: pip install {absence.name}"
+            raise InputError(missing) from absence
+        cases.append(Case(**row, sizes=sizes, prepare=prepare))
     if not cases:
         groups = ", ".join([*PAGE_GROUPS, *STUDY_GROUPS])
         raise InputError(
             f"unknown benchmark '{name}'; take all, a group ({groups}) or one of a group, as recovery-l1"
         )
     return tuple(cases)
-
-
-def _load_prepare(module: str, name: str) -> Prepare:
-    try:
-        made: dict[str, Prepare] = importlib.import_module(f"apps.benchmarks.{module}").PREPARE
-    except ImportError as absence:
-        missing = f"the benchmark '{name}' needs {absence.name}: pip install {absence.name}"
-        raise InputError(missing) from absence
-    return made[name]
 
 
 def main() -> None:
@@ -144,13 +141,24 @@ def describe_machine() -> dict[str, Any]:
     ``load``: how many other processes wanted a core, on average over the last minute; what the
     system does not report is None.
     """
-    memory = _ask_system(lambda: os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30)
+    known = Path("/proc/cpuinfo")
+    model = (
+        re.search(r"^model name\s*: *(.+)$", known.read_text(), re.M) if known.is_file() else None
+    )
+    devices = ["cpu"]
+    with contextlib.suppress(Exception):  # no CuPy, no driver, no device: all the same here
+        runtime = importlib.import_module("cupy").cuda.runtime
+        for number in range(runtime.getDeviceCount()):
+            device = runtime.getDeviceProperties(number)["name"].decode()
+            devices.append(f"cuda:{number} {device}")
     return {
-        "processor": _read_processor(),
+        "processor": model[1] if model else platform.processor() or platform.machine(),
         "cores": thread_count(),
-        "memory_gib": memory,
+        "memory_gib": _ask_system(
+            lambda: os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+        ),
         "system": f"{platform.system()} {platform.machine()}",
-        "devices": _find_devices(),
+        "devices": devices,
         "load": _ask_system(lambda: os.getloadavg()[0]),
         "python": platform.python_version(),
         "tofclip": __version__,
@@ -163,29 +171,6 @@ def _ask_system(question: Callable[[], float]) -> float | None:
         return round(question(), 1)
     except (AttributeError, ValueError, OSError):
         return None
-
-
-def _read_processor() -> str:
-    """The model of the processor, as the system calls it."""
-    known = Path("/proc/cpuinfo")
-    if known.is_file():
-        for line in known.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def _find_devices() -> list[str]:
-    """What arrays can be computed on: the processor, and what CuPy finds beside it."""
-    devices = ["cpu"]
-    try:
-        runtime = importlib.import_module("cupy").cuda.runtime
-        for number in range(runtime.getDeviceCount()):
-            name = runtime.getDeviceProperties(number)["name"].decode()
-            devices.append(f"cuda:{number} {name}")
-    except Exception:  # no CuPy, no driver, no device: all the same here
-        return ["cpu"]
-    return devices
 
 
 MIN_REPEATS, MAX_REPEATS = 3, 31
@@ -208,7 +193,12 @@ def measure_case(case: Case, size: int) -> dict[str, Any]:
     seconds = time_repeats(ready.action, REPEAT_TIME_S)
     ready.floor()
     floor = statistics.median(time_repeats(ready.floor, FLOOR_TIME_S)) / ready.floor_fraction
-    median = statistics.median(seconds)
+    median, peers = statistics.median(seconds), dict[str, Any]()
+    for name, peer in ready.peers.items():
+        try:
+            peers[name] = {"seconds": peer()}
+        except PeerUnavailableError as absence:
+            peers[name] = {"absent": str(absence)}
     figures = dict(ready.figures())
     return {
         "seconds": {
@@ -222,7 +212,7 @@ def measure_case(case: Case, size: int) -> dict[str, Any]:
         "own_mib": (peak - before) / BYTES_PER_MIB,
         "floor_seconds": floor,
         "times_floor": median / floor,
-        "peers": {name: _time_peer(peer) for name, peer in ready.peers.items()},
+        "peers": peers,
         **({"figures": figures} if figures else {}),
     }
 
@@ -238,13 +228,6 @@ def time_repeats(action: Action, seconds: float) -> list[float]:
         if enough and sum(times) >= seconds:
             break
     return times
-
-
-def _time_peer(peer: Peer) -> dict[str, Any]:
-    try:
-        return {"seconds": peer()}
-    except PeerUnavailableError as absence:
-        return {"absent": str(absence)}
 
 
 PEERS_VARIABLE = "TOFCLIP_PEERS"
@@ -376,7 +359,13 @@ def _run_case(
             runs.append({"size": size, "threads": count, **figures})
             advance(1)
     texts = {key: getattr(case, key) for key in ("name", "title", "size", "unit", "floor")}
-    return {**texts, "runs": runs, "growth": _fit_growth(runs, most)}
+    # Power of the size with which the time grows, between the least and the greatest size.
+    growth, known = None, [one for one in runs if one["threads"] == most and "seconds" in one]
+    if len(known) > 1:
+        first, last = known[0], known[-1]
+        times = last["seconds"]["median"] / first["seconds"]["median"]
+        growth = math.log(times) / math.log(last["size"] / first["size"])
+    return {**texts, "runs": runs, "growth": growth}
 
 
 def _run_process(
@@ -411,16 +400,6 @@ def _run_process(
     return figures
 
 
-def _fit_growth(runs: Sequence[dict[str, Any]], count: int) -> float | None:
-    """Power of the size with which the time grows, between the least and the greatest size."""
-    known = [run for run in runs if run["threads"] == count and "seconds" in run]
-    if len(known) < 2:
-        return None
-    first, last = known[0], known[-1]
-    times = last["seconds"]["median"] / first["seconds"]["median"]
-    return math.log(times) / math.log(last["size"] / first["size"])
-
-
 PAGE_HEADER = """\
 # Benchmarks
 
@@ -447,26 +426,16 @@ def render_page(figures: Mapping[str, Any], command: str) -> str:
     parts = [
         PAGE_HEADER.format(command=command, library_list=libraries, device_list=devices, **known)
     ]
+    head = [f"| {' | '.join(row)} |" for row in (TABLE_COLUMNS, ["---"] * len(TABLE_COLUMNS))]
     for group, title in {**PAGE_GROUPS, **STUDY_GROUPS}.items():
-        entries = [one for one in figures["entries"] if one["name"].partition("-")[0] == group]
-        if entries:
-            parts.append(_format_section(title, entries))
+        lines, notes = list[str](), list[str]()
+        for entry in figures["entries"]:
+            if entry["name"].partition("-")[0] == group:
+                lines += (f"| {' | '.join(_format_cells(entry, one))} |" for one in entry["runs"])
+                notes.append(_format_note(entry))
+        if notes:
+            parts.append("\n".join([f"## {title}", "", *head, *lines, "", *notes]))
     return "\n\n".join(parts) + "\n"
-
-
-def _format_section(title: str, entries: Iterable[Mapping[str, Any]]) -> str:
-    lines, notes = [_format_row(TABLE_COLUMNS), _format_row(["---"] * len(TABLE_COLUMNS))], []
-    for entry in entries:
-        lines.extend(_format_row(_format_cells(entry, run)) for run in entry["runs"])
-        notes.append(
-            f"* {entry['title']}: sizes are {entry['size']}, the floor is {entry['floor']}."
-            f"{_format_peers(entry)}{_format_figures(entry)}"
-        )
-    return "\n".join([f"## {title}", "", *lines, "", *notes])
-
-
-def _format_row(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 def _format_cells(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]:
@@ -490,10 +459,11 @@ def _format_cells(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]
     ]
 
 
-def _format_peers(entry: Mapping[str, Any]) -> str:
-    """Sentences about other programs, of the runs in which they were asked for."""
+def _format_note(entry: Mapping[str, Any]) -> str:
+    """What is measured, what other programs took where they were asked, and what else a size says."""
     comparisons: dict[str, list[str]] = {}
     absent: dict[str, str] = {}
+    further = ""
     for run in entry["runs"]:
         for name, answer in run.get("peers", {}).items():
             if "absent" in answer:
@@ -504,21 +474,15 @@ def _format_peers(entry: Mapping[str, Any]) -> str:
             comparisons.setdefault(name, []).append(
                 f"{_format_seconds(answer['seconds'])} at {extent} ({ratio:.1f} times ours)"
             )
-    sentences = [f" {name}: {'; '.join(texts)}." for name, texts in comparisons.items()]
-    sentences += [
-        f" Not compared: {reason}." for name, reason in absent.items() if name not in comparisons
-    ]
-    return "".join(sentences)
-
-
-def _format_figures(entry: Mapping[str, Any]) -> str:
-    """A sentence about each size that has more to say than its times."""
-    sentences = []
-    for run in entry["runs"]:
         texts = [f"{name} {value:.3g}" for name, value in run.get("figures", {}).items()]
         if texts:
-            sentences.append(f" At {run['size']}, threads {run['threads']}: {', '.join(texts)}.")
-    return "".join(sentences)
+            further += f" At {run['size']}, threads {run['threads']}: {', '.join(texts)}."
+    peers = [f" {name}: {'; '.join(texts)}." for name, texts in comparisons.items()]
+    peers += [
+        f" Not compared: {reason}." for name, reason in absent.items() if name not in comparisons
+    ]
+    what = f"sizes are {entry['size']}, the floor is {entry['floor']}"
+    return f"* {entry['title']}: {what}.{''.join(peers)}{further}"
 
 
 def _format_seconds(value: float) -> str:

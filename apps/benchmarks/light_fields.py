@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -201,59 +201,50 @@ BORDER_PX = 12
 SEEDS = 5
 
 
-@dataclass(frozen=True)
-class QualityCase:
-    """What is recovered, and how good it has to be."""
-
-    light_field: str  # name of the NPZ file, without its ending
-    shear: float
-    encoder: str
-    preset: str
-    # NMSE in per cent that must not be exceeded, by the sampling ratio in per cent
-    limits: dict[int, float]
-    corrupted: float = 0.0  # fraction of the measurements that are wildly wrong
-
-    @property
-    def name(self) -> str:
-        """The case's name on the command line."""
-        short = self.light_field.removeprefix("render_").removeprefix("hci_")
-        parts = ["quality", short, self.encoder, self.preset]
-        return "-".join([*parts, *([f"{self.corrupted:.0%}"] if self.corrupted else [])])
-
-
 LETTERS = "render_letters", -0.3
-QUALITY_CASES = (
-    QualityCase(*LETTERS, "line", "fast", {25: 17.0, 50: 8.5, 100: 4.5, 200: 3.0}),
-    QualityCase(*LETTERS, "line", "quality", {25: 10.0, 50: 4.5, 100: 3.0, 200: 2.0}),
-    QualityCase(*LETTERS, "single-pixel", "fast", {25: 7.6, 50: 4.3, 100: 2.6}),
-    QualityCase(*LETTERS, "single-pixel", "quality", {25: 5.5, 50: 3.0, 100: 1.8}),
-    *(
-        QualityCase(*LETTERS, "line", preset, {100: 5.5}, corrupted)
-        for preset in ("fast", "quality")
-        for corrupted in (0.01, 0.05, 0.1)
+# Light field, shear, encoder, preset, and the NMSE in per cent that must not be exceeded, by the sampling
+# ratio in per cent; behind the last dash of a name: measurements in per cent that are wildly wrong.
+QUALITY: dict[str, tuple[str, float, str, str, dict[int, float]]] = {
+    "letters-line-fast": (*LETTERS, "line", "fast", {25: 17.0, 50: 8.5, 100: 4.5, 200: 3.0}),
+    "letters-line-quality": (*LETTERS, "line", "quality", {25: 10.0, 50: 4.5, 100: 3.0, 200: 2.0}),
+    "letters-single-pixel-fast": (*LETTERS, "single-pixel", "fast", {25: 7.6, 50: 4.3, 100: 2.6}),
+    "letters-single-pixel-quality": (
+        *(*LETTERS, "single-pixel", "quality"),
+        {25: 5.5, 50: 3.0, 100: 1.8},
     ),
-    QualityCase("render_planes", 0.0, "line", "fast", {25: 10.8, 50: 6.9, 100: 4.1, 200: 2.6}),
-    QualityCase("hci_antinous", 0.0, "line", "fast", {25: 2.1, 50: 1.2, 100: 0.7, 200: 0.5}),
-)
+    **{
+        f"letters-line-{preset}-{percent}%": (*LETTERS, "line", preset, {100: 5.5})
+        for preset in ("fast", "quality")
+        for percent in (1, 5, 10)
+    },
+    "planes-line-fast": (
+        *("render_planes", 0.0, "line", "fast"),
+        {25: 10.8, 50: 6.9, 100: 4.1, 200: 2.6},
+    ),
+    "antinous-line-fast": (
+        *("hci_antinous", 0.0, "line", "fast"),
+        {25: 2.1, 50: 1.2, 100: 0.7, 200: 0.5},
+    ),
+}
 
 
-def prepare_quality(wanted: QualityCase, ratio_percent: int) -> PreparedCase:
+def prepare_quality(name: str, ratio_percent: int) -> PreparedCase:
     """A recovery with the weight that the search found, against the products it needs."""
-    path = Path(os.environ.get("TOFCLIP_DATA", ""), "lightfields", f"{wanted.light_field}.npz")
+    source, shear, encoder, preset, limits = QUALITY[name]
+    wrong = int(name.rpartition("-")[2][:-1]) / 100 if name.endswith("%") else 0.0
+    path = Path(os.environ.get("TOFCLIP_DATA", ""), "lightfields", f"{source}.npz")
     if not path.is_file():
         raise InputError(f"{path} is missing: TOFCLIP_DATA names the folder of recorded data")
     light_field = read_light_field(path)
-    truth = light_field.refocus(wanted.shear)
-    settings = ClipRecovery(
-        preset=wanted.preset, data_term="huber" if wanted.corrupted else "squares"
-    )
+    truth = light_field.refocus(shear)
+    settings = ClipRecovery(preset=preset, data_term="huber" if wrong else "squares")
 
     def measure_seed(seed: int) -> ClipMeasurement:
-        setup = CameraSetup(wanted.encoder, ratio_percent / 100, seed)
-        return corrupt_measurement(measure(light_field, setup), None, wanted.corrupted)
+        setup = CameraSetup(encoder, ratio_percent / 100, seed)
+        return corrupt_measurement(measure(light_field, setup), None, wrong)
 
     def recover(seed: int) -> tuple[float, float]:
-        found = settings.recover(measure_seed(seed), wanted.shear)
+        found = settings.recover(measure_seed(seed), shear)
         return 100 * nmse(found.picture, truth, BORDER_PX), found.seconds_weight
 
     def judge() -> dict[str, float]:
@@ -261,17 +252,17 @@ def prepare_quality(wanted: QualityCase, ratio_percent: int) -> PreparedCase:
         return {
             "nmse_percent": float(np.mean(errors)),
             "spread_percent": float(np.std(errors, ddof=1)),
-            "limit_percent": wanted.limits[ratio_percent],
+            "limit_percent": limits[ratio_percent],
             "weight_search_s": float(np.median(searches)),
         }
 
     measured = measure_seed(0)
     camera = measured.camera()
-    first = settings.recover(measured, wanted.shear)
+    first = settings.recover(measured, shear)
     solver = replace(settings, weight=first.weight)
-    model = camera.weighting() @ camera.model(wanted.shear)
+    model = camera.weighting() @ camera.model(shear)
     products = repeat_products(model, first.iterations)
-    return PreparedCase(lambda: solver.recover(measured, wanted.shear), products, 1, figures=judge)
+    return PreparedCase(lambda: solver.recover(measured, shear), products, 1, figures=judge)
 
 
 PREPARE: dict[str, Prepare] = {
@@ -281,5 +272,5 @@ PREPARE: dict[str, Prepare] = {
     "clip-given": partial(prepare_recovery, "diffuser", GIVEN_WEIGHT),
     "clip-lensless": prepare_lensless,
     **{f"camera-{name}": partial(prepare_camera, name) for name in CAMERAS},
-    **{case.name: partial(prepare_quality, case) for case in QUALITY_CASES},
+    **{f"quality-{name}": partial(prepare_quality, name) for name in QUALITY},
 }
