@@ -1,17 +1,32 @@
 """Options and arguments of the verbs, a line each: name, unit and meaning stand together, and what
 is given in ps, ns or mm is in s or m once it is inside.
+
+Settings are given in a TOML file or by flags, and written beside the result. They are a frozen
+dataclass of the library, or one that adds the verb's own. A field's name with the unit that it is
+written with is the key in the file and, with dashes, the flag: `wavelength`, m, is ``wavelength_mm``
+and ``--wavelength-mm``. Flags win over the file; inside everything is in SI units.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import dataclasses
+import inspect
+import math
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
+import tomli_w
 import typer
 
-from tofclip.errors import StorageError
+from tofclip.errors import InputError, StorageError
+from tofclip.files import atomic_path, read_toml, suggest_name
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 UNITS = {"mm": MILLIMETRE, "ns": NANOSECOND, "ps": PICOSECOND}
 """By the last word of an option's name."""
@@ -114,3 +129,178 @@ DEVICE = opt(
     "cpu",
     choices=("cpu", "cuda", "auto", "torch:cpu"),
 )
+
+
+HELP_PANEL = "Settings (keys of the TOML file, there with _ for -)"
+METAVARS = {
+    **dict.fromkeys(("letters",), "TEXT"),
+    **dict.fromkeys(("material", "method", "scan", "wall"), "NAME"),
+    "x": "M M",
+    "y": "M M",
+    "laser": "X Y",
+    "points": "'X,Y,Z; ...'",
+    "mesh": "FILE",
+    "flip": "AXIS",
+    "set": "NAME=VALUE",
+    "tolerance": "SHARE",
+    "falloff": "POWER",
+    "signal_to_noise": "RATIO",
+}
+"""Of the libraries' settings; the others show their unit, or N for a number without one."""
+
+Settings = TypeVar("Settings", bound="DataclassInstance")
+Verb = TypeVar("Verb", bound=Callable[..., None])
+
+
+def setting(
+    metavar: str | None,
+    meaning: str,
+    default: Any = None,
+    shown: str | None = None,
+    choices: Iterable[str] = (),
+    unit: str = "",
+    written: str | None = None,
+) -> Any:
+    """Declare a verb's own setting; its default None is found by the verb, or may be absent.
+    `shown`: the default in words; `unit`: that of SI; `written`: on the command line.
+    """
+    known = {"metavar": metavar, "help": meaning, "shown": shown, "choices": choices, "unit": unit}
+    return dataclasses.field(default=default, metadata={**known, "written": written or unit})
+
+
+@dataclasses.dataclass(frozen=True)
+class _Setting:
+    """A field as the command line and the file have it."""
+
+    field: dataclasses.Field[Any]
+    key: str
+    hint: Any
+    factor: float  # from the unit that it is written with
+
+    def write(self, value: Any) -> Any:
+        """Return a value in that unit, without the rounding errors of the change."""
+        changes = value is not None and self.factor != 1
+        return float(f"{value / self.factor:.15g}") if changes else value
+
+    def read(self, value: Any) -> Any:
+        """Return a value in SI units."""
+        return value * self.factor if value is not None and self.factor != 1 else value
+
+    def make_flag(self) -> inspect.Parameter:
+        """Return the parameter of a verb; None stands for a flag that is not given."""
+        known, default = self.field.metadata, self.write(self.field.default)
+        unit = known.get("written", known["unit"])
+        usual = unit.upper() if unit in ("m", "s", *UNITS) else "N"
+        is_flag = bool in (self.hint, *get_args(self.hint))
+        option = typer.Option(
+            metavar=None if is_flag else known.get("metavar", METAVARS.get(self.field.name, usual)),
+            help=known["help"],
+            show_default=str(default) if known["shown"] is None else known["shown"],
+            autocompletion=make_completer(known.get("choices", ())),
+            rich_help_panel=HELP_PANEL,
+        )
+        annotated: Any = Annotated  # with a computed type, which no type checker can follow
+        return inspect.Parameter(
+            self.key,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=None,
+            annotation=annotated[self.hint | None, option],
+        )
+
+
+@cache
+def _list_settings(kind: type[DataclassInstance]) -> dict[str, _Setting]:
+    """The settings of a class by their keys, its own before those that it inherits."""
+    hints, own = get_type_hints(kind), inspect.get_annotations(kind)
+    found = {}
+    for field in sorted(dataclasses.fields(kind), key=lambda field: field.name not in own):
+        if "help" not in field.metadata:
+            continue
+        unit = field.metadata["unit"]
+        written = field.metadata.get("written", unit)
+        key = f"{field.name}_{written}" if unit in ("m", "s") else field.name
+        found[key] = _Setting(field, key, hints[field.name], UNITS.get(written, 1.0))
+    return found
+
+
+def find_key(kind: type[DataclassInstance], name: str) -> str:
+    """Return how a field is called on the command line and in files."""
+    return next((key for key, one in _list_settings(kind).items() if one.field.name == name), name)
+
+
+def add_setting_flags(kind: type[DataclassInstance]) -> Callable[[Verb], Verb]:
+    """Give a verb a flag for every setting; they reach its ``**flags``, None where absent."""
+
+    def with_flags(verb: Verb) -> Verb:
+        known = inspect.signature(verb, eval_str=True)
+        own = [one for one in known.parameters.values() if one.kind is not one.VAR_KEYWORD]
+        flags = [one.make_flag() for one in _list_settings(kind).values()]
+        verb.__signature__ = known.replace(parameters=[*own, *flags])  # type: ignore[attr-defined]
+        return verb
+
+    return with_flags
+
+
+def load_settings(kind: type[Settings], file: Path | None, flags: Mapping[str, Any]) -> Settings:
+    """Return the settings of a TOML file and of flags, which win and are None where not given."""
+    given = {} if file is None else _read_file(kind, file)
+    given |= {key: value for key, value in flags.items() if value not in (None, [])}
+    known = _list_settings(kind)
+    return kind(**{known[key].field.name: known[key].read(given[key]) for key in given})
+
+
+def settings_to_dict(settings: DataclassInstance) -> dict[str, Any]:
+    """Return every setting that has a value by its key, as it is written."""
+    values = {
+        key: one.write(getattr(settings, one.field.name))
+        for key, one in _list_settings(type(settings)).items()
+    }
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def save_settings(settings: DataclassInstance, path: Path, heading: str) -> None:
+    """Write the settings that have a value to a TOML file, whole or not at all, below a comment."""
+    text = f"# {heading}\n{tomli_w.dumps(settings_to_dict(settings))}"
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _read_file(kind: type[DataclassInstance], file: Path) -> dict[str, Any]:
+    found, known = read_toml(file, "settings"), _list_settings(kind)
+    for key in found:
+        if key not in known:
+            hint = suggest_name(key, known)
+            raise InputError(f"{file}: no setting is called '{key}'; {hint}")
+    return {
+        key: _convert_value(value, known[key].hint, f"{file}: {key}")
+        for key, value in found.items()
+    }
+
+
+def _convert_value(value: Any, hint: Any, where: str) -> Any:
+    """Return a value of the file as the type that the field asks for."""
+    wanted = next((one for one in get_args(hint) if NoneType in get_args(hint)), hint)
+    if get_origin(wanted) is tuple:
+        count = len(get_args(wanted))
+        if isinstance(value, list) and len(value) == count and all(map(_is_number, value)):
+            return tuple(map(float, value))
+        raise InputError(f"{where} must be a list of {count} finite numbers, got {value!r}")
+    if get_origin(wanted) is list:
+        if isinstance(value, list) and all(isinstance(one, str) for one in value):
+            return value
+        raise InputError(f"{where} must be a list of texts, got {value!r}")
+    if wanted is float and _is_number(value):
+        return float(value)
+    if type(value) is wanted and wanted is not float:
+        return value
+    names = {
+        float: "a finite number",
+        int: "a whole number",
+        str: "a text in quotes",
+        bool: "true or false",
+    }
+    raise InputError(f"{where} must be {names[wanted]}, got {value!r}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

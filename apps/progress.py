@@ -1,4 +1,6 @@
-"""A progress bar on a terminal, and a quick end of the work when Ctrl-C is pressed."""
+"""A progress bar on a terminal, and a quick end of the work when Ctrl-C is pressed; the jobs of a
+sequence under it, with what became of them, and status 1 if some failed.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +10,18 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from apps.report import may_replace, name_options, report
+from tofclip.errors import MissingDependencyError
+
+if TYPE_CHECKING:
+    from tofclip.sequences.jobs import Job, Report, Summary
 
 Advance = Callable[[int], None]
 STEPS = 1000  # of a bar for a share
@@ -124,3 +136,73 @@ def _watch_interrupt() -> Iterator[threading.Event]:
         yield interrupted
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+EXIT_SOME_FAILED = 1
+BYTES_PER_MIB = 1 << 20
+
+
+def run_with_progress(
+    title: str,
+    jobs: Sequence[Job],
+    cluster: str | None,
+    watch: Callable[[Report], object] = lambda _: None,
+) -> Summary:
+    """Run the jobs that are not done yet, or all where results may be replaced, one after the other in
+    this process unless a cluster is named, with a bar that shows the time left; `watch` is called
+    with each report.
+    """
+    from tofclip.sequences.jobs import run_jobs, select_unfinished
+
+    if may_replace():
+        for job in jobs:
+            job.result.unlink(missing_ok=True)
+    missing = select_unfinished(jobs)
+    with show_progress(title, len(missing)) as advance:
+
+        def note(report: Report) -> None:
+            watch(report)
+            advance(1)
+
+        return run_jobs(missing, cluster, note)
+
+
+def resolve_device(device: str, cluster: str | None) -> str:
+    """Return which device a name stands for here; workers on other machines look for it themselves."""
+    from tofclip.arrays import parse_device
+
+    try:
+        found = str(parse_device(device))
+    except MissingDependencyError:
+        if cluster is None:
+            raise
+        return device
+    return found if cluster is None else device
+
+
+def report_summary(
+    summary: Summary, total: int, as_json: bool, out: Path, figures: Mapping[str, Any] | None = None
+) -> None:
+    """Print the figures of a sequence and its failures. `total`: its jobs, those included that were
+    done by an earlier run; `figures`: further ones.
+    """
+    failed = {one.name: name_options(one.problem) for one in summary.failures}
+    figures = {
+        "results": summary.done,
+        "kept_from_before": total - summary.done - len(failed),
+        "failed": len(failed),
+        "seconds": summary.seconds,
+        "results_per_second": summary.done / summary.seconds,
+        "processes": summary.processes,
+        "peak_memory_mib_per_process": summary.peak_bytes / BYTES_PER_MIB,
+        **(figures or {}),
+    }
+    if as_json:
+        listed = [{"name": name, "problem": problem} for name, problem in failed.items()]
+        figures |= {"failures": listed}
+    report(figures, as_json, [out])
+    if not as_json:
+        for name, problem in failed.items():
+            print(f"failed: {name}: {problem}", file=sys.stderr)
+    if failed:
+        raise typer.Exit(EXIT_SOME_FAILED)

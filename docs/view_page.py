@@ -10,9 +10,8 @@ from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
-from apps.occlusion.experiment import ExperimentSettings
+from apps.occlusion.experiment import ExperimentSettings, make_walking_scene
 from apps.occlusion.live import WalkSource
-from apps.occlusion.scenes import make_walking_scene
 from apps.viewer.page import Page
 from apps.viewer.session import Session
 from apps.viewer.source_factory import open_source

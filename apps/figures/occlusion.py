@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from apps.occlusion.experiment import Experiment
-    from apps.occlusion.probe import ProbeResult
+    from apps.occlusion.experiment import Experiment, ProbeResult
     from tofclip.occlusion import InactiveRegion
 
 

@@ -1,4 +1,5 @@
-"""The demonstration: one scene with an occluder, and three cameras that look at it.
+"""The demonstration: one scene with an occluder, and three cameras that look at it; the scenes; and small
+targets behind an occluder, by which the formula of the inactive region is tested.
 
 * Compact light-field photography with time of flight: a row of views, nonlocal measurements in
   every time bin.
@@ -9,6 +10,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,11 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.occlusion.scenes import OcclusionScene
 from tofclip.errors import InputError
 from tofclip.light_field import LightField
 from tofclip.light_field.views import CameraSetup
+from tofclip.metrics import correlation_coefficient
 from tofclip.occlusion import (
+    TV_WEIGHT,
     InactiveRegion,
     Rig,
     SeparatedImages,
@@ -29,7 +32,8 @@ from tofclip.occlusion import (
     measure_views,
     separate_occluder,
 )
-from tofclip.simulate.bodies import Body
+from tofclip.recovery.light_field import MAX_ITERATIONS, OBJECTIVE_TOLERANCE
+from tofclip.simulate.bodies import Body, Lambertian, Rectangle, Sphere
 from tofclip.simulate.light_fields import (
     CameraArray,
     PulsedScene,
@@ -37,6 +41,15 @@ from tofclip.simulate.light_fields import (
     render_flash,
     render_flash_view,
 )
+from tofclip.simulate.patterns import (
+    cut_pattern,
+    make_letter,
+    make_mottled_pattern,
+    make_plain_pattern,
+    make_rings,
+    make_text_pattern,
+)
+from tofclip.solvers import TotalVariation
 
 Array = NDArray[Any]
 
@@ -206,3 +219,346 @@ class Experiment:
         noisy = self._add_noise(self.pictures.sum(axis=-1), 3)
         shear = float(self.rig.array.shear(self.scene.distance))
         return LightField(noisy, self.rig.array.views).refocus(shear)
+
+
+BASELINE_M = 15e-3
+OCCLUDER_DISTANCE_M = 50e-3
+TARGET_DEPTH_M = 70e-3
+TARGET_Z_M = OCCLUDER_DISTANCE_M + TARGET_DEPTH_M
+OCCLUDER_REFLECTANCE = 0.6  # of all but the tree
+
+LEAF_COUNT, BUSH_RADIUS_M = 60, 8.5e-3
+# half width and half height of a slot in which nothing hangs but the middle leaf, so that the
+# formula holds there
+LEAF_CLEARANCE_M = 3.7e-3, 0.5e-3
+
+
+@dataclass(frozen=True)
+class OcclusionScene:
+    """What stands where."""
+
+    name: str
+    title: str
+    occluder: tuple[Body, ...]
+    target: tuple[Body, ...]
+    region: InactiveRegion  # of the occluder's solid part on the axis
+    behind: float = TARGET_DEPTH_M  # from the occluder to the target, m
+
+    @property
+    def distance(self) -> float:
+        """From the views to the target, m."""
+        return self.region.distance + self.behind
+
+    def move_target(self, across: float) -> OcclusionScene:
+        """Return the scene with its target moved to the right, m."""
+        return replace(self, target=tuple(body.shift(across, 0.0) for body in self.target))
+
+    def widen_occluder(self, width: float) -> OcclusionScene:
+        """Return the scene with its occluder scaled about the axis until its solid part is as wide, m."""
+        factor = width / self.region.width
+        return replace(
+            self,
+            occluder=tuple(_scale_plate(body, factor) for body in self.occluder),
+            region=replace(self.region, width=width),
+        )
+
+
+def make_walking_scene(name: str) -> OcclusionScene:
+    """Return a scene of `SCENES` with a person behind its occluder, instead of what stands there."""
+    scene = make_occlusion_scene(name)
+    behind = scene.title.partition(" behind ")[2]
+    return replace(scene, title=f"a person behind {behind}", target=_make_figure())
+
+
+def make_occlusion_scene(name: str) -> OcclusionScene:
+    """Return a scene of `SCENES`."""
+    if name not in SCENES:
+        raise InputError(f"unknown scene '{name}'; take one of {', '.join(SCENES)}")
+    title, make_occluder, make_target, solid_width = SCENES[name]
+    region = InactiveRegion(BASELINE_M, solid_width, OCCLUDER_DISTANCE_M)
+    return OcclusionScene(name, title, make_occluder(), make_target(), region)
+
+
+def make_upright_bar(width: float, distance: float = OCCLUDER_DISTANCE_M) -> Body:
+    """Return a bar on the axis, so long that no view sees its ends; width and distance in m."""
+    return _make_plate(width, 40 * width, z=distance)
+
+
+def _make_plate(
+    width: float,
+    height: float,
+    pattern: NDArray[Any] | None = None,
+    x: float = 0.0,
+    y: float = 0.0,
+    z: float = OCCLUDER_DISTANCE_M,
+) -> Body:
+    plain = make_plain_pattern(OCCLUDER_REFLECTANCE) if pattern is None else pattern
+    return Body(Rectangle(width, height), Lambertian(plain), np.array([x, y, z]))
+
+
+def _scale_plate(body: Body, factor: float) -> Body:
+    assert isinstance(body.shape, Rectangle)  # as all occluders are
+    shape = Rectangle(factor * body.shape.width, factor * body.shape.height)
+    return replace(body, shape=shape, centre=body.centre * (factor, factor, 1.0))
+
+
+def _make_word() -> tuple[Body, ...]:
+    return (_make_plate(40e-3, 18e-3, make_text_pattern("CLIP", 0.9), z=TARGET_Z_M),)
+
+
+def _make_disc() -> tuple[Body, ...]:
+    return (_make_plate(24e-3, 24e-3, make_rings(3, 0.15, 0.95), z=TARGET_Z_M),)
+
+
+def _make_figure() -> tuple[Body, ...]:
+    """A mannequin, 36 mm tall."""
+    skin = make_mottled_pattern(0.6, 0.95, 8, seed=3)
+    parts = (  # trunk, arms, legs: width, height and place
+        (9e-3, 15e-3, 0.0, -1e-3),
+        (26e-3, 3.4e-3, 0.0, -6e-3),
+        (3.4e-3, 12e-3, -2.8e-3, 12e-3),
+        (3.4e-3, 12e-3, 2.8e-3, 12e-3),
+    )
+    head = Body(Sphere(4e-3), Lambertian(skin), np.array([0.0, -13e-3, TARGET_Z_M]))
+    return (head, *(_make_plate(w, h, skin, x, y, TARGET_Z_M) for w, h, x, y in parts))
+
+
+V_SIDE_M, V_HEIGHT_M = 13e-3, 16e-3
+
+
+def _make_v_letter() -> tuple[Body, ...]:
+    """Supplementary Figure 14c: the axis meets the V where its strokes have joined, below 0.6 of
+    the height; at 0.75 it is 0.46 of its side wide.
+    """
+    pattern = cut_pattern(make_letter("V"), make_plain_pattern(OCCLUDER_REFLECTANCE))
+    return (_make_plate(V_SIDE_M, V_HEIGHT_M, pattern, y=-0.25 * V_HEIGHT_M),)
+
+
+def _make_small_plate() -> tuple[Body, ...]:
+    return (_make_plate(6e-3, 20e-3),)
+
+
+def _make_board() -> tuple[Body, ...]:
+    """Wider than the views are apart: the formula promises nothing."""
+    return (_make_plate(21e-3, 60e-3),)
+
+
+def _make_tree() -> tuple[Body, ...]:
+    """A trunk with branches and rough bark."""
+    bark = make_mottled_pattern(0.25, 0.85, 14, seed=5)
+    branches = (  # side, height and tilt
+        (1, -4.6e-3, 0.5),
+        (-1, -3.9e-3, 0.6),
+        (1, 4.4e-3, 0.4),
+        (-1, 6e-3, 0.5),
+    )
+    behind = OCCLUDER_DISTANCE_M + 1e-3
+    return (
+        _make_plate(4.5e-3, 40e-3, bark),
+        *(
+            _make_plate(11e-3, 1.3e-3, bark, side * 6e-3, y, behind).rotate(-side * tilt)
+            for side, y, tilt in branches
+        ),
+    )
+
+
+SLAT_M = 1.6e-3
+
+
+def _make_trellis() -> tuple[Body, ...]:
+    """Slats at right angles with holes between them, standing on a corner: one of them crosses the
+    axis.
+    """
+    pitch, side = 4e-3, 13.6e-3
+    across = np.linspace(-side / 2, side / 2, 340)
+    on_slat = abs((across + pitch / 2) % pitch - pitch / 2) < SLAT_M / 2
+    off_slat = abs(across % pitch - pitch / 2) < SLAT_M / 2
+    frame = abs(across) > side / 2 - SLAT_M / 2
+    slats = (on_slat | frame) | (off_slat | frame)[:, np.newaxis]
+    lattice = np.where(slats, OCCLUDER_REFLECTANCE, np.nan)
+    return (_make_plate(side, side, lattice).rotate(np.pi / 4),)
+
+
+def _make_bush() -> tuple[Body, ...]:
+    """Leaves at random between 48 and 52 mm, every one turned its own way; one hangs on the axis."""
+    random = np.random.default_rng(7)
+    down = np.linspace(0, np.pi, 40)
+    edge = 0.5 * np.sin(down)  # a leaf fills its rectangle from tip to tip, widest at its middle
+    outline = np.stack(
+        [0.5 + np.concatenate([edge, -edge[::-1]]), np.concatenate([down, down[::-1]]) / np.pi],
+        axis=-1,
+    )
+    leaf = cut_pattern([outline], make_plain_pattern(OCCLUDER_REFLECTANCE))
+    hung = [_make_plate(4e-3, 6e-3, leaf)]
+    while len(hung) < LEAF_COUNT:
+        place = random.uniform(
+            (-9e-3, -9e-3, OCCLUDER_DISTANCE_M - 2e-3), (9e-3, 9e-3, OCCLUDER_DISTANCE_M + 2e-3)
+        )
+        length = random.uniform(3e-3, 4.5e-3)
+        body = _make_plate(0.55 * length, length, leaf, *place)
+        body = body.tilt(random.uniform(-0.6, 0.6)).rotate(random.uniform(0, 2 * np.pi))
+        inside = np.hypot(*place[:2]) < BUSH_RADIUS_M
+        if inside and np.any(abs(place[:2]) > np.array(LEAF_CLEARANCE_M) + length / 2):
+            hung.append(body)
+    return tuple(hung)
+
+
+MakeBodies = Callable[[], tuple[Body, ...]]
+# title, occluder, target, and the width of the occluder's solid part on the axis, m
+SCENES: dict[str, tuple[str, MakeBodies, MakeBodies, float]] = {
+    "v-letter": ("a disc behind a letter V", _make_v_letter, _make_disc, 0.46 * V_SIDE_M),
+    "plate": ("a word behind a plate", _make_small_plate, _make_word, 6e-3),
+    "person": ("a figure behind a plate", _make_small_plate, _make_figure, 6e-3),
+    "tree": ("a figure behind a tree", _make_tree, _make_figure, 4.5e-3),
+    "bush": ("a word behind a bush", _make_bush, _make_word, 4e-3),
+    "trellis": ("a disc behind a trellis", _make_trellis, _make_disc, SLAT_M * np.sqrt(2)),
+    "board": ("a disc behind a board", _make_board, _make_disc, 21e-3),
+}
+
+
+DISTANCE_FACTORS = (0.8, 1.2, 2.0)  # behind the occluder, in lengths of the inactive region
+TARGET_WIDTH_FRACTION = 0.15  # of the occluder's; the umbra is 0.2 of it wide at 0.8 of its length
+MIN_CORRELATION = 0.8  # with the unoccluded truth: from there on a target counts as recovered
+
+PICTURE_PX = 48
+TARGET_PX = 20
+PROBE_PULSE_FWHM_S = 10e-12  # the nearest target of all trials answers 25 ps after its occluder
+MAX_GATE_S = 80e-12
+PEAK_PHOTONS = 2000.0  # of the brightest measurement, were there no occluder
+BACKGROUND_PHOTONS = 20.0  # photons of every measurement that come at any time
+SIGNIFICANCE_SIGMAS = 5.0  # standard deviations of the background
+MIN_VIEW_FRACTION = 0.5  # a view with less light than this share of the brightest view's is blocked
+
+FIXED_PICTURE_PX = 128
+FIXED_FOCUS_M = 0.1  # where pictures of all views agree; no target stands just there
+FIXED_BACKGROUND_PHOTONS = BACKGROUND_PHOTONS * BIN_WIDTH_S / MAX_GATE_S  # in every bin
+BOARD_ROWS = 32  # of cells, four pixels each
+
+
+@dataclass(frozen=True)
+class ProbeResult:
+    """One target and what became of it."""
+
+    distance: float  # from the views, m
+    factor: float  # distance from the occluder in lengths of the inactive region
+    # of the recovered picture with what the reference view would see without an occluder
+    correlation: float
+    views: int  # how many views got light from it
+    picture: Array  # (rows, columns)
+    truth: Array  # (rows, columns)
+
+    @property
+    def expected_visible(self) -> bool:
+        """Whether the formula promises it."""
+        return self.factor > 1
+
+    @property
+    def is_recovered(self) -> bool:
+        """Whether it was."""
+        return self.correlation >= MIN_CORRELATION
+
+
+def probe_target(
+    occluder: tuple[Body, ...], region: InactiveRegion, factor: float, seed: int = 0
+) -> ProbeResult:
+    """Put a target behind an occluder, at `factor` lengths of its region, which must have an end,
+    and try to recover it; `seed`: of the line angles and the photons.
+    """
+    distance = region.distance + factor * region.length
+    width = TARGET_WIDTH_FRACTION * region.width
+    focal_length_px = distance * TARGET_PX / width
+    setup = CameraSetup("line", 1.0, seed)
+    rig = make_rig(region, PICTURE_PX, focal_length_px, distance, 2, setup)
+    letter = Lambertian(cut_pattern(make_letter("L"), make_plain_pattern(0.9)))
+    target = Body(Rectangle(width, width), letter, np.array([0.0, 0.0, distance]))
+    # one bin about the target's return that opens halfway from the occluder's
+    near, far = rig.compute_flight_time(np.array([region.distance, distance]))
+    gate = TimeAxis(float(far), float(min(far - near, MAX_GATE_S)), 1, PROBE_PULSE_FWHM_S)
+    hidden, free = (
+        render_flash(PulsedScene(bodies, rig.lamps), rig.array, gate)
+        for bodies in ((target, *occluder), (target,))
+    )
+    light, unoccluded = (measure_views(one, rig, gate).values for one in (hidden, free))
+    picture, views = _recover_target(rig, light, unoccluded.max(), seed)
+    truth = free[VIEW_COUNT // 2, :, :, 0]
+    correlation = correlation_coefficient(picture, truth)
+    return ProbeResult(distance, factor, correlation, views, picture, truth)
+
+
+def probe_with_fixed_camera(
+    occluder: tuple[Body, ...], region: InactiveRegion, factor: float, seeds: int
+) -> list[ProbeResult]:
+    """Put a board behind an occluder, and look at its middle with a camera that knows neither.
+
+    One focal length, one focus and one pulse for all boards; the exposure is that of the brightest
+    measurement, of whatever body it is. Returns, gates and depths are found in the shot
+    (`TimedMeasurements.find_returns`). Such a camera gets too little light from a speck, so that
+    the board fills the picture; what is judged is a strip of it, as wide as the target of
+    `probe_target`, whose pattern has nothing to do with that beside it.
+
+    The occluder is upright, and so tall that no view sees its ends. Returns one result for each
+    seed, its pictures those of the strip; a correlation of 0 where no second return was found.
+    """
+    distance = region.distance + factor * region.length
+    width = TARGET_WIDTH_FRACTION * region.width
+    focal_length_px = FIXED_PICTURE_PX / FIELD_OF_VIEW_RAD
+    rigs = [
+        make_rig(region, FIXED_PICTURE_PX, focal_length_px, FIXED_FOCUS_M, 1, setup)
+        for setup in (CameraSetup("line", 1.0, seed) for seed in range(seeds))
+    ]
+    array, lamps = rigs[0].array, rigs[0].lamps
+    sweep = TimeAxis.for_ranges(
+        region.distance - RANGE_MARGIN_M,
+        distance + RANGE_MARGIN_M,
+        BIN_WIDTH_S,
+        PULSE_FWHM_S,
+    )
+    board = _make_random_board(width, FIELD_OF_VIEW_RAD * distance, distance)
+    # Light does not depend on what the seeds draw: it is cast once.
+    pictures = render_flash(PulsedScene((board, *occluder), lamps), array, sweep)
+    free = render_flash_view(PulsedScene((board,), lamps), array, sweep, (0.0, 0.0)).sum(axis=-1)
+    half, axis = int(focal_length_px * width / distance / 2), FIXED_PICTURE_PX // 2
+    strip = slice(axis - half, axis + half + 1)
+    truth, results = free[:, strip], []
+    for seed, rig in enumerate(rigs):
+        clean = measure_views(pictures, rig, sweep)
+        per_unit = PEAK_PHOTONS / float(clean.values.max())
+        dark = np.float32(FIXED_BACKGROUND_PHOTONS / per_unit)
+        noise = np.random.default_rng([seed, 4])
+        noisy = add_poisson_noise(clean.values + dark, per_unit, noise) - dark
+        picture = separate_occluder(replace(clean, values=noisy)).target[:, strip]
+        correlation = correlation_coefficient(picture, truth)
+        results.append(ProbeResult(distance, factor, correlation, VIEW_COUNT, picture, truth))
+    return results
+
+
+def _make_random_board(cell_width: float, side: float, distance: float) -> Body:
+    """A board of random bright and dark cells; one column of them lies on the axis."""
+    columns = 2 * round(side / cell_width / 2) + 1
+    bright = np.random.default_rng(0).random((BOARD_ROWS, columns)) < 0.5
+    return Body(
+        Rectangle(columns * cell_width, side),
+        Lambertian(np.where(bright, 0.9, 0.1)),
+        np.array([0.0, 0.0, distance]),
+    )
+
+
+def _recover_target(rig: Rig, light: Array, brightest: float, seed: int) -> tuple[Array, int]:
+    """Recover from noisy measurements, blocked views left out; nothing where no view got
+    significant light.
+    """
+    camera, per_unit = rig.camera, PEAK_PHOTONS / brightest
+    dark = BACKGROUND_PHOTONS / per_unit
+    measurements = add_poisson_noise(
+        light + dark, per_unit, np.random.default_rng([seed, 3])
+    ) - np.float32(dark)
+    sizes = [encoder.shape_out[0] for encoder in camera.encoders]
+    parts = np.split(measurements[:, 0], np.cumsum(sizes)[:-1])
+    lights = np.array([part.mean() for part in parts])
+    doubt = np.sqrt(BACKGROUND_PHOTONS / np.array(sizes)) / per_unit
+    seeing = (lights > SIGNIFICANCE_SIGMAS * doubt) & (lights > MIN_VIEW_FRACTION * lights.max())
+    if not seeing.any():
+        return np.zeros(rig.array.image_shape, np.float32), 0
+    valid = np.repeat(seeing, sizes)[:, np.newaxis]
+    method = TotalVariation(TV_WEIGHT, MAX_ITERATIONS, OBJECTIVE_TOLERANCE)
+    return method.recover(camera.model(0.0), measurements, valid).frames[0], int(seeing.sum())

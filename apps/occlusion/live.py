@@ -14,8 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from apps.occlusion.experiment import Experiment, ExperimentSettings
-from apps.occlusion.scenes import BASELINE_M, OCCLUDER_DISTANCE_M, OcclusionScene
+from apps.occlusion.experiment import (
+    BASELINE_M,
+    OCCLUDER_DISTANCE_M,
+    Experiment,
+    ExperimentSettings,
+    OcclusionScene,
+)
 from apps.viewer.source import Inflow, Picture, Setting, Source, View, make_cloud
 from apps.viewer.sources import RecoveredSource, TransientSource
 from tofclip.errors import InputError

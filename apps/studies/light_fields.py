@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.studies.best import LIGHT_FIELD_LABEL
 from apps.studies.cases import (
     BORDER_PX,
     CROSS_VALIDATED,
+    LIGHT_FIELD_LABEL,
     Advance,
     Case,
     Library,

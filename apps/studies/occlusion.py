@@ -7,14 +7,18 @@ from __future__ import annotations
 from itertools import groupby
 from typing import NamedTuple
 
-from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
-from apps.occlusion.probe import (
+from apps.occlusion.experiment import (
+    BASELINE_M,
+    DEFAULT_PHOTONS,
     DISTANCE_FACTORS,
+    Experiment,
+    ExperimentSettings,
     ProbeResult,
+    make_occlusion_scene,
+    make_upright_bar,
     probe_target,
     probe_with_fixed_camera,
 )
-from apps.occlusion.scenes import BASELINE_M, make_occlusion_scene, make_upright_bar
 from apps.studies.cases import (
     BORDER_PX,
     CAMERA_NAMES,

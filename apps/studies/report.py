@@ -17,17 +17,14 @@ from matplotlib.figure import Figure
 
 from apps.figures.style import DEPTH_COLOURMAP, SMALL_FONT_PT, draw_image, make_figure
 from apps.studies import (  # noqa: F401 - each registers its studies
-    coded_line,
-    diffuser,
+    cameras,
     hidden_scene_adjoint,
-    iteration_costs,
     light_fields,
     occlusion,
     pictures,
     surfaces,
 )
-from apps.studies.best import BestFigure
-from apps.studies.cases import LABEL_SEPARATOR, REGISTERED, Outcome, Study
+from apps.studies.cases import LABEL_SEPARATOR, REGISTERED, BestFigure, Outcome, Study
 from tofclip.errors import InputError
 from tofclip.files import atomic_path
 

@@ -12,10 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from apps.figures.style import store_picture
-from apps.jobs import run_with_progress
-from apps.progress import show_progress
-from apps.studies.best import SEED, SHEAR_RANGE, BestFigure, list_best_cases, solve_best
-from apps.studies.cases import Advance, Library, Study
+from apps.progress import run_with_progress, show_progress
+from apps.studies.cases import (
+    SEED,
+    SHEAR_RANGE,
+    Advance,
+    BestFigure,
+    Library,
+    Study,
+    list_best_cases,
+    solve_best,
+)
 from apps.studies.report import (
     STUDIES,
     Result,

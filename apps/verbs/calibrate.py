@@ -62,7 +62,7 @@ def calibrate(
     """
     import numpy as np
 
-    from apps.figures.calibration import make_calibration_figure
+    from apps.figures.instrument import make_calibration_figure
     from tofclip.camera.focus_pictures import calibrate_views
     from tofclip.io import read_streak
     from tofclip.notebook import save_figure
@@ -160,7 +160,7 @@ def calibrate_range(
     """
     import math
 
-    from apps.figures.calibration import make_range_calibration_figure
+    from apps.figures.instrument import make_range_calibration_figure
     from tofclip.camera import Camera
     from tofclip.lidar import Pulse
     from tofclip.lidar.range_calibration import fit_range_calibration

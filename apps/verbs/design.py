@@ -84,7 +84,7 @@ def design(
             known["optimised"] = better
             written.append(file)
         reports = {name: examine(one, shots, seed) for name, one in known.items()}
-    from apps.figures.design import make_design_figure
+    from apps.figures.instrument import make_design_figure
     from tofclip.notebook import save_figure
 
     save_figure(make_design_figure(reports), out)

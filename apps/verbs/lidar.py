@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from apps.help import make_group
-from apps.jobs import report_summary, run_with_progress
 from apps.options import (
     BIN_WIDTH,
     CAMERA,
@@ -25,7 +24,7 @@ from apps.options import (
     flag,
     opt,
 )
-from apps.progress import show_activity, show_progress
+from apps.progress import report_summary, run_with_progress, show_activity, show_progress
 from apps.report import (
     RECORD_SUFFIXES,
     describe_ranges,
@@ -211,7 +210,7 @@ def scene(
     """
     import numpy as np
 
-    from apps.figures.scene import make_scene_figure
+    from apps.figures.shot import make_scene_figure
     from tofclip.lidar import Detection, depth, point_cloud
     from tofclip.lidar.processing import find_objects
     from tofclip.lidar.significance import SCENE_BRIGHTNESS_QUANTILE

@@ -17,9 +17,21 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from apps.help import make_group
-from apps.jobs import EXIT_SOME_FAILED, resolve_device, run_with_progress
-from apps.options import CLUSTER, DEVICE, JSON, PICTURE_FORMATS, SETTINGS, arg, opt
-from apps.progress import show_activity
+from apps.options import (
+    CLUSTER,
+    DEVICE,
+    JSON,
+    PICTURE_FORMATS,
+    SETTINGS,
+    add_setting_flags,
+    arg,
+    load_settings,
+    opt,
+    save_settings,
+    setting,
+    settings_to_dict,
+)
+from apps.progress import EXIT_SOME_FAILED, resolve_device, run_with_progress, show_activity
 from apps.report import (
     RECORD_SUFFIXES,
     make_folder,
@@ -27,13 +39,6 @@ from apps.report import (
     name_beside,
     report,
     require_writable,
-)
-from apps.settings import (
-    add_setting_flags,
-    load_settings,
-    save_settings,
-    setting,
-    settings_to_dict,
 )
 from apps.verbs.nlos_imaging import (
     CAPTURE,

@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from apps.options import arg
+from apps.options import arg, find_key
 from apps.progress import show_activity, show_progress
 from apps.report import build_provenance
-from apps.settings import find_key
 from nlos.settings import METHODS, METHODS_BY_SPEED, Settings, list_taken
 from tofclip.errors import InputError
 

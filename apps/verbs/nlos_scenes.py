@@ -10,7 +10,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from apps.options import JSON, PICTURE_FORMATS, SEED, SETTINGS, opt
+from apps.options import (
+    JSON,
+    PICTURE_FORMATS,
+    SEED,
+    SETTINGS,
+    add_setting_flags,
+    load_settings,
+    opt,
+    save_settings,
+    setting,
+    settings_to_dict,
+)
 from apps.progress import show_activity
 from apps.report import (
     RECORD_SUFFIXES,
@@ -20,13 +31,6 @@ from apps.report import (
     report,
     require_new,
     require_writable,
-)
-from apps.settings import (
-    add_setting_flags,
-    load_settings,
-    save_settings,
-    setting,
-    settings_to_dict,
 )
 from apps.verbs.nlos_imaging import (
     CAPTURE,

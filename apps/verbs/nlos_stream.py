@@ -17,9 +17,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
-from apps.jobs import EXIT_SOME_FAILED
-from apps.options import JSON, SETTINGS, arg, flag, opt
-from apps.progress import show_progress
+from apps.options import (
+    JSON,
+    SETTINGS,
+    add_setting_flags,
+    arg,
+    flag,
+    load_settings,
+    opt,
+    save_settings,
+    setting,
+    settings_to_dict,
+)
+from apps.progress import EXIT_SOME_FAILED, show_progress
 from apps.report import (
     build_provenance,
     make_folder,
@@ -27,13 +37,6 @@ from apps.report import (
     report,
     require_new,
     require_writable,
-)
-from apps.settings import (
-    add_setting_flags,
-    load_settings,
-    save_settings,
-    setting,
-    settings_to_dict,
 )
 from apps.verbs.nlos_imaging import (
     CAPTURE,

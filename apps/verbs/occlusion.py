@@ -15,7 +15,7 @@ from tofclip.errors import InputError
 from tofclip.files import PICTURE_SUFFIXES
 
 SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board")
-"""Those of `apps.occlusion.scenes`, named here so that help appears without loading them."""
+"""Those of `apps.occlusion.experiment`, named here so that help appears without loading them."""
 
 SIDE_PX, LIVE_SIDE_PX = 128, 64
 """Rows and columns of the picture, unless given: a page shows a step every second."""
@@ -119,9 +119,15 @@ def demo(
         save_flash_film,
         save_walk_film,
     )
-    from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
-    from apps.occlusion.probe import DISTANCE_FACTORS, probe_target
-    from apps.occlusion.scenes import make_occlusion_scene, make_walking_scene
+    from apps.occlusion.experiment import (
+        DEFAULT_PHOTONS,
+        DISTANCE_FACTORS,
+        Experiment,
+        ExperimentSettings,
+        make_occlusion_scene,
+        make_walking_scene,
+        probe_target,
+    )
     from tofclip.metrics import correlation_coefficient, nmse
     from tofclip.notebook import save_figure
 

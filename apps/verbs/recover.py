@@ -8,7 +8,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from apps.jobs import report_summary, resolve_device, run_with_progress
 from apps.options import (
     BIN_WIDTH,
     CAMERA,
@@ -21,7 +20,13 @@ from apps.options import (
     flag,
     opt,
 )
-from apps.progress import show_activity, show_progress
+from apps.progress import (
+    report_summary,
+    resolve_device,
+    run_with_progress,
+    show_activity,
+    show_progress,
+)
 from apps.report import (
     build_provenance,
     choose_preview,

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import typer
 
-from apps.jobs import report_summary
 from apps.options import CLUSTER, JSON, opt
+from apps.progress import report_summary
 from apps.report import make_folder, report
 from tofclip.errors import InputError
 from tofclip.files import require_apart

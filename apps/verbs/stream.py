@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from apps.jobs import EXIT_SOME_FAILED
 from apps.options import (
     BIN_WIDTH,
     CAMERA,
@@ -25,14 +24,14 @@ from apps.options import (
     flag,
     opt,
 )
+from apps.progress import EXIT_SOME_FAILED
 from apps.report import make_folder, name_options, report, require_new, require_writable
 from apps.verbs.recover import require_format
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
 
 if TYPE_CHECKING:
-    from devices.tracking import TrackedShots
-    from devices.transients import ShotStamp
+    from devices.transients import ShotStamp, TrackedShots
     from tofclip.lidar import PointCloud
     from tofclip.sequences.streaming import LiveShot, StreamedCloud
 
@@ -89,7 +88,7 @@ def stream(
     from dataclasses import asdict
     from itertools import islice
 
-    from devices.tracking import TrackedShots
+    from devices.transients import TrackedShots
     from tofclip.recovery import parse_focus
     from tofclip.sequences import make_pipeline
     from tofclip.sequences.streaming import stream_clouds

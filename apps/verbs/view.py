@@ -65,10 +65,9 @@ def view(
 
     Example: tofclip view frames.h5 --png scene.png
     """
-    from apps.viewer.layers import LayeredSource
-    from apps.viewer.session import Session
+    from apps.viewer.session import Session, read_state, restore_state
+    from apps.viewer.source import LayeredSource
     from apps.viewer.source_factory import ShotOptions, open_source
-    from apps.viewer.state import read_state, restore_state
     from apps.viewer.still import (
         choose_frames,
         choose_renderer,

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.viewer.look import render_pictures
-from apps.viewer.panels import Controls, add_export, add_selection
-from apps.viewer.points import POINT_STYLE, FramePacer, Points, draw_furniture
-from apps.viewer.server import LOOPBACK, start_server, stop_server
-from apps.viewer.session import DisplayedFrame, Session
-from apps.viewer.texts import (
+from apps.viewer.html import (
     format_page_title,
     render_page_html,
     render_status_html,
     render_text_html,
 )
+from apps.viewer.look import render_pictures
+from apps.viewer.panels import Controls, add_export, add_selection
+from apps.viewer.points import POINT_STYLE, FramePacer, Points, draw_furniture
+from apps.viewer.server import LOOPBACK, start_server, stop_server
+from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.viewpoint import Box, Viewpoint, make_presets, move_camera, place_viewpoint
 from tofclip.errors import TofclipError
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.figures.style import DOTS_PER_INCH, make_figure
+from apps.viewer.html import render_histogram_html, render_scale_html, render_text_html
 from apps.viewer.look import (
     PALETTES,
     QUANTITIES,
@@ -33,11 +34,9 @@ from apps.viewer.look import (
     make_scale,
 )
 from apps.viewer.points import NO_SHADOWS, ClipBox, Post, SectionPlane, add_lines
-from apps.viewer.session import DisplayedFrame, Session
+from apps.viewer.session import DisplayedFrame, Session, write_state
 from apps.viewer.source import NO_LIMITS, OFF_ON, Choice, Limits, Setting
-from apps.viewer.state import write_state
 from apps.viewer.still import BACKGROUND, draw_colour_bar
-from apps.viewer.texts import render_histogram_html, render_scale_html, render_text_html
 from apps.viewer.viewpoint import (
     Box,
     Viewpoint,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from apps.viewer.source import Inflow, View
-from devices.tracking import TrackedShots
+from devices.transients import TrackedShots
 from tofclip.errors import InputError
 from tofclip.files import format_error_line
 from tofclip.lidar import PointCloud, Returns, point_cloud

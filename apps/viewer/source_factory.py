@@ -20,8 +20,7 @@ from apps.viewer.sources import (
     VolumeSource,
     make_look_method,
 )
-from devices.tracking import TrackedShots
-from devices.transients import read_transient, read_transients
+from devices.transients import TrackedShots, read_transient, read_transients
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import read_streak

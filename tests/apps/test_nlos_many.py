@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import nlos.phasor.plan
-from apps.settings import load_settings, save_settings
+from apps.options import load_settings, save_settings
 from apps.verbs import nlos as verbs
 from apps.verbs.nlos import ReconstructSettings, ResultFiles, note_content
 from apps.verbs.nlos_stream import VolumeStream

@@ -14,7 +14,14 @@ from PIL import Image
 from small_instrument import Shell
 
 from apps.figures import occlusion as occlusion_figures
-from apps.occlusion.experiment import Experiment, ExperimentSettings
+from apps.occlusion.experiment import (
+    SCENES,
+    Experiment,
+    ExperimentSettings,
+    ProbeResult,
+    make_occlusion_scene,
+    make_walking_scene,
+)
 from apps.occlusion.live import (
     CLIP_GATED,
     ONE_CAMERA,
@@ -23,8 +30,6 @@ from apps.occlusion.live import (
     WalkSource,
     look_behind,
 )
-from apps.occlusion.probe import ProbeResult
-from apps.occlusion.scenes import SCENES, make_occlusion_scene, make_walking_scene
 from apps.studies import occlusion
 from apps.studies.cases import Library, read_cases
 from apps.verbs.occlusion import SCENE_NAMES
@@ -236,7 +241,7 @@ class TestStudies:
         """
         small = {"FIXED_PICTURE_PX": 64, "FIXED_FIELD_OF_VIEW_RAD": 0.225, "BOARD_ROWS": 16}
         for name, value in small.items():
-            monkeypatch.setattr(f"apps.occlusion.probe.{name}", value)
+            monkeypatch.setattr(f"apps.occlusion.experiment.{name}", value)
         fitted = ProbeResult(0.1, 1.2, 0.9, 7, np.zeros((4, 4)), np.zeros((4, 4)))
         outcome = sweep(
             WIDTHS_MM=(6.0,),

@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 
 from apps.figures.shot import MAX_MOMENTS, choose_moments, make_preview_figure
 from apps.figures.style import make_figure
+from apps.options import load_settings, save_settings, setting, settings_to_dict
 from apps.progress import show_progress
 from apps.report import build_provenance, make_folder, report, require_writable, to_json_value
-from apps.settings import load_settings, save_settings, setting, settings_to_dict
 from apps.verbs.nlos import ReconstructSettings
 from apps.verbs.nlos_scenes import CompareSettings
 from nlos import simulate

@@ -12,14 +12,18 @@ import numpy as np
 import pytest
 
 from apps.studies import light_fields, pictures
-from apps.studies.best import SEED, BestFigure, choose_settings, list_best_cases, solve_best
 from apps.studies.cases import (
     BORDER_PX,
+    SEED,
+    BestFigure,
     Case,
     Library,
     Row,
+    choose_settings,
+    list_best_cases,
     measure_case,
     read_cases,
+    solve_best,
     solve_cases,
 )
 from apps.studies.light_fields import compute_depth_accuracy
@@ -285,8 +289,8 @@ class TestBest:
             depths = np.full(measurement.image_shape, -0.4)
             return recover_on_depth_map(measurement, depths, 1e-3, recovery)
 
-        monkeypatch.setattr("apps.studies.best.recover_all_in_focus", solve)
-        monkeypatch.setattr("apps.studies.best.PRESETS", ("fast",))
+        monkeypatch.setattr("apps.studies.cases.recover_all_in_focus", solve)
+        monkeypatch.setattr("apps.studies.cases.PRESETS", ("fast",))
         found = solve_best(cases, library, {}, kept.append, steps.append)
         assert (len(runs), sum(steps)) == (1, 2)
         assert kept[-1] == found

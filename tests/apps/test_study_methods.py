@@ -10,23 +10,21 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from apps.studies.coded_line import (
+from apps.studies.cameras import (
     LINES,
     MAX_ANGLE_RAD,
+    DiffuserRecording,
+    build_diffuser_model,
     compute_column_ranks,
     compute_psnr_db,
     make_coded_line_sensors,
+    measure_iteration_costs,
     measure_lines,
+    read_diffuser_recording,
+    recover_diffuser_scene,
     recover_from_lines,
     select_views,
 )
-from apps.studies.diffuser import (
-    DiffuserRecording,
-    build_diffuser_model,
-    read_diffuser_recording,
-    recover_diffuser_scene,
-)
-from apps.studies.iteration_costs import measure_iteration_costs
 from apps.studies.light_field_dictionary import (
     LightFieldDictionary,
     learn_dictionary,
@@ -93,8 +91,8 @@ class TestCodedLine:
     def test_the_weight_is_chosen_without_the_truth(self, monkeypatch):
         """Shift-and-add of the true views is the truth of this study: nobody may ask for it here."""
         monkeypatch.setattr(LightField, "refocus", lambda *_: pytest.fail("looked at the truth"))
-        monkeypatch.setattr("apps.studies.coded_line.SEARCH_ITERATIONS", 10)
-        monkeypatch.setattr("apps.studies.coded_line.ITERATIONS", 20)
+        monkeypatch.setattr("apps.studies.cameras.SEARCH_ITERATIONS", 10)
+        monkeypatch.setattr("apps.studies.cameras.ITERATIONS", 20)
         sensors = make_coded_line_sensors((16, 16), 2, 1, MAX_ANGLE_RAD, 0)
         _, weight = recover_from_lines(self.two_views(0.1), 0.0, sensors)
         assert weight > 0
@@ -153,7 +151,7 @@ class TestCosts:
             handled.append((numbers["prior"], numbers["measurements"]))
             return 1.0
 
-        monkeypatch.setattr("apps.studies.iteration_costs._measure_median_seconds", count_numbers)
+        monkeypatch.setattr("apps.studies.cameras._measure_median_seconds", count_numbers)
         self.measure()
         steps, products = handled[::2], handled[1::2]
         assert steps == list(zip(self.UNKNOWNS, self.MEASUREMENTS, strict=True))

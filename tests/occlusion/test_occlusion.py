@@ -12,14 +12,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apps.occlusion.experiment import ILLUMINATIONS, Experiment, ExperimentSettings
-from apps.occlusion.probe import probe_target
-from apps.occlusion.scenes import (
+from apps.occlusion.experiment import (
+    ILLUMINATIONS,
     OCCLUDER_DISTANCE_M,
     SCENES,
     TARGET_DEPTH_M,
+    Experiment,
+    ExperimentSettings,
     make_occlusion_scene,
     make_upright_bar,
+    probe_target,
 )
 from tofclip.errors import InputError, ShapeError
 from tofclip.metrics import correlation_coefficient, nmse

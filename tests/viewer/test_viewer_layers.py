@@ -11,11 +11,10 @@ import pytest
 from viewer_scenes import frames, plane, volume
 
 from apps.cli import main
-from apps.viewer.layers import LayeredSource
-from apps.viewer.session import Filters, Section, Session
+from apps.viewer.session import Filters, Section, Session, read_state, restore_state, write_state
+from apps.viewer.source import LayeredSource
 from apps.viewer.source_factory import open_source
 from apps.viewer.sources import GATE_AROUND_FRAME
-from apps.viewer.state import read_state, restore_state, write_state
 from apps.viewer.viewpoint import Viewpoint
 from tofclip.errors import FileFormatError
 

@@ -19,7 +19,7 @@ from matplotlib.image import imread
 from viewer_scenes import PlaneSource, frames, volume
 
 from apps.viewer.page import Page, serve_waiting
-from apps.viewer.session import Session
+from apps.viewer.session import Session, read_state
 from apps.viewer.source import Source
 from apps.viewer.sources import (
     GATE_AROUND_FRAME,
@@ -29,7 +29,6 @@ from apps.viewer.sources import (
     TransientSource,
     VolumeSource,
 )
-from apps.viewer.state import read_state
 from apps.viewer.viewpoint import Viewpoint
 from tofclip.lidar import PointCloud
 

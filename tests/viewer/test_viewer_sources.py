@@ -25,6 +25,7 @@ from viewer_scenes import (
     volume,
 )
 
+from apps.viewer.html import render_status_html
 from apps.viewer.session import Session
 from apps.viewer.shots import LiveShots
 from apps.viewer.source import Source, View, make_cloud
@@ -45,7 +46,6 @@ from apps.viewer.sources import (
     make_look_method,
     render_depth,
 )
-from apps.viewer.texts import render_status_html
 from tofclip.camera import registration
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io.streaks import save_stack
