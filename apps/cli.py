@@ -139,10 +139,11 @@ VERBS = {
 """The verbs, and groups of them, with their lines in the list of commands."""
 
 HOMES = {
+    **dict.fromkeys(("demo", "warm-up", "plugins", "doctor"), "installation"),
+    **dict.fromkeys(("reproduce", "bench"), "proof"),
+    **dict.fromkeys(("convert", "info"), "files"),
     "calibrate range": "calibrate",
     "cloud": "recover",
-    "convert": "files",
-    "info": "files",
     "record": "devices",
 }
 """Modules in `apps.verbs` that are not called like their verb."""

@@ -239,7 +239,7 @@ class TestStudies:
         """A part of its picture: 16 cells of the strip, which correlate by chance with a standard
         deviation of a quarter.
         """
-        small = {"FIXED_PICTURE_PX": 64, "FIXED_FIELD_OF_VIEW_RAD": 0.225, "BOARD_ROWS": 16}
+        small = {"FIXED_PICTURE_PX": 64, "FIELD_OF_VIEW_RAD": 0.225, "BOARD_ROWS": 16}
         for name, value in small.items():
             monkeypatch.setattr(f"apps.occlusion.experiment.{name}", value)
         fitted = ProbeResult(0.1, 1.2, 0.9, 7, np.zeros((4, 4)), np.zeros((4, 4)))

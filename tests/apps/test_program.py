@@ -21,7 +21,7 @@ from verb_pages import collect_verbs
 
 import tofclip
 from apps import cli
-from apps.verbs import warm_up
+from apps.verbs import installation
 from nlos.settings import METHODS
 from tofclip.files import describe_missing_package
 
@@ -329,7 +329,7 @@ sys.meta_path.insert(0, Absent())
 
 class TestWarmUp:
     def test_every_step_is_a_command_that_the_program_takes(self, tmp_path):
-        steps = [step.replace("@", f"{tmp_path}/").split() for step in warm_up.list_steps()]
+        steps = [step.replace("@", f"{tmp_path}/").split() for step in installation.list_steps()]
         for words in steps:
             for word in words:
                 if word.startswith(str(tmp_path)):
@@ -342,12 +342,12 @@ class TestWarmUp:
 
     def test_it_runs_its_steps(self, shell, monkeypatch):
         quick = ("linear", "adjoint", "cloud @frames")
-        steps = [one for one in warm_up.list_steps() if any(word in one for word in quick)]
-        monkeypatch.setattr(warm_up, "list_steps", lambda: steps)
+        steps = [one for one in installation.list_steps() if any(word in one for word in quick)]
+        monkeypatch.setattr(installation, "list_steps", lambda: steps)
         found = shell.figures("warm-up")
         assert found["steps"] == 3
         assert found["seconds"] > 0
 
     def test_a_step_that_fails_is_named(self, shell, monkeypatch):
-        monkeypatch.setattr(warm_up, "list_steps", lambda: ["info absent.h5"])
+        monkeypatch.setattr(installation, "list_steps", lambda: ["info absent.h5"])
         shell.refuses("warm-up", "info absent.h5 failed: absent.h5: no such file")
