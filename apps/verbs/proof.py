@@ -95,33 +95,34 @@ def reproduce(
 
     Example: tofclip reproduce table2 --out reproduction --seeds 3
     """
-    from apps.studies import runs
+    from apps.studies import report as paper
     from apps.studies.cases import Library
-    from apps.studies.report import STUDY_FOLDER, find_studies, write_page
 
-    studies = find_studies(name)
+    studies = paper.find_studies(name)
     if data is not None and not data.is_dir():
         raise InputError(f"{data}: no such folder of recorded data")
-    folder = out / STUDY_FOLDER
+    folder = out / paper.STUDY_FOLDER
     require_apart([out, folder], [data])
     make_folder(folder)
     library = Library(data)
     # A single study that was named is tried even without its recording, so that the reason is an
     # error.
-    possible = [study for study in studies if runs.is_possible(study, library) or len(studies) == 1]
+    possible = [
+        study for study in studies if paper.is_possible(study, library) or len(studies) == 1
+    ]
     summary = (
-        None if cluster is None else runs.run_on_cluster(possible, library, seeds, folder, cluster)
+        None if cluster is None else paper.run_on_cluster(possible, library, seeds, folder, cluster)
     )
     failed = set() if summary is None else {failure.name for failure in summary.failures}
     results = [
-        runs.complete_best(
-            runs.load_or_make_result(study, library, seeds, folder), study, library, folder
+        paper.complete_best(
+            paper.load_or_make_result(study, library, seeds, folder), study, library, folder
         )
         for study in possible
         if study.name not in failed
     ]
-    page = write_page(runs.load_all_results(library, seeds, folder), out)
-    figures = {result["name"]: runs.summarise_result(result) for result in results}
+    page = paper.write_page(paper.load_all_results(library, seeds, folder), out)
+    figures = {result["name"]: paper.summarise_result(result) for result in results}
     if summary is None:
         report({"seeds": seeds, **figures}, as_json, [page])
         return
