@@ -197,7 +197,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(words: Sequence[str], debug: bool) -> Any:
     """Run a verb and return its exit status."""
     try:
-        _require_no_empty(words)
         words = convert_quantities(words)
         text = find_help(app, words)
         if text is not None:
@@ -225,6 +224,8 @@ def convert_quantities(words: Sequence[str]) -> list[str]:
     ['--bin-width-ps', '20', '--gate-m=0.03']
     """
     converted: list[str] = []
+    if "" in words:  # as a path it would be the folder that one is in
+        raise InputError("an argument is empty; is a variable of the shell not set?")
     for word in words:
         option, equals, value = word.partition("=")
         if not equals:
@@ -243,12 +244,6 @@ def convert_quantities(words: Sequence[str]) -> list[str]:
             word = f"{option}={value}" if equals else value
         converted.append(word)
     return converted
-
-
-def _require_no_empty(words: Sequence[str]) -> None:
-    # As a path, an empty word would be the folder that one is in.
-    if "" in words:
-        raise InputError("an argument is empty; is a variable of the shell not set?")
 
 
 @contextlib.contextmanager

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tofclip.camera.focus_pictures import FocusCalibration
-    from tofclip.designs import Accuracy, DesignReport
+    from tofclip.designs import DesignReport
     from tofclip.lidar.range_calibration import RangeFit
 
 
@@ -282,17 +282,15 @@ def _draw_accuracy(axes: Axes, report: DesignReport) -> None:
         (0.2, report.simulated, SIMULATED_COLOUR, "simulated"),
     ):
         for place, one in enumerate(kinds.values()):
-            _draw_bar(axes, place + shift, one, colour)
+            left = place + shift
+            axes.bar(left, one.picture_bias, 0.38, color=colour)
+            axes.bar(left, one.picture_noise, 0.38, one.picture_bias, color=colour, alpha=0.4)
+            said = f"{one.median_deviation / MILLIMETRE:.2g}"
+            above: Any = {"fontsize": 7, "ha": "center", "va": "bottom"}
+            axes.annotate(said, (left, one.picture_error), **above)
         if kinds:
             axes.bar(0, 0, color=colour, label=kind)
     axes.set_xticks(range(len(report.predicted)), list(report.predicted))
     axes.set_ylim(0, 1.25 * axes.get_ylim()[1])
     axes.legend(fontsize=SMALL_FONT_PT, ncols=2, frameon=False)
     label_axes(axes, "picture error; range deviation (mm)", "", "NMSE")
-
-
-def _draw_bar(axes: Axes, place: float, one: Accuracy, colour: str) -> None:
-    axes.bar(place, one.picture_bias, 0.38, color=colour)
-    axes.bar(place, one.picture_noise, 0.38, one.picture_bias, color=colour, alpha=0.4)
-    said = f"{one.median_deviation / MILLIMETRE:.2g}"
-    axes.annotate(said, (place, one.picture_error), fontsize=7, ha="center", va="bottom")

@@ -64,8 +64,10 @@ def make_comparison_figure(
         drawn = draw_view(front, volume, "xy", truth)
         draw_view(top, volume, "xz", truth)
         down, away = ("y (m), down", "z (m), away from the wall") if column == 0 else ("", "")
-        label_axes(front, f"{name}\n{_format_cost(figures[name])}", "", down)
-        label_axes(top, "", f"x (m)\n\n{_format_merit(figures[name])}", away)
+        own = figures[name]
+        memory = "" if own["peak_mib"] is None else f", {own['peak_mib']:.0f} MiB"
+        label_axes(front, f"{name}\n{own['seconds']:.2g} s{memory}", "", down)
+        label_axes(top, "", f"x (m)\n\n{_format_merit(own)}", away)
     add_colour_bar(panels[0, -1], drawn, "relative to each method's brightest")
     letter_panels(panels[0])
     return figure
@@ -104,11 +106,6 @@ def draw_outline(axes: Axes, truth: HiddenTruth, plane: str) -> None:
     # corners of facets are rounded off, so that the contour is not a staircase
     smooth = gaussian_filter(inside, truth.spacing * CORNER_SMOOTHING / step)
     axes.contour(right, down, smooth, [0.5], colors=LINE_COLOUR, linewidths=1.0)
-
-
-def _format_cost(figures: Mapping[str, Any]) -> str:
-    memory = "" if figures["peak_mib"] is None else f", {figures['peak_mib']:.0f} MiB"
-    return f"{figures['seconds']:.2g} s{memory}"
 
 
 def _format_merit(figures: Mapping[str, Any]) -> str:

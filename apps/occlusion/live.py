@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from apps.viewer.sources import RecoveredSource, TransientSource
 from tofclip.errors import InputError
 from tofclip.files import format_error_line
 from tofclip.occlusion import TimedMeasurements, separate_occluder
-from tofclip.shots import Frames
 from tofclip.simulate.light_fields import CameraArray
 from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT
 
@@ -213,7 +213,8 @@ class GatedSource(Source):
                 f"{shots.title}: a gate needs light over time: give shots, frames or an instrument"
             )
         self._shots = shots
-        self._last: tuple[int, Frames] | None = None
+        # The gate is moved more often than the shot changes.
+        self._recover = lru_cache(1)(shots.recover_frames)
         ranges = shots.view(0).cloud.range
         low, high = (
             (float(one) for one in np.percentile(ranges, (0, 100))) if len(ranges) else (0.0, 1.0)
@@ -251,9 +252,3 @@ class GatedSource(Source):
 
     def close(self) -> None:
         self._shots.close()
-
-    def _recover(self, number: int) -> Frames:
-        # The gate is moved more often than the shot changes.
-        if self._last is None or self._last[0] != number:
-            self._last = number, self._shots.recover_frames(number)
-        return self._last[1]

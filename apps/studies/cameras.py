@@ -360,10 +360,8 @@ def measure_iteration_costs(
             measurements = camera.light_field_model()(seen)
             model = camera.model(shear) if recovers == PICTURE else _build_tall_model(camera)
             solver = _build_solver(model, measurements)
-            times = (
-                _measure_median_seconds(action, repeats)
-                for action in (solver.step, partial(_multiply, model, solver))
-            )
+            multiply = partial(_multiply, model, solver)
+            times = (_measure_median_seconds(one, repeats) for one in (solver.step, multiply))
             unknowns = int(np.prod(model.shape_in))
             numbers = (measurements.size, unknowns)
             costs.append(IterationCost(name, recovers, *numbers, complexity, *times))

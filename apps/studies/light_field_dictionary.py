@@ -106,7 +106,13 @@ def recover_with_dictionary(
     if min(exposure.shape) < size:
         raise ShapeError("the exposure", f"at least ({size}, {size}) px, a patch", exposure.shape)
     total, count = np.zeros(codes.shape, np.float32), np.zeros(exposure.shape, np.float32)
-    corners = _list_corners(exposure.shape, size, max(size // 2, 1))
+    # Upper left corners of patches that cover everything, the last ones flush with the border.
+    stride = max(size // 2, 1)
+    corners = [
+        *product(
+            *(sorted({*range(0, side - size + 1, stride), side - size}) for side in exposure.shape)
+        )
+    ]
     for some in split_blocks(len(corners), PATCHES_PER_BATCH):
         windows = [(slice(y, y + size), slice(x, x + size)) for y, x in corners[some]]
         measurements = np.stack([exposure[window].ravel() for window in windows]).astype(np.float32)
@@ -154,37 +160,25 @@ def _draw_training_patches(
     """
     if not light_fields:
         raise InputError("at least one light field is needed to learn from")
-    views = len(light_fields[0].pictures)
-    found = []
+    views, size, found = len(light_fields[0].pictures), (patch_px, patch_px), list[Array]()
     for light_field in light_fields:
-        _, rows, columns = light_field.pictures.shape
-        if len(light_field.pictures) != views or min(rows, columns) < patch_px:
+        pictures = light_field.pictures
+        if len(pictures) != views or min(pictures.shape[1:]) < patch_px:
             expected = f"({views}, at least {patch_px}, at least {patch_px})"
-            raise ShapeError(
-                "every light field to learn from", expected, light_field.pictures.shape
-            )
-        corners = _list_corners((rows, columns), patch_px, 1)
-        chosen = random.permutation(len(corners))[: 4 * TRAINING_PATCHES // len(light_fields)]
-        found += [
-            light_field.pictures[:, y : y + patch_px, x : x + patch_px]
-            for y, x in (corners[n] for n in chosen)
-        ]
-    spread = np.array([patch.std() for patch in found])
+            raise ShapeError("every light field to learn from", expected, pictures.shape)
+        windows = np.lib.stride_tricks.sliding_window_view(pictures, size, (1, 2))
+        _, rows, columns, *_ = windows.shape
+        chosen = random.permutation(rows * columns)[: 4 * TRAINING_PATCHES // len(light_fields)]
+        found.append(windows[:, chosen // columns, chosen % columns].swapaxes(0, 1))
+    patches = np.concatenate(found)
+    spread = patches.std(axis=(1, 2, 3))
     kept = np.argsort(spread)[::-1][:TRAINING_PATCHES]
     kept = kept[spread[kept] > 0]
     if kept.size == 0:
         raise InputError(
             "the light fields are flat everywhere; there is nothing to learn from them"
         )
-    patches = np.stack([found[number] for number in kept])
-    patches -= patches.mean(axis=(1, 2, 3), keepdims=True)
+    patches = patches[kept] - patches[kept].mean(axis=(1, 2, 3), keepdims=True)
     norms = spread[kept, np.newaxis, np.newaxis, np.newaxis] * np.sqrt(patches[0].size)
     unit: Array = patches / norms
     return unit
-
-
-def _list_corners(shape: tuple[int, ...], size: int, stride: int) -> list[tuple[int, ...]]:
-    """Upper left corners of patches that cover everything, the last ones flush with the border."""
-    return list(
-        product(*(sorted({*range(0, side - size + 1, stride), side - size}) for side in shape))
-    )

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
@@ -231,7 +231,12 @@ def reconstruct(
     Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png --surface mesh.ply
     """
     wanted = load_settings(ReconstructSettings, settings, flags)
-    _check_reconstruction(wanted)
+    # Settings that no capture could make sense of are refused before any is read.
+    if not 0 <= wanted.point_fraction <= 1:
+        raise InputError(f"point_fraction is a share between 0 and 1, got {wanted.point_fraction}")
+    names = choose_methods(wanted.method, PORTABLE_METHODS)
+    _check_refinement(wanted)
+    require_valid_settings(wanted, names)
     # A device that does not exist is refused before any capture is read.
     resolve_device(device, cluster)
     if is_capture_folder(source):
@@ -246,15 +251,6 @@ def reconstruct(
     results = ResultFiles([out], png, name_beside(out, ".toml"), surface)
     results.require_writable(source, settings)
     report(reconstruct_single(source, results, wanted, device), as_json, results.paths)
-
-
-def _check_reconstruction(wanted: ReconstructSettings) -> None:
-    """Refuse settings that no capture could make sense of, before any is read."""
-    if not 0 <= wanted.point_fraction <= 1:
-        raise InputError(f"point_fraction is a share between 0 and 1, got {wanted.point_fraction}")
-    names = choose_methods(wanted.method, PORTABLE_METHODS)
-    _check_refinement(wanted)
-    require_valid_settings(wanted, names)
 
 
 def _check_refinement(wanted: ReconstructSettings) -> None:
@@ -368,44 +364,30 @@ def reconstruct_single(
 
 def _image(prepared: PreparedImaging[ReconstructSettings]) -> tuple[ReconstructSettings, Volume]:
     """Make the image that settings ask for; return them as they are written beside it."""
-    settings, capture, grid = prepared.settings, prepared.capture, prepared.grid
-    found = show_settings(settings, [settings.method or ""])
-    if not found.refine:
-        plan = settings.make_method().plan(capture, grid)
-        return found, image_capture("imaging", plan, capture)
-    found = replace(
-        found,
-        iterations=found.iterations or ITERATIONS[found.refine],
-        prior_weight=PRIOR_WEIGHTS[found.refine]
-        if found.prior_weight is None
-        else found.prior_weight,
-    )
-    if found.refine == PHOTONS:
-        capture = settings.prepare_counts(prepared.recorded)
-    plan = _build_refinement(found, settings, grid).plan(capture, grid)
-    return found, image_capture("refining", plan, capture)
-
-
-def _build_refinement(found: ReconstructSettings, settings: Settings, grid: Grid) -> Method:
     from nlos import Refinement
     from nlos.preparation import MidpointImaging
     from nlos.refinement.l1 import build_total_variation
     from nlos.refinement.photons import PhotonRefinement
     from tofclip.solvers import Sparse
 
-    weight, iterations = found.prior_weight or 0.0, found.iterations or 1
-    method: Any = settings.make_method()
+    settings, capture, grid = prepared.settings, prepared.capture, prepared.grid
+    found, method = show_settings(settings, [settings.method or ""]), settings.make_method()
+    if not found.refine:
+        return found, image_capture("imaging", method.plan(capture, grid), capture)
+    iterations = found.iterations or ITERATIONS[found.refine]
+    weight = found.prior_weight
+    weight = PRIOR_WEIGHTS[found.refine] if weight is None else weight
+    found, iterated = replace(found, iterations=iterations, prior_weight=weight), cast(Any, method)
+    refined: Method
     if found.refine == PHOTONS:
-        return PhotonRefinement(
-            MidpointImaging(method),
-            iterations,
-            weight,
-            blank=settings.gate or 0.0,
-            ramp=settings.gate_ramp or 0.0,
-        )
-    if found.refine == "tv":
-        return Refinement(method, build_total_variation(grid, weight, iterations))
-    return Refinement(method, Sparse(weight, iterations))
+        capture = settings.prepare_counts(prepared.recorded)
+        dark = {"blank": settings.gate or 0.0, "ramp": settings.gate_ramp or 0.0}
+        refined = PhotonRefinement(MidpointImaging(iterated), iterations, weight, **dark)
+    elif found.refine == "tv":
+        refined = Refinement(iterated, build_total_variation(grid, weight, iterations))
+    else:
+        refined = Refinement(iterated, Sparse(weight, iterations))
+    return found, image_capture("refining", refined.plan(capture, grid), capture)
 
 
 def _reconstruct_folder(

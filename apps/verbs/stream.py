@@ -89,14 +89,16 @@ def stream(
     from itertools import islice
 
     from devices.transients import TrackedShots
+    from tofclip.lidar import ros
     from tofclip.recovery import parse_focus
     from tofclip.sequences import make_pipeline
+    from tofclip.sequences.ranger import build_cloud_path
     from tofclip.sequences.streaming import stream_clouds
 
     require_format(suffix)
     if shots is not None and shots < 1:
         raise InputError(f"--shots must be positive, got {shots}")
-    is_file = out is not None and out.suffix.lower() == ".mcap"
+    is_file = out is not None and out.suffix.lower() == ros.MCAP_SUFFIX
     if out is not None and is_file:
         require_writable(out, inputs=(source, camera))
     elif out is not None:
@@ -134,8 +136,12 @@ def stream(
         taken = tally.watch(islice(made, shots), coming)
         if out is None:
             deque(taken, maxlen=0)
+        elif is_file:
+            stamped = (ros.StampedCloud(cloud, stamp.epoch_ns) for cloud, stamp in taken)
+            ros.write_bag(stamped, out, topic or ros.TOPIC, frame_id)
         else:
-            _save_clouds(taken, out, suffix, topic, frame_id)
+            for cloud, stamp in taken:
+                cloud.save(build_cloud_path(out, stamp.number, suffix))
     # Counted last: only when the instrument has been stopped are its accounts final.
     accounts = coming.count_shots(tally.clouds, failed)
     figures = tally.list_figures() | {
@@ -160,14 +166,14 @@ def _read_shots(
     address = source if "://" in source else Path(source).is_file() and find_address(source)
     if address:
         return read_transients(address, bin_width)
-    return map(_read_or_fail, list_shots(source, bin_width).values())
 
+    def read(shot: Callable[[], LiveShot]) -> LiveShot | TofclipError:
+        try:
+            return shot()
+        except TofclipError as fault:
+            return fault
 
-def _read_or_fail(shot: Callable[[], LiveShot]) -> LiveShot | TofclipError:
-    try:
-        return shot()
-    except TofclipError as fault:
-        return fault
+    return map(read, list_shots(source, bin_width).values())
 
 
 class _Tally:
@@ -214,25 +220,6 @@ class _Tally:
             "latency_s": compute_quantiles(self._latency),
             "stages_s": stages,
         }
-
-
-def _save_clouds(
-    taken: Iterable[tuple[PointCloud, ShotStamp]],
-    out: Path,
-    suffix: str,
-    topic: str | None,
-    frame_id: str,
-) -> None:
-    """Write clouds as they come: files of a folder, or messages of an MCAP file."""
-    from tofclip.lidar.ros import MCAP_SUFFIX, TOPIC, StampedCloud, write_bag
-    from tofclip.sequences.ranger import build_cloud_path
-
-    if out.suffix.lower() == MCAP_SUFFIX:
-        clouds = (StampedCloud(cloud, stamp.epoch_ns) for cloud, stamp in taken)
-        write_bag(clouds, out, topic or TOPIC, frame_id)
-        return
-    for cloud, stamp in taken:
-        cloud.save(build_cloud_path(out, stamp.number, suffix))
 
 
 def compute_quantiles(seconds: Iterable[float]) -> dict[str, float]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from apps.viewer.source import Limits, Picture, View
@@ -202,10 +203,8 @@ def choose_round_values(low: float, high: float, count: int) -> FloatArray:
     """Return at most about `count` round values, evenly apart, between two limits."""
     if not high > low:
         return np.array([low])
-    step = 10.0 ** np.floor(np.log10((high - low) / count))
-    # the smallest of 1, 2, 5 and 10 times a power of ten that gives no more than asked for
-    step *= next(nice for nice in (1, 2, 5, 10) if (high - low) / (nice * step) <= count)
-    return np.asarray(step * np.arange(np.ceil(low / step), np.floor(high / step) + 1))
+    values = MaxNLocator(count, steps=(1, 2, 5, 10), min_n_ticks=1).tick_values(low, high)
+    return np.asarray(values[(values >= low) & (values <= high)])
 
 
 # rad; a click that misses every point by more, 10 pixels on a usual screen, means none of them
