@@ -142,7 +142,7 @@ HOMES = {
     **dict.fromkeys(("demo", "warm-up", "plugins", "doctor"), "installation"),
     **dict.fromkeys(("reproduce", "bench"), "proof"),
     **dict.fromkeys(("convert", "info"), "files"),
-    "calibrate range": "calibrate",
+    **dict.fromkeys(("calibrate range", "design"), "calibrate"),
     "cloud": "recover",
     "record": "devices",
 }

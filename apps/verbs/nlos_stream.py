@@ -450,7 +450,7 @@ def film(
     elif suffix == ".gif":
         video.save_film(out)
     else:
-        from apps.mp4 import open_film
+        from apps.figures.style import open_film
         from nlos.picture import render_frames
 
         with open_film(out, FRAME_RATE_HZ) as film:
@@ -481,6 +481,6 @@ def _check_film(settings: FilmSettings, out: Path) -> None:
             f"{out}: a film shows one picture per instant; write every depth to a .h5 file"
         )
     if out.suffix.lower() == ".mp4":
-        from apps.mp4 import import_opencv
+        from apps.figures.style import import_opencv
 
         import_opencv()  # a missing library is reported before the film is computed

@@ -145,7 +145,7 @@ def demo(
     settings = ExperimentSettings(side, encoder, sampling_ratio, illumination, usual, seed, rays)
     if live:
         from apps.occlusion.live import GatedSource, WalkSource
-        from apps.viewer.server import LOOPBACK
+        from apps.viewer.page import LOOPBACK
         from apps.viewer.session import Session
         from apps.viewer.source_factory import ShotOptions, open_source
 

@@ -136,8 +136,7 @@ class PageDoor:
 
     def open_waiting(self, title: str, words: str) -> None:
         """Serve a page that says what is being done, if there is none yet."""
-        from apps.viewer.page import say_waiting, serve_waiting
-        from apps.viewer.server import parse_host
+        from apps.viewer.page import parse_host, say_waiting, serve_waiting
 
         if self._waiting is not None:
             say_waiting(self._waiting[0], words)
@@ -147,8 +146,7 @@ class PageDoor:
 
     def serve(self, session: Session) -> None:
         """Serve a session until Ctrl-C."""
-        from apps.viewer.page import Page
-        from apps.viewer.server import parse_host
+        from apps.viewer.page import Page, parse_host
 
         page = Page(session, self.port, parse_host(self.host), self._waiting)
         was_waiting, self._waiting = self._waiting is not None, None
@@ -160,14 +158,14 @@ class PageDoor:
     def close(self) -> None:
         """Stop serving a page that still waits: there will be nothing to look at."""
         if self._waiting is not None:
-            from apps.viewer.server import stop_server
+            from apps.viewer.page import stop_server
 
             stop_server(self._waiting[0])
 
     def _show_address(self, address: str) -> None:
         import webbrowser
 
-        from apps.viewer.server import is_local, parse_host
+        from apps.viewer.page import is_local, parse_host
 
         report({"address": address}, self.as_json)
         sys.stdout.flush()  # a program that reads the address waits for it

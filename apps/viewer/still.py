@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.figures.style import DOTS_PER_INCH, make_figure
-from apps.mp4 import open_film
+from apps.figures.style import DOTS_PER_INCH, make_figure, open_film
 from apps.viewer.look import Image, Scale, choose_ticks, format_length, load_palette
 from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.viewpoint import (

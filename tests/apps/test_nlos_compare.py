@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from small_instrument import HIDDEN_POINT
 
-from apps.mp4 import open_film
+from apps.figures.style import open_film
 from apps.verbs import nlos_scenes
 from apps.verbs.nlos_imaging import _reset_peak_memory, measure_imaging
 from nlos import Capture, Grid, TransientVideo, Volume

@@ -12,8 +12,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from apps.viewer import server as served
-from apps.viewer.server import Guard, install_guard, parse_host, start_server, stop_server
+from apps.viewer import page as served
+from apps.viewer.page import Guard, install_guard, parse_host, start_server, stop_server
 from tofclip.errors import InputError, MissingDependencyError
 
 EVIL = "https://evil.example"
