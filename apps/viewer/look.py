@@ -203,8 +203,9 @@ def choose_round_values(low: float, high: float, count: int) -> FloatArray:
     """Return at most about `count` round values, evenly apart, between two limits."""
     if not high > low:
         return np.array([low])
-    values = MaxNLocator(count, steps=(1, 2, 5, 10), min_n_ticks=1).tick_values(low, high)
-    return np.asarray(values[(values >= low) & (values <= high)])
+    ticks = MaxNLocator(count, steps=(1, 2, 5, 10), min_n_ticks=1).tick_values(low, high)
+    values = np.asarray(ticks, np.float64)
+    return values[(values >= low) & (values <= high)]
 
 
 # rad; a click that misses every point by more, 10 pixels on a usual screen, means none of them
