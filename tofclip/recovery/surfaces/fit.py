@@ -230,7 +230,8 @@ def straighten_surfaces(
     light = np.maximum(model.render(solver.amplitude), np.float32(LEAST_COUNT))
     while straight:
         trial = model.straighten(straight, solver.amplitude)
-        after = refine_state(trial, solver.amplitude)
+        # what amplitudes explain hardly depends on the basis: begun there, but still a first step
+        after = refine_state(trial, solver.amplitude, replace(before, steps=0))
         change = ((after.rest**2 - before.rest**2) / light).astype(np.float32)
         excess = solver.amplitude * model.gather(model.weights * change)
         needed = []

@@ -325,7 +325,7 @@ def refine_state(
     groups = [
         group
         for group in iterate_derivatives(model, amplitude)
-        if earlier is not None or group.names[0][0] not in SWEEP_SIGMAS
+        if (earlier is not None and earlier.steps) or group.names[0][0] not in SWEEP_SIGMAS
     ]
     groups = _leave_out_even_shading(model, groups, rest)
     start = None if earlier is None else earlier.explained
