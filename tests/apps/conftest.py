@@ -23,6 +23,7 @@ from small_instrument import (
     wall_shot,
 )
 
+from apps.verbs import nlos_scenes
 from tofclip.camera import Camera, SkewSweep
 from tofclip.shots import Streak
 
@@ -107,8 +108,18 @@ def demonstration(request: pytest.FixtureRequest, demo_folder: Path) -> dict[str
 
 
 @pytest.fixture(scope="session")
-def hidden_letters(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Any]:
-    """Figures of `tofclip nlos demo`; who asks for it is in the group ``golden``."""
-    return Shell(request).figures(f"nlos demo --out {tmp_path_factory.mktemp('l')} --seed 1")
+def letters_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the demonstration around the corner puts its files."""
+    return tmp_path_factory.mktemp("letters") / "demo"
+
+
+@pytest.fixture(scope="session")
+def hidden_letters(request: pytest.FixtureRequest, letters_folder: Path) -> dict[str, Any]:
+    """Figures of `tofclip nlos demo` on a coarser wall and with fewer voxels; who asks for it is in
+    the group ``golden``.
+    """
+    small = {"WALL_POINTS": 24, "FACET_M": 0.06, "WAVELENGTH_M": 0.34, "VOXEL_M": 0.06}
+    with pytest.MonkeyPatch.context() as coarser:
+        for name, value in small.items():
+            coarser.setattr(nlos_scenes, name, value)
+        return Shell(request).figures("nlos demo --out {letters_folder} --seed 1")

@@ -9,9 +9,8 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,9 @@ import typer
 from small_instrument import Shell, write_views
 from verb_pages import collect_verbs
 
+from apps.benchmarks import harness
+from apps.benchmarks.harness import find_cases
+from apps.viewer.page import Page
 from tofclip.camera import Camera, SkewSweep
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_checkerboard
@@ -121,6 +123,7 @@ lidar sequence shots --out sequence
 lidar bag clouds --out clouds.mcap
 lidar parallax deep.h5 --out locked.h5 --gates 3
 view clouds.ply --png cloud.png
+view clouds.ply --no-browser
 convert {{files}}/wall.h5 --out wall.h5
 info {{files}}/streak.h5
 info {{files}}/camera.h5
@@ -164,30 +167,23 @@ bench decode-tags
 """What is run of each verb, one line after the other."""
 
 
-def open_page(file: Path) -> dict[str, Any]:
-    """What `tofclip view` says of the page that it serves until it is stopped."""
-    words = [sys.executable, "-m", "tofclip", "view", str(file), "--no-browser", "--json"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as page:
-        assert page.stdout is not None
-        found: dict[str, Any] = json.loads(page.stdout.readline())
-        page.terminate()
-    return found
-
-
 @pytest.fixture(scope="module")
 def keys(request, tmp_path_factory, files, curved, demonstration, hidden_letters):
     """Lines of the keys that each verb prints, over all that is run of it."""
     folder = tmp_path_factory.mktemp("golden")
     provide(folder, files, curved)
     found = {"demo": [*list_keys(demonstration)], "nlos demo": [*list_keys(hidden_letters)]}
-    with contextlib.chdir(folder):
+    small = [replace(case, sizes=(1,)) for case in find_cases("decode-tags")]
+    with contextlib.chdir(folder), pytest.MonkeyPatch.context() as quick:
+        quick.setattr(harness, "find_cases", lambda _: small)
+        quick.setenv("TOFCLIP_THREADS", "1")  # the bench is run once for each number
+        quick.setattr(Page, "run", lambda _: None)  # it would serve until it is stopped
         for line in LINES.strip().replace("\\\n", "").splitlines():
             words = line.split()
             verb = next(name for name in (" ".join(words[:2]), words[0]) if name in VERBS)
             outcome = Shell(request)(f"{line} --json")
             assert outcome.status == 0, outcome
             found.setdefault(verb, []).extend(list_keys(json.loads(outcome.out)))
-    found["view"].extend(list_keys(open_page(folder / "clouds.ply")))
     return {
         verb: [f"{verb}: --json {path}" for path in dict.fromkeys(lines)]
         for verb, lines in found.items()

@@ -1,4 +1,4 @@
-"""`tofclip nlos compare`, `demo` and `film`: methods side by side, what they cost, and the flash."""
+"""`tofclip nlos compare` and `film`: methods side by side, what they cost, and the flash."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from PIL import Image
 from small_instrument import HIDDEN_POINT
 
 from apps.figures.style import open_film
-from apps.verbs import nlos_scenes
 from apps.verbs.nlos_imaging import _reset_peak_memory, measure_imaging
 from nlos import Capture, Grid, TransientVideo, Volume
 from nlos.known_scenes import HiddenTruth, compare_with_truth, measure_sharpness
@@ -92,20 +91,6 @@ def test_memory_is_foretold_within_a_factor(shell):
             pytest.skip("this system does not tell how much memory a program took")
         assert foretold[name]["memory_mib"] < 4 * figures["peak_mib"] + 32
         assert figures["peak_mib"] < 4 * foretold[name]["memory_mib"] + 32
-
-
-def test_the_demonstration(shell, monkeypatch):
-    """As it is, with a coarser wall and fewer voxels."""
-    small = {"WALL_POINTS": 24, "FACET_M": 0.06, "WAVELENGTH_M": 0.34, "VOXEL_M": 0.06}
-    for name, value in small.items():
-        monkeypatch.setattr(nlos_scenes, name, value)
-    found = shell.figures("nlos demo --out demo --png picture.png")
-    assert found["hybrid"]["correlation"] > 0.999
-    assert found["flat"]["correlation"] < 0.95
-    assert found["flat"]["energy_near_truth"] < found["hybrid"]["energy_near_truth"]
-    assert Path("picture.png").read_bytes().startswith(PNG)
-    assert {*os.listdir("demo")} == {"capture.h5", "hybrid.h5", "backprojection.h5"}
-    assert HiddenTruth.load(Path("demo/capture.h5")) is not None
 
 
 def test_figures_of_merit_of_volumes_that_need_no_computing():
