@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from tofclip.lidar.range_calibration import RangeFit, TargetShot
     from tofclip.shots import Frames
 
-PHOTON_SUFFIXES = (".npy", ".mat", ".ptu", ".sdt")
-
 
 def calibrate(
     line: Path = opt("TIF", "Point source, slit open: a line for each lenslet.", ...),
@@ -252,6 +250,7 @@ class _ShotReader:
         from devices.transients import find_address
         from tofclip.files import translate_read_errors
         from tofclip.io import read_streak
+        from tofclip.lidar.photons.files import PHOTON_SUFFIXES
         from tofclip.recovery import make_method, open_shot, parse_focus, plan_recovery
         from tofclip.shots import Frames
         from tofclip.storage import HDF5_SIGNATURE, read_outline

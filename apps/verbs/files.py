@@ -20,8 +20,6 @@ from tofclip.errors import FileFormatError
 if TYPE_CHECKING:
     from tofclip.storage import Field, Record
 
-PHOTON_SUFFIXES = {".npy", ".mat", ".ptu", ".sdt"}  # counted photons or nothing of ours
-
 
 def convert(
     streak: Path = arg("STREAK", "HPD-TA TIFF or LIFT archive.", read=True),
@@ -75,7 +73,7 @@ def describe_file(file: Path) -> dict[str, Any]:
     """
     from devices.linospad2 import LinoSpad2File
     from devices.transients import STAMPS_SUFFIX
-    from tofclip.lidar.photons.files import describe_photons
+    from tofclip.lidar.photons.files import PHOTON_SUFFIXES, describe_photons
     from tofclip.loading import outline
     from tofclip.storage import Record, is_own_file
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
-from tofclip.lidar.photons.image import PhotonImage, SurfaceImage
+from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, add_errors
 from tofclip.lidar.photons.scene import (
     group_shades,
     learn_background,
@@ -34,7 +34,7 @@ MAX_EXACT_PHOTONS = 40  # up to this number of photons every one has a threshold
 THRESHOLD_RATIO = 1.2  # beyond, of the numbers for which there is one: others lie between
 PHOTON_LEVEL_RATIO = 1.03  # numbers that differ by less share a filter
 PULSE_CUTOFF = 1e-4  # of its peak: what a pulse brings beyond it is not worth the bins
-HISTOGRAMS_PER_BLOCK = 256
+HISTOGRAMS_PER_BLOCK = 1024  # of a live picture of as many pixels no thread is started
 MIN_RELATIVE_BACKGROUND = 1e-3  # of a usual bin; no bin is so dark that one photon decides
 NO_PILE_UP = 1e15  # cycles: the rate of any bin is as good as zero
 MAX_THRESHOLDS = 4096  # that are remembered, a number each
@@ -44,7 +44,6 @@ STEP_PHASES, STEP_PHOTONS, STEP_BACKGROUND, STEP_BLUR = 64, 200.0, 0.02, 0.05
 # a bin that hardly any cycle reaches says nothing, but not with infinite surety
 MIN_LIVE_CYCLES = 0.5
 SAMPLED_PIXELS = 8192  # that say what the pixels' background has in common
-DETECTED_PIXELS_PER_BLOCK = 1 << 10
 
 
 def correct_pile_up(
@@ -331,10 +330,13 @@ class PhotonDetector:
         (most returns, pixels, 4); NaN where there is none.
         """
         found = np.full((self.max_returns, pixels, 4), np.nan)
-        for piece in split_blocks(pixels, DETECTED_PIXELS_PER_BLOCK):
+
+        def work(piece: slice) -> None:
             arrivals = self.locate(read(piece), piece.start, cycles)
             located = np.stack([arrivals.range, arrivals.confidence, arrivals.photons], axis=-1)
             found[:, piece, :3] = located.swapaxes(0, 1)
+
+        run_blocks(work, pixels, HISTOGRAMS_PER_BLOCK)
         for layer in found:
             seen = np.isfinite(layer[:, 0])
             layer[seen, 3] = min(self.false_alarm_rate * pixels / max(int(seen.sum()), 1), 1.0)
@@ -460,8 +462,7 @@ class PhotonDetector:
         place = (
             np.nan_to_num(layers[..., 0] / step % 1 * STEP_PHASES).astype(np.int64) % STEP_PHASES
         )
-        ranges, sigma, *others = np.moveaxis(layers, -1, 0)
-        return np.stack([ranges, np.hypot(sigma, self._step_errors[place]), *others], axis=-1)
+        return add_errors(layers, self._step_errors[place])
 
     @cached_property
     def _step_errors(self) -> FloatArray:

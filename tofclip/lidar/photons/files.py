@@ -38,6 +38,7 @@ from tofclip.io.tcspc import TCSPC, PtuEvents, get_scan_shape, read_scan, read_s
 from tofclip.lidar.photons.image import PhotonImage
 from tofclip.storage import HDF5_SIGNATURE
 
+PHOTON_SUFFIXES = (".npy", ".mat", ".ptu", ".sdt")  # counted photons or nothing of ours
 MAX_IMAGE_BYTES = 1 << 32  # of a histogram that is made of a list of events
 MAX_BINS = MAX_PIXELS = 1 << 26  # events may claim any; pictures and histograms are not larger
 MIN_AXES_CERTAINTY = 2.0

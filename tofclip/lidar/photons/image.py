@@ -326,13 +326,18 @@ class PhotonImage:
         if self.bin_sigma is None:
             return layers
         bin_m = SPEED_OF_LIGHT / 2 * self.bin_width
-        ranges, sigma, *others = np.moveaxis(layers, -1, 0)
-        known = bin_m * np.interp(ranges / bin_m, np.arange(self.bins), self.bin_sigma)
-        return np.stack([ranges, np.hypot(sigma, known), *others], axis=-1)
+        known = np.interp(layers[..., 0] / bin_m, np.arange(self.bins), self.bin_sigma)
+        return add_errors(layers, bin_m * known)
 
     def histograms(self, pixels: slice) -> FloatArray:
         """Return the histograms of some pixels in raster order, (n, bins)."""
         return np.asarray(self.table[pixels].toarray(), np.float64)
+
+
+def add_errors(layers: FloatArray, errors: FloatArray) -> FloatArray:
+    """Add errors, m, to the deviations of layers (..., 4)."""
+    sigma = np.hypot(layers[..., 1], errors)
+    return np.concatenate([layers[..., :1], sigma[..., np.newaxis], layers[..., 2:]], axis=-1)
 
 
 # Photons of a hot pixel's fullest bin over those of the usual pixel's fullest bin, of the bins beside
@@ -399,19 +404,15 @@ def _find_peaked_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
     bright, peak = bright[peak > PEAK_RATIO * usual], peak[peak > PEAK_RATIO * usual]
     if not bright.size:
         return hot
-    number = table[bright].argmax(axis=1)
     # A surface goes on in the next pixel or the next bin; what stands alone in both is the sensor's.
-    alone = np.ones(bright.size, np.bool_)
-    for down, right in np.ndindex(3, 3):
-        y, x = bright // columns + down - 1, bright % columns + right - 1
-        for later in range(-NEIGHBOUR_BINS, NEIGHBOUR_BINS + 1):
-            beside = number + later
-            seen = (y >= 0) & (y < rows) & (x >= 0) & (x < columns)
-            seen &= (beside >= 0) & (beside < photons.bins)
-            if (down, right, later) != (1, 1, 0):
-                light = np.asarray(table[(y * columns + x)[seen], beside[seen]]).ravel()
-                alone[seen] &= light * PEAK_RATIO < peak[seen]
-    hot.ravel()[bright] = alone
+    y, x, when = (*np.divmod(bright, columns), table[bright].argmax(axis=1))
+    down, right, later = np.mgrid[-1:2, -1:2, -NEIGHBOUR_BINS : NEIGHBOUR_BINS + 1].reshape(3, -1)
+    y, x, when = y[:, np.newaxis] + down, x[:, np.newaxis] + right, when[:, np.newaxis] + later
+    seen = (y >= 0) & (y < rows) & (x >= 0) & (x < columns) & (when >= 0) & (when < photons.bins)
+    seen &= (down != 0) | (right != 0) | (later != 0)
+    light = np.zeros(seen.shape)
+    light[seen] = table[(y * columns + x)[seen], when[seen]]
+    hot.ravel()[bright] = light.max(axis=1) * PEAK_RATIO < peak
     return hot
 
 

@@ -385,6 +385,15 @@ def interpolate_rows(table, position):
 
 
 @compiled
+def interpolate_density(density, position):
+    """Density between two of its samples; none beyond them."""
+    if not 0 <= position < density.size - 1:
+        return 0.0
+    left = int(position)
+    return density[left] + (position - left) * (density[left + 1] - density[left])
+
+
+@compiled
 def measure_first_photons(
     offsets, bin_time, count, surface, table, start, step, brightness, around, dark, cycles, sums
 ):
@@ -444,12 +453,8 @@ def tally_first_photons(
             live -= count[event]
             event += 1
         while number < surface[pixel] + (slots[0] + sums.shape[0] - 1) * slots[1]:
-            late, rate = number - surface[pixel], dark
-            position = (late - start) / step
-            if 0 <= position < density.size - 1:
-                left = int(position)
-                rising = (position - left) * (density[left + 1] - density[left])
-                rate += brightness[pixel] * (density[left] + rising)
+            late = number - surface[pixel]
+            rate = dark + brightness[pixel] * interpolate_density(density, (late - start) / step)
             own = sums[int(late / slots[1] - slots[0] + 0.5)]
             own[1] += live
             own[2] += live * brightness[pixel]
@@ -571,12 +576,7 @@ def sum_evidence(
     for pixel in range(surface.size):
         total = 0.0
         for event in range(offsets[pixel], offsets[pixel + 1]):
-            position = (bin_time[event] - surface[pixel] - start) / step
-            ratio = 0.0
-            if 0 <= position < density.size - 1:
-                left = int(position)
-                part = position - left
-                ratio = density[left] * (1 - part) + density[left + 1] * part
-                ratio /= relative[event]
+            late = bin_time[event] - surface[pixel]
+            ratio = interpolate_density(density, (late - start) / step) / relative[event]
             total += count[event] * np.log(1 + signal[pixel] * (ratio - 1))
         evidence[pixel] = total

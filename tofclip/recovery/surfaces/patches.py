@@ -17,6 +17,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
+from tofclip.lidar.search import number_returns
 from tofclip.shots import Returns
 
 Pixels = NDArray[np.intp]
@@ -252,8 +253,7 @@ def _connect_neighbours(
 def rank_within_pixels(pixels: Pixels, distance: FloatArray) -> tuple[Pixels, Pixels]:
     """Return the order of returns by pixel and range, and the rank of each in its pixel, from 0."""
     order = np.lexsort((distance, pixels))
-    starts = np.flatnonzero(np.diff(pixels[order], prepend=-1))
-    return order, np.arange(order.size) - np.repeat(starts, np.diff(starts, append=order.size))
+    return order, number_returns(pixels[order]).astype(np.intp) - 1
 
 
 def _fit_quadratic(
