@@ -29,8 +29,10 @@ from tofclip.errors import MissingDependencyError
 from tofclip.files import import_open3d
 
 # How long an example takes says nothing where the first one compiles, or where other programs run.
-settings.register_profile("anywhere", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("anywhere")
+anywhere = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("day", anywhere, max_examples=40)
+settings.register_profile("night", anywhere, max_examples=400)
+settings.load_profile("day")
 
 
 @pytest.fixture(scope="session")

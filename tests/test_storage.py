@@ -98,9 +98,7 @@ def assert_same(got: Record, expected: Record) -> None:
 
 
 class TestRecord:
-    @settings(
-        max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-    )
+    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(expected=records)
     def test_a_record_survives_its_file(self, expected, path):
         expected.save(path)

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tofclip.camera import (
@@ -233,7 +233,6 @@ SEVEN = 60.0 + 90 * np.arange(7)
 optical = partial(Camera, SEVEN, np.linspace(-0.7, 0.8, 7), (16, 16), 660, focal_length_px=250.0)
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     pitch=st.floats(1e-4, 1e-2),
     focus=st.floats(0.3, 20.0),

@@ -7,7 +7,7 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from devices.frames import FrameCodec
 from devices.linospad2 import FIRMWARES, MAX_TIMESTAMPS, LinoSpad2Codec
@@ -88,7 +88,6 @@ DRAWN = {"timetag": draw_tags(), "linospad2": draw_stamps(), "frames": draw_fram
 
 
 @pytest.mark.parametrize("name", CODECS)
-@settings(deadline=None)  # the first call compiles
 @given(data=st.data())
 def test_a_stream_comes_back_wherever_it_is_cut(name: str, data: st.DataObject) -> None:
     codec, records = data.draw(DRAWN[name])
@@ -161,7 +160,6 @@ def test_impossible_settings_are_refused(name: str, settings: tuple[Any, ...], s
 # The time tagger's
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=600), st.booleans())
 def test_any_bytes_decode_to_valid_tags(raw: bytes, after_loss: bool) -> None:
     words = as_bytes(raw)[: TAGS.count_complete_bytes(as_bytes(raw))]

@@ -225,7 +225,7 @@ def own_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SendWindow, "clock", staticmethod(time.thread_time))
 
 
-@sample(300)
+@sample(120)
 def test_random_faults_of_a_time_tagger(seeds: range) -> None:
     outcomes = run_at_once(run_tagger, map(draw_tagger_script, seeds), seeds)
     for seed, outcome in zip(seeds, outcomes, strict=True):
@@ -311,7 +311,7 @@ def test_a_reader_64_mib_behind(policy: OverflowPolicy) -> None:
         source.keep_newest()
     deadline = monotonic() + 20
     while source.stats.acquired < (PICTURES if is_newest else 62) and monotonic() < deadline:
-        pass
+        time.sleep(1e-3)
     began, numbers = monotonic(), []
     try:
         for batch in source:

@@ -8,7 +8,7 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from numpy.typing import NDArray
 
 from devices.files import PHOTON_DTYPE
@@ -24,7 +24,6 @@ from devices.timetag_codec import DELTA, RECORD_DTYPE
 from tofclip.errors import InputError
 from tofclip.threads import THREADS_VARIABLE
 
-unhurried = settings(deadline=None)  # the first call compiles
 PS = 1e-12
 
 
@@ -51,7 +50,6 @@ axes = st.builds(
 )
 
 
-@unhurried
 @given(axes, st.integers(0, 2**32 - 1), st.sampled_from([5 * PS, 250 * PS, 5000 * PS]))
 def test_times_are_shared_out_over_the_bins_they_cover(
     axis: BinAxis, seed: int, resolution: float

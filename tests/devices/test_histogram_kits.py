@@ -10,7 +10,7 @@ from typing import Any
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from instruments import finish, take
 
 import devices
@@ -89,7 +89,6 @@ def test_what_is_missing_is_told() -> None:
 
 
 @given(st.binary(max_size=300))
-@settings(max_examples=60)
 def test_any_line_is_survived(line: bytes) -> None:
     for parser in (make_tmf_parser(), Vl53l8Parser(Vl53l8Options())):
         for head in (b"", b"#Raw,65,3,", b"#Obj,65,3,", b"Aggregate ", b"Aggregate 0, Bins: "):

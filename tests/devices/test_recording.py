@@ -205,7 +205,7 @@ def test_a_recording_of_version_0_1_0_opens(path: Path, out: Path) -> None:
 
 def test_killed_recorders_leave_what_they_flushed(tmp_path: Path, out: Path) -> None:
     script = run_script(
-        ROOT / "tests/devices/ended_recorders.py", tmp_path, 10, 5, stdout=subprocess.PIPE
+        ROOT / "tests/devices/ended_recorders.py", tmp_path, 6, 5, stdout=subprocess.PIPE
     )
     said, _ = script.communicate(timeout=120)
     assert script.returncode == 0
@@ -222,7 +222,7 @@ def test_killed_recorders_leave_what_they_flushed(tmp_path: Path, out: Path) -> 
         require_true_records(path, int(name.removeprefix("run").removesuffix(".h5")))
         assert repair(path, out).bytes >= found.bytes
         with_records += found.records > 0
-    assert with_records >= 5  # every other one is killed after its first report
+    assert with_records >= 3  # every other one is killed after its first report
 
 
 def test_a_killed_recorder_of_a_stream_that_pauses_has_all_that_came(path: Path) -> None:
@@ -408,7 +408,7 @@ def test_blocks_say_when_they_were_recorded(path: Path) -> None:
     assert times == sorted(times)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.data())
 def test_damage_is_found_and_the_rest_is_saved(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
@@ -455,7 +455,7 @@ def test_a_file_without_its_front_and_end_is_rebuilt(path: Path, out: Path) -> N
 def test_one_flipped_bit_costs_one_block(path: Path, out: Path) -> None:
     written(path)
     content, random = path.read_bytes(), np.random.default_rng(0)
-    for place in {*range(60), *random.integers(len(content), size=100).tolist()}:
+    for place in {*range(0, 60, 3), *random.integers(len(content), size=40).tolist()}:
         path.write_bytes(content)
         damage(path, place, 1 << int(random.integers(8)))
         found = verify(path)

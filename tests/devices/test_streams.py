@@ -116,7 +116,7 @@ class RingMachine(RuleBasedStateMachine):
 
 
 TestRing = RingMachine.TestCase
-TestRing.settings = settings(max_examples=200, stateful_step_count=30, deadline=None)
+TestRing.settings = settings(stateful_step_count=30)
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,6 @@ def test_x_is_right_y_is_down_and_the_axis_looks_forward() -> None:
     np.testing.assert_allclose(below, np.array([0, 0.1, 1]) / np.sqrt(1.01))
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     k=st.tuples(*[st.floats(-0.2, 0.2)] * 2, *[st.floats(-0.01, 0.01)] * 2, st.floats(-0.05, 0.05)),
     row=st.floats(0, 127),
@@ -152,7 +151,7 @@ def test_columns_that_do_not_fit_are_refused() -> None:
             PointCloud(positions, *columns)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(points=st.integers(0, 40), seed=st.integers(0, 2**32 - 1), known=st.booleans())
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_every_format_brings_every_bit_back(tmp_path_factory, suffix, points, seed, known) -> None:

@@ -55,7 +55,7 @@ def compute_rms(values):
     return np.sqrt(np.mean(np.square(values)))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(photons=st.floats(1, 1e5), fwhm=st.floats(30e-12, 300e-12))
 def test_without_background_the_bound_is_sigma_over_root_photons(photons, fwhm):
     # a bin hides where in it a photon came

@@ -76,7 +76,7 @@ def test_a_distant_surface_is_as_good_as_a_near_one_and_strays_are_left_out():
     assert np.sum(~near & ~far) <= 2
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(points=st.integers(0, 60), voxel=st.floats(0.05, 3.0), seed=st.integers(0, 99))
 def test_voxels_hold_one_point_each_and_keep_the_mean(points, voxel, seed):
     cloud = cloud_of(np.random.default_rng(seed).normal(size=(points, 3)))

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tofclip.errors import InputError
 from tofclip.lidar import Pulse
 
 
-@settings(max_examples=50, deadline=None)
 @given(fwhm=st.floats(1e-12, 1e-8), widths=st.floats(-3, 3))
 def test_a_gaussian_has_its_width_and_is_even(fwhm, widths):
     pulse = Pulse.gaussian(fwhm)

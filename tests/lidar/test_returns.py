@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tofclip.camera import Camera
@@ -46,7 +46,6 @@ def range_of(time: np.ndarray | float) -> np.ndarray | float:
     return SPEED_OF_LIGHT * time / 2
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     position=st.floats(8.0, 51.0),
     height=st.floats(1e-2, 1e6),
@@ -74,7 +73,6 @@ def test_background_neither_shifts_nor_brightens_a_return():
     np.testing.assert_allclose(lifted.intensity, clean.intensity, rtol=1e-3)
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     widths_apart=st.floats(1.3, 6.0),
     ratio=st.floats(0.7, 1.4),

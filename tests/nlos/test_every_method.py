@@ -123,7 +123,7 @@ def refusal(method: Any, capture: Capture, grid: Grid) -> str:
         *itertools.product(["rsd"], [False], ("single", "confocal")),
     ],
 )
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(x=st.floats(-0.4, 0.4), y=st.floats(-0.35, 0.35), z=st.floats(0.4, 0.9))
 def test_any_hidden_point_comes_back_where_it_is(
     name: str, curved: bool, laser: str, x: float, y: float, z: float

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from apps.occlusion.experiment import (
@@ -69,7 +69,6 @@ def test_the_papers_examples(width, distance, length):
     across=st.floats(-20, 20),
     behind=st.floats(0.5, 300),
 )
-@settings(max_examples=200, deadline=None)
 def test_a_point_is_inside_exactly_if_cast_rays_reach_it_from_no_view(
     baseline, share, distance, across, behind
 ):
@@ -148,7 +147,6 @@ def test_a_lamp_to_the_side_throws_the_shadow_to_the_other_side():
     factor=st.floats(0.3, 4),
     across=st.floats(-0.4, 0.4),
 )
-@settings(max_examples=40, deadline=None)
 def test_lamps_at_the_views_light_a_point_as_often_as_views_see_it(width, distance, factor, across):
     """With a lamp at each view, light gets there and back by the same lines of sight, or not at
     all.

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 import scipy.sparse
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tofclip.arrays import ComputeDevice, to_numpy
@@ -57,7 +57,6 @@ def lines(shape: tuple[int, int], slit: int, *views: tuple[float, float, float])
     return LineProjection(shape, slit, *zip(*views, strict=True), np.float64)
 
 
-@settings(max_examples=60, deadline=None)
 @given(angle=angles, centre=st.floats(40.0, 60.0), x=offsets, y=offsets, gain=st.floats(0.2, 3.0))
 def test_a_point_falls_where_the_geometry_says(angle, centre, x, y, gain):
     slit = lines((17, 19), 101, (centre, angle, gain))(point((17, 19), x, y))
@@ -186,7 +185,6 @@ def test_light_leaves_over_the_border_with_linear_and_returns_with_fourier():
     assert FourierShear((5, 6), 1.0, (0, 1), dtype=np.float64)(picture)[2, 0] == pytest.approx(1)
 
 
-@settings(max_examples=40, deadline=None)
 @given(s=st.floats(-0.9, 0.9), v=st.integers(-4, 3), u=st.integers(-4, 3), r=st.floats(-1.0, 1.0))
 def test_the_centroid_moves_by_the_shear_times_the_distance_from_the_reference(s, v, u, r):
     seen = LinearShear((21, 23), s, (v, u), (r, -r), np.float64)(point((21, 23), 0, 0))
@@ -205,7 +203,6 @@ def test_the_finest_pattern_fades_with_a_fractional_shift_and_moves_no_other_way
     np.testing.assert_allclose(seen, np.cos(np.pi * shift) * picture, atol=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
 @given(rows=sizes, columns=sizes, down=sizes, right=sizes, sensor_rows=sizes, sensor_columns=sizes)
 def test_every_point_puts_the_point_spread_about_its_own_place(
     rows, columns, down, right, sensor_rows, sensor_columns

@@ -98,9 +98,7 @@ texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"
 shapes = hnp.array_shapes(min_dims=2, max_dims=2, max_side=6)
 
 
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(shape=shapes, metadata=st.dictionaries(texts, texts, max_size=4), data=st.data())
 def test_a_streak_survives_its_file(shape, metadata, data, tmp_path):
     counts = data.draw(

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tofclip.camera import Camera, SkewSweep
@@ -40,7 +40,6 @@ def wall(depth: float, side: float = 10.0, **turned: float) -> Body:
     return make_plate((0.0, 0.0, depth), (side, side), np.full((4, 4), 0.5), **turned)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     yaw=st.floats(-1.0, 1.0), pitch=st.floats(-1.0, 1.0), depth=st.floats(0.5, 5.0),
     right=st.floats(-0.2, 0.2), down=st.floats(-0.2, 0.2),
@@ -165,7 +164,6 @@ def view_image(scene: Scene, made: Instrument, view: int) -> np.ndarray:
     return render_streak(cast_view_rays(scene, made, position), view, made)
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     x=st.floats(-15, 15), y=st.floats(-15, 15), depth=st.floats(1.2, 3.0), view=st.integers(0, 2)
 )
