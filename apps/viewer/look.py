@@ -273,12 +273,12 @@ FRONT_SIDE_PX, MIN_SIDE_PX, MAX_SIDE_PX = 128, 200, 420
 
 
 def render_pictures(pictures: Mapping[str, Picture], scale: Scale) -> dict[str, Image]:
-    """Turn pictures into images of a handy size. `pictures`: ``"depth"`` is in m, NaN where there
-    is nothing; all others are brightness; `scale`: the scene's colours.
+    """Turn pictures into images of a handy size. `pictures`: ``"depth"``, or a layer's ``"2 depth"``, is
+    in m, NaN where there is nothing; all others are brightness; `scale`: the scene's colours.
     """
     images = {}
     for name, picture in pictures.items():
-        image = (_colour_depth if name == "depth" else _colour_brightness)(picture, scale)
+        image = (_colour_depth if name.endswith("depth") else _colour_brightness)(picture, scale)
         # A large one is shrunk by taking every n-th pixel, a small one enlarged by repeating them.
         rows, columns = (slice(None, None, max(1, -(-n // MAX_SIDE_PX))) for n in picture.shape)
         image = image[rows, columns]

@@ -312,7 +312,8 @@ def draw_furniture(server: viser.ViserServer, box: Box) -> Callable[[viser.Clien
             return
         words, own = format_length(length_m), client.scene
         line = add_lines(own, "/scale", bar[np.newaxis], SCALE_BAR_COLOUR, 4.0)
-        look: Any = {"anchor": "top-center", "font_screen_scale": 0.9, "visible": switch.value}
+        # written above it: below may be the folded panel of a phone
+        look: Any = {"anchor": "bottom-center", "font_screen_scale": 0.9, "visible": switch.value}
         label = own.add_label("/scale_length", words, position=bar.mean(axis=0), **look)
         line.visible = switch.value
         bars[client.client_id] = bar, [line, label]

@@ -64,6 +64,7 @@ SCALE_BAR_FRACTION = 0.4  # the scale bar is at most as long as this fraction of
 # fractions of the box's depth, from its front: little stands before the scale bar, which farther in
 # front would need much of the window, and neither hides the other's words from any side
 SCALE_BAR_DEPTH, Z_MARK_DEPTH, X_MARK = 0.3, 0.85, 0.12
+SCALE_BAR_DROP = 0.04  # of the box's height: on its floor the bar would lie along a flat box's edge
 EDGES = [(n, n | bit) for bit in (1, 2, 4) for n in range(8) if not n & bit]  # by their corners
 
 
@@ -98,7 +99,7 @@ class Box:
         return edges
 
     def scale_bar(self, eye: FloatArray) -> FloatArray:
-        """Ends of a bar of a round length, (2, 3) in m: on the floor, near the side that an eye is at,
+        """Ends of a bar of a round length, (2, 3) in m: below the floor, near the side that an eye is at,
         across its line of sight.
         """
         right = Viewpoint(eye, self.middle).axes[0]
@@ -106,7 +107,7 @@ class Box:
         width, depth = float(np.abs(right) @ sides), float(np.abs(ahead) @ sides)
         length = round_length_down(SCALE_BAR_FRACTION * width) if width > 0 else 0.0
         middle = self.middle + (SCALE_BAR_DEPTH - 0.5) * depth * ahead
-        middle[1] = self.high[1]
+        middle[1] = self.high[1] + SCALE_BAR_DROP * sides[1]
         return middle + np.outer((-length / 2, length / 2), right)
 
     @property
