@@ -213,7 +213,9 @@ class SceneFigure:
             row, column, _ = self.viewpoint.project(edge, shape)
             axes.plot(column, row, color=BOX_COLOUR, linewidth=0.6, alpha=0.6)
         row, column, _ = self.viewpoint.project(box.length_marks, shape)
-        look: Any = {"color": BOX_COLOUR, "fontsize": 7, "va": "bottom", "clip_on": True}
+        look: Any = {"color": SCALE_BAR_COLOUR, "fontsize": 7, "va": "bottom", "clip_on": True}
+        # over bright points, words in no colour could be read
+        look["bbox"] = {"facecolor": np.array(BACKGROUND) / 255, "edgecolor": "none", "pad": 1}
         for name, length_m, x, y in zip("xyz", box.high - box.low, column, row, strict=True):
             axes.text(x, y, f"{name} {format_length(float(length_m))}", ha="center", **look)
         bar = box.scale_bar(self.viewpoint.eye)
