@@ -6,11 +6,11 @@ few pixels of the sensor (Supp. Fig. 4); what one iteration costs (Table 1).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,19 +62,6 @@ def make_coded_line_sensors(
     ]
     sensor_px = image_shape[0] + image_shape[1]
     return [SliceConvolution(image_shape, spread[np.newaxis], sensor_px) for spread in spreads]
-
-
-def compute_column_ranks(sensors: Sequence[SliceConvolution]) -> NDArray[np.int64]:
-    """Rank of G_k at every frequency k along the sensor (Eq. 14 to 16).
-
-    A column of the picture's spectrum has as many unknowns as the picture has rows, and only
-    rank(G_k) equations: one for a lone slice, whatever its PSF; at most M for M of them.
-
-    Returns (frequencies,).
-    """
-    spectra = np.concatenate([one.spectra for one in sensors], axis=1)
-    ranks: NDArray[np.int64] = np.linalg.matrix_rank(spectra.astype(np.complex128), rtol=1e-5)
-    return ranks
 
 
 def recover_from_lines(
@@ -305,8 +292,7 @@ NORM_ITERATIONS = 10
 WHOLE, PICTURE = "light field", "refocused picture"
 
 
-@dataclass(frozen=True)
-class IterationCost:
+class IterationCost(NamedTuple):
     """One row of Table 1, with what was measured."""
 
     method: str
@@ -318,7 +304,6 @@ class IterationCost:
     complexity: str
     # of one whole iteration: model, prior and bookkeeping; the median of the repeats
     seconds: float
-    model_seconds: float  # of the model and its adjoint alone, the median of the repeats
 
 
 def measure_iteration_costs(
@@ -357,34 +342,20 @@ def measure_iteration_costs(
     with limit_blas_threads():  # all methods on one core
         for name, camera, recovers, complexity in methods:
             seen = light_field.pictures[list(camera.used_views)]
-            measurements = camera.light_field_model()(seen)
-            model = camera.model(shear) if recovers == PICTURE else _build_tall_model(camera)
-            solver = _build_solver(model, measurements)
-            multiply = partial(_multiply, model, solver)
-            times = (_measure_median_seconds(one, repeats) for one in (solver.step, multiply))
-            unknowns = int(np.prod(model.shape_in))
-            numbers = (measurements.size, unknowns)
-            costs.append(IterationCost(name, recovers, *numbers, complexity, *times))
+            whole, model = camera.light_field_model(), camera.model(shear)
+            measurements = whole(seen)[:, np.newaxis]
+            if recovers == WHOLE:  # its views one below the other: priors take one picture
+                count, rows, columns = whole.shape_in
+                model = whole @ Reshape((count * rows, columns), whole.shape_in)
+            weight = TV_WEIGHT * float(model.adjoint(measurements).max())
+            # The power iteration approaches the norm from below, hence the margin.
+            step = 1 / (1.02 * estimate_squared_norm(model, NORM_ITERATIONS))
+            prior = NonnegativeTotalVariation(weight)
+            solver = Fista(model, LeastSquares(measurements), prior, step, 1)
+            numbers = (measurements.size, int(np.prod(model.shape_in)))
+            seconds = _measure_median_seconds(solver.step, repeats)
+            costs.append(IterationCost(name, recovers, *numbers, complexity, seconds))
     return costs
-
-
-def _multiply(model: LinearOperator, solver: Fista) -> None:
-    model.adjoint(model(solver.current))
-
-
-def _build_tall_model(camera: LightFieldCamera) -> LinearOperator:
-    """The light field's model for its views one below the other: priors take one picture."""
-    model = camera.light_field_model()
-    views, rows, columns = model.shape_in
-    return model @ Reshape((views * rows, columns), model.shape_in)
-
-
-def _build_solver(model: LinearOperator, measurements: NDArray[Any]) -> Fista:
-    block = measurements[:, np.newaxis]
-    weight = TV_WEIGHT * float(model.adjoint(block).max())
-    # The power iteration approaches the norm from below, hence the margin.
-    step = 1 / (1.02 * estimate_squared_norm(model, NORM_ITERATIONS))
-    return Fista(model, LeastSquares(block), NonnegativeTotalVariation(weight), step, 1)
 
 
 def _measure_median_seconds(action: Callable[[], object], repeats: int) -> float:
@@ -415,9 +386,6 @@ def run_iteration_table(library: Library, seeds: int, advance: Advance) -> Outco
     costs = measure_iteration_costs(library.light_field(SCENE), SHEAR, repeats=2 * seeds)
     advance(1)
     columns = ("method", "recovers", "measurements", "unknowns", "operations")
-    rows = [
-        Row((*map(str, astuple(cost)[:4]), cost.complexity), (1e3 * cost.seconds,))
-        for cost in costs
-    ]
+    rows = [Row(tuple(map(str, cost[:5])), (1e3 * cost.seconds,)) for cost in costs]
     panel = Panel(f"{SCENE}, s = {SHEAR:g}", library.light_field(SCENE).refocus(SHEAR))
     return Outcome(columns, "ms per iteration", rows, [[panel]])

@@ -15,7 +15,6 @@ from apps.studies.cameras import (
     MAX_ANGLE_RAD,
     DiffuserRecording,
     build_diffuser_model,
-    compute_column_ranks,
     compute_psnr_db,
     make_coded_line_sensors,
     measure_iteration_costs,
@@ -56,7 +55,10 @@ class TestCodedLine:
         """
         for lines in (1, 4):
             sensors = make_coded_line_sensors((24, 20), lines, width, steepest, 0)
-            assert np.unique(compute_column_ranks(sensors)).tolist() == [lines]
+            spectra = np.concatenate([one.spectra for one in sensors], axis=1)
+            # of G_k at every frequency k along the sensor (Eq. 14)
+            ranks = np.linalg.matrix_rank(spectra.astype(np.complex128), rtol=1e-5)
+            assert np.unique(ranks).tolist() == [lines]
 
     def test_the_sensors_are_long_enough_for_all_light_of_rotated_lines(self):
         """An even picture puts each row's light on the sensor as often as it has columns, at any
@@ -124,7 +126,7 @@ class TestCosts:
         assert [cost.recovers for cost in costs] == recovered
         assert tuple(cost.measurements for cost in costs) == self.MEASUREMENTS
         assert tuple(cost.unknowns for cost in costs) == self.UNKNOWNS
-        assert all(0 < cost.model_seconds < 1 and 0 < cost.seconds < 1 for cost in costs)
+        assert all(0 < cost.seconds < 1 for cost in costs)
 
     def test_refocusing_one_picture_takes_a_sixteenth_of_the_priors_work(self, monkeypatch):
         """What is counted is the numbers that an iteration's prior and products handle, not
@@ -153,9 +155,7 @@ class TestCosts:
 
         monkeypatch.setattr("apps.studies.cameras._measure_median_seconds", count_numbers)
         self.measure()
-        steps, products = handled[::2], handled[1::2]
-        assert steps == list(zip(self.UNKNOWNS, self.MEASUREMENTS, strict=True))
-        assert products == [(0, measured) for measured in self.MEASUREMENTS]
+        assert handled == list(zip(self.UNKNOWNS, self.MEASUREMENTS, strict=True))
 
 
 class TestDiffuser:
