@@ -143,7 +143,7 @@ HOMES = {
     **dict.fromkeys(("reproduce", "bench"), "proof"),
     **dict.fromkeys(("convert", "info"), "files"),
     **dict.fromkeys(("calibrate range", "design"), "calibrate"),
-    "cloud": "recover",
+    **dict.fromkeys(("cloud", "stream"), "recover"),
     "record": "devices",
 }
 """Modules in `apps.verbs` that are not called like their verb."""

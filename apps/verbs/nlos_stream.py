@@ -51,7 +51,7 @@ from apps.verbs.nlos_imaging import (
     require_valid_settings,
     show_settings,
 )
-from apps.verbs.stream import MAX_LATENCY_SAMPLES, compute_quantiles
+from apps.verbs.recover import MAX_LATENCY_SAMPLES, compute_quantiles
 from nlos.settings import METHODS, Settings
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
