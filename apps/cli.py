@@ -1,6 +1,9 @@
-"""The console program `tofclip`: one verb, one small module in `apps.verbs`.
+"""The console program `tofclip`: one verb, one function in a module of `apps.verbs`, and its help, made from
+its docstring.
 
-A verb's module is imported when the verb is called, so that the program's own help appears at once.
+A verb's module is imported when the verb is called, so that the program's own help appears at once: the
+list of commands and the completion of a verb's name come from a table of names and one-line helps. A
+docstring ends in a paragraph that begins with ``Example:``; several such paragraphs are several examples.
 """
 
 from __future__ import annotations
@@ -9,40 +12,50 @@ import atexit
 import contextlib
 import errno
 import gc
+import inspect
 import logging
 import os
 import re
 import signal
 import sys
+import textwrap
 import threading
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any
+from functools import partial
+from importlib import import_module
+from typing import Annotated, Any, cast
 
 import typer
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
-from apps.help import (
-    DEBUG_FLAG,
-    EPILOG,
-    EXIT_BROKEN_PIPE,
-    EXIT_DEFECT,
-    EXIT_INPUT_ERROR,
-    EXIT_INTERRUPTED,
-    HELP_OPTIONS,
-    MAX_HELP_WIDTH,
-    OVERWRITE_FLAG,
-    PROGRAM,
-    QUIET_FLAGS,
-    VERBOSE_FLAGS,
-    find_help,
-    make_verb_group,
-)
 from apps.progress import silence
 from apps.report import name_options, replace_results
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import describe_missing_package
 from tofclip.version import __version__
+
+PROGRAM = "tofclip"
+HELP_OPTIONS = ["-h", "--help"]
+DEBUG_FLAG, OVERWRITE_FLAG = "--debug", "--overwrite"
+QUIET_FLAGS, VERBOSE_FLAGS = ("-q", "--quiet"), ("-v", "--verbose")
+
+EXIT_INPUT_ERROR = 2
+EXIT_DEFECT = 1
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
+EPILOG = (
+    f"Exit status: 0 done; {EXIT_INPUT_ERROR} unusable input, with one line on standard error that says what to do; "
+    f"{EXIT_INTERRUPTED} interrupted; {EXIT_DEFECT} some of a sequence failed, or a defect of this program. "
+    f"Anywhere: {OVERWRITE_FLAG} replaces results that exist; {QUIET_FLAGS[0]} prints errors only, "
+    f"{VERBOSE_FLAGS[0]} what the libraries say as well, {DEBUG_FLAG} where an error came from."
+)
+
+EXAMPLE_MARK = "Example:"
+AS_WRITTEN = "\b\n"  # before a paragraph whose lines typer must not join
+MAX_EXAMPLE_WIDTH = 72  # columns, which with the indentation fit the narrowest usual terminal
+MAX_HELP_WIDTH = 100  # columns, on a terminal that has them
 
 QUANTITIES = {
     **{
@@ -146,11 +159,177 @@ HOMES = {
     **dict.fromkeys(("cloud", "stream"), "recover"),
     "record": "devices",
 }
-"""Modules in `apps.verbs` that are not called like their verb."""
+"""Modules in `apps.verbs` that are not called like their verb; each has its function, or a group
+``app``.
+"""
+
+Command = TyperCommand | TyperGroup
+
+
+class VerbGroup(TyperGroup):
+    """The program's verbs, of which only the one that is called is imported. A verb of two words,
+    such as ``calibrate range``, stands beside one called by the first alone.
+    """
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        for name, line in VERBS.items():
+            self.add_command(TyperCommand(name, help=line, short_help=line))
+        self.rich_markup_mode = None
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the options, those of completion too, which typer adds later."""
+        return _hide_types_of_flags(super().get_params(ctx))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the verb that is called, and import it."""
+        if " ".join(args[:2]) in VERBS:
+            args = [" ".join(args[:2]), *args[2:]]
+        name, listed, further = super().resolve_command(ctx, args)
+        return name, (name and self.load_verb(name)) or listed, further
+
+    def load_verb(self, name: str) -> Command:
+        """Import a verb and return its command, which is a group if that is what its module has."""
+        own = re.sub("[- ]", "_", name)
+        home = import_module(f"apps.verbs.{HOMES.get(name, own)}")
+        is_group = not hasattr(home, own)
+        app: typer.Typer = home.app if is_group else typer.Typer()
+        if not is_group:
+            app.command(name)(getattr(home, own))
+        for verb in app.registered_commands:
+            _set_help(verb)
+        group = typer.main.get_group(app)
+        group.name = name
+        command = group if is_group else cast("TyperCommand", group.commands[name])
+        simplify_help(command)
+        return command
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Complete single words, as shells take them."""
+        return [item for item in super().shell_complete(ctx, incomplete) if " " not in item.value]
+
+
+def make_group(name: str) -> typer.Typer:
+    """Return a group of `VERBS` that alone shows its help."""
+    app = typer.Typer()
+
+    def show_help(context: typer.Context) -> None:
+        if context.invoked_subcommand is None:
+            print(context.get_help())
+
+    app.callback(invoke_without_command=True, help=VERBS[name])(show_help)
+    return app
+
+
+def walk_verbs(group: VerbGroup) -> dict[str, TyperCommand]:
+    """Import every verb and return the commands by the words that call them, such as ``lidar scene``,
+    in the order of the help.
+    """
+    found: dict[str, TyperCommand] = {}
+    for name in VERBS:
+        command = group.load_verb(name)
+        if isinstance(command, TyperGroup):
+            found |= {f"{name} {word}": verb for word, verb in command.commands.items()}  # type: ignore[misc]
+        else:
+            found[name] = command
+    return found
+
+
+def find_help(words: Sequence[str]) -> str | None:
+    """Return the help that words ask for and nothing else, without what typer parses options with,
+    which takes longer to import than all the rest.
+    """
+    *names, last = words or ("",)
+    if last not in HELP_OPTIONS or not names or any(name.startswith("-") for name in names):
+        return None
+    command: Any = typer.main.get_group(app)
+    context = typer.Context(command, info_name=PROGRAM, **command.context_settings)
+    while names and isinstance(command, TyperGroup):
+        name, command, names = command.resolve_command(context, names)
+        context = typer.Context(command, info_name=name, parent=context)
+    return str(command.get_help(context))
+
+
+def simplify_help(command: Command) -> None:
+    """Let a command, and those of a group, show their help as plain text, without Python's types, and
+    take ``-o`` for ``--out``. Importing what draws frames around the help takes longer than all the
+    rest of showing it.
+    """
+    command.rich_markup_mode = None
+    command.format_options = partial(_write_options, command)  # type: ignore[method-assign]
+    usage = command.collect_usage_pieces
+    # typer writes ``{SHOT...}...``
+    command.collect_usage_pieces = lambda ctx: [  # type: ignore[method-assign]
+        re.sub(r"^\{(.*?)(\.\.\.)?\}", r"\1", piece) for piece in usage(ctx)
+    ]
+    context = typer.Context(command, help_option_names=HELP_OPTIONS)
+    for param in _hide_types_of_flags(command.get_params(context)):
+        if param.opts == ["--out"]:
+            param.opts.insert(0, "-o")
+    for further in getattr(command, "commands", {}).values():
+        simplify_help(further)
+
+
+def _write_options(command: Command, ctx: Any, formatter: Any) -> None:
+    """Write arguments, options and settings under their headings, and a group's verbs."""
+    panels: dict[str, list[tuple[str, str]]] = {}
+    for param in command.get_params(ctx):
+        entry = param.get_help_record(ctx)
+        if entry is not None:
+            usual = "Arguments" if param.param_type_name == "argument" else "Options"
+            heading = getattr(param, "rich_help_panel", None) or usual
+            # typer puts a default in words into brackets of its own
+            text = re.sub(r"\[default: \((.*)\)\]$", r"[default: \1]", entry[1])
+            name = re.sub(r" <.*>$", "", entry[0])
+            panels.setdefault(heading, []).append((name, text.removesuffix("  [default: none]")))
+    for heading, entries in panels.items():
+        with formatter.section(heading):
+            formatter.write_dl(entries)
+    if isinstance(command, TyperGroup):
+        command.format_commands(ctx, formatter)
+
+
+def _hide_types_of_flags(params: list[Any]) -> list[Any]:
+    for param in params:
+        if isinstance(param, TyperOption) and param.is_flag:
+            param.metavar = ""
+    return params
+
+
+def _set_help(verb: Any) -> None:
+    """Make a verb's help from its docstring; the exit statuses are its last paragraph."""
+    prose, examples = split_docstring(verb.callback.__doc__)
+    verb.help = "\n\n".join(f"{AS_WRITTEN}{one}" if _is_table(one) else one for one in prose)
+    verb.short_help = prose[0] if prose else None  # shown whole, not its first words
+    shown = [f"{AS_WRITTEN}{EXAMPLE_MARK}\n    {wrap_command(example)}" for example in examples]
+    verb.epilog = "\n\n".join([*shown, EPILOG])
+
+
+def split_docstring(docstring: str | None) -> tuple[list[str], list[str]]:
+    """Split a docstring into its paragraphs of prose and its example commands. Lines of a paragraph
+    are joined, since a terminal is narrower than the source; one with indented lines stays.
+    """
+    paragraphs = [one for one in inspect.cleandoc(docstring or "").split("\n\n") if one.strip()]
+    examples = [" ".join(one.split()[1:]) for one in paragraphs if one.startswith(EXAMPLE_MARK)]
+    prose = [one for one in paragraphs if not one.startswith(EXAMPLE_MARK)]
+    return [one if _is_table(one) else " ".join(one.split()) for one in prose], examples
+
+
+def wrap_command(command: str) -> str:
+    """Break a long command between its words, as a shell takes it."""
+    lines = textwrap.wrap(
+        command, MAX_EXAMPLE_WIDTH, break_long_words=False, break_on_hyphens=False
+    )
+    return " \\\n        ".join(lines)
+
+
+def _is_table(paragraph: str) -> bool:
+    return re.search(r"^( |[*-] )", paragraph, re.MULTILINE) is not None
+
 
 app = typer.Typer(
     name=PROGRAM,
-    cls=make_verb_group(VERBS, HOMES),
+    cls=VerbGroup,
     pretty_exceptions_enable=False,
     context_settings={"max_content_width": MAX_HELP_WIDTH, "help_option_names": HELP_OPTIONS},
     epilog=EPILOG,
@@ -198,7 +377,7 @@ def _run(words: Sequence[str], debug: bool) -> Any:
     """Run a verb and return its exit status."""
     try:
         words = convert_quantities(words)
-        text = find_help(app, words)
+        text = find_help(words)
         if text is not None:
             print(text)
         status = 0 if text else app(words, prog_name=PROGRAM, standalone_mode=False)

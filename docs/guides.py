@@ -17,9 +17,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from apps.cli import main
+from apps.cli import PROGRAM, main
 from apps.figures.style import store_picture
-from apps.help import PROGRAM
 
 BLOCK_PATTERN = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PICTURE_PATTERN = re.compile(r"!\[[^\]]*\]\((pictures/[^)]+)\)")

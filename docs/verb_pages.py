@@ -10,8 +10,7 @@ from pathlib import Path
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperOption
 
-from apps.cli import VERB_OVERVIEW, app
-from apps.help import EPILOG, PROGRAM, split_docstring, walk_verbs
+from apps.cli import EPILOG, PROGRAM, VERB_OVERVIEW, app, split_docstring, walk_verbs
 
 COMPLETION_NOTE = """\
 `tofclip --install-completion` teaches the shell that it is called from (bash, zsh or fish) to complete verbs, options

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apps.help import make_group
+from apps.cli import make_group
 from apps.options import JSON, arg, opt
 from apps.progress import show_progress
 from apps.report import RECORD_SUFFIXES, build_provenance, report, require_writable
@@ -26,7 +26,7 @@ ENCODERS = (
 SURFACES = "surfaces"
 READABLE = "NPZ, HDF5, EXR with a part per view, or a folder."
 
-app = make_group("Light fields from few nonlocal measurements.")
+app = make_group("clip")
 
 
 @app.command()

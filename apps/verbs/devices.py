@@ -12,7 +12,7 @@ from typing import Any
 
 import typer
 
-from apps.help import make_group
+from apps.cli import make_group
 from apps.options import JSON, arg, opt
 from apps.progress import show_share
 from apps.report import RECORD_SUFFIXES, build_provenance, may_replace, report, require_writable
@@ -22,9 +22,7 @@ EXIT_DAMAGED = 2
 ADDRESS = arg("URI", "Such as timetag://SERIAL, file://run.h5 or 'sim+timetag://?seed=1'.")
 RECORDING = arg("H5", "Made by tofclip record.", read=True)
 
-app = make_group(
-    "Streak cameras, SPAD sensors, time taggers and their recordings, which tofclip record makes."
-)
+app = make_group("devices")
 
 
 @app.command("list")

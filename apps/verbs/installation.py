@@ -24,7 +24,7 @@ from typing import Any
 
 import typer
 
-from apps.help import EXIT_INTERRUPTED
+from apps.cli import EXIT_INTERRUPTED
 from apps.options import JSON, SEED, arg, opt
 from apps.progress import show_activity, show_progress
 from apps.report import build_provenance, make_folder, report, require_new

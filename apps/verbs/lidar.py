@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apps.help import make_group
+from apps.cli import make_group
 from apps.options import (
     BIN_WIDTH,
     CAMERA,
@@ -40,9 +40,7 @@ from tofclip.files import PICTURE_SUFFIXES
 if TYPE_CHECKING:
     from tofclip.lidar.ros import StampedCloud
 
-app = make_group(
-    "How well a range can be known, and how the views' parallax grows with it; many shots in a row."
-)
+app = make_group("lidar")
 app.command()(photons)
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
-from apps.help import make_group
+from apps.cli import make_group
 from apps.options import (
     CLUSTER,
     DEVICE,
@@ -84,7 +84,7 @@ BLUR_FACTOR = 1.2
 `nlos.resolution`.
 """
 
-app = make_group("Image the scene hidden around a corner.")
+app = make_group("nlos")
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import contextlib
 import time
 from pathlib import Path
 
-from apps.help import make_group
+from apps.cli import make_group
 from apps.options import JSON, NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, flag, opt
 from apps.progress import show_activity, show_progress
 from apps.report import make_folder, report, require_new, require_writable
@@ -20,9 +20,7 @@ SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board"
 SIDE_PX, LIVE_SIDE_PX = 128, 64
 """Rows and columns of the picture, unless given: a page shows a step every second."""
 
-app = make_group(
-    "See through occluders: which places no view can see, and a demonstration of the others."
-)
+app = make_group("occlusion")
 
 
 @app.command()

@@ -15,9 +15,8 @@ import typer
 from verb_pages import collect_verbs, render_page, write_pages
 
 import tofclip
-from apps.cli import COMPLETION_VARIABLE, VERB_OVERVIEW, app
+from apps.cli import COMPLETION_VARIABLE, VERB_OVERVIEW, app, split_docstring, wrap_command
 from apps.cli import VERBS as LINES
-from apps.help import split_docstring, wrap_command
 from apps.studies.report import find_studies
 
 ROOT = Path(tofclip.__file__).parents[1]

@@ -13,7 +13,7 @@ import pytest
 from small_instrument import HIDDEN_POINT, HIDDEN_SCENE
 from verb_pages import collect_verbs
 
-from apps.help import split_docstring
+from apps.cli import split_docstring
 from nlos import Capture, Grid, Volume
 from nlos.analysis import find_sampling_step
 from nlos.export import Mesh

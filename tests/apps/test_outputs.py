@@ -12,8 +12,7 @@ import typer
 from small_instrument import Outcome, Shell
 
 import tofclip
-from apps.cli import app
-from apps.help import walk_verbs
+from apps.cli import app, walk_verbs
 from tofclip.errors import InputError
 from tofclip.files import require_apart
 from tofclip.storage import Record
