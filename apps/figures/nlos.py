@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-    from apps.verbs.nlos_scenes import DemoRun
+    from apps.verbs.nlos_imaging import DemoRun
     from nlos import Capture, Volume
     from nlos.known_scenes import HiddenTruth
 

@@ -46,14 +46,16 @@ from apps.verbs.nlos_imaging import (
     ImagingSettings,
     add_provenance,
     choose_methods,
+    compare,
+    demo,
     image_capture,
     is_capture_folder,
     list_captures,
     prepare_imaging,
     require_valid_settings,
     show_settings,
+    simulate,
 )
-from apps.verbs.nlos_scenes import compare, demo, simulate
 from apps.verbs.nlos_stream import film, stream
 from nlos.settings import METHODS, Settings
 from tofclip.errors import InputError

@@ -1,5 +1,6 @@
-"""What the verbs around corners share: captures on disk, and captures imaged as settings ask, under
-a bar and with a watch on time and memory.
+"""What the verbs around corners share: captures on disk, and captures imaged as settings ask, under a bar
+and with a watch on time and memory. `tofclip nlos compare`, `simulate` and `demo`: several methods side
+by side, captures of known hidden scenes, and both together.
 """
 
 from __future__ import annotations
@@ -8,20 +9,44 @@ import contextlib
 import ctypes
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from apps.options import arg, find_key
+from apps.options import (
+    JSON,
+    PICTURE_FORMATS,
+    SEED,
+    SETTINGS,
+    add_setting_flags,
+    arg,
+    find_key,
+    load_settings,
+    opt,
+    save_settings,
+    setting,
+    settings_to_dict,
+)
 from apps.progress import show_activity, show_progress
-from apps.report import build_provenance
+from apps.report import (
+    RECORD_SUFFIXES,
+    build_provenance,
+    make_folder,
+    name_beside,
+    report,
+    require_new,
+    require_writable,
+)
+from nlos.known_scenes import SceneSettings
 from nlos.settings import METHODS, METHODS_BY_SPEED, Settings, list_taken
 from tofclip.errors import InputError
+from tofclip.files import PICTURE_SUFFIXES, require_apart
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid, Method, Plan, Volume
     from nlos.imaging import PreparedImaging
+    from nlos.known_scenes import HiddenTruth
     from tofclip.arrays import ComputeDevice
 
 PORTABLE_METHODS = METHODS_BY_SPEED
@@ -141,25 +166,20 @@ def prepare_imaging(
 ) -> PreparedImaging[Imaging]:
     """Do what `nlos.imaging.prepare_imaging` does, under a progress bar."""
     from nlos import imaging
+    from nlos.band import Band, VirtualPulse
+    from nlos.illumination import describe_aliasing
 
     with show_activity("finding settings"):
         wanted = imaging.complete_settings(recorded, wanted)
     prepared = imaging.prepare_imaging(recorded, wanted, device, image_capture)
-    _warn_of_given_wavelength(prepared.capture, prepared.settings)
+    found, capture = prepared.settings, prepared.capture
+    is_taken = "wavelength" in list_taken(found.method or METHODS_BY_SPEED[0])
+    # One that was found was so with the wall's sampling in mind; a given one may make false images.
+    if found.wavelength is not None and "wavelength" not in found.reasons and is_taken:
+        band = Band(VirtualPulse(found.wavelength, found.cycles), capture.axis)
+        if text := describe_aliasing(capture, band):
+            print(f"tofclip: warning: {text}", file=sys.stderr)
     return prepared
-
-
-def _warn_of_given_wavelength(capture: Capture, found: Settings) -> None:
-    """Warn of false images; a wavelength that was found was so with the wall's sampling in mind."""
-    from nlos.band import Band, VirtualPulse
-    from nlos.illumination import describe_aliasing
-
-    wavelength, taken = found.wavelength, list_taken(found.method or METHODS_BY_SPEED[0])
-    if wavelength is None or "wavelength" in found.reasons or "wavelength" not in taken:
-        return
-    band = Band(VirtualPulse(wavelength, found.cycles), capture.axis)
-    if text := describe_aliasing(capture, band):
-        print(f"tofclip: warning: {text}", file=sys.stderr)
 
 
 def image_capture(title: str, plan: Plan, capture: Capture) -> Volume:
@@ -229,3 +249,280 @@ def _read_process_memory(entry: str) -> int | None:
         return None
     found = next((line for line in lines if line.startswith(f"{entry}:")), None)
     return None if found is None else int(found.split()[1]) * 1024
+
+
+WALL_SHAPE, WALL_POINTS = "cylinder", 64
+FACET_M = 0.03
+LETTERS = (("3", -0.27, 0.9, 0.5), ("D", 0.27, 1.15, 1.0))
+"""Of the demonstration: text, x and depth in m, and albedo: the nearer one is of grey paper, or it
+would outshine the other.
+"""
+
+LETTER_HEIGHT_M = 0.62
+BINS, BIN_WIDTH_S, JITTER_S = 480, 32e-12, 25e-12
+PEAK_COUNTS, BACKGROUND_COUNTS = 200.0, 0.5
+WAVELENGTH_M, VOXEL_M = 0.125, 0.012
+BOX_M = ((-0.8, 0.8), (-0.5, 0.5), (0.72, 1.32))
+
+
+@dataclass(frozen=True)
+class CompareSettings(ImagingSettings):
+    """What is compared on one capture."""
+
+    methods: str | None = setting(
+        "A,B,...",
+        f"Of {', '.join(METHODS.own)}; the first is the reference.",
+        shown="all that suit the capture",
+        choices=METHODS,
+    )
+
+
+@add_setting_flags(CompareSettings)
+def compare(
+    source: Path = CAPTURE,
+    out: Path = opt("PNG", f"The picture to write: {PICTURE_FORMATS}.", ...),
+    volumes: Path | None = opt("DIR", "Folder for the volumes, one file per method."),
+    settings: Path | None = SETTINGS,
+    as_json: bool = JSON,
+    **flags: Any,
+) -> None:
+    """Image one capture by several methods, and show images, time, memory and figures of merit side
+    by side.
+
+    The correlation is that of the front views with the first method's. The sharpness says how far
+    the light of the front view is gathered, which is good only where it is gathered in the right
+    place: captures of nlos simulate carry the truth, and for them the share of energy near hidden
+    things and the contrast against the rest are reported.
+
+    The settings that were given or found are written beside the picture (.toml) and give the same
+    comparison.
+
+    Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
+    """
+    from apps.figures.nlos import make_comparison_figure
+    from nlos.io import read_capture
+    from nlos.known_scenes import (
+        HiddenTruth,
+        compare_with_truth,
+        correlate_views,
+        measure_sharpness,
+    )
+    from tofclip.notebook import save_figure
+
+    wanted = load_settings(CompareSettings, settings, flags)
+    written = [out, name_beside(out, ".toml")]
+    require_writable(out, *PICTURE_SUFFIXES, inputs=(source, settings))
+    require_writable(written[1], inputs=(source, settings))
+    # Everything that can be refused is refused before the capture is read.
+    names = tuple(METHODS.own) if wanted.methods is None else parse_method_names(wanted.methods)
+    require_valid_settings(wanted, names)
+    if volumes is not None:
+        require_apart([volumes, *(volumes / f"{name}.h5" for name in METHODS)], [source, settings])
+        make_folder(volumes)
+    capture, truth = read_capture(source), HiddenTruth.load(source)
+    # The voxels are those of the virtual pulse, for all methods alike.
+    prepared = prepare_imaging(capture, wanted)
+    chosen, left_out = _choose_methods(names, wanted.methods is not None, prepared)
+    runs: dict[str, MeasuredVolume] = {}
+    figures: dict[str, dict[str, Any]] = {}
+    for name in chosen:
+        method = prepared.settings.make_method(name)
+        runs[name] = run = measure_imaging(name, method, prepared.capture, prepared.grid)
+        figures[name] = {
+            **run.costs,
+            "correlation": correlate_views(run.volume, runs[chosen[0]].volume),
+            "sharpness": measure_sharpness(run.volume),
+            **({} if truth is None else compare_with_truth(run.volume, truth)),
+        }
+    images = {name: run.volume for name, run in runs.items()}
+    save_figure(make_comparison_figure(images, figures, truth), out)
+    found = replace(show_settings(prepared.settings, chosen), methods=",".join(chosen))
+    for name, volume in images.items() if volumes is not None else ():
+        path = cast("Path", volumes) / f"{name}.h5"
+        past = {"verb": "nlos compare", "method": name, **settings_to_dict(found)}
+        add_provenance(volume, source, past).save(path)
+        written.append(path)
+    save_settings(found, written[1], "tofclip nlos compare CAPTURE --settings THIS --out PICTURE")
+    shape = {"voxels": prepared.grid.shape}
+    if as_json:
+        report({**shape, "methods": figures, "left_out": left_out}, as_json)
+        return
+    lines = {name: _format_line(one) for name, one in figures.items()}
+    reasons = {name: f"no: {reason}" for name, reason in left_out.items()}
+    report({**shape, **lines, **reasons}, as_json, written)
+
+
+def _choose_methods(
+    names: Sequence[str], named: bool, prepared: PreparedImaging[CompareSettings]
+) -> tuple[list[str], dict[str, str]]:
+    """Choose methods that suit; of those that were not named by the user the others are left out,
+    with the reason.
+    """
+    left_out = {}
+    for name in names:
+        try:
+            # A plan checks the geometry without imaging, and so is cheap.
+            prepared.settings.make_method(name).plan(prepared.capture, prepared.grid)
+        except InputError as refused:
+            left_out[name] = str(refused)
+    # A method that was named must not vanish silently; of all methods, one has to remain.
+    if left_out and (named or len(left_out) == len(names)):
+        name, reason = next(iter(left_out.items()))
+        raise InputError(f"{name} does not suit this capture: {reason}")
+    return [name for name in names if name not in left_out], left_out
+
+
+def _format_line(figures: Mapping[str, Any]) -> str:
+    """Put a method's figures into columns that stand below those of other methods."""
+    memory = "" if figures["peak_mib"] is None else f"{figures['peak_mib']:7.0f} MiB"
+    line = f"{figures['seconds']:8.2f} s{memory}  correlation {figures['correlation']:6.3f}"
+    line += f"  sharpness {figures['sharpness']:5.2f}"
+    if "energy_near_truth" in figures:
+        line += f"  near truth {figures['energy_near_truth']:4.0%}  contrast {figures['contrast_to_truth']:5.1f}"
+    return line
+
+
+@add_setting_flags(SceneSettings)
+def simulate(
+    out: Path = opt("H5", "The capture to write.", ...),
+    settings: Path | None = SETTINGS,
+    as_json: bool = JSON,
+    **flags: Any,
+) -> None:
+    """Simulate the capture of a known hidden scene before a relay wall.
+
+    Letters and meshes hide what is behind them; light that meets several surfaces is left out. The
+    capture carries the truth, for nlos compare. The settings are written beside it (.toml).
+
+    Example: tofclip nlos simulate --letters T --wall cylinder --wall-points 32 --out capture.h5
+    """
+    from nlos.known_scenes import simulate_scene
+
+    chosen = load_settings(SceneSettings, settings, flags)
+    inputs = [Path(path) for path in (settings, chosen.mesh) if path]
+    beside = name_beside(out, ".toml")
+    require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
+    require_writable(beside, inputs=inputs)
+    started = time.perf_counter()
+    capture, truth = simulate_scene(chosen)
+    known = {"verb": "nlos simulate", **settings_to_dict(chosen)}
+    past = build_provenance(known, *inputs, earlier=capture.provenance)
+    truth.attach_to_record(replace(capture, provenance=past)).save(out)
+    save_settings(chosen, beside, "tofclip nlos simulate --settings THIS --out CAPTURE")
+    figures = {
+        "wall_points": len(capture.points),
+        "bins": capture.axis.bins,
+        "path_m": [float(capture.axis.paths[0]), float(capture.axis.paths[-1])],
+        "hidden_facets": len(truth.positions),
+        "largest": float(capture.signal.max()),
+        "total": float(capture.signal.sum(dtype="float64")),
+        "seconds": time.perf_counter() - started,
+    }
+    report(figures, as_json, [out, beside])
+
+
+@dataclass(frozen=True)
+class DemoRun:
+    """Everything that a demonstration made."""
+
+    capture: Capture
+    truth: HiddenTruth
+    # by method; ``flat`` is the hybrid method for a wall without its depth
+    images: Mapping[str, MeasuredVolume]
+    wavelength: float  # of all methods, m
+
+
+def demo(
+    out: Path = opt("DIR", "Folder for the results; made if missing.", Path("nlos-demo-output")),
+    png: Path | None = opt(
+        "PNG", f"The picture to write: {PICTURE_FORMATS}.", shown="nlos_demo.png in --out"
+    ),
+    seed: int = SEED,
+    as_json: bool = JSON,
+) -> None:
+    """Hide two characters before a curved wall, simulate what the wall shows, and image them by two
+    methods.
+
+    The hybrid method and back-projection give the same picture; the times are those of this run, on
+    this machine. As if the wall were flat, the same signal gives none. Writes capture.h5,
+    hybrid.h5, backprojection.h5 and the picture.
+
+    Example: tofclip nlos demo --out nlos-demo-output
+    """
+    from apps.figures.nlos import make_demo_figure
+    from nlos.known_scenes import compare_with_truth, correlate_views
+    from tofclip.notebook import save_figure
+
+    started = time.perf_counter()
+    make_folder(out)
+    picture = out / "nlos_demo.png" if png is None else png
+    # Before the simulation and three images, which take a while.
+    require_writable(picture, *PICTURE_SUFFIXES)
+    written = [out / f"{name}.h5" for name in ("capture", "hybrid", "backprojection")]
+    require_new(*written)
+    run = run_demo(seed)
+    run.truth.attach_to_record(run.capture).save(written[0])
+    for path in written[1:]:
+        run.images[path.stem].volume.save(path)
+    save_figure(make_demo_figure(run), picture)
+    slow = run.images["backprojection"]
+    figures = {
+        "seed": seed,
+        "wall_points": len(run.capture.points),
+        "voxels": slow.volume.grid.shape,
+        **{
+            name: {
+                **image.costs,
+                "correlation": correlate_views(image.volume, slow.volume),
+                **compare_with_truth(image.volume, run.truth),
+            }
+            for name, image in run.images.items()
+        },
+        "times_faster": slow.seconds / run.images["hybrid"].seconds,
+        "seconds": time.perf_counter() - started,
+    }
+    report(figures, as_json, [*written, picture])
+
+
+def run_demo(seed: int) -> DemoRun:
+    """The whole way, from a scene to three images."""
+    from nlos import Backprojection, Grid, Hybrid
+
+    with show_activity("simulating"):
+        capture, truth = _simulate_letters(seed)
+    past = build_provenance({"verb": "nlos demo", "seed": seed}, earlier=capture.provenance)
+    capture = replace(capture, provenance=past)
+    grid, hybrid, slow = (
+        Grid.box(*BOX_M, VOXEL_M),
+        Hybrid(WAVELENGTH_M),
+        Backprojection(WAVELENGTH_M),
+    )
+    # The same signals with the curve ignored show what knowing the wall is worth.
+    wall, laser = capture.wall.copy(), capture.laser.copy()
+    wall[..., 2] = laser[..., 2] = 0.0
+    flat = replace(capture, wall=wall, laser=laser)
+    images = {
+        "hybrid": measure_imaging("hybrid", hybrid, capture, grid),
+        "backprojection": measure_imaging("backprojection", slow, capture, grid),
+        "flat": measure_imaging("as if flat", hybrid, flat, grid),
+    }
+    return DemoRun(capture, truth, images, WAVELENGTH_M)
+
+
+def _simulate_letters(seed: int) -> tuple[Capture, HiddenTruth]:
+    import numpy as np
+
+    from nlos.capture import TimeAxis
+    from nlos.known_scenes import HiddenTruth, find_nearest_wall_point
+    from nlos.simulate import HiddenScene, Lambert, Surface, add_poisson_noise, build_relay_wall
+
+    surfaces = [
+        Surface.letters(text, (x, 0.0, z), LETTER_HEIGHT_M, FACET_M, Lambert(albedo))
+        for text, x, z, albedo in LETTERS
+    ]
+    wall = build_relay_wall(WALL_SHAPE, WALL_POINTS)
+    spot = find_nearest_wall_point(wall, (0.0, 0.0))
+    axis = TimeAxis(BINS, BIN_WIDTH_S)
+    expected = HiddenScene(surfaces).simulate_capture(wall, spot, axis, JITTER_S)
+    truth = HiddenTruth(np.concatenate([surface.positions for surface in surfaces]), FACET_M)
+    return add_poisson_noise(expected, PEAK_COUNTS, BACKGROUND_COUNTS, seed), truth

@@ -22,7 +22,7 @@ from apps.options import load_settings, save_settings, setting, settings_to_dict
 from apps.progress import show_progress
 from apps.report import build_provenance, make_folder, report, require_writable, to_json_value
 from apps.verbs.nlos import ReconstructSettings
-from apps.verbs.nlos_scenes import CompareSettings
+from apps.verbs.nlos_imaging import CompareSettings
 from nlos import simulate
 from nlos.known_scenes import WALLS, SceneSettings
 from tofclip import Frames, Streak
