@@ -57,15 +57,12 @@ AS_WRITTEN = "\b\n"  # before a paragraph whose lines typer must not join
 MAX_EXAMPLE_WIDTH = 72  # columns, which with the indentation fit the narrowest usual terminal
 MAX_HELP_WIDTH = 100  # columns, on a terminal that has them
 
+POWERS = {
+    "length": {"um": -6, "mm": -3, "cm": -2, "m": 0},
+    "time": {"fs": -15, "ps": -12, "ns": -9, "us": -6, "ms": -3, "s": 0},
+}
 QUANTITIES = {
-    **{
-        name: ("length", 10.0**power)
-        for name, power in (("um", -6), ("mm", -3), ("cm", -2), ("m", 0))
-    },
-    **{
-        name: ("time", 10.0**power)
-        for name, power in (("fs", -15), ("ps", -12), ("ns", -9), ("us", -6), ("ms", -3), ("s", 0))
-    },
+    unit: (kind, 10.0**power) for kind, units in POWERS.items() for unit, power in units.items()
 }
 """Units that a value may carry, such as 20ps, and that options' names end in: kind, and in SI units."""
 QUANTITY = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?) ?(?P<unit>[^\W\d_]+)")

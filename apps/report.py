@@ -25,18 +25,13 @@ MAX_TABLE_WIDTH = 100  # columns of a terminal for several things side by side
 UNITS = {"m", "mm", "s", "ns", "ps", "px"}
 ARGUMENT_IN_MESSAGE = re.compile(r"`(?P<name>[a-z_]+)(?:=\"?(?P<value>[^`\"]*)\"?)?`")
 OPTIONS_OF_ARGUMENTS = {
-    "axes": "--axes",
+    name: f"--{name.replace('_', '-')}"
+    for name in ["axes", "device", "focus", "method", "overwrite", "region", "set", "single_pixel"]
+} | {
     "bin_width": "--bin-width-ps",
     "camera": "--camera camera.h5",
-    "device": "--device",
-    "focus": "--focus",
     "gate": "--gate-m",
-    "method": "--method",
-    "overwrite": "--overwrite",
     "pulse": "--pulse-ps",
-    "region": "--region",
-    "set": "--set",
-    "single_pixel": "--single-pixel",
     "target": "--target-m",
     "time_zero": "--time-zero-ns",
 }

@@ -113,7 +113,11 @@ def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult])
     truth. `probes`: small targets on the axis, drawn with a tick or a cross.
     """
     figure = make_figure(13, 7)
-    figure.suptitle(_format_headline(experiment), fontsize=SMALL_FONT_PT + 5)
+    views, side = len(experiment.rig.array.views), experiment.settings.side_px
+    pixels = " \N{MULTIPLICATION SIGN} ".join(map(str, (views, side, side)))
+    title, measurements = experiment.scene.title, experiment.rig.camera.measurements
+    title = f"{title[0].upper()}{title[1:]}, seen with {measurements} measurements instead of {pixels} pixels"
+    figure.suptitle(title, fontsize=SMALL_FONT_PT + 5)
     halves: Any = figure.subfigures(2, 1, height_ratios=[1.15, 1])
     upper, lower = halves
     plan, time = upper.subplots(1, 2, width_ratios=[1.8, 1])
@@ -131,14 +135,6 @@ def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult])
             axes.set_xlabel(f"correlation {found:.2f}", fontsize=SMALL_FONT_PT + 2, color=colour)
     letter_panels([plan, time, *panels])
     return figure
-
-
-def _format_headline(experiment: Experiment) -> str:
-    measurements, side = experiment.rig.camera.measurements, experiment.settings.side_px
-    views = len(experiment.rig.array.views)
-    pixels = " \N{MULTIPLICATION SIGN} ".join(map(str, (views, side, side)))
-    title = experiment.scene.title
-    return f"{title[0].upper()}{title[1:]}, seen with {measurements} measurements instead of {pixels} pixels"
 
 
 def _select_pictures(experiment: Experiment) -> list[tuple[str, NDArray[Any], NDArray[Any] | None]]:

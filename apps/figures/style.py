@@ -93,23 +93,22 @@ def store_picture(picture: Path, place: Path) -> None:
     from PIL import Image
 
     drawn = picture.read_bytes()
+
+    def compress(image: Image.Image) -> bytes:
+        file = io.BytesIO()
+        image.save(file, format="PNG", optimize=True)
+        return file.getvalue()
+
     if picture.suffix.lower() == ".png":
-        with Image.open(picture) as opened:
-            if opened.width > PAGE_WIDTH_PX:
-                whole, file = opened.convert("RGB"), io.BytesIO()
-                whole.thumbnail((PAGE_WIDTH_PX, PAGE_WIDTH_PX**2), Image.Resampling.LANCZOS)
-                whole.save(file, format="PNG", optimize=True)
-                drawn = file.getvalue()
-    for most, colours in FEWER_COLOURS.items():
-        if len(drawn) <= most or picture.suffix.lower() != ".png":
-            break
         with Image.open(io.BytesIO(drawn)) as opened:
             whole = opened.convert("RGB")
-        if colours:
-            whole = whole.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-        file = io.BytesIO()
-        whole.save(file, format="PNG", optimize=True)
-        drawn = file.getvalue()
+        if whole.width > PAGE_WIDTH_PX:
+            whole.thumbnail((PAGE_WIDTH_PX, PAGE_WIDTH_PX**2), Image.Resampling.LANCZOS)
+            drawn = compress(whole)
+        for most, colours in FEWER_COLOURS.items():
+            if len(drawn) > most:
+                look: Any = {"method": Image.Quantize.MAXCOVERAGE, "dither": Image.Dither.NONE}
+                drawn = compress(whole.quantize(colours, **look) if colours else whole)
     with atomic_path(place) as temporary:
         temporary.write_bytes(drawn)
 

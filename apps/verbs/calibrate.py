@@ -187,7 +187,14 @@ def calibrate_range(
     with show_progress("looking at the target", len(shots)) as advance:
         for shot, distance, percent in zip(shots, distances, percents, strict=True):
             one = replace(reader.read(shot, distance), reflectance_percent=percent)
-            seen.append(one if region is None else _cut(one, region))
+            if region is not None:
+                (top, bottom, left, right), y, x = region, one.returns.y, one.returns.x
+                rows, columns = one.returns.camera.image_shape
+                if not (0 <= top < bottom <= rows and 0 <= left < right <= columns):
+                    said = f"the picture has rows 0..{rows} and columns 0..{columns}"
+                    raise InputError(f"--region: {said}")
+                one = one.cut((y >= top) & (y < bottom) & (x >= left) & (x < right))
+            seen.append(one)
             advance(1)
     found = fit_range_calibration(seen, walk=walk)
     found.camera.save(out)
@@ -202,16 +209,6 @@ def _one_each(values: list[float], shots: int, option: str) -> list[float]:
             f"{option}: give one for all {shots} shots or one for each, got {len(values)}"
         )
     return values * shots if len(values) == 1 else values
-
-
-def _cut(shot: TargetShot, region: tuple[int, int, int, int]) -> TargetShot:
-    """Leave the returns within some rows and columns."""
-    top, bottom, left, right = region
-    rows, columns = shot.returns.camera.image_shape
-    if not (0 <= top < bottom <= rows and 0 <= left < right <= columns):
-        raise InputError(f"--region: the picture has rows 0..{rows} and columns 0..{columns}")
-    y, x = shot.returns.y, shot.returns.x
-    return shot.cut((y >= top) & (y < bottom) & (x >= left) & (x < right))
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ from tofclip.files import require_apart
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
-    from nlos import Capture, Plan, Volume
+    from nlos import Capture, Volume
     from nlos.imaging import PreparedImaging
 
 POLL_INTERVAL_S = 0.02
@@ -121,6 +121,9 @@ def stream(
 
     Example: tofclip nlos stream captures/ --out volumes/
     """
+    from nlos.method import PhasorPlan
+    from nlos.video import DepthAverage
+
     wanted = replace(load_settings(StreamSettings, settings, flags), everywhere=True)
     _check_stream(wanted, follow_s, captures)
     renderings = (path.parent for path in source.glob(f"*/{GEOMETRY_FILE}"))
@@ -139,7 +142,11 @@ def stream(
     make_folder(out)  # only now: captures that cannot be imaged leave no empty folder
     heading = "tofclip nlos stream SOURCE --settings THIS --out FOLDER"
     save_settings(show_settings(prepared.settings, [method or ""]), out / SETTINGS_NAME, heading)
-    imaging = _choose_imaging(plan, prepared, wanted.average)
+    imaging = plan.image
+    if wanted.average > 1 and isinstance(plan, PhasorPlan):
+        waves, far = plan.field, float(prepared.capture.points[:, 2].max())
+        average = DepthAverage(plan.grid, far, wanted.average)
+        imaging = lambda capture: average.add(waves(capture))  # noqa: E731
     made = VolumeStream(chain([first], coming), prepared, imaging, out, follow_s > 0)
     figures = _run_with_page(made, source) if view else made.run()
     figures = {"method": method, "voxels": prepared.grid.shape, **figures, "plan_s": planned}
@@ -162,19 +169,6 @@ def _check_stream(wanted: StreamSettings, follow_s: float, captures: int | None)
         raise InputError(f"--follow-s must be 0 s or more, got {follow_s}")
     if captures is not None and captures < 1:
         raise InputError(f"--captures must be positive, got {captures}")
-
-
-def _choose_imaging(
-    plan: Plan, prepared: PreparedImaging[StreamSettings], captures: int
-) -> Callable[[Capture], Volume]:
-    """Return what images a capture: the plan, or the plan and an average over depth."""
-    from nlos.method import PhasorPlan
-    from nlos.video import DepthAverage
-
-    if captures == 1 or not isinstance(plan, PhasorPlan):
-        return plan.image
-    average = DepthAverage(plan.grid, float(prepared.capture.points[:, 2].max()), captures)
-    return lambda capture: average.add(plan.field(capture))
 
 
 class _NamedCapture(NamedTuple):

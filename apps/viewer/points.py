@@ -94,18 +94,6 @@ class DetailChooser:
         )
 
 
-def time_frame(client: viser.ClientHandle) -> float:
-    """Return how long a browser takes to draw what it shows, s. It is asked for something that it
-    does not have: it answers once in each frame.
-    """
-    started = 0.0
-    for number in range(WARM_UP_FRAMES + TIMED_FRAMES):
-        if number == WARM_UP_FRAMES:
-            started = time.perf_counter()
-        client.local_storage.get_item("tofclip-drawn", ANSWER_TIMEOUT_S)
-    return (time.perf_counter() - started) / TIMED_FRAMES
-
-
 class Points:
     """The points or the surface in the scene. Of a large cloud a part is drawn: fewer while it moves,
     as many as the slowest browser can draw while it stands still. `post`: takes what is to be done
@@ -240,11 +228,16 @@ class Points:
 
     def _time_browser(self, client: viser.ClientHandle) -> None:
         """Time a browser's frames, on a thread of its own; a movement meanwhile makes it void."""
-        started, points, seconds = time.monotonic(), self.drawn, np.inf
+        started, points, seconds, began = time.monotonic(), self.drawn, np.inf, 0.0
         browser, rates = client.client_id, self.detail.points_per_s
         # a browser that has gone, or keeps no storage, is not waited for
         with contextlib.suppress(RuntimeError, TimeoutError):
-            seconds = time_frame(client)
+            # It is asked for something that it does not have: it answers once in each frame.
+            for number in range(WARM_UP_FRAMES + TIMED_FRAMES):
+                if number == WARM_UP_FRAMES:
+                    began = time.perf_counter()
+                client.local_storage.get_item("tofclip-drawn", ANSWER_TIMEOUT_S)
+            seconds = (time.perf_counter() - began) / TIMED_FRAMES
 
         def learn() -> None:
             self._timing.discard(browser)

@@ -207,7 +207,11 @@ class LayeredSource(Source):
         if not views:
             return replace(lead.select(np.zeros(len(lead.cloud), bool)), surface=None)
         shifts = np.repeat([self._width * self.shifts[n].value for n in shown], sizes)
-        cloud = _join_clouds(clouds)
+        names = [name for name, one in vars(clouds[0]).items() if isinstance(one, np.ndarray)]
+        joined: Any = {
+            name: np.concatenate([getattr(one, name) for one in clouds]) for name in names
+        }
+        cloud = PointCloud(**joined)
         aside = np.stack([shifts, 0 * shifts, 0 * shifts], axis=1).astype(np.float32)
         surfaces = [one.surface for one in views if one.surface is not None]
         return replace(
@@ -247,9 +251,3 @@ class LayeredSource(Source):
 
 def _fill(values: NDArray[Any] | None, shape: tuple[int, ...], by: Any) -> NDArray[Any]:
     return np.full(shape, by) if values is None else values
-
-
-def _join_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
-    names = [name for name, column in vars(clouds[0]).items() if isinstance(column, np.ndarray)]
-    columns: Any = {name: np.concatenate([getattr(one, name) for one in clouds]) for name in names}
-    return PointCloud(**columns)
