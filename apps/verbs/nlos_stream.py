@@ -142,7 +142,7 @@ def stream(
     make_folder(out)  # only now: captures that cannot be imaged leave no empty folder
     heading = "tofclip nlos stream SOURCE --settings THIS --out FOLDER"
     save_settings(show_settings(prepared.settings, [method or ""]), out / SETTINGS_NAME, heading)
-    imaging = plan.image
+    imaging: Callable[[Capture], Volume] = plan.image
     if wanted.average > 1 and isinstance(plan, PhasorPlan):
         waves, far = plan.field, float(prepared.capture.points[:, 2].max())
         average = DepthAverage(plan.grid, far, wanted.average)
