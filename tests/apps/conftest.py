@@ -23,7 +23,7 @@ from small_instrument import (
     wall_shot,
 )
 
-from apps.verbs import nlos_scenes
+from apps.verbs import nlos_imaging
 from tofclip.camera import Camera, SkewSweep
 from tofclip.shots import Streak
 
@@ -121,5 +121,5 @@ def hidden_letters(request: pytest.FixtureRequest, letters_folder: Path) -> dict
     small = {"WALL_POINTS": 24, "FACET_M": 0.06, "WAVELENGTH_M": 0.34, "VOXEL_M": 0.06}
     with pytest.MonkeyPatch.context() as coarser:
         for name, value in small.items():
-            coarser.setattr(nlos_scenes, name, value)
+            coarser.setattr(nlos_imaging, name, value)
         return Shell(request).figures("nlos demo --out {letters_folder} --seed 1")
