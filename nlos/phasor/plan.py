@@ -347,7 +347,7 @@ class PlanarRSD(WaveMethod):
 # wall's rim cuts off, for fields that fade as `VirtualPlane`'s.
 RIM_ERROR, RIM_POWER = 0.01, 0.47
 # Of the error allowed, what the virtual plane's rim, and the way from the wall to it, may take.
-RIM_ERROR_FRACTION, WALL_TO_PLANE_ERROR_FRACTION = 0.3, 0.6
+RIM_ERROR_FRACTION, WALL_TO_PLANE_ERROR_FRACTION = 0.25, 0.6
 # Of all time, what the way from the wall to the plane takes, roughly.
 WALL_TO_PLANE_TIME_FRACTIONS = {"spectral": 0.4, "time": 0.95}
 

@@ -21,8 +21,8 @@ Sides = tuple[float, float]
 # Where the window begins to fall at least, relative to the largest distance of a source and a
 # target, and how much farther out for each digit of the tolerance. Between two squares few pairs
 # are so far apart: independent signals (noise) miss some 0.1 % of their amplitude beyond 0.87, 0.01
-# % beyond 0.93.
-INNER_RADIUS_FRACTION, INNER_RADIUS_FRACTION_PER_DIGIT = 0.75, 0.06
+# % beyond 0.93, and of an even background, all of which is in step, ten times as much.
+INNER_RADIUS_FRACTION, INNER_RADIUS_FRACTION_PER_DIGIT = 0.67, 0.1
 # Width of the window's edge, relative to the largest distance along one axis.
 MIN_EDGE_FRACTION, MAX_EDGE_FRACTION = 0.25, 0.5
 # Lengths of single-precision Fourier transforms, among the multiples of 16, that take no longer
@@ -118,7 +118,7 @@ class Offsets:
 def find_min_periods(offsets: Offsets, tolerance: float) -> Sides:
     """Return the shortest periods along y and x in which a window has room, m."""
     inner = INNER_RADIUS_FRACTION - INNER_RADIUS_FRACTION_PER_DIGIT * np.log10(tolerance)
-    edge = inner * offsets.reach + MIN_EDGE_FRACTION * offsets.along
+    edge = min(inner, 1) * offsets.reach + MIN_EDGE_FRACTION * offsets.along
     y, x = (
         max(edge + far, extent)
         for far, extent in zip(offsets.farthest, offsets.extents, strict=True)

@@ -24,7 +24,7 @@ from nlos.capture import TimeAxis
 # are interpolated.
 GRID = Grid(np.linspace(-1, 1, 6), np.linspace(-1, 1, 4), np.linspace(0.6, 1.6, 16))
 FINE_DEPTHS = Grid(np.linspace(-1, 1, 4), np.linspace(-1, 1, 3), np.linspace(0.6, 1.6, 100))
-WALLS = [("planar", PlanarRSD), *((shape, Hybrid) for shape in SHAPES if shape != "relief")]
+WALLS = [("planar", PlanarRSD), *((shape, Hybrid) for shape in SHAPES if shape != "planar")]
 # The wall samples half of either twice: a confocal scan sees it by both ways.
 WAVELENGTHS = {"single": 0.3, "confocal": 0.4}
 LONG, SHORT = 700, 360  # bins: any path by way of the voxels, and less than some
@@ -64,7 +64,7 @@ def list_errors(
 
 
 NARROWEST = (PlanarRSD, "planar", "confocal"), (Hybrid, "wavy", "confocal")
-"""Where errors are the largest part of what is allowed: 0.75 and 0.89 of it."""
+"""Where errors are the largest part of what is allowed."""
 
 
 @pytest.mark.parametrize("bins", [LONG, SHORT])
@@ -96,7 +96,7 @@ def test_a_tolerance_is_kept_where_many_depths_are_interpolated(
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("scan", WAVELENGTHS)
-@pytest.mark.parametrize(("shape", "method"), [*WALLS, ("relief", Hybrid)])
+@pytest.mark.parametrize(("shape", "method"), WALLS)
 def test_a_tolerance_is_kept_on_64_x_64_points(
     shape: str, method: type[PlanarRSD] | type[Hybrid], scan: str
 ) -> None:
