@@ -18,7 +18,8 @@ from tofclip.errors import InputError
 
 # Steps of the mean signal's profile per width of the wall.
 PROFILE_STEPS_PER_WALL = 50
-# The wall's own light arrives within this fraction of the wall's width of its own path.
+# The wall's own light arrives within this fraction of the wall's width of its own path: earlier,
+# there is noise only, and later, hidden things.
 FIRST_BOUNCE_WALL_FRACTION = 0.1
 # The wall's own light falls at least by this factor before anything else arrives.
 MIN_BOUNCE_RATIO = 3.0
@@ -26,6 +27,8 @@ MIN_BOUNCE_RATIO = 3.0
 FADED_FRACTION = 0.1
 # Of the samples, before any light can have come, that tell the noise.
 MIN_EARLY_FRACTION = 0.02
+# Of the record, over which its window rises, and falls.
+WINDOW_EDGE_FRACTION = 0.05
 # Of all frequencies, the highest are taken for noise.
 NOISE_BAND_FRACTION = 0.25
 # Wall points whose signals are looked at.
@@ -39,7 +42,7 @@ MAX_FLOOR_SLOPE, MAX_COLOURED_SLOPE = 0.1, 1.0
 LIT_END_FRACTION = 0.01
 # Signal over noise of all wall points together that a wavelength needs: with it a letter of some
 # hundred resolved voxels stands out. Measured on recorded letters and a mannequin.
-MIN_COHERENT_SIGNAL = 800.0
+MIN_COHERENT_SIGNAL = 600.0
 # Energy that a wavelength has in the record, relative to before any light can have come.
 MIN_BAND_OVER_EARLY = 3.0
 # Of a pulse's signal, what may be of waves finer than the wall samples.
@@ -72,15 +75,16 @@ class FirstBounce:
 def find_first_bounce(capture: Capture) -> FirstBounce | None:
     """Recognise the light that the wall returns at once, after the path from the laser spot, and
     how long it lasts: it falls until hidden things' light rises. None where the record has none.
+
+    A record that begins after its arrival may begin with its tail, which falls from the first bin on.
     """
     late, level = _compute_profile(capture)
     extent = float(np.ptp(capture.points, axis=0).max())
-    if late.size < 4:
+    own = np.abs(late) <= FIRST_BOUNCE_WALL_FRACTION * extent
+    recorded = late[:1].min(initial=np.inf) <= FIRST_BOUNCE_WALL_FRACTION * extent
+    if late.size < 4 or own.all() or (recorded and not own.any()):
         return None
-    early = late <= FIRST_BOUNCE_WALL_FRACTION * extent
-    if not early.any() or early.all():
-        return None
-    peak = int(np.argmax(np.where(early, level, -np.inf)))
+    peak = int(np.argmax(np.where(own, level, -np.inf))) if recorded else 0
     # From the peak on, the lowest level before the highest that rises from it again.
     fall = np.minimum.accumulate(level[peak:])
     rise = level[peak:] - fall
@@ -90,6 +94,8 @@ def find_first_bounce(capture: Capture) -> FirstBounce | None:
     follows = float(level[valley:].max()) - lowest
     if level[peak] < MIN_BOUNCE_RATIO * max(lowest, 0.0) or level[peak] <= 0:
         return None
+    if follows <= 0 and not recorded:
+        return None  # it may be hidden things' own
     if follows <= 0:
         follows = float(level[peak]) * FADED_FRACTION
     faded = np.flatnonzero(level[peak : valley + 1] - lowest <= FADED_FRACTION * follows)
@@ -117,8 +123,11 @@ class SignalSpectrum:
     def of(cls, capture: Capture, margin: float) -> SignalSpectrum:
         """Analyse a gated capture; a wave reaches `margin` m ahead of its light."""
         traces, direct = _select_traces(capture)
-        # Waves would see an edge where the record ends while light still comes.
-        spectrum = np.fft.rfft(traces * np.hanning(traces.shape[1]), axis=1)
+        # Waves would see an edge where the record ends while light still comes. Between the ends
+        # the window is flat: light counts alike wherever in the record it comes.
+        inward = np.minimum(places := np.arange(traces.shape[1]), places[::-1])
+        rising = np.minimum(inward / (WINDOW_EDGE_FRACTION * traces.shape[1]), 1)
+        spectrum = np.fft.rfft(traces * (1 - np.cos(np.pi * rising)) / 2, axis=1)
         power = np.mean(np.abs(spectrum) ** 2, axis=0)
         floor = float(np.mean(power[-max(1, int(NOISE_BAND_FRACTION * power.size)) :]))
         early = capture.axis.paths < (direct - margin)[:, np.newaxis]

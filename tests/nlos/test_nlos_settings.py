@@ -106,6 +106,26 @@ def test_nothing_is_gated_where_the_wall_is_dark() -> None:
     assert settings_for(clean(), wavelength=0.3).wavelength == 0.3
 
 
+def test_a_record_that_begins_amid_the_walls_own_light_is_gated_alike() -> None:
+    capture = with_glare(clean(), 2.0)
+    late = replace(capture, signal=capture.signal[20:], start=20 * AXIS.spacing)
+    whole, cut = find_first_bounce(capture), find_first_bounce(late)
+    assert whole is not None
+    assert cut is not None
+    assert cut.end == pytest.approx(whole.end, rel=0.1)
+    # Of hidden light alone, its fall is not that of the wall's.
+    hidden = replace(clean(), signal=clean().signal[400 * 3 // 4 :], start=300 * AXIS.spacing)
+    assert find_first_bounce(hidden) is None
+
+
+def test_what_comes_before_the_walls_own_light_can_is_noise() -> None:
+    """Recovered frames are not dark before: their noise is no light of the wall's."""
+    capture = clean(confocal=False)
+    early = capture.axis.paths[:, None, None] < np.linalg.norm(WALL, axis=-1) - 0.15
+    noise = 0.2 * capture.signal.max() * early
+    assert find_first_bounce(replace(capture, signal=capture.signal + noise)) is None
+
+
 def test_background_is_not_the_walls_own_light() -> None:
     """Few counts before anything else, of which some are the first: nothing fades after them."""
     capture = clean(confocal=False)

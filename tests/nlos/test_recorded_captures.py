@@ -115,6 +115,7 @@ def test_settings_of_a_capture_do_not_hang_on_how_it_is_handed_over(
         signal, wall = recorded.signal[:, :32, :32], recorded.wall[:32, :32]
         recorded = replace(recorded, signal=signal, wall=wall, laser=wall)
     random, places = np.random.default_rng(0), np.arange(len(recorded.points))
+    bins = round(1e-9 / recorded.bin_width)
     half = random.binomial(recorded.signal.astype(int), 0.5).astype(np.float32)
     capture, order = replace(recorded, signal=half), random.permutation(places)
     expected = complete_settings(capture, Settings())
@@ -124,6 +125,9 @@ def test_settings_of_a_capture_do_not_hang_on_how_it_is_handed_over(
         "missing": reorder(capture, np.sort(order[places.size // 100 :])),
         "row": reorder(capture, places[math.isqrt(places.size) :]),
         "earlier": reorder(capture, places, SPEED_OF_LIGHT * 1e-9),
+        "later": replace(
+            capture, signal=half[bins:], start=capture.start + bins * capture.axis.spacing
+        ),
         "photons": replace(capture, signal=recorded.signal - half),
         "saved": Capture.load(tmp_path / "capture.h5"),
     }
