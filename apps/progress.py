@@ -1,5 +1,6 @@
-"""A progress bar on a terminal, and a quick end of the work when Ctrl-C is pressed; the jobs of a
-sequence under it, with what became of them, and status 1 if some failed.
+"""A progress bar on a terminal, a word elsewhere where work takes its time, and a quick end of the
+work when Ctrl-C is pressed; the jobs of a sequence under it, with what became of them, and status 1
+if some failed.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
 Advance = Callable[[int], None]
 STEPS = 1000  # of a bar for a share
+MAX_SILENCE_S = 2.0  # where no bar is drawn
 
 _screen_lock = threading.Lock()
 
@@ -33,9 +36,10 @@ _screen_lock = threading.Lock()
 def show_progress(title: str, total: int) -> Iterator[Advance]:
     """Yield a function to call with the amount of work just done, from any thread.
 
-    The bar is drawn on standard error, and only on a terminal; inside another bar, or off the main
-    thread as on a cluster's worker, there is none. After Ctrl-C the function raises in every thread
-    that calls it, so that none goes on computing for nothing.
+    The bar is drawn on standard error; where that is no terminal, one line says what goes on after
+    `MAX_SILENCE_S`. Inside another bar, or off the main thread as on a cluster's worker, there is
+    none. After Ctrl-C the function raises in every thread that calls it, so that none goes on
+    computing for nothing.
 
     `total`: amount of work at which the bar is full.
     """
@@ -51,9 +55,7 @@ def show_progress(title: str, total: int) -> Iterator[Advance]:
 
 @contextlib.contextmanager
 def show_activity(title: str) -> Iterator[None]:
-    """Show that work whose amount is not known goes on, and for how long; as `show_progress`, on a
-    terminal only.
-    """
+    """Show that work whose amount is not known goes on, and for how long; as `show_progress`."""
     with _open_bar(title, None):
         yield
 
@@ -88,9 +90,20 @@ def silence() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _open_bar(title: str, total: int | None) -> Iterator[Advance]:
-    watched = sys.stderr.isatty() and threading.current_thread() is threading.main_thread()
-    if not watched or not _screen_lock.acquire(blocking=False):
+    own_thread = threading.current_thread() is threading.main_thread()
+    if not own_thread or not _screen_lock.acquire(blocking=False):
         yield lambda _: None
+        return
+    if not sys.stderr.isatty():
+        say = partial(print, f"tofclip: {title} ...", file=sys.stderr, flush=True)
+        timer = threading.Timer(MAX_SILENCE_S, say)
+        timer.daemon = True
+        timer.start()
+        try:
+            yield lambda _: None
+        finally:
+            timer.cancel()
+            _screen_lock.release()
         return
     from rich import progress
     from rich.console import Console

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from apps.figures.shot import MAX_MOMENTS, choose_moments, make_preview_figure
 from apps.figures.style import make_figure
 from apps.options import load_settings, save_settings, setting, settings_to_dict
-from apps.progress import show_progress
+from apps.progress import show_activity, show_progress
 from apps.report import build_provenance, make_folder, report, require_writable, to_json_value
 from apps.verbs.nlos import ReconstructSettings
 from apps.verbs.nlos_imaging import CompareSettings
@@ -138,6 +138,14 @@ class TestProgress:
         worker.start()
         worker.join(timeout=10)
         assert amounts == [1]
+
+    def test_where_there_is_no_terminal_long_work_says_once_what_it_does(self, capsys, monkeypatch):
+        monkeypatch.setattr("apps.progress.MAX_SILENCE_S", 0.01)
+        said = ""
+        with show_activity("reading wall.npz"), show_progress("a part of it", 1):
+            while not said:
+                said = capsys.readouterr().err
+        assert said == "tofclip: reading wall.npz ...\n"
 
 
 class TestFiles:
