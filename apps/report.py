@@ -253,7 +253,7 @@ def _format_entry(name: str, value: Any) -> str:
     *words, last = name.split("_")
     if last not in UNITS:
         return f"{_format_name(name)} {_format_value(value)}"
-    return " ".join([*words, _format_value(value), *([] if value is None else [last])])
+    return " ".join([*words, _format_value(value), last])
 
 
 def summarise_list(values: Sequence[Any]) -> str:
@@ -272,7 +272,8 @@ def _format_value(value: Any) -> str:
         long = len(value) > MAX_LISTED_VALUES
         return summarise_list(value) if long else ", ".join(map(_format_value, value))
     if isinstance(value, dict):
-        return ", ".join(_format_entry(name, entry) for name, entry in value.items())
+        known = {name: entry for name, entry in value.items() if entry not in (None, "")}
+        return ", ".join(_format_entry(name, entry) for name, entry in known.items())
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"
     if isinstance(value, bool):

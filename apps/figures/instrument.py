@@ -153,7 +153,8 @@ def make_range_calibration_figure(found: RangeFit, distances: Sequence[float]) -
     # There may be no two powers of ten to number.
     ticks = [float(f"{tick:.3g}") for tick in np.geomspace(weakest, strongest, 4)]
     walk.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    zero, spread = found.camera.time_zero / NANOSECOND, known.time_zero_sigma / PICOSECOND
+    zero = round(found.camera.time_zero / NANOSECOND, 3) + 0.0  # never "-0.000"
+    spread = known.time_zero_sigma / PICOSECOND
     targets = ", ".join(f"{distance:g}" for distance in distances)
     figure.suptitle(
         f"target at {targets} m: time zero {zero:.3f} ns \N{PLUS-MINUS SIGN} {spread:.2g} ps",
