@@ -20,7 +20,10 @@ def simulate(shell, encoder: str, ratio: float) -> int:
     return shell.figures(f"clip simulate {LETTERS} {words}")["readings"]
 
 
-@pytest.mark.parametrize(("encoder", "worst"), [("line", 0.085), ("single-pixel", 0.043)])
+@pytest.mark.parametrize(
+    ("encoder", "worst"),
+    [("line", 0.085), pytest.param("single-pixel", 0.043, marks=pytest.mark.nightly)],
+)
 def test_letters_are_recovered(shell, shared_data, encoder, worst):
     """The bounds are the project's acceptance at half as many measurements as pixels."""
     assert simulate(shell, encoder, 0.5) == 8192

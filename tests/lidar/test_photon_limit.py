@@ -96,7 +96,7 @@ def test_the_bound_is_that_of_the_whole_fisher_matrix(decay, width_ps, backgroun
 
 @pytest.mark.parametrize(
     ("photons", "background"),
-    [(20, 0.01), (100, 0.1), (1000, 1.0), (500, 20.0), (800, 50.0)],
+    [(20, 0.01), (100, 0.1), (800, 50.0)],
 )
 def test_ranges_are_true_and_within_a_tenth_of_the_bound(detector, photons, background):
     """2000 returns: bias within four deviations of a mean, deviations within four of theirs."""

@@ -239,7 +239,7 @@ def test_a_pulse_shorter_than_a_bin_still_gives_a_range():
     assert returns.time[0] == pytest.approx(times[20], abs=1e-3 * BIN)
 
 
-@pytest.mark.parametrize(("photons", "background"), [(20, 0.02), (500, 0.05), (200, 2.0)])
+@pytest.mark.parametrize(("photons", "background"), [(20, 0.02), (200, 2.0)])
 def test_a_cube_of_counts_has_the_deviations_of_photons(photons: float, background: float) -> None:
     """Those of least squares are four times too large; the bound is 3 sigma of 576 pixels' spread."""
     width, times = 400e-12, 80e-12 * np.arange(200)

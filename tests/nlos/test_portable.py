@@ -154,13 +154,13 @@ def case(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Cas
     return case
 
 
-@libraries
 @pytest.mark.parametrize("case", CASES, indirect=True)
-def test_the_field_is_that_of_the_compiled_loops(case: Case, library: str) -> None:
-    moved = case.capture.on(find_device(library))
+def test_the_field_is_that_of_the_compiled_loops(case: Case) -> None:
+    """By PyTorch; `test_fields_stay_on_their_device` compares those of a stricter library."""
+    moved = case.capture.on(find_device("torch"))
     found = case.method.phasor_field(moved, case.grid)
     expected = case.method.phasor_field(case.capture, case.grid)
-    assert found.device == find_device(library)
+    assert found.device == find_device("torch")
     assert found.provenance == expected.provenance
     assert relative_error(found.values, expected.values) < case.agreement
     assert found.find_brightest() == expected.find_brightest()
@@ -239,7 +239,7 @@ PREPARATIONS: tuple[Callable[[Capture], Capture], ...] = (
 # --- plans and memory
 
 
-@pytest.mark.parametrize("library", [*DEVICE_NAMES, "numpy"])
+@pytest.mark.parametrize("library", ["torch", "numpy"])
 @pytest.mark.parametrize(
     "case", ["rsd, single", "hybrid, spots, True", "hybrid, spots, False"], indirect=True
 )

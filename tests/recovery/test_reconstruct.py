@@ -180,9 +180,8 @@ def test_energy_curves_give_the_skew_to_a_row_and_registration_lowers_the_residu
     np.testing.assert_array_equal(found.camera.centres_px, shot.camera.centres_px)
 
 
-@pytest.mark.parametrize(
-    "error_px", [*(pytest.param(error, marks=pytest.mark.nightly) for error in (0.4, 1.0)), 3.0]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("error_px", [0.4, 1.0, 3.0])
 def test_slit_centres_are_found_from_the_shot(shot, error_px):
     """Of a camera that knows its parallax, from centres that are off by as much at the worst view.
 

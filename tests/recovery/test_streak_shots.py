@@ -112,7 +112,7 @@ def check_returns(kind: str, method: str, scene: oracle.Scene, counts: np.ndarra
 
 
 FAST = {("clean", "l1"), ("clean", "tv"), ("dark", "l1"), ("tracks", "l1")}
-FAST |= {("retroreflector", "l1"), ("dark", "tv"), ("clipped", "tv")}
+FAST |= {("retroreflector", "l1"), ("clipped", "tv")}
 
 
 @pytest.mark.parametrize(
@@ -304,7 +304,10 @@ def test_what_strikes_the_sensor_is_not_taken_for_the_lights_own_noise() -> None
 
 @pytest.mark.parametrize(
     "method",
-    [TotalVariation(iterations=300), PlugAndPlay(TotalVariation(iterations=300), calls=1)],
+    [
+        TotalVariation(iterations=300),
+        pytest.param(PlugAndPlay(TotalVariation(iterations=300), calls=1), marks=SLOW),
+    ],
     ids=lambda method: method.name,
 )
 def test_light_that_is_cut_off_is_recovered_whatever_the_dark_level_is(method) -> None:

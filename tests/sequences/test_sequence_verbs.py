@@ -166,6 +166,7 @@ def test_a_study_that_fails_on_a_cluster(run, scheduler, tmp_path):
     assert "psf_hand_300x400.npz" in failure["problem"]
 
 
+@pytest.mark.nightly
 def test_captures_on_a_cluster_are_imaged_as_here(run, scheduler, tmp_path):
     captures = tmp_path / "captures"
     captures.mkdir()
