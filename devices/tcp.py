@@ -93,7 +93,8 @@ class TcpLink(Closing):
         self._socket.close()
 
     def _take_bytes(self, length: int) -> bytes:
-        taken = bytes(self._buffer[:length])
+        with memoryview(self._buffer) as held:  # a slice of the buffer itself is one more copy
+            taken = bytes(held[:length])
         del self._buffer[:length]
         return taken
 

@@ -180,6 +180,8 @@ def read_photons(address: str, bin_width: float | None = None) -> PhotonCube:
 def find_address(file: str) -> str | None:
     """Return the address of a file that holds an instrument's records, None of any other file."""
     path = Path(file)
+    if path.is_dir():  # a cube with a file for each row
+        return None
     is_stamps = path.suffix.lower() == STAMPS_SUFFIX
     return f"file://{file}" if is_stamps or read_head_if_recording(path) is not None else None
 

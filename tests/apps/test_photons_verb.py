@@ -191,14 +191,18 @@ def test_a_given_background_and_cycles_are_used(shell):
 
 
 def test_all_returns_of_a_pixel_are_in_a_range_image(shell):
-    """A pane before a wall, 40 photons each: both are in the file, with and without neighbours."""
+    """A pane before a wall, 40 photons each: both are in the file, with and without neighbours. The
+    cube lies in a folder, with a file for each row.
+    """
     noise = np.random.default_rng(5)
     cube = noise.poisson(0.01, (24, 32, 200))
     for place in (50.0, 140.0):
         add_photons(cube, np.full((24, 32), place), 40, noise)
-    np.save("pane.npy", cube.astype(np.uint16))
+    Path("pane").mkdir()
+    for row, histograms in enumerate(cube.astype(np.uint16)):
+        np.save(f"pane/{row}.npy", histograms)
     for words in ("", "--single-pixel"):
-        line = f"lidar photons pane.npy --overwrite --out range.npz {PULSE} --returns 3 {words}"
+        line = f"lidar photons pane --overwrite --out range.npz {PULSE} --returns 3 {words}"
         figures, written = shell.figures(line), load()
         assert set(written) == FIELDS | {f"returns_{name}" for name in FIELDS}
         for name in FIELDS:

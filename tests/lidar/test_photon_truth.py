@@ -142,6 +142,17 @@ def test_first_photons_of_a_cycle_are_not_taken_for_all(photons, unaware):
         assert found.settings["pile_up"] == 0
 
 
+def test_a_surface_before_another_is_no_pile_up():
+    """Light of the nearer one was taken for background that the farther one hides: 81 % were said to be
+    missing.
+    """
+    surface = scenes.make_surface((40, 48))
+    near, far = np.full(surface.shape, 8.0), np.full(surface.shape, 10.0)
+    rates = scenes.make_rates(surface, far, 0.02)
+    rates += scenes.make_rates(np.maximum(surface - 120, 20), near, 0.0)
+    assert estimate(rates).settings["pile_up"] == 0
+
+
 @pytest.mark.parametrize(("decay", "least"), [(0.15, 0.99), (0.0, 0.97)])
 def test_a_background_that_changes_over_picture_and_time_is_no_surface(decay, least):
     """A wave that moves over the picture, or what decays over the record: the surface was found where

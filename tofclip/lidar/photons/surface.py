@@ -59,7 +59,7 @@ MIN_EXPLAINED_DENSITY = 0.003  # of the response's peak: where it is brighter ph
 # Of the time axis, and pixels that have to show a stretch before their surfaces; photons expected behind
 # surfaces, and the share of them that has to be missing before a detector is said to be blind there.
 BLIND_STRETCHES, MIN_WITNESSES = 64, 20
-MIN_BLIND_PHOTONS, MIN_MISSED_SHARE = 400.0, 0.2
+MIN_BLIND_PHOTONS, MIN_MISSED_SHARE, SURFACE_SIGMAS = 400.0, 0.2, 4.0
 # That the background alone shows as many photons at a further surface, in the pixel and in the nine
 # pixels around it.
 MAX_OWN_CHANCE, MAX_POOLED_CHANCE = 0.02, 1e-4
@@ -172,7 +172,13 @@ def estimate_surface(
     strongest = np.argsort(-np.nan_to_num(stack[..., 2], nan=-1.0), axis=0, kind="stable")
     stack = np.take_along_axis(stack, strongest[..., np.newaxis], axis=0)[:max_returns]
     bin_m = SPEED_OF_LIGHT / 2 * photons.bin_width
-    missed = 0.0 if cycles is not None else find_missed_share(photons, scene, layers[0][..., 0])
+    missed = 0.0 if cycles is not None else find_missed_share(photons, scene, layers)
+    if (
+        missed and len(layers) == 1
+    ):  # light of a surface before it would be missing behind it as well
+        rest = remove_return(photons, scene, layers[0])
+        further = keep_significant(rest, scene, plan.locate(rest, scene))
+        missed = find_missed_share(photons, scene, [layers[0], further])
     settings: dict[str, float | str] = {
         "response": "given" if learnt is None else "learnt",
         "pulse_fwhm_ps": scene.response.pulse.fwhm * 1e12,
@@ -229,24 +235,32 @@ def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> Phot
     return photons.select(photons.count * ~((late >= bright[0]) & (late <= bright[-1])))
 
 
-def find_missed_share(photons: PhotonImage, scene: Scene, surface: FloatArray) -> float:
-    """Share of the background that is missing behind surfaces, as of a detector that their photons
-    blind; 0 where nothing says so. What is expected there is a pixel's own background before its
-    surface, with the course over time that pixels show whose surfaces come later.
+def find_missed_share(photons: PhotonImage, scene: Scene, layers: list[FloatArray]) -> float:
+    """Share of the background that is missing behind surfaces, the first of `layers` as of
+    `SurfacePlan.locate`, as of a detector that their photons blind; 0 where nothing says so. What is
+    expected there is a pixel's own background before its surface and beside the others, with the
+    course over time that pixels show whose surfaces come later.
     """
     seen = photons.count_stretches(BLIND_STRETCHES)
     pixels, number = seen.shape
     length = photons.bins / number
-    late = (np.arange(number) + 0.5) * length - surface.reshape(-1, 1)
-    before = late < -2 * scene.response.width - length
+    middle, reach = (np.arange(number) + 0.5) * length, 2 * scene.response.width + length
+    late, *others = (middle - layer[..., 0].reshape(-1, 1) for layer in layers)
+    before = late < -reach
+    for other in others:
+        before &= ~(np.abs(other) < reach)
     known = (late > 12 * scene.response.width + length) & (before.sum(axis=0) >= MIN_WITNESSES)
     own, course = np.ones((pixels, 1)), np.ones(number)
     for _ in range(5):
         own = (seen * before).sum(1, keepdims=True) / np.maximum(before @ course, 1e-9)[:, None]
         course = (seen * before).sum(axis=0) / np.maximum((before * own).sum(axis=0), 1e-9)
-    expected = float((known * own * course).sum())
-    share = 1 - float((seen * known).sum()) / max(expected, 1e-9)
-    return share if expected > MIN_BLIND_PHOTONS and share > MIN_MISSED_SHARE else 0.0
+        expected = own * course
+        before &= seen <= expected + SURFACE_SIGMAS * np.sqrt(
+            expected + 1
+        )  # more is another surface
+    light = float((known * expected).sum())
+    share = 1 - float((seen * known).sum()) / max(light, 1e-9)
+    return share if light > MIN_BLIND_PHOTONS and share > MIN_MISSED_SHARE else 0.0
 
 
 def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> FloatArray:
