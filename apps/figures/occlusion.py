@@ -4,7 +4,7 @@ films of a flash as it travels and of a target that walks past behind.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -218,45 +218,73 @@ class FlashFrame(NamedTuple):
     pictures: tuple[NDArray[Any], NDArray[Any]]
 
 
+class _Film:
+    """A GIF whose pictures are drawn into panels of one figure, in inches, beside other panels."""
+
+    def __init__(
+        self, size: tuple[float, float], names: Sequence[str], experiment: Experiment, **layout: Any
+    ) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        self.figure = make_figure(*size)
+        self.figure.set_layout_engine("none")
+        self._canvas = FigureCanvasAgg(self.figure)
+        columns, side = layout.pop("columns"), experiment.settings.side_px
+        self.panels = self.figure.subplots(1, columns, gridspec_kw={**PANEL_LAYOUT, **layout})
+        self._pictures, self._drawn = list[Any](), list[Any]()
+        for axes, name in zip(self.panels, names, strict=False):
+            blank, extent = 0 * experiment.truth, (0, side, side, 0)
+            self._pictures.append(draw_image(axes, blank, extent, vmin=0, vmax=1))
+            axes.set(xticks=[], yticks=[])
+            axes.set_title(name, fontsize=SMALL_FONT_PT + 2)
+
+    def add(self, pictures: Sequence[NDArray[Any]], title: str) -> None:
+        """Put pictures from 0 to 1 into their places, and draw the figure."""
+        from PIL import Image
+
+        for shown, picture in zip(self._pictures, pictures, strict=True):
+            shown.set_data(picture)
+        self.figure.suptitle(title, fontsize=SMALL_FONT_PT + 4)
+        self._canvas.draw()
+        drawn: Any = self._canvas.buffer_rgba()
+        self._drawn.append(Image.fromarray(np.asarray(drawn)[..., :3]))
+
+    def save(self, path: Path, shown_ms: int, last_ms: int | None = None) -> None:
+        """Write it; where no time is given for the last picture, it runs there and back again, without
+        showing the ends twice.
+        """
+        first, *others = self._drawn if last_ms else [*self._drawn, *self._drawn[-2:0:-1]]
+        duration = [*[shown_ms] * len(others), last_ms or shown_ms]
+        with atomic_path(path) as temporary:
+            first.save(temporary, save_all=True, append_images=others, duration=duration, loop=0)
+
+
 def save_flash_film(experiment: Experiment, path: Path) -> None:
     """Write a GIF: light reaches the occluder, then what stands behind it.
 
     Each return is shown at its own brightness; the recovered pictures light up as the measurements
     of their gates do.
-
-    `path`: of the GIF.
     """
-    figure, frames = _make_canvas(8, 3.2), _make_flash_frames(experiment)
-    left, right, time = figure.subplots(1, 3, gridspec_kw=PANEL_LAYOUT)
-    images = _lay_out_pictures((left, right), ("what one view sees", "ToF-CLIP"), experiment)
+    film = _Film((8, 3.2), ("what one view sees", "ToF-CLIP"), experiment, columns=3)
+    time = film.panels[-1]
     draw_history(time, experiment)
     time.set_title("sum of all measurements", fontsize=SMALL_FONT_PT + 2)
     time.set_ylabel("")
     time.tick_params(axis="y", labelleft=False)
     cursor = time.axvline(experiment.time_axis.start / PICOSECOND, color=UNSEEN_COLOUR, lw=2)
-
-    def drawn() -> Iterator[Any]:
-        for frame in frames:
-            cursor.set_xdata([frame.time, frame.time])
-            yield _render_image(figure, images, frame.pictures, frame.title)
-
-    _write_gif(path, list(drawn()), [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS])
+    for frame in _make_flash_frames(experiment):
+        cursor.set_xdata([frame.time, frame.time])
+        film.add(frame.pictures, frame.title)
+    film.save(path, FRAME_MS, LAST_FRAME_MS)
 
 
 def save_walk_film(experiment: Experiment, path: Path, advance: Callable[[int], None]) -> None:
     """Write a GIF: the target walks past behind the occluder, each step flashed, measured and
-    recovered again.
-
-    Calls ``advance(1)`` after each of `WALK_STEPS`.
-
-    `path`: of the GIF.
+    recovered again. Calls ``advance(1)`` after each of `WALK_STEPS`.
     """
-    figure = _make_canvas(9.4, 2.9)
     names = ("one view, all its light", "one view, the second return", "ToF-CLIP", "truth")
-    images = _lay_out_pictures(
-        figure.subplots(1, 4, gridspec_kw={**PANEL_LAYOUT, "bottom": 0.02}), names, experiment
-    )
-    brightest, drawn = float(experiment.truth.max()), []
+    film = _Film((9.4, 2.9), names, experiment, columns=4, bottom=0.02)
+    brightest = float(experiment.truth.max())
     for number, across in enumerate(np.linspace(-WALK_REACH_M, WALK_REACH_M, WALK_STEPS)):
         settings = replace(experiment.settings, seed=experiment.settings.seed + number)
         there = type(experiment)(experiment.scene.move_target(float(across)), settings)
@@ -264,54 +292,9 @@ def save_walk_film(experiment: Experiment, path: Path, advance: Callable[[int], 
         seen = everything * (brightest / everything.max())
         pictures = seen, there.single_view, there.separated.target, there.truth
         title = f"target {across / MILLIMETRE:+.0f} mm from the axis, {there.scene.behind / MILLIMETRE:.0f} mm behind"
-        drawn.append(_render_image(figure, images, [one / brightest for one in pictures], title))
+        film.add([one / brightest for one in pictures], title)
         advance(1)
-    # there and back again, without showing the ends twice
-    _write_gif(path, [*drawn, *drawn[-2:0:-1]], [WALK_STEP_MS] * (2 * WALK_STEPS - 2))
-
-
-def _make_canvas(width: float, height: float) -> Figure:
-    """Make a figure whose drawing can be read back, in inches."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    figure = make_figure(width, height)
-    figure.set_layout_engine("none")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _lay_out_pictures(
-    panels: Sequence[Axes], names: Sequence[str], experiment: Experiment
-) -> list[Any]:
-    """Lay out pictures of a film and return what changes in them."""
-    side = experiment.settings.side_px
-    images = []
-    for axes, name in zip(panels, names, strict=True):
-        images.append(draw_image(axes, 0 * experiment.truth, (0, side, side, 0), vmin=0, vmax=1))
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(name, fontsize=SMALL_FONT_PT + 2)
-    return images
-
-
-def _render_image(
-    figure: Figure, images: Sequence[Any], pictures: Sequence[NDArray[Any]], title: str
-) -> Any:
-    """Put pictures from 0 to 1 into their places and return the figure as an image."""
-    from PIL import Image
-
-    for image, picture in zip(images, pictures, strict=True):
-        image.set_data(picture)
-    figure.suptitle(title, fontsize=SMALL_FONT_PT + 4)
-    canvas: Any = figure.canvas
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
-
-
-def _write_gif(path: Path, images: list[Any], durations_ms: list[int]) -> None:
-    with atomic_path(path) as temporary:
-        images[0].save(
-            temporary, save_all=True, append_images=images[1:], duration=durations_ms, loop=0
-        )
+    film.save(path, WALK_STEP_MS)
 
 
 def _make_flash_frames(experiment: Experiment) -> list[FlashFrame]:

@@ -207,15 +207,6 @@ class DiffuserRecording:
             )
 
 
-@dataclass(frozen=True)
-class DiffuserRecovery:
-    """The scene behind a recording."""
-
-    scene: NDArray[Any]  # (2 rows, 2 columns): a PSF as large as the sensor brings light from there
-    pitch_px: int  # every so manieth pixel of either axis was used
-    relative_residual: float  # ``|A h - f| / |f|`` over the measurements that were used
-
-
 def read_diffuser_recording(path: str | Path) -> DiffuserRecording:
     """Read an ``.npz`` with `psf` and `raw`, both (rows, columns) in counts, and one number
     `background`.
@@ -241,15 +232,17 @@ def build_diffuser_model(recording: DiffuserRecording, pitch_px: int) -> LinearO
 
 def recover_diffuser_scene(
     recording: DiffuserRecording, pitch_px: int, iterations: int = HAND_ITERATIONS
-) -> DiffuserRecovery:
+) -> tuple[NDArray[Any], float]:
     """Recover the scene with nonnegative total variation from every n-th pixel of either axis; an
-    iteration takes 16 ms for a sensor of 300 x 400 pixels on one core.
+    iteration takes 16 ms for a sensor of 300 x 400 pixels on one core. Returns the scene (2 rows,
+    2 columns), since a PSF as large as the sensor brings light from there, and ``|A h - f| / |f|``
+    over the measurements that were used.
     """
     model = build_diffuser_model(recording, pitch_px)
     every_nth = recording.measurements[::pitch_px, ::pitch_px]
     measurements = (every_nth / recording.measurements.max()).astype(np.float32).reshape(-1, 1)
     frames = TotalVariation(HAND_WEIGHT, iterations).recover(model, measurements).frames
-    return DiffuserRecovery(frames[0], pitch_px, relative_residual(model, frames, measurements))
+    return frames[0], relative_residual(model, frames, measurements)
 
 
 RECORDING = "diffusercam/psf_hand_300x400.npz"
@@ -277,13 +270,13 @@ def run_lensless_hand(library: Library, seeds: int, advance: Advance) -> Outcome
     for pitch in PITCHES_PX:
         recoveries.append(recover_diffuser_scene(recording, pitch))
         advance(1)
-    bright = np.nonzero(recoveries[0].scene > DISPLAY_THRESHOLD * recoveries[0].scene.max())
+    whole = recoveries[0][0]
+    bright = np.nonzero(whole > DISPLAY_THRESHOLD * whole.max())
     window = tuple(slice(axis.min(), axis.max() + 1) for axis in bright)
     rows, line = [], []
-    for one in recoveries:
-        percent = 100 * one.relative_residual
-        rows.append(Row((str(one.pitch_px),), (percent,)))
-        line.append(Panel(f"every {one.pitch_px}. pixel\n{percent:.2f} %", one.scene[window]))
+    for pitch, (scene, residual) in zip(PITCHES_PX, recoveries, strict=True):
+        rows.append(Row((str(pitch),), (100 * residual,)))
+        line.append(Panel(f"every {pitch}. pixel\n{100 * residual:.2f} %", scene[window]))
     return Outcome(("every n-th pixel",), "relative residual, %", rows, [line])
 
 
