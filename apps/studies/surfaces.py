@@ -7,6 +7,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,13 +25,12 @@ from tofclip.simulate import (
     make_default_instrument,
     make_default_scene,
     make_nominal_camera,
-    make_plate,
     render_true_frames,
     score_returns,
     simulate_shot,
 )
 from tofclip.simulate.bodies import Body, Lambertian, Sphere
-from tofclip.simulate.demo import ANGLES_DEG, GAINS, LENSLET_PITCH_M
+from tofclip.simulate.demo import ANGLES_DEG, GAINS, LENSLET_PITCH_M, place_plate
 from tofclip.simulate.patterns import (
     TEXELS,
     Pattern,
@@ -88,17 +88,7 @@ def make_small_instrument(photons: float, rays_per_pixel_side: int = 4) -> Instr
     return Instrument(camera, StreakDetector(400, peak_photons=photons), rays_per_pixel_side)
 
 
-def _place(
-    pattern: Pattern,
-    middle_px: tuple[float, float],
-    side_px: float,
-    distance: float,
-    **turned: float,
-) -> Body:
-    """Square plate around a picture point, `side_px` wide if it faced the camera."""
-    pixel = distance / FOCAL_LENGTH_PX
-    middle = (middle_px[0] * pixel, middle_px[1] * pixel, distance)
-    return make_plate(middle, (side_px * pixel, side_px * pixel), pattern, **turned)
+_place = partial(place_plate, focal_length_px=FOCAL_LENGTH_PX)
 
 
 def make_slanted_scene() -> Scene:

@@ -116,10 +116,9 @@ class Filters:
             if not low <= high:
                 raise InputError(f"the limits of {name} must rise, got {low:g} and {high:g}")
 
-    def limit(self, name: str, limits: Limits | None) -> Filters:
-        """Return filters with other limits of a quantity, or none."""
-        others = {other: its for other, its in self.limits.items() if other != name}
-        return replace(self, limits=others if limits is None else {**others, name: limits})
+    def limit(self, name: str, limits: Limits) -> Filters:
+        """Return filters with other limits of a quantity."""
+        return replace(self, limits={**self.limits, name: limits})
 
     def select(self, view: View) -> NDArray[np.bool_]:
         """Return for each point whether it is shown, (n,)."""

@@ -19,12 +19,10 @@ from tofclip.simulate import (
     StreakDetector,
     make_default_instrument,
     make_default_scene,
-    make_plate,
     simulate_shot,
 )
-from tofclip.simulate.bodies import Body
+from tofclip.simulate.demo import place_plate
 from tofclip.simulate.patterns import (
-    Pattern,
     cut_pattern,
     make_letter,
     make_plain_pattern,
@@ -90,16 +88,17 @@ def make_line_instrument() -> Instrument:
 
 
 def make_line_scene() -> Scene:
-    """Return a letter and four plates between 1.7 and 3.2 m, coarse enough for 32 pixels."""
+    """Return a letter and four plates between 1.7 and 3.2 m, coarse enough for 32 pixels; places and
+    sizes are pixels of the demonstration's camera, whose field the line's is.
+    """
+    bright = make_plain_pattern(0.8)
     return Scene(
         (
-            _make_plate(
-                cut_pattern(make_letter("U"), make_plain_pattern(0.8)), (-26, -22), 44, 1.75
-            ),
-            _make_plate(make_plain_pattern(0.8), (24, -24), 36, 2.1, yaw=0.15),
-            _make_plate(make_plain_pattern(0.7), (-24, 26), 34, 2.5),
-            _make_plate(make_plain_pattern(0.8), (24, 24), 40, 2.8, pitch=-0.15),
-            _make_plate(make_stripes(3, 0.3, 0.9), (0, 0), 100, 3.18),
+            place_plate(cut_pattern(make_letter("U"), bright), (-26, -22), 44, 1.75),
+            place_plate(bright, (24, -24), 36, 2.1, yaw=0.15),
+            place_plate(make_plain_pattern(0.7), (-24, 26), 34, 2.5),
+            place_plate(bright, (24, 24), 40, 2.8, pitch=-0.15),
+            place_plate(make_stripes(3, 0.3, 0.9), (0, 0), 100, 3.18),
         )
     )
 
@@ -170,18 +169,3 @@ def _simulate_light(scene: Scene, instrument: Instrument) -> LineLight:
     photons = shot.signal.astype(np.float64) + detector.background_photons
     photons.flags.writeable = False  # it is shared by all who look at this scene
     return LineLight(photons, detector.row_times, shot.camera, shot.truth)
-
-
-def _make_plate(
-    pattern: Pattern,
-    middle: tuple[float, float],
-    side: float,
-    depth: float,
-    yaw: float = 0.0,
-    pitch: float = 0.0,
-) -> Body:
-    """Square plate; `middle` from the optical axis and `side` in 128ths of the picture's side."""
-    unit = depth / make_default_instrument().camera.focal_length_px
-    return make_plate(
-        (middle[0] * unit, middle[1] * unit, depth), (side * unit, side * unit), pattern, yaw, pitch
-    )

@@ -83,20 +83,21 @@ def make_default_scene() -> Scene:
         (make_rings(3, 0.3, 0.9), (-2, 36), 36, 3.0, 0.0, 0.0),
         (make_stripes(4, 0.3, 0.9), (0, 0), 96, 3.18, 0.0, 0.0),
     )
-    return Scene(tuple(_place_plate(*plate) for plate in plates))
+    return Scene(tuple(place_plate(*plate) for plate in plates))
 
 
-def _place_plate(
+def place_plate(
     pattern: Pattern,
     middle_px: tuple[float, float],
     side_px: float,
     depth: float,
-    yaw: float,
-    pitch: float,
+    yaw: float = 0.0,
+    pitch: float = 0.0,
+    focal_length_px: float = FOCAL_LENGTH_PX,
 ) -> Body:
     """Square plate that appears around pixel offset `middle_px` (x, y) from the optical axis,
     `side_px` wide.
     """
-    pixel = depth / FOCAL_LENGTH_PX
+    pixel = depth / focal_length_px
     centre: Vector = (middle_px[0] * pixel, middle_px[1] * pixel, depth)
     return make_plate(centre, (side_px * pixel, side_px * pixel), pattern, yaw, pitch)
