@@ -5,7 +5,7 @@ nothing.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from struct import Struct
@@ -56,34 +56,27 @@ def add_panels(
     columns: int,
     band: tuple[float, float],
     room: tuple[float, float, float, float] = LABEL_ROOM_INCHES,
-    widths: Sequence[float] | None = None,
 ) -> NDArray[Any]:
-    """Put a grid of panels across a figure, at places known beforehand.
+    """Put a grid of panels, (rows, columns), across a figure, at places known beforehand.
 
     To search for places that fit around the labels takes longer than to draw a figure of many
     panels; with this the figure's own search is off.
 
     `band`: where the grid begins and ends, inches from the top of the figure; `room` (left, right,
-    bottom, top): inches that ticks and labels take around each panel; `widths`: of the columns,
-    relative to each other; equal by default. Returns (rows, columns).
+    bottom, top): inches that ticks and labels take around each panel.
     """
     figure.set_layout_engine(None)
     width, height = figure.get_size_inches()
     left, right, bottom, top = room
-    shares = np.ones(columns) if widths is None else np.asarray(widths, np.float64)
-    edges = width * np.concatenate([[0.0], np.cumsum(shares) / np.sum(shares)])
-    cell_height = (band[1] - band[0]) / rows
-    panels = np.empty((rows, columns), object)
-    for row, column in np.ndindex(rows, columns):
-        panels[row, column] = figure.add_axes(
-            (
-                (edges[column] + left) / width,
-                1 - (band[0] + (row + 1) * cell_height - bottom) / height,
-                (edges[column + 1] - edges[column] - left - right) / width,
-                (cell_height - bottom - top) / height,
-            )
-        )
-    return panels
+    place = {
+        "left": left / width,
+        "right": 1 - right / width,
+        "bottom": 1 - (band[1] - bottom) / height,
+        "top": 1 - (band[0] + top) / height,
+        "wspace": (left + right) / (width / columns - left - right),
+        "hspace": (bottom + top) / ((band[1] - band[0]) / rows - bottom - top),
+    }
+    return figure.subplots(rows, columns, squeeze=False, gridspec_kw=place)
 
 
 def store_picture(picture: Path, place: Path) -> None:
