@@ -71,15 +71,12 @@ def flag(name: str, meaning: str) -> Any:
     return typer.Option(False, name, help=meaning)
 
 
-def arg(
-    metavar: str, meaning: str, default: Any = ..., choices: Iterable[str] = (), read: bool = False
-) -> Any:
+def arg(metavar: str, meaning: str, default: Any = ..., read: bool = False) -> Any:
     """Declare an argument; one that is read has to be there, unless it is an address or a pattern."""
     return typer.Argument(
         default,
         metavar=metavar,
         help=meaning,
-        autocompletion=make_completer(choices),
         callback=_require_there if read else None,
     )
 

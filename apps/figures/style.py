@@ -211,11 +211,9 @@ def scatter_points(
     axes.scatter(right, up, c=light, s=size, **look)
 
 
-def tone_map(
-    picture: NDArray[Any], brightest: float = WHITE_PERCENTILE, gamma: float = 1.0
-) -> NDArray[Any]:
-    """Scale brightness to 0..1 for the eye, with the percentile `brightest` at 1."""
-    top = (np.percentile(picture, brightest) or picture.max() or 1.0) if picture.size else 1.0
+def tone_map(picture: NDArray[Any], gamma: float = 1.0) -> NDArray[Any]:
+    """Scale brightness to 0..1 for the eye; a glint does not darken the rest."""
+    top = (np.percentile(picture, WHITE_PERCENTILE) or picture.max() or 1.0) if picture.size else 1
     toned: NDArray[Any] = np.clip(picture / top, 0, 1) ** gamma
     return toned
 
