@@ -86,8 +86,8 @@ class TestReport:
                     "  2  0.2         yes",
                 ],
             ),
-            # units stand behind their figures
-            ({"wall": {"width_m": 2.0, "gap_mm": None}}, ["wall  width 2 m, gap -"]),
+            # units stand behind their figures; what is not known is left out
+            ({"wall": {"width_m": 2.0, "gap_mm": None}}, ["wall  width 2 m"]),
             (
                 {"why": {"a": "x" * 60, "long_one": "y" * 60}},
                 ["why", f"  a         {'x' * 60}", f"  long one  {'y' * 60}"],
