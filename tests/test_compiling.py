@@ -79,29 +79,39 @@ def test_the_program_announces_compiling_in_one_line_on_a_terminal_only(is_termi
 
 
 class TestCache:
-    CALL_A_VERB = """
-from apps.cli import main
-words = "nlos simulate --letters T --facet-mm 200 --wall-points 4 --bin-width-ps 32 --json"
-sys.exit(main([*words.split(), "--out", sys.argv[1]]))
+    LOOP = """
+from tofclip.compiling import compile_loop
+
+@compile_loop()
+def add_one(numbers):
+    numbers[0] += 1
+"""
+    CALL_IT = """
+from apps import cli
+
+def run(*_, **__):
+    import numpy
+    from loops import add_one
+    add_one(numpy.zeros(1))
+
+cli.app = run
+sys.exit(cli.main([]))
 """
 
-    def simulate(self, home, cache, *first: str) -> list[str]:
+    def run(self, folder, home, cache, *first: str) -> list[str]:
         """Compile and run a loop by the program, in a process without other places for the cache;
         return the lines that it says.
         """
-        made = home.parent / "made.h5"
-        made.unlink(missing_ok=True)
-        code = "import sys; " + "; ".join(first) + self.CALL_A_VERB
+        (folder / "loops.py").write_text(self.LOOP)
         places = {"HOME": str(home), "XDG_CACHE_HOME": str(home), "NUMBA_CACHE_DIR": str(cache)}
         done = subprocess.run(
-            [sys.executable, "-c", code, str(made)],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **places},
+            [sys.executable, "-c", "import sys; " + "; ".join(first) + self.CALL_IT],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sys.path]), **places},
             capture_output=True,
             text=True,
             check=False,
         )
-        assert done.returncode == 0
-        assert made.is_file()
+        assert done.returncode == 0, done.stderr
         return done.stderr.splitlines()
 
     def assert_not_kept(self, said: list[str]) -> None:
@@ -110,28 +120,26 @@ sys.exit(main([*words.split(), "--out", sys.argv[1]]))
         assert line.startswith(f"tofclip: warning: {warning}")
         assert "NUMBA_CACHE_DIR" in line
 
-    @pytest.mark.nightly
     def test_without_a_place_for_compiled_loops_they_are_compiled_for_the_run(self, tmp_path):
         """As in an installation that is read-only, for a user without a home."""
         (tmp_path / "file").touch()  # a folder below it cannot be made by anybody
         forbid = "from numba.core.caching import InTreeCacheLocator as place"
         nowhere = "place.get_cache_path = lambda _: '/dev/null/cache'"
         below = tmp_path / "file" / "cache"
-        self.assert_not_kept(self.simulate(tmp_path / "file", below, forbid, nowhere))
+        self.assert_not_kept(self.run(tmp_path, tmp_path / "file", below, forbid, nowhere))
 
-    @pytest.mark.nightly
     def test_a_full_disk_of_the_cache_keeps_no_result(self, tmp_path):
         fill = "from numba.core.caching import IndexDataCacheFile as file"
         full = "file._save_data = lambda *_: open('/dev/full', 'w', 1).write('loop\\n')"
-        self.assert_not_kept(self.simulate(tmp_path / "home", tmp_path / "cache", fill, full))
+        self.assert_not_kept(self.run(tmp_path, tmp_path / "home", tmp_path / "cache", fill, full))
 
     def test_a_damaged_cache_is_passed_over(self, tmp_path):
-        assert self.simulate(tmp_path / "home", tmp_path) == []
+        assert self.run(tmp_path, tmp_path / "home", tmp_path) == []
         kept = list(tmp_path.rglob("*.nb[ic]"))
         assert kept
         for file in kept:
             file.write_bytes(b"")
-        self.assert_not_kept(self.simulate(tmp_path / "home", tmp_path))
+        self.assert_not_kept(self.run(tmp_path, tmp_path / "home", tmp_path))
 
 
 # Vectors in compiled loops do what NumPy does with sixteen numbers: whole ones, of which float32

@@ -5,6 +5,7 @@ used, their docstrings' examples run and name every argument, and the exceptions
 from __future__ import annotations
 
 import ast
+import dataclasses
 import doctest
 import importlib
 import inspect
@@ -36,6 +37,22 @@ CONTRACT = (
 )
 """Names that users write most: their arguments are held too, and the members of the classes."""
 
+MEASURED = (
+    *("tofclip.solvers.Sparse", "tofclip.solvers.TotalVariation", "tofclip.solvers.Wavelets"),
+    *("tofclip.solvers.LinearInverse", "tofclip.solvers.fista.LightFieldVariation"),
+    *("tofclip.solvers.PlugAndPlay", "tofclip.solvers.RegularisationByDenoising"),
+    "tofclip.solvers.denoising.NonlocalMeans",
+    "tofclip.solvers.denoising.CollaborativeWiener",
+    *("tofclip.lidar.Detection", "tofclip.lidar.photons.PhotonDetector"),
+    *("tofclip.lidar.photons.Smoothness", "tofclip.simulate.StreakDetector"),
+    *("tofclip.recovery.SurfaceRecovery", "tofclip.recovery.DepthLockedFocus"),
+    *("tofclip.recovery.FixedFocus", "nlos.Refinement", "nlos.refinement.l1.build_total_variation"),
+    "nlos.refinement.photons.PhotonRefinement",
+)
+"""Of these the defaults are held: who changes one measures it anew, and says so where docs/recovery_algorithm.md,
+docs/nlos.md, docs/nlos_algorithm.md or docs/results speak of it.
+"""
+
 OF_METHODS = ("plan", "reconstruct")
 """The members that are held of a method of imaging around corners."""
 HEAVY = {"h5py", "matplotlib", "numba", "numpy", "open3d", "pyvista", "scipy", "tifffile"}
@@ -52,8 +69,13 @@ def list_packages() -> Iterator[str]:
 
 def show_signature(value: Any) -> str:
     """Names, kinds and defaults of arguments; types may be put more exactly."""
-    plain = inspect.signature(value)
+    plain, fields = inspect.signature(value), getattr(value, "__dataclass_fields__", {})
     shown = [one.replace(annotation=inspect.Parameter.empty) for one in plain.parameters.values()]
+    for number, one in enumerate(shown):
+        if repr(one.default) == "<factory>":
+            made = fields[one.name].default_factory()
+            if dataclasses.is_dataclass(made):
+                shown[number] = one.replace(default=made)
     text = str(plain.replace(parameters=shown, return_annotation=inspect.Signature.empty))
     return re.sub(r"<(?:function|class) '?([\w.]+)[^>]*>", r"\1", text)
 
@@ -71,18 +93,18 @@ def list_members(name: str, home: type) -> Iterator[str]:
 
 
 def list_names() -> Iterator[str]:
-    """What every package exports, then the contract in full."""
+    """What every package exports, then the contract in full, and what else has measured defaults."""
     for package in list_packages():
         module = importlib.import_module(package)
         for name in sorted(getattr(module, "__all__", ())):
             assert name in dir(module)
             assert getattr(module, name) is not None
             yield f"{package}.{name}"
-    for name in CONTRACT:
+    for name in (*CONTRACT, *MEASURED):
         package, _, one = name.rpartition(".")
         value = getattr(importlib.import_module(package), one)
         yield f"{name}{show_signature(value)}"
-        if inspect.isclass(value):
+        if inspect.isclass(value) and name in CONTRACT:
             yield from list_members(name, value)
 
 
