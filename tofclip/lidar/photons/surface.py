@@ -30,6 +30,7 @@ from tofclip.lidar.photons.held_out import (
 )
 from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, find_dim_pixels
 from tofclip.lidar.photons.matching import (
+    PLANE_ROUNDS,
     LabelAxis,
     choose_label_axis,
     compute_scores,
@@ -54,6 +55,7 @@ JUMP_COST_RATIO = 9.0  # any larger change costs this many times as much
 # How well it is known where in a response that was learnt from the scene its surface lies: one offset
 # for the whole picture, which `settings` state and no pixel's deviation holds.
 LEARNT_RESPONSE_SIGMA_WIDTHS = 1 / 30
+LONG_GATE_STEPS, LONG_GATE_ROUNDS = 4.0, 20
 LABEL_SIGMA_WIDTHS = 1 / np.sqrt(6)  # of a triangle that falls to nothing a width to either side
 MIN_EXPLAINED_DENSITY = 0.003  # of the response's peak: where it is brighter photons are explained
 # Of the time axis, and pixels that have to show a stretch before their surfaces; photons expected behind
@@ -215,7 +217,11 @@ class SurfacePlan:
         volume = compute_scores(photons, scene, self.axis)
         labels, margin = match_labels(volume, photons.image_shape, *self.costs)
         del volume
-        nested = fit_surface(photons, scene, self.axis.to_bins(labels), max(self.reach // 2, 1))
+        # labels of a gate that is open for many steps are further off than its edges are steep
+        is_long = photons.sampled and scene.response.width > LONG_GATE_STEPS
+        rounds = LONG_GATE_ROUNDS if is_long else PLANE_ROUNDS
+        near = max(self.reach // 2, 1)
+        nested = fit_surface(photons, scene, self.axis.to_bins(labels), near, rounds)
         fitted = fit_surface(photons, scene, nested[..., 0], self.reach)
         # Where no photon is near, or none on a slope of the response, the label is all there is.
         counted = np.minimum(fitted[..., 1], scene.response.width * LABEL_SIGMA_WIDTHS)
