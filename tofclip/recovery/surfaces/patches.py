@@ -37,7 +37,8 @@ DIMMER_BINS = 0.8  # misfit of its returns
 DIMMER_REACH_BINS = 4.0  # nearer to a surface, a return is a part of it
 MERGE_BINS = 0.5  # misfit of either of two patches to one surface for both
 MERGE_EXCESS = 1.3  # or of their misfit to a surface of their own
-MERGE_REACH_BINS = 7.0  # of the larger's fit at the smaller: further off it is not tried
+# Of the larger's fit at the smaller: further off it is not tried, nor than so many of its own misfits.
+MERGE_REACH_BINS, MERGE_REACH_MISFITS = 7.0, 5.0
 # Of returns, also in their deviations: further off a patch's surface they may be another's.
 SPLIT_BINS, SPLIT_SIGMAS = 4.0, 3.0
 MERGE_SIGMAS = 1.0  # median; 0.67 are expected of returns of the surface
@@ -204,7 +205,10 @@ def _split(patch: Patch, bin_m: float) -> list[Patch]:
                 one
                 for one in _split(part.take(far), bin_m)
                 if one.pixels.size >= MIN_DIMMER_PX
-                and one.compute_error() < BENT_FRACTION * one.compute_error(whole)
+                and one.compute_error(whole) > MERGE_BINS * bin_m
+                # what stands there may be round itself
+                and _bend_where_needed(one, bin_m).compute_error()
+                < BENT_FRACTION * one.compute_error(whole)
             ]
         if apart:
             left = ~np.isin(part.pixels, np.concatenate([one.pixels for one in apart]))
@@ -291,7 +295,8 @@ def _merge(large: Patch, small: Patch, bin_m: float) -> Patch | None:
     """Return both as one patch if one surface fits either as well as a surface of its own, or as well
     as returns are known.
     """
-    if small.compute_error(large) > MERGE_REACH_BINS * bin_m:
+    reach = max(MERGE_REACH_BINS * bin_m, MERGE_REACH_MISFITS * large.compute_error())
+    if small.compute_error(large) > reach:
         return None
     both = large, small
     pixels = np.concatenate([one.pixels for one in both])
