@@ -276,12 +276,17 @@ SHOWN = {
     "streak.h5": "streak",
     "frames.h5": "frames",
     "range.npz": "range image",
-    "returns.npz": "range image",
     "depth.exr": "depth picture",
-    "cloud_depth.exr": "depth picture",
     "photons.ply": "cloud",
     "volume.h5": "volume",
 }
+ALIKE = {
+    **dict.fromkeys(CLOUDS, "cloud"),
+    "returns.npz": "range image",
+    "cloud_depth.exr": "depth picture",
+}
+"""Shown as those above are, or below."""
+
 NOT_SHOWN = {
     "camera.h5": "camera",
     "run.h5": "recording",
@@ -315,9 +320,7 @@ def written(request, files, confocal, tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"), (SHOWN | NOT_SHOWN | dict.fromkeys(CLOUDS, "cloud")).items()
-)
+@pytest.mark.parametrize(("name", "kind"), (SHOWN | NOT_SHOWN | ALIKE).items())
 def test_every_output_is_opened(shell, written, name, kind):
     assert shell.figures("info {written}/{name}", name=name)["kind"] == kind
     loaded = tofclip.load(written / name)
