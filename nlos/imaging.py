@@ -304,11 +304,12 @@ def _complete_box(capture: Capture, settings: Wanted) -> Wanted:
     return completed
 
 
-# A picture is judged by what this fraction of its voxels exceeds, against that of so many decoys:
-# two, or as many as fill these voxels: the few speckles of small pictures tell little.
-BRIGHT_QUANTILE, DECOYS, MAX_DECOYS, DECOY_VOXELS = 0.999, 2, 8, 1 << 15
-# With less evidence than this, a picture may be of noise, a glow, or of wrong units.
-MIN_EVIDENCE = 2.0
+# A picture is judged by what this fraction of its voxels exceeds, against that of as many decoys as
+# fill these voxels: the few speckles of small pictures tell little.
+BRIGHT_QUANTILE, MAX_DECOYS, DECOY_VOXELS = 0.999, 8, 1 << 15
+# With less evidence than this, a picture may be of noise or a glow: backgrounds and shuffled records
+# reach 1.24, other laboratories' scenes have 1.5 to 47.
+MIN_EVIDENCE = 1.35
 
 
 def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
@@ -316,18 +317,13 @@ def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
     with its signals shuffled among the wall points; about 1 where there is nothing. Each depth
     counts relative to the decoys': noise and the wall's glow fade with it.
     """
-    own, decoys = measure_brightness(capture, plan, picture, DECOYS)
+    own, decoys = measure_brightness(capture, plan, picture)
     return own / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
 
 
-def measure_brightness(
-    capture: Capture, plan: Plan, picture: Volume, count: int | None = None
-) -> tuple[float, list[float]]:
-    """Brightest of a picture, and of decoys, by default as many as it needs; see
-    `measure_evidence`.
-    """
-    if count is None:
-        count = int(np.clip(DECOY_VOXELS // picture.values.size, 1, MAX_DECOYS))
+def measure_brightness(capture: Capture, plan: Plan, picture: Volume) -> tuple[float, list[float]]:
+    """Brightest of a picture, and of decoys; see `measure_evidence`."""
+    count = int(np.clip(DECOY_VOXELS // picture.values.size, 1, MAX_DECOYS))
     xp, places = namespace(capture.signal), np.flatnonzero(capture.valid)
     # Whatever order the points come in, the decoys are the same.
     ordered = places[np.lexsort((capture.points + capture.lasers).T)]

@@ -176,27 +176,19 @@ class Settings:
         from nlos.illumination import choose_roles
 
         capture = choose_roles((join or preparation.join_near_lasers)(capture))
-        capture = self._orient(capture)
         if self.gate is not None:
             capture = preparation.remove_first_bounce(capture, self.gate, self.gate_ramp or 0.0)
         if self.fade:
             capture = preparation.fade_record_end(capture, self.fade)
-        return self._join_bins(capture)
+        return self.prepare_counts(capture)
 
     def prepare_counts(self, capture: Capture) -> Capture:
         """Do what `prepare` does to a ``capture``, but what is counted stays counted: no blanking."""
-        return self._join_bins(self._orient(capture))
+        from nlos.preparation import flip_capture, rebin_capture
 
-    def _orient(self, capture: Capture) -> Capture:
-        from nlos.preparation import flip_capture
-
-        return flip_capture(capture, self.flip) if self.flip else capture
-
-    def _join_bins(self, capture: Capture) -> Capture:
-        from nlos.preparation import rebin_capture
-
+        flipped = flip_capture(capture, self.flip) if self.flip else capture
         bins = 1 if self.bins_together is None else self.bins_together
-        return capture if bins == 1 else rebin_capture(capture, bins)
+        return flipped if bins == 1 else rebin_capture(flipped, bins)
 
     def grid(self, voxel: float | None = None) -> Grid:
         """Fill the box with voxels, of the settings' size unless ``voxel`` (m) says otherwise."""
