@@ -32,8 +32,6 @@ from tofclip.solvers.methods import (
     GAP_INTERVAL,
     MIN_FURTHER_FALL,
     NOISE_FRACTION,
-    IterationHistory,
-    Result,
 )
 from tofclip.solvers.priors import NonnegativeLightFieldVariation, NonnegativeWavelets
 from tofclip.threads import LANES
@@ -338,12 +336,6 @@ def test_a_weight_that_leaves_nothing_takes_no_iteration():
     np.testing.assert_allclose(result.objective, [60.0])
 
 
-def test_blocks_that_stopped_early_count_with_their_last_value():
-    histories = [IterationHistory(np.array(values), True) for values in ([10.0, 5], [8.0, 4, 2])]
-    found = Result.from_blocks(np.zeros((2, 1, 1)), histories)
-    assert (found.objective.tolist(), found.iterations) == ([18, 9, 7], 2)
-
-
 def test_pictures_to_begin_at_save_iterations_at_the_same_objective():
     """Two shots of one scene, which differ in their noise."""
     operator, random = projection(), np.random.default_rng(5)
@@ -389,19 +381,6 @@ def smooth(
     result, penalty = denoise(NonnegativeTotalVariation(weight), block, calls)
     assert np.ptp(result, axis=-1).max() == 0  # every lane the same
     return result[..., 0], float(penalty[0])
-
-
-def test_two_plateaus_approach_each_other():
-    """A step between halves of `n` columns moves each by weight / n (Strong and Chan 2003), until
-    they meet.
-    """
-    picture = np.repeat([1.0, 3.0], 4) * np.ones((6, 1))
-    result, penalty = smooth(picture, 0.4)
-    np.testing.assert_allclose(result, np.repeat([1.1, 2.9], 4) * np.ones((6, 1)), atol=1e-6)
-    assert penalty == pytest.approx(0.4 * 6 * (2 - 0.2), rel=1e-6)
-    picture = np.random.default_rng(0).random((7, 5))
-    result, _ = smooth(picture, 50.0, calls=3000)
-    np.testing.assert_allclose(result, picture.mean(), atol=1e-4)
 
 
 def test_it_beats_every_nearby_picture():
