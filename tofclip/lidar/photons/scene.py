@@ -313,13 +313,16 @@ def measure_bins(
     seen = np.bincount(whole, light, bins)
     parts = np.array_split(np.arange(bins), UNEVEN_PARTS)
     counted, bright = np.array([[seen[p].sum(), expected[p].sum()] for p in parts]).T
-    if counted.min() <= 0 or np.ptp(np.log(counted / bright)) > np.log(MIN_SHADING_RATIO):
+    if counted.min() <= 0:
         return None
     # What changes slowly is light, unless parts differ as much from a cubic as they do from each other.
     ratio = counted / bright - counted.sum() / bright.sum()
     course = np.polyfit(np.arange(UNEVEN_PARTS), ratio, 3)
-    misfit = np.sum((ratio - np.polyval(course, np.arange(UNEVEN_PARTS))) ** 2)
-    slow = np.sum(ratio**2) > MIN_SLOW_RATIO * misfit
+    smooth = np.polyval(course, np.arange(UNEVEN_PARTS))
+    level = counted.sum() / bright.sum() + smooth
+    if not 0 < level.max() < MIN_SHADING_RATIO * level.min():
+        return None
+    slow = np.sum(ratio**2) > MIN_SLOW_RATIO * np.sum((ratio - smooth) ** 2)
     if slow:
         place = (np.arange(bins) + 0.5) * UNEVEN_PARTS / bins - 0.5
         expected *= 1 + np.polyval(course, place) * bright.sum() / counted.sum()
