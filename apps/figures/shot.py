@@ -247,11 +247,11 @@ def _draw_errors(axes: Axes, returns: Returns, truth: GroundTruth) -> None:
     error = (returns.image("range") - truth.range)[truth.target] / MILLIMETRE
     error = error[np.isfinite(error)]
     bin_mm = SPEED_OF_LIGHT * truth.bin_width / 2 / MILLIMETRE
-    reach = min(2 * bin_mm, 5 * float(np.percentile(np.abs(error), 90)))
+    reach = min(2 * bin_mm, 3 * float(np.percentile(np.abs(error), 90)))
     edges = np.linspace(-reach, reach, HISTOGRAM_BINS).tolist()
     axes.hist(np.clip(error, edges[0], edges[-1]), edges, color="#4c72b0")
     title = f"range error, median {np.median(np.abs(error)):.2f} mm"
-    meaning = f"range error (mm), more at the ends; a bin is {bin_mm:.2f} mm"
+    meaning = f"range error (mm); a bin is {bin_mm:.2f} mm"
     label_axes(axes, title, meaning, "target pixels")
 
 
