@@ -302,9 +302,7 @@ def measure_bins(
         free &= ~((whole >= early[photons.pixel]) & (whole < late[photons.pixel]))
     light = photons.count * free
     level = np.bincount(photons.pixel, light, photons.offsets.size - 1) / bins
-    hidden = np.zeros(
-        bins + 1
-    )  # of the background, by surfaces: first bins and ends of their windows
+    hidden = np.zeros(bins + 1)  # of the background, by windows around surfaces
     for ends, sign in zip(windows, (1, -1), strict=True):
         known = np.isfinite(ends)
         place = np.clip(np.ceil(ends[known]), 0, bins).astype(np.int64)
@@ -324,8 +322,8 @@ def measure_bins(
         return None
     slow = np.sum(ratio**2) > MIN_SLOW_RATIO * np.sum((ratio - smooth) ** 2)
     if slow:
-        place = (np.arange(bins) + 0.5) * UNEVEN_PARTS / bins - 0.5
-        expected *= 1 + np.polyval(course, place) * bright.sum() / counted.sum()
+        where = (np.arange(bins) + 0.5) * UNEVEN_PARTS / bins - 0.5
+        expected *= 1 + np.polyval(course, where) * bright.sum() / counted.sum()
     expected *= seen.sum() / expected.sum()
     noise, excess = 1 / expected, seen / expected - 1
     window = min(2 * round(UNEVEN_WIDTHS * width) + 1, bins // UNEVEN_PARTS)
