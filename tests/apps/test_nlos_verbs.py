@@ -180,13 +180,9 @@ class TestReconstruct:
         # Where the method itself had looked, the box would end at 1.54 m.
         assert Volume.load("volume.h5").grid.z[-1] < 1.0
 
-    @pytest.mark.parametrize(
-        ("suffix", "start"),
-        [("vti", b"<?xml"), ("npz", b"PK"), ("exr", b"\x76\x2f\x31\x01"), ("ply", b"ply")],
-    )
-    def test_formats(self, shell, suffix, start):
-        shell.figures(f"nlos reconstruct {{curved}} --voxel-mm 60 --out volume.{suffix}")
-        assert Path(f"volume.{suffix}").read_bytes().startswith(start)
+    def test_another_format(self, shell):
+        shell.figures("nlos reconstruct {curved} --voxel-mm 60 --out volume.exr")
+        assert Path("volume.exr").read_bytes().startswith(b"\x76\x2f\x31\x01")
 
 
 class TestRefine:

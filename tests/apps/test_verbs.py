@@ -54,20 +54,6 @@ class TestCalibrate:
         assert len(lines) == 1 + 7 + 2  # heading, views, two files
         assert lines[-2:] == ["wrote camera.h5", "wrote fits.png"]
 
-    def test_the_recorded_focus_pictures(self, shell, shared_data):
-        pictures = (
-            "--line {clip}/LinePattern.tif --line-background {clip}/LinePattern_bkg.tif"
-            " --dot {clip}/DotPattern.tif --dot-background {clip}/DotPattern_bkg.tif"
-        )
-        line = f"calibrate {pictures} --out camera.h5"
-        found = shell.figures(line, clip=shared_data / "clip")
-        # An independent trial on the same pictures; half a degree and half a pixel is what the two
-        # may differ by.
-        angles = [-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0]
-        centres = [147.7, 320.0, 490.2, 664.1, 835.5, 1011.5, 1192.3]
-        np.testing.assert_allclose(found["angles_deg"], angles, atol=0.5)
-        np.testing.assert_allclose(found["centres_px"], centres, atol=0.5)
-
 
 class TestRecover:
     def test_contract_of_json_and_files(self, shell):
@@ -98,10 +84,9 @@ class TestRecover:
         np.testing.assert_allclose(found["view_gains"], 1, atol=0.1)
         assert 0 < found["duality_gap"] < 1
 
-    @pytest.mark.parametrize("method", ["linear", "adjoint"])
-    def test_direct_methods(self, shell, method):
-        found = shell.figures(f"recover {{files}}/streak.h5 --out f.h5 --method {method}")
-        assert (found["method"], found["iterations"]) == (method, 0)
+    def test_a_direct_method(self, shell):
+        found = shell.figures("recover {files}/streak.h5 --out f.h5 --method adjoint")
+        assert (found["method"], found["iterations"]) == ("adjoint", 0)
         assert found["stopped_because"] == "direct method"
 
     def test_time_axis_flags_override_the_file(self, shell):
@@ -194,13 +179,6 @@ class TestInfo:
         fields = shell.figures("info {files}/camera.h5")["fields"]
         assert fields["angles"]["units"] == "rad"
         np.testing.assert_allclose(fields["centres"]["values"], CENTRES_PX)
-
-    @pytest.mark.parametrize("suffix", ["ply", "pcd", "csv", "npz", "h5"])
-    def test_clouds_of_every_format(self, shell, suffix):
-        points = shell.figures(f"cloud {{frames_file}} --out scene.{suffix}")["points"]
-        found = shell.figures(f"info scene.{suffix}")
-        assert found["kind"] == "cloud"
-        assert found["fields"]["xyz"]["shape"] == [points, 3]
 
     def test_outline_for_people(self, shell):
         lines = shell("info {frames_file}").out.splitlines()
