@@ -32,8 +32,6 @@ from tofclip.shots import Streak
 def shell(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Shell:
     """Run the program in this process, in the test's own folder."""
     monkeypatch.chdir(tmp_path)
-    # What it says does not depend on how slow this machine is.
-    monkeypatch.setattr("apps.progress.MAX_SILENCE_S", 3600.0)
     return Shell(request)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -68,7 +69,9 @@ class Shell:
         known = Names(self.request, names)
         words = [word.format_map(known) for word in shlex.split(line)]
         out, err = io.StringIO(), io.StringIO()
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        # What it says does not depend on how slow this machine is.
+        patient = mock.patch("apps.progress.MAX_SILENCE_S", 3600.0)
+        with patient, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             status = main(words)
         return Outcome(status, out.getvalue(), err.getvalue())
 
