@@ -21,6 +21,7 @@ from nlos.band import VirtualPulse
 from nlos.capture import Capture
 from nlos.illumination import AliasingWarning, choose_roles
 from nlos.method import Plan
+from nlos.plane import WallLattice
 from nlos.preparation import fade_record_end, join_near_lasers
 from nlos.resolution import compute_diffraction_limit
 from nlos.settings import METHODS_BY_SPEED, Limits, Settings, Wanted, list_taken
@@ -238,13 +239,26 @@ def _judge_wavelength(
 
 
 def _thin_out(capture: Capture) -> Capture:
-    """Return a capture of at most `MAX_JUDGED_POINTS`, every nth along each axis of the wall."""
-    axes = capture.wall.ndim - 1
-    step = math.ceil((capture.valid.size / MAX_JUDGED_POINTS) ** (1 / axes)) if axes else 1
-    some = (slice(None, None, step),) * axes
-    laser = capture.laser if capture.laser.ndim == 1 else capture.laser[some]
-    signal = capture.signal[(slice(None), *some)]
-    return replace(capture, signal=signal, wall=capture.wall[some], laser=laser)
+    """Return a capture of about `MAX_JUDGED_POINTS`, evenly picked, in whatever order they come:
+    every nth row and column of a lattice, else one of each cell of the wall.
+    """
+    points, places = capture.points, np.flatnonzero(capture.valid)
+    if len(points) <= MAX_JUDGED_POINTS:
+        return capture
+    if (lattice := WallLattice.find(points)) is not None:
+        step = math.ceil(math.sqrt(len(points) / MAX_JUDGED_POINTS))
+        some = np.flatnonzero((lattice.row % step == 0) & (lattice.column % step == 0))
+    else:
+        # Of a round size, so that a wall without some points has the same cells.
+        side = float(np.ptp(points[:, :2], axis=0).max()) / math.sqrt(MAX_JUDGED_POINTS)
+        cells = np.floor(points[:, :2] / 2 ** (math.ceil(4 * math.log2(side)) / 4))
+        ordered = np.lexsort((points + capture.lasers).T)
+        some = np.sort(ordered[np.unique(cells[ordered], axis=0, return_index=True)[1]])
+    laser = capture.laser if capture.laser.ndim == 1 else capture.lasers[some]
+    xp = namespace(capture.signal)
+    flat = xp.reshape(capture.signal, (capture.axis.bins, -1))
+    signal = xp.take(flat, capture.device.put(places[some]), axis=1)
+    return replace(capture, signal=signal, wall=points[some], laser=laser)
 
 
 def _by_lattice(capture: Capture, settings: Settings) -> bool:

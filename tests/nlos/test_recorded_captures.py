@@ -30,6 +30,7 @@ FIRST_BOUNCE_BINS = 600
 OUTDOOR = "nlos_native/otoole2018_outdoor_s.mat"
 DIFFUSE = "nlos/otoole2018_diffuse_s.npz"
 MANNEQUIN = "nlos_native/cmu_mannequin_transient.mat"
+STREAK = "lift/nlos_LetterVI.npz"
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +106,10 @@ def test_settings_of_recorded_captures(
 
 @pytest.mark.parametrize(
     "name",
-    [DIFFUSE, *(pytest.param(one, marks=pytest.mark.nightly) for one in (OUTDOOR, MANNEQUIN))],
+    [
+        DIFFUSE,
+        *(pytest.param(one, marks=pytest.mark.nightly) for one in (OUTDOOR, MANNEQUIN, STREAK)),
+    ],
 )
 def test_settings_of_a_capture_do_not_hang_on_how_it_is_handed_over(
     name: str, shared_data: Path, tmp_path: Path
@@ -116,7 +120,9 @@ def test_settings_of_a_capture_do_not_hang_on_how_it_is_handed_over(
         recorded = replace(recorded, signal=signal, wall=wall, laser=wall)
     random, places = np.random.default_rng(0), np.arange(len(recorded.points))
     bins = round(1e-9 / recorded.bin_width)
-    half = random.binomial(recorded.signal.astype(int), 0.5).astype(np.float32)
+    half = recorded.signal
+    if name != STREAK:  # whose frames are recovered: no counts
+        half = random.binomial(half.astype(int), 0.5).astype(np.float32)
     capture, order = replace(recorded, signal=half), random.permutation(places)
     expected = complete_settings(capture, Settings())
     capture.save(tmp_path / "capture.h5")
@@ -128,7 +134,7 @@ def test_settings_of_a_capture_do_not_hang_on_how_it_is_handed_over(
         "later": replace(
             capture, signal=half[bins:], start=capture.start + bins * capture.axis.spacing
         ),
-        "photons": replace(capture, signal=recorded.signal - half),
+        "photons": replace(capture, signal=recorded.signal - half) if name != STREAK else capture,
         "saved": Capture.load(tmp_path / "capture.h5"),
     }
     for change, same in changed.items():
