@@ -347,10 +347,14 @@ def _draw_top_view(
 ) -> None:
     light = MIN_BRIGHTNESS + (1 - MIN_BRIGHTNESS) * tone_map(cloud.intensity)
     scatter_points(axes, cloud.xyz[:, 0], cloud.xyz[:, 2], light)
-    size, taken = np.ptp(cloud.xyz[:, ::2], axis=0), list[Any]()
+    size, written = np.ptp(cloud.xyz[:, ::2], axis=0), list[Any]()
     for number, one in numbered:
-        place = np.array([one.centre[0], one.centre[2]])
-        if all(np.abs((place - other) / size).max() > LABEL_DISTANCE for other in taken):
-            axes.annotate(str(number), place, color="white", fontsize=SMALL_FONT_PT)
-            taken.append(place)
+        place, words = np.array([one.centre[0], one.centre[2]]), str(number)
+        for other in written:  # what would lie over another number is written behind it
+            if np.abs((place - other.xy) / size).max() <= LABEL_DISTANCE:
+                other.set_text(f"{other.get_text()}, {words}")
+                break
+        else:
+            look: Any = {"color": "white", "fontsize": SMALL_FONT_PT}
+            written.append(axes.annotate(words, place, **look))
     label_axes(axes, "objects from above", "x (m)", "z, away from the camera (m)")
