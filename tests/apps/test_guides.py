@@ -112,7 +112,7 @@ class TestPictures:
         guide.write_text(
             "```python\nimport numpy as np\nfrom matplotlib.image import imsave\n"
             "imsave('square.png', np.loadtxt('numbers.txt').reshape(2, 2))\n"
-            "imsave('noise.png', np.random.default_rng(0).random((400, 400, 3)))\n```\n\n"
+            "imsave('noise.png', np.random.default_rng(0).random((320, 320, 3)))\n```\n\n"
             "![A square](pictures/small/square.png) ![Noise](pictures/small/noise.png)\n"
             "![Another's](pictures/other.png)\n"
         )
@@ -120,7 +120,7 @@ class TestPictures:
         assert {*os.listdir(tmp_path / "pictures" / "small")} == {"square.png", "noise.png"}
         assert not (tmp_path / "pictures" / "other.png").exists()
         with Image.open(tmp_path / "pictures" / "small" / "noise.png") as image:
-            assert (image.mode, image.size) == ("P", (400, 400))
+            assert (image.mode, image.size) == ("P", (320, 320))
 
     def test_a_step_that_fails_is_named(self, tmp_path, inputs):
         guide = tmp_path / "faulty.md"
