@@ -46,7 +46,6 @@ DISTRIBUTIONS = {
     "PIL": "pillow",
     "pywt": "pywavelets",
     "skimage": "scikit-image",
-    "sklearn": "scikit-learn",
     "usb": "pyusb",
 }
 

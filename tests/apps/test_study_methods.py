@@ -4,11 +4,8 @@ a dictionary of light-field patches.
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
 from apps.studies.cameras import (
     LINES,
@@ -24,17 +21,10 @@ from apps.studies.cameras import (
     recover_from_lines,
     select_views,
 )
-from apps.studies.light_field_dictionary import (
-    LightFieldDictionary,
-    learn_dictionary,
-    recover_with_dictionary,
-)
-from tofclip.errors import FileFormatError, InputError, MissingDependencyError, ShapeError
+from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field import LightField
-from tofclip.metrics import nmse
-from tofclip.operators import LinearOperator, LinearShear
-from tofclip.operators.cameras import MarwahCamera
+from tofclip.operators import LinearOperator
 from tofclip.solvers import NonnegativeTotalVariation
 
 
@@ -209,59 +199,3 @@ class TestDiffuser:
         np.savez(tmp_path / "no_background.npz", psf=np.ones((3, 4)), raw=np.ones((3, 4)))
         with pytest.raises(FileFormatError, match="'background'"):
             read_diffuser_recording(tmp_path / "no_background.npz")
-
-
-class TestDictionary:
-    VIEWS = tuple((float(v), float(u)) for v in range(-1, 2) for u in range(-1, 2))
-    SHAPE = (40, 44)
-
-    def scene(self, seed: int) -> LightField:
-        """Bright edges at one depth, smooth enough for the shear's interpolation."""
-        noise = gaussian_filter(np.random.default_rng(seed).standard_normal(self.SHAPE), 4)
-        picture = gaussian_filter((noise > 0).astype(np.float32), 0.7)
-        pictures = [LinearShear(self.SHAPE, 0.8, view)(picture) for view in self.VIEWS]
-        return LightField(np.stack(pictures), np.array(self.VIEWS))
-
-    def test_a_light_field_comes_back_from_one_exposure(self, monkeypatch):
-        pytest.importorskip("sklearn")
-        # a quarter of the time
-        monkeypatch.setattr("apps.studies.light_field_dictionary.TRAINING_PATCHES", 500)
-        seen = [self.scene(1), self.scene(2)]
-        dictionary = learn_dictionary(seen, patch_px=6, atoms=48, seed=0)
-        assert (dictionary.atoms.shape, dictionary.patch_px) == ((48, 9, 6, 6), 6)
-        lengths = np.linalg.norm(dictionary.atoms.reshape(48, -1), axis=1)
-        np.testing.assert_allclose(lengths, 1, rtol=1e-5)
-        true, camera = self.scene(3).pictures, MarwahCamera(self.SHAPE, self.VIEWS, 1, 0)
-        exposure = camera.light_field_model()(true).reshape(self.SHAPE)
-        found = recover_with_dictionary(exposure, camera.codes(), dictionary)
-        # A control: the exposure itself, as bright as a view, for every view.
-        plain = np.broadcast_to(exposure / camera.codes().sum(axis=0), true.shape)
-        assert nmse(found, true, 6) < min(0.05, 0.3 * nmse(plain, true, 6))
-
-    def test_a_patch_made_of_few_atoms_is_found(self):
-        """Two of twenty random atoms and brightness: the exposure's 64 pixels tell which, the weight
-        takes its toll.
-        """
-        atoms = np.random.default_rng(0).standard_normal((20, 9, 8, 8)).astype(np.float32)
-        atoms[0] = 1
-        atoms /= np.linalg.norm(atoms.reshape(20, -1), axis=1)[:, None, None, None]
-        true = 30 * atoms[0] + 5 * atoms[7] - 4 * atoms[12]
-        codes = MarwahCamera((8, 8), self.VIEWS, 1, 1).codes()
-        exposure, dictionary = (codes * true).sum(axis=0), LightFieldDictionary(atoms)
-        found = recover_with_dictionary(exposure, codes, dictionary, 1e-4, 2000)
-        np.testing.assert_allclose(found, true, atol=0.02 * np.abs(true).max())
-
-    def test_what_does_not_fit_is_refused(self, monkeypatch):
-        dictionary = LightFieldDictionary(np.ones((2, 9, 6, 6), np.float32))
-        with pytest.raises(ShapeError, match="mask codes"):
-            recover_with_dictionary(np.ones((8, 8)), np.ones((4, 8, 8)), dictionary)
-        with pytest.raises(ShapeError, match="a patch"):
-            recover_with_dictionary(np.ones((5, 8)), np.ones((9, 5, 8)), dictionary)
-        pytest.importorskip("sklearn")
-        with pytest.raises(InputError, match="at least one light field"):
-            learn_dictionary([])
-        with pytest.raises(ShapeError, match="to learn from"):
-            learn_dictionary([self.scene(1)], patch_px=41)
-        monkeypatch.setitem(sys.modules, "sklearn.decomposition", None)
-        with pytest.raises(MissingDependencyError, match=r"tofclip\[learning\]"):
-            learn_dictionary([self.scene(1)])
