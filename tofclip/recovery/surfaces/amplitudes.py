@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 import scipy
@@ -19,9 +21,16 @@ NORM_ITERATIONS, FURTHER_NORM_ITERATIONS = 10, 2
 NORM_MARGIN = 1.1
 EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
-# Of a surface's border: rounds of taking it off, steps of FISTA before and after, deviations of what is
-# needed, and the part of the points of which as few are not that no further round is worth it
-BORDER_ROUNDS, BORDER_STEPS, NEEDED_SIGMAS, FEW_POINTS = 4, 5, 4.0, 0.002
+# Of light that was spread beyond its surface: rounds of taking a border off and iterations in each; the
+# deviations from which on a border is needed, and by which it would be missed if nothing took its light;
+# the part of the usual brightness below which light was spread; the part of the points of which as few
+# are not that no further round is worth it; how much brighter the inside has to become by that light, or
+# of the brightness inside what a pixel has at most that is hardly filled
+BORDER_ROUNDS, TAKING_ITERATIONS, FURTHER_TAKING_ITERATIONS = 8, 30, 15
+NEEDED_SIGMAS, MISSED_SIGMAS, DIM_FRACTION, FEW_POINTS = 4.0, 8.0, 0.75, 0.0005
+GAINED_RATIO, HARDLY_FILLED = 1.1, 0.35
+# Sides of squares: of a place's brightness, and of light that stays there as it spreads
+FILLED_PX, SPREAD_PX = 3, 31
 MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 TINY = float(np.finfo(np.float32).tiny)
@@ -96,65 +105,88 @@ class AmplitudeSolver:
         # running sums may leave a rounding error below nothing
         return np.asarray(self.amplitude * np.sqrt(np.maximum(found, 0)))
 
-    def weigh_borders(self, shown: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-        """Return by how many deviations the whole shot is explained worse without the border of its
-        surface that is nearest to each of the points `shown`, (points,), those inside free to take over
-        the light; and how far inside each point is, px. Borders that are not needed are taken off, and
-        those behind them weighed: the light of a level line may lie anywhere in a lens about it.
+    def map_pictures(
+        self, work: Callable[[FloatArray], NDArray[Any]], values: NDArray[Any]
+    ) -> FloatArray:
+        """Apply `work` to the picture of each surface, the part that it covers, 0 beside it; return
+        what it makes of `values`, (points,).
         """
-        model, left = self.model, shown.copy()
-        precision = model.weights / self.estimate_local_variance()
-        need, amplitude = np.full(shown.size, np.nan), self.amplitude
-        for _ in range(BORDER_ROUNDS):
-            inner = np.zeros_like(model.masks)
-            inner[model.masks] = left
-            inner &= [scipy.ndimage.binary_erosion(one, border_value=1) for one in inner]
-            border = left & ~inner[model.masks]
-            amplitude, rest = self._explain(left, amplitude)
-            _, without = self._explain(left & ~border, amplitude)
-            light = np.where(border, amplitude, np.float32(0))
-            worse = precision * (without**2 - rest**2)
-            worse /= np.maximum(model.render(light), LEAST_COUNT)
-            # whose light it is says to which border a change of the misfit belongs
-            change = light * model.gather(worse.astype(np.float32))
-            for mask, part in zip(model.masks, model.parts, strict=True):
-                picture = np.zeros(mask.shape)
-                picture[mask] = change[part]
-                near = scipy.ndimage.uniform_filter(picture, NEIGHBOURHOOD_PX, mode="constant")
-                around = np.sign(near[mask]) * NEIGHBOURHOOD_PX * np.sqrt(np.abs(near[mask]))
-                need[part] = np.where(border[part], around, need[part])
-            idle = border & (need < NEEDED_SIGMAS)
+        found, model = np.zeros(values.size), self.model
+        for mask, box, part in zip(model.masks, self._boxes, model.parts, strict=True):
+            lit = mask[box]
+            picture = np.zeros(lit.shape)
+            picture[lit] = values[part]
+            found[part] = work(picture)[lit]
+        return found
+
+    def find_spread(self, shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Say which of the points `shown`, (points,), have light that belongs further inside.
+
+        The light of a line of one range that runs level may lie anywhere in a lens about it: no view
+        tells, and the prior favours the lens, which is dimmer. From the borders inwards such points are
+        found: the whole shot is explained as well without them and all that lie outside, those inside
+        free to take over the light (`explain_by_amplitude`), and with that light inside their
+        surface is still dimmer than beside the nearest border that the shot needs. What hardly
+        makes it brighter was not spread: a surface is dark there, unless its border alone is.
+        Nothing is known of light so weak that it would not be missed.
+        """
+        model = copy.copy(self.model)
+        model.weights = model.weights / self.estimate_local_variance()
+        amplitude, left = self.amplitude, shown.copy()
+        taken, usual = np.zeros_like(amplitude), np.zeros(shown.size)
+
+        def average(values: NDArray[Any], side: int) -> FloatArray:
+            mean = partial(scipy.ndimage.uniform_filter, size=side, mode="constant")
+            return self.map_pictures(mean, values)
+
+        def sum_near(light: Image, seen: Image) -> FloatArray:
+            """What some light about each point says of how much worse the shot is explained."""
+            own = light * model.gather(model.weights * seen)
+            return NEIGHBOURHOOD_PX**2 * average(own, NEIGHBOURHOOD_PX)
+
+        # how bright the surface is inside, where no pixel is only partly filled
+        light = np.where(shown, amplitude, np.float32(0))
+        bright = average(light, FILLED_PX) / np.maximum(average(shown, FILLED_PX), TINY)
+        largest = partial(scipy.ndimage.maximum_filter, size=NEIGHBOURHOOD_PX, mode="constant")
+        bright = self.map_pictures(largest, np.where(shown, bright, 0))
+        around = average(light, SPREAD_PX)
+        for number in range(BORDER_ROUNDS):
+            inside = np.zeros_like(model.masks)
+            inside[model.masks] = left
+            inside &= [scipy.ndimage.binary_erosion(one, border_value=1) for one in inside]
+            free = inside[model.masks]
+            border, without = left & ~free, np.where(free, np.float32(0), light)
+            taken = np.where(free, taken, np.float32(0))
+            iterations = FURTHER_TAKING_ITERATIONS if number else TAKING_ITERATIONS
+            image = model.render(without - taken)
+            taken += explain_by_amplitude(model, image, scale_amplitude(model, free), iterations)
+            # at the best that is free these add up to what the shot is explained worse by
+            needed = sum_near(without, model.render(without - taken)) > NEEDED_SIGMAS**2
+            missed = sum_near(without, model.render(without)) > MISSED_SIGMAS**2
+            if number == 0:
+                usual = self._spread_from(border & needed, bright)
+            gained = around / np.maximum(average(light * left, SPREAD_PX), TINY)
+            idle = border & ~needed & missed
+            idle &= bright * gained < DIM_FRACTION * usual
             left &= ~idle
-            if idle.sum() < FEW_POINTS * max(left.sum(), 1):
+            if idle.sum() <= FEW_POINTS * left.sum():
                 break
-        return self._spread_from_borders(need)
+        gained = around / np.maximum(average(light * left, SPREAD_PX), TINY)
+        faint = amplitude < HARDLY_FILLED * bright
+        return shown & ~left & (faint | (gained > GAINED_RATIO))
 
-    def _explain(self, kept: NDArray[np.bool_], amplitude: Image) -> tuple[Image, Image]:
-        """Amplitudes, (points,), of which only some are kept and solved for anew, and what they leave
-        of the image.
-        """
-        found, masks = np.zeros_like(amplitude), np.zeros_like(self.model.masks)
-        if not kept.any():
-            return found, self.model.image
-        masks[self.model.masks] = kept
-        begun = copy.copy(self)
-        begun.amplitude = amplitude
-        solver = begun.cover(masks)
-        solver.run(BORDER_STEPS)
-        found[kept] = solver.amplitude
-        return found, self.model.image - solver.model.render(solver.amplitude)
+    def _spread_from(self, known: NDArray[np.bool_], values: FloatArray) -> FloatArray:
+        """What the nearest point of the surface among those that are known has; 0 where none is."""
 
-    def _spread_from_borders(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What the nearest point of the surface with a value has, and how far that is, px."""
-        nearest, away = np.zeros((2, values.size))
-        for mask, part in zip(self.model.masks, self.model.parts, strict=True):
-            picture = np.full(mask.shape, np.nan)
-            picture[mask] = values[part]
-            known = np.isfinite(picture)
-            if known.any():
-                far, place = scipy.ndimage.distance_transform_edt(~known, return_indices=True)
-                nearest[part], away[part] = picture[tuple(place)][mask], far[mask]
-        return nearest, away
+        def spread(picture: FloatArray) -> FloatArray:
+            if not picture.any():
+                return picture
+            nearest = scipy.ndimage.distance_transform_edt(
+                picture == 0, return_distances=False, return_indices=True
+            )
+            return np.asarray(picture[tuple(nearest)])
+
+        return self.map_pictures(spread, np.where(known, values, 0))
 
     def run(self, iterations: int, tick: Tick = lambda: None) -> None:
         """Take some steps, with a call of `tick` after each."""

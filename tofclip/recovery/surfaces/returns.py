@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,11 +20,11 @@ from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
 # Logarithm of the odds that a surface's point is false: nothing known, for each e-fold of its
-# significance over 20, for each deviation by which the border beside it is needed, within limits, for
-# each e-fold of 1 and its way to that border, px, and where the frames have a return. From scenes of
-# known returns (tests/lidar/physics_scenes.py); docs tell what they miss.
-FALSE_ODDS = np.array([1.79, -0.29, -0.28, -0.82, -3.24])
-BORDER_LIMITS = -5.0, 10.0
+# significance over 20, where the frames have returns beside all points about it, and where its light
+# belongs further inside. From scenes of known returns (tests/lidar/physics_scenes.py); docs tell what
+# they miss.
+FALSE_ODDS = np.array([0.95, -0.73, -5.27, 2.35])
+ABOUT_PX = 5  # side of the square
 
 # Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
 # the rest. Medians over ten kinds of bent surfaces of known range are 0.13 to 0.75.
@@ -94,17 +95,18 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
 
 
 def _judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
-    """Numbers of the candidates among the points, and how probable it is that each is false."""
-    model, seen = fit.solver.model, fit.seen
-    shown, significance = find_candidates(fit.solver, limit)
-    need, inside = fit.solver.weigh_borders(shown)
+    """Numbers of the candidates among the points, and how probable it is that each is false. Where light
+    was spread beyond its surface, frames spread it as well: their returns say nothing there.
+    """
+    solver, model, seen = fit.solver, fit.solver.model, fit.seen
+    shown, significance = find_candidates(solver, limit)
     points = model.row[shown], model.column[shown], model.distance[shown]
-    known = [
-        np.log(significance[shown] / SURE_SIGMAS),
-        np.clip(need[shown], *BORDER_LIMITS),
-        np.log1p(inside[shown]),
-        find_near(points, (seen.y, seen.x, seen.range), model.row_m),
-    ]
+    confirmed = shown.copy()
+    confirmed[shown] = find_near(points, (seen.y, seen.x, seen.range), model.row_m)
+    mean = partial(scipy.ndimage.uniform_filter, size=ABOUT_PX, mode="constant")
+    about = solver.map_pictures(mean, confirmed)[shown] / solver.map_pictures(mean, shown)[shown]
+    spread = solver.find_spread(shown)[shown]
+    known = [np.log(significance[shown] / SURE_SIGMAS), np.where(spread, 0, about), spread]
     return np.flatnonzero(shown), scipy.special.expit(
         FALSE_ODDS[0] + FALSE_ODDS[1:] @ np.array(known)
     )
