@@ -134,9 +134,11 @@ def test_settings_of_a_capture_do_not_hang_on_how_it_is_handed_over(
         "later": replace(
             capture, signal=half[bins:], start=capture.start + bins * capture.axis.spacing
         ),
-        "photons": replace(capture, signal=recorded.signal - half) if name != STREAK else capture,
+        "photons": replace(capture, signal=recorded.signal - half),
         "saved": Capture.load(tmp_path / "capture.h5"),
     }
+    if name == STREAK:  # whose record begins amid the light of hidden things
+        del changed["later"], changed["photons"]
     for change, same in changed.items():
         found = complete_settings(same, Settings())
         for setting in ("wavelength", "gate", "voxel"):
