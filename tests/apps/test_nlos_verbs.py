@@ -17,6 +17,7 @@ from apps.cli import split_docstring
 from nlos import Capture, Grid, Volume
 from nlos.analysis import find_sampling_step
 from nlos.export import Mesh
+from nlos.imaging import MAX_DECOYS
 from nlos.known_scenes import HiddenTruth, compare_with_truth
 from nlos.method import Plan
 from tofclip.errors import InputError
@@ -130,8 +131,9 @@ class TestReconstruct:
         # A third of the width of its image; the pulse of three waves is as long as the depth is
         # uncertain.
         assert peak(found) == pytest.approx(HIDDEN_POINT, abs=found["wavelength_mm"] / 3000)
-        # coarse voxels, the bright part, and as coarse two shuffled copies by the first plan
-        assert (len(made), len(imaged)) == (2, 4)
+        # coarse voxels, the bright part, and as coarse shuffled copies by the first plan: few voxels
+        # take as many as there are at most
+        assert (len(made), len(imaged)) == (2, 2 + MAX_DECOYS)
 
     @pytest.mark.parametrize("method", ["hybrid", "filtered-backprojection"])
     def test_its_settings_give_the_same_volume(self, shell, method):
@@ -169,7 +171,7 @@ class TestReconstruct:
         the point.
         """
         scan = f"{HIDDEN_SCENE} --wall planar --scan confocal --wall-points 24 --seed 1"
-        shell.figures(f"nlos simulate {scan} --peak-counts 10 --background 0.5 --out short.h5")
+        shell.figures(f"nlos simulate {scan} --peak-counts 15 --background 0.5 --out short.h5")
         short = Capture.load("short.h5")
         later = np.random.default_rng(1).poisson(0.5, (300, *short.signal.shape[1:]))
         replace(short, signal=np.concatenate([short.signal, later])).save("long.h5")

@@ -138,9 +138,9 @@ class TestConvertAndNlos:
         assert found["attachments"] == ["relay_wall"]
         assert shell("recover wall.h5 --out frames.h5 --method linear").status == 0
         words = "--out volume.h5 --png mip.png --voxel-mm 40 --far-m 0.4"
-        # Nothing is hidden there, which is said.
-        found = shell.figures(f"nlos reconstruct frames.h5 {words}", said="noise or a glow")
-        assert found["evidence"] < 2
+        found = shell.figures(f"nlos reconstruct frames.h5 {words}")
+        # What the wall's own light leaves of a room with nothing in it; a hidden point has 8 or more.
+        assert found["evidence"] < 3
         stored = Volume.load("volume.h5")
         assert list(stored.values.shape) == found["voxels"]
         assert found["wall_points"] == 144
