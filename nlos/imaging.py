@@ -337,7 +337,7 @@ def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
 
 def measure_brightness(capture: Capture, plan: Plan, picture: Volume) -> tuple[float, list[float]]:
     """Brightest of a picture, and of decoys; see `measure_evidence`."""
-    count = int(np.clip(DECOY_VOXELS // picture.values.size, 1, MAX_DECOYS))
+    count = int(np.clip(DECOY_VOXELS // math.prod(picture.values.shape), 1, MAX_DECOYS))
     xp, places = namespace(capture.signal), np.flatnonzero(capture.valid)
     # Whatever order the points come in, the decoys are the same.
     ordered = places[np.lexsort((capture.points + capture.lasers).T)]

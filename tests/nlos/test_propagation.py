@@ -250,6 +250,6 @@ def test_lattices_are_as_short_as_the_paths_allow() -> None:
     assert narrow is not None
     assert wide is not None
     assert plan_transforms(geometry, waves, np.ones(waves.count), 1e-4) is None  # too strict
-    assert (narrow.lattice, wide.lattice) == ((144, 144), (192, 192))
+    assert (narrow.lattice, wide.lattice) == ((144, 144), (240, 240))
     # What fades before it reaches a voxel is left out, which are many waves of low frequencies.
     assert narrow.lateral_limits[0] < 0.85 * wide.lateral_limits[0]
