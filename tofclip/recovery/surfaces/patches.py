@@ -206,9 +206,12 @@ def _split(patch: Patch, bin_m: float) -> list[Patch]:
                 for one in _split(part.take(far), bin_m)
                 if one.pixels.size >= MIN_DIMMER_PX
                 and one.compute_error(whole) > MERGE_BINS * bin_m
-                # what stands there may be round itself
-                and _bend_where_needed(one, bin_m).compute_error()
-                < BENT_FRACTION * one.compute_error(whole)
+                and (
+                    # six numbers that say as much as all splines; what is round takes its own
+                    one.compute_error() < one.compute_error(whole)
+                    or _bend_where_needed(one, bin_m).compute_error()
+                    < BENT_FRACTION * one.compute_error(whole)
+                )
             ]
         if apart:
             left = ~np.isin(part.pixels, np.concatenate([one.pixels for one in apart]))
