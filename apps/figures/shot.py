@@ -217,8 +217,8 @@ def make_demo_figure(
     panels = figure.subplots(2, 4)
     title, look = "one shot, seven views", scale_brightness(streak.counts)
     draw_streak(panels[0, 0], streak.counts, streak.times, title, "photons", **look)
-    _draw_brightness(panels[0, 1], frames, "surfaces")
-    _draw_brightness(panels[0, 2], compared, "tv")
+    _draw_brightness(panels[0, 1], frames)
+    _draw_brightness(panels[0, 2], compared)
     distance = returns.image("range")
     title = "range of the strongest return"
     draw_camera_picture(panels[0, 3], distance, title, "range (m)", cmap=DEPTH_COLOURMAP)
@@ -236,10 +236,10 @@ def make_demo_figure(
     return figure
 
 
-def _draw_brightness(axes: Axes, frames: Frames, name: str) -> None:
+def _draw_brightness(axes: Axes, frames: Frames) -> None:
     squared = np.maximum(frames.ranges, 0).astype(np.float32) ** 2
     picture = np.tensordot(squared, frames.values, axes=1)
-    title = f"{name}: brightness{SQUARED_RANGE}"
+    title = f"{frames.figures['method']}: brightness{SQUARED_RANGE}"
     draw_camera_picture(axes, picture, title, "photons at 1 m", **scale_brightness(picture))
 
 

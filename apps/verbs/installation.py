@@ -273,7 +273,7 @@ def demo(
     with show_progress("recovering", surfaces.work) as advance:
         frames = surfaces.run(advance)
     # The sweep found by the first recovery serves the second, so that only the methods differ.
-    by_frames = plan_recovery(open_shot(streak, frames.camera))
+    by_frames = plan_recovery(open_shot(streak, frames.camera), "tv")
     with show_progress("for comparison", by_frames.work) as advance:
         compared = by_frames.run(advance)
     past = build_provenance({"verb": "demo", "seed": seed}, earlier=frames.provenance)
