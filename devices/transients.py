@@ -23,7 +23,7 @@ gate's scans; ``axes`` there is the order of what comes, ``tyx`` by default. A `
 where the pixels look. Any other source gives streak images.
 
 Read shot after shot, a source gives shots as they come (`TransientStream`); behind stages
-that make clouds of them, `devices.transients.TrackedShots` knows the age of each and what became of all others.
+that make clouds of them, `TrackedShots` knows the age of each and what became of all others.
 """
 
 from __future__ import annotations
@@ -542,7 +542,7 @@ class ShotAccounts:
 
 class TrackedShots(Iterator[LiveShot | TofclipError]):
     """Shots on their way into stages, each with its stamp, so that the consumer behind the stages
-    can say how old a shot is and where the others went. `shots`: a `devices.transients.TransientStream`, or shots from
+    can say how old a shot is and where the others went. `shots`: a `TransientStream`, or shots from
     files: in the place of one that cannot be read its error.
     """
 

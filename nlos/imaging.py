@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Generic
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlos import analysis
 from nlos.band import VirtualPulse
@@ -252,13 +253,18 @@ def _thin_out(capture: Capture) -> Capture:
         # Of a round size, so that a wall without some points has the same cells.
         side = float(np.ptp(points[:, :2], axis=0).max()) / math.sqrt(MAX_JUDGED_POINTS)
         cells = np.floor(points[:, :2] / 2 ** (math.ceil(4 * math.log2(side)) / 4))
-        ordered = np.lexsort((points + capture.lasers).T)
+        ordered = _sort_points(capture)
         some = np.sort(ordered[np.unique(cells[ordered], axis=0, return_index=True)[1]])
     laser = capture.laser if capture.laser.ndim == 1 else capture.lasers[some]
     xp = namespace(capture.signal)
     flat = xp.reshape(capture.signal, (capture.axis.bins, -1))
     signal = xp.take(flat, capture.device.put(places[some]), axis=1)
     return replace(capture, signal=signal, wall=points[some], laser=laser)
+
+
+def _sort_points(capture: Capture) -> NDArray[np.intp]:
+    """Return the order of the wall's points by where they and their lasers are."""
+    return np.lexsort((capture.points + capture.lasers).T)
 
 
 def _by_lattice(capture: Capture, settings: Settings) -> bool:
@@ -340,7 +346,7 @@ def measure_brightness(capture: Capture, plan: Plan, picture: Volume) -> tuple[f
     count = int(np.clip(DECOY_VOXELS // math.prod(picture.values.shape), 1, MAX_DECOYS))
     xp, places = namespace(capture.signal), np.flatnonzero(capture.valid)
     # Whatever order the points come in, the decoys are the same.
-    ordered = places[np.lexsort((capture.points + capture.lasers).T)]
+    ordered = places[_sort_points(capture)]
     flat, pictures = xp.reshape(capture.signal, (capture.axis.bins, -1)), [picture]
     for seed in range(1, count + 1):
         order = np.arange(capture.valid.size)

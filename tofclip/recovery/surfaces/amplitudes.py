@@ -95,28 +95,22 @@ class AmplitudeSolver:
         if variance is None:
             variance = self.estimate_local_variance()
         information = self.model.gather(self.model.weights / variance, squared=True)
-        found = np.zeros_like(information)
-        for mask, box, part in zip(self.model.masks, self._boxes, self.model.parts, strict=True):
-            lit, pictures = mask[box], np.zeros((2, *mask[box].shape), np.float32)
-            if part.stop == part.start:
-                continue
-            pictures[:, lit] = information[part], self.amplitude[part]
-            found[part] = pool_information(*pictures)[lit]
+        found = self.map_pictures(pool_information, information, self.amplitude)
         # running sums may leave a rounding error below nothing
         return np.asarray(self.amplitude * np.sqrt(np.maximum(found, 0)))
 
     def map_pictures(
-        self, work: Callable[[FloatArray], NDArray[Any]], values: NDArray[Any]
-    ) -> FloatArray:
-        """Apply `work` to the picture of each surface, the part that it covers, 0 beside it; return
-        what it makes of `values`, (points,).
+        self, work: Callable[..., NDArray[Any]], *values: NDArray[Any]
+    ) -> NDArray[Any]:
+        """Apply `work` to the pictures of each surface, the part that it covers, 0 beside it; return
+        what it makes of `values`, (points,) each, in the type of the first.
         """
-        found, model = np.zeros(values.size), self.model
+        found, model = np.zeros_like(values[0]), self.model
         for mask, box, part in zip(model.masks, self._boxes, model.parts, strict=True):
             lit = mask[box]
-            picture = np.zeros(lit.shape)
-            picture[lit] = values[part]
-            found[part] = work(picture)[lit]
+            pictures = np.zeros((len(values), *lit.shape), found.dtype)
+            pictures[:, lit] = [one[part] for one in values]
+            found[part] = work(*pictures)[lit]
         return found
 
     def find_spread(self, shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -137,7 +131,7 @@ class AmplitudeSolver:
 
         def average(values: NDArray[Any], side: int) -> FloatArray:
             mean = partial(scipy.ndimage.uniform_filter, size=side, mode="constant")
-            return self.map_pictures(mean, values)
+            return self.map_pictures(mean, values.astype(np.float64))
 
         def sum_near(light: Image, seen: Image) -> FloatArray:
             """What some light about each point says of how much worse the shot is explained."""

@@ -204,14 +204,7 @@ def _split(patch: Patch, bin_m: float) -> list[Patch]:
             apart = [
                 one
                 for one in _split(part.take(far), bin_m)
-                if one.pixels.size >= MIN_DIMMER_PX
-                and one.compute_error(whole) > MERGE_BINS * bin_m
-                and (
-                    # six numbers that say as much as all splines; what is round takes its own
-                    one.compute_error() < one.compute_error(whole)
-                    or _bend_where_needed(one, bin_m).compute_error()
-                    < BENT_FRACTION * one.compute_error(whole)
-                )
+                if one.pixels.size >= MIN_DIMMER_PX and _stands_apart(one, whole, bin_m)
             ]
         if apart:
             left = ~np.isin(part.pixels, np.concatenate([one.pixels for one in apart]))
@@ -219,6 +212,18 @@ def _split(patch: Patch, bin_m: float) -> list[Patch]:
         else:
             found.append(part)
     return found
+
+
+def _stands_apart(part: Patch, whole: Patch, bin_m: float) -> bool:
+    """Whether a part of a patch is better followed by a surface of its own than by that of the whole."""
+    followed = part.compute_error(whole)
+    if followed <= MERGE_BINS * bin_m:
+        return False
+    # six numbers that say as much as all splines; what is round takes its own
+    return (
+        part.compute_error() < followed
+        or _bend_where_needed(part, bin_m).compute_error() < BENT_FRACTION * followed
+    )
 
 
 def _connect_neighbours(

@@ -101,10 +101,11 @@ def _judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
     solver, model, seen = fit.solver, fit.solver.model, fit.seen
     shown, significance = find_candidates(solver, limit)
     points = model.row[shown], model.column[shown], model.distance[shown]
-    confirmed = shown.copy()
+    candidates, confirmed = shown.astype(np.float64), np.zeros(shown.size)
     confirmed[shown] = find_near(points, (seen.y, seen.x, seen.range), model.row_m)
     mean = partial(scipy.ndimage.uniform_filter, size=ABOUT_PX, mode="constant")
-    about = solver.map_pictures(mean, confirmed)[shown] / solver.map_pictures(mean, shown)[shown]
+    about, near = (solver.map_pictures(mean, one)[shown] for one in (confirmed, candidates))
+    about /= near
     spread = solver.find_spread(shown)[shown]
     known = [np.log(significance[shown] / SURE_SIGMAS), np.where(spread, 0, about), spread]
     return np.flatnonzero(shown), scipy.special.expit(
