@@ -24,7 +24,12 @@ from tofclip.errors import InputError, MissingDependencyError
 
 T = TypeVar("T")
 
+AnyArray = NDArray[Any]
+BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+IndexArray = NDArray[np.intp]
+IntArray = NDArray[np.int64]
 
 Array = Any  # of any library that follows the array API standard
 
@@ -42,7 +47,7 @@ def is_numpy(array: Array) -> bool:
     return isinstance(array, np.ndarray | np.generic) or not hasattr(array, "__dlpack__")
 
 
-def empty_aligned(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+def empty_aligned(shape: tuple[int, ...], dtype: DTypeLike) -> AnyArray:
     """Return an array whose first element begins a cache line: NumPy's begin anywhere, and then
     every vector of 512 bits lies in two lines. Returns contiguous; its elements are not set.
     """
@@ -86,7 +91,7 @@ def clip_values(values: Array, lowest: float | None = None, highest: float | Non
     return values if highest is None else np.minimum(values, highest)
 
 
-def to_numpy(array: Array) -> NDArray[Any]:
+def to_numpy(array: Array) -> AnyArray:
     """Return the values as a NumPy array, fetched from wherever they are; a NumPy array comes back
     as it is.
     """
@@ -94,7 +99,7 @@ def to_numpy(array: Array) -> NDArray[Any]:
         array = array.detach().cpu()
     elif hasattr(array, "get") and not is_numpy(array):  # CuPy copies nothing unless asked to
         array = array.get()
-    values: NDArray[Any] = np.asarray(array)
+    values: AnyArray = np.asarray(array)
     return values
 
 

@@ -21,9 +21,8 @@ from typing import Any
 import numpy as np
 import scipy
 import tomli_w
-from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import BoolArray, Float32Array, FloatArray, IndexArray
 from tofclip.camera import Camera, Measurement, SkewSweep, measure
 from tofclip.errors import InputError, require, require_known
 from tofclip.files import atomic_path, read_toml, suggest_name
@@ -246,7 +245,7 @@ class Design:
         return kind(self.camera.image_shape, views, self.sampling_ratio, 0)
 
     @cached_property
-    def weights(self) -> NDArray[np.float32]:
+    def weights(self) -> Float32Array:
         """W that readings and operator get in the recovery, (readings, readings)."""
         if self.encoder is None:
             return np.eye(self.camera.slit_width_px, dtype=np.float32)
@@ -278,7 +277,7 @@ class Design:
         return PreparedInverse(operator, np.linalg.inv(gram).astype(np.float32))
 
 
-def _make_dense(operator: LinearOperator) -> NDArray[np.float32]:
+def _make_dense(operator: LinearOperator) -> Float32Array:
     rows = operator.adjoint(np.eye(operator.shape_out[0], dtype=np.float32))
     return np.ascontiguousarray(rows.reshape(-1, operator.shape_out[0]).T)
 
@@ -445,7 +444,7 @@ def _find_peak(matrices: list[Any], segments: list[FrameSegment], flat: Any) -> 
     return max(float((matrix @ flat[:, one.frames]).max()) for matrix, one in pairs)
 
 
-def _choose_pixels(design: Design, scene: Scene) -> tuple[FloatArray, NDArray[np.intp]]:
+def _choose_pixels(design: Design, scene: Scene) -> tuple[FloatArray, IndexArray]:
     """True ranges, and the pixels whose ranges are asked for, spread evenly."""
     truth = GroundTruth.from_scene(scene, design.instrument)
     # in a small picture no pixel has neighbours on its own surface all around
@@ -476,7 +475,7 @@ def _fit_pulses(
 
 def draw_shots(
     design: Design, scene: Scene, shots: int, seed: int
-) -> tuple[float, Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]]:
+) -> tuple[float, Iterator[tuple[Float32Array, BoolArray]]]:
     """Return the exposure and noisy readings (bins, readings) with where they are saturated, shot by
     shot.
     """

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import ShapeError, require
 
 
@@ -67,7 +68,7 @@ def correlation_coefficient(estimate: ArrayLike, truth: ArrayLike, border_px: in
 
 def _crop_borders(
     estimate: ArrayLike, truth: ArrayLike, border_px: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     h, g = np.asarray(estimate, dtype=np.float64), np.asarray(truth, dtype=np.float64)
     if h.shape != g.shape:
         raise ShapeError("the estimate", f"{g.shape} like the truth", h.shape)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import MissingDependencyError
 from tofclip.files import PICTURE_SUFFIXES, atomic_path, describe_missing_package, require_suffix
 
@@ -55,7 +56,7 @@ def plot_picture(
     ax: Axes | None = None,
     *,
     unit: str = "counts",
-    sides: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+    sides: tuple[FloatArray, FloatArray] | None = None,
 ) -> Axes:
     """Draw a picture (y, x) with a scale of its brightness; `sides` (x, y) are places of columns and
     rows, m, which are numbered by default.
@@ -110,11 +111,11 @@ def save_figure(figure: Figure, path: str | Path) -> None:
 
 
 def make_data_array(
-    values: NDArray[Any],
-    axes: Mapping[str, tuple[NDArray[Any], str]],
+    values: AnyArray,
+    axes: Mapping[str, tuple[AnyArray, str]],
     name: str,
     unit: str,
-    ranges: NDArray[np.float64] | None = None,
+    ranges: FloatArray | None = None,
 ) -> Any:
     """Return an `xarray.DataArray` whose coordinates carry their units; `axes` are coordinates and
     unit of each axis, in order, `ranges` those of the times, m.

@@ -12,11 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofclip.arrays import AnyArray, FloatArray, IntArray
 from tofclip.errors import require, require_positive, require_shape
 from tofclip.light_field.views import CameraSetup, ClipMeasurement
 from tofclip.operators import Diagonal, LinearOperator, LinearShear, Stack
@@ -64,7 +64,7 @@ class InactiveRegion:
             return float("inf")
         return self.distance * self.width / (self.baseline - self.width)
 
-    def sees(self, place: ArrayLike, across: ArrayLike, behind: ArrayLike) -> NDArray[Any]:
+    def sees(self, place: ArrayLike, across: ArrayLike, behind: ArrayLike) -> AnyArray:
         """Return whether the line of sight passes the occluder, from a `place` on the aperture, m from the
         axis, to a point: m from the axis, and m behind the occluder. All three are broadcast.
         """
@@ -72,7 +72,7 @@ class InactiveRegion:
         passed = np.asarray(across) * self.distance + np.asarray(place) * behind
         return np.asarray(2 * abs(passed) >= self.width * (self.distance + behind))
 
-    def contains(self, across: ArrayLike, behind: ArrayLike) -> NDArray[Any]:
+    def contains(self, across: ArrayLike, behind: ArrayLike) -> AnyArray:
         """Return whether a point is hidden from the whole aperture; arguments as for `sees`."""
         # a convex occluder on the axis hides a point from the whole aperture if it hides it from
         # both ends
@@ -80,7 +80,7 @@ class InactiveRegion:
         return np.asarray(~(left | right))
 
 
-Array = NDArray[Any]
+Array = AnyArray
 
 # Rise of a return above what is around it, in standard deviations of what the measurements say of it one
 # by one. Noise of 2,304 measurements over 38 instants rose by up to 3.0.
@@ -99,7 +99,7 @@ class Rig:
     """The instrument: where views and lamps stand, and what each view reads."""
 
     array: CameraArray
-    lamps: NDArray[np.float64]  # (lamps, 3), m; they flash together
+    lamps: FloatArray  # (lamps, 3), m; they flash together
     setup: CameraSetup  # which nonlocal measurements the views get
 
     @cached_property
@@ -155,7 +155,7 @@ class TimedMeasurements:
         cuts = [0, *map(int, between), self.time_axis.bins]
         return tuple(self._locate_return(slice(*ends)) for ends in pairwise(cuts))
 
-    def _find_peaks(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _find_peaks(self) -> tuple[IntArray, FloatArray]:
         """Instants of the history's peaks that are no noise, and their prominences."""
         from scipy.signal import find_peaks
 

@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import Array, namespace, to_numpy
+from tofclip.arrays import (
+    AnyArray,
+    Array,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    namespace,
+    to_numpy,
+)
 from tofclip.camera import Camera
 from tofclip.errors import (
     InputError,
@@ -78,13 +86,11 @@ class Streak(Storable):
 
     RECORD_KIND = "streak"
 
-    counts: NDArray[np.float32] = field(
-        metadata=stored_array("count", "time", "column", dtype=np.float32)
-    )
-    row_times: NDArray[np.float64] | None = field(
+    counts: Float32Array = field(metadata=stored_array("count", "time", "column", dtype=np.float32))
+    row_times: FloatArray | None = field(
         default=None, metadata=stored_array("s", "time", optional=True)
     )
-    saturated: NDArray[np.bool_] | None = field(
+    saturated: BoolArray | None = field(
         default=None, metadata=stored_array("", "time", "column", dtype=bool, optional=True)
     )
     metadata: Mapping[str, str] = field(default_factory=dict, metadata=stored_texts())
@@ -120,7 +126,7 @@ class Streak(Storable):
                 require_credible_bin_width(float(np.diff(times).mean()), longest=MAX_ROW_S)
             object.__setattr__(self, "row_times", times)
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> AnyArray:
         return np.asarray(self.counts, dtype=dtype)
 
     def __repr__(self) -> str:
@@ -162,7 +168,7 @@ class Streak(Storable):
         )
 
     @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Instant of each row, s; raises `MissingTimeAxisError` where none is known."""
         if self.row_times is None:
             raise MissingTimeAxisError(
@@ -233,19 +239,17 @@ class Returns(Storable):
 
     y: NDArray[np.int32] = field(metadata=stored_array("px", "return", dtype=np.int32))
     x: NDArray[np.int32] = field(metadata=stored_array("px", "return", dtype=np.int32))
-    range: NDArray[np.float64] = field(metadata=stored_array("m", "return"))
-    intensity: NDArray[np.float32] = field(
-        metadata=stored_array("count", "return", dtype=np.float32)
-    )
-    confidence: NDArray[np.float32] = field(metadata=stored_array("m", "return", dtype=np.float32))
+    range: FloatArray = field(metadata=stored_array("m", "return"))
+    intensity: Float32Array = field(metadata=stored_array("count", "return", dtype=np.float32))
+    confidence: Float32Array = field(metadata=stored_array("m", "return", dtype=np.float32))
     return_number: NDArray[np.uint8] = field(metadata=stored_array("", "return", dtype=np.uint8))
-    time: NDArray[np.float64] = field(metadata=stored_array("s", "return"))
+    time: FloatArray = field(metadata=stored_array("s", "return"))
     camera: Camera = field(metadata=stored_child(Camera.from_record, "camera"))
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
-    shear: NDArray[np.float64] = field(
+    shear: FloatArray = field(
         default_factory=lambda: np.empty(0), metadata=stored_array("px", "return", optional=True)
     )
-    false_alarm: NDArray[np.float64] = field(
+    false_alarm: FloatArray = field(
         default_factory=lambda: np.empty(0), metadata=stored_array("", "return", optional=True)
     )
 
@@ -257,7 +261,7 @@ class Returns(Storable):
             require_shape(f"{name} of the returns", self.y.shape, column.shape)
 
     @property
-    def _columns(self) -> dict[str, NDArray[Any]]:
+    def _columns(self) -> dict[str, Any]:
         values = {one.name: getattr(self, one.name) for one in fields(self)}
         return {name: one for name, one in values.items() if isinstance(one, np.ndarray)}
 
@@ -271,7 +275,7 @@ class Returns(Storable):
         return f"Returns({len(self)} returns, range {near:.3g} to {far:.3g} m)"
 
     @property
-    def line_of_sight_px(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def line_of_sight_px(self) -> tuple[FloatArray, FloatArray]:
         """(rows, columns) of the reference view's pixels in which the returns lie.
 
         A picture that was not recovered at the shear of its range is displaced by the parallax;
@@ -283,12 +287,12 @@ class Returns(Storable):
         return self.y - known * rows * missing, self.x - known * columns * missing
 
     @property
-    def range_sigma(self) -> NDArray[np.float32]:
+    def range_sigma(self) -> Float32Array:
         """`confidence` by the name that clouds have for it: one standard deviation, m."""
         return self.confidence
 
     @property
-    def reflectance(self) -> NDArray[np.float32]:
+    def reflectance(self) -> Float32Array:
         """Reflectance of the surfaces as if they faced the camera, percent; NaN where the camera has
         not seen a target of known reflectance.
         """
@@ -297,7 +301,7 @@ class Returns(Storable):
             return np.full(self.y.shape, np.nan, np.float32)
         return known.compute_reflectance(self.intensity, self.y, self.x).astype(np.float32)
 
-    def __getitem__(self, chosen: NDArray[Any]) -> Returns:
+    def __getitem__(self, chosen: AnyArray) -> Returns:
         """Return some of the returns, by a mask or by numbers."""
         return replace(self, **{name: column[chosen] for name, column in self._columns.items()})
 
@@ -318,7 +322,7 @@ class Returns(Storable):
         require_known("return", which, RETURN_CHOICES)
         if which == "all":
             return self
-        ranks: dict[str, NDArray[Any]] = {
+        ranks: dict[str, AnyArray] = {
             "first": self.range,
             "last": -self.range,
             "strongest": -self.intensity,
@@ -328,7 +332,7 @@ class Returns(Storable):
         first_of_pixel = np.flatnonzero(np.diff(pixel[order], prepend=-1))
         return self[np.sort(order[first_of_pixel])]
 
-    def image(self, name: str) -> NDArray[np.float32]:
+    def image(self, name: str) -> Float32Array:
         """Picture (y, x) of one of `PICTURE_COLUMNS` of each pixel's most intense return; NaN where
         nothing came back.
         """
@@ -371,18 +375,18 @@ class Frames(Storable):
     RECORD_KIND = "frames"
 
     values: Array = field(metadata=stored_array("count", "time", "y", "x", dtype=np.float32))
-    times: NDArray[np.float64] = field(metadata=stored_array("s", "time"))
+    times: FloatArray = field(metadata=stored_array("s", "time"))
     camera: Camera = field(metadata=stored_child(Camera.from_record, "camera"))
     figures: Mapping[str, Scalar] = field(default_factory=dict, metadata=stored_attributes())
     attachments: Mapping[str, Record] = field(default_factory=dict, metadata=stored_attachments())
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
-    shears: NDArray[np.float64] = field(
+    shears: FloatArray = field(
         default_factory=lambda: np.empty(0), metadata=stored_array("px", "time", optional=True)
     )
     returns: Returns | None = field(
         default=None, metadata=stored_child(Returns.from_record, "returns", optional=True)
     )
-    measured: NDArray[np.float32] = field(
+    measured: Float32Array = field(
         default_factory=lambda: np.empty((0, 0), np.float32),
         metadata=stored_array(
             "count", "column", "time", dtype=np.float32, optional=True, skip_empty=True
@@ -417,7 +421,7 @@ class Frames(Storable):
     def __len__(self) -> int:
         return int(self.times.size)
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> AnyArray:
         return np.asarray(to_numpy(self.values), dtype=dtype)
 
     def __getitem__(self, frames: Any) -> Any:
@@ -487,7 +491,7 @@ class Frames(Storable):
         return frames, rows, columns
 
     @property
-    def ranges(self) -> NDArray[np.float64]:
+    def ranges(self) -> FloatArray:
         """Range of each frame (time,), m; see `time_zero_note`."""
         return SPEED_OF_LIGHT * self.times / 2
 

@@ -11,7 +11,7 @@ metadata of each field of the dataclass how it lies in a file::
     class Trace(Storable):
         RECORD_KIND = "trace"
 
-        counts: NDArray[np.float32] = field(metadata=stored_array("count", "time", dtype=np.float32))
+        counts: Float32Array = field(metadata=stored_array("count", "time", dtype=np.float32))
         start: float = field(default=0.0, metadata=stored_value("start_s"))
 """
 
@@ -32,9 +32,9 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
-from tofclip.arrays import to_numpy
+from tofclip.arrays import AnyArray, to_numpy
 from tofclip.errors import FileFormatError, require_path
 from tofclip.files import (
     atomic_path,
@@ -67,7 +67,7 @@ MAX_OUTLINE_VALUES = 9  # arrays up to this size are part of a record's outline
 class Field:
     """An array with its unit and the names of its axes."""
 
-    values: NDArray[Any]
+    values: AnyArray
     # SI unit (``"s"``, ``"m"``, ``"rad"``), ``"px"``, ``"count"``, or ``""`` for a pure number
     units: str = ""
     axes: tuple[str, ...] = ()  # one name per dimension, e.g. ``("time", "y", "x")``
@@ -85,7 +85,7 @@ class Record:
     provenance: Mapping[str, Any] = field(default_factory=dict)  # any tree that JSON can hold
     origin: str = ""  # the file it was read from, for error messages
 
-    def array(self, name: str, dtype: DTypeLike, dimensions: int, units: str = "") -> NDArray[Any]:
+    def array(self, name: str, dtype: DTypeLike, dimensions: int, units: str = "") -> AnyArray:
         """Return field `name`, contiguous; `FileFormatError` where it is absent, of another number
         of dimensions or unit, or of a type that does not convert to `dtype`.
         """
@@ -177,12 +177,12 @@ def is_own_file(path: str | Path) -> bool:
     return False
 
 
-def make_stand_in(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
+def make_stand_in(shape: Sequence[int], dtype: DTypeLike) -> AnyArray:
     """Return an array of that shape and type that takes no memory; all its values are the same."""
     return np.broadcast_to(np.zeros((), dtype), tuple(shape))
 
 
-def is_stand_in(values: NDArray[Any]) -> bool:
+def is_stand_in(values: AnyArray) -> bool:
     """Whether an array came from `make_stand_in`."""
     return values.ndim > 0 and not any(values.strides)
 
@@ -211,7 +211,7 @@ def _write_attribute(item: h5py.Group | h5py.Dataset, name: str, value: Scalar) 
         item.attrs[name] = value
 
 
-def _storage_options(values: NDArray[Any], compressed: bool) -> dict[str, Any]:
+def _storage_options(values: AnyArray, compressed: bool) -> dict[str, Any]:
     """Checksums for every array, compression for the large ones if it is asked for."""
     if values.size == 0 or values.ndim == 0:
         return {}

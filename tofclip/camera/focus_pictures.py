@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import FloatArray, IndexArray, IntArray
 from tofclip.camera.model import Camera
 from tofclip.errors import CalibrationError, InputError, ShapeError
 
@@ -53,7 +53,7 @@ class FocusCalibration:
     centre_uncertainty_px: FloatArray
     angle_uncertainty: FloatArray
     dot_rows_px: FloatArray
-    line_rows_px: NDArray[np.int64]
+    line_rows_px: IntArray
     line_columns_px: FloatArray
     signal: FloatArray
     dots: FloatArray
@@ -131,7 +131,7 @@ def _subtract_background(picture: ArrayLike, background: ArrayLike) -> FloatArra
     return difference
 
 
-def _find_dots(dots: FloatArray, views: int) -> tuple[int, NDArray[np.intp]]:
+def _find_dots(dots: FloatArray, views: int) -> tuple[int, IndexArray]:
     """Row of the slit and the columns of the `views` strongest dots, from left to right."""
     from scipy.ndimage import gaussian_filter1d, median_filter
     from scipy.signal import find_peaks

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import BoolArray, FloatArray
 from tofclip.camera.range_calibration import RangeCalibration, empty_array
 from tofclip.errors import CalibrationError, FileFormatError, ShapeError
 from tofclip.notebook import render_html
@@ -252,7 +252,7 @@ class Camera(Storable):
     sweep: Sweep | None = field(
         default=None, metadata=stored_child(sweep_from_record, optional=True)
     )
-    dead_columns: NDArray[np.bool_] = empty_array("", "column", dtype=bool)
+    dead_columns: BoolArray = empty_array("", "column", dtype=bool)
     time_zero: float = field(default=0.0, metadata=stored_value("time_zero_s"))
     pulse_fwhm: float = field(default=60e-12, metadata=stored_value("pulse_fwhm_s"))
     focal_length_px: float = field(

@@ -11,11 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray, BoolArray, Float32Array
 from tofclip.camera.rectifier import Measurement
 from tofclip.operators import LineProjection
 from tofclip.storage import Scalar
@@ -71,7 +70,7 @@ class MeasurementNoise:
         }
         return figures | ({DAZZLE_FIGURE: self.dazzle} if np.isfinite(self.dazzle) else {})
 
-    def compute_variance(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+    def compute_variance(self, light: Float32Array) -> Float32Array:
         """Return the variance of each measurement, (columns, frames), of which the frames predict so
         much light, not negative.
         """
@@ -85,7 +84,7 @@ class MeasurementNoise:
             variance += (DAZZLE_MISFIT * beside) ** 2
         return np.asarray(variance, dtype=np.float32)
 
-    def find_dazzling(self, light: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def find_dazzling(self, light: Float32Array) -> BoolArray:
         """Find light that is too bright for what else there is at the same instant. Where a bright
         object is alone, there is nothing that it could dazzle. Counts, (columns, frames).
         """
@@ -110,13 +109,13 @@ def find_dazzle_limit(measurement: Measurement, floor: float) -> float:
     return limit if 0 < number <= MAX_DAZZLED_FRACTION * lit.size else float("inf")
 
 
-def find_dazzled(measurement: Measurement, noise: MeasurementNoise) -> NDArray[np.bool_]:
+def find_dazzled(measurement: Measurement, noise: MeasurementNoise) -> BoolArray:
     """Find the measurements, (columns, frames), beside light far brighter than what else there is."""
     light = np.where(measurement.valid, measurement.values, 0)
     return _take_brightest_around(noise.find_dazzling(light))
 
 
-def find_glints(operator: LineProjection, dazzled: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def find_glints(operator: LineProjection, dazzled: BoolArray) -> BoolArray:
     """Find the pixels, (frames, rows, columns), that are seen by dazzled measurements only, (columns,
     frames).
     """
@@ -127,7 +126,7 @@ def find_glints(operator: LineProjection, dazzled: NDArray[np.bool_]) -> NDArray
     return np.asarray(glints.reshape(-1, *operator.shape_in))
 
 
-def _take_brightest_around(light: NDArray[Any]) -> NDArray[Any]:
+def _take_brightest_around(light: AnyArray) -> AnyArray:
     """Return the greatest value within `DAZZLE_REACH_COLUMNS`, (columns, frames)."""
     from scipy.ndimage import maximum_filter1d  # reading a shot has to be quick
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import Float32Array, FloatArray
 from tofclip.camera.model import Camera
 from tofclip.camera.rectifier import Measurement
 from tofclip.errors import CalibrationError, InputError, ShapeError
@@ -220,7 +220,7 @@ def find_sharpest_shears(
     return _fit_focus_curve(table, tried, light)
 
 
-def measure_sharpness(frames: NDArray[np.float32]) -> float:
+def measure_sharpness(frames: Float32Array) -> float:
     """Mean square over squared mean of the frames, weighted by their light; 1 for even pictures, 0
     without light.
     """

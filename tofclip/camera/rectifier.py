@@ -14,12 +14,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import BoolArray, Float32Array, IntArray
 from tofclip.camera.model import Camera
 from tofclip.errors import CalibrationError, InputError, ShapeError
 from tofclip.threads import LANES, count_block_threads, run_blocks, split_blocks
-
-FloatImage = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 DARK_ROW_FRACTION = 0.05
 ROWS_PER_BLOCK = 64
@@ -39,12 +37,12 @@ class Measurement:
         False where a sensor pixel was saturated or dead, or where the raw image ends.
     """
 
-    values: FloatImage
-    valid: Mask
+    values: Float32Array
+    valid: BoolArray
 
 
 def measure(
-    counts: FloatImage, saturated: Mask | None, camera: Camera, dark: float | None = None
+    counts: Float32Array, saturated: BoolArray | None, camera: Camera, dark: float | None = None
 ) -> Measurement:
     """Subtract the dark level and rectify the sweep.
 
@@ -73,7 +71,7 @@ def measure(
     return Rectifier(camera, counts.shape[0]).measure(counts, saturated, dark)
 
 
-def require_width(counts: FloatImage, camera: Camera) -> None:
+def require_width(counts: Float32Array, camera: Camera) -> None:
     """Raise `CalibrationError` unless the picture is as wide as the camera's slit.
 
     Parameters
@@ -94,7 +92,7 @@ def require_width(counts: FloatImage, camera: Camera) -> None:
         )
 
 
-def estimate_dark_level(counts: FloatImage, row_sums: FloatImage | None = None) -> float:
+def estimate_dark_level(counts: Float32Array, row_sums: Float32Array | None = None) -> float:
     """Median of the quietest rows, in counts.
 
     Taken from whole rows, before or after the light came, so that it stays where the measurements
@@ -155,8 +153,8 @@ class Rectifier:
 
     def measure(
         self,
-        counts: FloatImage,
-        saturated: Mask | None = None,
+        counts: Float32Array,
+        saturated: BoolArray | None = None,
         dark: float | None = None,
         delay: float = 0.0,
     ) -> Measurement:
@@ -183,8 +181,8 @@ class Rectifier:
         return Measurement(measurements, valid)
 
     def rectify(
-        self, counts: FloatImage, dark: float | None = None, delay: float = 0.0
-    ) -> FloatImage:
+        self, counts: Float32Array, dark: float | None = None, delay: float = 0.0
+    ) -> Float32Array:
         """Return the measurements alone, (columns, rows), for methods that cannot leave out single ones:
         0 beyond the raw image and in dead columns.
 
@@ -203,9 +201,7 @@ class Rectifier:
             raise InputError(NO_LIGHT_MESSAGE)
         return measurements.T
 
-    def rectify_rows(
-        self, counts: FloatImage, dark: float, numbers: NDArray[np.int64]
-    ) -> FloatImage:
+    def rectify_rows(self, counts: Float32Array, dark: float, numbers: IntArray) -> Float32Array:
         """Return the measurements of the rows `numbers` of `counts` above `dark`, (columns, n), as
         `rectify` does.
         """
@@ -213,11 +209,11 @@ class Rectifier:
 
     def _sample(
         self,
-        counts: FloatImage,
+        counts: Float32Array,
         dark: float,
         delay: float,
-        numbers: NDArray[np.int64] | None = None,
-    ) -> FloatImage:
+        numbers: IntArray | None = None,
+    ) -> Float32Array:
         """Some or all rectified rows, (rows, columns)."""
         from tofclip.camera.kernels import sample_bilinear, sample_delayed_rows, sample_rows
 
@@ -242,15 +238,15 @@ class Rectifier:
         return measurements
 
     @property
-    def inside(self) -> Mask:
+    def inside(self) -> BoolArray:
         """Where the raw image has what a rectified pixel shows, (rows, columns)."""
         rows, columns = self._raw_row.shape
-        inside: Mask = (self._raw_row >= 0) & (self._raw_row <= rows - 1)
+        inside: BoolArray = (self._raw_row >= 0) & (self._raw_row <= rows - 1)
         inside &= (self._raw_column >= 0) & (self._raw_column <= columns - 1)
         return inside
 
     @cached_property
-    def _runs(self) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
+    def _runs(self) -> tuple[NDArray[np.uint64], IntArray]:
         """Neighbours in a row that come from the same two raw rows, and where each row's begin; see
         `sample_row`.
         """
@@ -265,7 +261,7 @@ class Rectifier:
         runs = np.stack([first, last, top[row, first]], axis=1).astype(np.uint64)
         return runs, np.searchsorted(row, np.arange(rows + 1))
 
-    def _find_valid(self, bad: Mask, delay: float) -> Mask:
+    def _find_valid(self, bad: BoolArray, delay: float) -> BoolArray:
         from tofclip.camera.kernels import mark_valid
 
         valid, raw = np.empty(self._raw_row.shape, bool), np.ascontiguousarray(bad)
@@ -280,7 +276,7 @@ class Rectifier:
         valid &= ~self.camera.dead_columns
         return valid.T
 
-    def _prepare(self, counts: FloatImage) -> FloatImage:
+    def _prepare(self, counts: Float32Array) -> Float32Array:
         """Return a streak image that fits as compiled loops take it."""
         require_width(counts, self.camera)
         if counts.shape != self._raw_row.shape:
@@ -293,7 +289,7 @@ class RowSums:
     what stays the same from shot to shot. Memory: as much as the sums.
     """
 
-    def __init__(self, rectifier: Rectifier, starts: NDArray[np.int64], length: int) -> None:
+    def __init__(self, rectifier: Rectifier, starts: IntArray, length: int) -> None:
         self._rectifier, self._starts, self._length = rectifier, starts, length
         inside = np.pad(np.cumsum(rectifier.inside, axis=0, dtype=np.uint16), ((1, 0), (0, 0)))
         # how many rows of each sum lie within the raw image; differences are right beyond 65,535 too
@@ -301,7 +297,7 @@ class RowSums:
         self._measured = np.ascontiguousarray(measured, np.float32)
         self._measured[rectifier.camera.dead_columns] = 0
 
-    def add_up(self, counts: FloatImage, sums: FloatImage) -> float:
+    def add_up(self, counts: Float32Array, sums: Float32Array) -> float:
         """Overwrite `sums` (columns, at least sums) by those of a shot's measurements; return its dark
         level, which is taken off. They are 0 where nothing was measured.
         """
@@ -319,7 +315,7 @@ class RowSums:
             raise InputError(NO_LIGHT_MESSAGE)
         return dark
 
-    def _add_rows(self, counts: FloatImage, sums: FloatImage) -> FloatImage:
+    def _add_rows(self, counts: Float32Array, sums: Float32Array) -> Float32Array:
         """Add up rectified rows as they are; return the sum of each raw row, (rows,)."""
         from tofclip.camera.kernels import sum_boxes, sum_sampled_boxes
 

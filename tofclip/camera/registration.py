@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import BoolArray, Float32Array, FloatArray, IndexArray
 from tofclip.camera.model import Camera, SkewSweep
 from tofclip.camera.rectifier import Measurement, estimate_dark_level, measure, require_width
 from tofclip.errors import CalibrationError
@@ -45,7 +44,7 @@ class SkewEstimate:
     correlations: FloatArray
 
 
-def estimate_skew(counts: NDArray[np.float32], camera: Camera) -> SkewEstimate:
+def estimate_skew(counts: Float32Array, camera: Camera) -> SkewEstimate:
     """Match each view's energy curve to the reference view's by ``row_k = offset_k + (1 +
     stretch_k) * row``.
 
@@ -83,7 +82,7 @@ def estimate_skew(counts: NDArray[np.float32], camera: Camera) -> SkewEstimate:
     return SkewEstimate(SkewSweep(camera.centres_px, offsets, stretches), correlations)
 
 
-def sum_view_energies(counts: NDArray[np.float32], camera: Camera) -> FloatArray:
+def sum_view_energies(counts: Float32Array, camera: Camera) -> FloatArray:
     """Sum of each row over each view's part of the slit, above the dark level; (views, rows)."""
     require_width(counts, camera)
     # Without its dark level, which would swamp the correlation with a constant.
@@ -130,7 +129,7 @@ def _match_curves(curve: FloatArray, reference: FloatArray) -> tuple[float, floa
     return float(best.x[0]), float(best.x[1]), -float(best.fun)
 
 
-Array = NDArray[np.float32]
+Array = Float32Array
 
 MIN_ROUND_COUNT, MAX_ROUND_COUNT = 5, 10
 SETTLED_PX = 0.05  # no centre moves further in a round: enough rounds
@@ -168,7 +167,7 @@ class Registration:
 
 def register_views(
     counts: Array,
-    saturated: NDArray[np.bool_] | None,
+    saturated: BoolArray | None,
     camera: Camera,
     progress: Progress = ignore_progress,
     times: FloatArray | None = None,
@@ -230,7 +229,7 @@ def count_registration_iterations() -> int:
     return (MAX_ROUND_COUNT + 1) * REGISTRATION_METHOD.work(MAX_FRAMES)
 
 
-def _select_frames(measurement: Measurement) -> NDArray[np.intp]:
+def _select_frames(measurement: Measurement) -> IndexArray:
     """Pick instants evenly in cumulated brightness, so that far and dim objects are represented
     too.
     """
@@ -245,7 +244,7 @@ Groups = list[tuple[slice, float]]
 """Consecutive ones of the chosen frames, and their shear in pixels per view step."""
 
 
-def _group_by_shear(camera: Camera, times: FloatArray | None, chosen: NDArray[np.intp]) -> Groups:
+def _group_by_shear(camera: Camera, times: FloatArray | None, chosen: IndexArray) -> Groups:
     """Cut the chosen frames where the shear of their range has changed."""
     if times is None or camera.lenslet_pitch <= 0:
         return [(slice(0, chosen.size), 0.0)]
@@ -327,8 +326,8 @@ class _Evidence:
     pictures: Array
     groups: Groups
     misfit: Array
-    valid: NDArray[np.bool_]
-    rows: NDArray[np.intp]
+    valid: BoolArray
+    rows: IndexArray
 
     def solve_corrections(
         self, camera: Camera, view: int, drift: float, slope: Array

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import FileFormatError
 from tofclip.files import BoundedFile, guard, require_bounded_size
 
@@ -47,7 +47,7 @@ class ArchiveEntry:
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]  # objects for MATLAB's cells
-    load: Callable[[], NDArray[Any]]  # reads the values
+    load: Callable[[], AnyArray]  # reads the values
 
     @classmethod
     def of(cls, values: Any) -> ArchiveEntry:
@@ -91,7 +91,7 @@ def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     return shape, dtype
 
 
-def _load_npz_member(path: Path, member: zipfile.ZipInfo) -> NDArray[Any]:
+def _load_npz_member(path: Path, member: zipfile.ZipInfo) -> AnyArray:
     with BoundedFile(path) as opened, zipfile.ZipFile(opened) as archive:
         return np.asarray(np.lib.format.read_array(archive.open(member), allow_pickle=False))
 
@@ -154,7 +154,7 @@ def _read_element(
         return _MatMatrix(path, order, content) if kind == MAT_MATRIX else None
 
 
-def _read_values(*where: Any) -> NDArray[Any]:
+def _read_values(*where: Any) -> AnyArray:
     matrix: _MatMatrix = _read_element(*where)
     return matrix.values()
 
@@ -194,7 +194,7 @@ class _MatMatrix:
             return kind & 0xFFFF, at + 4, at + 4 + min(kind >> 16, 4), at + 8
         return kind, at + 8, at + 8 + length, at + 8 + length + (-length) % 8
 
-    def values(self, is_cell: bool = False) -> NDArray[Any]:
+    def values(self, is_cell: bool = False) -> AnyArray:
         """Return the numbers, or the contents of the cells, which hold no cells."""
         with nullcontext() if is_cell else guard(self._path, DAMAGED_MAT):
             number = math.prod(self.shape)
@@ -270,13 +270,13 @@ class Archive:
             raise FileFormatError(self.path, f"has no field '{name}', which is needed here")
         return self._entries[name]
 
-    def read(self, name: str) -> NDArray[Any]:
+    def read(self, name: str) -> AnyArray:
         """Return entry `name`, of whatever shape and type."""
         entry = self.describe(name)
         with guard(self.path, self._problem):
             return entry.load()
 
-    def array(self, name: str, *shape: int | None) -> NDArray[Any]:
+    def array(self, name: str, *shape: int | None) -> AnyArray:
         """Return entry `name`, a numeric array of `shape`; None stands for any length but zero."""
         self.require_numbers(name, *shape)
         return self.read(name)
@@ -294,7 +294,7 @@ class Archive:
                 f"field '{name}' must be numbers of shape {wanted}, found {entry.dtype} of {entry.shape}",
             )
 
-    def finite_array(self, name: str, *shape: int | None) -> NDArray[np.float64]:
+    def finite_array(self, name: str, *shape: int | None) -> FloatArray:
         """Return entry `name` in float64, refusing NaN and infinity; arguments as in `array`."""
         values = self.array(name, *shape).astype(np.float64)
         if not np.all(np.isfinite(values)):

@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import FileFormatError, InputError, require
 from tofclip.files import MAX_COMPRESSION, BoundedFile, guard, translate_read_errors
 from tofclip.shots import Streak, outline_streak
@@ -77,9 +77,7 @@ def parse_text(text: str) -> dict[str, str]:
     return entries
 
 
-def read_row_times(
-    metadata: Mapping[str, str], path: str | Path, rows: int
-) -> NDArray[np.float64] | None:
+def read_row_times(metadata: Mapping[str, str], path: str | Path, rows: int) -> FloatArray | None:
     """Return the instant of each row, s, counted from the start of the sweep; None in focus mode,
     where nothing is swept, and without a unit of time. The table covers the whole sweep; a picture
     of a part of the sensor (``areSource`` = left, top, width, height) begins at its row ``top``.
@@ -116,7 +114,7 @@ def find_table(metadata: Mapping[str, str], axis: str) -> tuple[int, int] | None
     return (int(place[1]), int(place[2])) if place else None
 
 
-def _read_table(path: str | Path, start: int, count: int) -> NDArray[np.float64]:
+def _read_table(path: str | Path, start: int, count: int) -> FloatArray:
     with translate_read_errors(path), BoundedFile(path) as file:
         file.seek(start)
         data = file.read(count * _ENTRY_BYTES)
@@ -143,8 +141,8 @@ def parse_full_scale(metadata: Mapping[str, str]) -> float:
 
 
 def _make_streak(
-    pixels: NDArray[Any],
-    times: NDArray[np.float64] | None,
+    pixels: AnyArray,
+    times: FloatArray | None,
     metadata: Mapping[str, str],
     path: str | Path,
 ) -> Streak:
@@ -251,7 +249,7 @@ def open_itex(path: str | Path) -> Iterator[StreakFile]:
 
 def decode_itex(
     data: bytes | memoryview, path: str | Path = "ITEX picture"
-) -> tuple[NDArray[Any], dict[str, str]]:
+) -> tuple[AnyArray, dict[str, str]]:
     """Return the pixels of an ITEX file, (rows, columns), as a view of its bytes, and its text by
     `parse_text`; a damaged header cannot make this take more memory than `data` itself.
     """

@@ -15,11 +15,10 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray, FloatArray, IntArray
 from tofclip.errors import FileFormatError, MissingDependencyError, StorageError
 from tofclip.files import (
     BoundedFile,
@@ -43,7 +42,7 @@ LUMA_WEIGHTS = np.array([0.2125, 0.7154, 0.0721])
 GRID_NAME_PATTERN = re.compile(r"(?<!\d)(\d+)\D+(\d+)\D*$")
 RASTER_NAME_PATTERN = re.compile(r"(?<!\d)(\d+)\D*$")
 
-Channels = dict[str, NDArray[Any]]
+Channels = dict[str, AnyArray]
 
 
 def read_exr_parts(path: Path) -> list[tuple[str, Channels]]:
@@ -141,7 +140,7 @@ def read_folder(folder: Path) -> LightField:
     return LightField(np.stack(pictures), (places - shape // 2)[order].astype(np.float64))
 
 
-def compute_luminance(picture: NDArray[Any]) -> NDArray[Any]:
+def compute_luminance(picture: AnyArray) -> AnyArray:
     """Return the luminance (rows, columns), float32, of a grey or colour picture; an alpha channel
     is dropped.
     """
@@ -152,7 +151,7 @@ def compute_luminance(picture: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(picture[..., :3] @ LUMA_WEIGHTS, np.float32)
 
 
-def _parse_grid_positions(folder: Path, paths: list[Path]) -> NDArray[np.int64]:
+def _parse_grid_positions(folder: Path, paths: list[Path]) -> IntArray:
     """Row and column of each picture on the grid, from 0, (pictures, 2)."""
     groups = []
     for path in paths:
@@ -176,7 +175,7 @@ def _parse_grid_positions(folder: Path, paths: list[Path]) -> NDArray[np.int64]:
     return np.stack(np.divmod(numbers, side), axis=-1)
 
 
-def _read_picture(path: Path) -> NDArray[Any]:
+def _read_picture(path: Path) -> AnyArray:
     with guard(path, "is a damaged picture"), BoundedFile(path) as file:
         is_tiff = path.suffix.lower() in TIFF_SUFFIXES
         picture = _decode_tiff(path, file) if is_tiff else _decode(path, file)
@@ -186,7 +185,7 @@ def _read_picture(path: Path) -> NDArray[Any]:
     return compute_luminance(picture) / np.float32(scale)
 
 
-def _decode_tiff(path: Path, file: BoundedFile) -> NDArray[Any]:
+def _decode_tiff(path: Path, file: BoundedFile) -> AnyArray:
     import tifffile
 
     with tifffile.TiffFile(file) as tiff:
@@ -196,7 +195,7 @@ def _decode_tiff(path: Path, file: BoundedFile) -> NDArray[Any]:
         return np.asarray(tiff.pages.first.asarray())
 
 
-def _decode(path: Path, file: BoundedFile) -> NDArray[Any]:
+def _decode(path: Path, file: BoundedFile) -> AnyArray:
     from matplotlib.image import imread
     from PIL import Image
 
@@ -237,7 +236,7 @@ def write_light_field(light_field: LightField, path: str | Path) -> None:
     _WRITERS[target.suffix.lower()](light_field, target)
 
 
-def read_depth_map(path: str | Path) -> NDArray[np.float64]:
+def read_depth_map(path: str | Path) -> FloatArray:
     """Read the shear of each pixel of the reference view, (rows, columns), pixels per view step,
     infinite where there is nothing: ``.npy``, or ``.h5`` written by ``tofclip clip recover
     --all-in-focus``.

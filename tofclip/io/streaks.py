@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import (
     FileFormatError,
     require,
@@ -151,7 +151,7 @@ class StreakStack:
         import h5py
 
         self.path = Path(path)
-        self.row_times: NDArray[np.float64] | None = None
+        self.row_times: FloatArray | None = None
         with guard(path, "is not a stack of streak images"), h5py.File(path, "r") as file:
             for name in ("counts", "row_times"):
                 if name in file and not isinstance(file.get(name, getlink=True), h5py.HardLink):

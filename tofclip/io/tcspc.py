@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from tofclip.errors import FileFormatError
 from tofclip.files import BoundedFile, import_file_reader, require_bounded_size
 from tofclip.io.archive import MEMBER_COMPRESSIONS
@@ -51,8 +52,8 @@ class PulseCount:
         return (self.last - self.first) / (self.pulses - 1) if self.pulses > 1 else 0.0
 
     def find_pulses(
-        self, times: NDArray[np.int64], is_pulse: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], PulseCount]:
+        self, times: IntArray, is_pulse: BoolArray
+    ) -> tuple[IntArray, IntArray, PulseCount]:
         """Find the last pulse before each of the events that follow, at `times` (n,) in ticks that
         do not go back: its number from 0, -1 where there was none, and the ticks since it; and the
         count behind these events.
@@ -79,12 +80,12 @@ class Checkpoint:
 class Events:
     """Events of a piece, in their order; each array has one value for each."""
 
-    time: NDArray[np.int64]  # number of the pulse in T3 mode, ticks in T2 mode
-    pulse: NDArray[np.int64]  # number of the last pulse from 0
-    delay: NDArray[np.int64]  # time after it, in bins
+    time: IntArray  # number of the pulse in T3 mode, ticks in T2 mode
+    pulse: IntArray  # number of the last pulse from 0
+    delay: IntArray  # time after it, in bins
     channel: NDArray[np.int16]  # of photons from 0
     # others are pulses, markers, overflows, and photons before the first pulse
-    is_photon: NDArray[np.bool_]
+    is_photon: BoolArray
     marker: NDArray[np.uint8]  # one bit for each marker, where the event is one
 
 
@@ -166,16 +167,16 @@ class ScannedPhotons:
 
     x: NDArray[np.uint16]  # (photons,), pixel
     y: NDArray[np.uint16]  # (photons,), pixel
-    time: NDArray[np.float64]  # (photons,), s after the laser's pulse
+    time: FloatArray  # (photons,), s after the laser's pulse
 
 
 class _Lines(NamedTuple):
     """When the scanner was on which row: ticks where each line begins and ends, and its row."""
 
-    begin: NDArray[np.int64]
-    end: NDArray[np.int64]
-    duration: NDArray[np.int64]
-    row: NDArray[np.int64]
+    begin: IntArray
+    end: IntArray
+    duration: IntArray
+    row: IntArray
 
 
 def get_scan_shape(events: PtuEvents) -> tuple[int, int]:
@@ -207,7 +208,7 @@ def read_scan(events: PtuEvents) -> ScannedPhotons:
         y = lines.row[line]
         if is_back:
             x = np.where(y % 2, columns - 1 - x, x)
-        delay: NDArray[np.float64] = piece.delay[inside] * np.float64(events.resolution)
+        delay: FloatArray = piece.delay[inside] * np.float64(events.resolution)
         found.append(ScannedPhotons(x.astype(np.uint16), y.astype(np.uint16), delay))
         photons += len(x)
         if photons * PHOTON_BYTES > MAX_SCAN_BYTES:
@@ -225,7 +226,7 @@ def _find_lines(events: PtuEvents, rows: int, columns: int) -> _Lines:
     """
     numbers = (int(events.tags.get(f"ImgHdr_{name}", 0)) for name in MARKER_TAGS)
     start, stop, change = (1 << number - 1 if 0 < number <= 8 else 0 for number in numbers)
-    marked: dict[int, list[NDArray[np.int64]]] = {start: [], stop: [], change: []}
+    marked: dict[int, list[IntArray]] = {start: [], stop: [], change: []}
     count = PulseCount()
     for piece, at in events:
         count = at.count
@@ -256,7 +257,7 @@ LAST_OLD_REVISION = 14
 EXTENDED_COUNT = 0x7FFF  # where 16 bits do not suffice: the number of blocks is in `reserved1`
 
 
-def read_sdt_blocks(path: Path) -> tuple[list[NDArray[Any]], float]:
+def read_sdt_blocks(path: Path) -> tuple[list[AnyArray], float]:
     """Read counts (..., bins) of each block, (rows, columns, bins) of an image, and the duration of
     a bin, s.
     """

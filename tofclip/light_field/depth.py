@@ -6,15 +6,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofclip.arrays import AnyArray, FloatArray, IntArray
 from tofclip.errors import ShapeError, require, require_shape
 from tofclip.light_field.views import LightField
 
-Array = NDArray[Any]
+Array = AnyArray
 
 MAX_ITERATIONS = 40
 MAX_LABEL_STEP = 3  # labels farther apart cost no more: depth may jump at an object's border
@@ -22,7 +22,7 @@ MAX_LABEL_STEP = 3  # labels farther apart cost no more: depth may jump at an ob
 
 def find_smooth_labels(
     costs: Array, smoothness: float, iterations: int = MAX_ITERATIONS
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Choose labels of low total cost: each pixel's own, and `smoothness` times the steps between
     neighbours.
 
@@ -72,7 +72,7 @@ def find_smooth_labels(
             else:
                 said, heard = said[..., pixels], messages[towards, ..., neighbours]
             heard += (said - heard) / 2  # half of the step: undamped messages may oscillate
-    chosen: NDArray[np.int64] = (own + messages.sum(axis=0)).argmin(axis=0)
+    chosen: IntArray = (own + messages.sum(axis=0)).argmin(axis=0)
     return chosen
 
 
@@ -110,7 +110,7 @@ class FocalStack:
     """
 
     pictures: Array
-    shears: NDArray[np.float64]
+    shears: FloatArray
 
     def __post_init__(self) -> None:
         if self.pictures.ndim != 3 or self.shears.shape != (len(self.pictures),):
@@ -122,7 +122,7 @@ class FocalStack:
             "a focal stack needs finite pictures and ascending shears",
         )
 
-    def all_in_focus(self, depths: NDArray[np.int64]) -> Array:
+    def all_in_focus(self, depths: IntArray) -> Array:
         """Return the all-in-focus picture: each pixel from the picture whose number is in (rows,
         columns) `depths`.
         """
@@ -190,7 +190,7 @@ def estimate_depth_from_focus(
     measure: Callable[[Array], Array] = compute_image_energy,
     window_px: float = WINDOW_PX,
     smoothness: float = SMOOTHNESS,
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Return for each pixel the number of the picture of the stack in which it is sharp, (rows,
     columns).
 

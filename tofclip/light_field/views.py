@@ -16,7 +16,7 @@ import scipy.ndimage
 import scipy.sparse
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, FloatArray, IntArray
 from tofclip.errors import ShapeError, require, require_known, require_positive, require_shape
 from tofclip.operators import LinearShear
 from tofclip.operators.cameras import CAMERAS, EvenAngleLineCamera, LightFieldCamera
@@ -49,8 +49,8 @@ class LightField(Storable):
 
     RECORD_KIND = "light_field"
 
-    pictures: NDArray[Any] = field(metadata=stored_array("", "view", "y", "x", dtype=np.float32))
-    views: NDArray[np.float64] = field(metadata=stored_array("", "view", "vu"))
+    pictures: AnyArray = field(metadata=stored_array("", "view", "y", "x", dtype=np.float32))
+    views: FloatArray = field(metadata=stored_array("", "view", "vu"))
 
     def __post_init__(self) -> None:
         shape, expected = self.pictures.shape, (len(self.pictures), 2)
@@ -63,7 +63,7 @@ class LightField(Storable):
             "a light field whose pictures are all one even tone shows nothing to recover",
         )
 
-    def refocus(self, shear: float, reference: tuple[float, float] = (0.0, 0.0)) -> NDArray[Any]:
+    def refocus(self, shear: float, reference: tuple[float, float] = (0.0, 0.0)) -> AnyArray:
         """Shift and add: each view is shifted back and the mean taken of those that see the pixel.
 
         Parameters
@@ -87,14 +87,12 @@ class LightField(Storable):
         return total / np.maximum(seen, 1e-6)
 
 
-Labels = NDArray[np.int64]
-
 SAME_SURFACE_PX = 1.0  # by which neighbours drift apart in the outermost view at most
 SEEN_FRACTION = 0.5  # of a pixel, from which on a surface covers it
 MIN_WEIGHT = 0.05  # of a surface's own pixels around a point; below, the point was hidden
 
 
-def make_view_warp(labels: Labels, shears: FloatArray, views: list[View]) -> SparseMatrix:
+def make_view_warp(labels: IntArray, shears: FloatArray, views: list[View]) -> SparseMatrix:
     """Return the map from the reference view's picture, (rows, columns), to the pictures of all views.
 
     `labels` (rows, columns) say which of the ascending shears each pixel of the reference view has. A
@@ -122,7 +120,7 @@ def make_view_warp(labels: Labels, shears: FloatArray, views: list[View]) -> Spa
     return SparseMatrix(whole, labels.shape, (len(views), *labels.shape))
 
 
-def find_view_labels(labels: Labels, shears: FloatArray, view: View) -> Labels:
+def find_view_labels(labels: IntArray, shears: FloatArray, view: View) -> IntArray:
     """Return which shear each pixel of another view has, (rows, columns)."""
     seen = np.full(labels.shape, -1, np.int64)
     for label in np.unique(labels)[::-1]:  # nearer surfaces are painted over farther ones
@@ -140,7 +138,7 @@ def find_view_labels(labels: Labels, shears: FloatArray, view: View) -> Labels:
 
 
 def _make_view(
-    labels: Labels,
+    labels: IntArray,
     shears: FloatArray,
     view: View,
     same: float,
@@ -192,7 +190,7 @@ class CameraSetup:
         if self.encoder == "line-spread":
             object.__setattr__(self, "encoder", EvenAngleLineCamera.name)
 
-    def camera(self, image_shape: tuple[int, int], views: NDArray[np.float64]) -> LightFieldCamera:
+    def camera(self, image_shape: tuple[int, int], views: FloatArray) -> LightFieldCamera:
         """Build the camera of views (v, u), (views, 2); the same setup builds the same one again."""
         require_known("encoder", self.encoder, CAMERAS)
         return CAMERAS[self.encoder](
@@ -206,11 +204,11 @@ class ClipMeasurement(Storable):
 
     RECORD_KIND = "clip_measurement"
 
-    values: NDArray[Any] = field(
+    values: AnyArray = field(
         metadata=stored_array("", "reading", dtype=np.float32, name="readings")
     )  # (measurements,)
     # (views, 2), (v, u) of every view
-    views: NDArray[np.float64] = field(metadata=stored_array("", "view", "vu"))
+    views: FloatArray = field(metadata=stored_array("", "view", "vu"))
     image_shape: tuple[int, int] = field(metadata=stored_value("rows", "columns", dtype=int))
     setup: CameraSetup = field(metadata=stored_part(CameraSetup))
     # what a measurement of 1 means in counted photons; 0: not known
@@ -228,13 +226,13 @@ class ClipMeasurement(Storable):
         require_shape("the measurements of this camera", (camera.measurements,), self.values.shape)
         return camera
 
-    def counts(self) -> NDArray[Any]:
+    def counts(self) -> AnyArray:
         """Return the measurements in photons, (measurements,) float32."""
         require(
             self.photons_per_unit > 0,
             "these measurements do not say how many photons they stand for; take squares or huber",
         )
-        counted: NDArray[Any] = self.values * np.float32(self.photons_per_unit)
+        counted: AnyArray = self.values * np.float32(self.photons_per_unit)
         return counted
 
 

@@ -16,11 +16,12 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
 from tofclip.arrays import (
     Array,
     ComputeDevice,
+    IndexArray,
     PerDevice,
     as_type,
     is_complex,
@@ -378,7 +379,7 @@ class Selection(LinearOperator):
     """
 
     def __init__(
-        self, shape_in: Shape, shape_out: Shape, chosen: NDArray[np.intp], dtype: DTypeLike
+        self, shape_in: Shape, shape_out: Shape, chosen: IndexArray, dtype: DTypeLike
     ) -> None:
         super().__init__(shape_in, shape_out, dtype)
         self._chosen = chosen

@@ -15,9 +15,8 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import FloatArray, IndexArray
 from tofclip.errors import require, require_positive
 from tofclip.operators.base import (
     BlockDiagonal,
@@ -173,7 +172,7 @@ def assign_evenly(
     return _group_by_view(directions, owners)
 
 
-def _group_by_view(directions: FloatArray, owners: NDArray[np.intp]) -> AngleAssignment:
+def _group_by_view(directions: FloatArray, owners: IndexArray) -> AngleAssignment:
     used = tuple(int(view) for view in np.unique(owners))
     return used, [directions[owners == view] for view in used]
 

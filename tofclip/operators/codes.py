@@ -7,9 +7,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
-from tofclip.arrays import Array
+from tofclip.arrays import Array, FloatArray, IndexArray
 from tofclip.errors import ShapeError, require
 from tofclip.operators.base import (
     Adjoint,
@@ -40,9 +40,7 @@ class DenseSensor(Reshape):
 class _Sensor(Selection):
     """The measurements of `pixels`, flat numbers on the sensor's plane."""
 
-    def __init__(
-        self, plane_shape: tuple[int, int], pixels: NDArray[np.intp], dtype: DTypeLike
-    ) -> None:
+    def __init__(self, plane_shape: tuple[int, int], pixels: IndexArray, dtype: DTypeLike) -> None:
         require(
             pixels.size != 0,
             f"no pixel of the {tuple(plane_shape)} plane is read; check the sensor's mask and offset",
@@ -275,7 +273,7 @@ def make_sheared_mask(
     views: Sequence[View],
     mask_shear: float,
     random: np.random.Generator,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Make the codes of a random mask at some distance in front of the sensor, (views, rows, columns):
     from view to view it appears moved by `mask_shear` pixels. Transmissions are evenly from 0 to 1.
     """

@@ -17,12 +17,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
-from tofclip.arrays import Array, FloatArray
+from tofclip.arrays import AnyArray, Array, FloatArray
 from tofclip.errors import ShapeError, require
 from tofclip.operators.base import LinearOperator
 from tofclip.operators.shear import LinearShear, View
@@ -97,9 +97,7 @@ class PointSpreadConvolution(LinearOperator):
     def _adjoint(self, block: Array) -> Array:
         return self._apply_spectrum(block, self._conjugate, self.shape_in)
 
-    def _apply_spectrum(
-        self, block: Array, spectrum: NDArray[Any], shape: tuple[int, ...]
-    ) -> Array:
+    def _apply_spectrum(self, block: Array, spectrum: AnyArray, shape: tuple[int, ...]) -> Array:
         import scipy.fft
 
         # One axis after the other: rows of padding need no transform along themselves.
@@ -254,13 +252,11 @@ def make_coded_line(
     return spread
 
 
-Coordinates = FloatArray
-
 # Along each side of a view's patch of the aperture: 0.15 million for 8 x 8 views.
 RAYS_PER_SIDE = 48
 
 
-Rays = tuple[Coordinates, Coordinates, Coordinates]
+Rays = tuple[FloatArray, FloatArray, FloatArray]
 """(rays, rays) each: what fraction of each ray an element in the aperture passes, and by how many pixels
 it deflects it down and to the right. Pupil coordinates v, (rays, 1), down and u, (1, rays), right go from
 -1 to 1.
@@ -274,9 +270,9 @@ class CodedAperture:
     it is a point.
     """
 
-    code: NDArray[Any]  # (rows, columns), transmission of the mask's cells, which fill the aperture
+    code: AnyArray  # (rows, columns), transmission of the mask's cells, which fill the aperture
 
-    def trace_rays(self, v: Coordinates, u: Coordinates) -> Rays:
+    def trace_rays(self, v: FloatArray, u: FloatArray) -> Rays:
         """View u looks through the mask at -u, as in Eq. 6."""
         cells = [
             np.clip(((1 - place) / 2 * size).astype(int), 0, size - 1)
@@ -297,7 +293,7 @@ class CubicPhasePlate:
 
     strength_px: float  # extent of the PSF on either axis
 
-    def trace_rays(self, v: Coordinates, u: Coordinates) -> Rays:
+    def trace_rays(self, v: FloatArray, u: FloatArray) -> Rays:
         # 1/2 shifts the PSF as a whole, which lies about its own centre then
         passed = np.ones((v * u).shape)
         down, right = (self.strength_px * (pupil**2 - 0.5) * passed for pupil in (v, u))
@@ -312,7 +308,7 @@ class Diffuser:
     grain: float  # correlation length of the phase on the aperture, whose half width is 1
     seed: int
 
-    def trace_rays(self, v: Coordinates, u: Coordinates) -> Rays:
+    def trace_rays(self, v: FloatArray, u: FloatArray) -> Rays:
         phase = self._phase
         down, right = phase(v.ravel(), u.ravel(), dx=1), phase(v.ravel(), u.ravel(), dy=1)
         return np.ones(down.shape), down, right
@@ -375,7 +371,7 @@ def trace_view_point_spreads(
 
 
 def shear_point_spreads(
-    spreads: NDArray[Any], views: Sequence[View], shear: float, reference: View = (0.0, 0.0)
+    spreads: AnyArray, views: Sequence[View], shear: float, reference: View = (0.0, 0.0)
 ) -> FloatArray:
     """Move each view's PSF, (views, rows, columns), by ``s (u - u_ref)``: convolving with it is shearing
     the picture and convolving then. Their sum is the camera's ``g(x, s)`` (supplement Eq. 4).
@@ -428,7 +424,7 @@ class MeasuredPointSpreads:
 
 
 def _accumulate_rays(
-    light: Coordinates, down: Coordinates, right: Coordinates, shape: tuple[int, int]
+    light: FloatArray, down: FloatArray, right: FloatArray, shape: tuple[int, int]
 ) -> FloatArray:
     """Gather rays on pixels; each is shared between the four nearest."""
     total = np.zeros(shape[0] * shape[1])

@@ -6,9 +6,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
-from tofclip.arrays import Array
+from tofclip.arrays import Array, IntArray
 from tofclip.errors import ShapeError, require
 from tofclip.operators.base import LinearOperator
 from tofclip.operators.sparse import SparseMatrix
@@ -98,7 +98,7 @@ class RadonProjection(SparseMatrix):
         return SparseMatrix(made, self.shape_in, self.shape_out).matrix
 
     @cached_property
-    def _line_paths(self) -> tuple[int, int, list[NDArray[np.int64]]]:
+    def _line_paths(self) -> tuple[int, int, list[IntArray]]:
         """Bins before the detector's first, bins in all, and positions on lines extended so.
 
         The positions are those of each line's first pixel and the steps to its right and lower

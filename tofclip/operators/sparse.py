@@ -8,12 +8,20 @@ import operator
 import warnings
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from tofclip.arrays import Array, ComputeDevice, PerDevice, is_numpy, namespace
+from tofclip.arrays import (
+    AnyArray,
+    Array,
+    ComputeDevice,
+    IntArray,
+    PerDevice,
+    is_numpy,
+    namespace,
+)
 from tofclip.errors import ShapeError, require, require_shape
 from tofclip.operators.base import LinearOperator, Shape
 from tofclip.threads import LANES, run_blocks, split_blocks
@@ -33,9 +41,9 @@ class Tiles(NamedTuple):
     stays in cache: nonzeros in the order of tile, row, and their place in the row.
     """
 
-    starts: NDArray[np.int64]  # (tiles, rows + 1), where each row's nonzeros begin in the other two
+    starts: IntArray  # (tiles, rows + 1), where each row's nonzeros begin in the other two
     columns: NDArray[np.uint32]  # (nonzeros,)
-    values: NDArray[Any]  # (nonzeros,)
+    values: AnyArray  # (nonzeros,)
 
     @classmethod
     def from_csr(cls, matrix: scipy.sparse.csr_array) -> Tiles:
@@ -82,7 +90,7 @@ def make_product(matrix: scipy.sparse.csr_array, device: ComputeDevice) -> Produ
     return partial(_multiply_gathered, device.put(columns), device.put(values[..., np.newaxis]))
 
 
-def _multiply_tiles(tiles: Tiles, block: NDArray[Any]) -> NDArray[Any]:
+def _multiply_tiles(tiles: Tiles, block: AnyArray) -> AnyArray:
     from tofclip.operators.kernels import multiply_sparse_block
 
     result = np.empty((tiles.starts.shape[1] - 1, block.shape[-1]), block.dtype)

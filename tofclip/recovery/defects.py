@@ -15,16 +15,13 @@ from functools import partial
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from tofclip.arrays import BoolArray, Float32Array
 from tofclip.camera import Measurement, estimate_dark_level
 from tofclip.camera.noise import MeasurementNoise, find_dazzle_limit
 from tofclip.shots import Streak
 from tofclip.solvers import ClippedSquares, DataTermMaker, LeastSquares
 from tofclip.storage import Scalar
-
-FloatImage = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 DEFECTS_KEY, CLIPPED_KEY = "defective_readings", "clipped_readings"
 # Full widths of the shortest pulse that is distinguished from a single row; and of the longest, as
@@ -59,11 +56,11 @@ MIN_NOISE_COUNT = 0.3  # a dark image whose readings are whole counts still hide
 class Defects:
     """What is wrong with a streak image."""
 
-    pixels: Mask  # (rows, columns), measurements that are sharper in time than a pulse
-    columns: Mask  # (columns,), columns that see nothing
+    pixels: BoolArray  # (rows, columns), measurements that are sharper in time than a pulse
+    columns: BoolArray  # (columns,), columns that see nothing
 
     @property
-    def mask(self) -> Mask:
+    def mask(self) -> BoolArray:
         """Measurements that cannot be trusted, (rows, columns)."""
         return self.pixels | self.columns
 
@@ -110,7 +107,7 @@ def find_defects(streak: Streak, pulse_rows: float) -> Defects:
     return Defects(defects & ~columns, columns)
 
 
-def find_clipping_level(counts: FloatImage) -> float:
+def find_clipping_level(counts: Float32Array) -> float:
     """Find the value at which a streak image is cut off; infinite where nothing is. What is cut off
     is at least as bright as it shows, which says more than nothing: it is not masked, but fitted
     from below (`tofclip.solvers.ClippedSquares`).
@@ -127,7 +124,7 @@ def find_clipping_level(counts: FloatImage) -> float:
     return highest if number > MIN_CLIPPED_RATIO * usual else float("inf")
 
 
-def estimate_noise(counts: FloatImage) -> tuple[float, float, float]:
+def estimate_noise(counts: Float32Array) -> tuple[float, float, float]:
     """Estimate dark level and its noise, counts, and the variance that a count of light adds."""
     if len(counts) < 3:  # no row has two neighbours to differ from: photons' own noise
         dark = float(np.median(counts))
@@ -163,13 +160,13 @@ def estimate_noise(counts: FloatImage) -> tuple[float, float, float]:
     return dark, noise, max(1.0, float(fitted[0]))
 
 
-def find_dead_columns(counts: FloatImage, noise: float) -> Mask:
+def find_dead_columns(counts: Float32Array, noise: float) -> BoolArray:
     """Find columns, (columns,), that do not even show the noise of the others in the dark."""
     changes = np.abs(np.diff(counts, axis=0))
     rough = changes.mean(axis=0)
     # Of a bright scene the usual column is lit; a column that sees none of it is not dead.
     usual = min(float(np.median(rough)), MEAN_CHANGE * noise)
-    dead: Mask = rough < DEAD_COLUMN_FRACTION * usual
+    dead: BoolArray = rough < DEAD_COLUMN_FRACTION * usual
     if not np.median(changes):  # no noise by which a column is known to be alive
         return np.zeros(dead.shape, bool)
     return dead if dead.mean() <= MAX_CONSTANT_FRACTION else np.zeros(dead.shape, bool)
@@ -229,7 +226,7 @@ def describe_noise(streak: Streak, measurement: Measurement) -> MeasurementNoise
 
 
 def list_noise_figures(
-    noise: MeasurementNoise, measurement: Measurement, used: Mask, residual: float
+    noise: MeasurementNoise, measurement: Measurement, used: BoolArray, residual: float
 ) -> dict[str, Scalar]:
     """List what the frames have to know of their measurements: noise, and what the model misses.
     `used` (measurements, frames): those that were fitted; `residual`: norm of what is left of them

@@ -19,12 +19,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 import scipy.ndimage
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofclip.arrays import AnyArray, FloatArray, IntArray
 from tofclip.errors import require, require_known, require_positive, require_shape
 from tofclip.light_field import FocalStack, LightField, estimate_depth_from_focus
 from tofclip.light_field.views import ClipMeasurement, make_view_warp
@@ -83,7 +83,7 @@ THOROUGH_SEARCH = WeightSearch()
 class ClipResult:
     """A picture and how it came about."""
 
-    picture: NDArray[Any]  # (rows, columns)
+    picture: AnyArray  # (rows, columns)
     weight: float  # of the variational prior, relative to the largest value of A'f
     iterations: int
     stop_reason: str
@@ -243,7 +243,7 @@ class _InverseProblem:
     """Model and measurements (measurements, 1) weighted as the data term wants them."""
 
     model: LinearOperator
-    measurements: NDArray[Any]
+    measurements: AnyArray
     correlation_length: int
     data_term: DataTermMaker
 
@@ -290,10 +290,10 @@ SHEAR_STEP_PX = 0.6  # by which the outermost view moves between depths that are
 class AllInFocus:
     """A picture with the depth of each pixel."""
 
-    picture: NDArray[Any]  # (rows, columns), what the reference view (0, 0) sees
-    shears: NDArray[np.float64]  # (rows, columns), pixels per view step
+    picture: AnyArray  # (rows, columns), what the reference view (0, 0) sees
+    shears: FloatArray  # (rows, columns), pixels per view step
     # (rows, columns), the same from pictures refocused one by one; None where the depths were known
-    refocused: NDArray[Any] | None
+    refocused: AnyArray | None
     weight: float  # of the prior, relative to the largest value of A'f
     iterations: int
     stop_reason: str
@@ -311,9 +311,7 @@ class AllInFocus:
         return LightField(warp(self.picture), wanted)
 
 
-def make_shear_range(
-    nearest: float, farthest: float, views: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def make_shear_range(nearest: float, farthest: float, views: FloatArray) -> FloatArray:
     """Return shears, (depths,), to look for surfaces at between two of them, pixels per view step, as
     close as the views, (views, 2) of (v, u) in view steps, can tell them apart.
     """
@@ -373,7 +371,7 @@ def count_recoveries(shears: ArrayLike) -> int:
 
 def recover_on_depth_map(
     measurement: ClipMeasurement,
-    shears: NDArray[np.float64],
+    shears: FloatArray,
     weight: float | None = None,
     recovery: ClipRecovery | None = None,
 ) -> AllInFocus:
@@ -397,8 +395,8 @@ def recover_on_depth_map(
 
 def _solve(
     measurement: ClipMeasurement,
-    labels: NDArray[np.int64],
-    shears: NDArray[np.float64],
+    labels: IntArray,
+    shears: FloatArray,
     recovery: ClipRecovery,
     began: float,
 ) -> AllInFocus:

@@ -17,9 +17,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import CPU, Array, ComputeDevice, namespace, parse_device, to_numpy, zeros
+from tofclip.arrays import (
+    CPU,
+    Array,
+    BoolArray,
+    ComputeDevice,
+    Float32Array,
+    FloatArray,
+    namespace,
+    parse_device,
+    to_numpy,
+    zeros,
+)
 from tofclip.camera import Camera, Measurement, measure
 from tofclip.camera.noise import MeasurementNoise, find_dazzled, find_glints
 from tofclip.camera.registration import count_registration_iterations
@@ -372,7 +382,7 @@ def recover(
 def recover_measurement(
     method: Method,
     camera: Camera,
-    times: NDArray[np.float64],
+    times: FloatArray,
     measurement: Measurement,
     noise: MeasurementNoise | None,
     focus: Focus = DEFAULT_FOCUS,
@@ -494,14 +504,14 @@ def _join_results(frames: Array, results: list[Result]) -> Result:
 
 
 def recover_glints(
-    frames: NDArray[np.float32],
+    frames: Float32Array,
     method: Method,
     camera: Camera,
     measurement: Measurement,
     segments: Sequence[FrameSegment],
-    dazzled: NDArray[np.bool_],
+    dazzled: BoolArray,
     device: ComputeDevice,
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Return frames that were recovered without dazzled measurements, (measurements, frames), with the
     pixels that these alone see.
     """

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.camera.registration import MAX_ROUND_COUNT, estimate_skew, register_views
 from tofclip.errors import InputError
@@ -41,7 +41,7 @@ class Shot:
     centre_error_px: float = 0.0
 
     @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Time of flight of each row, (rows,), s: the camera's time zero is taken off."""
         return self.streak.times - self.camera.time_zero
 

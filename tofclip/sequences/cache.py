@@ -13,9 +13,9 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
-from tofclip.arrays import Array, namespace, to_numpy
+from tofclip.arrays import Array, BoolArray, namespace, to_numpy
 from tofclip.camera import Camera
 from tofclip.operators import LinearOperator, LineProjection
 from tofclip.solvers import (
@@ -79,7 +79,7 @@ def _hash_record(record: Record) -> str:
 
 
 def prepare_inverse(
-    method: LinearInverse, operator: LinearOperator, alive: NDArray[np.bool_]
+    method: LinearInverse, operator: LinearOperator, alive: BoolArray
 ) -> PreparedInverse:
     """Return what `LinearInverse.prepare` does, the same object for the same arguments; the 16
     inverses used last are kept. `operator`: of a camera that `get_cached_camera` returned; another

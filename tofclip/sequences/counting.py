@@ -8,8 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.photons import PhotonCube, PhotonDetector, SurfaceImage
@@ -17,9 +17,6 @@ from tofclip.lidar.photons.scene import prepare_photons
 from tofclip.lidar.pulse import Pulse
 from tofclip.shots import Returns
 from tofclip.units import SPEED_OF_LIGHT
-
-FloatArray = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 SUMMED_SHOTS = 16  # of a pixel at most: a block of shots and the block before
 # Standard deviations by which a window of a pixel's light has to differ, in a shot from all before it
@@ -48,7 +45,7 @@ class StillSum:
         self._windows = np.zeros((2, pixels, self._starts.size), np.float32)
         self.shots = np.zeros((2, pixels), np.int64)
 
-    def add(self, histograms: FloatArray) -> NDArray[np.bool_]:
+    def add(self, histograms: Float32Array) -> BoolArray:
         """Add a shot (pixels, bins); say of which pixels the older block shows what the newer does."""
         seen = np.add.reduceat(histograms, self._starts, axis=1)
         moved = _differ(seen, 1, self._windows.sum(axis=0), self.shots.sum(axis=0), SHOT_SIGMAS)
@@ -69,7 +66,7 @@ class StillSum:
         older, newer = zip(self._windows, self.shots, strict=True)
         return ~_differ(*newer, *older, BLOCK_SIGMAS)
 
-    def average(self, still: NDArray[np.bool_]) -> FloatArray:
+    def average(self, still: BoolArray) -> Float32Array:
         """Return the mean of a shot (pixels, bins), of both blocks where that is `still` the same."""
         older, newer = self.blocks
         before, shots = self.shots
@@ -78,12 +75,12 @@ class StillSum:
 
 
 def _differ(
-    one: FloatArray,
-    shots: int | NDArray[np.int64],
-    other: FloatArray,
-    others: NDArray[np.int64],
+    one: Float32Array,
+    shots: int | IntArray,
+    other: Float32Array,
+    others: IntArray,
     limit: float,
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Say of which pixels, seen in some shots, a window differs from what it was in others."""
     first = np.asarray(shots, np.float32).reshape(-1, 1)
     second = np.maximum(others, 1).astype(np.float32).reshape(-1, 1)
@@ -110,9 +107,9 @@ class PhotonPipeline:
     def __init__(
         self,
         camera: Camera,
-        times: NDArray[np.float64],
+        times: FloatArray,
         detector: PhotonDetector,
-        hot: NDArray[np.bool_],
+        hot: BoolArray,
         sampled: bool = False,
     ) -> None:
         self.camera, self.times, self.detector, self.hot = camera, times, detector, hot
@@ -145,18 +142,18 @@ class PhotonPipeline:
         detector = PhotonDetector(pulse, photons.bin_width, photons.bins)
         return cls(seen_by, shot.times, detector.learn(photons), hot, shot.sampled)
 
-    def rectify(self, shot: PhotonCube) -> FloatArray:
+    def rectify(self, shot: PhotonCube) -> Float32Array:
         """Put the bins of a pixel side by side, (pixels, bins)."""
         if shot.counts.shape != (self.times.size, *self.camera.image_shape):
             expected = self.times.size, *self.camera.image_shape
             raise ShapeError("histograms", expected, shot.counts.shape)
         return shot.histograms
 
-    def recover_shot(self, shot: PhotonCube, rectified: FloatArray) -> NDArray[np.bool_]:
+    def recover_shot(self, shot: PhotonCube, rectified: Float32Array) -> BoolArray:
         """Add the shots before it, pixel by pixel, as far as nothing has jumped."""
         return self._sum.add(rectified)
 
-    def search(self, still: NDArray[np.bool_]) -> Returns:
+    def search(self, still: BoolArray) -> Returns:
         """Find the returns of the sums where they are now; their intensity is that of one shot."""
         (older, newer), (before, shots) = self._sum.blocks, self._sum.shots
         used = before * still
@@ -175,8 +172,8 @@ class PhotonPipeline:
         return image.calibrate(self.camera, float(self.times[0])).to_returns(self.camera)
 
     def _measure_speed(
-        self, layer: Float64Array, photons: Float64Array, age: Float64Array
-    ) -> tuple[Float64Array, Float64Array]:
+        self, layer: FloatArray, photons: FloatArray, age: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """How far the surface of each pixel moves in a shot, m, and the standard deviation, by newer and
         older photons of the pixels around it that lie on the same surface. `photons`: of all bins in a
         shot; `age`: of what gave the range, in shots.
@@ -205,7 +202,7 @@ class PhotonPipeline:
             speed, sigma = pushed / held, 1 / np.sqrt(held)
         return speed, sigma
 
-    def _pool(self, terms: Float64Array, ranges: Float64Array, near: float) -> Float64Array:
+    def _pool(self, terms: FloatArray, ranges: FloatArray, near: float) -> FloatArray:
         """Add up what the pixels around each one say, (terms, pixels), that are as near as that, m."""
         rows, columns = self.camera.image_shape
         stack = np.concatenate([ranges[np.newaxis], terms]).reshape(-1, rows, columns)

@@ -18,9 +18,8 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import BoolArray, Float32Array, FloatArray
 from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.errors import ShapeError
 from tofclip.lidar import Detection, PointCloud, point_cloud
@@ -69,7 +68,7 @@ class WarmStartedRecovery:
         self,
         method: ProximalMethod,
         places: Sequence[tuple[slice, LinearOperator]],
-        alive: NDArray[np.bool_],
+        alive: BoolArray,
         iterations: int = WARM_ITERATIONS,
     ) -> None:
         self.method, self._places, self._alive = method, places, alive
@@ -78,7 +77,7 @@ class WarmStartedRecovery:
         self._rows = np.zeros(0, np.int64)
         self._pictures = np.zeros((0, *places[0][1].shape_in), np.float32)
 
-    def recover(self, measurements: NDArray[np.float32], bins: TraceBins) -> PictureTraces:
+    def recover(self, measurements: Float32Array, bins: TraceBins) -> PictureTraces:
         """Recover some rows of a shot from their rectified measurements (columns, bins); those of
         which one stands for several are dark, and stay so.
         """
@@ -101,10 +100,10 @@ class WarmStartedRecovery:
     def _recover_place(
         self,
         operator: LinearOperator,
-        seen: NDArray[np.float32],
-        start: NDArray[np.float32],
+        seen: Float32Array,
+        start: Float32Array,
         known: bool,
-    ) -> NDArray[np.float32]:
+    ) -> Float32Array:
         """Recover rows of one shear, beginning at `start` where some of them are `known`."""
         valid = None if self._alive.all() else np.repeat(self._alive[:, None], seen.shape[1], 1)
         if known:
@@ -164,7 +163,7 @@ class SurfacePipeline:
                 self._fit = fit_surfaces(shot, start, weight, iterations)
             return self._fit
 
-    def _look(self, shot: Streak) -> tuple[Returns, NDArray[np.float32]]:
+    def _look(self, shot: Streak) -> tuple[Returns, Float32Array]:
         """Return what l1 shows of a shot: its returns, and the light of each pixel."""
         self.searches += 1
         if self._quick is None:
@@ -187,7 +186,7 @@ class StillAverage:
     `most`: shots that are averaged at most. Memory: three such images.
     """
 
-    def __init__(self, first: NDArray[np.float32], pulse_rows: float, most: int) -> None:
+    def __init__(self, first: Float32Array, pulse_rows: float, most: int) -> None:
         self._dark, floor, self._gain = estimate_noise(first)
         # photons, and as many besides as would scatter like a dark measurement
         self._offset = (floor / self._gain) ** 2
@@ -195,7 +194,7 @@ class StillAverage:
         down, across = (-(-n // side) for n, side in zip(first.shape, self._sides, strict=True))
         self._sum = StillSum(down * across, height * width, height * width, most)
 
-    def add(self, counts: NDArray[np.float32]) -> NDArray[np.float32]:
+    def add(self, counts: Float32Array) -> Float32Array:
         """Return the average of the newest image with those before."""
         (rows, columns), (height, width) = counts.shape, self._sides
         padded = np.pad(
@@ -242,7 +241,7 @@ class AveragedPipeline:
 class SummedShot(NamedTuple):
     """What a look at all rows of a shot brings."""
 
-    sums: NDArray[np.float32]  # (columns, instants and some), see `SignalRowFinder.bins`
+    sums: Float32Array  # (columns, instants and some), see `SignalRowFinder.bins`
     dark: float  # dark level, counts
 
 
@@ -327,11 +326,11 @@ class RangingPipeline:
         """Whether what comes out of a shot depends on those before it."""
         return self._warm_start is not None
 
-    def find_returns(self, measurements: NDArray[np.float32]) -> Returns:
+    def find_returns(self, measurements: Float32Array) -> Returns:
         """Find the returns in one shot's rectified measurements, (columns, rows)."""
         return self.search(self.recover(measurements))
 
-    def recover(self, measurements: NDArray[np.float32]) -> Traces:
+    def recover(self, measurements: Float32Array) -> Traces:
         """Do what a shot, (columns, rows), rectified, needs as a whole before its pixels are
         recovered, a few at a time, as they are asked for.
         """
@@ -342,7 +341,7 @@ class RangingPipeline:
         # by rows, which is how measurements lie in memory
         return self._recover_bins(np.take(measurements.T, bins.numbers, axis=0).T, bins)
 
-    def _recover_bins(self, measurements: NDArray[np.float32], bins: TraceBins) -> Traces:
+    def _recover_bins(self, measurements: Float32Array, bins: TraceBins) -> Traces:
         """Recover from measurements (columns, bins)."""
         if self._warm_start is not None:
             return self._warm_start.recover(measurements, bins)
@@ -362,7 +361,7 @@ class RangingPipeline:
         """Find the returns in what `recover` returned."""
         return self._search.find_returns(found)
 
-    def cloud(self, measurements: NDArray[np.float32]) -> PointCloud:
+    def cloud(self, measurements: Float32Array) -> PointCloud:
         """Make the cloud of one shot's rectified measurements, (columns, rows)."""
         return point_cloud(self.find_returns(measurements))
 
@@ -371,10 +370,10 @@ class _ShotTraces:
     """Traces of a shot, recovered as they are asked for; see `tofclip.lidar.pulse_tables.Traces`."""
 
     def __init__(
-        self, pipeline: RangingPipeline, measurements: NDArray[np.float32], bins: TraceBins
+        self, pipeline: RangingPipeline, measurements: Float32Array, bins: TraceBins
     ) -> None:
         self.pixels, self.bins = pipeline.pixels, bins
-        self._parts: list[tuple[InverseTraces, slice, NDArray[np.float32]]] = []
+        self._parts: list[tuple[InverseTraces, slice, Float32Array]] = []
         for place in pipeline.places:
             first, last = np.searchsorted(bins.numbers, [place.rows.start, place.rows.stop])
             if first < last:
@@ -382,7 +381,7 @@ class _ShotTraces:
                 weights = place.inverse.inverse.weights(measurements[:, held])
                 self._parts.append((place.inverse, held, weights))
 
-    def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
+    def fill(self, piece: slice, traces: Float32Array) -> None:
         """Write the traces (n, bins) of some pixels, recovered now."""
         for inverse, held, weights in self._parts:
             inverse.fill(weights, piece, traces, held)

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import Float32Array, FloatArray
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.files import compute_sha256, require_apart
@@ -49,8 +48,8 @@ class RangingPlan(Storable):
     RECORD_KIND = "ranging"
 
     camera: Camera = field(metadata=stored_child(Camera.from_record, "camera"))
-    row_times: NDArray[np.float64] = field(metadata=stored_array("s", "time"))
-    light: NDArray[np.float64] = field(metadata=stored_array("count", "time"))
+    row_times: FloatArray = field(metadata=stored_array("s", "time"))
+    light: FloatArray = field(metadata=stored_array("count", "time"))
     focus: str = field(metadata=stored_value(dtype=str))
 
 
@@ -205,7 +204,7 @@ def make_average_cloud(
         raise InputError("a cloud needs at least one shot")
     late = np.zeros(len(shots))
 
-    def measurements(place: int) -> NDArray[np.float32]:
+    def measurements(place: int) -> Float32Array:
         streak = shots[place]()
         if jitter is not None:
             late[place] = jitter.late_bin(compute_light_curve(streak, pipeline.camera))

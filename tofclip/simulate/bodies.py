@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray, IndexArray
 from tofclip.errors import ShapeError, require
 
-Array = NDArray[Any]
+Array = AnyArray
 Vector = tuple[float, float, float]
 
 AMBIENT_FRACTION = 0.4  # of the light, that comes from everywhere
@@ -348,7 +348,7 @@ def compute_irradiance(bodies: Sequence[Body], lamp: Array, points: Array, norma
     return light
 
 
-def number_ray_pixels(image_shape: tuple[int, int], rays_per_side: int) -> NDArray[np.intp]:
+def number_ray_pixels(image_shape: tuple[int, int], rays_per_side: int) -> IndexArray:
     """Return the raster number of the pixel to which each ray belongs, in raster order of rays over
     the whole picture.
     """
@@ -356,13 +356,13 @@ def number_ray_pixels(image_shape: tuple[int, int], rays_per_side: int) -> NDArr
     return numbers.repeat(rays_per_side, axis=0).repeat(rays_per_side, axis=1).ravel()
 
 
-def accumulate_cells(cell: NDArray[np.intp], amount: Array, shape: tuple[int, ...]) -> Array:
+def accumulate_cells(cell: IndexArray, amount: Array, shape: tuple[int, ...]) -> Array:
     """Add each amount to its cell, numbered in raster order, of a float64 array of `shape`."""
     total: Any = np.bincount(cell.ravel(), amount.ravel(), minlength=int(np.prod(shape)))
     return np.asarray(total, dtype=np.float64).reshape(shape)
 
 
-def spread_pulse(position: Array, sigma: Array) -> tuple[NDArray[np.intp], Array]:
+def spread_pulse(position: Array, sigma: Array) -> tuple[IndexArray, Array]:
     """Integrate Gaussian pulses at `position` (n,), in bins, over the bins around them; bin i
     reaches from i - 1/2 to i + 1/2. Returns the first bin of each pulse, and (n, reach) fractions
     of its energy in that bin and those after it.
@@ -378,7 +378,7 @@ def spread_pulse(position: Array, sigma: Array) -> tuple[NDArray[np.intp], Array
 
 
 def bin_by_time(
-    pixel: NDArray[np.intp], position: Array, light: Array, sigma: float, shape: tuple[int, int]
+    pixel: IndexArray, position: Array, light: Array, sigma: float, shape: tuple[int, int]
 ) -> Array:
     """Add the light of rays to the bins of their pixels, (pixels, bins), each spread over its pulse
     about its arrival, in bins; light outside of the axis is lost.

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, Float32Array, FloatArray
 from tofclip.errors import ShapeError, require
 from tofclip.light_field import LightField
 from tofclip.operators.shear import View
@@ -30,7 +29,7 @@ from tofclip.simulate.bodies import (
 from tofclip.threads import limit_blas_threads, run_blocks
 from tofclip.units import FWHM_PER_SIGMA, SPEED_OF_LIGHT
 
-Array = NDArray[Any]
+Array = AnyArray
 
 LIGHT_DIRECTION = (-0.35, -0.45, -0.82)  # towards the lamp: over the viewer's left shoulder
 
@@ -240,9 +239,7 @@ class TimeAxis:
         return cls(start, bin_width, bins, pulse_fwhm)
 
 
-def render_flash(
-    scene: PulsedScene, array: CameraArray, time_axis: TimeAxis
-) -> NDArray[np.float32]:
+def render_flash(scene: PulsedScene, array: CameraArray, time_axis: TimeAxis) -> Float32Array:
     """Return what every view sees at every instant, (views, rows, columns, bins). A surface of
     reflectance 1 that faces all lamps from the distance of the array's focus has brightness 1,
     summed over time. Memory beyond the result is about 1 kB for each ray of a view and thread.

@@ -6,12 +6,12 @@ A pattern is a picture over the unit square, x to the right, y down; NaN marks a
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import Float32Array, FloatArray
 from tofclip.errors import require, require_known
 
-Outline = NDArray[np.float64]
-Pattern = NDArray[np.float32]
+Outline = FloatArray
+Pattern = Float32Array
 
 STROKE_WIDTH = 0.26  # width of a letter's stroke
 TEXELS = 192  # per side; finer than the rays at every range that the rest of this room uses

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray
 from tofclip.camera import Camera
 from tofclip.errors import require, require_shape
 from tofclip.lidar import Returns
@@ -93,7 +93,7 @@ def make_plate(
 class RayCast(NamedTuple):
     """What the rays of one viewpoint see, ray by ray."""
 
-    body: NDArray[np.intp]  # number of the body; `NO_BODY` where the ray meets none
+    body: IndexArray  # number of the body; `NO_BODY` where the ray meets none
     # half of the path of the light from the lamp over the surface to the viewpoint, m
     path: FloatArray
     distance: FloatArray  # of the surface from the lamp, m
@@ -193,7 +193,7 @@ class StreakDetector:
 
     def expose(
         self, signal: FloatArray, noise: np.random.Generator
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    ) -> tuple[Float32Array, BoolArray]:
         """Draw one shot of an expected signal, (rows, columns), by `noise`, a generator:
         measurements in photons, none above full scale, and which of them saturated.
         """
@@ -318,7 +318,7 @@ def render_streak(rays: RayBundle, view: int, instrument: Instrument) -> FloatAr
 
 def _split_over_columns(
     position: FloatArray, light: FloatArray, side: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+) -> tuple[IndexArray, IndexArray, FloatArray]:
     """Split each ray, 1/side of a pixel wide, exactly between the one or two slit pixels that it
     covers; slit pixel j reaches from j - 1/2 to j + 1/2. Returns ray number, slit pixel and amount
     of light, piece by piece.
@@ -360,9 +360,9 @@ class GroundTruth:
         Duration of a bin of the shot, s, which sets the scale of range errors.
     """
 
-    range: NDArray[np.float32]
-    reflectance: NDArray[np.float32]
-    target: NDArray[np.bool_]
+    range: Float32Array
+    reflectance: Float32Array
+    target: BoolArray
     bin_width: float
 
     @classmethod
@@ -371,7 +371,7 @@ class GroundTruth:
         hits = instrument.look_at(scene)
         (rows, columns), side = instrument.camera.image_shape, instrument.rays_per_pixel_side
 
-        def group_by_pixel(values: NDArray[Any]) -> NDArray[Any]:
+        def group_by_pixel(values: AnyArray) -> AnyArray:
             by_side = values.reshape(rows, side, columns, side)
             return by_side.swapaxes(1, 2).reshape(rows, columns, side**2)
 
@@ -498,7 +498,7 @@ class SimulatedShot:
     streak: Streak
     camera: Camera
     truth: GroundTruth
-    signal: NDArray[np.float32]
+    signal: Float32Array
     exposure: float
 
 

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import Array, require_numpy
+from tofclip.arrays import AnyArray, Array, require_numpy
 from tofclip.errors import MissingDependencyError, require, require_shape
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm, DataTermMaker, Mask
@@ -21,7 +20,7 @@ from tofclip.solvers.fista import ProximalMethod, TotalVariation
 from tofclip.solvers.methods import Method, Progress, Result, ignore_progress
 from tofclip.threads import limit_blas_threads
 
-Picture = NDArray[Any]
+Picture = AnyArray
 
 
 Denoiser = Callable[[Picture, Picture, float], Picture]
@@ -221,10 +220,10 @@ class RegularisationByDenoising(PlugAndPlay):
 def solve_data_step(
     operator: LinearOperator,
     misfit: DataTerm,
-    anchor: NDArray[Any],
+    anchor: AnyArray,
     coupling: float,
     iterations: int = 10,
-) -> NDArray[Any]:
+) -> AnyArray:
     """Minimise ``misfit(A h) + coupling / 2 |h - anchor|^2`` near `anchor`, for a misfit of a single
     frame, by conjugate gradients; ten leave 1 % of the first gradient at the couplings in use.
 

@@ -11,14 +11,15 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofclip.arrays import (
+    AnyArray,
     Array,
+    BoolArray,
     ComputeDevice,
+    IntArray,
     PerDevice,
     empty_aligned,
     is_numpy,
@@ -65,9 +66,7 @@ class LinearInverse(Method):
     name = "linear"
     portable = True
 
-    def prepare(
-        self, operator: LinearOperator, alive: NDArray[np.bool_] | None = None
-    ) -> PreparedInverse:
+    def prepare(self, operator: LinearOperator, alive: BoolArray | None = None) -> PreparedInverse:
         """Invert the Gram matrix of the living measurements.
 
         Parameters
@@ -136,7 +135,7 @@ class PreparedInverse:
     """
 
     operator: LinearOperator
-    inverse_gram: NDArray[Any]
+    inverse_gram: AnyArray
 
     @cached_property
     def _inverse(self) -> PerDevice[Array]:
@@ -161,7 +160,7 @@ class PreparedInverse:
         blocks.for_each(project)
         return Result(blocks.frames)
 
-    def weights(self, measurements: NDArray[Any]) -> NDArray[Any]:
+    def weights(self, measurements: AnyArray) -> AnyArray:
         """Return ``(A A' + mu I)^-1 f``, (measurements, frames and some): its adjoint is the pictures.
 
         Beyond the last frame rows are zero to a multiple of `LANES` frames and `ROW_GAP` more.
@@ -228,7 +227,7 @@ PATCH_ROWS, PATCH_COLUMNS = 8, 8  # what such a patch looks at stays in the firs
 GROUP_PIXELS = 4  # neighbours in a row of a patch, which look at nearly the same measurements
 
 
-def order_by_patch(image_shape: tuple[int, int]) -> NDArray[np.int64]:
+def order_by_patch(image_shape: tuple[int, int]) -> IntArray:
     """Return the numbers of all pixels of a picture, counted in raster order, patch by patch."""
     row, column = np.divmod(np.arange(image_shape[0] * image_shape[1]), image_shape[1])
     return np.lexsort((column, row, column // PATCH_COLUMNS, row // PATCH_ROWS))
@@ -240,7 +239,7 @@ class InverseTraces:
     operator's transpose, a row for each pixel, without measurements that are not used.
     """
 
-    def __init__(self, inverse: PreparedInverse, pixels: NDArray[np.int64]) -> None:
+    def __init__(self, inverse: PreparedInverse, pixels: IntArray) -> None:
         if not isinstance(inverse.operator, SparseMatrix):
             raise InputError(
                 f"traces of single pixels need a sparse matrix, not {inverse.operator!r}"

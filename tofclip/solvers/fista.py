@@ -15,10 +15,11 @@ from math import log
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofclip.arrays import (
     Array,
+    BoolArray,
+    FloatArray,
     clip_values,
     is_numpy,
     namespace,
@@ -325,7 +326,7 @@ class ProximalMethod(Method):
 
     def _look_at_zero(
         self, operator: LinearOperator, blocks: Blocks, measurements: Array, valid: Mask
-    ) -> NDArray[np.float64]:
+    ) -> FloatArray:
         """What is known of pictures of nothing, (3, frames): the largest value of A'f, that of the data
         term's negative gradient, and the data term.
         """
@@ -337,7 +338,7 @@ class ProximalMethod(Method):
             trusted = None if valid is None else blocks.take(valid, piece)
             nothing = namespace(block).zeros_like(block)
 
-            def pull(data: DataTerm) -> NDArray[np.float64]:
+            def pull(data: DataTerm) -> FloatArray:
                 back = operator.adjoint(-data.gradient(nothing))
                 for _ in operator.shape_in:  # NumPy takes five times as long for all axes at once
                     back = namespace(back).max(back, axis=0)
@@ -422,9 +423,9 @@ class WeightChoice:
     """The weights tried and what their recoveries failed to predict."""
 
     weight: float  # the best, between those tried
-    trial_weights: NDArray[np.float64]  # (trials,), ascending
+    trial_weights: FloatArray  # (trials,), ascending
     # (trials,), value of the data term on the measurements held out, all folds together
-    errors: NDArray[np.float64]
+    errors: FloatArray
 
 
 def choose_weight(
@@ -457,7 +458,7 @@ def choose_weight(
     parts = np.split(held, held.shape[1], axis=1)
     column = measurements[:, np.newaxis]
 
-    def unpredicted(trial: ProximalMethod, out: NDArray[np.bool_]) -> float:
+    def unpredicted(trial: ProximalMethod, out: BoolArray) -> float:
         # Recovered without the measurements of this fold, judged by them alone.
         picture = trial.recover(operator, column, ~out).frames[0]
         progress(FOLD_COUNT // len(parts))
@@ -473,7 +474,7 @@ def choose_weight(
     return choice
 
 
-def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
+def assign_folds(count: int, run: int, seed: int) -> BoolArray:
     """Assign runs of consecutive measurements to folds at random: (count, folds), True where a
     measurement is left out of a fold that is tried.
     """
@@ -488,7 +489,7 @@ def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
     dealt = np.random.default_rng(seed).permutation(runs) % min(FOLD_COUNT, runs)
     # This many runs in one fold already give the error to a few percent.
     used = 1 if runs >= SINGLE_FOLD_RUNS else min(FOLD_COUNT, runs)
-    out: NDArray[np.bool_] = np.repeat(dealt, run)[:count, np.newaxis] == np.arange(used)
+    out: BoolArray = np.repeat(dealt, run)[:count, np.newaxis] == np.arange(used)
     return out
 
 

@@ -15,9 +15,17 @@ from math import prod
 from typing import Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import Array, as_type, is_numpy, namespace, to_numpy, zeros
+from tofclip.arrays import (
+    Array,
+    BoolArray,
+    FloatArray,
+    as_type,
+    is_numpy,
+    namespace,
+    to_numpy,
+    zeros,
+)
 from tofclip.errors import ShapeError, require
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTermMaker, Mask
@@ -126,7 +134,7 @@ class IterationHistory:
         How far the last objective is above the least one at most; NaN where that is not known.
     """
 
-    objective: NDArray[np.float64]
+    objective: FloatArray
     converged: bool
     gap: float = float("nan")
 
@@ -204,7 +212,7 @@ class Result:
 
     frames: Array
     iterations: int = 0
-    objective: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    objective: FloatArray = field(default_factory=lambda: np.empty(0))
     stop_reason: str = "direct method"
     setup_seconds: float = 0.0
     duality_gap: float = float("nan")
@@ -378,7 +386,7 @@ class Blocks:
         )
         self._order = np.arange(number)
 
-    def leave_out(self, dark: NDArray[np.bool_]) -> None:
+    def leave_out(self, dark: BoolArray) -> None:
         """Make the frames that are dark zero; pieces count the others only."""
         if self._compiled:
             self.frames[dark] = 0
