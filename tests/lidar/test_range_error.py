@@ -98,7 +98,7 @@ def test_neighbours_count_within_a_ball_whose_radius_in_range_is_in_gates() -> N
         distance = np.array([1.0, 1.0 + off * 0.01, 9.0])
         pooled = np.empty(3)
         own = np.array([1.0, 2.0, 4.0])
-        pool_significance(pixel, distance, distance, own, starts, (7, 7), (4.0, 0.01), pooled)
+        pool_significance(pixel, distance, own, starts, (7, 7), (4.0, 0.01), pooled)
         assert pooled[0] == (3.0 if counted else 1.0)
         assert pooled[2] == 4.0
 

@@ -450,11 +450,10 @@ def cut_out(trace, background, start, held, rest):
 
 
 @compile_loop()
-def pool_significance(pixel, at, distance, own, starts, image_shape, limits, pooled):
+def pool_significance(pixel, distance, own, starts, image_shape, limits, pooled):
     """Add to each candidate's significance those of its neighbours at the same range. `pixel` (n,)
-    does not decrease; `at, distance` (n,): range at which neighbours are looked for, and their own,
-    m; `starts` (pixels + 1,): first candidate of each pixel; `limits`: radius in pixels, and gate
-    in m for each of them.
+    does not decrease; `distance` (n,): range, m; `starts` (pixels + 1,): first candidate of each
+    pixel; `limits`: radius in pixels, and gate in m for each of them.
     """
     rows, columns = image_shape
     radius, gate = limits
@@ -472,7 +471,7 @@ def pool_significance(pixel, at, distance, own, starts, image_shape, limits, poo
                 most = gate * math.sqrt(left)
                 there = (y + j) * columns + x + i
                 for k in range(starts[there], starts[there + 1]):
-                    if math.fabs(distance[k] - at[number]) <= most:
+                    if math.fabs(distance[k] - distance[number]) <= most:
                         total += own[k]
         pooled[number] = total
 

@@ -10,9 +10,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray, to_numpy
+from tofclip.arrays import FloatArray
 from tofclip.lidar.pulse import Pulse, Table
-from tofclip.shots import Frames
 
 
 @dataclass(frozen=True)
@@ -61,13 +60,6 @@ class PictureTraces:
 
         # contiguous: the loop is compiled for solvers' blocks, and copying short runs costs little
         copy_lanes_to_frames(np.ascontiguousarray(self.pictures[:, piece]), 0, traces)
-
-
-class FrameTraces(PictureTraces):
-    """Traces of a transient cube, fetched from wherever it is."""
-
-    def __init__(self, frames: Frames) -> None:
-        super().__init__(to_numpy(frames.values), TraceBins.all_bins(frames.times.size))
 
 
 def list_windows(
@@ -134,26 +126,13 @@ class PhaseTable(NamedTuple):
         # what a change of height cannot mimic
         across = slope - shape * (mixed / squares)[:, np.newaxis]
         across_energy = steepness - mixed**2 / squares
-        fitted = (
-            shape**2 / squares[:, np.newaxis] + across**2 / across_energy[:, np.newaxis]
-        )  # the fit's leverages
-        columns = (
-            squares,
-            mixed,
-            steepness,
-            shape.sum(axis=1),
-            np.sum(shape * (1 - fitted), axis=1),
-            np.sum(across**2 * shape, axis=1),
-            np.count_nonzero(matters, axis=1),
-        )
-        return cls(
-            shape.astype(np.float32),
-            slope.astype(np.float32),
-            tails.astype(np.float32),
-            np.stack(columns, 1),
-            half,
-            width,
-        )
+        # the fit's leverages
+        fitted = shape**2 / squares[:, np.newaxis] + across**2 / across_energy[:, np.newaxis]
+        unfitted, weighted = shape * (1 - fitted), across**2 * shape
+        further = (np.sum(one, axis=1) for one in (shape, unfitted, weighted, matters))
+        sums = np.stack([squares, mixed, steepness, *further], 1)
+        single = (one.astype(np.float32) for one in (shape, slope, tails))
+        return cls._make([*single, sums, half, width])
 
     def find_even_bins(self, bins: TraceBins) -> NDArray[np.bool_]:
         """Say around which of the bins, (n,), all those of the table are held."""

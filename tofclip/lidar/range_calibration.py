@@ -81,34 +81,19 @@ class Measurements(NamedTuple):
         return Measurements._make(part[chosen] for part in self)
 
 
-class Variances(NamedTuple):
-    """What varies."""
-
-    noise: float  # factor of the measurements' own variances
-    shots: float  # variances of the shots' and the pixels' effects; 0: none
-    pixels: float
-
-
 class Effects(NamedTuple):
     """What was found."""
 
     fixed: FloatArray
-    covariance: FloatArray  # of the fixed effects
     shots: FloatArray  # each shot's own
     pixels: FloatArray  # each pixel's own, and its variance
     pixel_variance: FloatArray
-    variances: Variances
-    inliers: NDArray[np.bool_]  # measurements that were used
-
-
-class _Solution(NamedTuple):
-    fixed: FloatArray
-    shots: FloatArray
-    pixels: FloatArray
-    pixel_variance: FloatArray
-    covariance: FloatArray  # of the fixed effects and the shots'
+    covariance: FloatArray  # of the fixed effects; while it is solved for of these and the shots'
     residual: FloatArray
     fitted_variance: FloatArray  # of what is fitted to each measurement
+    # factor of the measurements' own variances, variances of the shots' and of the pixels' effects
+    variances: FloatArray
+    inliers: NDArray[np.bool_]  # measurements that were used
 
 
 def fit_effects(data: Measurements, with_shots: bool, with_pixels: bool) -> Effects:
@@ -118,26 +103,27 @@ def fit_effects(data: Measurements, with_shots: bool, with_pixels: bool) -> Effe
     inliers = np.ones(data.value.size, bool)
     for rounds in EM_ROUNDS:
         some = data.keep(inliers & (data.pixel % step == 0))
-        variances = _estimate_variances(some, sizes, (with_shots, with_pixels), rounds)
+        variances = _estimate_variances(
+            some, sizes, np.array([True, with_shots, with_pixels]), rounds
+        )
         found = _solve(data.keep(inliers), variances, sizes)
         predicted = data.design @ found.fixed + found.shots[data.shot] + found.pixels[data.pixel]
-        distance = np.abs(data.value - predicted) / (data.sigma * np.sqrt(variances.noise))
+        distance = np.abs(data.value - predicted) / (data.sigma * np.sqrt(variances[0]))
         inliers = distance < OUTLIER_SIGMA
     used = data.keep(inliers)
     found = _solve(used, variances, sizes)
-    shared = measure_correlation(found.residual / (used.sigma * np.sqrt(variances.noise)), used)
     # Errors that neighbours share do not average out: as many measurements as are independent.
-    fewer = variances._replace(noise=variances.noise * shared)
+    shared = measure_correlation(found.residual / (used.sigma * np.sqrt(variances[0])), used)
     effects = data.design.shape[1]
-    covariance = _solve(used, fewer, sizes).covariance[:effects, :effects]
-    if variances.shots > 0:
-        without = _solve(used, fewer._replace(shots=0.0), sizes).covariance[:effects, :effects]
-        # What a handful of shots say of their own spread is uncertain itself: Student's t.
-        freedom = max(sizes[0] - effects, 1)
-        widened = float(scipy.special.stdtrit(freedom, scipy.special.ndtr(1.0))) ** 2
-        covariance = without + widened * (covariance - without)
-    own = found.shots, found.pixels, found.pixel_variance
-    return Effects(found.fixed, covariance, *own, variances, inliers)
+    covariance, without = (
+        _solve(used, variances * [shared, with_them, 1], sizes).covariance[:effects, :effects]
+        for with_them in (1, 0)
+    )
+    # What a handful of shots say of their own spread is uncertain itself: Student's t.
+    freedom = max(sizes[0] - effects, 1)
+    widened = float(scipy.special.stdtrit(freedom, scipy.special.ndtr(1.0))) ** 2
+    covariance = without + widened * (covariance - without)
+    return found._replace(covariance=covariance, inliers=inliers)
 
 
 def measure_correlation(standardised: FloatArray, data: Measurements) -> float:
@@ -159,76 +145,77 @@ def measure_correlation(standardised: FloatArray, data: Measurements) -> float:
 
 
 def _estimate_variances(
-    data: Measurements, sizes: tuple[int, int], present: tuple[bool, bool], rounds: int
-) -> Variances:
+    data: Measurements, sizes: tuple[int, int], present: NDArray[np.bool_], rounds: int
+) -> FloatArray:
     """Estimate what varies, from the scatter of the means over shots and over pixels. `sizes`:
-    numbers of shots and of pixels; `present`: whether these have effects of their own.
+    numbers of shots and of pixels; `present`: that there is noise, and whether these have effects of
+    their own.
     """
-    if data.value.size <= data.design.shape[1]:
+    alone = np.array([1.0, 0.0, 0.0])
+    effects = data.design.shape[1]
+    if data.value.size <= effects:
         # Nothing is left over that would tell the noise: the measurements' own deviations hold.
-        return Variances(1.0, 0.0, 0.0)
-    start = _solve(data, Variances(1.0, 0.0, 0.0), sizes)
+        return alone
+    start = _solve(data, alone, sizes)
     scatter = float(np.mean(start.residual**2 / data.sigma**2))
-    typical = scatter * float(np.median(data.sigma**2))
-    spread = []
+    typical, spread = scatter * float(np.median(data.sigma**2)), [scatter]
     for group in (data.shot, data.pixel):
         number = np.bincount(group)
         seen = number > 0
         means = np.bincount(group, start.residual)[seen] / number[seen]
         # at least what the noise alone makes of the means
         spread.append(max(float(np.var(means)), typical * means.size / group.size))
-    now = Variances(max(scatter, TINY), present[0] * spread[0], present[1] * spread[1])
-    seen = np.unique(data.pixel)
+    least = TINY * alone
+    now: FloatArray = np.maximum(present * spread, least)
+    pixels = np.unique(data.pixel)
     for _ in range(rounds):
-        found = _solve(data, now, sizes)
-        squares = (found.residual**2 + found.fitted_variance) / data.sigma**2
-        own = np.diagonal(found.covariance)[data.design.shape[1] :]
-        before = np.array(now)
-        now = Variances(
-            max(float(np.mean(squares)), TINY),
-            present[0] * float(np.mean(found.shots**2 + own)),
-            present[1] * float(np.mean((found.pixels**2 + found.pixel_variance)[seen])),
+        found, before = _solve(data, now, sizes), now
+        squares = (
+            (found.residual**2 + found.fitted_variance) / data.sigma**2,
+            found.shots**2 + np.diagonal(found.covariance)[effects:],
+            (found.pixels**2 + found.pixel_variance)[pixels],
         )
+        now = np.maximum(present * [np.mean(one) for one in squares], least)
         if np.all(np.abs(now - before) <= EM_TOLERANCE * before):
             break
     return now
 
 
-def _solve(data: Measurements, variances: Variances, sizes: tuple[int, int]) -> _Solution:
-    """Solve for all effects at once; those of pixels are eliminated first."""
+def _solve(data: Measurements, variances: FloatArray, sizes: tuple[int, int]) -> Effects:
+    """Solve for all effects at once; those of pixels are eliminated first. What does not vary is held
+    at zero by a variance of next to nothing.
+    """
     shots, pixels = sizes
-    weight = 1 / (variances.noise * data.sigma**2)
-    effects = data.design.shape[1]
-    design, prior = data.design, np.zeros(effects)
-    if variances.shots > 0:
-        design = np.hstack([design, data.shot[:, np.newaxis] == np.arange(shots)])
-        prior = np.r_[prior, np.full(shots, 1 / variances.shots)]
+    noise, *own_variances = variances
+    for_shots, for_pixels = 1 / np.maximum(own_variances, TINY)
+    weight, effects = 1 / (noise * data.sigma**2), data.design.shape[1]
+    design = np.hstack([data.design, data.shot[:, np.newaxis] == np.arange(shots)])
     weighted = design * weight[:, np.newaxis]
-    normal, moment = design.T @ weighted + np.diag(prior), weighted.T @ data.value
-    leverage, own_moment = np.zeros((pixels, design.shape[1])), np.zeros(pixels)
-    total = np.full(pixels, np.inf)
-    if variances.pixels > 0:
-        total = np.bincount(data.pixel, weight, pixels) + 1 / variances.pixels
-        gathered = np.stack([np.bincount(data.pixel, part, pixels) for part in weighted.T], 1)
-        leverage = gathered / total[:, np.newaxis]
-        own_moment = np.bincount(data.pixel, weight * data.value, pixels) / total
-        normal = normal - gathered.T @ leverage
-        moment = moment - gathered.T @ own_moment
+    total = np.bincount(data.pixel, weight, pixels) + for_pixels
+    gathered = np.stack([np.bincount(data.pixel, part, pixels) for part in weighted.T], 1)
+    leverage = gathered / total[:, np.newaxis]
+    own_moment = np.bincount(data.pixel, weight * data.value, pixels) / total
+    normal = design.T @ weighted - gathered.T @ leverage
+    normal += np.diag(np.repeat([0, for_shots], [effects, shots]))
     # Columns of very different units are scaled, so that none is lost in rounding.
     scale = 1 / np.sqrt(np.maximum(np.diagonal(normal), TINY))
-    inverse = np.linalg.pinv(normal * np.outer(scale, scale), hermitian=True)
-    covariance = inverse * np.outer(scale, scale)
-    theta = covariance @ moment
+    scales = np.outer(scale, scale)
+    covariance = np.linalg.pinv(normal * scales, hermitian=True) * scales
+    theta = covariance @ (weighted.T @ data.value - gathered.T @ own_moment)
     own = own_moment - leverage @ theta
-    own_variance = 1 / total + np.einsum("pi,ij,pj->p", leverage, covariance, leverage)
     # effects as they are seen beside the measurement's pixel
     beside = design - leverage[data.pixel]
-    fitted = np.einsum("ni,ij,nj->n", beside, covariance, beside) + 1 / total[data.pixel]
-    residual = data.value - design @ theta - own[data.pixel]
-    if variances.shots == 0:
-        theta, covariance = np.pad(theta, (0, shots)), np.pad(covariance, (0, shots))
-    both = theta[:effects], theta[effects:]
-    return _Solution(*both, own, own_variance, covariance, residual, fitted)
+    return Effects(
+        theta[:effects],
+        theta[effects:],
+        own,
+        1 / total + np.einsum("pi,ij,pj->p", leverage, covariance, leverage),
+        covariance,
+        data.value - design @ theta - own[data.pixel],
+        np.einsum("ni,ij,nj->n", beside, covariance, beside) + 1 / total[data.pixel],
+        variances,
+        np.ones(data.value.size, bool),
+    )
 
 
 def correct_returns(returns: Returns) -> Returns:

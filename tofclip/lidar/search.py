@@ -39,7 +39,7 @@ from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError, ShapeError, require_type
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.pulse import Pulse
-from tofclip.lidar.pulse_tables import FrameTraces, PulseFilters, Traces
+from tofclip.lidar.pulse_tables import PictureTraces, PulseFilters, TraceBins, Traces
 from tofclip.lidar.range_calibration import correct_returns
 from tofclip.lidar.significance import (
     CANDIDATES,
@@ -101,20 +101,17 @@ class ReturnSearch:
         # the compiler takes as long to import as all else
         from tofclip.lidar.neighbours import add_recovery_error
 
-        pixel, (time, signal, deviation) = self._find_candidates(traces, judge is not None)
+        pixel, found = self._find_candidates(traces, judge is not None)
+        doubt = np.empty(0)
+        if judge is not None:
+            pixel, found = join_candidates(judge.frames, self.pulse, pixel, found)
+            doubt = judge.judge(pixel, *found[:2])
+            kept = doubt <= judge.max_false_alarm
+        time, signal, deviation = found
         intensity = signal * _square_distance(time)
-        false_alarm = np.empty(0)
         if judge is None:
             kept = self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
-            kept &= time > 0
-        else:
-            pixel, (time, signal, deviation) = join_candidates(
-                judge.frames, self.pulse, pixel, np.array([time, signal, deviation])
-            )
-            intensity = signal * _square_distance(time)
-            doubt = judge.judge(pixel, time, signal)
-            kept = (time > 0) & (doubt <= judge.max_false_alarm)
-            false_alarm = doubt[kept]
+        kept &= time > 0
         chosen = np.flatnonzero(kept)
         pixel, time = pixel.take(chosen), time.take(chosen)
         y, x = np.divmod(pixel.astype(np.int32), np.int32(self.camera.image_shape[1]))
@@ -129,6 +126,11 @@ class ReturnSearch:
         )
         # looking up every instant takes longer than placing it in space
         moves = np.ptp(self.shears) > 0
+        shear = (
+            np.interp(time, self.times, self.shears)
+            if moves
+            else np.full(time.size, self.shears[0])
+        )
         return correct_returns(
             Returns(
                 y=y,
@@ -139,11 +141,9 @@ class ReturnSearch:
                 return_number=number_returns(pixel),
                 time=time,
                 camera=self.camera,
-                shear=np.interp(time, self.times, self.shears)
-                if moves
-                else np.full(time.size, self.shears[0]),
+                shear=shear,
                 provenance={} if provenance is None else provenance,
-                false_alarm=false_alarm,
+                false_alarm=doubt[kept] if doubt.size else doubt,
             )
         )
 
@@ -293,7 +293,8 @@ def depth(
     if noise is not None:
         limit = DEFAULT_FALSE_ALARM if false_alarm is None else false_alarm
         judge = EvidenceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
-    return search.find_returns(FrameTraces(frames), frames.provenance, judge)
+    traces = PictureTraces(to_numpy(frames.values), TraceBins.all_bins(frames.times.size))
+    return search.find_returns(traces, frames.provenance, judge)
 
 
 def number_returns(pixel: NDArray[np.int64]) -> NDArray[np.uint8]:

@@ -8,8 +8,7 @@ a return is true if it is neither noise nor spread.
 * **Noise.** A return of brightness h puts ``h a_m`` on measurement m of variance ``floor^2 + gain *
   (F h)_m``. With all other pixels known its brightness would be known to ``1 / sqrt(sum a_m^2 /
   variance_m)``. Surfaces go on in the pixels around, at the same range, and noise does not: what counts
-  is the sum of significances of a candidate with its neighbours, and how many these are
-  (`CandidatePool`).
+  is the sum of significances of a candidate with its neighbours, and how many these are.
 * **Spread.** What is spread around a bright object is weaker than it at the same instant, weak in its
   scene, and in its pixel weaker than the surface that is there; and the shot contradicts it: the
   measurements that should see it hold less light than the frames explain, because only some views have
@@ -23,6 +22,7 @@ of known returns by a forward model of their own (docs/recovery_algorithm.md has
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -89,27 +89,15 @@ class Detection:
     def find_significant(
         self, pixel: NDArray[np.int64], time: FloatArray, intensity: FloatArray, pulse_width: float
     ) -> NDArray[np.bool_]:
-        """Say which candidates are strong enough.
-
-        Parameters
-        ----------
-        pixel : (n,) int array
-            Pixel number of each candidate.
-        time : (n,) array
-            Its instant, s.
-        intensity : (n,) array
-            Its brightness with the fall-off with range undone.
-        pulse_width : float
-            Instants that differ by less than this, s, are the same.
-
-        Returns
-        -------
-        (n,) bool array
+        """Say which candidates are strong enough, (n,). `pixel, time, intensity` (n,): number of each
+        one's pixel, instant, s, and brightness with the fall-off with range undone; instants that differ
+        by less than `pulse_width`, s, are the same.
         """
         if pixel.size == 0:
             return np.zeros(0, bool)
-        strongest, least = self._compare(pixel, time, intensity, pulse_width, time)
-        return (intensity >= self.min_pixel_fraction * strongest[pixel]) & (intensity >= least)
+        in_pixel = self.min_pixel_fraction * find_strongest(pixel, intensity)[pixel]
+        least = self.compute_least_intensity(pixel, time, intensity, pulse_width, time)
+        return (intensity >= in_pixel) & (intensity >= least)
 
     def compute_least_intensity(
         self,
@@ -119,45 +107,23 @@ class Detection:
         pulse_width: float,
         at: FloatArray,
     ) -> FloatArray:
-        """Return what the scene and its other returns at the same instant ask of a return.
-
-        Parameters
-        ----------
-        pixel, time, intensity, pulse_width
-            As for `find_significant`; at least one candidate.
-        at : (m,) array
-            Instants, s.
-
-        Returns
-        -------
-        (m,) float64 array
-            Brightness with the fall-off with range undone.
+        """Return what the scene and its other returns at the same instant ask of a return at instants
+        `at` (m,), s: brightness with the fall-off with range undone. The rest, of at least one
+        candidate, is as for `find_significant`.
         """
-        return self._compare(pixel, time, intensity, pulse_width, at)[1]
-
-    def _compare(
-        self,
-        pixel: NDArray[np.int64],
-        time: FloatArray,
-        intensity: FloatArray,
-        width: float,
-        at: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Largest intensity of each pixel, 0 where there is no candidate, and `compute_least_intensity`."""
-        strongest = find_strongest(pixel, intensity)
         start, end = min(time.min(), at.min()), max(time.max(), at.max())
 
         def find_slot(instants: FloatArray) -> NDArray[np.int64]:
-            slots = (instants - start) * (SLOTS_PER_WIDTH / width) + 0.5
+            slots = (instants - start) * (SLOTS_PER_WIDTH / pulse_width) + 0.5
             return np.asarray(slots, dtype=np.int64)
 
         brightest = np.zeros(int(find_slot(end)) + 1)
         np.maximum.at(brightest, find_slot(time), intensity)
         around = scipy.ndimage.maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)
+        strongest = find_strongest(pixel, intensity)
         scene = find_quantile_value(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
         needed = np.maximum(self.min_scene_fraction * scene, self.min_time_bin_fraction * around)
-        least: FloatArray = needed[find_slot(at)]
-        return strongest, least
+        return np.asarray(needed[find_slot(at)])
 
 
 def find_strongest(pixel: NDArray[np.int64], intensity: FloatArray) -> FloatArray:
@@ -179,13 +145,7 @@ def find_quantile_value(values: NDArray[np.floating], fraction: float) -> float:
 
 DEFAULT_FALSE_ALARM = 0.1  # probability of being false above which a candidate is dropped
 
-CANDIDATES = Detection(
-    signal_to_noise=3.0,
-    min_scene_fraction=0.0,
-    min_time_bin_fraction=0.0,
-    min_pixel_fraction=0.02,
-    max_returns=6,
-)
+CANDIDATES = Detection(3.0, 0.0, 0.0, min_pixel_fraction=0.02, max_returns=6)
 """What is looked at: nearly everything that a trace shows."""
 
 AT_INSTANT = Detection(min_scene_fraction=0, min_time_bin_fraction=1, min_pixel_fraction=0)
@@ -244,20 +204,34 @@ class EvidenceJudge:
         `NOISE` and `SPREAD` are the weights, a line each; and how much of what is spread is seen.
         """
         width, distance = self.pulse.fwhm, SPEED_OF_LIGHT / 2 * time
+        # what ranges may differ by for each pixel of the pool's radius, m: it reaches less far in range
+        # the further a neighbour is, like a ball
         gate = GATE_PULSES_PER_PX * SPEED_OF_LIGHT / 2 * width
-        pool = CandidatePool(pixel, distance, self.frames.camera.image_shape, gate)
+        # the compiler takes as long to import as all else
+        from tofclip.lidar.peak_kernels import pool_significance
+
+        shape = self.frames.camera.image_shape
+        starts = np.searchsorted(pixel, np.arange(math.prod(shape) + 1))
+
+        def sum_around(own: FloatArray) -> FloatArray:
+            """Sum over each candidate and those around it at the same range."""
+            pooled = np.empty(own.size)
+            limits = POOL_RADIUS_PX, gate
+            pool_significance(pixel, distance, own, starts, shape, limits, pooled)
+            return pooled
+
         # what the model does not explain is known by its brightness
         noise = replace(self.noise, misfit=0.0, dazzle=np.inf)
         own, missing, light = weigh_candidates(self.frames, noise, self.pulse, pixel, time, signal)
-        pooled, neighbours = pool.sum_around(own), pool.sum_around(np.ones(own.size))
+        pooled, neighbours = sum_around(own), sum_around(np.ones(own.size))
         most = AT_INSTANT.compute_least_intensity(pixel, time, pooled, width, time)
         # float32's least: a quotient by float64's may overflow
-        explained = np.maximum(pool.sum_around(light), np.finfo(np.float32).tiny)
-        excess = pool.sum_around(missing) / explained
+        explained = np.maximum(sum_around(light), np.finfo(np.float32).tiny)
+        excess = sum_around(missing) / explained
         # of what is hardly seen, noise makes as much
         excess = np.clip(excess, *EXCESS_LIMITS) * pooled**2 / (pooled**2 + 4 * neighbours)
         intensity = signal * distance**2
-        around = pool.sum_around(intensity)
+        around = sum_around(intensity)
         ratios = [
             around / find_brightness_at_instant(time, around, width),
             intensity / find_brightness(intensity),
@@ -293,8 +267,7 @@ def find_brightness_at_instant(time: FloatArray, values: FloatArray, width: floa
         first, last = edges[max(number - 1, 0)], edges[min(number + 2, edges.size - 1)]
         if first < last:
             usual[number] = find_brightness(values[order[first:last]])
-    at_each: FloatArray = usual[slot]
-    return at_each
+    return np.asarray(usual[slot])
 
 
 def weigh_candidates(
@@ -390,27 +363,3 @@ def join_candidates(
         ]
     )
     return pixel[first], surfaces
-
-
-@dataclass(frozen=True)
-class CandidatePool:
-    """Candidates and what their neighbours bring."""
-
-    pixel: NDArray[np.int64]  # (n,), not decreasing
-    distance: FloatArray  # (n,), m
-    image_shape: tuple[int, int]
-    # what ranges may differ by for each pixel of the pool's radius, m: it reaches less far in range
-    # the further a neighbour is, like a ball
-    gate: float
-
-    def sum_around(self, own: FloatArray) -> FloatArray:
-        """Return the sum of `own` (n,) over each candidate and those around it at the same range."""
-        # the compiler takes as long to import as all else
-        from tofclip.lidar.peak_kernels import pool_significance
-
-        rows, columns = self.image_shape
-        starts = np.searchsorted(self.pixel, np.arange(rows * columns + 1))
-        pooled = np.empty(own.size)
-        settings = self.image_shape, (POOL_RADIUS_PX, self.gate)
-        pool_significance(self.pixel, self.distance, self.distance, own, starts, *settings, pooled)
-        return pooled

@@ -8,14 +8,13 @@ are found by the same compiled steps. `PhotonDetector` takes every pixel alone, 
 lets neighbours lend each other their photons.
 """
 
-from tofclip.lidar.photons.cube import PhotonCube
 from tofclip.lidar.photons.detector import (
     Arrivals,
     PhotonDetector,
     correct_pile_up,
     estimate_pixels,
 )
-from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, make_pinhole
+from tofclip.lidar.photons.image import PhotonCube, PhotonImage, SurfaceImage, make_pinhole
 from tofclip.lidar.photons.limits import Accuracy, compute_range_bound, measure_accuracy
 from tofclip.lidar.photons.scene import learn_background
 from tofclip.lidar.photons.surface import (

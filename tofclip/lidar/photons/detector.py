@@ -15,9 +15,9 @@ from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, add_errors
 from tofclip.lidar.photons.scene import (
+    even_out_bins,
     group_shades,
     learn_background,
-    measure_bins,
     prepare_photons,
 )
 from tofclip.lidar.pulse import Pulse, Table
@@ -318,8 +318,8 @@ class PhotonDetector:
         if photons.sampled:
             # A gate is open as long at every step: what looks uneven are returns, which last as long.
             return replace(self, background=np.ones(self.bins))
-        pixels = photons.offsets.size - 1  # all over the picture
-        some = photons.histograms(slice(0, pixels, -(-pixels // SAMPLED_PIXELS)))
+        # all over the picture
+        some = photons.histograms(slice(0, photons.pixels, -(-photons.pixels // SAMPLED_PIXELS)))
         return replace(self, background=self.adapt(some).relative_background)
 
     def locate_pixels(
@@ -459,10 +459,8 @@ class PhotonDetector:
         unknown of ranges, however many photons there are.
         """
         step = SPEED_OF_LIGHT / 2 * self.bin_width
-        place = (
-            np.nan_to_num(layers[..., 0] / step % 1 * STEP_PHASES).astype(np.int64) % STEP_PHASES
-        )
-        return add_errors(layers, self._step_errors[place])
+        phase = np.nan_to_num(layers[..., 0] / step % 1 * STEP_PHASES)
+        return add_errors(layers, self._step_errors[phase.astype(np.int64) % STEP_PHASES])
 
     @cached_property
     def _step_errors(self) -> FloatArray:
@@ -525,17 +523,16 @@ def estimate_pixels(
     InputError
         No pulse is given and none can be recognised, or the time axis is shorter than two pulses.
     """
-    # a background that is given has the photons' own bins
     counted = photons
+    # a background that is given has the photons' own bins
     photons, shape, hot = prepare_photons(photons, pulse, join=background is None)
     settings = shape, photons.bin_width, photons.bins, false_alarm_rate, max_returns
     detector = PhotonDetector(*settings, background=background).learn(photons)
-    found = detector.locate_pixels(photons.histograms, photons.offsets.size - 1, cycles)
-    if background is None and cycles is None and photons.bins == counted.bins:
+    found = detector.locate_pixels(photons.histograms, photons.pixels, cycles)
+    if background is None and cycles is None:
         places = found[..., 0] / (SPEED_OF_LIGHT / 2 * photons.bin_width)
-        uneven = measure_bins(photons, places, shape.fwhm / photons.bin_width)
-        if uneven is not None:
-            even = counted.even_out(*uneven)
+        even = even_out_bins(counted, photons, places, shape.fwhm / photons.bin_width)
+        if even is not None:
             return estimate_pixels(even, pulse, false_alarm_rate, max_returns=max_returns)
     learnt = "learnt" if np.ptp(detector.relative_background) else "even"
     chosen: dict[str, float | str] = {

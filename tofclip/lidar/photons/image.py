@@ -1,12 +1,11 @@
-"""Photons counted in every pixel of a picture, as a list of events: what a photon-counting camera
-delivers, without the empty bins of a cube; which of its pixels are hot; and the picture of ranges
-that is made of it.
+"""Photons counted in every pixel of a picture, as histograms or as a list of events, without the
+empty bins; which of its pixels are hot; and the picture of ranges that is made of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -132,10 +131,6 @@ class PhotonImage:
         bin_width : float
             Duration of a bin, s.
 
-        Returns
-        -------
-        PhotonImage
-
         Raises
         ------
         ShapeError, InputError
@@ -146,15 +141,11 @@ class PhotonImage:
             raise ShapeError("counts", "(rows, columns, bins)", cube.shape)
         if not np.all(np.isfinite(cube)) or cube.min(initial=0) < 0:
             raise InputError("photon counts must be finite and not negative")
-        histograms = cube.reshape(-1, cube.shape[2])
-        pixel, bin_number = np.nonzero(histograms)
-        offsets = np.searchsorted(pixel, np.arange(len(histograms) + 1)).astype(np.int64)
-        count, when = (
-            histograms[pixel, bin_number].astype(np.float32),
-            bin_number.astype(np.float32),
-        )
         rows, columns, bins = cube.shape
-        return cls(offsets, when, count, (rows, columns), bins, float(bin_width))
+        histograms = cube.reshape(-1, bins)
+        pixel, number = np.nonzero(histograms)
+        photons = cls.from_events(pixel, number, (rows, columns), bin_width, bins)
+        return replace(photons, count=histograms[pixel, number].astype(np.float32))
 
     @classmethod
     def from_events(
@@ -180,10 +171,6 @@ class PhotonImage:
         bins : int, optional
             Bins of the time axis; by default up to the latest photon.
 
-        Returns
-        -------
-        PhotonImage
-
         Raises
         ------
         InputError
@@ -197,14 +184,27 @@ class PhotonImage:
         length = int(when.max()) + 1 if bins is None else bins
         order = np.argsort(pixel, kind="stable")
         offsets = np.searchsorted(pixel[order], np.arange(image_shape[0] * image_shape[1] + 1))
-        ones = np.ones(when.size, np.float32)
-        own = offsets.astype(np.int64), when[order], ones
+        own = offsets.astype(np.int64), when[order], np.ones(when.size, np.float32)
         return cls(*own, image_shape, length, float(bin_width))
+
+    @property
+    def pixels(self) -> int:
+        """How many there are."""
+        return self.offsets.size - 1
 
     @cached_property
     def pixel(self) -> NDArray[np.int64]:
         """Raster number of the pixel of each event."""
-        return np.repeat(np.arange(self.offsets.size - 1), np.diff(self.offsets))
+        return np.repeat(np.arange(self.pixels), np.diff(self.offsets))
+
+    def times_after(self, surface: FloatArray) -> FloatArray:
+        """Return by how many bins each event comes after its pixel's surface, (rows, columns)."""
+        return np.asarray(self.bin - surface.ravel()[self.pixel])
+
+    def sum_by_pixel(self, weights: NDArray[Any]) -> FloatArray:
+        """Return the sums over each pixel's events of their `weights`, (rows, columns)."""
+        total = np.bincount(self.pixel, weights, self.pixels)
+        return total.reshape(self.image_shape).astype(np.float64)
 
     @cached_property
     def relative(self) -> NDArray[np.float32]:
@@ -213,11 +213,18 @@ class PhotonImage:
             return np.ones(self.bin.size, np.float32)
         return np.asarray(self.shading.at(self.pixel, self.bin))
 
+    def relative_at(self, surface: FloatArray) -> NDArray[np.float32]:
+        """Return the background at each pixel's surface over its mean, (rows, columns)."""
+        if self.shading is None:
+            return np.ones(surface.shape, np.float32)
+        found = self.shading.at(np.arange(surface.size), surface.ravel())
+        return np.asarray(found.reshape(surface.shape))
+
     @cached_property
     def table(self) -> csr_array:
         """Photons by pixel and bin, (pixels, bins); bins of several events are not summed up yet."""
         whole = np.clip(np.rint(self.bin), 0, self.bins - 1).astype(np.int64)
-        return csr_array((self.count, whole, self.offsets), (self.offsets.size - 1, self.bins))
+        return csr_array((self.count, whole, self.offsets), (self.pixels, self.bins))
 
     @property
     def photons(self) -> float:
@@ -227,8 +234,7 @@ class PhotonImage:
     @cached_property
     def photons_per_pixel(self) -> FloatArray:
         """Photons of each pixel, (rows, columns)."""
-        total = np.bincount(self.pixel, self.count, self.offsets.size - 1)
-        return total.reshape(self.image_shape).astype(np.float64)
+        return self.sum_by_pixel(self.count)
 
     @cached_property
     def time_profile(self) -> FloatArray:
@@ -237,17 +243,16 @@ class PhotonImage:
 
     def count_stretches(self, number: int) -> FloatArray:
         """Photons of each pixel in equal parts of the time axis, at most its bins, (pixels, parts)."""
-        number, pixels = min(number, self.bins), self.offsets.size - 1
+        number = min(number, self.bins)
         part = np.clip(self.bin * (number / self.bins), 0, number - 1).astype(np.int64)
-        counts = np.bincount(self.pixel * number + part, self.count, pixels * number)
-        return np.asarray(counts.reshape(pixels, number), np.float64)
+        counts = np.bincount(self.pixel * number + part, self.count, self.pixels * number)
+        return np.asarray(counts.reshape(self.pixels, number), np.float64)
 
     def select(self, count: NDArray[np.float32]) -> PhotonImage:
         """Return the events with other counts, (events,); those with none are left out."""
         kept = count > 0
         offsets = np.concatenate([[0], np.cumsum(kept)])[self.offsets]
-        own = self.bin[kept], count[kept]
-        return replace(self, offsets=offsets, bin=own[0], count=own[1], axes="")
+        return replace(self, offsets=offsets, bin=self.bin[kept], count=count[kept], axes="")
 
     def join_bins(self, number: int) -> PhotonImage:
         """Return the same events, at the same instants, on a time axis of bins that are as many
@@ -291,8 +296,8 @@ class PhotonImage:
             )
         table = self.table.copy()
         table.sum_duplicates()
-        own = table.indptr.astype(np.int64), table.indices.astype(np.float32), table.data
-        return replace(self, offsets=own[0], bin=own[1], count=own[2], cycles=float(cycles))
+        offsets, bins = table.indptr.astype(np.int64), table.indices.astype(np.float32)
+        return replace(self, offsets=offsets, bin=bins, count=table.data, cycles=float(cycles))
 
     def even_out(self, edges: FloatArray, sigma: FloatArray, seed: int = 0) -> PhotonImage:
         """Return the same photons, in whole bins, on an even time axis, on which bins begin and end at
@@ -307,10 +312,10 @@ class PhotonImage:
         late = number - noise.binomial(number, one)
         last = noise.binomial(late, np.clip((1 - two) / np.maximum(1 - one, 1e-12), 0, 1))
         count = np.stack([number - late, late - last, last], axis=1).astype(np.float32).ravel()
-        when = (
-            np.minimum(first[:, np.newaxis] + (0, 1, 2), self.bins - 1).astype(np.float32).ravel()
+        when = np.minimum(first[:, np.newaxis] + (0, 1, 2), self.bins - 1).astype(np.float32)
+        spread = replace(
+            self, offsets=3 * self.offsets, bin=when.ravel(), count=count, bin_sigma=sigma
         )
-        spread = replace(self, offsets=3 * self.offsets, bin=when, count=count, bin_sigma=sigma)
         return replace(spread.select(count), axes=self.axes)
 
     @property
@@ -332,6 +337,74 @@ class PhotonImage:
     def histograms(self, pixels: slice) -> FloatArray:
         """Return the histograms of some pixels in raster order, (n, bins)."""
         return np.asarray(self.table[pixels].toarray(), np.float64)
+
+
+@dataclass(frozen=True)
+class PhotonCube:
+    """Histograms of a picture, as an instrument counted them.
+
+    Parameters
+    ----------
+    counts : (bins, rows, columns) array
+        Photons, not negative; of any number type.
+    times : (bins,) float64 array
+        Middle of each bin, s after the laser's pulse; evenly spaced.
+    camera : Camera, optional
+        Where the pixels look; `Camera.pinhole` where only that is known.
+    pulse : Pulse, optional
+        How a return at one instant shows in successive bins, where the instrument knows.
+    sampled : bool
+        Whether a bin shows one instant, as a picture behind a gate does, not all up to the next bin.
+    source : str
+        Where it came from, for messages.
+    provenance : mapping
+        How it came about.
+
+    Raises
+    ------
+    ShapeError, InputError
+        Not a cube, a time axis of another length, or one that is not even or not credible.
+    """
+
+    counts: NDArray[Any]
+    times: NDArray[np.float64]
+    camera: Camera | None = None
+    pulse: Pulse | None = None
+    sampled: bool = False
+    source: str = "histograms"
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.counts.ndim != 3 or self.counts.size == 0:
+            raise ShapeError(f"{self.source}: counts", "(bins, rows, columns)", self.counts.shape)
+        if self.times.shape != self.counts.shape[:1] or self.times.size < 2:
+            raise ShapeError(f"{self.source}: times", self.counts.shape[:1], self.times.shape)
+        steps = np.diff(self.times)
+        if not (steps.min() > 0 and np.ptp(steps) < 1e-3 * self.bin_width):
+            raise InputError(f"{self.source}: the bins of histograms are to be equally long")
+        require_credible_bin_width(self.bin_width)
+
+    @property
+    def bin_width(self) -> float:
+        """Duration of a bin, s."""
+        return float(self.times[-1] - self.times[0]) / (self.times.size - 1)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        _, rows, columns = self.counts.shape
+        return rows, columns
+
+    @property
+    def histograms(self) -> NDArray[np.float32]:
+        """Photons (pixels, bins), pixels in raster order."""
+        flat = self.counts.reshape(self.times.size, -1).T
+        return np.ascontiguousarray(flat, dtype=np.float32)
+
+    def to_image(self) -> PhotonImage:
+        """Return the photons as events, sorted by pixel."""
+        image = PhotonImage.from_cube(np.moveaxis(self.counts, 0, -1), self.bin_width)
+        return replace(image, sampled=self.sampled)
 
 
 def add_errors(layers: FloatArray, errors: FloatArray) -> FloatArray:
@@ -359,7 +432,12 @@ def find_hot_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
     at all times, or in one bin. Pairs of photons grow with the square of their number: one such pixel
     would say more about the pulse than all others together. They are found before anything is learnt.
     """
-    return _find_peaked_pixels(photons) | _find_pixels_hot_throughout(photons)
+    light = np.sort(photons.count_stretches(STRETCHES), axis=1)
+    quiet = light[:, : light.shape[1] - light.shape[1] // 4].sum(axis=1)
+    quiet = quiet.reshape(photons.image_shape)
+    around = _rank_neighbours(quiet, -1 - NEIGHBOUR_RANK)
+    throughout = quiet > FAULT_RATIO * around + FAULT_SIGMAS * np.sqrt(around + 4)
+    return np.asarray(throughout | _find_peaked_pixels(photons))
 
 
 def find_dim_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
@@ -369,23 +447,14 @@ def find_dim_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
     return np.asarray(FAULT_RATIO * light + FAULT_SIGMAS * np.sqrt(light + 4) < around)
 
 
-def _find_pixels_hot_throughout(photons: PhotonImage) -> NDArray[np.bool_]:
-    light = np.sort(photons.count_stretches(STRETCHES), axis=1)
-    quiet = light[:, : light.shape[1] - light.shape[1] // 4].sum(axis=1)
-    quiet = quiet.reshape(photons.image_shape)
-    around = _rank_neighbours(quiet, -1 - NEIGHBOUR_RANK)
-    return np.asarray(quiet > FAULT_RATIO * around + FAULT_SIGMAS * np.sqrt(around + 4))
-
-
 def _rank_neighbours(values: FloatArray, rank: int) -> FloatArray:
     """Value of that rank among each pixel's eight neighbours, of a line the eight along it; of a lone
     pixel its own.
     """
     if values.size == 1:
         return values
-    footprint = np.ones(
-        (3, 3) if min(values.shape) > 1 else np.where(np.array(values.shape) > 1, 9, 1)
-    )
+    line = np.where(np.array(values.shape) > 1, 9, 1)
+    footprint = np.ones((3, 3) if min(values.shape) > 1 else line)
     footprint[footprint.shape[0] // 2, footprint.shape[1] // 2] = 0
     return np.asarray(scipy.ndimage.rank_filter(values, rank, footprint=footprint, mode="mirror"))
 
@@ -487,10 +556,6 @@ class SurfaceImage:
         first_time : float
             Reading of the time axis at the middle of the first bin, s.
 
-        Returns
-        -------
-        SurfaceImage
-
         Raises
         ------
         CalibrationError
@@ -519,10 +584,6 @@ class SurfaceImage:
             Says where the pixels look, see `Camera.pinhole`.
         provenance : mapping, optional
             How they came about.
-
-        Returns
-        -------
-        tofclip.lidar.Returns
         """
         layers = [self, *self.further]
         distance, sigma, signal, doubt = (

@@ -123,10 +123,6 @@ def measure_accuracy(
     progress : callable
         Called with the number of trials just done.
 
-    Returns
-    -------
-    Accuracy
-
     Raises
     ------
     InputError

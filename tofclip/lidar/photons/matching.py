@@ -53,10 +53,6 @@ class LabelAxis:
         """Return the coarse bin of each event."""
         return ((photons.bin + 0.5) / self.coarse).astype(np.int64)
 
-    def to_bins(self, label: NDArray[np.int64]) -> FloatArray:
-        """Return the instants in the middle of labels, in bins."""
-        return np.asarray((self.numbers[label] + 0.5) * self.coarse - 0.5, dtype=np.float64)
-
 
 def choose_label_axis(photons: PhotonImage, scene: Scene) -> LabelAxis:
     """Cut the time axis into labels and leave out those at which nothing comes back anywhere."""
@@ -69,7 +65,7 @@ def choose_label_axis(photons: PhotonImage, scene: Scene) -> LabelAxis:
             numbers = np.flatnonzero(_find_occupied_bins(photons, scene, axis, tiles))
             axis = LabelAxis(coarse, numbers, total) if numbers.size else axis
             # two float32 volumes, the scores and their sums, have to fit
-            if 2 * 4 * (photons.offsets.size - 1) * axis.numbers.size <= MAX_VOLUME_BYTES:
+            if 2 * 4 * photons.pixels * axis.numbers.size <= MAX_VOLUME_BYTES:
                 return axis
         coarse *= 2
 
@@ -81,9 +77,8 @@ def _find_occupied_bins(
     y, x = np.divmod(photons.pixel, photons.image_shape[1])
     tile = (y // TILE_PX) * -(-photons.image_shape[1] // TILE_PX) + x // TILE_PX
     number = tile * axis.coarse_bins + axis.number_events(photons)
-    counts = np.bincount(
-        number, photons.count / photons.relative, tiles * axis.coarse_bins
-    ).reshape(tiles, -1)
+    light = photons.count / photons.relative
+    counts = np.bincount(number, light, tiles * axis.coarse_bins).reshape(tiles, -1)
     length = max(1, round(scene.response.width / axis.coarse))
     pooled = scipy.ndimage.uniform_filter1d(counts, length, axis=1, mode="constant") * length
     # A tile may be brighter or darker than the others throughout.
@@ -103,7 +98,7 @@ def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArr
     odds = scene.count_signal(photons) * shares / (scene.background * axis.coarse)
     level, shade = group_shades(photons.relative)
     weights = np.log1p(odds / level[:, np.newaxis]).astype(np.float32)
-    score = np.empty((photons.offsets.size - 1, axis.numbers.size), np.float32)
+    score = np.empty((photons.pixels, axis.numbers.size), np.float32)
     number, label = axis.number_events(photons), np.full(axis.coarse_bins, -1)
     label[axis.numbers] = np.arange(axis.numbers.size)
 
@@ -118,11 +113,15 @@ def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArr
 
 
 def match_labels(
-    score: NDArray[np.float32], image_shape: tuple[int, int], slope_cost: float, jump_cost: float
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Find the labels of the most likely piecewise smooth surface, (rows, columns), and by how much
-    each beats the next best that is not beside it. The costs are of a change by one label, and by
-    more.
+    score: NDArray[np.float32],
+    axis: LabelAxis,
+    image_shape: tuple[int, int],
+    slope_cost: float,
+    jump_cost: float,
+) -> tuple[FloatArray, NDArray[np.float32]]:
+    """Find the most likely piecewise smooth surface, instants (rows, columns) in bins, and by how much
+    the label of each beats the next best that is not beside it. The costs are of a change by one
+    label, and by more.
     """
     from tofclip.lidar.photons import kernels
 
@@ -139,7 +138,9 @@ def match_labels(
         kernels.find_best_labels(*own, label[piece], margin[piece])
 
     run_blocks(work, score.shape[0], PIXELS_PER_BLOCK)
-    return label.reshape(image_shape), margin.reshape(image_shape)
+    # in the middle of labels
+    surface = (axis.numbers[label] + 0.5) * axis.coarse - 0.5
+    return surface.reshape(image_shape).astype(np.float64), margin.reshape(image_shape)
 
 
 def fit_surface(
@@ -152,6 +153,7 @@ def fit_surface(
     from tofclip.lidar.photons import kernels
 
     response, now = scene.response, np.array(surface, dtype=np.float64)
+    all_counted = np.isinf(photons.cycles)
     table = np.stack([response.log_slope, response.density / scene.background], axis=1)
     brightness = around = np.full(now.size, scene.count_signal(photons))
     slopes, gate = np.zeros((*now.shape, 2)), GATE_WIDTHS * response.width
@@ -161,7 +163,7 @@ def fit_surface(
         offsets, flat = photons.offsets[piece.start : piece.stop + 1], now.reshape(-1)[piece]
         sampled = table, response.start, response.step, brightness[piece]
         seen = offsets, photons.bin, photons.count, flat, *sampled
-        if np.isinf(photons.cycles):
+        if all_counted:
             kernels.measure_events(*seen, photons.relative, sums[piece])
         else:
             dead = around[piece], scene.background / photons.cycles, photons.cycles
@@ -172,15 +174,15 @@ def fit_surface(
         kernels.fit_planes(now, around, reach, gate, slopes, (piece.start, piece.stop), fitted)
 
     # signal and instant say something of each other where cycles end with the first photon
-    for _ in range(rounds if np.isinf(photons.cycles) else 4 * rounds):
+    for _ in range(rounds if all_counted else 4 * rounds):
         run_blocks(measure, now.size, PIXELS_PER_BLOCK)
         run_blocks(fit, now.shape[0], ROWS_PER_BLOCK)
         now = fitted[..., 0].copy()
         brightness = around = np.maximum(fitted[..., 2].ravel(), MIN_SIGNAL_PHOTONS)
-        if not np.isinf(photons.cycles):
+        if not all_counted:
             weight = kernels.NEIGHBOURS_PHOTONS / around
             brightness = (sums[:, 2] + weight * around) / (sums[:, 3] + weight)
-    if not np.isinf(photons.cycles):
+    if not all_counted:
         fitted[..., 2] = brightness.reshape(now.shape)
     return fitted
 

@@ -138,7 +138,7 @@ class Scene:
         level = np.add.reduceat(photons.time_profile, edges[:-1]) / np.diff(edges)
         # a low quantile: bins with a surface in them are brighter than the background
         quiet = float(np.quantile(level, BACKGROUND_QUANTILE))
-        background = max(quiet, MIN_BACKGROUND_PHOTONS / photons.bins) / (photons.offsets.size - 1)
+        background = max(quiet, MIN_BACKGROUND_PHOTONS / photons.bins) / photons.pixels
         if photons.shading is not None:
             background = photons.shading.mean
         shape = pulse.integrate_bins(photons.bin_width)
@@ -150,7 +150,7 @@ class Scene:
 
     def count_signal(self, photons: PhotonImage) -> float:
         """Mean signal photons of a pixel."""
-        mean = photons.photons / (photons.offsets.size - 1)
+        mean = photons.photons / photons.pixels
         return max(mean - self.background * photons.bins, MIN_SIGNAL_PHOTONS)
 
 
@@ -166,7 +166,7 @@ def prepare_photons(
         photons = photons.join_bins(find_time_step(photons))
     pulse = Pulse.gaussian(measure_pulse_width(photons)) if pulse is None else pulse
     require_plausible_pulse(photons, pulse)
-    if join and photons.bins * (photons.offsets.size - 1) > MAX_CELLS:
+    if join and photons.bins * photons.pixels > MAX_CELLS:
         # photons keep their times, and a pulse that is spread over a quarter of itself its width
         photons = photons.join_bins(max(int(pulse.fwhm / 4 / photons.bin_width), 1))
     return photons, pulse, hot
@@ -184,12 +184,10 @@ def find_time_step(photons: PhotonImage) -> int:
 
 def require_plausible_pulse(photons: PhotonImage, pulse: Pulse) -> None:
     """Refuse a pulse that no counter shows, or that is longer than the record, as of a wrong unit."""
-    if pulse.fwhm < MIN_PULSE_S:
-        fault = "shorter than any counter's"
-    elif pulse.fwhm > photons.bins * photons.bin_width:
-        fault = f"longer than all {photons.bins} bins"
-    else:
+    if MIN_PULSE_S <= pulse.fwhm <= photons.bins * photons.bin_width:
         return
+    is_short = pulse.fwhm < MIN_PULSE_S
+    fault = "shorter than any counter's" if is_short else f"longer than all {photons.bins} bins"
     raise InputError(
         f"a pulse of {pulse.fwhm / PICOSECOND:.3g} ps in bins of {photons.bin_width / PICOSECOND:.4g} "
         f"ps is {fault}; check the unit of `bin_width`"
@@ -285,23 +283,24 @@ def learn_shading(photons: PhotonImage, width: float) -> Shading | None:
     return None
 
 
-def measure_bins(
-    photons: PhotonImage, layers: FloatArray, width: float
-) -> tuple[FloatArray, FloatArray] | None:
+def even_out_bins(
+    original: PhotonImage, photons: PhotonImage, layers: FloatArray, width: float
+) -> PhotonImage | None:
     """Find where the bins of an uneven converter lie by the background that they count away from surfaces
-    at `layers` (layers, rows, columns), in bins, of a pulse of `width` bins: their edges and the
-    deviation of their instants, as of `PhotonImage.even_out`. None where they are even as far as
-    the photons say, where the background is not, or where times are not in whole bins.
+    at `layers` (layers, rows, columns), in bins, of a pulse of `width` bins; return the `original`
+    photons, hot pixels' among them, on an even axis. None where bins are even as far as the photons
+    say, where the background is not, or where times are not in whole bins, the converter's own.
     """
     bins, whole = photons.bins, photons.bin.astype(np.int64)
-    if photons.sampled or photons.bin_sigma is not None or np.any(photons.bin != whole):
+    own = bins == original.bins and photons.bin_sigma is None and not photons.sampled
+    if not own or np.any(photons.bin != whole):
         return None
     windows = [layers.reshape(len(layers), -1) + edge * width for edge in EXTENT_WIDTHS]
     free = np.ones(whole.size, np.bool_)
     for early, late in zip(*windows, strict=True):
         free &= ~((whole >= early[photons.pixel]) & (whole < late[photons.pixel]))
     light = photons.count * free
-    level = np.bincount(photons.pixel, light, photons.offsets.size - 1) / bins
+    level = photons.sum_by_pixel(light).ravel() / bins
     hidden = np.zeros(bins + 1)  # of the background, by windows around surfaces
     for ends, sign in zip(windows, (1, -1), strict=True):
         known = np.isfinite(ends)
@@ -344,7 +343,7 @@ def measure_bins(
     part = np.arange(bins + 1) / bins
     # of a sum of lengths whose total is known
     sigma = np.sqrt(left * (1 - part) ** 2 + (left[-1] - left) * part**2)
-    return edges * (bins / edges[-1]), (sigma[1:] + sigma[:-1]) / 2
+    return original.even_out(edges * (bins / edges[-1]), (sigma[1:] + sigma[:-1]) / 2)
 
 
 def learn_response(

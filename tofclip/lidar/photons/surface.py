@@ -5,15 +5,16 @@
 2. Further returns are looked for in what the first surface leaves.
 
 How much neighbours have to agree, how far they reach, the response and the probability of an
-outlier come from the data: a part of the photons is held back, and what explains it best counts
-(`held_out`). `locate_with_smoothness` is the same search with a detector's pulse and given costs.
+outlier come from the data: a part of the photons is held back, and what explains it best counts.
+`locate_with_smoothness` is the same search with a detector's pulse and given costs.
 """
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import scipy
@@ -22,15 +23,10 @@ from numpy.typing import ArrayLike, NDArray
 from tofclip.arrays import FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.photons.detector import Arrivals, PhotonDetector
-from tofclip.lidar.photons.held_out import (
-    calibrate_outliers,
-    choose_reach,
-    learn_scene,
-    weigh_evidence,
-)
 from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, find_dim_pixels
 from tofclip.lidar.photons.matching import (
     PLANE_ROUNDS,
+    TRIAL_ROUNDS,
     LabelAxis,
     choose_label_axis,
     compute_scores,
@@ -39,9 +35,12 @@ from tofclip.lidar.photons.matching import (
     match_labels,
 )
 from tofclip.lidar.photons.scene import (
+    MIN_SHAPE_BINS,
+    BinnedResponse,
     Scene,
+    even_out_bins,
+    learn_response,
     learn_shading,
-    measure_bins,
     prepare_photons,
     require_plausible_pulse,
 )
@@ -49,6 +48,22 @@ from tofclip.lidar.pulse import Pulse
 from tofclip.units import SPEED_OF_LIGHT
 
 HELD_OUT_FRACTION = 0.25
+REACHES_PX = (1, 2, 3, 4, 6, 8)
+RESPONSE_ROUNDS, RESPONSE_REACH_PX = 4, 3
+# Log-likelihood, and its standard deviations, by which a learnt response has to beat a given one;
+# its free shape alone gains some hundred.
+MIN_LEARNT_GAIN, MIN_LEARNT_SIGNIFICANCE = 500.0, 5.0
+SIGNAL_POOL_PX, MIN_SIGNAL_SHARE = 5, 0.002
+WIDER_POOLS_PX = (SIGNAL_POOL_PX, 9, 17, 33, 65)
+# Log odds in a unit of a label's margin, and how far (in its logarithm) scenes differ in it: eight
+# paths count what they share several times. In 16 simulated scenes of 0.7 to 20 signal and 2 to 200
+# background photons the weight was 0.076 to 0.28.
+MARGIN_WEIGHT, MARGIN_WEIGHT_SPREAD = 1 / 7, 0.5
+# Of the logarithm of the number of labels that rival the best one: about one on surfaces (0.6 to
+# 2.4 in the same scenes), many where no light comes back.
+RIVAL_SPREAD = 0.5
+MARGIN_WEIGHTS, RIVALS = np.geomspace(0.03, 0.8, 24), np.geomspace(0.5, 256, 10)
+MAX_JUDGED_PIXELS = 20_000  # evenly chosen, that the outlier probability is learnt from
 SLOPE_COSTS = (0.5, 2.0, 10.0)  # log-likelihood that a change by one label has to bring
 JUMP_COST_RATIO = 9.0  # any larger change costs this many times as much
 
@@ -110,13 +125,13 @@ def estimate_surface(
     -----
     Memory: at most 2 GiB beside the photons.
     """
-    report = (lambda _: None) if progress is None else progress
+    report = progress or (lambda _: None)
     counted, dim = photons, find_dim_pixels(photons)
     photons, start, hot = prepare_photons(photons, pulse)
-    if cycles is None and not photons.sampled:
-        photons = replace(photons, shading=learn_shading(photons, start.fwhm / photons.bin_width))
-    elif cycles is not None:
+    if cycles is not None:
         photons = photons.correct_pile_up(cycles)
+    elif not photons.sampled:
+        photons = replace(photons, shading=learn_shading(photons, start.fwhm / photons.bin_width))
     scene = Scene.start(photons, start)
     axis = choose_label_axis(photons, scene)
     train, test = photons.split(HELD_OUT_FRACTION, seed)
@@ -126,8 +141,9 @@ def estimate_surface(
     volume = compute_scores(train, training, axis)
     trials = []
     for cost in SLOPE_COSTS:
-        labels, margin = match_labels(volume, train.image_shape, cost, cost * JUMP_COST_RATIO)
-        surface = axis.to_bins(labels)
+        surface, margin = match_labels(
+            volume, axis, train.image_shape, cost, cost * JUMP_COST_RATIO
+        )
         evidence = float(weigh_evidence(test, train, training, surface).mean())
         trials.append((evidence, cost, surface, margin))
         report(0.1 + 0.1 * len(trials))
@@ -143,44 +159,57 @@ def estimate_surface(
         training = scene.scale(1 - HELD_OUT_FRACTION)
         del volume  # before there is another one
         volume = compute_scores(train, training, axis)
-        labels, margin = match_labels(volume, train.image_shape, *costs)
-        surface = axis.to_bins(labels)
+        surface, margin = match_labels(volume, axis, train.image_shape, *costs)
     del volume
     report(0.6)
-    if cycles is None and photons.shading is None and photons.bins == counted.bins:
-        uneven = measure_bins(photons, surface[np.newaxis], scene.response.width)
-        if uneven is not None:
-            even = counted.even_out(*uneven)
+    if cycles is None and photons.shading is None:
+        even = even_out_bins(counted, photons, surface[np.newaxis], scene.response.width)
+        if even is not None:
             return estimate_surface(even, pulse, learn, max_returns, seed, progress)
     reach, fitted = choose_reach(train, test, training, surface)
     to_probability = calibrate_outliers(test, train, training, fitted, margin)
     report(0.8)
 
-    common = LEARNT_RESPONSE_SIGMA_WIDTHS * scene.response.width if learnt is not None else 0.0
-    plan = SurfacePlan(axis, costs, reach, to_probability)
-    layers = [plan.locate(photons, scene)]
-    rest = photons
+    def locate(photons: PhotonImage) -> FloatArray:
+        """Find the strongest surface, (rows, columns, 4): instant and deviation in bins, photons, and
+        probability of an outlier.
+        """
+        volume = compute_scores(photons, scene, axis)
+        surface, margin = match_labels(volume, axis, photons.image_shape, *costs)
+        del volume
+        # labels of a gate that is open for many steps are further off than its edges are steep
+        is_long = photons.sampled and scene.response.width > LONG_GATE_STEPS
+        rounds = LONG_GATE_ROUNDS if is_long else PLANE_ROUNDS
+        nested = fit_surface(photons, scene, surface, max(reach // 2, 1), rounds)
+        fitted = fit_surface(photons, scene, nested[..., 0], reach)
+        # Where no photon is near, or none on a slope of the response, the label is all there is.
+        counted = np.minimum(fitted[..., 1], scene.response.width * LABEL_SIGMA_WIDTHS)
+        bias = estimate_bias(fitted, nested, reach, scene.response.width)
+        sigma = np.sqrt(counted**2 + bias)
+        return np.stack([fitted[..., 0], sigma, fitted[..., 2], to_probability(margin)], -1)
+
+    layers, rest = [locate(photons)], photons
     # A surface goes on where another one stops: behind an edge the second of a pixel may be found
     # only when the third of the picture is looked for.
     for _ in range(max_returns if max_returns > 1 else 0):
         rest = remove_return(rest, scene, layers[-1])
         if not rest.bin.size:
             break
-        further = keep_significant(rest, scene, plan.locate(rest, scene))
+        further = keep_significant(rest, scene, locate(rest))
         if np.isnan(further).all():
             break
         layers.append(further)
     stack = np.stack(layers)
     strongest = np.argsort(-np.nan_to_num(stack[..., 2], nan=-1.0), axis=0, kind="stable")
     stack = np.take_along_axis(stack, strongest[..., np.newaxis], axis=0)[:max_returns]
-    bin_m = SPEED_OF_LIGHT / 2 * photons.bin_width
     missed = 0.0 if cycles is not None else find_missed_share(photons, scene, layers)
-    if (
-        missed and len(layers) == 1
-    ):  # light of a surface before it would be missing behind it as well
+    if missed and len(layers) == 1:
+        # light of a surface before it would be missing behind it as well
         rest = remove_return(photons, scene, layers[0])
-        further = keep_significant(rest, scene, plan.locate(rest, scene))
+        further = keep_significant(rest, scene, locate(rest))
         missed = find_missed_share(photons, scene, [layers[0], further])
+    bin_m = SPEED_OF_LIGHT / 2 * photons.bin_width
+    common = LEARNT_RESPONSE_SIGMA_WIDTHS * scene.response.width if learnt is not None else 0.0
     settings: dict[str, float | str] = {
         "response": "given" if learnt is None else "learnt",
         "pulse_fwhm_ps": scene.response.pulse.fwhm * 1e12,
@@ -201,49 +230,136 @@ def estimate_surface(
     return SurfaceImage.from_layers(stack, scene.response.pulse, settings, hot)
 
 
-@dataclass(frozen=True)
-class SurfacePlan:
-    """How the surface of a picture's photons is located, all choices made."""
+def weigh_evidence(
+    test: PhotonImage,
+    train: PhotonImage,
+    scene: Scene,
+    surface: FloatArray,
+    signal_pool: int = SIGNAL_POOL_PX,
+) -> FloatArray:
+    """Log-likelihood ratio of each pixel's held-back photons, (pixels,): this surface, in bins,
+    against any instant. Pixels in a square of `signal_pool` share one fraction of signal photons.
+    """
+    from tofclip.lidar.photons import kernels
 
-    axis: LabelAxis
-    costs: tuple[float, float]  # of a slope and of a jump, see `match_labels`
-    reach: int  # see `fit_surface`
-    to_probability: Callable[[NDArray[np.float32]], FloatArray]  # see `calibrate_outliers`
+    response, late = scene.response, train.times_after(surface)
+    inside = (late >= response.start) & (late <= response.width - response.start)
+    length = response.width - 2 * response.start
+    seen, total, even = (
+        scipy.ndimage.uniform_filter(train.sum_by_pixel(part), signal_pool, mode="nearest")
+        for part in (train.count * inside, train.count, train.count * ~inside / train.relative)
+    )
+    # Background within the response's length, as dense as outside of it where it is as bright.
+    outside = even * train.relative_at(surface) * length / max(train.bins - length, 1)
+    # That all is signal is never claimed: one photon against it would decide for the pixel. More
+    # than there is would count against every surface in a hundred times as much background.
+    signal = np.clip((seen - outside) / np.maximum(total, 1e-9), MIN_SIGNAL_SHARE, 0.98)
+    evidence, course = np.empty(test.pixels), test.relative
+    flat = np.ascontiguousarray(surface, dtype=np.float64).ravel()
+    if train.shading is not None:
+        course = course / train.shading.average().at(np.arange(flat.size), flat)[test.pixel]
+    sampled = response.density * train.bins, response.start, response.step, signal.ravel()
+    kernels.sum_evidence(test.offsets, test.bin, test.count, course, flat, *sampled, evidence)
+    return evidence
 
-    def locate(self, photons: PhotonImage, scene: Scene) -> FloatArray:
-        """Find the strongest surface, (rows, columns, 4): instant and deviation in bins, photons, and
-        probability of an outlier.
-        """
-        volume = compute_scores(photons, scene, self.axis)
-        labels, margin = match_labels(volume, photons.image_shape, *self.costs)
-        del volume
-        # labels of a gate that is open for many steps are further off than its edges are steep
-        is_long = photons.sampled and scene.response.width > LONG_GATE_STEPS
-        rounds = LONG_GATE_ROUNDS if is_long else PLANE_ROUNDS
-        near = max(self.reach // 2, 1)
-        nested = fit_surface(photons, scene, self.axis.to_bins(labels), near, rounds)
-        fitted = fit_surface(photons, scene, nested[..., 0], self.reach)
-        # Where no photon is near, or none on a slope of the response, the label is all there is.
-        counted = np.minimum(fitted[..., 1], scene.response.width * LABEL_SIGMA_WIDTHS)
-        bias = estimate_bias(fitted, nested, self.reach, scene.response.width)
-        sigma = np.sqrt(counted**2 + bias)
-        return np.stack([fitted[..., 0], sigma, fitted[..., 2], self.to_probability(margin)], -1)
+
+def learn_scene(
+    train: PhotonImage, test: PhotonImage, scene: Scene, surface: FloatArray, required: bool
+) -> BinnedResponse | None:
+    """Learn the response from the photons held back, around the surface that the others found.
+    Returns None if the response known so far explains the photons as well and none is required.
+    """
+    known = scene.response
+    fitted = fit_surface(train, scene, surface, RESPONSE_REACH_PX)
+    before = weigh_evidence(test, train, scene, fitted[..., 0])
+    for _ in range(RESPONSE_ROUNDS):
+        scene, later = learn_response(test, train, scene, fitted)
+        begin = fitted[..., 0] + later
+        fitted = fit_surface(train, scene, begin, RESPONSE_REACH_PX, TRIAL_ROUNDS)
+        if scene.response.width < MIN_SHAPE_BINS and not np.any(test.bin % 1):
+            return known if required else None  # whole bins show no shape
+    gain = weigh_evidence(test, train, scene, fitted[..., 0]) - before
+    clear = MIN_LEARNT_SIGNIFICANCE * np.sqrt(gain.size) * gain.std() + MIN_LEARNT_GAIN
+    return scene.response if required or gain.sum() > clear else None
+
+
+def choose_reach(
+    train: PhotonImage, test: PhotonImage, scene: Scene, surface: FloatArray
+) -> tuple[int, FloatArray]:
+    """Find the reach of planes, in pixels, that explains the photons held back best, and what
+    `fit_surface` gives with it.
+    """
+    best, chosen, highest = REACHES_PX[0], np.zeros(0), -np.inf
+    rounds = PLANE_ROUNDS
+    for reach in REACHES_PX:
+        if reach > REACHES_PX[0] and 2 * reach + 1 > min(surface.shape):
+            break
+        fitted = fit_surface(train, scene, surface, reach, rounds)
+        surface, rounds = fitted[..., 0], TRIAL_ROUNDS
+        value = float(weigh_evidence(test, train, scene, surface).mean())
+        if value <= highest:
+            break
+        best, chosen, highest = reach, fitted, value
+    return best, chosen
+
+
+def calibrate_outliers(
+    test: PhotonImage,
+    train: PhotonImage,
+    scene: Scene,
+    fitted: FloatArray,
+    margin: NDArray[np.float32],
+) -> Callable[[NDArray[np.float32]], FloatArray]:
+    """Learn how to turn margins of labels into probabilities of an outlier.
+
+    A margin is what the paths make of the log odds: the probability is a logistic function of it,
+    one half where two labels are as good and the others are not. Its slope and the number of rivals
+    are the most likely ones given the photons held back, in which right and wrong pixels are mixed.
+    """
+    # A response does not explain the photons that it was learnt from as it does others, nor one that
+    # is given what a surface that is slightly off shows: either half is judged by the other one's.
+    # Noise of the assumed share of signal makes surfaces look surer than they are: it is taken from
+    # as large a neighbourhood as explains the photons best.
+    one, other = test.split(0.5, 0)
+    evidence = np.zeros(margin.size)
+    for teacher, part in ((other, one), (one, other)):
+        learnt, later = scene, 0.0
+        with contextlib.suppress(InputError):  # too few photons to show one
+            learnt, later = learn_response(teacher, train, scene, fitted)
+        moved = fitted[..., 0] + later
+        pooled = [weigh_evidence(part, train, learnt, moved, pool) for pool in WIDER_POOLS_PX]
+        evidence += max(pooled, key=np.sum)
+    some = slice(None, None, -(-margin.size // MAX_JUDGED_PIXELS))
+    for_surface = np.exp(np.clip(evidence[some], -30, 30))
+
+    def doubt(value: NDArray[np.float32], weight: float, rivals: float) -> FloatArray:
+        odds = np.log(rivals) - weight * np.maximum(value, 0).astype(np.float64)
+        return np.asarray(scipy.special.expit(odds))
+
+    def weigh(choice: tuple[float, float]) -> float:
+        wrong = doubt(margin.ravel()[some], *choice)
+        prior = (np.log(choice[0] / MARGIN_WEIGHT) / MARGIN_WEIGHT_SPREAD) ** 2
+        prior += (np.log(choice[1]) / RIVAL_SPREAD) ** 2
+        return float(np.sum(np.log((1 - wrong) * for_surface + wrong)) - prior / 2)
+
+    weight, rivals = max(itertools.product(MARGIN_WEIGHTS, RIVALS), key=weigh)
+    return lambda value: doubt(value, weight, rivals)
 
 
 def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> PhotonImage:
-    """Leave out the photons that a surface, as of `SurfacePlan.locate`, explains better than the
+    """Leave out the photons that a surface, the first of a `layer`'s numbers, explains better than the
     background does.
     """
     response = scene.response
     times = response.start + response.step * np.arange(response.density.size)
     bright = times[response.density >= MIN_EXPLAINED_DENSITY * response.density.max()]
-    late = photons.bin - layer[..., 0].ravel()[photons.pixel]
+    late = photons.times_after(layer[..., 0])
     return photons.select(photons.count * ~((late >= bright[0]) & (late <= bright[-1])))
 
 
 def find_missed_share(photons: PhotonImage, scene: Scene, layers: list[FloatArray]) -> float:
-    """Share of the background that is missing behind surfaces, the first of `layers` as of
-    `SurfacePlan.locate`, as of a detector that their photons blind; 0 where nothing says so. What is
+    """Share of the background that is missing behind surfaces, the first numbers of `layers`, as of a
+    detector that their photons blind; 0 where nothing says so. What is
     expected there is a pixel's own background before its surface and beside the others, with the
     course over time that pixels show whose surfaces come later.
     """
@@ -261,9 +377,8 @@ def find_missed_share(photons: PhotonImage, scene: Scene, layers: list[FloatArra
         own = (seen * before).sum(1, keepdims=True) / np.maximum(before @ course, 1e-9)[:, None]
         course = (seen * before).sum(axis=0) / np.maximum((before * own).sum(axis=0), 1e-9)
         expected = own * course
-        before &= seen <= expected + SURFACE_SIGMAS * np.sqrt(
-            expected + 1
-        )  # more is another surface
+        # more is another surface
+        before &= seen <= expected + SURFACE_SIGMAS * np.sqrt(expected + 1)
     light = float((known * expected).sum())
     share = 1 - float((seen * known).sum()) / max(light, 1e-9)
     return share if light > MIN_BLIND_PHOTONS and share > MIN_MISSED_SHARE else 0.0
@@ -271,26 +386,22 @@ def find_missed_share(photons: PhotonImage, scene: Scene, layers: list[FloatArra
 
 def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> FloatArray:
     """Return a further surface, NaN where the background alone would explain its photons.
-    `photons`: those that no nearer surface explains; `layer`: as of `SurfacePlan.locate`.
+    `photons`: those that no nearer surface explains; `layer` (rows, columns, 4).
     """
-    reach = 0.5 * scene.response.width + 1
-    late = photons.bin - layer[..., 0].ravel()[photons.pixel]
-    near = photons.count * (np.abs(late) <= reach)
-    seen = np.bincount(photons.pixel, near, layer[..., 0].size).reshape(layer.shape[:2])
-    expected = np.full(seen.shape, scene.background * (2 * reach + 1))
-    if photons.shading is not None:
-        instant = layer[..., 0].ravel()
-        expected *= photons.shading.at(np.arange(instant.size), instant).reshape(seen.shape)
-    pooled = scipy.ndimage.uniform_filter(seen, 3, mode="nearest") * 9
-    own = _find_chance(seen, expected) < MAX_OWN_CHANCE
-    around = _find_chance(np.rint(pooled), 9 * expected) < MAX_POOLED_CHANCE
-    return np.where((own & around)[..., np.newaxis], layer, np.nan)
+    reach, surface = 0.5 * scene.response.width + 1, layer[..., 0]
+    seen = photons.sum_by_pixel(photons.count * (np.abs(photons.times_after(surface)) <= reach))
+    expected = scene.background * (2 * reach + 1) * photons.relative_at(surface).astype(np.float64)
+    pooled = np.rint(scipy.ndimage.uniform_filter(seen, 3, mode="nearest") * 9)
 
+    def is_rare(seen: FloatArray, expected: FloatArray, most: float) -> NDArray[np.bool_]:
+        # chance of that many photons or more by Poisson's law; scipy.stats loads for a second
+        chance = scipy.special.gammainc(np.maximum(seen, 1), expected)
+        return np.asarray((seen > 0) & (chance < most))
 
-def _find_chance(seen: NDArray[Any], expected: FloatArray) -> FloatArray:
-    """Chance of that many photons or more where a Poisson law with that mean holds."""
-    found = scipy.special.gammainc(np.maximum(seen, 1), expected)  # scipy.stats loads for a second
-    return np.where(seen > 0, found, 1.0)
+    kept = is_rare(seen, expected, MAX_OWN_CHANCE) & is_rare(
+        pooled, 9 * expected, MAX_POOLED_CHANCE
+    )
+    return np.where(kept[..., np.newaxis], layer, np.nan)
 
 
 @dataclass(frozen=True)
@@ -358,7 +469,8 @@ def locate_with_smoothness(
     scene = Scene.start(photons, detector.pulse)
     every = LabelAxis(1, np.arange(detector.bins), detector.bins)
     volume = compute_scores(photons, scene, every)
-    labels, _ = match_labels(volume, photons.image_shape, chosen.slope_cost, chosen.jump_cost)
-    fitted = fit_surface(photons, scene, every.to_bins(labels), chosen.reach_px).reshape(-1, 1, 3)
+    costs = chosen.slope_cost, chosen.jump_cost
+    surface, _ = match_labels(volume, every, photons.image_shape, *costs)
+    fitted = fit_surface(photons, scene, surface, chosen.reach_px).reshape(-1, 1, 3)
     bin_m = SPEED_OF_LIGHT / 2 * detector.bin_width
     return Arrivals(bin_m * fitted[..., 0], fitted[..., 2], bin_m * fitted[..., 1])
