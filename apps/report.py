@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import math
 import os
 import re
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from tofclip.errors import StorageError
 from tofclip.files import PICTURE_SUFFIXES, require_apart, require_suffix
 
 if TYPE_CHECKING:
     from tofclip.shots import Frames
+
+Result = TypeVar("Result")
 
 SETTINGS_SUFFIX = ".toml"
 RECORD_SUFFIXES = (".h5", ".hdf5")
@@ -130,6 +134,19 @@ def build_provenance(
     }
     described = collect_provenance(plain, *inputs)
     return described | {"earlier": dict(earlier)} if earlier else described
+
+
+def with_past(result: Result, settings: Mapping[str, Any], *inputs: Path) -> Result:
+    """Return a result that knows how it came about, and what it knew of its own past."""
+    made: Any = result
+    past = build_provenance(settings, *inputs, earlier=made.provenance)
+    changed: Result = dataclasses.replace(made, provenance=past)
+    return changed
+
+
+def say(what: str, text: object) -> None:
+    """Say in a line on standard error what is a ``warning``, or has ``failed``."""
+    print(f"tofclip: {what}: {text}", file=sys.stderr)
 
 
 def describe_ranges(frames: Frames) -> str:

@@ -265,18 +265,19 @@ class OcclusionScene:
 
 def make_walking_scene(name: str) -> OcclusionScene:
     """Return a scene of `SCENES` with a person behind its occluder, instead of what stands there."""
-    scene = make_occlusion_scene(name)
-    behind = scene.title.partition(" behind ")[2]
-    return replace(scene, title=f"a person behind {behind}", target=_make_figure())
+    scene, (_, occluder) = make_occlusion_scene(name), SCENES[name]
+    return replace(scene, title=f"a person behind a {occluder}", target=_make_figure())
 
 
 def make_occlusion_scene(name: str) -> OcclusionScene:
     """Return a scene of `SCENES`."""
     if name not in SCENES:
         raise InputError(f"unknown scene '{name}'; take one of {', '.join(SCENES)}")
-    title, make_occluder, make_target, solid_width = SCENES[name]
+    target, occluder = SCENES[name]
+    make_occluder, solid_width = OCCLUDERS[occluder]
     region = InactiveRegion(BASELINE_M, solid_width, OCCLUDER_DISTANCE_M)
-    return OcclusionScene(name, title, make_occluder(), make_target(), region)
+    title = f"a {target} behind a {occluder}"
+    return OcclusionScene(name, title, make_occluder(), TARGETS[target](), region)
 
 
 def make_upright_bar(width: float, distance: float = OCCLUDER_DISTANCE_M) -> Body:
@@ -302,14 +303,6 @@ def _scale_plate(body: Body, factor: float) -> Body:
     return replace(body, shape=shape, centre=body.centre * (factor, factor, 1.0))
 
 
-def _make_word() -> tuple[Body, ...]:
-    return (_make_plate(40e-3, 18e-3, make_text_pattern("CLIP", 0.9), z=TARGET_Z_M),)
-
-
-def _make_disc() -> tuple[Body, ...]:
-    return (_make_plate(24e-3, 24e-3, make_rings(3, 0.15, 0.95), z=TARGET_Z_M),)
-
-
 def _make_figure() -> tuple[Body, ...]:
     """A mannequin, 36 mm tall."""
     skin = make_mottled_pattern(0.6, 0.95, 8, seed=3)
@@ -332,15 +325,6 @@ def _make_v_letter() -> tuple[Body, ...]:
     """
     pattern = cut_pattern(make_letter("V"), make_plain_pattern(OCCLUDER_REFLECTANCE))
     return (_make_plate(V_SIDE_M, V_HEIGHT_M, pattern, y=-0.25 * V_HEIGHT_M),)
-
-
-def _make_small_plate() -> tuple[Body, ...]:
-    return (_make_plate(6e-3, 20e-3),)
-
-
-def _make_board() -> tuple[Body, ...]:
-    """Wider than the views are apart: the formula promises nothing."""
-    return (_make_plate(21e-3, 60e-3),)
 
 
 def _make_tree() -> tuple[Body, ...]:
@@ -404,16 +388,31 @@ def _make_bush() -> tuple[Body, ...]:
 
 
 MakeBodies = Callable[[], tuple[Body, ...]]
-# title, occluder, target, and the width of the occluder's solid part on the axis, m
-SCENES: dict[str, tuple[str, MakeBodies, MakeBodies, float]] = {
-    "v-letter": ("a disc behind a letter V", _make_v_letter, _make_disc, 0.46 * V_SIDE_M),
-    "plate": ("a word behind a plate", _make_small_plate, _make_word, 6e-3),
-    "person": ("a figure behind a plate", _make_small_plate, _make_figure, 6e-3),
-    "tree": ("a figure behind a tree", _make_tree, _make_figure, 4.5e-3),
-    "bush": ("a word behind a bush", _make_bush, _make_word, 4e-3),
-    "trellis": ("a disc behind a trellis", _make_trellis, _make_disc, SLAT_M * np.sqrt(2)),
-    "board": ("a disc behind a board", _make_board, _make_disc, 21e-3),
+TARGETS: dict[str, MakeBodies] = {
+    "word": lambda: (_make_plate(40e-3, 18e-3, make_text_pattern("CLIP", 0.9), z=TARGET_Z_M),),
+    "disc": lambda: (_make_plate(24e-3, 24e-3, make_rings(3, 0.15, 0.95), z=TARGET_Z_M),),
+    "figure": _make_figure,
 }
+OCCLUDERS: dict[str, tuple[MakeBodies, float]] = {
+    "letter V": (_make_v_letter, 0.46 * V_SIDE_M),
+    "plate": (lambda: (_make_plate(6e-3, 20e-3),), 6e-3),
+    "tree": (_make_tree, 4.5e-3),
+    "bush": (_make_bush, 4e-3),
+    "trellis": (_make_trellis, SLAT_M * np.sqrt(2)),
+    # wider than the views are apart: the formula promises nothing
+    "board": (lambda: (_make_plate(21e-3, 60e-3),), 21e-3),
+}
+"""By what they are, with the width of their solid part on the axis, m."""
+SCENES = {
+    "v-letter": ("disc", "letter V"),
+    "plate": ("word", "plate"),
+    "person": ("figure", "plate"),
+    "tree": ("figure", "tree"),
+    "bush": ("word", "bush"),
+    "trellis": ("disc", "trellis"),
+    "board": ("disc", "board"),
+}
+"""Target and occluder."""
 
 
 DISTANCE_FACTORS = (0.8, 1.2, 2.0)  # behind the occluder, in lengths of the inactive region

@@ -7,7 +7,6 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -22,7 +21,7 @@ from apps.occlusion.experiment import (
     ExperimentSettings,
     OcclusionScene,
 )
-from apps.viewer.source import Inflow, Picture, Setting, Source, View, make_cloud
+from apps.viewer.source import Inflow, KeptFrames, Picture, Setting, Source, View, make_cloud
 from apps.viewer.sources import RecoveredSource, TransientSource
 from tofclip.errors import InputError
 from tofclip.files import format_error_line
@@ -49,9 +48,8 @@ SHOWN_SIDE_PX, GAP_PX = 192, 6  # of the pictures beside the scene, and between 
 class WalkFrame:
     """A step of the walk, as it was seen."""
 
-    view: View  # occluder and person, each at its own distance
+    view: View  # occluder and person, each at its own distance; its text: what the formula promises
     pictures: Mapping[str, Picture]  # by what each of them shows
-    description: str  # what the formula promises
 
 
 class WalkSource(Source):
@@ -71,9 +69,8 @@ class WalkSource(Source):
             f"{scene.title}, live", 2.0, frame_name="step", settings=(self._width, self._gate)
         )
         self._scene, self._settings = scene, settings
-        self._frames: deque[WalkFrame] = deque(maxlen=MAX_KEPT_FRAMES)
-        self._lock, self._stopping = threading.Lock(), threading.Event()
-        self._count, self._seconds, self._failure_text = 0, float("nan"), ""
+        self._kept, self._stopping = KeptFrames[WalkFrame](), threading.Event()
+        self._seconds, self._failure_text = float("nan"), ""
         places = np.linspace(-WALK_REACH_M, WALK_REACH_M, WALK_STEPS).tolist()
         self._walk = itertools.cycle([*places, *places[-2:0:-1]])
         self._take_step()
@@ -81,21 +78,19 @@ class WalkSource(Source):
         self._thread.start()
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._kept)
 
     @property
     def inflow(self) -> Inflow:
-        is_live = self._thread.is_alive()
+        is_live, oldest = self._thread.is_alive(), self._kept.oldest
         rate = 1 / self._seconds if is_live else 0.0
-        oldest = self._count - len(self._frames)
         return Inflow(oldest, is_live, rate, self._seconds, failure_text=self._failure_text)
 
     def view(self, number: int) -> View:
-        step = self._find_frame(number)
-        return replace(step.view, text=step.description)
+        return self._kept.get(number).view
 
     def pictures(self, number: int) -> Mapping[str, Picture]:
-        pictures = self._find_frame(number).pictures
+        pictures = self._kept.get(number).pictures
         return {
             f"{left} | {right}": pair_pictures(pictures[left], pictures[right])
             for left, right in ((ONE_CAMERA, CLIP_GATED), (ONE_CAMERA_GATED, TRUTH))
@@ -104,12 +99,6 @@ class WalkSource(Source):
     def close(self) -> None:
         self._stopping.set()
         self._thread.join(STOP_TIMEOUT_S)
-
-    def _find_frame(self, number: int) -> WalkFrame:
-        """Return a step, or the nearest that is kept."""
-        with self._lock:
-            place = number - (self._count - len(self._frames))
-            return self._frames[min(max(place, 0), len(self._frames) - 1)]
 
     def _run(self) -> None:
         try:
@@ -122,12 +111,9 @@ class WalkSource(Source):
     def _take_step(self) -> None:
         started = time.monotonic()
         scene = self._scene.widen_occluder(self._width.value * MILLIMETRE)
-        settings = replace(self._settings, seed=self._settings.seed + self._count)
+        settings = replace(self._settings, seed=self._settings.seed + len(self))
         there = Experiment(scene.move_target(next(self._walk)), settings)
-        made = look_behind(there, self._gate.value * MILLIMETRE)
-        with self._lock:
-            self._frames.append(made)
-            self._count += 1
+        self._kept.append(look_behind(there, self._gate.value * MILLIMETRE), MAX_KEPT_FRAMES)
         self._seconds = time.monotonic() - started
 
 
@@ -145,7 +131,7 @@ def look_behind(experiment: Experiment, opens: float) -> WalkFrame:
         TRUTH: experiment.truth,
     }
     view = _place_pictures(measurements.rig.array, [front, behind], distances)
-    return WalkFrame(view, pictures, describe_region(experiment.scene))
+    return WalkFrame(replace(view, text=describe_region(experiment.scene)), pictures)
 
 
 def separate_at(

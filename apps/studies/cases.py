@@ -208,21 +208,16 @@ def read_cases(name: str) -> list[Case]:
     """Return the cases of a study, in the order of its table."""
     with PAPER.open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["study"] == name]
-    return [
-        Case(
-            tuple(row["labels"].split(LABEL_SEPARATOR)),
-            row["scene"],
-            row["encoder"],
-            float(row["sampling_ratio"]),
-            float(row["shear"]),
-            float(row["paper"]) if row["paper"] else None,
-            float(row["bad_fraction"]),
-            float(row["photons"]) if row["photons"] else None,
-            float(row["white_noise"]),
-            row["data_term"],
-        )
-        for row in rows
-    ]
+    texts = ("study", "labels", "scene", "encoder", "data_term")
+    cases = []
+    for row in rows:
+        known: dict[str, Any] = {
+            name: text if name in texts else float(text) if text else None
+            for name, text in row.items()
+        }
+        del known["study"]
+        cases.append(Case(**known | {"labels": tuple(row["labels"].split(LABEL_SEPARATOR))}))
+    return cases
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from apps.cli import make_group
 from apps.options import JSON, arg, opt
 from apps.progress import show_progress
-from apps.report import RECORD_SUFFIXES, build_provenance, report, require_writable
+from apps.report import RECORD_SUFFIXES, build_provenance, report, require_writable, with_past
 from tofclip.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ def simulate(
     setup = CameraSetup(encoder, sampling_ratio, seed)
     measurement = corrupt_measurement(measure(known, setup), photons, bad_fraction)
     noise = {"bad_fraction": bad_fraction, "photons": photons or 0.0}
-    past = build_provenance({"verb": "clip simulate", **asdict(setup), **noise}, light_field)
-    replace(measurement, provenance=past).save(out)
+    past = {"verb": "clip simulate", **asdict(setup), **noise}
+    with_past(measurement, past, light_field).save(out)
     figures = {"readings": measurement.values.size, "image_shape": measurement.image_shape}
     report({**figures, **asdict(setup)}, as_json, [out])
 
@@ -208,6 +208,8 @@ def _write_picture(
     """Write the picture; a PNG is scaled to the picture's own brightest pixel, the others keep the
     values, and HDF5 keeps its shears as well.
     """
+    import numpy as np
+
     from tofclip.files import atomic_path
     from tofclip.storage import Field, Record
 
@@ -224,7 +226,9 @@ def _write_picture(
             import OpenEXR
 
             header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-            OpenEXR.File(header, {"Y": picture}).write(str(temporary))
+            # The library writes wrong pixels of arrays that are not contiguous.
+            channels = {"Y": np.ascontiguousarray(picture, np.float32)}
+            OpenEXR.File(header, channels).write(str(temporary))
         else:
             from matplotlib.image import imsave
 

@@ -50,7 +50,9 @@ def convert(
 
 
 def info(
-    file: Path = arg("FILE", "Any file of ours, or a streak image of others.", read=True),
+    file: Path = arg(
+        "FILE", "Any file of ours, or a streak image or ROS 2 bag of others.", read=True
+    ),
     as_json: bool = JSON,
 ) -> None:
     """Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.
@@ -68,15 +70,18 @@ def info(
 
 
 def describe_file(file: Path) -> dict[str, Any]:
-    """Describe our own records, streak images, point clouds and counted photons by their headers:
-    their values may not fit into memory.
+    """Describe our own records, streak images, point clouds, counted photons and ROS 2 bags by their
+    headers: their values may not fit into memory.
     """
     from devices.linospad2 import LinoSpad2File
     from devices.transients import STAMPS_SUFFIX
+    from tofclip.lidar import ros
     from tofclip.lidar.photons.files import PHOTON_SUFFIXES, describe_photons
     from tofclip.loading import outline
     from tofclip.storage import Record, is_own_file
 
+    if ros.is_bag(file):
+        return ros.outline_bag(file)
     if file.suffix.lower() == STAMPS_SUFFIX:
         with LinoSpad2File(file) as source:
             known = {"instrument": source.info.instrument, **source.info.details}

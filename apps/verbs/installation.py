@@ -15,7 +15,7 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -27,7 +27,7 @@ import typer
 from apps.cli import EXIT_INTERRUPTED
 from apps.options import JSON, SEED, arg, opt
 from apps.progress import show_activity, show_progress
-from apps.report import build_provenance, make_folder, report, require_new
+from apps.report import make_folder, report, require_new, with_past
 from devices.address import Options
 from tofclip.errors import InputError
 from tofclip.files import describe_missing_package
@@ -276,8 +276,7 @@ def demo(
     by_frames = plan_recovery(open_shot(streak, frames.camera), "tv")
     with show_progress("for comparison", by_frames.work) as advance:
         compared = by_frames.run(advance)
-    past = build_provenance({"verb": "demo", "seed": seed}, earlier=frames.provenance)
-    frames = replace(frames, provenance=past)
+    frames = with_past(frames, {"verb": "demo", "seed": seed})
     returns = depth(frames)
     cloud = point_cloud(returns)
     streak.save(written[0])
@@ -338,23 +337,26 @@ def list_parts() -> Iterator[dict[str, Any]]:
     from nlos.settings import METHODS as HIDDEN_SCENE_METHODS
 
     streaks = METHODS, DENOISERS, READERS, SOURCES, FINDERS, CODECS
-    own = *streaks, HIDDEN_SCENE_METHODS, CAPTURE_READERS
-    for parts in own:
+    for parts in (*streaks, HIDDEN_SCENE_METHODS, CAPTURE_READERS):
         for name in parts:
-            yield _describe(parts, name)
+            known = {"group": parts.group, "name": name, "origin": parts.get_origin(name)}
+            yield known | _describe(parts, name)
         for name, package in parts.list_unused():
             fault = f"not used: {parts.get_origin(name)} has this name already"
-            yield _make_entry(parts, name, package, fault)
+            known = {"group": parts.group, "name": name, "origin": package}
+            yield known | NOTHING_KNOWN | {"fault": fault}
+
+
+NOTHING_KNOWN: dict[str, Any] = {"fault": "", "meaning": "", "settings": []}
 
 
 def _describe(parts: Parts, name: str) -> dict[str, Any]:
-    origin = parts.get_origin(name)
     try:
         part = parts[name]
     except InputError as fault:
-        return _make_entry(parts, name, origin, str(fault))
+        return NOTHING_KNOWN | {"fault": str(fault)}
     makes = parts.kind in ("method", "denoiser", "codec")  # the others are used as they are
-    known = {} if isinstance(part, Reader) or not makes else list_settings(part)
+    known = list_settings(part) if makes else {}
     settings = [
         {"name": one, "default": _show_default(value)}
         for one, value in known.items()
@@ -370,19 +372,7 @@ def _describe(parts: Parts, name: str) -> dict[str, Any]:
         ]
     explained = part.read if isinstance(part, Reader) else part
     meaning = (inspect.getdoc(explained) or "").split("\n\n")[0]
-    return _make_entry(parts, name, origin, "", " ".join(meaning.split()), settings)
-
-
-def _make_entry(
-    parts: Parts,
-    name: str,
-    origin: str,
-    fault: str,
-    meaning: str = "",
-    settings: Sequence[Mapping[str, str]] = (),
-) -> dict[str, Any]:
-    known = {"group": parts.group, "name": name, "origin": origin, "fault": fault}
-    return known | {"meaning": meaning, "settings": list(settings)}
+    return NOTHING_KNOWN | {"meaning": " ".join(meaning.split()), "settings": settings}
 
 
 def _show_default(setting: inspect.Parameter) -> str:

@@ -79,7 +79,7 @@ def bag(
 
     if not (rate_hz > 0 and start_s >= 0):
         raise InputError("the rate must be positive and the start not negative")
-    if clouds.suffix.lower() == MCAP_SUFFIX or (clouds / "metadata.yaml").exists():
+    if ros.is_bag(clouds):
         require_format(suffix)
         points, stamps = 0, []
         for number, one in enumerate(ros.read_bag(clouds, topic)):

@@ -39,12 +39,13 @@ from apps.report import (
     name_beside,
     report,
     require_writable,
+    say,
+    with_past,
 )
 from apps.verbs.nlos_imaging import (
     CAPTURE,
     PORTABLE_METHODS,
     ImagingSettings,
-    add_provenance,
     choose_methods,
     compare,
     demo,
@@ -55,6 +56,7 @@ from apps.verbs.nlos_imaging import (
     require_valid_settings,
     show_settings,
     simulate,
+    try_methods,
 )
 from apps.verbs.nlos_stream import film, stream
 from nlos.settings import METHODS, Settings
@@ -266,19 +268,15 @@ def _check_refinement(wanted: ReconstructSettings) -> None:
         return
     if wanted.refine not in REFINEMENTS:
         raise InputError(f"unknown prior '{wanted.refine}'; refine by {NAMED_REFINEMENTS}")
-    by_photons, method = wanted.refine == PHOTONS, wanted.method
-    if by_photons and method not in (None, *PORTABLE_METHODS):
-        raise InputError(
-            f"--refine photons begins with an image by {', '.join(PORTABLE_METHODS)}, not by "
-            f"{method}; leave --method out"
-        )
-    if not by_photons and method not in (None, REFINED_METHOD):
-        raise InputError(
-            f"--refine iterates the {REFINED_METHOD} method, not {method}; leave --method out"
-        )
+    begins, suitable, most = f"iterates the {REFINED_METHOD} method", [REFINED_METHOD], 1.0
+    if wanted.refine == PHOTONS:
+        begins = f"photons begins with an image by {', '.join(PORTABLE_METHODS)}"
+        suitable, most = [*PORTABLE_METHODS], 10.0
+    if wanted.method not in (None, *suitable):
+        raise InputError(f"--refine {begins}, not {wanted.method}; leave --method out")
     if wanted.iterations is not None and wanted.iterations < 1:
         raise InputError(f"iterations must be 1 or more, got {wanted.iterations}")
-    weight, most = wanted.prior_weight, 10.0 if by_photons else 1.0
+    weight = wanted.prior_weight
     if weight is not None and not 0 <= weight < most:
         raise InputError(f"prior_weight is a share from 0 to less than {most:g}, got {weight}")
 
@@ -306,26 +304,23 @@ def reconstruct_single(
     found, volume = _image(prepared)
     on_wall = is_brightest_on_wall(volume, capture, found.wavelength or 0.0)
     if on_wall:
-        print(
-            f"tofclip: warning: {source}: the brightest voxel lies on the wall, whose own light the picture shows; "
+        say(
+            "warning",
+            f"{source}: the brightest voxel lies on the wall, whose own light the picture shows; "
             "blank more of it by --gate-m, or begin farther away by --near-m",
-            file=sys.stderr,
-        )
-    volume = prepared.describe(volume)
-    evidence = volume.provenance["imaging"]["evidence"]
-    if not evidence >= MIN_EVIDENCE:
-        print(
-            f"tofclip: warning: {source}: the picture's brightest is {evidence:.2g} times that of shuffled copies "
-            "of the capture: noise or a glow; see that the bin width and the wall's size are right",
-            file=sys.stderr,
         )
     # Files are written from the host's memory.
-    volume = volume.on(ComputeDevice())
-    seconds, imaging = time.perf_counter() - started, volume.provenance.get("imaging", {})
+    volume = prepared.describe(volume).on(ComputeDevice())
+    seconds, imaging = time.perf_counter() - started, volume.provenance["imaging"]
+    if not imaging["evidence"] >= MIN_EVIDENCE:
+        say(
+            "warning",
+            f"{source}: the picture's brightest is {imaging['evidence']:.2g} times that of shuffled "
+            "copies of the capture: noise or a glow; see that the bin width and the wall's size are right",
+        )
     shown = settings_to_dict(found)
-    resolution = imaging.get("resolution_m")
     past = {"verb": "nlos reconstruct", "device": str(used), **shown}
-    volume = add_provenance(volume, source, past)
+    volume = with_past(volume, past, source)
     for path in results.volumes:
         if path.suffix.lower() in RECORD_SUFFIXES:
             volume.save(path)
@@ -333,27 +328,28 @@ def reconstruct_single(
             volume.export(path, found.point_fraction)
     if results.picture is not None:
         volume.save_picture(results.picture)
-    further = {}
+    further, refined = {}, dict[str, Any]()
     if results.surface is not None:
         seen = find_imaged_surface(prepared.capture, volume, found.point_fraction)
         seen.save(results.surface)
         further = {"surface_points": len(seen.points), "surface_source": seen.source}
+    if found.refine:
+        refined = {name: imaging[name] for name in ("iterations", "stopped_because")}
+        refined = {"refine": found.refine, **refined}
     heading = "tofclip nlos reconstruct CAPTURE --settings THIS --out VOLUME"
     save_settings(found, results.settings, f"{heading}\n{content}")
-    stop = ("iterations", "stopped_because") if found.refine else ()
     return {
         "method": found.method,
         "device": str(used),
-        **({"refine": found.refine} if found.refine else {}),
-        **{name: imaging[name] for name in stop},
+        **refined,
         "gate_m": found.gate,
         "gate_found": found.gate_found,
         "wavelength_mm": shown["wavelength_mm"],
         "wavelength_reason": found.reasons.get("wavelength", "given"),
         "bins_together": found.bins_together,
         "brightest_on_wall": on_wall,
-        "evidence": evidence,
-        "resolution_m": resolution,
+        "evidence": imaging["evidence"],
+        "resolution_m": imaging.get("resolution_m"),
         "voxel_mm": shown["voxel_mm"],
         "voxels": volume.grid.shape,
         "wall_points": len(capture.points),
@@ -385,10 +381,11 @@ def _image(prepared: PreparedImaging[ReconstructSettings]) -> tuple[ReconstructS
         capture = settings.prepare_counts(prepared.recorded)
         dark = {"blank": settings.gate or 0.0, "ramp": settings.gate_ramp or 0.0}
         refined = PhotonRefinement(MidpointImaging(iterated), iterations, weight, **dark)
-    elif found.refine == "tv":
-        refined = Refinement(iterated, build_total_variation(grid, weight, iterations))
     else:
-        refined = Refinement(iterated, Sparse(weight, iterations))
+        prior: Any = Sparse(weight, iterations)
+        if found.refine == "tv":
+            prior = build_total_variation(grid, weight, iterations)
+        refined = Refinement(iterated, prior)
     return found, image_capture("refining", refined.plan(capture, grid), capture)
 
 
@@ -404,20 +401,23 @@ def _reconstruct_folder(
     """Image every capture of a folder whose results are not there yet."""
     from tofclip.sequences.jobs import Job, run_jobs
 
-    for suffix in suffixes:
-        if suffix not in list_volume_suffixes():
-            known = ", ".join(list_volume_suffixes())
-            raise InputError(f"no format of volumes is called '{suffix}'; use one of {known}")
-    sources = list_captures(inputs[0])
-    results = {path: _name_results(out, path.stem, suffixes) for path in sources}
+    known = list_volume_suffixes()
+    if unknown := [suffix for suffix in suffixes if suffix not in known]:
+        raise InputError(
+            f"no format of volumes is called '{unknown[0]}'; use one of {', '.join(known)}"
+        )
+    sources, results = list_captures(inputs[0]), {}
+    for path in sources:
+        volumes = [out.resolve() / f"{path.stem}{suffix}" for suffix in suffixes]
+        picture = volumes[0].with_name(f"{path.stem}.png")
+        results[path] = ResultFiles(volumes, picture, picture.with_name(f"{path.stem}.toml"))
     written = [path for one in results.values() for path in one.paths]
     require_apart([out, *written], [*inputs, *sources])
     make_folder(out)
     # Results of other settings in the same folder would be taken for finished.
     _check_folder_settings(out / FOLDER_SETTINGS_NAME, wanted)
     jobs, skipped, imaged = [], [], list[dict[str, Any]]()
-    for path in sources:
-        made = _name_results(out.resolve(), path.stem, suffixes)
+    for path, made in results.items():
         if made.is_up_to_date(path) and not may_replace():
             skipped.append(path.name)
             continue
@@ -439,7 +439,7 @@ def _reconstruct_folder(
     imaged.sort(key=lambda one: str(one["capture"]))
     failed = {failure.name: failure.problem for failure in summary.failures}
     for name, reason in failed.items():
-        print(f"tofclip: failed: {name}: {reason}", file=sys.stderr)
+        say("failed", f"{name}: {reason}")
     lists = {"imaged": imaged, "skipped": skipped, "failed": failed}
     counts = {"imaged": summary.done, "skipped": len(skipped), "failed": len(failed)}
     figures = {"captures": len(sources), **(lists if as_json else counts)}
@@ -455,11 +455,6 @@ def _run_job(
     if sys.stderr.isatty() and threading.current_thread() is threading.main_thread():
         print(source.name, file=sys.stderr)
     return reconstruct_single(source, results, wanted, device)
-
-
-def _name_results(folder: Path, stem: str, suffixes: Sequence[str]) -> ResultFiles:
-    volumes = [folder / f"{stem}{suffix}" for suffix in suffixes]
-    return ResultFiles(volumes, folder / f"{stem}.png", folder / f"{stem}.toml")
 
 
 def _check_folder_settings(file: Path, wanted: ReconstructSettings) -> None:
@@ -535,22 +530,15 @@ def info(
         "voxels": {"size_mm": shown["voxel_mm"], "shape": grid.shape},
         "truth": HiddenTruth.load(source) is not None,
     }
-    methods: dict[str, dict[str, Any]] = {}
-    for name in METHODS:
-        try:
-            plan = found.make_method(name).plan(capture, grid)
-        except InputError as refused:  # which is the reason to show
-            methods[name] = {"suits": False, "reason": str(refused)}
-        else:
-            methods[name] = {"suits": True, "memory_mib": plan.memory_bytes / 2**20}
+    memory, refused = try_methods(found, METHODS, capture, grid)
+    mib = {name: size / 2**20 for name, size in memory.items()}
     if as_json:
-        report({**figures, "methods": methods}, as_json)
+        suits = {name: {"suits": True, "memory_mib": size} for name, size in mib.items()}
+        others = {name: {"suits": False, "reason": reason} for name, reason in refused.items()}
+        report({**figures, "methods": suits | others}, as_json)
         return
-    lines = {
-        name: f"yes, {one['memory_mib']:.0f} MiB" if one["suits"] else f"no: {one['reason']}"
-        for name, one in methods.items()
-    }
-    report({**figures, **lines}, as_json)
+    lines = {name: f"yes, {size:.0f} MiB" for name, size in mib.items()}
+    report({**figures, **lines, **{name: f"no: {one}" for name, one in refused.items()}}, as_json)
 
 
 def _describe_wall(capture: Capture) -> dict[str, Any]:

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from apps.options import (
     JSON,
@@ -31,12 +30,13 @@ from apps.options import (
 from apps.progress import show_activity, show_progress
 from apps.report import (
     RECORD_SUFFIXES,
-    build_provenance,
     make_folder,
     name_beside,
     report,
     require_new,
     require_writable,
+    say,
+    with_past,
 )
 from nlos.known_scenes import SceneSettings
 from nlos.settings import METHODS, METHODS_BY_SPEED, Settings, list_taken
@@ -78,15 +78,17 @@ def is_capture_folder(source: Path) -> bool:
     return source.is_dir() and not (source / GEOMETRY_FILE).is_file()
 
 
-def list_captures(folder: Path) -> list[Path]:
-    """List the captures of a folder: files that may hold one, and folders of renderings."""
+def list_captures(folder: Path, may_be_empty: bool = False) -> list[Path]:
+    """List the captures of a folder: files that may hold one, and folders of renderings. One that is
+    waited for may be empty yet.
+    """
     found = sorted(
         path
         for path in folder.iterdir()
         if not path.name.startswith(".")
         and (path.suffix.lower() in CAPTURE_SUFFIXES or (path / GEOMETRY_FILE).is_file())
     )
-    if not found:
+    if not found and not may_be_empty:
         raise InputError(
             f"{folder}: no capture is in there ({', '.join(CAPTURE_SUFFIXES)}, or folders of renderings)"
         )
@@ -98,11 +100,6 @@ def list_captures(folder: Path) -> list[Path]:
                 f"{folder}: {other.name} and {path.name} would have results of one name; rename one"
             )
     return found
-
-
-def add_provenance(volume: Volume, source: Path, settings: dict[str, object]) -> Volume:
-    """Record in a volume's provenance which file it was made of, and how."""
-    return replace(volume, provenance=build_provenance(settings, source, earlier=volume.provenance))
 
 
 def parse_method_names(text: str) -> tuple[str, ...]:
@@ -148,6 +145,21 @@ def _list_own_settings(methods: Iterable[str]) -> set[str]:
     return {name for one in methods for name in list_taken(one)} - PULSE_SETTINGS
 
 
+def try_methods(
+    found: Settings, methods: Iterable[str], capture: Capture, grid: Grid
+) -> tuple[dict[str, int], dict[str, str]]:
+    """Return the memory, bytes, of methods that suit a capture, and why the others do not. A plan
+    checks the geometry without imaging, and so is cheap.
+    """
+    memory, refused = {}, {}
+    for name in methods:
+        try:
+            memory[name] = found.make_method(name).plan(capture, grid).memory_bytes
+        except InputError as refusal:
+            refused[name] = str(refusal)
+    return memory, refused
+
+
 def show_settings(found: Imaging, methods: Sequence[str]) -> Imaging:
     """Return the settings as they are written beside a result: what the methods' classes take where
     nothing is given is named, and what none of the methods takes is left out.
@@ -178,7 +190,7 @@ def prepare_imaging(
     if found.wavelength is not None and "wavelength" not in found.reasons and is_taken:
         band = Band(VirtualPulse(found.wavelength, found.cycles), capture.axis)
         if text := describe_aliasing(capture, band):
-            print(f"tofclip: warning: {text}", file=sys.stderr)
+            say("warning", text)
     return prepared
 
 
@@ -322,54 +334,39 @@ def compare(
     capture, truth = read_capture(source), HiddenTruth.load(source)
     # The voxels are those of the virtual pulse, for all methods alike.
     prepared = prepare_imaging(capture, wanted)
-    chosen, left_out = _choose_methods(names, wanted.methods is not None, prepared)
+    ours, grid = prepared.capture, prepared.grid
+    chosen, left_out = try_methods(prepared.settings, names, ours, grid)
+    # A method that was named must not vanish silently; of all methods, one has to remain.
+    if left_out and (wanted.methods is not None or not chosen):
+        name, reason = next(iter(left_out.items()))
+        raise InputError(f"{name} does not suit this capture: {reason}")
     runs: dict[str, MeasuredVolume] = {}
     figures: dict[str, dict[str, Any]] = {}
     for name in chosen:
         method = prepared.settings.make_method(name)
-        runs[name] = run = measure_imaging(name, method, prepared.capture, prepared.grid)
+        runs[name] = run = measure_imaging(name, method, ours, grid)
         figures[name] = {
             **run.costs,
-            "correlation": correlate_views(run.volume, runs[chosen[0]].volume),
+            "correlation": correlate_views(run.volume, next(iter(runs.values())).volume),
             "sharpness": measure_sharpness(run.volume),
             **({} if truth is None else compare_with_truth(run.volume, truth)),
         }
     images = {name: run.volume for name, run in runs.items()}
     save_figure(make_comparison_figure(images, figures, truth), out)
-    found = replace(show_settings(prepared.settings, chosen), methods=",".join(chosen))
-    for name, volume in images.items() if volumes is not None else ():
-        path = cast("Path", volumes) / f"{name}.h5"
-        past = {"verb": "nlos compare", "method": name, **settings_to_dict(found)}
-        add_provenance(volume, source, past).save(path)
-        written.append(path)
+    found = replace(show_settings(prepared.settings, [*chosen]), methods=",".join(chosen))
+    for name, volume in images.items():
+        if volumes is not None:
+            past = {"verb": "nlos compare", "method": name, **settings_to_dict(found)}
+            written.append(volumes / f"{name}.h5")
+            with_past(volume, past, source).save(written[-1])
     save_settings(found, written[1], "tofclip nlos compare CAPTURE --settings THIS --out PICTURE")
-    shape = {"voxels": prepared.grid.shape}
+    shape = {"voxels": grid.shape}
     if as_json:
         report({**shape, "methods": figures, "left_out": left_out}, as_json)
         return
     lines = {name: _format_line(one) for name, one in figures.items()}
     reasons = {name: f"no: {reason}" for name, reason in left_out.items()}
     report({**shape, **lines, **reasons}, as_json, written)
-
-
-def _choose_methods(
-    names: Sequence[str], named: bool, prepared: PreparedImaging[CompareSettings]
-) -> tuple[list[str], dict[str, str]]:
-    """Choose methods that suit; of those that were not named by the user the others are left out,
-    with the reason.
-    """
-    left_out = {}
-    for name in names:
-        try:
-            # A plan checks the geometry without imaging, and so is cheap.
-            prepared.settings.make_method(name).plan(prepared.capture, prepared.grid)
-        except InputError as refused:
-            left_out[name] = str(refused)
-    # A method that was named must not vanish silently; of all methods, one has to remain.
-    if left_out and (named or len(left_out) == len(names)):
-        name, reason = next(iter(left_out.items()))
-        raise InputError(f"{name} does not suit this capture: {reason}")
-    return [name for name in names if name not in left_out], left_out
 
 
 def _format_line(figures: Mapping[str, Any]) -> str:
@@ -405,9 +402,8 @@ def simulate(
     require_writable(beside, inputs=inputs)
     started = time.perf_counter()
     capture, truth = simulate_scene(chosen)
-    known = {"verb": "nlos simulate", **settings_to_dict(chosen)}
-    past = build_provenance(known, *inputs, earlier=capture.provenance)
-    truth.attach_to_record(replace(capture, provenance=past)).save(out)
+    capture = with_past(capture, {"verb": "nlos simulate", **settings_to_dict(chosen)}, *inputs)
+    truth.attach_to_record(capture).save(out)
     save_settings(chosen, beside, "tofclip nlos simulate --settings THIS --out CAPTURE")
     figures = {
         "wall_points": len(capture.points),
@@ -490,20 +486,17 @@ def run_demo(seed: int) -> DemoRun:
 
     with show_activity("simulating"):
         capture, truth = _simulate_letters(seed)
-    past = build_provenance({"verb": "nlos demo", "seed": seed}, earlier=capture.provenance)
-    capture = replace(capture, provenance=past)
-    grid, hybrid, slow = (
-        Grid.box(*BOX_M, VOXEL_M),
-        Hybrid(WAVELENGTH_M),
-        Backprojection(WAVELENGTH_M),
-    )
+    capture = with_past(capture, {"verb": "nlos demo", "seed": seed})
+    grid, hybrid = Grid.box(*BOX_M, VOXEL_M), Hybrid(WAVELENGTH_M)
     # The same signals with the curve ignored show what knowing the wall is worth.
     wall, laser = capture.wall.copy(), capture.laser.copy()
     wall[..., 2] = laser[..., 2] = 0.0
     flat = replace(capture, wall=wall, laser=laser)
     images = {
         "hybrid": measure_imaging("hybrid", hybrid, capture, grid),
-        "backprojection": measure_imaging("backprojection", slow, capture, grid),
+        "backprojection": measure_imaging(
+            "backprojection", Backprojection(WAVELENGTH_M), capture, grid
+        ),
         "flat": measure_imaging("as if flat", hybrid, flat, grid),
     }
     return DemoRun(capture, truth, images, WAVELENGTH_M)

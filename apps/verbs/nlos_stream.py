@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -31,16 +31,16 @@ from apps.options import (
 )
 from apps.progress import EXIT_SOME_FAILED, show_progress
 from apps.report import (
-    build_provenance,
     make_folder,
     name_beside,
     report,
     require_new,
     require_writable,
+    say,
+    with_past,
 )
 from apps.verbs.nlos_imaging import (
     CAPTURE,
-    CAPTURE_SUFFIXES,
     GEOMETRY_FILE,
     PORTABLE_METHODS,
     choose_methods,
@@ -60,6 +60,8 @@ from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 if TYPE_CHECKING:
     from nlos import Capture, Volume
     from nlos.imaging import PreparedImaging
+
+    Coming = tuple[str, Capture] | TofclipError  # with its name; or why it cannot be read
 
 POLL_INTERVAL_S = 0.02
 SETTINGS_NAME = "stream.toml"
@@ -131,11 +133,11 @@ def stream(
     require_apart([out, out / SETTINGS_NAME, *existing], [source, settings, *renderings])
     require_new(*existing)
     coming = islice(_read_captures(source, follow_s), captures)
-    first = next((one for one in coming if one.capture is not None), None)
-    if first is None or first.capture is None:
+    first = next(coming, None)  # those that cannot be read come last
+    if first is None or isinstance(first, TofclipError):
         raise InputError(f"{source}: the source ended before it gave a capture that can be read")
     started = time.perf_counter()
-    prepared = prepare_imaging(first.capture, wanted)
+    prepared = prepare_imaging(first[1], wanted)
     method = prepared.settings.method
     plan = prepared.settings.make_method().plan(prepared.capture, prepared.grid)
     planned = time.perf_counter() - started
@@ -171,30 +173,26 @@ def _check_stream(wanted: StreamSettings, follow_s: float, captures: int | None)
         raise InputError(f"--captures must be positive, got {captures}")
 
 
-class _NamedCapture(NamedTuple):
-    """A capture as it comes, or why it cannot be read."""
-
-    name: str
-    capture: Capture | None
-    problem: str = ""
-
-
-def _read_captures(source: Path, follow_s: float) -> Iterator[_NamedCapture]:
-    """Read the captures of a folder in the order of their names, and those that come later."""
+def _read_captures(source: Path, follow_s: float) -> Iterator[Coming]:
+    """Read the captures of a folder in the order of their names, and those that come later; at last
+    say what cannot be read.
+    """
     from nlos.io import read_capture
 
     if not is_capture_folder(source):
-        yield _NamedCapture(source.stem, read_capture(source))
+        yield source.stem, read_capture(source)
         return
     done: set[Path] = set()
     unreadable: dict[Path, tuple[tuple[int, int], str]] = {}
     last = time.monotonic()
     while True:
-        # A folder that is waited for may be empty yet.
-        found = _list_present(source) if follow_s > 0 else list_captures(source)
-        for path in found:
-            state = _read_state(path)
-            if path in done or state is None or state == unreadable.get(path, (None,))[0]:
+        for path in list_captures(source, may_be_empty=follow_s > 0):
+            try:
+                known = path.stat()
+            except OSError:  # it is gone since it was listed
+                continue
+            state = known.st_size, known.st_mtime_ns
+            if path in done or state == unreadable.get(path, (None,))[0]:
                 continue
             try:
                 capture = read_capture(path)
@@ -204,31 +202,14 @@ def _read_captures(source: Path, follow_s: float) -> Iterator[_NamedCapture]:
             else:
                 done.add(path)
                 unreadable.pop(path, None)
-                yield _NamedCapture(path.stem, capture)
+                yield path.stem, capture
             last = time.monotonic()
         if time.monotonic() - last >= follow_s:
             break
         time.sleep(POLL_INTERVAL_S)
     for path, (_, problem) in unreadable.items():
         if path.exists():  # it may have been a name for the time of writing
-            yield _NamedCapture(path.stem, None, problem)
-
-
-def _read_state(path: Path) -> tuple[int, int] | None:
-    """Return what changes when a file is written to; None if it is gone since it was listed."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_size, found.st_mtime_ns
-
-
-def _list_present(folder: Path) -> list[Path]:
-    return sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in CAPTURE_SUFFIXES and not path.name.startswith(".")
-    )
+            yield InputError(f"{path.stem}: {problem}")
 
 
 class VolumeStream:
@@ -240,7 +221,7 @@ class VolumeStream:
 
     def __init__(
         self,
-        coming: Iterable[_NamedCapture],
+        coming: Iterable[Coming],
         prepared: PreparedImaging[StreamSettings],
         imaging: Callable[[Capture], Volume],
         out: Path,
@@ -303,22 +284,21 @@ class VolumeStream:
             "plan_run_median_s": compute_quantiles(self._imaging).get("median"),
         }
 
-    def _count(self) -> Iterator[_NamedCapture]:
+    def _count(self) -> Iterator[Coming]:
         for one in self._coming:
             self._acquired += 1
             yield one
 
-    def _image_named(self, one: _NamedCapture) -> tuple[str, Volume]:
+    def _image_named(self, named: tuple[str, Capture]) -> tuple[str, Volume]:
+        name, capture = named
         try:
-            if one.capture is None:
-                raise InputError(one.problem)
-            capture = self._settings.prepare(one.capture, self._join)
+            capture = self._settings.prepare(capture, self._join)
             started = time.perf_counter()
             volume = self._image(capture)
             self._imaging.append(time.perf_counter() - started)
         except TofclipError as fault:
-            raise InputError(f"{one.name}: {fault}") from fault
-        return one.name, volume
+            raise InputError(f"{name}: {fault}") from fault
+        return name, volume
 
     def _write(self, number: int, name: str, volume: Volume) -> bool:
         """Write a volume and show it; a disk that is full fails it alone."""
@@ -333,7 +313,7 @@ class VolumeStream:
 
     def _note_failure(self, _: int, fault: TofclipError) -> None:
         self.failed += 1
-        print(f"tofclip: failed: {fault}", file=sys.stderr)
+        say("failed", fault)
 
 
 def _run_with_page(made: VolumeStream, source: Path) -> dict[str, Any]:
@@ -436,8 +416,7 @@ def film(
         video = take(capture, grid, times, advance)
     seconds = time.perf_counter() - started
     shown = settings_to_dict(found)
-    past = build_provenance({"verb": "nlos film", **shown}, source, earlier=video.provenance)
-    video = replace(video, provenance=past)
+    video = with_past(video, {"verb": "nlos film", **shown}, source)
     suffix = out.suffix.lower()
     if suffix == ".h5":
         video.save(out)

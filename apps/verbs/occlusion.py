@@ -10,7 +10,6 @@ from apps.cli import make_group
 from apps.options import JSON, NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, flag, opt
 from apps.progress import show_activity, show_progress
 from apps.report import make_folder, report, require_new, require_writable
-from apps.verbs.view import PageDoor
 from tofclip.errors import InputError
 from tofclip.files import PICTURE_SUFFIXES
 
@@ -143,7 +142,7 @@ def demo(
     settings = ExperimentSettings(side, encoder, sampling_ratio, illumination, usual, seed, rays)
     if live:
         from apps.occlusion.live import GatedSource, WalkSource
-        from apps.viewer.page import LOOPBACK
+        from apps.viewer.page import LOOPBACK, PageDoor
         from apps.viewer.session import Session
         from apps.viewer.source_factory import ShotOptions, open_source
 

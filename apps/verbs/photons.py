@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apps.options import JSON, arg, flag, opt
 from apps.progress import show_share
-from apps.report import build_provenance, report, require_writable
+from apps.report import build_provenance, report, require_writable, say
 from apps.verbs.recover import CLOUD_SUFFIXES, DEPTH_SUFFIX
 from tofclip.errors import InputError
 from tofclip.files import PICTURE_SUFFIXES
@@ -192,7 +191,7 @@ def photons(
         "settings": settings,
     }
     if doubt := find_doubt(image, found.settings, cycles):
-        print(f"tofclip: warning: {doubt}", file=sys.stderr)
+        say("warning", doubt)
     report(figures, as_json, [out])
 
 

@@ -5,12 +5,10 @@ they come, with every stage's latency.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +39,6 @@ from apps.progress import (
     show_progress,
 )
 from apps.report import (
-    build_provenance,
     choose_preview,
     describe_ranges,
     make_folder,
@@ -49,6 +46,8 @@ from apps.report import (
     report,
     require_new,
     require_writable,
+    say,
+    with_past,
 )
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
@@ -313,8 +312,8 @@ def cloud(
     with show_activity("finding returns"):
         recovered = Frames.load(frames)
         # The cloud carries the history of its frames, and so that of the shot.
-        past = build_provenance({"verb": "cloud"}, frames, earlier=recovered.provenance)
-        points, kept = settings.make_cloud(replace(recovered, provenance=past), str(frames))
+        recovered = with_past(recovered, {"verb": "cloud"}, frames)
+        points, kept = settings.make_cloud(recovered, str(frames))
         save_cloud(points, kept, out, organised)
     rows, columns = kept.camera.image_shape
     figures = {
@@ -419,7 +418,7 @@ def stream(
     def note_failure(number: int, fault: TofclipError) -> None:
         nonlocal failed
         failed += 1
-        print(f"tofclip: failed: shot {number}: {name_options(str(fault))}", file=sys.stderr)
+        say("failed", f"shot {number}: {name_options(str(fault))}")
 
     # Instruments do not wait: the newest shot counts. Files do, and lose nothing.
     made = stream_clouds(
@@ -479,44 +478,39 @@ class _Tally:
 
     def __init__(self) -> None:
         self.clouds = self.points = 0
-        self._stages: dict[str, deque[float]] = {}
-        self._latency: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
-        self._ages: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
+        self._times = {name: deque[float](maxlen=MAX_LATENCY_SAMPLES) for name in ("age", "all")}
         self._origin, self._seconds = "file", 0.0
 
     def watch(
         self, made: Iterable[StreamedCloud], shots: TrackedShots
     ) -> Iterator[tuple[PointCloud, ShotStamp]]:
         """Yield every cloud with its shot's stamp."""
-        from time import perf_counter
-
-        started = perf_counter()
+        started = time.perf_counter()
         for one in made:
             stamp = shots.get_stamp(one.shot)
             age = stamp.compute_age()
-            self._ages.append(one.latency if age is None else age)
             known = "instrument" if stamp.taken_at else "arrival" if stamp.received_at else ""
             self._origin = known or self._origin
-            self._latency.append(one.latency)
             yield one.cloud, stamp
             self.clouds += 1
             self.points += len(one.cloud)
-            for name, seconds in one.seconds.items():
-                self._stages.setdefault(name, deque(maxlen=MAX_LATENCY_SAMPLES)).append(seconds)
-            self._seconds = perf_counter() - started
+            seconds = {"age": one.latency if age is None else age, "all": one.latency}
+            for name, value in (seconds | dict(one.seconds)).items():
+                self._times.setdefault(name, deque(maxlen=MAX_LATENCY_SAMPLES)).append(value)
+            self._seconds = time.perf_counter() - started
 
     def list_figures(self) -> dict[str, Any]:
         """What is reported at the end."""
-        ages = compute_quantiles(self._ages)
-        stages = {name: compute_quantiles(seconds) for name, seconds in self._stages.items()}
+        known = {name: compute_quantiles(seconds) for name, seconds in self._times.items()}
+        ages, latency = known.pop("age"), known.pop("all")
         return {
             "clouds": self.clouds,
             **{f"latency_{name}_s": value for name, value in ages.items()},
             "latency_from": self._origin,
             "points": self.points,
             "clouds_per_second": self.clouds / self._seconds if self.clouds else 0.0,
-            "latency_s": compute_quantiles(self._latency),
-            "stages_s": stages,
+            "latency_s": latency,
+            "stages_s": known,
         }
 
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from apps.options import JSON, NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, arg, flag, opt
 from apps.progress import show_activity, show_progress
@@ -16,10 +13,6 @@ from apps.report import report, require_writable
 from tofclip.errors import InputError
 from tofclip.files import PICTURE_SUFFIXES
 from tofclip.plugins import METHODS
-
-if TYPE_CHECKING:
-    from apps.viewer.page import Served
-    from apps.viewer.session import Session
 
 
 def view(
@@ -65,6 +58,7 @@ def view(
 
     Example: tofclip view frames.h5 --png scene.png
     """
+    from apps.viewer.page import PageDoor
     from apps.viewer.session import Session, read_state, restore_state
     from apps.viewer.source import LayeredSource
     from apps.viewer.source_factory import ShotOptions, open_source
@@ -120,60 +114,3 @@ def view(
         figures = {"points": points, "backend": renderer.name}
         figures |= {"seconds": time.perf_counter() - started, **further}
         report(figures, as_json, [path for path in (png, mp4) if path is not None])
-
-
-@dataclass
-class PageDoor:
-    """Where the page is served, and how a browser comes there: at once where a source takes seconds,
-    so that the page is loaded by then.
-    """
-
-    host: str  # an IP address of this computer, or ``"localhost"``
-    port: int | None = None  # A free one by default
-    no_browser: bool = False  # whether the page is not opened here
-    as_json: bool = False  # whether its address is reported as JSON
-    _waiting: Served | None = None
-
-    def open_waiting(self, title: str, words: str) -> None:
-        """Serve a page that says what is being done, if there is none yet."""
-        from apps.viewer.page import parse_host, say_waiting, serve_waiting
-
-        if self._waiting is not None:
-            say_waiting(self._waiting[0], words)
-            return
-        self._waiting = serve_waiting(title, words, self.port, parse_host(self.host))
-        self._show_address(self._waiting[1])
-
-    def serve(self, session: Session) -> None:
-        """Serve a session until Ctrl-C."""
-        from apps.viewer.page import Page, parse_host
-
-        page = Page(session, self.port, parse_host(self.host), self._waiting)
-        was_waiting, self._waiting = self._waiting is not None, None
-        with contextlib.closing(page):
-            if not was_waiting:
-                self._show_address(page.address)
-            page.run()
-
-    def close(self) -> None:
-        """Stop serving a page that still waits: there will be nothing to look at."""
-        if self._waiting is not None:
-            from apps.viewer.page import stop_server
-
-            stop_server(self._waiting[0])
-
-    def _show_address(self, address: str) -> None:
-        import webbrowser
-
-        from apps.viewer.page import is_local, parse_host
-
-        report({"address": address}, self.as_json)
-        sys.stdout.flush()  # a program that reads the address waits for it
-        if not is_local(parse_host(self.host)):
-            print(
-                "tofclip: other computers can reach this page, unencrypted: anyone who has its address, "
-                "with the token, can see and control it",
-                file=sys.stderr,
-            )
-        if not self.no_browser:
-            webbrowser.open(address)

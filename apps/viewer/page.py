@@ -13,9 +13,12 @@ import ipaddress
 import queue
 import secrets
 import socket
+import sys
 import threading
 import time
+import webbrowser
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
@@ -23,6 +26,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from apps.report import report
 from apps.viewer.html import (
     format_page_title,
     render_page_html,
@@ -377,6 +381,53 @@ class Page:
                     else:
                         handle = self.server.gui.add_image(image, label=name)
                         self._pictures[name] = handle
+
+
+@dataclass
+class PageDoor:
+    """Where a page is served, and how a browser comes there: at once where a source takes seconds,
+    so that the page is loaded by then.
+    """
+
+    host: str  # an IP address of this computer, or ``"localhost"``
+    port: int | None = None  # A free one by default
+    no_browser: bool = False  # whether the page is not opened here
+    as_json: bool = False  # whether its address is reported as JSON
+    _waiting: Served | None = None
+
+    def open_waiting(self, title: str, words: str) -> None:
+        """Serve a page that says what is being done, if there is none yet."""
+        if self._waiting is None:
+            self._waiting = serve_waiting(title, words, self.port, parse_host(self.host))
+            self._show_address(self._waiting[1])
+        else:
+            say_waiting(self._waiting[0], words)
+
+    def serve(self, session: Session) -> None:
+        """Serve a session until Ctrl-C."""
+        page = Page(session, self.port, parse_host(self.host), self._waiting)
+        was_waiting, self._waiting = self._waiting is not None, None
+        with contextlib.closing(page):
+            if not was_waiting:
+                self._show_address(page.address)
+            page.run()
+
+    def close(self) -> None:
+        """Stop serving a page that still waits: there will be nothing to look at."""
+        if self._waiting is not None:
+            stop_server(self._waiting[0])
+
+    def _show_address(self, address: str) -> None:
+        report({"address": address}, self.as_json)
+        sys.stdout.flush()  # a program that reads the address waits for it
+        if not is_local(parse_host(self.host)):
+            print(
+                "tofclip: other computers can reach this page, unencrypted: anyone who has its address, "
+                "with the token, can see and control it",
+                file=sys.stderr,
+            )
+        if not self.no_browser:
+            webbrowser.open(address)
 
 
 def _set_up_panel(server: viser.ViserServer, title: str) -> None:

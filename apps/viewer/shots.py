@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from apps.viewer.source import Inflow, View
+from apps.viewer.source import Inflow, KeptFrames, View
 from devices.transients import TrackedShots
 from tofclip.errors import InputError
 from tofclip.files import format_error_line
@@ -78,37 +78,29 @@ class LiveShots:
         self, title: str, shots: Iterator[LiveShot] | TrackedShots, pipeline: CloudPipeline
     ) -> None:
         self._shots = shots if isinstance(shots, TrackedShots) else TrackedShots(shots)
-        self._pipeline, self._count, self._inflow = pipeline, 0, Inflow(is_live=True)
+        self._pipeline, self._inflow = pipeline, Inflow(is_live=True)
         self.method_name = pipeline.method_name
-        self._cache: deque[TakenShot] = deque()
+        self._kept = KeptFrames[TakenShot]()
+        self.get = self._kept.get
         self._arrivals: deque[float] = deque(maxlen=RATE_WINDOW_SHOTS + 1)
-        self._lock, self._stopping = threading.Lock(), threading.Event()
-        self._began = threading.Event()
+        self._stopping, self._began = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="live shots", daemon=True)
         self._thread.start()
         self._began.wait()
-        if not self._count:
+        if not len(self):
             said = self._inflow.failure_text or "the source ended before it gave anything"
             raise InputError(f"{title}: {said}")
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._kept)
 
     @property
     def inflow(self) -> Inflow:
         """What comes in, and how fast."""
-        with self._lock:
-            oldest, rate = self._count - len(self._cache), 0.0
-            if len(self._arrivals) > 1 and self._inflow.is_live:
-                span = self._arrivals[-1] - self._arrivals[0]
-                rate = (len(self._arrivals) - 1) / max(span, 1e-9)
-            return replace(self._inflow, oldest=oldest, data_rate=rate)
-
-    def get(self, number: int) -> TakenShot:
-        """Return what is kept of a shot, or of the nearest that is."""
-        with self._lock:
-            place = number - (self._count - len(self._cache))
-            return self._cache[min(max(place, 0), len(self._cache) - 1)]
+        arrivals, rate = [*self._arrivals], 0.0
+        if len(arrivals) > 1 and self._inflow.is_live:
+            rate = (len(arrivals) - 1) / max(arrivals[-1] - arrivals[0], 1e-9)
+        return replace(self._inflow, oldest=self._kept.oldest, data_rate=rate)
 
     def close(self) -> None:
         """Let go of the instrument."""
@@ -128,28 +120,22 @@ class LiveShots:
                         if self._stopping.is_set():
                             break
                         stamp = self._shots.get_stamp(made.shot)
-                        self._append(TakenShot(made.taken, make_view(made.returns, made.cloud)))
+                        most = max(MAX_CACHED_SHOTS, MAX_CACHED_BYTES // made.taken.counts.nbytes)
+                        view = make_view(made.returns, made.cloud)
+                        self._kept.append(TakenShot(made.taken, view), most)
+                        self._arrivals.append(time.monotonic())
                         age = stamp.compute_age()
                         latency = made.latency if age is None else age
-                        lost = self._shots.count_dropped(stamp, self._count)
+                        lost = self._shots.count_dropped(stamp, len(self))
                         self._inflow = replace(self._inflow, latency=latency, lost=lost)
                         self._began.set()
         except Exception as fault:
             # Whatever ends it is shown on the page: an exception on this thread would be lost.
             self._inflow = replace(self._inflow, failure_text=format_error_line(fault))
         finally:
-            lost = self._shots.count_shots(self._count).dropped
+            lost = self._shots.count_shots(len(self)).dropped
             self._inflow = replace(self._inflow, is_live=False, lost=lost)
             self._began.set()
-
-    def _append(self, taken: TakenShot) -> None:
-        kept = max(MAX_CACHED_SHOTS, MAX_CACHED_BYTES // taken.shot.counts.nbytes)
-        with self._lock:
-            self._cache.append(taken)
-            if len(self._cache) > kept:
-                self._cache.popleft()
-            self._count += 1
-            self._arrivals.append(time.monotonic())
 
 
 Shots = StoredShots | LiveShots

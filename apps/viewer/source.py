@@ -5,9 +5,11 @@ frames; and several of them at once, as layers of one scene.
 from __future__ import annotations
 
 import abc
+import threading
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from tofclip.units import SPEED_OF_LIGHT
 if TYPE_CHECKING:
     from nlos.export import Mesh
 
+Frame = TypeVar("Frame")
 Picture = NDArray[np.float32]  # (rows, columns)
 Limits = tuple[float, float]  # both inclusive
 NO_LIMITS: Limits = (-np.inf, np.inf)
@@ -91,6 +94,35 @@ class Inflow:
     latency: float = np.nan
     lost: int = 0  # shots that were taken and are not shown, wherever they were lost
     failure_text: str = ""  # what ended it early, in a line
+
+
+class KeptFrames(Generic[Frame]):
+    """The last frames of those that come while one looks, numbered from the first that came."""
+
+    def __init__(self) -> None:
+        self._frames: deque[Frame] = deque()
+        self._lock, self._count = threading.Lock(), 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def oldest(self) -> int:
+        """Number of the first that is still there."""
+        return self._count - len(self._frames)
+
+    def append(self, frame: Frame, most: int) -> None:
+        """Add a frame, and forget old ones beyond so many."""
+        with self._lock:
+            self._frames.append(frame)
+            self._count += 1
+            if len(self._frames) > most:
+                self._frames.popleft()
+
+    def get(self, number: int) -> Frame:
+        """Return a frame, or the nearest that is kept."""
+        with self._lock:
+            return self._frames[min(max(number - self.oldest, 0), len(self._frames) - 1)]
 
 
 @dataclass

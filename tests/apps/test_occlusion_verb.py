@@ -33,7 +33,7 @@ from apps.occlusion.live import (
 from apps.studies import occlusion
 from apps.studies.cases import Library, read_cases
 from apps.verbs.occlusion import SCENE_NAMES
-from apps.verbs.view import PageDoor
+from apps.viewer.page import PageDoor
 from apps.viewer.session import Session
 from apps.viewer.source_factory import open_source
 from tofclip.errors import InputError
@@ -128,7 +128,7 @@ class TestLive:
         # the occluder and the person, each to a bin of 3 mm
         assert abs(depths[depths < 0.085] - 0.05).max() < 3e-3
         assert abs(depths[depths > 0.085] - 0.12).max() < 3e-3
-        assert between.description == "hides 33 mm behind it; person at 70 mm: seen"
+        assert between.view.text == "hides 33 mm behind it; person at 70 mm: seen"
         # open before the occluder: its light is in the picture too; open after the person: no light
         # is
         early = look_behind(Experiment(scene, SETTINGS), 0.036)
@@ -140,7 +140,7 @@ class TestLive:
         assert wide.region.width == 15e-3
         assert wide.occluder[0].shape.half_extent[0] == pytest.approx(7.5e-3)
         hidden = look_behind(Experiment(wide, SETTINGS), 0.085)
-        assert "nothing is promised" in hidden.description
+        assert "nothing is promised" in hidden.view.text
         # What passes beside the occluder is light, far above its noise; it shows no person.
         seen, gated = between.pictures[CLIP_GATED], hidden.pictures[CLIP_GATED]
         assert gated.sum() < 0.25 * seen.sum()

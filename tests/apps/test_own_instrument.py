@@ -18,7 +18,7 @@ from devices import registry
 from devices.emulation.harness import HOST, Connection, LoopbackServer
 from tofclip.camera import Camera
 from tofclip.lidar import PointCloud
-from tofclip.lidar.ros import read_bag
+from tofclip.lidar.ros import MESSAGE_TYPE, read_bag
 from tofclip.units import SPEED_OF_LIGHT
 
 SIGNAL, BACKGROUND, PULSE_S = 20.0, 0.02, 300e-12  # photons, photons a bin, standard deviation
@@ -109,6 +109,9 @@ def test_one_file_and_every_verb(shell: Any, address: str) -> None:
     shell.figures(f"stream {address} --shots 3 --out live.mcap --topic /kit/points --frame-id kit")
     stamps = [one.stamp_ns for one in read_bag("live.mcap")]
     assert before < stamps[0] < stamps[1] < stamps[2] < time.time_ns()
+    held = shell.figures("info live.mcap")
+    assert held["topics"] == {"/kit/points": {"type": MESSAGE_TYPE, "messages": 3}}
+    assert held["seconds"] == pytest.approx((stamps[2] - stamps[0]) / 1e9, abs=1e-6)
     assert shell.figures("lidar bag live.mcap --out back --topic /kit/points")["clouds"] == 3
     for verb in ("stream run.h5", "view run.h5 --png tv.png"):
         assert "leave out the method" in shell(f"{verb} --method tv").err

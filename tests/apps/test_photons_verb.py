@@ -243,6 +243,18 @@ def test_photons_of_a_plate_calibrate_a_detector(shell, monkeypatch):
     assert np.sqrt(np.mean(scores**2)) == pytest.approx(1, abs=3 / np.sqrt(2 * scores.size))
 
 
+def test_a_region_leaves_out_what_stands_beside_the_plate(shell, monkeypatch):
+    monkeypatch.setattr(detector, "CALIBRATION_HISTOGRAMS", 2000)
+    save_plate(Path("plate.npy"), 0.5, 100, 0, LATE_S)
+    cube = np.load("plate.npy")
+    cube[:, 4:] = np.roll(cube[:, 4:], 20, axis=-1)  # columns of something farther away
+    np.save("plate.npy", cube)
+    line = f"calibrate range --target-m 0.5 plate.npy {PULSE} --focal-length-px 20 --out c.h5"
+    figures = shell.figures(f"{line} --region 0 5 0 4")
+    late = 1e3 * figures["time_zero_ns"] - 1e12 * LATE_S
+    assert abs(late) < 4 * figures["time_zero_sigma_ps"] < 100
+
+
 def test_a_streak_shot_of_a_plate_gives_time_zero(shell, camera):
     """300 ps late, known to a twentieth of a row; ranges of a recovery with it are the plate's."""
     distance = SPEED_OF_LIGHT / 2 * (40 * BIN_WIDTH - LATE_S)

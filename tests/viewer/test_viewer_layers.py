@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from viewer_scenes import frames, plane, volume
+from viewer_scenes import NEAR_FRAME, frames, plane, volume
 
 from apps.cli import main
 from apps.viewer.session import Filters, Section, Session, read_state, restore_state, write_state
 from apps.viewer.source import LayeredSource
 from apps.viewer.source_factory import open_source
-from apps.viewer.sources import GATE_AROUND_FRAME
+from apps.viewer.sources import GATE_AROUND_FRAME, TransientSource
 from apps.viewer.viewpoint import Viewpoint
 from tofclip.errors import FileFormatError
 
@@ -54,6 +54,15 @@ def test_layers_are_shown_together_each_on_and_off_and_moved_aside(paths: list[s
     source.switches[1].value = "off"
     assert len(session.frame_at(0.0).cloud) == 0
     assert {"1 streak", "2 depth", "3 intensity"} - set(source.pictures(0)) == {"2 depth"}
+
+
+def test_layers_with_times_of_their_own_are_shown_at_one_instant() -> None:
+    whole, later = TransientSource("whole", frames()), TransientSource("later", frames()[10:])
+    for one in (whole, later):
+        one.gate.value, one.half_gate.value = GATE_AROUND_FRAME, 5
+    session = Session(LayeredSource([whole, later]))
+    session.clock.jump(NEAR_FRAME)
+    assert np.bincount(session.frame_at(0.0).layers).tolist() == [0, 36, 36]
 
 
 def test_a_pick_reads_the_waveform_of_its_own_layer(paths: list[str]) -> None:

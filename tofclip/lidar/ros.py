@@ -95,6 +95,27 @@ def read_bag(path: str | Path, topic: str | None = None) -> Iterator[StampedClou
             yield _read_message(typestore.deserialize_cdr(data, MESSAGE_TYPE))
 
 
+def is_bag(path: Path) -> bool:
+    """Return whether a path names an MCAP file or a bag's folder."""
+    return path.suffix.lower() == MCAP_SUFFIX or (path / "metadata.yaml").exists()
+
+
+def outline_bag(path: Path) -> dict[str, Any]:
+    """Describe a bag or an MCAP file, of any messages, by its index: topics, when, how long."""
+    import_file_reader("rosbags", "tofclip[exchange]")
+    from rosbags import rosbag2
+
+    with guard(path, "is no ROS 2 bag, or damaged"), rosbag2.Reader(path) as reader:
+        topics = {
+            name: {"type": one.msgtype, "messages": one.msgcount}
+            for name, one in reader.topics.items()
+        }
+        start, seconds = (
+            time / NANOSECONDS_PER_SECOND for time in (reader.start_time, reader.duration)
+        )
+        return {"kind": "ROS 2 bag", "topics": topics, "start_s": start, "seconds": seconds}
+
+
 def _read_message(message: Any) -> StampedCloud:
     order = ">" if message.is_bigendian else "<"
     fields = [one for one in message.fields if one.count == 1]
