@@ -23,7 +23,7 @@ import scipy
 import tomli_w
 
 from tofclip.arrays import BoolArray, Float32Array, FloatArray, IndexArray
-from tofclip.camera import Camera, Measurement, SkewSweep, measure
+from tofclip.camera import Camera, SkewSweep, measure
 from tofclip.errors import InputError, require, require_known
 from tofclip.files import atomic_path, read_toml, suggest_name
 from tofclip.lidar import Pulse, depth
@@ -259,12 +259,8 @@ class Design:
 
     def plan_segments(self, frames: Frames) -> list[FrameSegment]:
         """Cut the frames where another shear is needed."""
-        nothing = np.zeros((1, frames.times.size), np.float32)
-        locked = self.views > 1
-        focus = DepthLockedFocus() if locked else FixedFocus()
-        return focus.plan_segments(
-            self.camera, frames.times, Measurement(nothing, nothing.astype(bool))
-        )
+        focus = DepthLockedFocus() if self.views > 1 else FixedFocus()
+        return focus.plan_segments(self.camera, frames.times)
 
     def prepare(self, shear: float) -> PreparedInverse:
         """Return the linear inverse; its Gram matrix is that of W A."""

@@ -250,7 +250,7 @@ def test_a_row_begins_at_its_own_picture_whatever_rows_were_lit_before():
     operator = camera.operator()
     seen = operator(scene)
     method = Sparse(iterations=600, gap=0.0)
-    recovery = WarmStartedRecovery(method, [(slice(0, 999), operator)], ~camera.dead_columns, 1)
+    recovery = WarmStartedRecovery(method, [(slice(0, 999), operator)], ~camera.dead_columns)
 
     def recover(*rows: int) -> dict[int, np.ndarray]:
         bins = TraceBins(np.array(rows), np.ones(len(rows), bool), np.ones(len(rows), np.float32))
@@ -266,6 +266,6 @@ def test_a_row_begins_at_its_own_picture_whatever_rows_were_lit_before():
         last = {row: picture for row, picture in last.items() if row in rows}
         for row, picture in last.items():
             assert np.linalg.norm(found[row] - picture) < 0.01 * np.linalg.norm(picture)
-        # one iteration from darkness, or from another row's picture, is far from it
+        # twelve iterations from darkness, or from another row's picture, are far from it
         truth = scene[..., new].ravel()
         assert np.linalg.norm(found[new] - truth) > 0.3 * np.linalg.norm(truth)

@@ -62,7 +62,7 @@ class Focus:
         self,
         camera: Camera,
         times: FloatArray,
-        measurement: Measurement,
+        measurement: Measurement | None = None,
         progress: Progress = ignore_progress,
     ) -> list[FrameSegment]:
         """Cut the frames at `times` (s of flight) into pieces, in order and without gaps.
@@ -72,8 +72,8 @@ class Focus:
         camera : Camera
         times : (frames,) float array
             Times of flight, s.
-        measurement : Measurement
-            Of the same frames.
+        measurement : Measurement, optional
+            Of the same frames; `SharpestFocus` needs it.
         progress : callable
             Called with the number of frame iterations just done, `work` of them.
 
@@ -108,7 +108,7 @@ class FixedFocus(Focus):
         self,
         camera: Camera,
         times: FloatArray,
-        measurement: Measurement,
+        measurement: Measurement | None = None,
         progress: Progress = ignore_progress,
     ) -> list[FrameSegment]:
         """Return a single piece."""
@@ -151,7 +151,7 @@ class DepthLockedFocus(Focus):
         self,
         camera: Camera,
         times: FloatArray,
-        measurement: Measurement,
+        measurement: Measurement | None = None,
         progress: Progress = ignore_progress,
     ) -> list[FrameSegment]:
         """Cut where the shear has changed by twice the tolerance, or light is a third weaker."""
@@ -199,10 +199,12 @@ class SharpestFocus(Focus):
         self,
         camera: Camera,
         times: FloatArray,
-        measurement: Measurement,
+        measurement: Measurement | None = None,
         progress: Progress = ignore_progress,
     ) -> list[FrameSegment]:
         """Try all shears on each gate."""
+        if measurement is None:
+            raise InputError("the sharpest shears are found in the measurements of a shot")
         starts = range(0, times.size, GATE_BINS)
         gates = [slice(start, min(start + GATE_BINS, times.size)) for start in starts]
         shears = np.linspace(self.first, self.last, self.number)

@@ -1,12 +1,11 @@
 """What does not change from shot to shot, made once in a process: operators and inverted matrices
 of a camera. Sequences, streams and views share them.
 
-Things are known by their content: two shots whose files carry the same camera share its operators.
+Operators are known by what they project: two shots whose files carry the same camera share its own.
 """
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from threading import Lock
@@ -15,18 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from tofclip.arrays import Array, BoolArray, namespace, to_numpy
+from tofclip.arrays import BoolArray
 from tofclip.camera import Camera
 from tofclip.operators import LinearOperator, LineProjection
-from tofclip.solvers import (
-    LinearInverse,
-    Method,
-    PreparedInverse,
-    Progress,
-    Result,
-    ignore_progress,
-)
-from tofclip.storage import Record
+from tofclip.solvers import LinearInverse, PreparedInverse
 
 # Frames at more shears than that make the further operators anew. Twice as many operators, so that
 # one whose inverse is kept is kept as well.
@@ -36,19 +27,20 @@ _inverse_lock = Lock()
 
 
 class _CachedCamera(Camera):
-    """A camera that is equal to others of its content, with which it shares operators. Memory: for
-    each of the operators 16 bytes for each of ``views * rows * columns * 2`` entries.
+    """A camera that is equal to others that project alike, with which it shares operators. Memory:
+    for each of the operators 16 bytes for each of ``views * rows * columns * 2`` entries.
     """
 
     @cached_property
-    def _digest(self) -> str:
-        return _hash_record(self.to_record())
+    def _projection(self) -> tuple[Any, ...]:
+        lines = self.centres_px, self.angles, self.gains, self.view_positions
+        return self.image_shape, self.slit_width_px, *(one.tobytes() for one in lines)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _CachedCamera) and self._digest == other._digest
+        return isinstance(other, _CachedCamera) and self._projection == other._projection
 
     def __hash__(self) -> int:
-        return hash(self._digest)
+        return hash(self._projection)
 
     def operator(self, shear: float = 0.0, dtype: DTypeLike = np.float32) -> LineProjection:
         """Return F(d), see `Camera.operator`; the same object for the same arguments."""
@@ -65,62 +57,22 @@ def get_cached_camera(camera: Camera) -> Camera:
     return _CachedCamera(**{one.name: getattr(camera, one.name) for one in fields(camera)})
 
 
-def _hash_record(record: Record) -> str:
-    """SHA-256 of a record's arrays and numbers, and of those inside it."""
-    digest = hashlib.sha256()
-    for name, field in sorted(record.fields.items()):
-        values = np.ascontiguousarray(field.values)
-        digest.update(f"{name} {values.dtype.str} {values.shape} {field.units}".encode())
-        digest.update(values.tobytes())
-    digest.update(repr(sorted(record.attributes.items())).encode())
-    for name, child in sorted(record.children.items()):
-        digest.update(f"{name} {_hash_record(child)}".encode())
-    return digest.hexdigest()
-
-
-def prepare_inverse(
-    method: LinearInverse, operator: LinearOperator, alive: BoolArray
-) -> PreparedInverse:
-    """Return what `LinearInverse.prepare` does, the same object for the same arguments; the 16
-    inverses used last are kept. `operator`: of a camera that `get_cached_camera` returned; another
-    one is not found again.
+@dataclass(frozen=True, repr=False)
+class CachedInverse(LinearInverse):
+    """The linear inverse, whose Gram matrices are inverted once for each operator of a camera that
+    `get_cached_camera` returned; another one is not found again. The 16 used last are kept.
     """
-    with _inverse_lock:  # threads that ask at the same time wait for a single preparation
-        return _prepare(method, operator, alive.tobytes())
+
+    def __repr__(self) -> str:
+        return repr(LinearInverse(self.damping))  # results say what was done, not what was kept
+
+    def prepare(self, operator: LinearOperator, alive: BoolArray | None = None) -> PreparedInverse:
+        """Do as `LinearInverse.prepare`; the same object for the same arguments."""
+        known = np.ones(operator.shape_out, bool) if alive is None else alive
+        with _inverse_lock:  # threads that ask at the same time wait for a single preparation
+            return _prepare(self.damping, operator, known.tobytes())
 
 
 @lru_cache(maxsize=MAX_CACHED_INVERSES)
-def _prepare(method: LinearInverse, operator: Any, alive: bytes) -> PreparedInverse:
-    return method.prepare(operator, np.frombuffer(alive, bool))
-
-
-@dataclass(frozen=True, repr=False)
-class CachedInverse(Method):
-    """The linear inverse, whose Gram matrices are inverted once for each operator that is kept."""
-
-    method: LinearInverse
-    name = "linear"
-    portable = True
-
-    def __repr__(self) -> str:
-        return repr(self.method)
-
-    def recover(
-        self,
-        operator: LinearOperator,
-        measurements: Array,
-        valid: Array | None = None,
-        progress: Progress = ignore_progress,
-    ) -> Result:
-        """Recover one picture per column of `measurements`; see `LinearInverse.recover`. A slit
-        column that is dead in every frame drops out of the Gram matrix; one masked in some frames
-        stays.
-        """
-        alive = np.ones(operator.shape_out, bool)
-        if valid is not None:
-            alive = to_numpy(namespace(valid).any(valid, axis=1))
-        return prepare_inverse(self.method, operator, alive).recover(measurements, progress)
-
-    def work(self, frames: int) -> int:
-        """Return how many frame iterations `recover` reports at most."""
-        return self.method.work(frames)
+def _prepare(damping: float, operator: Any, alive: bytes) -> PreparedInverse:
+    return LinearInverse(damping).prepare(operator, np.frombuffer(alive, bool))

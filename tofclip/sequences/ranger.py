@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tofclip.arrays import BoolArray, Float32Array, FloatArray
-from tofclip.camera import Camera, Measurement, Rectifier
+from tofclip.camera import Camera, Rectifier
 from tofclip.errors import ShapeError
-from tofclip.lidar import Detection, PointCloud, point_cloud
+from tofclip.lidar import PointCloud, point_cloud
 from tofclip.lidar.pulse_tables import PictureTraces, TraceBins, Traces
 from tofclip.lidar.search import ReturnSearch, keep_probable
 from tofclip.lidar.signal_rows import RowBlock, SignalRowFinder
@@ -39,7 +39,7 @@ from tofclip.recovery.defects import estimate_noise
 from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces
 from tofclip.recovery.surfaces.returns import list_returns
-from tofclip.sequences.cache import get_cached_camera, prepare_inverse
+from tofclip.sequences.cache import CachedInverse, get_cached_camera
 from tofclip.sequences.counting import StillSum
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse, ProximalMethod, Sparse
@@ -69,11 +69,10 @@ class WarmStartedRecovery:
         method: ProximalMethod,
         places: Sequence[tuple[slice, LinearOperator]],
         alive: BoolArray,
-        iterations: int = WARM_ITERATIONS,
     ) -> None:
         self.method, self._places, self._alive = method, places, alive
         # so few iterations end before the gap is looked at
-        self._warm = replace(method, iterations=iterations, gap=0.0)
+        self._warm = replace(method, iterations=WARM_ITERATIONS, gap=0.0)
         self._rows = np.zeros(0, np.int64)
         self._pictures = np.zeros((0, *places[0][1].shape_in), np.float32)
 
@@ -90,27 +89,16 @@ class WarmStartedRecovery:
         for place, operator in self._places:
             own = slice(*np.searchsorted(rows, [place.start, place.stop]))
             if own.start < own.stop:
-                known = bool(np.isin(rows[own], shared).any())
-                found[own] = self._recover_place(operator, seen[:, own], found[own], known)
+                part, alive = seen[:, own], self._alive[:, np.newaxis]
+                valid = None if alive.all() else np.repeat(alive, part.shape[1], axis=1)
+                # of rows that were dark before nothing is known: as many iterations as at first
+                known = np.isin(rows[own], shared).any()
+                method, start = (self._warm, found[own]) if known else (self.method, None)
+                found[own] = method.recover(operator, part, valid, start=start).frames
         self._rows, self._pictures = rows, found
         pictures = np.zeros((bins.numbers.size, *found.shape[1:]), np.float32)
         pictures[lit] = found
         return PictureTraces(pictures, bins)
-
-    def _recover_place(
-        self,
-        operator: LinearOperator,
-        seen: Float32Array,
-        start: Float32Array,
-        known: bool,
-    ) -> Float32Array:
-        """Recover rows of one shear, beginning at `start` where some of them are `known`."""
-        valid = None if self._alive.all() else np.repeat(self._alive[:, None], seen.shape[1], 1)
-        if known:
-            frames = self._warm.recover(operator, seen, valid, start=start).frames
-        else:
-            frames = self.method.recover(operator, seen, valid).frames
-        return np.asarray(frames, np.float32)
 
 
 class SurfacePipeline:
@@ -271,26 +259,22 @@ class RangingPipeline:
         row_times: FloatArray,
         method: LinearInverse | ProximalMethod | None = None,
         focus: Focus = DEFAULT_FOCUS,
-        detection: Detection | None = None,
     ) -> None:
         focus.check_camera(camera)
         self.method = LinearInverse() if method is None else method
         self.method_name = self.method.name
         # Rows with light are told by the filter matched to the operator, whatever recovers them.
-        inverse = self.method if isinstance(self.method, LinearInverse) else LinearInverse()
+        own = self.method if isinstance(self.method, LinearInverse) else LinearInverse()
+        inverse = CachedInverse(own.damping)
         self.camera = camera
         self.times = np.asarray(row_times, dtype=np.float64) - camera.time_zero
         self.rectifier = Rectifier(camera, self.times.size)
-        # The focus is one that does not look at the shot, so that an empty one does for the plan.
-        nothing = Measurement(np.empty((0, 0), np.float32), np.empty((0, 0), bool))
-        pieces = focus.plan_segments(camera, self.times, nothing)
+        pieces = focus.plan_segments(camera, self.times)
         cached = get_cached_camera(camera)
         alive, self.pixels = ~camera.dead_columns, order_by_patch(camera.image_shape)
         operators = [cached.operator(piece.shear) for piece in pieces]
         self.places = [
-            RowBlock(
-                piece.frames, InverseTraces(prepare_inverse(inverse, operator, alive), self.pixels)
-            )
+            RowBlock(piece.frames, InverseTraces(inverse.prepare(operator, alive), self.pixels))
             for piece, operator in zip(pieces, operators, strict=True)
         ]
         self._warm_start: WarmStartedRecovery | None = None
@@ -299,7 +283,7 @@ class RangingPipeline:
             places = list(zip(rows, operators, strict=True))
             self._warm_start = WarmStartedRecovery(self.method, places, alive)
         shears = np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces])
-        self._search = ReturnSearch(camera, self.times, detection, shears=shears)
+        self._search = ReturnSearch(camera, self.times, shears=shears)
         # mean duration of a row: the sweep is nearly even
         row = float(self.times[-1] - self.times[0]) / (self.times.size - 1)
         limit, width = self._search.detection.signal_to_noise, self._search.pulse.fwhm / row

@@ -129,7 +129,7 @@ def recover_shot(recovery: RecoverySettings, shot: Shot, result: Path) -> None:
         known = replace(plan.shot, camera=get_cached_camera(plan.shot.camera))
         plan = replace(plan, shot=known)
         if isinstance(plan.method, LinearInverse):
-            plan = replace(plan, method=CachedInverse(plan.method))
+            plan = replace(plan, method=CachedInverse(plan.method.damping))
     plan.add_provenance(plan.run()).save(result)
 
 

@@ -63,7 +63,7 @@ def make_pipeline(
     camera: Path | Camera | None = None,
     time_zero: float | None = None,
     focus: Focus = DEFAULT_FOCUS,
-    method: str | LinearInverse | ProximalMethod | None = None,
+    method: str | LinearInverse | ProximalMethod | SurfaceRecovery | None = None,
     average: int = 1,
 ) -> CloudPipeline:
     """Prepare for shots like this one: `PhotonPipeline` for histograms of a picture; of streak images
@@ -79,7 +79,7 @@ def make_pipeline(
         Reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
     focus : Focus
         One that needs no look at the shot: ``FixedFocus`` or ``DepthLockedFocus``.
-    method : str, LinearInverse or ProximalMethod, optional
+    method : str, LinearInverse, ProximalMethod or SurfaceRecovery, optional
         Of streak images alone: ``"l1"``, the default, ``"tv"``, ``"linear"``, ``"surfaces"``, or another name of
         `tofclip.plugins.METHODS` that stands for one with a prior.
     average : int
@@ -113,7 +113,7 @@ def make_pipeline(
         )
     pipeline: RangingPipeline | SurfacePipeline
     if isinstance(chosen, SurfaceRecovery):  # each surface is recovered at the shear of its range
-        pipeline = SurfacePipeline.for_shot(shot, camera, time_zero)
+        pipeline = SurfacePipeline.for_shot(shot, camera, time_zero, chosen)
     else:
         pipeline = RangingPipeline.for_shot(shot, camera, focus, time_zero, chosen)
     return pipeline if average == 1 else AveragedPipeline(pipeline, average, shot)
