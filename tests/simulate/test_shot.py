@@ -29,7 +29,7 @@ from tofclip.simulate.patterns import (
     make_rings,
     make_stripes,
 )
-from tofclip.simulate.streak import cast_view_rays, render_streak
+from tofclip.simulate.streak import render_streak
 from tofclip.units import SPEED_OF_LIGHT
 
 ORIGIN = np.zeros(3)
@@ -159,17 +159,12 @@ def plate(pattern: np.ndarray, size: tuple[float, float], depth: float = 2.0) ->
     return Scene((make_plate((0, 0, depth), size, pattern),))
 
 
-def view_image(scene: Scene, made: Instrument, view: int) -> np.ndarray:
-    position = float(made.camera.view_positions[view])
-    return render_streak(cast_view_rays(scene, made, position), view, made)
-
-
 @given(
     x=st.floats(-15, 15), y=st.floats(-15, 15), depth=st.floats(1.2, 3.0), view=st.integers(0, 2)
 )
 def test_a_point_falls_on_the_column_and_row_of_the_camera_s_formula(x, y, depth, view):
     made = instrument(around=depth)
-    image = view_image(spot(x, y, depth), made, view)
+    image = render_streak(spot(x, y, depth), made, view)
     u = made.camera.view_positions[view]
     shear = -FOCAL * WIDE_PITCH * (1 / depth - 1 / FOCUS)
     assert made.camera.shear_at(depth) == pytest.approx(shear)
@@ -190,7 +185,7 @@ def test_views_agree_at_the_focus_and_move_apart_in_front_of_it():
     made = instrument()
     assert made.camera.shear_at(1.0) < made.camera.shear_at(FOCUS) == 0 < made.camera.shear_at(3.0)
     in_focus, near = (
-        [centroid(view_image(scene, instrument(around=depth), k).sum(axis=0)) for k in range(3)]
+        [centroid(render_streak(scene, instrument(around=depth), k).sum(axis=0)) for k in range(3)]
         - CENTRES
         for depth, scene in ((depth, spot(0.2, 0.1, depth)) for depth in (FOCUS, 1.4))
     )
@@ -201,13 +196,13 @@ def test_views_agree_at_the_focus_and_move_apart_in_front_of_it():
 
 def test_the_pulse_has_its_width_and_a_sub_bin_delay():
     made = instrument()
-    profile = view_image(spot(), made, 1).sum(axis=1)
+    profile = render_streak(spot(), made, 1).sum(axis=1)
     # beside the middle of the spot its range is longer, by 2 m / (12 * 200^2) = 4 um or 1.4e-3 bin
     # on average
     assert centroid(profile) == pytest.approx(60.0 + 1.4e-3, abs=1e-4)
     # a row integrates over its width
     assert width(profile, 60.0) == pytest.approx(SIGMA_BIN**2 + 1 / 12, rel=1e-3)
-    later = view_image(spot(depth=2.0 + 0.3 * SPEED_OF_LIGHT * BIN / 2), made, 1).sum(axis=1)
+    later = render_streak(spot(depth=2.0 + 0.3 * SPEED_OF_LIGHT * BIN / 2), made, 1).sum(axis=1)
     assert centroid(later) == pytest.approx(60.3 + 1.4e-3, abs=1e-4)
 
 
@@ -215,20 +210,22 @@ def test_no_light_is_lost_between_the_rays_and_the_slit():
     made, pattern = instrument(), make_stripes(3, 0.2, 0.9)
     scene = Scene((make_plate((0.02, -0.01, 2.1), (0.25, 0.2), pattern, yaw=0.2),))
     for view in range(3):
-        rays = cast_view_rays(scene, made, float(made.camera.view_positions[view]))
+        hits = made.look_at(scene, float(made.camera.view_positions[view]))
+        seen, rays = hits.reflectance > 0, made.rays_per_pixel_side**2
+        light = np.sum(hits.reflectance[seen] / hits.distance[seen] ** 2) / rays
         # the pulse is cut at 5 standard deviations, 6e-7 of its energy
-        expected = GAINS[view] * rays.brightness.sum()
-        assert render_streak(rays, view, made).sum() == pytest.approx(expected, rel=1e-6)
+        expected = pytest.approx(GAINS[view] * light, rel=1e-6)
+        assert render_streak(scene, made, view).sum() == expected
 
 
 def test_light_beyond_the_screen_is_lost_quietly():
     made = instrument(rows=61)  # the pulse's second half would fall on rows 61 and later
-    whole = view_image(spot(), instrument(), 1)
-    np.testing.assert_allclose(view_image(spot(), made, 1), whole[:61])
+    whole = render_streak(spot(), instrument(), 1)
+    np.testing.assert_allclose(render_streak(spot(), made, 1), whole[:61])
     aside = made.camera.replace(centres_px=np.array([1.0, 170.3, 338.0]))
     scene = plate(make_plain_pattern(0.8), (0.5, 0.4))
-    edge = view_image(scene, replace(made, camera=aside), 0)
-    assert 0 < edge.sum() < 0.7 * view_image(scene, made, 0).sum()
+    edge = render_streak(scene, replace(made, camera=aside), 0)
+    assert 0 < edge.sum() < 0.7 * render_streak(scene, made, 0).sum()
 
 
 @pytest.mark.parametrize("depth", [1.7, 2.0, 2.6])
@@ -256,14 +253,14 @@ def test_a_side_view_looks_behind_the_occluder():
     made, lamp = instrument(lenslet_pitch=0.12), (0.0, -1.0, 0.0)
     behind = slice(45, 76)  # rows around range 2 m
     for bodies in ((near, hidden), (hidden, near)):
-        assert view_image(Scene(bodies, lamp), made, 1)[behind].sum() == 0
-    alone, seen = (view_image(Scene(b, lamp), made, 0) for b in ((hidden,), (near, hidden)))
+        assert render_streak(Scene(bodies, lamp), made, 1)[behind].sum() == 0
+    alone, seen = (render_streak(Scene(b, lamp), made, 0) for b in ((hidden,), (near, hidden)))
     assert seen.sum() > 0.5 * alone.sum() > 0
 
 
 def test_brightness_falls_with_the_square_of_the_range():
     # the spot fills the same pixel at both ranges
-    near, far = (view_image(spot(depth=d), instrument(around=d), 1).sum() for d in (1.8, 3.6))
+    near, far = (render_streak(spot(depth=d), instrument(around=d), 1).sum() for d in (1.8, 3.6))
     assert near / far == pytest.approx(4.0, rel=1e-3)
 
 
@@ -271,7 +268,7 @@ def test_a_sweep_that_is_skewed_moves_and_stretches_the_rows():
     sweep = SkewSweep(CENTRES, np.array([-7.5, 0.0, 6.25]), np.array([0.02, 0.0, -0.05]))
     for view, (offset, stretch) in enumerate(zip(sweep.offsets_bin, sweep.stretches, strict=True)):
         straight, skewed = (
-            view_image(spot(), made, view).sum(axis=1)
+            render_streak(spot(), made, view).sum(axis=1)
             for made in (instrument(), instrument(sweep=sweep))
         )
         # the spot lies within a pixel of the view's centre, where the skew changes by 0.07 rows a

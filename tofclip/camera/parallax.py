@@ -208,13 +208,13 @@ def find_sharpest_shears(
     for column, shear in enumerate(tried):
         operator = camera.operator(float(shear))
         for row, gate in enumerate(gates):
-            measurements = np.ascontiguousarray(measurement.values[:, gate])
-            valid = np.ascontiguousarray(measurement.valid[:, gate])
-            if operator.adjoint(measurements * valid).max() <= 0:
-                progress(GATE_METHOD.work(measurements.shape[1]))  # dark
+            part = measurement.select(gate)
+            if operator.adjoint(part.values * part.valid).max() <= 0:
+                progress(GATE_METHOD.work(part.values.shape[1]))  # dark
                 continue
-            frames = GATE_METHOD.recover(operator, measurements, valid, progress).frames
-            table[row, column] = relative_residual(operator, frames, measurements, valid) ** -2
+            frames = GATE_METHOD.recover(operator, part.values, part.valid, progress).frames
+            left = relative_residual(operator, frames, part.values, part.valid)
+            table[row, column] = left**-2
     good = measurement.values * measurement.valid
     light = np.array([np.sum(good[:, gate].clip(0)) for gate in gates])
     return _fit_focus_curve(table, tried, light)

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import BoolArray, Float32Array, IntArray
+from tofclip.arrays import BoolArray, Float32Array, IndexArray, IntArray
 from tofclip.camera.model import Camera
 from tofclip.errors import CalibrationError, InputError, ShapeError
 from tofclip.threads import LANES, count_block_threads, run_blocks, split_blocks
@@ -39,6 +39,10 @@ class Measurement:
 
     values: Float32Array
     valid: BoolArray
+
+    def select(self, frames: slice | IndexArray) -> Measurement:
+        """Return the measurements of some `frames`, by a slice or by numbers."""
+        return Measurement(self.values[:, frames], self.valid[:, frames])
 
 
 def measure(

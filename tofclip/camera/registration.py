@@ -205,12 +205,12 @@ def register_views(
     for number in range(max_rounds + 1):
         measurement = measure(counts, saturated, camera)
         chosen = _select_frames(measurement)
-        part = Measurement(measurement.values[:, chosen], measurement.valid[:, chosen])
+        part = measurement.select(chosen)
         groups = _group_by_shear(camera, times, chosen)
         model = _Model(camera, groups)
         pictures = model.recover(part, progress)
         predicted = model.predict(pictures)
-        misfit, good = part.values - predicted, part.valid.astype(bool)
+        misfit, good = part.values - predicted, part.valid
         residual = np.linalg.norm(misfit[good]) / np.linalg.norm(part.values[good])
         residuals.append(float(residual))
         best = min(best, (residuals[-1], camera), key=lambda pair: pair[0])
@@ -266,9 +266,9 @@ class _Model:
         """Recover the chosen frames, (rows, columns, frames)."""
         pictures = []
         for frames, operator in self._parts:
-            values = np.ascontiguousarray(part.values[:, frames])
-            valid = np.ascontiguousarray(part.valid[:, frames])
-            pictures.append(REGISTRATION_METHOD.recover(operator, values, valid, progress).frames)
+            some = part.select(frames)
+            found = REGISTRATION_METHOD.recover(operator, some.values, some.valid, progress)
+            pictures.append(found.frames)
         return np.ascontiguousarray(np.moveaxis(np.concatenate(pictures), 0, -1))
 
     def predict(self, pictures: Array) -> Array:

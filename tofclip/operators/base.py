@@ -349,7 +349,7 @@ class BlockDiagonal(_Joined):
         return namespace(block).stack(parts)
 
 
-class Integration(LinearOperator):
+class Integration(Adjoint):
     """The sum of what an operator makes of each entry of the input's first axis: ``[A_1, A_2, ...]
     [x_1; x_2; ...]``.
 
@@ -359,18 +359,10 @@ class Integration(LinearOperator):
 
     def __init__(self, operators: Sequence[LinearOperator]) -> None:
         first = _require_alike("an integration", operators, 0)
-        super().__init__((len(operators), *first.shape_in), first.shape_out, first.dtype)
-        self._set_parts(*operators)
-
-    def _forward(self, block: Array) -> Array:
-        total = zeros((*self.shape_out, block.shape[-1]), block)
-        for k, operator in enumerate(self.parts):
-            total += operator._forward(block[k, ...])
-        return total
-
-    def _adjoint(self, block: Array) -> Array:
-        # the sensor did not keep apart what fell on it
-        return namespace(block).stack([operator._adjoint(block) for operator in self.parts])
+        # the sensor did not keep apart what fell on it: each view gets back all of it
+        every = Stack([operator.H for operator in operators])
+        views = Reshape(every.shape_out, (len(operators), *first.shape_in), first.dtype)
+        super().__init__(views @ every)
 
 
 class Selection(LinearOperator):

@@ -345,19 +345,17 @@ def trace_view_point_spreads(
     element: ApertureElement,
     views: Sequence[View],
     shape: tuple[int, int],
-    rays: int = RAYS_PER_SIDE,
 ) -> FloatArray:
     """Trace each view's PSF ``r(x, -u_k)``, (views, rows, columns): the light that passes its patch of
     the aperture, one view step wide, from a point at infinity. The patches fill the aperture; all PSFs
-    together have the sum 1 for an element that lets all light pass onto `shape`. There are `rays` along
-    each side of a patch.
+    together have the sum 1 for an element that lets all light pass onto `shape`.
     """
     grid = np.asarray(views, dtype=np.float64)
     middle = (grid.max(axis=0) + grid.min(axis=0)) / 2
     # every view looks through a part one view step wide, hence the + 1
     half = (np.ptp(grid, axis=0) + 1) / 2
     # Rays at the middles of even cells, the same for each view.
-    within = (np.arange(rays) + 0.5) / rays - 0.5
+    within = (np.arange(RAYS_PER_SIDE) + 0.5) / RAYS_PER_SIDE - 0.5
     spreads = np.empty((len(grid), *shape))
     for spread, view in zip(spreads, grid, strict=True):
         v, u = (
@@ -366,7 +364,9 @@ def trace_view_point_spreads(
         )
         # an open aperture passes light 1, all views together
         transmission, down, right = element.trace_rays(v[:, np.newaxis], u[np.newaxis, :])
-        spread[:] = _accumulate_rays(transmission / (rays**2 * len(grid)), down, right, shape)
+        spread[:] = _accumulate_rays(
+            transmission / (RAYS_PER_SIDE**2 * len(grid)), down, right, shape
+        )
     return spreads
 
 

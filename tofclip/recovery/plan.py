@@ -12,7 +12,6 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -171,10 +170,35 @@ class RecoveryPlan:
             As `recover` returns them.
         """
         started = time.perf_counter()
-        shot = self.shot.fit_camera(progress)
-        streak, method = shot.streak, self.method
+        shot, method = self.shot.fit_camera(progress), self.method
+        streak, clipping = shot.streak, find_clipping_level(shot.streak.counts)
         measurement = measure(streak.counts, streak.saturated, shot.camera)
-        recover_frames = partial(self._recover_frames, shot, measurement, progress)
+
+        def recover_frames(method: Method, focus: Focus) -> Frames:
+            found = recover_measurement(
+                method,
+                shot.camera,
+                shot.times,
+                measurement,
+                describe_noise(streak, measurement) if method.has_prior else None,
+                focus,
+                self.device,
+                clip_from_below(streak, clipping),
+                progress,
+            )
+            of_shot = {
+                "method": method.name,
+                "focus": str(focus),
+                "device": str(self.device),
+                **count_defects(streak, clipping),
+            }
+            return replace(
+                found,
+                figures={**found.figures, **of_shot},
+                attachments=streak.attachments,
+                provenance={**streak.provenance, **found.provenance},
+            )
+
         if isinstance(method, SurfaceRecovery):
             found = self._recover_surfaces(shot, method, recover_frames, progress)
             seconds = time.perf_counter() - started
@@ -184,40 +208,6 @@ class RecoveryPlan:
             pace = {"seconds": time.perf_counter() - started}
         return replace(found, figures={**found.figures, **pace})
 
-    def _recover_frames(
-        self,
-        shot: Shot,
-        measurement: Measurement,
-        progress: Progress,
-        method: Method,
-        focus: Focus,
-    ) -> Frames:
-        """Recover every frame from its measurements alone."""
-        streak, clipping = shot.streak, find_clipping_level(shot.streak.counts)
-        found = recover_measurement(
-            method,
-            shot.camera,
-            shot.times,
-            measurement,
-            describe_noise(streak, measurement) if method.has_prior else None,
-            focus,
-            self.device,
-            clip_from_below(streak, clipping),
-            progress,
-        )
-        of_shot = {
-            "method": method.name,
-            "focus": str(focus),
-            "device": str(self.device),
-            **count_defects(streak, clipping),
-        }
-        return replace(
-            found,
-            figures={**found.figures, **of_shot},
-            attachments=streak.attachments,
-            provenance={**streak.provenance, **found.provenance},
-        )
-
     def _recover_surfaces(
         self,
         shot: Shot,
@@ -226,7 +216,11 @@ class RecoveryPlan:
         progress: Progress,
     ) -> Frames:
         """Recover frames, quickly, and then the surfaces in them; or better frames where there are none."""
-        why = None if method.otherwise is None else self._find_reason_for_frames()
+        why = None
+        if method.otherwise is not None and RELAY_WALL in shot.streak.attachments:
+            why = "the light is that of a relay wall"
+        elif method.otherwise is not None and self.focus != DEFAULT_FOCUS:
+            why = "frames at a given focus are asked for"
         if why is None:
             focus = DepthLockedFocus() if shot.camera.lenslet_pitch > 0 else self.focus
             start = recover_frames(method.start, focus)
@@ -240,12 +234,6 @@ class RecoveryPlan:
         assert method.otherwise is not None
         found = recover_frames(method.otherwise, self.focus)
         return replace(found, figures={**found.figures, "why_no_surfaces": why})
-
-    def _find_reason_for_frames(self) -> str | None:
-        """Say why frames are wanted, whatever the light is on; None if they are not."""
-        if RELAY_WALL in self.shot.streak.attachments:
-            return "the light is that of a relay wall"
-        return None if self.focus == DEFAULT_FOCUS else "frames at a given focus are asked for"
 
     def add_provenance(self, frames: Frames, *inputs: str | Path) -> Frames:
         """Return frames that say how they came about.
@@ -455,17 +443,12 @@ def recover_segments(
         if peak <= 0:
             progress(method.work(segment.size))  # dark: nothing to recover
             continue
-        part, operator = _slice_measurement(measurement, segment), camera.operator(segment.shear)
+        part, operator = measurement.select(segment.frames), camera.operator(segment.shear)
         weighted = method.scale_weight(float(bright / peak))
         result = weighted.recover(operator, part.values, part.valid, progress)
         frames[segment.frames, ...] = result.frames
         results.append(replace(result, frames=frames[segment.frames, ...]))
     return _join_results(frames, results)
-
-
-def _slice_measurement(measurement: Measurement, segment: FrameSegment) -> Measurement:
-    columns = segment.frames
-    return Measurement(measurement.values[:, columns], measurement.valid[:, columns])
 
 
 def _zero_invalid(part: Measurement) -> Array:
@@ -475,7 +458,7 @@ def _zero_invalid(part: Measurement) -> Array:
 def _find_peak(camera: Camera, measurement: Measurement, segment: FrameSegment) -> float:
     """Largest value of F'f over a segment's valid measurements."""
     operator = camera.operator(segment.shear)
-    measurements = _zero_invalid(_slice_measurement(measurement, segment))
+    measurements = _zero_invalid(measurement.select(segment.frames))
     xp = namespace(measurements)
     blocks = split_blocks(measurements.shape[1], frames_per_block(operator, measurements))
     return max(float(xp.max(operator.adjoint(measurements[:, block]))) for block in blocks)
@@ -521,12 +504,8 @@ def recover_glints(
         some = own[dazzled[:, own].any(axis=0)]
         if not some.size:
             continue
-        operator = camera.operator(segment.shear)
-        whole = method.recover(
-            operator,
-            device.put(np.ascontiguousarray(measurement.values[:, some])),
-            device.put(np.ascontiguousarray(measurement.valid[:, some])),
-        )
+        operator, part = camera.operator(segment.shear), measurement.select(some)
+        whole = method.recover(operator, device.put(part.values), device.put(part.valid))
         glints = find_glints(operator, dazzled[:, some])
         complete[some] = np.where(glints, to_numpy(whole.frames), complete[some])
     return complete
@@ -538,7 +517,7 @@ def compute_segments_residual(
     """Return ``|F h - f| / |f|`` over all valid measurements, each frame with its own operator."""
     misfit = energy = 0.0
     for segment in segments:
-        part = _slice_measurement(measurement, segment)
+        part = measurement.select(segment.frames)
         xp = namespace(part.values)
         own = float(xp.sum(_zero_invalid(part) ** 2, dtype=xp.float64))
         if own > 0:

@@ -171,10 +171,6 @@ class Lambertian:
         found: Array = self.pattern[row, column]
         return found
 
-    def is_solid(self, place: Array) -> Array:
-        """Return where there is no hole."""
-        return np.isfinite(self.reflectance(place))
-
     def radiance(self, place: Array, normal: Array, directions: Array, light: Array) -> Array:
         """Return the light that goes back along rays, (points,), from each `place` on the surface.
 
@@ -237,7 +233,7 @@ class Body:
         `Shape.intersect`.
         """
         found = self.shape.intersect((origin - self.centre) @ self.axes, directions @ self.axes)
-        solid = self.material.is_solid(found.pattern_position)
+        solid = np.isfinite(self.material.reflectance(found.pattern_position))
         return Hits(
             np.where(solid, found.distance, np.inf),
             found.normal @ self.axes.T,

@@ -261,48 +261,30 @@ class Instrument:
         return np.stack([x / focal - aside, y / focal, np.ones_like(x)], axis=-1)
 
 
-class RayBundle(NamedTuple):
-    """The light that one view receives."""
-
-    x: FloatArray  # (n,), where the rays fall in the view's picture, pixels from its optical axis
-    y: FloatArray
-    time: FloatArray  # (n,), arrival, s after time zero
-    # (n,), arbitrary units, the same for all views; proportional to reflectance / range^2
-    brightness: FloatArray
-
-
-def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundle:
-    """Cast the rays of the view at `position` view steps; those that bring no light are left out."""
-    (x, y), hits = instrument.pixel_grid(), instrument.look_at(scene, position)
-    bright = (hits.body != NO_BODY) & (hits.reflectance > 0)
-    share = 1 / instrument.rays_per_pixel_side**2
-    return RayBundle(
-        x[bright],
-        y[bright],
-        2 * hits.path[bright] / SPEED_OF_LIGHT,
-        # light falls with the square of the distance, on the way back from a matt surface
-        share * hits.reflectance[bright] / hits.distance[bright] ** 2,
-    )
-
-
-def render_streak(rays: RayBundle, view: int, instrument: Instrument) -> FloatArray:
-    """Put one view's light on the streak image: (rows, columns), in the units of the rays'
-    brightness; views are counted from 0.
+def render_streak(scene: Scene, instrument: Instrument, view: int) -> FloatArray:
+    """Put the light of one view, counted from 0, on the streak image: (rows, columns), in arbitrary
+    units, the same for all views; proportional to reflectance / range^2.
     """
     camera, detector = instrument.camera, instrument.detector
+    (x, y), hits = (
+        instrument.pixel_grid(),
+        instrument.look_at(scene, float(camera.view_positions[view])),
+    )
+    bright = (hits.body != NO_BODY) & (hits.reflectance > 0)
+    # light falls with the square of the distance, on the way back from a matt surface
+    brightness = hits.reflectance[bright] / hits.distance[bright] ** 2
+    brightness *= camera.gains[view] / instrument.rays_per_pixel_side**2
     # a cylindrical lenslet turned by the angle images a point as a slanted line, which crosses the
     # slit here
-    slit = camera.centres_px[view] + rays.x - rays.y * np.tan(camera.angles[view])
-    row = (rays.time + camera.time_zero) / detector.bin_width
+    slit = camera.centres_px[view] + x[bright] - y[bright] * np.tan(camera.angles[view])
+    row = (2 * hits.path[bright] / SPEED_OF_LIGHT + camera.time_zero) / detector.bin_width
     stretch = np.ones_like(row)
     if camera.sweep is not None:
         # raw rows for one rectified row, which lengthen the pulse as well
         late, early = (camera.sweep.raw_position(row + half, slit)[0] for half in (0.5, -0.5))
         stretch = late - early
         row, slit = camera.sweep.raw_position(row, slit)
-    ray, column, light = _split_over_columns(
-        slit, camera.gains[view] * rays.brightness, instrument.rays_per_pixel_side
-    )
+    ray, column, light = _split_over_columns(slit, brightness, instrument.rays_per_pixel_side)
     first, pulse = spread_pulse(row, stretch * compute_pulse_sigma_bins(instrument))
     reach, width = pulse.shape[1], camera.slit_width_px
     seen = (first[ray] > -reach) & (first[ray] < detector.rows) & (column >= 0) & (column < width)
@@ -525,8 +507,8 @@ def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedS
     camera, detector = instrument.camera, instrument.detector
     # In relative units: the exposure below decides what a unit is in photons.
     light = np.zeros((detector.rows, camera.slit_width_px))
-    for view, position in enumerate(camera.view_positions):
-        light += render_streak(cast_view_rays(scene, instrument, float(position)), view, instrument)
+    for view in range(camera.views):
+        light += render_streak(scene, instrument, view)
     require(
         light.any(),
         "no light of the scene reaches the streak image: check positions, number of rows and time zero",
