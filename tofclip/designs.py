@@ -166,12 +166,8 @@ class Design:
 
     @classmethod
     def load(cls, path: str | Path) -> Design:
-        """Read a TOML file.
-
-        Raises
-        ------
-        FileFormatError, InputError
-            It is no TOML file, has an unknown key, or a value that no instrument has.
+        """Read a TOML file, `path`; `FileFormatError` or `InputError` where it is none, has an unknown
+        key, or a value that no instrument has.
         """
         found = read_toml(path, "a design")
         try:

@@ -44,19 +44,10 @@ class Parts(Mapping[str, Any]):
         self.registered: dict[str, Any] = {}
 
     def register(self, name: str, part: Any) -> None:
-        """Add a part for as long as this program runs; the same name again replaces it.
-
-        Parameters
-        ----------
-        name : str
-        part : object
-            As the entry point of a package names it: the class or function that makes a method or a
-            denoiser of its settings, a `Reader`, or a function from an address to a source.
-
-        Raises
-        ------
-        InputError
-            We have a part of that name ourselves.
+        """Add a `part` of that `name` for as long as this program runs; the same name again replaces
+        it. It is what the entry point of a package names: the class or function that makes a method
+        or a denoiser of its settings, a `Reader`, or a function from an address to a source.
+        `InputError` where we have a part of that name ourselves.
         """
         require(
             name not in self.own, f"the {self.kind} '{name}' is tofclip's own; take another name"

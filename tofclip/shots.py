@@ -306,18 +306,9 @@ class Returns(Storable):
         return replace(self, **{name: column[chosen] for name, column in self._columns.items()})
 
     def select(self, which: str) -> Returns:
-        """Return one return of each pixel, or all of them.
-
-        Parameters
-        ----------
-        which : str
-            ``"first"`` is the nearest of a pixel, ``"last"`` the furthest, ``"strongest"`` the one
-            of the highest intensity; ``"all"`` are all.
-
-        Raises
-        ------
-        InputError
-            There is no such choice.
+        """Return one return of each pixel, or all of them; `which` is ``"first"``, the nearest of a
+        pixel, ``"last"``, the furthest, ``"strongest"``, of the highest intensity, or ``"all"``;
+        `InputError` for another.
         """
         require_known("return", which, RETURN_CHOICES)
         if which == "all":
@@ -454,19 +445,9 @@ class Frames(Storable):
         range: tuple[float, float] | None = None,  # noqa: A002 - the field's word
         time: tuple[float, float] | None = None,
     ) -> Frames:
-        """Return the frames of some ranges, or of some times of flight, ends included.
-
-        Parameters
-        ----------
-        range : (float, float), optional
-            Nearest and furthest range, m.
-        time : (float, float), optional
-            First and last time of flight, s.
-
-        Raises
-        ------
-        InputError
-            Neither is given, or both are, or no frame lies between.
+        """Return the frames of a `range`, (nearest, furthest), m, or of a `time` of flight, (first,
+        last), s, ends included. `InputError` where neither is given, or both are, or no frame lies
+        between.
         """
         require(
             (range is None) != (time is None),

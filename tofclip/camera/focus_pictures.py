@@ -59,13 +59,9 @@ class FocusCalibration:
     dots: FloatArray
 
     def camera(self, **settings: Any) -> Camera:
-        """Make a `Camera`; the picture is as high as the longest line and as wide as the views'
-        pitch.
-
-        Parameters
-        ----------
-        **settings
-            Further entries of `Camera`, such as ``time_zero`` or another ``image_shape``.
+        """Make a `Camera`; the picture is as high as the longest line and as wide as the views' pitch.
+        `settings` are further entries of `Camera`, such as ``time_zero`` or another
+        ``image_shape``.
         """
         width = height = int(np.ptp(self.line_rows_px, axis=1).max()) // 2 * 2
         if self.centres_px.size > 1:

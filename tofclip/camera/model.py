@@ -36,18 +36,8 @@ class Sweep(Storable):
             object.__setattr__(self, item.name, values)
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the raw (row, column) of rectified positions; arguments broadcast against each
-        other.
-
-        Parameters
-        ----------
-        row, column : float array
-            Rectified, pixels.
-
-        Returns
-        -------
-        raw_row, raw_column : float array
-            Pixels, of the broadcast shape.
+        """Return the raw (row, column) of rectified positions `row` and `column`, pixels; they
+        broadcast against each other.
         """
         raise NotImplementedError
 
@@ -55,18 +45,11 @@ class Sweep(Storable):
 @dataclass(frozen=True)
 class SkewSweep(Sweep):
     """A time skew per view: ``raw row = offset_k + (1 + stretch_k) * row`` at each view's centre.
+    `centres_px` (views,) are slit columns, increasing, `offsets_bin` (views,) the rows by which
+    a view is late, `stretches` (views,) the relative excess of rows per instant.
 
-    Between two centres offset and stretch are interpolated linearly, beyond the outer ones they go
-    on linearly: the sweep's distortion is a smooth function of the slit column.
-
-    Parameters
-    ----------
-    centres_px : (views,) array
-        Slit columns where the skew is known, increasing.
-    offsets_bin : (views,) array
-        Rows by which a view is late.
-    stretches : (views,) array
-        Relative excess of rows per instant.
+    Between two centres offset and stretch are interpolated linearly, beyond the outer ones they
+    go on linearly: the sweep's distortion is a smooth function of the slit column.
     """
 
     RECORD_KIND = "skew_sweep"
@@ -137,11 +120,8 @@ class PolynomialSweep(Sweep):
 
 @dataclass(frozen=True)
 class ProjectiveSweep(Sweep):
-    """A homography: ``[raw column, raw row, 1] ~ matrix @ [column, row, 1]``, 0-based pixels.
-
-    Parameters
-    ----------
-    matrix : (3, 3) array
+    """A homography: ``[raw column, raw row, 1] ~ matrix @ [column, row, 1]``, 0-based pixels;
+    `matrix` (3, 3).
     """
 
     RECORD_KIND = "projective_sweep"
@@ -405,23 +385,10 @@ class Camera(Storable):
         return self.image_shape[0] // 2, self.image_shape[1] // 2
 
     def operator(self, shear: float = 0.0, dtype: DTypeLike = np.float32) -> LineProjection:
-        """Return F(d), which maps a picture refocused at `shear` onto the slit (supplement Eq. 21).
-
-        Because a line integral turns a 2D shift into a 1D one, refocusing only moves the views on
-        the slit.
-
-        Parameters
-        ----------
-        shear : float
-            Pixels per view step; negative for objects nearer than the calibrated depth (SPEC: ``s =
-            -a/d``).
-        dtype : dtype
-            float32 or float64.
-
-        Returns
-        -------
-        LineProjection
-            (rows, columns) pictures to (slit pixels,) vectors.
+        """Return F(d), which maps a (rows, columns) picture refocused at `shear` onto (slit pixels,),
+        in `dtype` float32 or float64 (supplement Eq. 21). Because a line integral turns a 2D shift
+        into a 1D one, refocusing only moves the views on the slit. Pixels per view step, negative
+        for objects nearer than the calibrated depth (SPEC: ``s = -a/d``).
         """
         return LineProjection(
             self.image_shape,
@@ -435,17 +402,13 @@ class Camera(Storable):
         )
 
     def shear_at(self, distance: ArrayLike) -> FloatArray:
-        """Shear of a surface at `distance`, m: ``s(d) = -f * pitch * (1/d - 1/focus_distance)``.
+        """Shear of a surface at `distance`, m: ``s(d) = -f * pitch * (1/d - 1/focus_distance)``,
+        pixels per view step, negative nearer than the focus; 0 everywhere where no lenslet pitch is
+        known.
 
         The distance is the depth z. A range along the line of sight does in its place as long as
         the field of view is narrow: at an angle a from the axis it is longer by 1/cos(a), 2 % at 11
         degrees.
-
-        Returns
-        -------
-        float64 array, as `distance`
-            Pixels per view step; negative nearer than the focus; 0 everywhere where no lenslet
-            pitch is known.
         """
         # An infinite focus distance gives 0 here, so that views coincide at infinity.
         nearness = 1 / np.asarray(distance, dtype=np.float64) - 1 / self.focus_distance

@@ -26,17 +26,10 @@ MIN_CHANGE_PX = 1e-3  # of shear over the distances; less is rounding
 
 @dataclass(frozen=True)
 class Parallax:
-    """A fitted ``s(d) = -strength * (1/d - nearness)``.
-
-    Parameters
-    ----------
-    strength : float
-        Focal length (px) times lenslet pitch (m), px m.
-    focus_dioptres : float
-        Inverse of the focus distance, 1/m; may come out slightly negative where the views are
-        focused on infinity.
-    misfit_px : float
-        Root mean square of what the fit leaves, pixels of shear, or of a slit centre.
+    """A fitted ``s(d) = -strength * (1/d - focus_dioptres)``: `strength` is focal length (px)
+    times lenslet pitch (m), px m; `focus_dioptres` the inverse of the focus distance, 1/m,
+    slightly negative perhaps where the views are focused on infinity; `misfit_px` the root mean
+    square of what the fit leaves, pixels of shear, or of a slit centre.
     """
 
     strength: float
@@ -59,17 +52,10 @@ class Parallax:
 
 @dataclass(frozen=True)
 class FocusCurve:
-    """Agreement of the views, gate by gate, over shears.
-
-    Parameters
-    ----------
-    agreement : (gates, shears) array
-        Energy of the measurements over that of the residual; 0 for dark gates.
-    shears : (gates,) array
-        Where each is highest, between the shears tried.
-    weight : (gates,) array
-        How surely: relative curvature at the maximum times the gate's light; 0 where the maximum
-        lies at an end.
+    """How well the views agree, gate by gate, over shears: `agreement` (gates, shears), energy of
+    the measurements over that of the residual, 0 for dark gates; `shears` (gates,) where it is
+    highest, between those tried; `weight` (gates,) how surely: relative curvature at the
+    maximum times the gate's light, 0 where the maximum lies at an end.
     """
 
     agreement: FloatArray
@@ -80,19 +66,8 @@ class FocusCurve:
 def fit_parallax_to_shears(
     shears: ArrayLike, distances: ArrayLike, weight: ArrayLike | None = None
 ) -> Parallax:
-    """Fit s(d) to shears of surfaces at known distances.
-
-    Parameters
-    ----------
-    shears : (n,) array
-        Pixels per view step.
-    distances : (n,) array
-        Metres.
-    weight : (n,) array, optional
-
-    Returns
-    -------
-    Parallax
+    """Fit s(d) to `shears` (n,), pixels per view step, of surfaces at known `distances` (n,), m,
+    each with a `weight` (n,), all alike by default.
 
     Raises
     ------
@@ -133,25 +108,9 @@ def _require_signal(strength: float, design: FloatArray, squares: float) -> None
 def fit_parallax_to_centres(
     camera: Camera, centres_px: ArrayLike, distances: ArrayLike
 ) -> Parallax:
-    """Fit s(d) to the views' slit centres, measured with a target at known distances.
-
-    Parameters
-    ----------
-    camera : Camera
-        Its own centres are those at the focus distance that is to be found.
-    centres_px : (views, n) array
-        0-based slit columns of the views' optical axes.
-    distances : (n,) array
-        Metres.
-
-    Returns
-    -------
-    Parallax
-
-    Raises
-    ------
-    ShapeError
-        The centres are not (views, distances).
+    """Fit s(d) to the views' slit centres, `centres_px` (views, n), measured with a target at
+    known `distances` (n,), m. The own centres of `camera` are those at the focus distance that
+    is to be found. `ShapeError` where the centres are not (views, distances).
     """
     centres = np.asarray(centres_px, dtype=np.float64)
     if centres.ndim != 2 or centres.shape[0] != camera.views:

@@ -26,15 +26,9 @@ NO_LIGHT_MESSAGE = "nothing rises above the dark level; was there any light?"
 
 @dataclass(frozen=True)
 class Measurement:
-    """Rectified measurements with the dark level taken off.
-
-    Parameters
-    ----------
-    values : (columns, frames) float32 array
-        Counts on the slit, one column of the array for each instant. May be negative: noise about a
-        dark level is.
-    valid : (columns, frames) bool array
-        False where a sensor pixel was saturated or dead, or where the raw image ends.
+    """Rectified measurements with the dark level taken off: `values` (columns, frames) float32,
+    counts on the slit, which may be negative as noise about a dark level is; `valid` (columns,
+    frames) is False where a sensor pixel was saturated or dead, or where the raw image ends.
     """
 
     values: Float32Array
@@ -76,18 +70,8 @@ def measure(
 
 
 def require_width(counts: Float32Array, camera: Camera) -> None:
-    """Raise `CalibrationError` unless the picture is as wide as the camera's slit.
-
-    Parameters
-    ----------
-    counts : (rows, columns) float32 array
-        Raw streak image.
-    camera : Camera
-
-    Raises
-    ------
-    CalibrationError
-        The image is not as wide as the camera's slit.
+    """Raise `CalibrationError` unless `counts`, (rows, columns), are as wide as the slit of
+    `camera`.
     """
     if counts.shape[1] != camera.slit_width_px:
         raise CalibrationError(
@@ -97,20 +81,11 @@ def require_width(counts: Float32Array, camera: Camera) -> None:
 
 
 def estimate_dark_level(counts: Float32Array, row_sums: Float32Array | None = None) -> float:
-    """Median of the quietest rows, in counts.
+    """Median of the quietest rows of `counts`, (rows, columns), whose sums are `row_sums`,
+    (rows,), where they are known already.
 
-    Taken from whole rows, before or after the light came, so that it stays where the measurements
-    scatter about it: the least value of a picture would turn noise into an offset.
-
-    Parameters
-    ----------
-    counts : (rows, columns) float32 array
-    row_sums : (rows,) float32 array, optional
-        Sum of each row, where it is known already.
-
-    Returns
-    -------
-    float
+    Taken from whole rows, before or after the light came, so that it stays where the
+    measurements scatter about it: the least value of a picture would turn noise into an offset.
     """
     if row_sums is None:
         # a product, which reads the picture at the rate of memory: NumPy's sum takes thrice as long
@@ -123,19 +98,9 @@ def estimate_dark_level(counts: Float32Array, row_sums: Float32Array | None = No
 
 
 class Rectifier:
-    """Turns raw streak images of one camera into measurements; holding one saves working out the
-    sweep for every shot.
-
-    Parameters
-    ----------
-    camera : Camera
-    rows : int
-        Of the raw pictures.
-
-    Notes
-    -----
-    Memory: as much as a raw picture, twice if the sweep moves light across columns, and at first
-    use four times as much for a moment.
+    """Turns raw streak images of one `camera`, so many `rows` high, into measurements; holding one
+    saves working out the sweep for every shot. Memory: as much as a raw picture, twice if the
+    sweep moves light across columns, and at first use four times as much for a moment.
     """
 
     def __init__(self, camera: Camera, rows: int) -> None:
@@ -162,14 +127,10 @@ class Rectifier:
         dark: float | None = None,
         delay: float = 0.0,
     ) -> Measurement:
-        """Subtract the dark level and rectify the sweep (bilinear); see `tofclip.camera.measure`.
-
-        Parameters
-        ----------
-        counts, saturated, dark
-            As there; a measurement is bad if any raw pixel that contributes to it is.
-        delay : float
-            Rows by which this shot's light comes later than the camera's calibration says.
+        """Subtract the dark level and rectify the sweep (bilinear); `counts`, `saturated` and `dark`
+        as for `tofclip.camera.measure`. A measurement is bad if any raw pixel that contributes to
+        it is. `delay`: rows by which this shot's light comes later than the camera's calibration
+        says.
         """
         self._prepare(counts)
         bad = np.zeros(counts.shape, bool) if saturated is None else saturated
@@ -187,15 +148,9 @@ class Rectifier:
     def rectify(
         self, counts: Float32Array, dark: float | None = None, delay: float = 0.0
     ) -> Float32Array:
-        """Return the measurements alone, (columns, rows), for methods that cannot leave out single ones:
-        0 beyond the raw image and in dead columns.
-
-        All columns of a row lie side by side in memory, as in the raw picture.
-
-        Parameters
-        ----------
-        counts, dark, delay
-            As for `measure`.
+        """Return the measurements alone, (columns, rows), arguments as for `measure`, for methods that
+        cannot leave out single ones: 0 beyond the raw image and in dead columns. All columns of a
+        row lie side by side in memory, as in the raw picture.
         """
         level = estimate_dark_level(counts) if dark is None else dark
         measurements = self._sample(counts, level, delay)

@@ -31,13 +31,8 @@ MIN_CORRELATION = 0.6
 
 @dataclass(frozen=True)
 class SkewEstimate:
-    """A sweep found from energy curves.
-
-    Parameters
-    ----------
-    sweep : SkewSweep
-    correlations : (views,) array
-        Agreement of each view's curve with the reference view's; 1 at the reference.
+    """A `sweep` found from energy curves, and the `correlations` (views,) of each view's curve
+    with the reference view's; 1 at the reference.
     """
 
     sweep: SkewSweep
@@ -151,14 +146,8 @@ FLOOR_FRACTION = 0.1  # frames dimmer than this share of the brightest count les
 
 @dataclass(frozen=True)
 class Registration:
-    """A refined camera and what the refinement gained.
-
-    Parameters
-    ----------
-    camera : Camera
-        With sweep, gains and centres refined.
-    residuals : (rounds + 1,) array
-        Relative data residual of the frames used, before each round and after the last.
+    """A refined `camera`, and what the refinement gained: `residuals` (rounds + 1,), the relative
+    data residual of the frames used, before each round and after the last.
     """
 
     camera: Camera

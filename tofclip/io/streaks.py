@@ -114,19 +114,10 @@ def _outline(reader: Reader, path: Path) -> Record:
 
 
 class StreakStack:
-    """A sequence of streak images in an HDF5 file: dataset ``counts`` (shot, time, column),
-    ``row_times`` (time) in s.
-
-    Any program can write such a file. Only the shot that is asked for is in memory.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Raises
-    ------
-    FileFormatError, StorageError
-        No HDF5 file, or one without these datasets.
+    """A sequence of streak images in an HDF5 file, `path`: dataset ``counts`` (shot, time,
+    column), ``row_times`` (time) in s. Any program can write such a file. Only the shot that is
+    asked for is in memory. `FileFormatError` or `StorageError` for no HDF5 file, or one without
+    these datasets.
     """
 
     @staticmethod

@@ -23,34 +23,18 @@ MAX_LABEL_STEP = 3  # labels farther apart cost no more: depth may jump at an ob
 def find_smooth_labels(
     costs: Array, smoothness: float, iterations: int = MAX_ITERATIONS
 ) -> IntArray:
-    """Choose labels of low total cost: each pixel's own, and `smoothness` times the steps between
-    neighbours.
+    """Choose labels (rows, columns) of low total cost: each pixel's own, of `costs` (labels, rows,
+    columns), and `smoothness` times the steps between neighbours; zero takes each pixel's
+    cheapest label. Messages travel one pixel in each of the `iterations`. Memory is ten times
+    that of `costs` in float32.
 
     Damped min-sum belief propagation with a truncated linear price, all pixels at once (P. F.
     Felzenszwalb, D. P. Huttenlocher, Int. J. Comput. Vis. 70, 41, 2006).
 
-    Parameters
-    ----------
-    costs : (labels, rows, columns) array
-    smoothness : float
-        Zero or more; zero takes each pixel's cheapest label.
-    iterations : int
-        Messages travel one pixel in each.
-
-    Returns
-    -------
-    (rows, columns) array of whole numbers
-
     Raises
     ------
-    ShapeError
-        The costs have not three dimensions.
-    InputError
-        A cost is not finite, or the smoothness is negative.
-
-    Notes
-    -----
-    Memory is ten times that of `costs` in float32.
+    ShapeError, InputError
+        The costs have not three dimensions, one is not finite, or the smoothness is negative.
     """
     if costs.ndim != 3:
         raise ShapeError("costs", "(labels, rows, columns)", costs.shape)
@@ -95,18 +79,9 @@ WINDOW_PX = 1.5
 
 @dataclass(frozen=True)
 class FocalStack:
-    """One scene refocused at several depths, from a light field or from recoveries.
-
-    Parameters
-    ----------
-    pictures : (depths, rows, columns) array
-    shears : (depths,) array
-        s of each picture, pixels per view step, ascending.
-
-    Raises
-    ------
-    ShapeError, InputError
-        Pictures and shears do not match, hold NaN, or the shears do not ascend.
+    """One scene refocused at several depths, from a light field or from recoveries: `pictures`
+    (depths, rows, columns), and the `shears` (depths,) of each, pixels per view step,
+    ascending. `ShapeError` or `InputError` where they do not match, hold NaN, or do not ascend.
     """
 
     pictures: Array
@@ -134,24 +109,9 @@ class FocalStack:
 def make_focal_stack(
     light_field: LightField, shears: ArrayLike, reference: tuple[float, float] = (0.0, 0.0)
 ) -> FocalStack:
-    """Refocus a light field at several shears, as seen from `reference`, any (v, u), fractions
-    included.
-
-    Depth from focus and `FocalStack.all_in_focus` on a stack from another reference synthesise that
-    viewpoint.
-
-    Parameters
-    ----------
-    light_field : LightField
-    shears : (depths,) array_like
-        Pixels per view step.
-    reference : (float, float)
-        Viewpoint (v, u) in view steps.
-
-    Returns
-    -------
-    FocalStack
-        Pictures (depths, rows, columns).
+    """Refocus a `light_field` at several `shears` (depths,), pixels per view step, as seen from
+    `reference`, any (v, u) in view steps, fractions included. Depth from focus and
+    `FocalStack.all_in_focus` on a stack from another reference synthesise that viewpoint.
     """
     depths = np.asarray(shears, np.float64)
     pictures = [light_field.refocus(float(shear), reference) for shear in depths]
@@ -159,16 +119,8 @@ def make_focal_stack(
 
 
 def compute_modified_laplacian(pictures: Array) -> Array:
-    """Second differences along rows and columns, their sizes added (S. K. Nayar, Y. Nakagawa, TPAMI
-    16, 824, 1994).
-
-    Parameters
-    ----------
-    pictures : (..., rows, columns) array
-
-    Returns
-    -------
-    array like `pictures`
+    """Second differences of `pictures` (..., rows, columns) along rows and columns, their sizes
+    added (S. K. Nayar, Y. Nakagawa, TPAMI 16, 824, 1994).
     """
     padded = np.pad(pictures, [(0, 0)] * (pictures.ndim - 2) + [(1, 1), (1, 1)], mode="edge")
     middle = 2 * padded[..., 1:-1, 1:-1]

@@ -33,18 +33,9 @@ from tofclip.storage import (
 
 @dataclass(frozen=True)
 class LightField(Storable):
-    """The sub-aperture pictures of a scene.
-
-    Parameters
-    ----------
-    pictures : (views, rows, columns) float32 array
-    views : (views, 2) array
-        (v, u) of each picture on the view grid.
-
-    Raises
-    ------
-    ShapeError, InputError
-        Views and pictures do not match, or the pictures hold NaN or are constant.
+    """The sub-aperture `pictures` (views, rows, columns), float32, of a scene, and the `views`
+    (views, 2), (v, u) of each on the view grid. `ShapeError` or `InputError` where they do not
+    match, or the pictures hold NaN or are constant.
     """
 
     RECORD_KIND = "light_field"
@@ -64,18 +55,9 @@ class LightField(Storable):
         )
 
     def refocus(self, shear: float, reference: tuple[float, float] = (0.0, 0.0)) -> AnyArray:
-        """Shift and add: each view is shifted back and the mean taken of those that see the pixel.
-
-        Parameters
-        ----------
-        shear : float
-            s, pixels per view step.
-        reference : (float, float)
-            (v, u) of the view whose picture it becomes.
-
-        Returns
-        -------
-        (rows, columns) float32 array
+        """Shift and add: each view is shifted back by the `shear`, pixels per view step, and the mean
+        taken of those that see the pixel, (rows, columns) float32, of the picture of view
+        `reference`, (v, u).
         """
         shape = (self.pictures.shape[1], self.pictures.shape[2])
         total, seen = np.zeros(shape, np.float32), np.zeros(shape, np.float32)

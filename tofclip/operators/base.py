@@ -232,28 +232,13 @@ class Diagonal(LinearOperator):
 
 
 def estimate_squared_norm(operator: LinearOperator, iterations: int = 30, seed: int = 0) -> float:
-    """Estimate the largest eigenvalue of A'A from below, by the Lanczos iteration.
+    """Estimate the largest eigenvalue of A'A of an `operator` from below, by the Lanczos
+    iteration: as many products with A'A as `iterations`, from a random start of a `seed`.
+    `InputError` where it maps everything to zero.
 
     For a solver's step this is used with a margin. Power iteration needs several times as many
-    products where the largest eigenvalues lie close together, as they do for codes whose mean was
-    taken off.
-
-    Parameters
-    ----------
-    operator : LinearOperator
-    iterations : int
-        Products with A'A.
-    seed : int
-        Of the random start.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    InputError
-        The operator maps everything to zero.
+    products where the largest eigenvalues lie close together, as they do for codes whose mean
+    was taken off.
     """
     # a random start has a part along the largest eigenvector, whatever the operator
     import scipy.linalg
@@ -389,16 +374,9 @@ class Selection(LinearOperator):
 
 
 class ViewSelection(Selection):
-    """Keeps some of a light field's views; the adjoint leaves the others dark.
-
-    Parameters
-    ----------
-    light_field_shape : (int, int, int)
-        Views, rows, columns.
-    kept : sequence of int
-        Numbers of the views to keep, without repeats.
-    dtype : dtype
-        float32 or float64.
+    """Keeps some of the views of a light field of `light_field_shape`, (views, rows, columns),
+    those of the numbers `kept`, without repeats; the adjoint leaves the others dark. `dtype`
+    float32 or float64.
     """
 
     def __init__(
@@ -418,20 +396,12 @@ class ViewSelection(Selection):
 
 
 class MeanWeighting(LinearOperator):
-    """``W = I - (1 - w) 11' / m_k`` for each view's m_k measurements: their mean counts w times;
-    self-adjoint.
+    """``W = I - (1 - w) 11' / m_k`` for each view's m_k measurements, `counts` in the order of the
+    measurements: their mean counts w times, the `weight` between 0 and 1; self-adjoint; `dtype`
+    float32 or float64.
 
-    Codes of 0 and 1 all measure half the picture's sum, which swamps what tells them apart; apply W
-    to the measurements and to the operator alike.
-
-    Parameters
-    ----------
-    counts : sequence of int
-        m_k, measurements of each view, in the order of the measurements.
-    weight : float
-        w, between 0 and 1.
-    dtype : dtype
-        float32 or float64.
+    Codes of 0 and 1 all measure half the picture's sum, which swamps what tells them apart;
+    apply W to the measurements and to the operator alike.
     """
 
     def __init__(

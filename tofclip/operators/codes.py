@@ -24,13 +24,8 @@ from tofclip.operators.shear import LinearShear, View
 
 
 class DenseSensor(Reshape):
-    """Every pixel is read, row by row.
-
-    Parameters
-    ----------
-    plane_shape : (int, int)
-    dtype : dtype
-        float32 or float64.
+    """Every pixel of a plane of `plane_shape`, (int, int), is read, row by row; `dtype` float32 or
+    float64.
     """
 
     def __init__(self, plane_shape: tuple[int, int], dtype: DTypeLike = np.float32) -> None:
@@ -92,14 +87,8 @@ class PitchedSensor(_Sensor):
 
 
 class MaskedSensor(_Sensor):
-    """Only live pixels are read: defective ones are left out, or the sensor has any layout
-    whatever.
-
-    Parameters
-    ----------
-    live : (rows, columns) bool array
-    dtype : dtype
-        float32 or float64.
+    """Only `live` pixels, (rows, columns) bool, are read, in `dtype` float32 or float64: defective
+    ones are left out, or the sensor has any layout whatever.
     """
 
     def __init__(self, live: ArrayLike, dtype: DTypeLike = np.float32) -> None:
@@ -176,19 +165,10 @@ class HadamardCodes(LinearOperator):
 
 
 class WeightedViews(LinearOperator):
-    """Exposures through masks in the aperture: ``y_j = sum_k w_jk P_k`` (supplement Eq. 17).
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-    weights : (exposures, views) array
-        w, what fraction of each view's light an exposure's mask lets pass.
-    dtype : dtype
-        float32 or float64.
-
-    Notes
-    -----
-    Light fields are (views, rows, columns); measurements are (exposures * rows * columns,).
+    """Exposures through masks in the aperture: ``y_j = sum_k w_jk P_k`` (supplement Eq. 17), from
+    light fields (views, rows, columns) of pictures of `image_shape` to (exposures * rows *
+    columns,). `weights` (exposures, views) are w, what fraction of each view's light an
+    exposure's mask lets pass; `dtype` float32 or float64.
     """
 
     def __init__(
@@ -216,18 +196,8 @@ class WeightedViews(LinearOperator):
 
 class MaskedViews(Composition):
     """One exposure through a mask near the sensor: ``y = sum_k C_k P_k``, C_k the mask as view k
-    sees it (Eq. 18).
-
-    Parameters
-    ----------
-    codes : (views, rows, columns) array
-        Diagonals of C_k.
-    dtype : dtype
-        float32 or float64.
-
-    Notes
-    -----
-    Light fields are (views, rows, columns); measurements are (rows * columns,).
+    sees it (Eq. 18), from light fields (views, rows, columns) to (rows * columns,). `codes`
+    (views, rows, columns) are the diagonals of C_k; `dtype` float32 or float64.
     """
 
     def __init__(self, codes: ArrayLike, dtype: DTypeLike = np.float32) -> None:
@@ -239,21 +209,12 @@ class MaskedViews(Composition):
 
 
 class ShearedViews(Adjoint):
-    """All views that a picture at one depth has: ``[B_1; B_2; ...]``, (rows, columns) to (views,
-    rows, columns).
+    """All `views`, (v, u) each, that a picture of `image_shape` at one depth has: ``[B_1; B_2;
+    ...]``, (rows, columns) to (views, rows, columns), at a `shear` s, pixels per view step,
+    from view `reference`; `dtype` float32 or float64.
 
     Composed with a model of the whole light field it makes that of the picture refocused at one
     depth (Eq. 21).
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-    views : sequence of (float, float)
-    shear : float
-        s, pixels per view step.
-    reference : (float, float)
-    dtype : dtype
-        float32 or float64.
     """
 
     def __init__(

@@ -33,16 +33,9 @@ GATE_BINS = 64
 
 @dataclass(frozen=True)
 class FrameSegment:
-    """Successive frames that share an operator.
-
-    Parameters
-    ----------
-    frames : slice
-    shear : float
-        Pixels per view step.
-    brightness : float
-        How bright a surface appears there, relative to the other pieces: a prior weighs in
-        proportion.
+    """Successive `frames` that share an operator, and its `shear`, pixels per view step.
+    `brightness`: how bright a surface appears there, relative to the other pieces: a prior
+    weighs in proportion.
     """
 
     frames: slice
@@ -117,15 +110,9 @@ class FixedFocus(Focus):
 
 @dataclass(frozen=True)
 class DepthLockedFocus(Focus):
-    """Every frame at the shear of the range that its time of flight says, s(c t / 2).
-
-    Frames whose shears put no view further off the slit than the tolerance share an operator. The
+    """Every frame at the shear of the range that its time of flight says, s(c t / 2). Frames whose
+    shears put no view further off the slit than `tolerance_px`, pixels, share an operator. The
     light of a frame is expected to fall off as 1/range^2, and the prior's weight with it.
-
-    Parameters
-    ----------
-    tolerance_px : float
-        Largest error of a view's place on the slit.
     """
 
     tolerance_px: float = 0.25
@@ -172,14 +159,8 @@ class DepthLockedFocus(Focus):
 
 @dataclass(frozen=True)
 class SharpestFocus(Focus):
-    """Every gate of 64 frames at that shear, of a stack, at which its pictures are sharpest.
-
-    Parameters
-    ----------
-    first, last : float
-        Ends of the stack, pixels per view step.
-    number : int
-        Shears tried.
+    """Every gate of 64 frames at that shear, of a `number` of them from `first` to `last`, pixels
+    per view step, at which its pictures are sharpest.
     """
 
     first: float
@@ -220,12 +201,8 @@ DEFAULT_FOCUS = FixedFocus()
 
 
 def parse_focus(text: str) -> Focus:
-    """Read ``depth-locked``, ``fixed:S`` or ``stack:S0:S1:N``.
-
-    Raises
-    ------
-    InputError
-        Anything else.
+    """Read a `text` ``depth-locked``, ``fixed:S`` or ``stack:S0:S1:N``; `InputError` for anything
+    else.
     """
     name, *numbers = text.split(":")
     try:
@@ -242,16 +219,9 @@ def parse_focus(text: str) -> Focus:
 
 @dataclass(frozen=True)
 class ShotParallax:
-    """What a shot says about the parallax.
-
-    Parameters
-    ----------
-    camera : Camera
-        With sweep, gains, centres, lenslet pitch and focus distance.
-    parallax : Parallax
-    distances : (gates,) array
-        Mean range of each gate's light, m.
-    curve : FocusCurve
+    """What a shot says about the `parallax`: the `camera` with sweep, gains, centres, lenslet
+    pitch and focus distance; the mean range of each gate's light, `distances` (gates,), m; and
+    the focus `curve`.
     """
 
     camera: Camera
@@ -308,17 +278,8 @@ def fit_parallax_to_shot(
 
 
 def count_parallax_work(shot: Shot, shears: tuple[float, float, int]) -> int:
-    """Return how many frame iterations `fit_parallax_to_shot` reports at most.
-
-    Parameters
-    ----------
-    shot : Shot
-    shears : (float, float, int)
-        First, last and number of shears.
-
-    Returns
-    -------
-    int
+    """Return how many frame iterations `fit_parallax_to_shot` reports at most for a `shot` and
+    `shears`: first, last and number.
     """
     rows = shot.streak.counts.shape[0]
     fitting = count_registration_iterations() if shot.camera.sweep is None else 0

@@ -116,17 +116,9 @@ def make_method(name: str, **settings: Any) -> AnyMethod:
 
 @dataclass(frozen=True)
 class RecoveryPlan:
-    """A recovery that was checked and can be run.
-
-    Parameters
-    ----------
-    shot : Shot
-    method : Method
-    focus : Focus
-        At which shear each frame is recovered.
-    device : ComputeDevice
-        Where the recovery runs: measurements are put there, and frames fetched from there. What
-        precedes the recovery is done in NumPy.
+    """A recovery that was checked and can be run: of a `shot` by a `method`, each frame at the
+    shear that the `focus` says, on a `device`: measurements are put there, and frames fetched
+    from there. What precedes the recovery is done in NumPy.
     """
 
     shot: Shot
@@ -157,17 +149,8 @@ class RecoveryPlan:
         return int(measured + rows * height * width * np.dtype(np.float32).itemsize)
 
     def run(self, progress: Progress = ignore_progress) -> Frames:
-        """Recover every frame.
-
-        Parameters
-        ----------
-        progress : callable
-            Called with the number of frame iterations just done, `work` of them at most.
-
-        Returns
-        -------
-        Frames
-            As `recover` returns them.
+        """Recover every frame, as `recover` does; `progress` is called with the number of frame
+        iterations just done, `work` of them at most.
         """
         started = time.perf_counter()
         shot, method = self.shot.fit_camera(progress), self.method
@@ -236,14 +219,8 @@ class RecoveryPlan:
         return replace(found, figures={**found.figures, "why_no_surfaces": why})
 
     def add_provenance(self, frames: Frames, *inputs: str | Path) -> Frames:
-        """Return frames that say how they came about.
-
-        Parameters
-        ----------
-        frames : Frames
-            Of `run`.
-        *inputs : path-like
-            Files that the result depends on; their hashes are noted.
+        """Return `frames` of `run` that say how they came about; `inputs` are files that the result
+        depends on, whose hashes are noted.
         """
         used = self.method
         if isinstance(used, SurfaceRecovery) and used.otherwise is not None:

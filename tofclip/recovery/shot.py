@@ -48,17 +48,8 @@ class Shot:
     def fit_camera(
         self, progress: Progress = ignore_progress, max_rounds: int = MAX_ROUND_COUNT
     ) -> Shot:
-        """Return this shot with a camera whose sweep is known, found from the shot if need be.
-
-        Parameters
-        ----------
-        progress : callable
-        max_rounds : int
-            Refinements at most, see `tofclip.camera.register_views`.
-
-        Returns
-        -------
-        Shot
+        """Return this shot with a camera whose sweep is known, found from the shot if need be, in
+        `max_rounds` refinements at most; `progress` as for `tofclip.camera.register_views`.
         """
         if self.camera.sweep is not None:
             return self
@@ -129,19 +120,9 @@ def open_shot(
 
 
 def require_plausible_rows(streak: Streak, camera: Camera) -> None:
-    """Refuse a time axis whose rows do not go with the camera's pulse, as of a wrong unit.
-
-    Parameters
-    ----------
-    streak : Streak
-    camera : Camera
-
-    Raises
-    ------
-    MissingTimeAxisError
-        There is no time axis.
-    InputError
-        A row is far longer than the pulse, or all rows together are shorter than it.
+    """Refuse a `streak` image whose rows do not go with the pulse of `camera`, as of a wrong unit:
+    `MissingTimeAxisError` without a time axis, `InputError` where a row is far longer than the
+    pulse, or all rows together are shorter than it.
     """
     times, pulse = streak.times, camera.pulse_fwhm
     rows = times.size
@@ -164,21 +145,8 @@ def fit_camera_to_shot(
     progress: Progress = ignore_progress,
     max_rounds: int = MAX_ROUND_COUNT,
 ) -> Camera:
-    """Return `camera` with sweep, gains and centres found from the shot itself.
-
-    Parameters
-    ----------
-    streak : Streak
-    camera : Camera
-        Where the search starts.
-    progress : callable
-        Called as the search for the views goes on.
-    max_rounds : int
-        Refinements at most, see `tofclip.camera.register_views`.
-
-    Returns
-    -------
-    Camera
+    """Return `camera`, where the search starts, with sweep, gains and centres found from a
+    `streak` image itself; `progress` and `max_rounds` as for `tofclip.camera.register_views`.
     """
     skew = estimate_skew(streak.counts, camera)
     # registration refines a skew that is right to a few rows, which the energy curves give

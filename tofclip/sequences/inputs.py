@@ -20,13 +20,8 @@ RESULT_SUFFIXES = (".png", ".pdf", ".svg", ".ply", ".toml", ".json")
 
 @dataclass(frozen=True)
 class FileShot:
-    """A streak image in a file of its own; calling it reads it.
-
-    Parameters
-    ----------
-    path : Path
-    bin_width : float, optional
-        Duration of a row, s; overrides the file's time axis.
+    """A streak image in a file of its own, `path`; calling it reads it. `bin_width`: duration of a
+    row, s, which overrides the file's time axis.
     """
 
     path: Path
@@ -39,14 +34,8 @@ class FileShot:
 
 @dataclass(frozen=True)
 class StackShot:
-    """A streak image in a stack; calling it reads its part of the file and no other.
-
-    Parameters
-    ----------
-    path : Path
-    number : int
-    bin_width : float, optional
-        Duration of a row, s; overrides the stack's time axis.
+    """The streak image of that `number` in the stack `path`; calling it reads its part of the file
+    and no other. `bin_width`: duration of a row, s, which overrides the stack's time axis.
     """
 
     path: Path
@@ -75,24 +64,10 @@ def is_sequence(source: str | Path) -> bool:
 
 
 def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, Shot]:
-    """Return the shots of a sequence by name, in order.
-
-    Parameters
-    ----------
-    source : path-like
-        Folder, glob pattern or HDF5 stack (`tofclip.shots`). Cameras, frames and pictures that lie
-        beside the shots of a folder are left out.
-    bin_width : float, optional
-        Duration of a row, s; overrides time axes.
-
-    Returns
-    -------
-    dict of str to Shot
-
-    Raises
-    ------
-    InputError, StorageError, FileFormatError
-        There is none.
+    """Return the shots of a sequence by name, in order: of a `source`, folder, glob pattern or
+    HDF5 stack (`tofclip.io.StreakStack`). Cameras, frames and pictures that lie beside the
+    shots of a folder are left out. `bin_width`: duration of a row, s, which overrides time
+    axes. `InputError`, `StorageError` or `FileFormatError` where there is none.
     """
     path = Path(source)
     if path.is_dir() or not path.exists():

@@ -30,19 +30,10 @@ MAX_JITTER_BINS = 32
 
 @dataclass(frozen=True)
 class RangingPlan(Storable):
-    """What all shots of a sequence share.
-
-    Parameters
-    ----------
-    camera : Camera
-        With its sweep.
-    row_times : (rows,) array
-        Instant of each row, s.
-    light : (rows,) array
-        Light of the first shot over time, with which the others are compared; empty where they are
-        taken as they come.
-    focus : str
-        As `tofclip.recovery.parse_focus` reads it.
+    """What all shots of a sequence share: the `camera` with its sweep; `row_times` (rows,), the
+    instant of each row, s; the `light` (rows,) of the first shot over time, with which the
+    others are compared, empty where they are taken as they come; the `focus`, as
+    `tofclip.recovery.parse_focus` reads it.
     """
 
     RECORD_KIND = "ranging"

@@ -140,24 +140,10 @@ PARAMETER_TYPES = {"method": str, "iterations": int, "weight": float, "focus": s
 def expand_sweep(
     recovery: RecoverySettings, values: Mapping[str, Sequence[str]]
 ) -> dict[str, RecoverySettings]:
-    """Return a recovery for every combination of values, by a name that can be a folder's.
-
-    Parameters
-    ----------
-    recovery : RecoverySettings
-        Has the settings that are not swept.
-    values : mapping of str to sequence of str
-        Values of ``method``, ``iterations``, ``weight`` and ``focus``.
-
-    Returns
-    -------
-    dict of str to RecoverySettings
-
-    Raises
-    ------
-    InputError
-        No such setting, no such value, or a combination that does not exist, such as iterations of
-        ``linear``.
+    """Return a recovery for every combination of `values` of ``method``, ``iterations``,
+    ``weight`` and ``focus``, by a name that can be a folder's; `recovery` has the settings that
+    are not swept. `InputError` for no such setting or value, or a combination that does not
+    exist, such as iterations of ``linear``.
     """
     unknown = [name for name in values if name not in PARAMETER_TYPES]
     if unknown:

@@ -26,16 +26,10 @@ AMBIENT_FRACTION = 0.4  # of the light, that comes from everywhere
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays meet a shape.
-
-    Parameters
-    ----------
-    distance : (rays,) array
-        In lengths of the ray's direction; infinite where it misses.
-    normal : (rays, 3) array
-        Of length 1, towards the ray's origin.
-    pattern_position : (rays, 2) array
-        On the pattern, from 0 to 1, right and down; meaningless where the ray misses.
+    """Where rays meet a shape: `distance` (rays,) in lengths of the ray's direction, infinite
+    where it misses; `normal` (rays, 3) of length 1, towards the ray's origin;
+    `pattern_position` (rays, 2) on the pattern, from 0 to 1, right and down, meaningless where
+    the ray misses.
     """
 
     distance: Array
@@ -140,17 +134,9 @@ class Box(Shape):
 
 @dataclass(frozen=True)
 class Lambertian:
-    """A matt surface: as bright from every side.
-
-    Parameters
-    ----------
-    pattern : (rows, columns) array
-        Reflectance from 0 to 1; NaN where there is a hole.
-
-    Raises
-    ------
-    ShapeError, InputError
-        The pattern is not a picture, has nothing but holes, or a reflectance lies outside 0 to 1.
+    """A matt surface, as bright from every side, of a `pattern` (rows, columns): reflectance from
+    0 to 1, NaN where there is a hole. `ShapeError` or `InputError` where it is not a picture,
+    has nothing but holes, or a reflectance lies outside 0 to 1.
     """
 
     pattern: Array
@@ -184,14 +170,8 @@ class Lambertian:
 @dataclass(frozen=True)
 class Specular(Lambertian):
     """A glossy surface: a matt one, and a lobe about the mirror's direction (B. T. Phong, Commun.
-    ACM 18, 311, 1975).
-
-    Parameters
-    ----------
-    gloss : float
-        Brightness of the lobe at its peak.
-    exponent : float
-        The larger, the more like a mirror.
+    ACM 18, 311, 1975), of brightness `gloss` at its peak; the larger the `exponent`, the more
+    like a mirror.
     """
 
     gloss: float = 1.0
@@ -211,16 +191,8 @@ Material = Lambertian  # any of the two
 
 @dataclass(frozen=True)
 class Body:
-    """A shape that stands somewhere.
-
-    Parameters
-    ----------
-    shape : Shape
-    material : Material
-    centre : (3,) array
-        Metres.
-    axes : (3, 3) array
-        Columns: where the shape's own x, y and z point; orthonormal, mirrored for a flipped body.
+    """A `shape` of a `material` that stands somewhere: `centre` (3,), m; the columns of `axes` (3,
+    3) say where the shape's own x, y and z point, orthonormal, mirrored for a flipped body.
     """
 
     shape: Shape

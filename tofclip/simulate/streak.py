@@ -102,19 +102,9 @@ class RayCast(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Bodies lit by one pulsed point source.
-
-    Parameters
-    ----------
-    bodies : tuple of Body
-    lamp : (float, float, float)
-        Position of the source, m, before the bodies. At the origin it is co-located with the
-        reference view, which then sees no shadow.
-
-    Raises
-    ------
-    InputError
-        There is no body.
+    """`bodies` lit by one pulsed point source, the `lamp`, whose position, m, lies before them. At
+    the origin it is co-located with the reference view, which then sees no shadow. `InputError`
+    where there is no body.
     """
 
     bodies: tuple[Body, ...]
@@ -376,22 +366,10 @@ class GroundTruth:
 def render_true_frames(
     scene: Scene, instrument: Instrument, exposure: float = 1.0, position: float = 0.0
 ) -> Frames:
-    """Transient frames that a perfect camera at the reference viewpoint, or at that of another view,
-    would deliver, without noise or background.
-
-    Parameters
-    ----------
-    scene : Scene
-    instrument : Instrument
-    exposure : float
-        Photons for reflectance 1 at 1 m that fills a pixel.
-    position : float
-        Of the viewpoint, in view steps.
-
-    Returns
-    -------
-    Frames
-        On the time axis of the instrument's streak images, time zero taken off.
+    """Transient frames that a perfect camera at the reference viewpoint, or at that of another
+    view, `position` view steps away, would deliver of a `scene`, without noise or background,
+    on the time axis of the streak images of `instrument`, time zero taken off. `exposure`:
+    photons for reflectance 1 at 1 m that fills a pixel.
     """
     camera, detector = instrument.camera, instrument.detector
     hits = instrument.look_at(scene, position)

@@ -105,14 +105,8 @@ class LeastSquares(_SquaredNearZero):
 
 
 class ClippedSquares(DataTerm):
-    """Least squares of measurements that are cut off at a limit: those there may be brighter.
-
-    Parameters
-    ----------
-    measurements : (measurements, frames) array
-    valid : (measurements, frames) bool array, optional
-    limit : float
-        Measurements from here on count only while less is predicted.
+    """Least squares of `measurements` that are cut off at a `limit`: those from there on may be
+    brighter, and count only while less is predicted. `valid` as for `DataTerm`.
     """
 
     def __init__(self, measurements: Array, valid: Mask = None, *, limit: float) -> None:
@@ -131,16 +125,9 @@ class ClippedSquares(DataTerm):
 
 class Huber(_SquaredNearZero):
     """Squares up to a threshold and straight lines beyond: a few wildly wrong measurements do no
-    harm.
-
-    P. J. Huber, Ann. Math. Stat. 35, 73 (1964).
-
-    Parameters
-    ----------
-    measurements : (measurements, frames) array
-    valid : (measurements, frames) bool array, optional
-    threshold : float
-        In the unit of the measurements; one to three times `estimate_robust_deviation` is usual.
+    harm. P. J. Huber, Ann. Math. Stat. 35, 73 (1964). `measurements` and `valid` as for
+    `DataTerm`; `threshold` in their unit: one to three times `estimate_robust_deviation` is
+    usual.
     """
 
     def __init__(self, measurements: Array, valid: Mask = None, *, threshold: float) -> None:

@@ -67,22 +67,9 @@ class LinearInverse(Method):
     portable = True
 
     def prepare(self, operator: LinearOperator, alive: BoolArray | None = None) -> PreparedInverse:
-        """Invert the Gram matrix of the living measurements.
-
-        Parameters
-        ----------
-        operator : SparseMatrix
-        alive : (measurements,) bool array, optional
-            False for measurements that are never to be trusted.
-
-        Returns
-        -------
-        PreparedInverse
-
-        Raises
-        ------
-        InputError
-            The operator is not a sparse matrix, or the damping is not positive.
+        """Invert the Gram matrix of the living measurements of an `operator`; `alive` (measurements,)
+        is False for those that are never to be trusted. `InputError` where the operator is not a
+        `SparseMatrix`, or the damping is not positive.
         """
         import scipy.linalg
 
@@ -125,13 +112,9 @@ class LinearInverse(Method):
 
 @dataclass(frozen=True)
 class PreparedInverse:
-    """A `LinearInverse` whose Gram matrix is inverted already.
-
-    Parameters
-    ----------
-    operator : LinearOperator
-    inverse_gram : (measurements, measurements) array
-        ``(A A' + mu I)^-1`` of the measurements that are alive and see a pixel; 0 for the others.
+    """A `LinearInverse` of an `operator` A whose Gram matrix is inverted already: `inverse_gram`
+    (measurements, measurements) is ``(A A' + mu I)^-1`` of the measurements that are alive and
+    see a pixel; 0 for the others.
     """
 
     operator: LinearOperator

@@ -122,16 +122,10 @@ class IterativeSolver(Protocol):
 
 @dataclass(frozen=True)
 class IterationHistory:
-    """What a run left behind.
-
-    Parameters
-    ----------
-    objective : (iterations + 1,) array
-        Sum over the frames before the first and after every iteration.
-    converged : bool
-        Whether the tolerance, the gap or the noise ended it.
-    gap : float
-        How far the last objective is above the least one at most; NaN where that is not known.
+    """What a run left behind: `objective` (iterations + 1,), the sum over the frames before the
+    first and after every iteration; `converged`, whether the tolerance, the gap or the noise
+    ended it; `gap`, how far the last objective is above the least one at most, NaN where that
+    is not known.
     """
 
     objective: FloatArray
@@ -301,23 +295,9 @@ class Method(Protocol):
 def relative_residual(
     operator: LinearOperator, frames: Array, measurements: Array, valid: Mask = None
 ) -> float:
-    """``|A h - f| / |f|`` over all good measurements of all frames.
-
-    Parameters
-    ----------
-    operator : LinearOperator
-    frames : (frames, rows, columns) array
-    measurements : (measurements, frames) array
-    valid : (measurements, frames) bool array, optional
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    InputError
-        Every valid measurement is zero.
+    """``|A h - f| / |f|`` over all good `measurements` (measurements, frames), those that are
+    `valid`, of all `frames` (frames, rows, columns), by their `operator`. `InputError` where
+    every valid measurement is zero.
     """
     # Block by block: predictions of all frames at once would double the memory.
     misfit = energy = 0.0

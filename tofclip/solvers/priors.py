@@ -20,16 +20,9 @@ TINY = 1e-300
 
 
 class ProximalStep(NamedTuple):
-    """A proximal gradient step and what is known about it, frame by frame.
-
-    Parameters
-    ----------
-    picture : (rows, columns, lanes) array
-    penalty : (lanes,) float64 array
-        R of the picture.
-    distance : (lanes,) float64 array, optional
-        Squared distance of the picture from the point that the step began at. Without it, steps keep
-        their size.
+    """A proximal gradient step and what is known about it, frame by frame: the `picture` (rows,
+    columns, lanes); its `penalty` R (lanes,), float64; and the squared `distance` (lanes,),
+    float64, from the point that the step began at, without which steps keep their size.
     """
 
     picture: Array
