@@ -225,17 +225,12 @@ def parse_device(name: str) -> ComputeDevice:
     """
     if name == "cpu":
         return ComputeDevice()
-    if name == "auto":
-        return next(
-            (device for library in GRAPHICS_LIBRARIES if (device := _find_gpu(library, 0))),
-            ComputeDevice(),
-        )
     kind, _, which = name.partition(":")
-    if kind == "cuda" and (which.isdecimal() or name == "cuda"):
+    if name == "auto" or (kind == "cuda" and (which.isdecimal() or name == "cuda")):
         number = int(which or 0)
-        for library in GRAPHICS_LIBRARIES:
-            if device := _find_gpu(library, number):
-                return device
+        found = filter(None, (_find_gpu(library, number) for library in GRAPHICS_LIBRARIES))
+        if device := next(found, ComputeDevice() if name == "auto" else None):
+            return device
         raise MissingDependencyError(
             f'no CUDA device {number} was found through CuPy or PyTorch; install tofclip[cuda], or use `device="cpu"`'
         )

@@ -44,6 +44,7 @@ from tofclip.simulate import (
     simulate_shot,
 )
 from tofclip.simulate.patterns import (
+    Pattern,
     cut_pattern,
     make_checkerboard,
     make_letter,
@@ -276,30 +277,30 @@ def _make_dense(operator: LinearOperator) -> Float32Array:
 
 # pattern, middle and sides as parts of half the picture and of the picture, depth as a part of the
 # scene's, yaw in rad
-Plate = tuple[Callable[[], Any], tuple[float, float], tuple[float, float], float, float]
+Plate = tuple[Pattern, tuple[float, float], tuple[float, float], float, float]
 
 
-def _letter(name: str) -> Callable[[], Any]:
-    return lambda: cut_pattern(make_letter(name), make_plain_pattern(0.8))
+def _cut_letter(name: str) -> Pattern:
+    return cut_pattern(make_letter(name), make_plain_pattern(0.8))
 
 
 SCENES: dict[str, tuple[Plate, ...]] = {
     "letters": (
-        (_letter("C"), (-0.45, -0.42), (0.34, 0.34), 0.05, 0.0),
-        (_letter("L"), (0.42, -0.45), (0.32, 0.32), 0.3, 0.1),
-        (_letter("U"), (-0.4, 0.42), (0.32, 0.32), 0.55, 0.0),
-        (_letter("A"), (0.42, 0.4), (0.36, 0.36), 0.8, -0.1),
+        (_cut_letter("C"), (-0.45, -0.42), (0.34, 0.34), 0.05, 0.0),
+        (_cut_letter("L"), (0.42, -0.45), (0.32, 0.32), 0.3, 0.1),
+        (_cut_letter("U"), (-0.4, 0.42), (0.32, 0.32), 0.55, 0.0),
+        (_cut_letter("A"), (0.42, 0.4), (0.36, 0.36), 0.8, -0.1),
     ),
     "plates": (
-        (lambda: make_checkerboard(4, 0.3, 0.9), (-0.4, -0.35), (0.36, 0.36), 0.1, -0.3),
-        (lambda: make_rings(3, 0.3, 0.9), (0.4, 0.35), (0.4, 0.4), 0.4, 0.0),
-        (lambda: make_stripes(4, 0.3, 0.9), (0.05, 0.0), (0.7, 0.7), 0.9, 0.0),
+        (make_checkerboard(4, 0.3, 0.9), (-0.4, -0.35), (0.36, 0.36), 0.1, -0.3),
+        (make_rings(3, 0.3, 0.9), (0.4, 0.35), (0.4, 0.4), 0.4, 0.0),
+        (make_stripes(4, 0.3, 0.9), (0.05, 0.0), (0.7, 0.7), 0.9, 0.0),
     ),
     "poles": (
-        (lambda: make_plain_pattern(0.6), (-0.55, 0.0), (0.08, 0.8), 0.1, 0.0),
-        (lambda: make_plain_pattern(0.8), (0.2, -0.1), (0.12, 0.6), 0.35, 0.0),
-        (lambda: make_plain_pattern(0.5), (0.0, 0.6), (0.8, 0.1), 0.6, 0.0),
-        (lambda: make_mottled_pattern(0.2, 0.9, 5, 0), (0.35, -0.2), (0.4, 0.4), 0.9, 0.2),
+        (make_plain_pattern(0.6), (-0.55, 0.0), (0.08, 0.8), 0.1, 0.0),
+        (make_plain_pattern(0.8), (0.2, -0.1), (0.12, 0.6), 0.35, 0.0),
+        (make_plain_pattern(0.5), (0.0, 0.6), (0.8, 0.1), 0.6, 0.0),
+        (make_mottled_pattern(0.2, 0.9, 5, 0), (0.35, -0.2), (0.4, 0.4), 0.9, 0.2),
     ),
 }
 
@@ -310,11 +311,9 @@ def make_scene(name: str, design: Design) -> Scene:
     bodies = []
     for pattern, (x, y), sides, part, yaw in SCENES[name]:
         z = design.near_m + (0.05 + 0.85 * part) * (design.far_m - design.near_m)
-        width, height = (
-            z / design.focal_length_px * side for side in design.camera.image_shape[::-1]
-        )
-        size = (sides[0] * width, sides[1] * height)
-        bodies.append(make_plate((x * width / 2, y * height / 2, z), size, pattern(), yaw))
+        rows, columns = (z / design.focal_length_px * n for n in design.camera.image_shape)
+        size = (sides[0] * columns, sides[1] * rows)
+        bodies.append(make_plate((x * columns / 2, y * rows / 2, z), size, pattern, yaw))
     return Scene(tuple(bodies))
 
 
@@ -399,11 +398,14 @@ def predict_accuracy(design: Design, scene: Scene) -> Accuracy:
     flat = frames.values.reshape(len(frames.values), -1).T
     segments = design.plan_segments(frames)
     matrices = [design.matrix(one.shear) for one in segments]
-    scale = design.photons / _find_peak(matrices, segments, flat)
+    # the brightest reading at an exposure of 1
+    pairs = list(zip(segments, matrices, strict=True))
+    peak = max(float((matrix @ flat[:, one.frames]).max()) for one, matrix in pairs)
+    scale = design.photons / peak
     mean, noise = np.zeros(flat.shape[0]), np.zeros(flat.shape[0])
     expected = np.zeros((pixels.size, flat.shape[1]), np.float32)
     variance = np.zeros_like(expected)
-    for segment, matrix in zip(segments, matrices, strict=True):
+    for segment, matrix in pairs:
         weighted = matrix if design.encoder is None else design.weights @ matrix
         linear = weighted.T @ (design.prepare(segment.shear).inverse_gram @ design.weights)
         light = scale * (matrix @ flat[:, segment.frames])
@@ -417,23 +419,18 @@ def predict_accuracy(design: Design, scene: Scene) -> Accuracy:
         variance[near, segment.frames] = rows**2 @ counts
     truth = scale * flat.sum(axis=1)
     spread = np.sum((truth - truth.mean()) ** 2)
-    deviation, offset = np.full((2, flat.shape[0]), np.nan)
     fitted = _fit_pulses(frames.times, times, expected, variance, design)
-    deviation[pixels], offset[pixels] = (SPEED_OF_LIGHT / 2 * part for part in fitted)
-    shape = frames.values.shape[1:]
-    return Accuracy(
-        float(np.sum((mean - truth) ** 2) / spread),
-        float(noise.sum() / spread),
-        deviation.reshape(shape),
-        offset.reshape(shape),
-        mean.reshape(shape),
-    )
+    bias, chance = np.sum((mean - truth) ** 2) / spread, noise.sum() / spread
+    deviation, offset = (_map(SPEED_OF_LIGHT / 2 * part, pixels, target.shape) for part in fitted)
+    picture = mean.reshape(target.shape)
+    return Accuracy(float(bias), float(chance), deviation, offset, picture)
 
 
-def _find_peak(matrices: list[Any], segments: list[FrameSegment], flat: Any) -> float:
-    """The brightest reading at an exposure of 1."""
-    pairs = zip(matrices, segments, strict=True)
-    return max(float((matrix @ flat[:, one.frames]).max()) for matrix, one in pairs)
+def _map(values: FloatArray, pixels: IndexArray, shape: tuple[int, ...]) -> FloatArray:
+    """A picture of the values of some pixels, NaN elsewhere."""
+    picture = np.full(shape, np.nan)
+    picture.ravel()[pixels] = values
+    return picture
 
 
 def _choose_pixels(design: Design, scene: Scene) -> tuple[FloatArray, IndexArray]:
@@ -540,16 +537,10 @@ def try_out(design: Design, scene: Scene, shots: int = 20, seed: int = 0) -> Acc
     bias = float(np.sum((mean - truth) ** 2) / spread - scatter / shots)
     middle = np.nanmedian(ranges, axis=0)
     # robust: a shot in which another return is the stronger one does not count
-    deviation, offset = np.full((2, truth.size), np.nan)
-    deviation[pixels] = (
-        MAD_TO_SIGMA
-        * shots
-        / (shots - 0.8)
-        * np.nanmedian(np.abs(np.array(ranges) - middle), axis=0)
-    )
-    offset[pixels] = middle - true_ranges.ravel()[pixels]
-    maps = [part.reshape(truth.shape) for part in (deviation, offset)]
-    return Accuracy(bias, float(scatter), maps[0], maps[1], mean, float(np.median(seconds)))
+    away = np.nanmedian(np.abs(np.array(ranges) - middle), axis=0)
+    deviation = _map(MAD_TO_SIGMA * shots / (shots - 0.8) * away, pixels, truth.shape)
+    offset = _map(middle - true_ranges.ravel()[pixels], pixels, truth.shape)
+    return Accuracy(bias, float(scatter), deviation, offset, mean, float(np.median(seconds)))
 
 
 @dataclass(frozen=True)
@@ -709,17 +700,14 @@ def optimise_angles(known: Design) -> Design:
     if known.encoder is not None:
         raise InputError(f"a {known.sensor} sensor has no lines whose angles could be better")
     scale = SMALL_SIDE_PX / max(known.rows_px, known.columns_px)
-    sizes = {
-        name: max(1, round(getattr(known.camera, side)[axis] * scale))
-        for name, side, axis in (("rows_px", "image_shape", 0), ("columns_px", "image_shape", 1))
-    }
-    centres = tuple(float(c) for c in known.camera.centres_px * scale)
+    rows, columns = (max(1, round(side * scale)) for side in known.camera.image_shape)
     small = replace(
         known,
-        **sizes,
+        rows_px=rows,
+        columns_px=columns,
         focal_length_px=known.focal_length_px * scale,
         sensor_px=round(known.camera.slit_width_px * scale),
-        centres_px=centres,
+        centres_px=tuple((known.camera.centres_px * scale).tolist()),
     )
     y, x = np.indices(small.camera.image_shape).reshape(2, -1)
     down, across = abs(y[:, np.newaxis] - y), abs(x[:, np.newaxis] - x)

@@ -34,7 +34,7 @@ named as in Python, in backquotes (`bin_width`); the command line puts its optio
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from math import inf
 from os import PathLike
 from pathlib import Path
@@ -130,6 +130,13 @@ def require(holds: object, problem: str) -> None:
     """Refuse what the caller passed, with a `problem`, unless a condition holds."""
     if not holds:
         raise InputError(problem)
+
+
+def require_consistent(conditions: Iterable[tuple[object, str]]) -> None:
+    """Refuse a calibration of which a condition does not hold, with what is said of that one."""
+    for holds, problem in conditions:
+        if not holds:
+            raise CalibrationError(problem)
 
 
 def require_known(what: str, name: str, known: Collection[str]) -> None:

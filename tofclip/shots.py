@@ -19,6 +19,7 @@ from tofclip.arrays import (
     to_numpy,
 )
 from tofclip.camera import Camera
+from tofclip.camera.range_calibration import empty_array
 from tofclip.errors import (
     InputError,
     MissingTimeAxisError,
@@ -246,12 +247,8 @@ class Returns(Storable):
     time: FloatArray = field(metadata=stored_array("s", "return"))
     camera: Camera = field(metadata=stored_child(Camera.from_record, "camera"))
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
-    shear: FloatArray = field(
-        default_factory=lambda: np.empty(0), metadata=stored_array("px", "return", optional=True)
-    )
-    false_alarm: FloatArray = field(
-        default_factory=lambda: np.empty(0), metadata=stored_array("", "return", optional=True)
-    )
+    shear: FloatArray = empty_array("px", "return", optional=True)
+    false_alarm: FloatArray = empty_array("", "return", optional=True)
 
     def __post_init__(self) -> None:
         for name, unknown in (("shear", 0.0), ("false_alarm", np.nan)):
@@ -371,17 +368,12 @@ class Frames(Storable):
     figures: Mapping[str, Scalar] = field(default_factory=dict, metadata=stored_attributes())
     attachments: Mapping[str, Record] = field(default_factory=dict, metadata=stored_attachments())
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
-    shears: FloatArray = field(
-        default_factory=lambda: np.empty(0), metadata=stored_array("px", "time", optional=True)
-    )
+    shears: FloatArray = empty_array("px", "time", optional=True)
     returns: Returns | None = field(
         default=None, metadata=stored_child(Returns.from_record, "returns", optional=True)
     )
-    measured: Float32Array = field(
-        default_factory=lambda: np.empty((0, 0), np.float32),
-        metadata=stored_array(
-            "count", "column", "time", dtype=np.float32, optional=True, skip_empty=True
-        ),
+    measured: Float32Array = empty_array(
+        "count", "column", "time", dtype=np.float32, optional=True, skip_empty=True
     )
 
     def __post_init__(self) -> None:

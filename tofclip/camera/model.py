@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
@@ -20,7 +21,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from tofclip.arrays import BoolArray, FloatArray
 from tofclip.camera.range_calibration import RangeCalibration, empty_array
-from tofclip.errors import CalibrationError, FileFormatError, ShapeError
+from tofclip.errors import CalibrationError, FileFormatError, ShapeError, require_consistent
 from tofclip.notebook import render_html
 from tofclip.operators import LineProjection
 from tofclip.storage import Record, Storable, stored_array, stored_child, stored_value
@@ -280,13 +281,11 @@ class Camera(Storable):
             raise CalibrationError(f"a picture has two sides, got {self.image_shape}")
         rows, columns = (int(side) for side in self.image_shape)
         object.__setattr__(self, "image_shape", (rows, columns))
-        for holds, message in self._list_conditions():
-            if not holds:
-                raise CalibrationError(message)
+        require_consistent(self._list_conditions())
         if self.range_calibration is not None:
             self.range_calibration.require_shape(self.image_shape)
 
-    def _list_conditions(self) -> Iterator[tuple[bool | np.bool_, str]]:
+    def _list_conditions(self) -> Iterator[tuple[object, str]]:
         """What holds of every camera, and what to say where it does not."""
         views, width, centres = self.views, self.slit_width_px, self.centres_px
         yield views > 0, "a camera needs at least one view"
@@ -443,3 +442,20 @@ class Camera(Storable):
         if record.kind == "camera":
             return cls.from_record(record)
         return cls.from_record(record.child("camera", "camera"))
+
+
+def split_by_shear(
+    camera: Camera, distance: FloatArray, tolerance_px: float, *others: FloatArray
+) -> list[tuple[slice, float]]:
+    """Cut instants, whose light comes from a `distance` (n,), m, each, into pieces that share an
+    operator, and return them with their mean shear: no view lies further off its place on the slit
+    than the tolerance, and none of the `others` (n,) changes.
+    """
+    shears = camera.shear_at(distance)
+    # a piece reaches the tolerance to either side of its mean shear at the outermost view
+    step = 2 * tolerance_px / np.abs(camera.view_positions).max(initial=1.0)
+    numbers = np.floor((shears - shears[0]) / step), *others
+    changed = np.logical_or.reduce([np.diff(one) != 0 for one in numbers])
+    cuts = np.flatnonzero(np.concatenate([[True], changed, [True]])).tolist()
+    parts = [slice(*ends) for ends in pairwise(cuts)]
+    return [(part, float(shears[part].mean())) for part in parts]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.errors import CalibrationError
+from tofclip.errors import CalibrationError, require_consistent
 from tofclip.storage import Storable, stored_array, stored_value
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -88,9 +88,7 @@ class RangeCalibration(Storable):
             object.__setattr__(self, name, array)
             if not np.all(np.isfinite(array)):
                 raise CalibrationError(f"{name} of a range calibration must be finite")
-        for holds, message in self._list_conditions():
-            if not holds:
-                raise CalibrationError(message)
+        require_consistent(self._list_conditions())
 
     def _list_conditions(self) -> Iterator[tuple[Any, str]]:
         """What holds of every calibration, and what to say where it does not."""

@@ -12,12 +12,11 @@ calibration is within a few pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from tofclip.arrays import BoolArray, Float32Array, FloatArray, IndexArray
-from tofclip.camera.model import Camera, SkewSweep
+from tofclip.camera.model import Camera, SkewSweep, split_by_shear
 from tofclip.camera.rectifier import Measurement, estimate_dark_level, measure, require_width
 from tofclip.errors import CalibrationError
 from tofclip.solvers import Progress, Sparse, ignore_progress
@@ -238,11 +237,7 @@ def _group_by_shear(camera: Camera, times: FloatArray | None, chosen: IndexArray
     if times is None or camera.lenslet_pitch <= 0:
         return [(slice(0, chosen.size), 0.0)]
     distance = np.maximum(SPEED_OF_LIGHT * times[chosen] / 2, MIN_RANGE_M)
-    shears = camera.shear_at(distance)
-    step = 2 * SHEAR_TOLERANCE_PX / np.abs(camera.view_positions).max(initial=1.0)
-    changed = np.diff(np.floor((shears - shears[0]) / step)) != 0
-    cuts = np.flatnonzero(np.concatenate([[True], changed, [True]])).tolist()
-    return [(slice(*ends), float(shears[slice(*ends)].mean())) for ends in pairwise(cuts)]
+    return split_by_shear(camera, distance, SHEAR_TOLERANCE_PX)
 
 
 class _Model:

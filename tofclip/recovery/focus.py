@@ -12,6 +12,7 @@ import numpy as np
 
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, Measurement, measure
+from tofclip.camera.model import split_by_shear
 from tofclip.camera.parallax import (
     GATE_METHOD,
     FocusCurve,
@@ -143,17 +144,11 @@ class DepthLockedFocus(Focus):
     ) -> list[FrameSegment]:
         """Cut where the shear has changed by twice the tolerance, or light is a third weaker."""
         distance = np.maximum(SPEED_OF_LIGHT * times / 2, MIN_RANGE_M)
-        shears = camera.shear_at(distance)
-        # a piece reaches the tolerance to either side of its mean shear at the outermost view
-        step = 2 * self.tolerance_px / np.abs(camera.view_positions).max(initial=1.0)
-        number = np.floor((shears - shears[0]) / step).astype(np.int64)
         octave = np.floor(np.log(distance / distance[0]) / np.log(SEGMENT_RANGE_RATIO))
-        changed = (np.diff(number) != 0) | (np.diff(octave) != 0)
-        cuts = np.flatnonzero(np.concatenate([[True], changed, [True]]))
-        parts = [slice(int(first), int(last)) for first, last in pairwise(cuts)]
+        pieces = split_by_shear(camera, distance, self.tolerance_px, octave)
         return [
-            FrameSegment(part, float(shears[part].mean()), float(np.mean(distance[part] ** -2.0)))
-            for part in parts
+            FrameSegment(part, shear, float(np.mean(distance[part] ** -2.0)))
+            for part, shear in pieces
         ]
 
 

@@ -289,6 +289,7 @@ def _descend(
     )
 
 
+WAVELET = "db4"  # by PyWavelets' name
 SHIFT_COUNT = 4  # grid positions that are averaged over
 
 
@@ -298,15 +299,14 @@ class NonnegativeWavelets(_Prior):
     Cycle spinning (R. Coifman, D. Donoho, 1995): the picture is shifted, its details are shrunk, it
     is shifted back, and the results are averaged. The average of proximal maps is the proximal map
     of the penalties' proximal average (Y. Yu, NIPS 2013), so with shifts that stay the same the
-    solver's objective still falls. The approximation is not shrunk. `wavelet` is PyWavelets' name.
+    solver's objective still falls. The approximation is not shrunk.
     """
 
-    def __init__(self, weight: float, wavelet: str = "db4", seed: int = 0) -> None:
+    def __init__(self, weight: float) -> None:
         super().__init__(weight)
-        self.wavelet = wavelet
         # The same shifts in every iteration: new ones would be another penalty each time, and the
         # objective could rise.
-        self._shifts = np.random.default_rng(seed).integers(0, 64, (SHIFT_COUNT, 2))
+        self._shifts = np.random.default_rng(0).integers(0, 64, (SHIFT_COUNT, 2))
 
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
@@ -332,7 +332,7 @@ class NonnegativeWavelets(_Prior):
         # As deep as the approximation still has a dozen pixels a side. Periodic borders keep the
         # transform orthogonal, so that shrinking is the exact proximal map.
         levels = max(1, int(np.log2(min(rows, columns) / 12)))
-        grid = {"wavelet": self.wavelet, "mode": "periodization", "axes": (0, 1)}
+        grid = {"wavelet": WAVELET, "mode": "periodization", "axes": (0, 1)}
         approximation, *details = pywt.wavedec2(picture, level=levels, **grid)
         soft = [
             tuple(pywt.threshold(band, threshold, "soft").astype(picture.dtype) for band in bands)
