@@ -9,7 +9,7 @@ import pytest
 
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, Pulse, depth
-from tofclip.lidar.fit_kernels import fit_lone_returns
+from tofclip.lidar.fit_kernels import fit_returns
 from tofclip.lidar.peak_kernels import (
     CANDIDATE_COLUMNS,
     FIRST_OFFSET,
@@ -129,14 +129,14 @@ def test_a_return_is_followed_when_it_moves_away_from_its_peak(peak, there):
     room = Room(
         **dict.fromkeys(("score", "responses", "free"), np.empty(0, np.float32)),
         **dict.fromkeys(("peaks", "estimates"), np.empty((0, 2))),
-        **dict.fromkeys(("lone", "crowded"), np.zeros(1, np.int64)),
+        fitted=np.zeros(1, np.int64),
         level=np.empty(0),
         places=np.empty((4, 0), np.int32),
         moments=np.array([[3.0, 1.0]]),
         candidates=candidates,
         rests=rests,
     )
-    fit_lone_returns(traces[:1], table, even, room, 1)
+    fit_returns(traces[:1], table, even, room, 1)
     assert candidates[0, PEAK_BIN] + candidates[0, FIRST_OFFSET] == pytest.approx(peak + 0.1)
     if there:
         assert candidates[0, PEAK_BIN] + candidates[0, OFFSET] == pytest.approx(30.2, abs=1e-3)

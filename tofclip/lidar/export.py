@@ -207,19 +207,16 @@ def _write_pcd(path: Path, columns: Columns, shape: Any, provenance: Mapping[str
     _write_binary(path, lines, columns)
 
 
-def make_rows(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+def make_rows(columns: Columns) -> NDArray[Any]:
     """Return columns as packed rows, little endian."""
-    layout = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
-    rows = np.empty(next(iter(columns.values())).size, layout)
-    for name, values in columns.items():
-        rows[name] = values
-    return rows
+    layout = np.dtype([(one.name, one.values.dtype.newbyteorder("<")) for one in columns])
+    return np.rec.fromarrays([one.values for one in columns], dtype=layout)
 
 
 def _write_binary(path: Path, header: list[str], columns: Columns) -> None:
     with open(path, "wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
-        file.write(make_rows({column.name: column.values for column in columns}).tobytes())
+        file.write(make_rows(columns).tobytes())
 
 
 def _list_ply(path: Path) -> Entries:
@@ -305,9 +302,8 @@ def _list_csv(path: Path) -> Entries:
 
 
 def _write_npz(path: Path, columns: Columns, shape: tuple[int, int] | None, _: Any) -> None:
-    arrays: dict[str, Any] = {
-        column.label: column.values.reshape(-1 if shape is None else shape) for column in columns
-    }
+    shape = columns[0].values.shape if shape is None else shape
+    arrays: Any = {column.label: column.values.reshape(shape) for column in columns}
     np.savez_compressed(path, **arrays)
 
 
@@ -396,8 +392,8 @@ def _write_e57(path: Path, columns: Columns, *_: Any) -> None:
         bounds = lib.StructureNode(image)
         for column in columns:
             if column.name in "xyz":
-                ends = (column.values.min(), column.values.max()) if column.values.size else (0, 0)
-                for which, end in zip(("Minimum", "Maximum"), ends, strict=True):
+                values = column.values if column.values.size else np.zeros(1)
+                for which, end in (("Minimum", values.min()), ("Maximum", values.max())):
                     bounds.set(column.name + which, lib.FloatNode(image, float(end)))
         scan.set("cartesianBounds", bounds)
 
@@ -438,20 +434,19 @@ def _write_vector(lib: Any, image: Any, columns: Columns, attach: Callable[[Any]
 
 def _list_e57(path: Path) -> Entries:
     def read() -> Mapping[str, Any]:
-        found = {}
+        found: dict[str, NDArray[Any]] = {}
         with _open_e57(path) as (lib, image, tables):
             for table, elements in tables:
                 points, buffers = table.childCount(), lib.VectorSourceDestBuffer()
-                for label, name, kind in elements:
-                    found[name] = np.empty(points, kind)
-                    if points:
-                        buffers.append(
-                            lib.SourceDestBuffer(image, label, found[name], points, True, False)
-                        )
-                if points:
-                    reader = table.reader(buffers)
-                    reader.read()
-                    reader.close()
+                found |= {name: np.empty(points, kind) for _, name, kind in elements}
+                if not points:
+                    continue
+                for label, name, _ in elements:
+                    to = lib.SourceDestBuffer(image, label, found[name], points, True, False)
+                    buffers.append(to)
+                reader = table.reader(buffers)
+                reader.read()
+                reader.close()
         return found
 
     types: dict[str, DTypeLike] = {}

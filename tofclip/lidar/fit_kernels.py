@@ -62,9 +62,8 @@ def search_traces(traces, pixels, axis, limits, table, pulse, room, found, count
     which they belong; `found` (all pixels, most returns, 3) gets instants, s, sums over the bins
     and standard deviations, s, nearest first, and `counts` (all pixels,) how many.
     """
-    listed, lone, crowded = find_candidates(traces, pixels, axis, limits, table.half, room, counts)
-    fit_lone_returns(traces, table, axis.even, room, lone)
-    fit_crowded_returns(traces, table, axis.even, room, crowded)
+    listed, number = find_candidates(traces, pixels, axis, limits, table.half, room, counts)
+    fit_returns(traces, table, axis.even, room, number)
     least = limits.signal_to_noise
     measure_returns_by_table(room, listed, least, pixels, axis.times, table, found, counts)
     exact = False
@@ -75,49 +74,20 @@ def search_traces(traces, pixels, axis, limits, table, pulse, room, found, count
 
 
 @search_step
-def fit_lone_returns(traces, table, even, room, moving):
-    """Fit returns whose bins no other one shares, the first `moving` of `room.lone`: each round takes
-    one step of every return that still moves.
-
-    A step waits for the one before it; those of different returns do not, so that the processor works
-    on several at a time. Heights become 0 or less where there is no pulse, and NaN where a return moved
-    to where the exact fit is needed; `PEAK_BIN` follows one that moves further than `MAX_OFFSET_BINS`.
+def fit_returns(traces, table, even, room, number):
+    """Fit the first `number` returns of `room.fitted`, those that overlap together, by steps on one at
+    a time. In the end `rests` is what the others leave. A return that moved no more and that no moving
+    one reaches is left alone. Heights become 0 or less where there is no pulse, and NaN where a return
+    moved to where the exact fit is needed; `PEAK_BIN` follows one that moves further than
+    `MAX_OFFSET_BINS`.
     """
-    for _ in range(MAX_FIT_ROUNDS):
-        still = 0
-        for a in range(moving):
-            k = room.lone[a]
-            own, rest = room.candidates[k], room.rests[k]
-            phase = find_phase(own[OFFSET])
-            along_pulse = along_slope = fill_vector(np.float32(0))
-            for w in range(np.uintp(0), np.uintp(rest.size), STEP):
-                left = load_vector(rest, w)
-                along_pulse += left * load_vector(table.shapes[phase], w)
-                along_slope += left * load_vector(table.slopes[phase], w)
-            take_table_step(
-                own, phase, sum_vector(along_pulse), sum_vector(along_slope), table.sums
-            )
-            follow_return(own, rest, traces, room.moments, even, table.half)
-            room.lone[still] = k
-            still += 1 if own[MOVED] >= CONVERGENCE_STEP_BINS else 0
-        moving = still
-        if moving == 0:
-            break
-
-
-@search_part
-def fit_crowded_returns(traces, table, even, room, number):
-    """Fit returns that overlap, the first `number` of `room.crowded`, as `fit_lone_returns` does,
-    by steps on one at a time. In the end `rests` is what the others leave. A return that moved no
-    more and that no moving one reaches is left alone.
-    """
-    candidates, crowded, half = room.candidates, room.crowded, table.half
+    candidates, fitted, half = room.candidates, room.fitted, table.half
     start = 0
     while start < number:
         end = start + 1
-        while end < number and is_near(candidates, crowded[end - 1], crowded[end], half):
+        while end < number and is_near(candidates, fitted[end - 1], fitted[end], half):
             end += 1
-        group = crowded[start:end]
+        group = fitted[start:end]
         for _ in range(MAX_FIT_ROUNDS):
             largest = 0.0
             for k in group:

@@ -27,18 +27,6 @@ from tofclip.arrays import FloatArray
 from tofclip.compiling import compile_as_part, compile_loop, inlined
 from tofclip.threads import run_blocks
 from tofclip.units import MAD_TO_SIGMA
-from tofclip.vectors import (
-    LENGTH,
-    STEP,
-    choose,
-    count_set_lanes,
-    fill_vector,
-    find_highest_lane,
-    list_set_lanes,
-    load_vector,
-    store_vector,
-    sum_vector,
-)
 
 fit_part = compile_as_part(fastmath=True, _nrt=False)
 
@@ -129,7 +117,7 @@ def layer_returns(
     none; of pixels of even rows and columns, even rows and odd columns, and so on, within a margin.
     """
     rows, columns = (-(-size // STRIDE_PX) + 2 * MARGIN for size in image_shape)
-    shape = (int(np.diff(starts).max()), STRIDE_PX**2, rows, columns + LENGTH - SIDE)
+    shape = (int(np.diff(starts).max()), STRIDE_PX**2, rows, columns)
     y, x = np.arange(image_shape[0])[:, np.newaxis], np.arange(image_shape[1])
     part = y % STRIDE_PX * STRIDE_PX + x % STRIDE_PX
     place = (part * rows + y // STRIDE_PX + MARGIN) * shape[3] + x // STRIDE_PX + MARGIN
@@ -192,44 +180,40 @@ def take_nearest(layers, own, nearness, metres, off):
     """Of each pixel around (row, column) `own`, take the return that is nearest in range to one of this
     `nearness`, and enter by how much further it is, m; beyond any gate where there is none.
     """
-    top, left = own[0] // STRIDE_PX, np.uintp(own[1] // STRIDE_PX)
+    top, left = own[0] // STRIDE_PX, own[1] // STRIDE_PX
     part = own[0] % STRIDE_PX * STRIDE_PX + own[1] % STRIDE_PX
-    here, scale, zero = fill_vector(nearness), fill_vector(metres), fill_vector(np.float32(0))
     for j in range(SIDE):
-        nearest = far = fill_vector(np.float32(FAR))
+        row = off[SIDE * j : SIDE * (j + 1)]
+        row[:] = FAR
         for layer in range(layers.shape[0]):
-            away = here - load_vector(layers[layer, part, top + j], left)
-            distance = choose(away > zero, away, zero - away)
-            nearest = choose(far > distance, away, nearest)
-            far = choose(far > distance, distance, far)
-        # the lanes behind the row's last place are overwritten by the next row
-        store_vector(off, np.uintp(SIDE * j), nearest * scale)
-    for t in range(SIDE * SIDE, NEIGHBOURS):
-        off[t] = FAR
+            there = layers[layer, part, top + j, left : left + SIDE]
+            for i in range(SIDE):
+                away = (nearness - there[i]) * metres
+                row[i] = away if abs(away) < abs(row[i]) else row[i]
 
 
 @inlined
 def measure_offsets(window, system):
     """Enter the distance, m, of each neighbour from the surface, whose terms stand in the last column."""
-    off, residual, zero = window[OFF], window[RESIDUAL], fill_vector(np.float32(0))
-    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
-        above = load_vector(off, t)
-        for k in range(TERMS):
-            share = fill_vector(np.float32(system[k, TERMS]))
-            above -= share * load_vector(window[FIRST_TERM + k], t)
-        store_vector(residual, t, choose(above > zero, above, zero - above))
+    off, residual = window[OFF], window[RESIDUAL]
+    for t in range(NEIGHBOURS):
+        residual[t] = off[t]
+    for k in range(TERMS):
+        share, term = np.float32(system[k, TERMS]), window[FIRST_TERM + k]
+        for t in range(NEIGHBOURS):
+            residual[t] -= share * term[t]
+    for t in range(NEIGHBOURS):
+        residual[t] = abs(residual[t])
 
 
 @inlined
 def mark_near(memory, most):
     """Use the neighbours that are off by at most so much, m; return whether others were used before."""
-    used, residual = memory[USED], memory[RESIDUAL]
-    farthest, changed = fill_vector(np.float32(most)), np.uint64(0)
-    one, zero = fill_vector(np.float32(1)), fill_vector(np.float32(0))
-    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
-        near = farthest >= load_vector(residual, t)
-        changed |= list_set_lanes(near) ^ list_set_lanes(load_vector(used, t) > zero)
-        store_vector(used, t, choose(near, one, zero))
+    used, residual, changed = memory[USED], memory[RESIDUAL], np.float32(0)
+    for t in range(NEIGHBOURS):
+        near = np.float32(residual[t] <= np.float32(most))
+        changed += abs(near - used[t])
+        used[t] = near
     return changed != 0
 
 
@@ -267,12 +251,10 @@ def find_median(memory, count, guess):
 @inlined
 def count_used_below(memory, limit):
     """How many of those used are off by at most `limit`."""
-    used, residual, below = memory[USED], memory[RESIDUAL], 0
-    most, zero = fill_vector(limit), fill_vector(np.float32(0))
-    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
-        near = most >= load_vector(residual, t)
-        below += count_set_lanes(near & (load_vector(used, t) > zero))
-    return below
+    used, residual, below = memory[USED], memory[RESIDUAL], np.float32(0)
+    for t in range(NEIGHBOURS):
+        below += used[t] if residual[t] <= limit else np.float32(0)
+    return int(below)
 
 
 @fit_part
@@ -280,14 +262,12 @@ def find_residuals_beside(memory, limit):
     """The largest residual of those used that is at most `limit`, or 0, and the smallest above it, or
     `FAR`.
     """
-    used, residual = memory[USED], memory[RESIDUAL]
-    most, zero = fill_vector(limit), fill_vector(np.float32(0))
-    last, first = zero, fill_vector(np.float32(FAR))
-    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
-        here, counted = load_vector(residual, t), load_vector(used, t) > zero
-        last = choose(counted & (most >= here) & (here > last), here, last)
-        first = choose(counted & (here > most) & (first > here), here, first)
-    return find_highest_lane(last), -find_highest_lane(zero - first)
+    used, residual, last, first = memory[USED], memory[RESIDUAL], np.float32(0), np.float32(FAR)
+    for t in range(NEIGHBOURS):
+        here, counted = residual[t], used[t] > 0
+        last = max(last, here if counted & (here <= limit) else np.float32(0))
+        first = min(first, here if counted & (here > limit) else np.float32(FAR))
+    return last, first
 
 
 @fit_part
@@ -323,11 +303,11 @@ def fit_quadratic(window, system):
 @fit_part
 def sum_used(window, row, factor):
     """Sum over the neighbours that are used of one row, or of its products with another one."""
-    used, total = window[USED], fill_vector(np.float32(0))
-    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
-        part = load_vector(used, t) * load_vector(window[row], t)
-        total += part if factor == USED else part * load_vector(window[factor], t)
-    return float(sum_vector(total))
+    used, total = window[USED], np.float32(0)
+    for t in range(NEIGHBOURS):
+        part = used[t] * window[row, t]
+        total += part if factor == USED else part * window[factor, t]
+    return float(total)
 
 
 @compile_loop()

@@ -104,8 +104,7 @@ class Room(NamedTuple):
     candidates: FloatArray  # (pixels * returns, CANDIDATE_COLUMNS), a trace's side by side, in time
     # (pixels * returns, width), trace less background around each peak; zero where that fills up
     rests: Float32
-    lone: NDArray[np.int64]  # (pixels * returns,), candidates whose bins no other one shares
-    crowded: NDArray[np.int64]  # (pixels * returns,), the others that the table fits
+    fitted: NDArray[np.int64]  # (pixels * returns,), candidates that the table fits
     estimates: FloatArray  # (returns, 5), of the exact fit
     level: FloatArray  # (bins,), background of the exact fit
 
@@ -116,9 +115,9 @@ def find_candidates(traces, pixels, axis, limits, half, room, counts):
     `traces` (n, bins) have memory for another one after the last; `pixels` (n,): their pixels;
     `half`: of the table of the pulse, which says how far to cut out. `counts` (all pixels,) become
     0, or `NEEDS_EXACT_FIT` where a candidate's bins are not all there. Returns how many candidates
-    there are, and how many of them stand alone and do not.
+    there are, and how many of them do not.
     """
-    listed = lone = crowded = 0
+    listed = number = 0
     candidates = room.candidates
     all_bins = np.float32(0)
     for i in range(np.uintp(0), np.uintp(traces.shape[1])):
@@ -128,13 +127,13 @@ def find_candidates(traces, pixels, axis, limits, half, room, counts):
         centre, sum_left, square_left = sum_about(trace, axis.bin_weights)
         apply_filter(trace, axis, room.score)
         level = np.float32(limits.background_gain) * (centre + np.float32(sum_left) / all_bins)
-        number = list_maxima(room.score, limits.of_interest, axis.words, level, room.places)
+        maxima = list_maxima(room.score, limits.of_interest, axis.words, level, room.places)
         about = centre, all_bins, sum_left, square_left
-        background, noise, number = take_strongest_peaks(trace, axis, limits, about, number, room)
+        background, noise, peaks = take_strongest_peaks(trace, axis, limits, about, maxima, room)
         room.moments[place, 0] = background
         room.moments[place, 1] = noise
         known = background, noise, place
-        listed = confirm_peaks(trace, axis, limits, known, room.peaks[:number], candidates, first)
+        listed = confirm_peaks(trace, axis, limits, known, room.peaks[:peaks], candidates, first)
         counts[pixels[place]] = 0
         for k in range(first, listed):
             j = int(candidates[k, PEAK_BIN])
@@ -142,15 +141,9 @@ def find_candidates(traces, pixels, axis, limits, half, room, counts):
                 counts[pixels[place]] = NEEDS_EXACT_FIT
                 continue
             cut_out(trace, background, j - half, 2 * half + 1, room.rests[k])
-            # light that ends before the other's begins, whatever both of them move
-            near = k > 0 and is_near(candidates, k - 1, k, half)
-            if near or (k + 1 < listed and is_near(candidates, k, k + 1, half)):
-                room.crowded[crowded] = k
-                crowded += 1
-            else:
-                room.lone[lone] = k
-                lone += 1
-    return listed, lone, crowded
+            room.fitted[number] = k
+            number += 1
+    return listed, number
 
 
 @search_part

@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ MESSAGE_TYPE = "sensor_msgs/msg/PointCloud2"
 FIELD_TYPES = {"<f4": 7, "|u1": 2}  # NumPy's name of a type and ROS's number for it
 NUMBERED_TYPES = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), start=1))
 
+NAMES = {"time": "time_of_flight"}  # of columns, where messages have others
 NANOSECONDS_PER_SECOND = 1_000_000_000
 
 
@@ -57,12 +58,19 @@ def write_bag(
 
     typestore = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     plugin = rosbag2.StoragePlugin.MCAP if single else rosbag2.StoragePlugin.SQLITE3
+    number = latest = 0
     try:
         with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as scratch:
             bag = Path(scratch) / target.name
             # Version 8 is read by all present releases of ROS 2.
             with rosbag2.Writer(bag, version=8, storage_plugin=plugin) as writer:
-                number = _write_messages(clouds, writer, typestore, topic, frame_id)
+                connection = writer.add_connection(topic, MESSAGE_TYPE, typestore=typestore)
+                for stamped in clouds:
+                    if stamped.stamp_ns < latest:
+                        raise InputError("stamps must not be negative, nor earlier than before")
+                    message = _make_message(stamped, typestore.types, frame_id)
+                    number, latest = number + 1, stamped.stamp_ns
+                    writer.write(connection, latest, typestore.serialize_cdr(message, MESSAGE_TYPE))
             if number == 0:
                 raise InputError(f"{target}: there is no cloud to write")
             if single:
@@ -138,36 +146,15 @@ def _read_message(message: Any) -> StampedCloud:
     )
 
 
-def _write_messages(
-    clouds: Iterable[StampedCloud], writer: Any, typestore: Any, topic: str, frame_id: str
-) -> int:
-    connection = writer.add_connection(topic, MESSAGE_TYPE, typestore=typestore)
-    number, latest = 0, 0
-    for stamped in clouds:
-        if stamped.stamp_ns < latest:
-            raise InputError("stamps must not be negative, nor earlier than the one before")
-        latest = stamped.stamp_ns
-        message = _make_message(stamped, typestore.types, frame_id)
-        writer.write(connection, latest, typestore.serialize_cdr(message, MESSAGE_TYPE))
-        number += 1
-    return number
-
-
 def _make_message(stamped: StampedCloud, types: Any, frame_id: str) -> Any:
     rows = make_rows(
-        {
-            "time_of_flight" if column.name == "time" else column.name: column.values
-            for column in stamped.cloud.columns
-        }
+        [replace(one, name=NAMES.get(one.name, one.name)) for one in stamped.cloud.columns]
     )
     fields = [
-        types["sensor_msgs/msg/PointField"](
-            name=name, offset=offset, datatype=FIELD_TYPES[kind.str], count=1
-        )
+        types["sensor_msgs/msg/PointField"](name, offset, FIELD_TYPES[kind.str], 1)
         for name, (kind, offset, *_) in (rows.dtype.fields or {}).items()
     ]
-    seconds, rest = divmod(stamped.stamp_ns, NANOSECONDS_PER_SECOND)
-    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
+    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamped.stamp_ns, NANOSECONDS_PER_SECOND))
     return types[MESSAGE_TYPE](
         header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id),
         height=1,

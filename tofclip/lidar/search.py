@@ -16,8 +16,8 @@ The steps, for each pixel (`tofclip.lidar.trace_search` takes some of them at on
 3. Keep those that the matched filter confirms against noise and the pixel's strongest return, and
    place them below a bin (`confirm_peaks`).
 4. Fit arrival and height by Gauss-Newton steps on one return at a time, each against what the
-   others leave: on an even time axis by a table of the pulse (`fit_lone_returns`,
-   `fit_crowded_returns`), elsewhere exactly (`fit_returns_exactly`).
+   others leave: on an even time axis by a table of the pulse (`fit_returns`), elsewhere exactly
+   (`fit_returns_exactly`).
 5. Measure what the fit confirms: sum over the bins and the arrival's standard deviation
    (`measure_returns_by_table`).
 6. Add the recovery's own errors to the deviation, by what neighbours show (`add_recovery_error`).

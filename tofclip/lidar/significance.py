@@ -192,32 +192,20 @@ class EvidenceJudge:
         """
         if pixel.size == 0:
             return np.empty(0)
-        against_noise, against_spread, seen = self.describe(pixel, time, signal)
-        no_noise = scipy.special.expit(NOISE[:-1] @ against_noise + NOISE[-1])
-        spread = scipy.special.expit(-SPREAD[:-1] @ against_spread - SPREAD[-1])
-        return np.asarray(1 - no_noise * (1 - seen * spread))
-
-    def describe(
-        self, pixel: NDArray[np.int64], time: FloatArray, signal: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what speaks against noise, and against spread, of each candidate: the numbers of which
-        `NOISE` and `SPREAD` are the weights, a line each; and how much of what is spread is seen.
-        """
-        width, distance = self.pulse.fwhm, SPEED_OF_LIGHT / 2 * time
-        # what ranges may differ by for each pixel of the pool's radius, m: it reaches less far in range
-        # the further a neighbour is, like a ball
-        gate = GATE_PULSES_PER_PX * SPEED_OF_LIGHT / 2 * width
         # the compiler takes as long to import as all else
         from tofclip.lidar.peak_kernels import pool_significance
 
+        width, distance = self.pulse.fwhm, SPEED_OF_LIGHT / 2 * time
         shape = self.frames.camera.image_shape
         starts = np.searchsorted(pixel, np.arange(math.prod(shape) + 1))
+        # what ranges may differ by for each pixel of the radius: it reaches less far in range the
+        # further a neighbour is, like a ball
+        ball = POOL_RADIUS_PX, GATE_PULSES_PER_PX * SPEED_OF_LIGHT / 2 * width
 
         def sum_around(own: FloatArray) -> FloatArray:
             """Sum over each candidate and those around it at the same range."""
             pooled = np.empty(own.size)
-            limits = POOL_RADIUS_PX, gate
-            pool_significance(pixel, distance, own, starts, shape, limits, pooled)
+            pool_significance(pixel, distance, own, starts, shape, ball, pooled)
             return pooled
 
         # what the model does not explain is known by its brightness
@@ -242,9 +230,11 @@ class EvidenceJudge:
         misfit = 0.0 if self.frames.figures.get(CLIPPED_KEY) else self.noise.misfit
         brightness[1] *= misfit / (misfit + HALF_MISFIT)
         # what has no significance does not gain any by being many
-        many = np.minimum(neighbours, 3 * pooled)
-        no_noise = np.array([np.log(np.maximum(pooled, TINY)), many])
-        return no_noise, np.array([*brightness, excess]), most**2 / (most**2 + HALF_SEEN**2)
+        against_noise = [np.log(np.maximum(pooled, TINY)), np.minimum(neighbours, 3 * pooled)]
+        no_noise = scipy.special.expit(NOISE[:-1] @ against_noise + NOISE[-1])
+        spread = scipy.special.expit(-SPREAD[:-1] @ [*brightness, excess] - SPREAD[-1])
+        seen = most**2 / (most**2 + HALF_SEEN**2)
+        return np.asarray(1 - no_noise * (1 - seen * spread))
 
 
 def find_brightness(values: FloatArray) -> float:

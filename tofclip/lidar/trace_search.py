@@ -143,8 +143,7 @@ class TraceSearch:
             moments=np.empty((pixels, 2)),
             candidates=np.empty((listed, CANDIDATE_COLUMNS)),
             rests=np.empty((listed, width), np.float32),
-            lone=np.empty(listed, np.int64),
-            crowded=np.empty(listed, np.int64),
+            fitted=np.empty(listed, np.int64),
             estimates=np.empty((most, 5)),
             level=np.empty(self._number),
         )
