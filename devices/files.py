@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from devices.address import Uri
 from devices.frames import make_streak_calibration
 from devices.source import READ_TIMEOUT_S, Batch, Info, Ledger, Records, Source, Stats
+from tofclip.arrays import IntArray
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import (
     BoundedFile,
@@ -225,7 +225,7 @@ class SwabianPhotons:
 
     def _read_next(
         self,
-    ) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], int]:
+    ) -> tuple[tuple[IntArray, IntArray, IntArray], int]:
         """Return pulse, delay and channel of the next photons, and how many tags were lost."""
         tags = self._file.getData(SWABIAN_CHUNK_TAGS)
         kind, channel = np.asarray(tags.getEventTypes()), np.asarray(tags.getChannels(), np.int64)

@@ -11,11 +11,11 @@ from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from devices.address import Uri, option
 from devices.source import ByteView, Codec, DecodeResult, Gap, Ledger, Records
 from devices.stream import Feed, InstrumentClock, LiveOptions, Transfer, retry_connect
+from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.storage import Field, Record, Scalar
@@ -46,7 +46,7 @@ class GatedOptions(LiveOptions):
         return self.gate_steps if self.is_gated else 1
 
     @property
-    def opening_times(self) -> NDArray[np.float64]:
+    def opening_times(self) -> FloatArray:
         """When the gate opens in each picture of a scan, s after the laser's pulse."""
         steps = np.arange(self.gate_steps, dtype=np.float64)
         return (self.gate_offset_ps + self.gate_step_ps * steps) * 1e-12
@@ -66,7 +66,7 @@ class GatedOptions(LiveOptions):
         return found
 
 
-def make_streak_calibration(times: NDArray[np.float64], camera: Camera | None = None) -> Record:
+def make_streak_calibration(times: FloatArray, camera: Camera | None = None) -> Record:
     """Return what is known of streak pictures whose rows are at these times, s, and of the camera
     before them.
     """

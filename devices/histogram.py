@@ -9,14 +9,13 @@ import abc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from devices.linospad2 import CLOCK_PERIOD_S, PIXELS, BoardCalibration
 from devices.source import Records
 from devices.timetag_codec import DELTA
+from tofclip.arrays import AnyArray, FloatArray, IntArray
 from tofclip.errors import InputError
 from tofclip.shots import Streak
 from tofclip.threads import run_blocks, thread_count
@@ -62,9 +61,9 @@ class BinAxis:
             )
 
     @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """Middle of each bin, s."""
-        times: NDArray[np.float64] = self.start + np.arange(self.bins) * np.float64(self.bin_width)
+        times: FloatArray = self.start + np.arange(self.bins) * np.float64(self.bin_width)
         return times
 
     @property
@@ -84,7 +83,7 @@ class Histogram(abc.ABC):
     """
 
     def __init__(
-        self, pixels: int, axis: BinAxis, hot_pixels: NDArray[np.int64] | tuple[int, ...] = ()
+        self, pixels: int, axis: BinAxis, hot_pixels: IntArray | tuple[int, ...] = ()
     ) -> None:
         if pixels < 1 or pixels * axis.bins > MAX_CELLS:
             raise InputError(
@@ -92,7 +91,7 @@ class Histogram(abc.ABC):
             )
         self.pixels, self.axis = pixels, axis
         self._hot = np.asarray(hot_pixels, np.int64)
-        self._parts: list[NDArray[np.float64]] = []
+        self._parts: list[FloatArray] = []
 
     @abc.abstractmethod
     def add(self, records: Records, after_gap: bool = False) -> None:
@@ -101,7 +100,7 @@ class Histogram(abc.ABC):
         """
 
     @property
-    def counts(self) -> NDArray[np.float64]:
+    def counts(self) -> FloatArray:
         """Photons so far, (bins, pixels); right to a millionth of a photon."""
         total = np.zeros((self.pixels, self.axis.bins + 2))
         for part in self._parts:
@@ -121,7 +120,7 @@ class Histogram(abc.ABC):
         untrusted[:, self._hot] = True
         return Streak(counts, self.axis.times, untrusted, source="photon histogram")
 
-    def _add_in_parallel(self, add: Callable[[slice, NDArray[Any]], None], total: int) -> None:
+    def _add_in_parallel(self, add: Callable[[slice, AnyArray], None], total: int) -> None:
         """Call `add` on pieces of ``range(total)``, each with steps that no other thread uses."""
         size = max(_MIN_PIECE, -(-total // thread_count()))
         # a sum for each piece, so that threads never write to the same one
@@ -159,7 +158,7 @@ class StampHistogram(Histogram):
 
         strays: list[int] = []  # appending is safe on several threads
 
-        def add(piece: slice, steps: NDArray[Any]) -> None:
+        def add(piece: slice, steps: AnyArray) -> None:
             strays.append(add_stamps(rows[piece], clock, self._codes, period, steps))
 
         self._add_in_parallel(add, len(records))
@@ -203,7 +202,7 @@ class TagHistogram(Histogram):
         columns = [records[name] for name in ("time_ticks", "channels", "flags")]
         place = (self._pixel_of, self._tick_bins, self.axis.shift_bins, self.axis.period_bins)
 
-        def add(piece: slice, steps: NDArray[Any]) -> None:
+        def add(piece: slice, steps: AnyArray) -> None:
             # Each thread begins in the middle of the batch and looks back for the pulse that counts
             # there.
             start = find_last_sync(*columns, DELTA, self._sync, piece.start, known)
@@ -234,7 +233,7 @@ class BinHistogram(Histogram):
         scale, shift, period = 1 / self.axis.bin_width, self.axis.shift_bins, self.axis.period_bins
         width = max(self._resolution * scale, MIN_WIDTH_BINS)
 
-        def add(piece: slice, steps: NDArray[Any]) -> None:
+        def add(piece: slice, steps: AnyArray) -> None:
             add_times(pixels[piece], times[piece], scale, shift, width, period, steps)
 
         self._add_in_parallel(add, len(records))

@@ -32,6 +32,7 @@ from devices.address import Uri, option
 from devices.frames import FrameCodec, FrameFeed
 from devices.source import Info
 from devices.stream import LiveOptions, StreamSource, Transfer
+from tofclip.arrays import IntArray
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceNotFoundError,
@@ -51,7 +52,7 @@ VL53_NATIVE_BIN_S = 2 * 37.5348e-3 / 299_792_458  # s; of the 37.5348 mm that ST
 VL53_SCALE = 10  # Counts are sent with one digit after the point
 
 
-def find_tmf_zones(zones: int) -> NDArray[np.int64]:
+def find_tmf_zones(zones: int) -> IntArray:
     """Return the pixel, in raster order, at which each zone looks, in the order in which zones come:
     captures, then halves, then channels. Of 64 zones the maker's own programs put them so; 9 come row
     by row.

@@ -47,6 +47,7 @@ from devices.source import (
     SeekableSource,
     as_bytes,
 )
+from tofclip.arrays import FloatArray, IntArray
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
 from tofclip.files import guard, read_toml, suggest_name, translate_read_errors
 from tofclip.storage import Record, Storable, stored_array
@@ -194,7 +195,7 @@ class LinoSpad2Codec(Codec):
         converter = self.address_of[records["pixel"]] // ADDRESSES
         return records[np.lexsort([converter, records["cycle"]])]
 
-    def _count_per_cycle(self, cycles: NDArray[np.uint32]) -> tuple[NDArray[np.int64], int]:
+    def _count_per_cycle(self, cycles: NDArray[np.uint32]) -> tuple[IntArray, int]:
         """Count the time stamps of each cycle, and all malformed words."""
         from devices.linospad2_kernels import count_stamps
 
@@ -225,9 +226,9 @@ class BoardCalibration(Storable):
 
     RECORD_KIND = "linospad2_calibration"
 
-    code_ends: NDArray[np.float64] = field(metadata=stored_array("s", "pixel", "code"))
-    offsets: NDArray[np.float64] = field(metadata=stored_array("s", "pixel"))
-    hot_pixels: NDArray[np.int64] = field(
+    code_ends: FloatArray = field(metadata=stored_array("s", "pixel", "code"))
+    offsets: FloatArray = field(metadata=stored_array("s", "pixel"))
+    hot_pixels: IntArray = field(
         default_factory=lambda: np.empty(0, np.int64),
         metadata=stored_array("px", "hot", dtype=np.int64, optional=True, skip_empty=True),
     )
@@ -259,17 +260,17 @@ class BoardCalibration(Storable):
         return cls(np.tile(ends, (PIXELS, 1)), np.zeros(PIXELS))
 
     @property
-    def code_begins(self) -> NDArray[np.float64]:
+    def code_begins(self) -> FloatArray:
         """Instant at which each code begins, s since the clock's tick, (256, 140)."""
-        begins: NDArray[np.float64] = np.pad(self.code_ends[:, :-1], ((0, 0), (1, 0)))
+        begins: FloatArray = np.pad(self.code_ends[:, :-1], ((0, 0), (1, 0)))
         return begins
 
-    def times(self, records: Records) -> NDArray[np.float64]:
+    def times(self, records: Records) -> FloatArray:
         """Return when each photon came, s since its cycle began: the end of its code. ``time =
         (code - code % 140) * 2500 ps / 140 + code_ends[pixel, code % 140] + offsets[pixel]``.
         """
         periods, code = np.divmod(records["code"], CODES_PER_PERIOD)
-        found: NDArray[np.float64] = periods * CLOCK_PERIOD_S
+        found: FloatArray = periods * CLOCK_PERIOD_S
         found += self.code_ends[records["pixel"], code]
         found += self.offsets[records["pixel"]]
         return found

@@ -25,13 +25,13 @@ from sys import maxsize
 from time import monotonic, sleep
 
 import numpy as np
-from numpy.typing import NDArray
 
 from devices.address import Uri, option, parse_numbers
 from devices.frames import MAX_FRAME_BYTES, FrameCodec, FrameFeed, make_streak_calibration
 from devices.source import Gap, Info
 from devices.stream import LiveOptions, StreamSource, Transfer
 from devices.tcp import TcpLink
+from tofclip.arrays import Float32Array, FloatArray
 from tofclip.errors import (
     DeviceBusyError,
     DeviceDisconnectedError,
@@ -280,7 +280,7 @@ class RemoteExClient:
             rows, columns, depth, pixels, parse_integer(shape[4], "a picture's number")
         )
 
-    def read_scaling_table(self) -> NDArray[np.float32]:
+    def read_scaling_table(self) -> Float32Array:
         """Return the picture's vertical scaling, a number per row, in the time range's unit."""
         shape = self.ask("ImgDataGet", "current", "ScalingTable", "Vertical")
         if not shape:
@@ -606,7 +606,7 @@ class RemoteExFeed(FrameFeed):
         self.ledger.lose(max(0, self._newest - self._next + 1))
         self._newest, self._unread_frame = self._next - 1, None
 
-    def _read_row_times(self, known: Mapping[str, Scalar]) -> NDArray[np.float64] | None:
+    def _read_row_times(self, known: Mapping[str, Scalar]) -> FloatArray | None:
         """Return the rows' times, s, None where the camera does not sweep; the table is in the unit of
         the time range, as the files show.
         """

@@ -23,10 +23,11 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from tofclip.arrays import AnyArray
 from tofclip.errors import BufferOverflowError, DeviceTimeoutError, InputError
 from tofclip.storage import Record, Scalar
 
-Records = NDArray[Any]  # One-dimensional NumPy structured array, one row per record
+Records = AnyArray  # One-dimensional NumPy structured array, one row per record
 
 # One-dimensional bytes. `as_bytes` makes one of anything that holds bytes, without a copy.
 ByteView = NDArray[np.uint8]
@@ -103,7 +104,7 @@ class Codec(abc.ABC):
     def encode(self, records: Records) -> bytes:
         """Return the bytes that the instrument would have sent for ``records`` (n,)."""
 
-    def _view_units(self, data: ByteView, dtype: DTypeLike = np.uint8) -> NDArray[Any]:
+    def _view_units(self, data: ByteView, dtype: DTypeLike = np.uint8) -> AnyArray:
         """Return whole units as rows of words, (units, words)."""
         found = as_bytes(data)
         if found.size % self.unit_bytes:

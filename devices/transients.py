@@ -43,7 +43,6 @@ from time import monotonic, time_ns
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from devices import registry
 from devices.address import Options, Uri, option, parse_integers, parse_shape
@@ -52,6 +51,7 @@ from devices.linospad2 import BoardCalibration
 from devices.recording.read import read_head_if_recording
 from devices.source import READ_TIMEOUT_S, Batch, Source, Stats
 from devices.stream import InstrumentClock, StreamSource
+from tofclip.arrays import AnyArray, Float32Array, FloatArray
 from tofclip.camera import Camera
 from tofclip.errors import DeviceTimeoutError, InputError, TofclipError
 from tofclip.lidar import Pulse
@@ -233,7 +233,7 @@ def _accumulate(batches: Iterator[Batch], known: Record, gathering: Accumulation
     return PhotonCube(_reshape(counts, (len(counts), *shape)), streak.times)
 
 
-def _reshape(counts: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+def _reshape(counts: AnyArray, shape: tuple[int, ...]) -> AnyArray:
     if counts.size != math.prod(shape):
         raise InputError(f"{counts.size} numbers are no picture of {' x '.join(map(str, shape))}")
     return counts.reshape(shape)
@@ -277,7 +277,7 @@ def _sum_frames(
             "this instrument counts no photons in time for each pixel; a SPAD array does with mode=gated"
         )
     limit = np.iinfo(dtype.base).max if dtype.base.kind in "ui" else np.inf
-    total: NDArray[np.float64] = np.zeros(dtype.shape)
+    total: FloatArray = np.zeros(dtype.shape)
     saturated, left = np.zeros(total.shape, bool), gathering.pictures
     for batch in batches:
         pictures = batch.records["counts"][:left]
@@ -297,9 +297,7 @@ def _sum_frames(
     return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
 
 
-def _arrange_histograms(
-    counts: NDArray[np.float64], known: Record, gathering: Accumulation
-) -> PhotonCube:
+def _arrange_histograms(counts: FloatArray, known: Record, gathering: Accumulation) -> PhotonCube:
     """Put histograms that an instrument has made where its calibration says they look."""
     _require_own_bins(gathering)
     times = known.array("bin_times", np.float64, 1, "s")
@@ -333,8 +331,8 @@ def _read_scans(
     _require_own_bins(gathering)
     times, binning = known.array("gate_times", np.float64, 1, "s"), gathering.binning
     pulse, steps = _make_gate_response(known, times), times.size
-    total: NDArray[np.float32] = np.zeros(0, np.float32)
-    scan: list[NDArray[np.float32]] = []
+    total: Float32Array = np.zeros(0, np.float32)
+    scan: list[Float32Array] = []
     done = begun = 0  # `begun`: number of the scan's first picture
     for record in itertools.chain.from_iterable(batch.records for batch in batches):
         number = int(record["number"])
@@ -365,7 +363,7 @@ def _read_scans(
         raise InputError(f"the source ended after {done} of {gathering.pictures} whole scans")
 
 
-def _make_gate_response(known: Record, times: NDArray[np.float64]) -> Pulse:
+def _make_gate_response(known: Record, times: FloatArray) -> Pulse:
     """Return how one instant shows while a gate moves over it: it is seen from when the gate still
     closes behind it until it opens after it, which is the instant itself.
     """

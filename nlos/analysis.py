@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nlos.band import VirtualPulse
 from nlos.capture import Capture
 from nlos.illumination import is_confocal
-from tofclip.arrays import FloatArray, to_numpy
+from tofclip.arrays import BoolArray, FloatArray, to_numpy
 from tofclip.errors import InputError
 
 # Steps of the mean signal's profile per width of the wall.
@@ -116,7 +116,7 @@ class SignalSpectrum:
     wavenumbers: FloatArray  # (frequencies,), rad/m of path
     spectrum: NDArray[np.complex128]  # (n, frequencies), of some wall points
     # (n, t), samples before any light can have come; none where there are too few
-    early: NDArray[np.bool_]
+    early: BoolArray
     points: int  # all wall points
 
     @classmethod

@@ -11,7 +11,6 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse, Waveforms
 from nlos.capture import Capture
@@ -29,7 +28,7 @@ from nlos.method import (
 from nlos.phasor.arrays import ArrayLibrary, BandTransform, get_traces
 from nlos.plane import axis_step, is_evenly_spaced
 from nlos.volume import Grid, Volume
-from tofclip.arrays import Array, is_numpy
+from tofclip.arrays import Array, ComplexArray, Float32Array, is_numpy
 from tofclip.errors import InputError, require_positive
 from tofclip.threads import run_blocks, split_blocks
 
@@ -126,7 +125,7 @@ class BackprojectionPlan(PhasorPlan):
             values = backproject_on_device(capture, grid, band, weighting, progress)
             return Volume(values, grid, history)
 
-        def apply_filter(traces: NDArray[np.float32]) -> Waveforms:
+        def apply_filter(traces: Float32Array) -> Waveforms:
             return band.waveforms(band.compute_phasors(traces))
 
         samples = band.sample_count
@@ -137,11 +136,11 @@ class BackprojectionPlan(PhasorPlan):
 def backproject_signals(
     capture: Capture,
     grid: Grid,
-    apply_filter: Callable[[NDArray[np.float32]], Waveforms],
+    apply_filter: Callable[[Float32Array], Waveforms],
     samples: int,
     weighting: Weighting,
     progress: Progress,
-) -> NDArray[np.complex64]:
+) -> ComplexArray:
     """Smear every wall point's filtered signal over the voxels (z, y, x) that it may come from.
     `apply_filter`: from signals (points, t) to so many `samples`.
     """
@@ -287,7 +286,7 @@ class FilteredBackprojectionPlan(Plan):
     def _image(self, capture: Capture, progress: Progress) -> Volume:
         grid, method, spacing = self.grid, self.method, capture.axis.spacing
 
-        def pad_signals(traces: NDArray[np.float32]) -> Waveforms:
+        def pad_signals(traces: Float32Array) -> Waveforms:
             values = np.pad(traces, ((0, 0), PADDING_SAMPLES)).astype(np.complex64)
             return Waveforms(values, capture.start - spacing, spacing)
 
@@ -299,7 +298,7 @@ class FilteredBackprojectionPlan(Plan):
         return Volume(np.maximum(sharpened, 0), grid, history)
 
 
-def _apply_laplacian(values: NDArray[np.float32], grid: Grid, sigma: float) -> NDArray[np.float32]:
+def _apply_laplacian(values: Float32Array, grid: Grid, sigma: float) -> Float32Array:
     from scipy.ndimage import gaussian_filter
 
     axes = (grid.z, grid.y, grid.x)

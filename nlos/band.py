@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import TimeAxis
+from tofclip.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from tofclip.errors import InputError, require_positive, require_type
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 
@@ -81,7 +82,7 @@ class VirtualPulse:
         """Wavenumbers on either side of the carrier's that the pulse holds, rad/m."""
         return BAND_EDGE / self.sigma
 
-    def spectrum(self, wavenumbers: Any) -> NDArray[np.float64]:
+    def spectrum(self, wavenumbers: Any) -> FloatArray:
         """Strength of the pulse at ``wavenumbers``, rad/m, 1 at the carrier, 0 beyond the band.
 
         J. F. Kaiser, R. W. Schafer, IEEE Trans. Acoust. Speech Signal Process. 28, 105 (1980).
@@ -91,17 +92,17 @@ class VirtualPulse:
         inside, root = self._find_in_band(wavenumbers)
         return np.where(inside, (i0(KAISER * root) - 1) / (i0(KAISER) - 1), 0.0)
 
-    def slope(self, wavenumbers: Any) -> NDArray[np.float64]:
+    def slope(self, wavenumbers: Any) -> FloatArray:
         """Slope, m, of the logarithm of `spectrum` at ``wavenumbers``, rad/m, of the band."""
         from scipy.special import i0, i1
 
         _, root = self._find_in_band(wavenumbers)
         argument = KAISER * np.maximum(root, 1e-3)
         detuning = np.asarray(wavenumbers, dtype=np.float64) - self.wavenumber
-        change: NDArray[np.float64] = i1(argument) / (argument * (i0(argument) - 1))
+        change: FloatArray = i1(argument) / (argument * (i0(argument) - 1))
         return -((KAISER / self.half_band) ** 2) * detuning * change
 
-    def _find_in_band(self, wavenumbers: Any) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    def _find_in_band(self, wavenumbers: Any) -> tuple[BoolArray, FloatArray]:
         """Which wavenumbers are in the band, and ``sqrt(1 - u^2)`` of their places -1 < u < 1."""
         place = (np.asarray(wavenumbers, dtype=np.float64) - self.wavenumber) / self.half_band
         return np.abs(place) <= 1, np.sqrt(np.maximum(1 - place**2, 0))
@@ -112,7 +113,7 @@ class Waveforms:
     """Band-limited complex signals, finely sampled over path length."""
 
     # (points, samples), 0 at the first and the last two: holding them means silence outside
-    values: NDArray[Any]
+    values: AnyArray
     start: float  # path length of sample 0, m
     spacing: float  # path between samples, m
 
@@ -147,7 +148,7 @@ class Band:
         return int(next_fast_len(self.axis.bins + 2 * self.tail_bins, real=True))
 
     @cached_property
-    def harmonics(self) -> NDArray[np.int64]:
+    def harmonics(self) -> IntArray:
         """Which frequencies of the transform; not 0 nor Nyquist's, which have no phase."""
         indices = np.arange(1, (self.period_bins + 1) // 2)
         return indices[self.pulse.spectrum(indices * self._fundamental_wavenumber) > 0]
@@ -157,23 +158,23 @@ class Band:
         return 2 * np.pi / (self.period_bins * self.axis.spacing)
 
     @property
-    def wavenumbers(self) -> NDArray[np.float64]:
+    def wavenumbers(self) -> FloatArray:
         """The band's wavenumbers k, rad/m, evenly spaced, shape (frequencies,)."""
         return self._fundamental_wavenumber * self.harmonics.astype(np.float64)
 
     @property
-    def weights(self) -> NDArray[np.float64]:
+    def weights(self) -> FloatArray:
         """The pulse's weights G_k; phasors of ``cos(k * L)`` add up to ``exp(1j * k * L)``."""
         # 2 / n: positive frequencies stand for both signs of a real signal
         return self.pulse.spectrum(self.wavenumbers) * (2 / self.period_bins)
 
     @property
-    def strength(self) -> NDArray[np.float64]:
+    def strength(self) -> FloatArray:
         """The pulse's weights relative to the largest, shape (frequencies,)."""
-        strength: NDArray[np.float64] = self.weights / self.weights.max()
+        strength: FloatArray = self.weights / self.weights.max()
         return strength
 
-    def compute_phasors(self, traces: NDArray[Any]) -> NDArray[Any]:
+    def compute_phasors(self, traces: AnyArray) -> AnyArray:
         """Return the phasors P_k (points, frequencies) of signals (points, t), as precise as these."""
         real, bins = traces.dtype.type, traces.shape[1]
         # A library's own threads would go on waiting, busily, where ours want to work.
@@ -198,9 +199,7 @@ class Band:
             run_blocks(filter_block, len(traces), POINTS_PER_BLOCK)
         return parts.view(np.result_type(real, np.complex64))
 
-    def _get_fourier_matrices(
-        self, bins: int, real: type[Any]
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
+    def _get_fourier_matrices(self, bins: int, real: type[Any]) -> tuple[AnyArray, AnyArray]:
         """Matrices of two steps of a Fourier transform at the band's frequencies: few shapes (bins,
         n) make up a narrow band's waves in a block of bins, whatever their phases; (blocks * n, 2 *
         frequencies) turn their strengths into phasors, real and imaginary parts interleaved.
@@ -221,10 +220,10 @@ class Band:
         return self._matrices[bins, real]
 
     @cached_property
-    def _matrices(self) -> dict[tuple[int, type[Any]], tuple[NDArray[Any], NDArray[Any]]]:
+    def _matrices(self) -> dict[tuple[int, type[Any]], tuple[AnyArray, AnyArray]]:
         return {}
 
-    def waveforms(self, phasors: NDArray[Any]) -> Waveforms:
+    def waveforms(self, phasors: AnyArray) -> Waveforms:
         """Return ``sum_k P_k * exp(1j * k * L)``, sampled for linear interpolation."""
         # So few frequencies are summed faster by a matrix product than by a padded transform.
         carriers, start, spacing = self.carriers

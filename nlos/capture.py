@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.kernels import shift_signals
 from tofclip.arrays import (
+    AnyArray,
     Array,
+    BoolArray,
     ComputeDevice,
+    Float32Array,
     FloatArray,
     is_numpy,
     namespace,
@@ -72,7 +74,7 @@ class TimeAxis:
         return SPEED_OF_LIGHT * self.bin_width
 
     @property
-    def paths(self) -> NDArray[np.float64]:
+    def paths(self) -> FloatArray:
         """Path length of every bin, m, shape (bins,)."""
         return self.start + self.spacing * np.arange(self.bins, dtype=np.float64)
 
@@ -240,7 +242,7 @@ class Capture:
         return TimeAxis(self.signal.shape[0], self.bin_width, self.start)
 
     @cached_property
-    def valid(self) -> NDArray[np.bool_]:
+    def valid(self) -> BoolArray:
         """Wall points whose position, and whose own laser spot, is known; shape (...)."""
         known = np.isfinite(self.wall) & np.isfinite(self.laser)
         return np.asarray(known.all(axis=-1))
@@ -267,12 +269,12 @@ class Capture:
         some = places[:: len(places) // MAX_SPACING_POINTS + 1]
         return float(np.median(cKDTree(places).query(some, 2)[0][:, 1]))
 
-    def traces(self, selection: slice = slice(None)) -> NDArray[np.float32]:
+    def traces(self, selection: slice = slice(None)) -> Float32Array:
         """Signals (points, t) of the ``selection`` of `points`, NumPy's only; all of a complete wall
         are not copied, so that time is the slow axis in memory.
         """
         require_numpy("this treatment of a capture's signal", self.signal)
-        in_time: NDArray[np.float32] = self.signal.reshape(self.signal.shape[0], -1)
+        in_time: Float32Array = self.signal.reshape(self.signal.shape[0], -1)
         if selection == slice(None) and self.valid.all():
             return in_time.T
         return np.ascontiguousarray(in_time[:, np.flatnonzero(self.valid)[selection]].T)
@@ -373,7 +375,7 @@ def _to_float_signal(values: Any) -> Array:
     return xp.astype(values, xp.float32, copy=False)
 
 
-def _count_non_finite(signal: Array, valid: NDArray[np.bool_]) -> int:
+def _count_non_finite(signal: Array, valid: BoolArray) -> int:
     """Count the samples (t, ...) that are NaN or infinite at valid wall points."""
     if is_numpy(signal):
         # One bad sample spoils the sum: only then are they looked for one by one.
@@ -386,7 +388,7 @@ def _count_non_finite(signal: Array, valid: NDArray[np.bool_]) -> int:
     return int(xp.sum(xp.astype(bad, xp.int64)))
 
 
-def _to_real_array(values: Any, dtype: type, name: str) -> NDArray[Any]:
+def _to_real_array(values: Any, dtype: type, name: str) -> AnyArray:
     array = np.asarray(values)
     if array.dtype.kind not in "fiub":
         raise InputError(f"{name} must hold real numbers, got {array.dtype}")
@@ -399,7 +401,7 @@ STEP_TOLERANCE = 1e-3
 
 def unwarp_signal(
     signal: Any, wall: Any, camera: Any, laser: Any, bin_width: float
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Shift every wall point's signal (t, ...) earlier by ``(|r_p - camera| - |laser - camera|) /
     c``, so that bins hold one path laser spot -> hidden point -> wall point; linear between bins, 0
     outside and where a wall point (..., 3) is NaN. The result is NumPy's.
@@ -435,9 +437,9 @@ def _require_position(name: str, position: Any) -> FloatArray:
     return place
 
 
-def _shift_earlier(signal: NDArray[np.float32], bins: FloatArray) -> NDArray[np.float32]:
+def _shift_earlier(signal: Float32Array, bins: FloatArray) -> Float32Array:
     # A shift by the whole record reads nothing but zeros.
     delay = np.nan_to_num(bins, nan=signal.shape[0] + 1.0).ravel()
     flat = np.ascontiguousarray(signal.reshape(signal.shape[0], -1))
-    shifted: NDArray[np.float32] = shift_signals(flat, delay).reshape(signal.shape)
+    shifted: Float32Array = shift_signals(flat, delay).reshape(signal.shape)
     return shifted

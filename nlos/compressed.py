@@ -13,12 +13,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.method import Method, Plan
 from nlos.volume import Grid, Volume
-from tofclip.arrays import FloatArray, require_numpy
+from tofclip.arrays import Float32Array, FloatArray, require_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
 from tofclip.solvers import Backprojection
@@ -29,7 +28,7 @@ from tofclip.solvers import Method as Recovery
 class CompressedCapture:
     """Measurements ``f = F h`` of a wall's transient pictures h, one column per time bin."""
 
-    measurements: NDArray[np.float32]  # (measurements, t), kept as float32
+    measurements: Float32Array  # (measurements, t), kept as float32
     operator: LinearOperator  # f, from pictures (rows, columns) to (measurements,)
     wall: FloatArray  # (rows, columns, 3), the wall point of every pixel, m; NaN where unknown
     laser: FloatArray  # (3,), laser spot, or one per wall point, m

@@ -25,7 +25,7 @@ from nlos.method import (
 )
 from nlos.plane import PlanarWall, Plane, axis_step
 from nlos.volume import Grid, Volume
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, ComplexArray, Float32Array, FloatArray
 from tofclip.errors import InputError, require_positive
 from tofclip.threads import run_blocks, thread_count
 
@@ -44,7 +44,7 @@ class ConfocalScan:
     """Signals on a lattice of wall points; where a point is missing, it is dark."""
 
     # (y, x, t), what every wall point saw; bin i stands for the distance ``i * spacing`` from it
-    signal: NDArray[np.float32]
+    signal: Float32Array
     plane: Plane  # the wall points
     spacing: float  # distance per bin, m: half the path
 
@@ -58,7 +58,7 @@ class ConfocalScan:
         traces = _shift_to_distance_zero(capture, bins)
         return cls(wall.lattice.place(traces), wall.plane, spacing / 2)
 
-    def correct_falloff(self, falloff: float) -> NDArray[np.float32]:
+    def correct_falloff(self, falloff: float) -> Float32Array:
         """Return the signal times d^falloff, relative to the farthest bin's distance d."""
         relative = np.arange(self.signal.shape[2], dtype=np.float32) / (self.signal.shape[2] - 1)
         return np.asarray(self.signal * relative**falloff, dtype=np.float32)
@@ -73,7 +73,7 @@ class ConfocalPlan(Plan):
         self,
         capture: Capture,
         grid: Grid,
-        compute: Callable[[ConfocalScan, Grid], NDArray[np.float32]],
+        compute: Callable[[ConfocalScan, Grid], Float32Array],
         settings: Mapping[str, Any],
     ) -> None:
         require_numpy_signal("a light-cone transform or f-k migration", capture)
@@ -101,9 +101,7 @@ def find_padded_length(count: int) -> int:
     return 2 * int(next_fast_len(count))
 
 
-def interpolate_axis(
-    values: NDArray[np.float32], position: FloatArray, axis: int
-) -> NDArray[np.float32]:
+def interpolate_axis(values: Float32Array, position: FloatArray, axis: int) -> Float32Array:
     """Read a periodic axis at fractional positions (n,), in its steps, by linear interpolation."""
     below = np.floor(position).astype(np.intp)
     weight = (position - below).astype(np.float32)
@@ -115,8 +113,8 @@ def interpolate_axis(
 
 
 def resample_to_grid(
-    values: NDArray[np.float32], scan: ConfocalScan, grid: Grid, depth_position: FloatArray
-) -> NDArray[np.float32]:
+    values: Float32Array, scan: ConfocalScan, grid: Grid, depth_position: FloatArray
+) -> Float32Array:
     """Read an image (y, x, depth) on the padded lattice at voxels (z, y, x), whose planes are at
     `depth_position` (z,) in its steps.
     """
@@ -154,7 +152,7 @@ def _require_lattice(capture: Capture, grid: Grid) -> Plane:
     return plane
 
 
-def _shift_to_distance_zero(capture: Capture, bins: int) -> NDArray[np.float32]:
+def _shift_to_distance_zero(capture: Capture, bins: int) -> Float32Array:
     """Signals (points, bins) from path 0 on, by whole bins if that suffices."""
     delay, traces = capture.start / capture.axis.spacing, capture.traces()
     whole = round(delay)
@@ -212,7 +210,7 @@ class LightCone(Method):
         settings = {"signal_to_noise": self.signal_to_noise, "falloff": self.falloff}
         return ConfocalPlan(capture, grid, self._compute, {"method": "lightcone", **settings})
 
-    def _compute(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
+    def _compute(self, scan: ConfocalScan, grid: Grid) -> Float32Array:
         """Return the image (z, y, x) of a scan on a grid."""
         from scipy.fft import dctn, ifft2, irfft
 
@@ -235,7 +233,7 @@ class LightCone(Method):
 
 
 def apply_wiener_filter(
-    spectrum: NDArray[np.complex64], kernel: NDArray[np.complex64], signal_to_noise: float
+    spectrum: ComplexArray, kernel: ComplexArray, signal_to_noise: float
 ) -> None:
     """Filter a spectrum (y, x, v) in place; a quarter of the kernel's, which is even, is enough."""
     # the gain falls where the kernel is weaker than the noise
@@ -251,7 +249,7 @@ def apply_wiener_filter(
 
 def transform_squared_distances(
     scan: ConfocalScan, squares: float, falloff: float
-) -> tuple[NDArray[np.complex64], tuple[int, int, int]]:
+) -> tuple[ComplexArray, tuple[int, int, int]]:
     """Return the half spectrum (y, x, v) of the signals over the square v of the distance, times
     d^falloff, padded, and its samples with the padding; `squares`: from sample to sample of v, m^2.
     """
@@ -270,7 +268,7 @@ def transform_squared_distances(
 
 
 def transform_paraboloid(
-    y: NDArray[Any], x: NDArray[Any], squares: float, shape: tuple[int, int, int], some: slice
+    y: AnyArray, x: AnyArray, squares: float, shape: tuple[int, int, int], some: slice
 ) -> NDArray[np.complex128]:
     """Spectrum along v (y, x, frequencies) of the kernel ``v = x^2 + y^2`` of unit energy, the same
     at every depth: an impulse for every column (y, x), m, shared linearly between two samples.
@@ -323,7 +321,7 @@ class FKMigration(Method):
         settings = {"method": "fk", "falloff": self.falloff}
         return ConfocalPlan(capture, grid, self._compute, settings)
 
-    def _compute(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
+    def _compute(self, scan: ConfocalScan, grid: Grid) -> Float32Array:
         """Return the image (z, y, x) of a scan on a grid."""
         from scipy.fft import fft2, ifft, ifft2, rfft
 

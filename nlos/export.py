@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.plane import axis_step, is_evenly_spaced
-from tofclip.arrays import to_numpy
+from tofclip.arrays import Float32Array, to_numpy
 from tofclip.errors import InputError
 from tofclip.files import atomic_path, require_suffix
 
@@ -36,7 +36,7 @@ class Mesh:
         Corners of each triangle.
     """
 
-    vertices: NDArray[np.float32]
+    vertices: Float32Array
     faces: NDArray[np.int32]
 
     def save(self, path: str | Path) -> None:
@@ -47,7 +47,7 @@ class Mesh:
 def write_ply(
     path: str | Path,
     names: Sequence[str],
-    vertices: NDArray[np.float32],
+    vertices: Float32Array,
     faces: NDArray[np.int32],
     comment: str = "",
 ) -> None:
@@ -86,9 +86,7 @@ def extract_surface(volume: Volume, fraction: float) -> Mesh:
     return Mesh(np.asarray(found.points, np.float32), faces)
 
 
-def extract_points(
-    volume: Volume, fraction: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def extract_points(volume: Volume, fraction: float) -> tuple[Float32Array, Float32Array]:
     """Positions and magnitudes of bright voxels; see `Volume.points`."""
     z, y, x = np.nonzero(volume.threshold(fraction).magnitude)
     xyz = np.stack([volume.grid.x[x], volume.grid.y[y], volume.grid.z[z]], axis=-1)

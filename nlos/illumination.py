@@ -9,14 +9,13 @@ import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture, TimeAxis
 from nlos.phasor.to_depths_compiled import LaserSource
 from nlos.phasor.transfer import SphericalWaves
 from nlos.volume import Grid
-from tofclip.arrays import FloatArray
+from tofclip.arrays import FloatArray, IndexArray
 
 # Of the wall's width: nearer to each other, a laser spot and a wall point are one.
 SAME_SPOT_FRACTION = 1e-6
@@ -28,7 +27,7 @@ class IlluminationGroup:
 
     # (3,), m; None for a confocal scan, in which the way out is the way back
     laser: FloatArray | None
-    indices: NDArray[np.intp]  # (n,), which of the capture's valid points
+    indices: IndexArray  # (n,), which of the capture's valid points
 
     @property
     def legs(self) -> int:

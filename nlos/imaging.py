@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Generic
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos import analysis
 from nlos.band import VirtualPulse
@@ -27,7 +26,7 @@ from nlos.preparation import fade_record_end, join_near_lasers
 from nlos.resolution import compute_diffraction_limit
 from nlos.settings import METHODS_BY_SPEED, Limits, Settings, Wanted, list_taken
 from nlos.volume import Grid, Volume
-from tofclip.arrays import ComputeDevice, namespace, to_numpy
+from tofclip.arrays import ComputeDevice, IndexArray, namespace, to_numpy
 from tofclip.errors import InputError
 
 VOXELS_PER_WAVELENGTH = 8
@@ -262,7 +261,7 @@ def _thin_out(capture: Capture) -> Capture:
     return replace(capture, signal=signal, wall=points[some], laser=laser)
 
 
-def _sort_points(capture: Capture) -> NDArray[np.intp]:
+def _sort_points(capture: Capture) -> IndexArray:
     """Return the order of the wall's points by where they and their lasers are."""
     return np.lexsort((capture.points + capture.lasers).T)
 

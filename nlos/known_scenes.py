@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlos.settings import declare_setting
+from tofclip.arrays import BoolArray, FloatArray
 from tofclip.errors import FileFormatError, InputError, require_positive
 from tofclip.units import SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from nlos.capture import Capture, TimeAxis
     from nlos.simulate import HiddenScene, PointScene
     from nlos.volume import Grid, Volume
@@ -207,7 +205,7 @@ class HiddenTruth:
             return None
         return cls(found.array("positions", np.float64, 2, "m"), found.number("spacing_m"))
 
-    def mask_near(self, grid: Grid, reach: float) -> NDArray[np.bool_]:
+    def mask_near(self, grid: Grid, reach: float) -> BoolArray:
         """Voxels (z, y, x) whose centres lie within `reach` m of something hidden."""
         import numpy as np
         from scipy.spatial import cKDTree

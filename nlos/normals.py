@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,14 @@ from nlos.confocal import (
 from nlos.export import write_ply
 from nlos.plane import axis_step
 from nlos.volume import Grid, Volume
-from tofclip.arrays import ComputeDevice, FloatArray
+from tofclip.arrays import (
+    AnyArray,
+    BoolArray,
+    ComplexArray,
+    ComputeDevice,
+    Float32Array,
+    FloatArray,
+)
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, thread_count
 
@@ -38,22 +44,22 @@ class FrontSurface:
 
     x: FloatArray  # (n,), pixels, m
     y: FloatArray  # (n,), pixels, m
-    depth: NDArray[np.float32]  # (y, x), m; NaN where nothing is seen
-    albedo: NDArray[np.float32]  # (y, x), brightness, 0 where nothing is seen
+    depth: Float32Array  # (y, x), m; NaN where nothing is seen
+    albedo: Float32Array  # (y, x), brightness, 0 where nothing is seen
     # (y, x, 3), unit vectors that point to the wall's side (z < 0); NaN where nothing is seen
-    normals: NDArray[np.float32]
+    normals: Float32Array
     source: str = "gradient of the volume"  # what depth and normals were found from
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self) -> BoolArray:
         """Pixels with a surface, (y, x)."""
         return np.isfinite(self.depth)
 
     @property
-    def points(self) -> NDArray[np.float32]:
+    def points(self) -> Float32Array:
         """Places of the pixels with a surface, (n, 3), m."""
         rows, columns = np.nonzero(self.seen)
-        places: list[NDArray[Any]] = [self.x[columns], self.y[rows], self.depth[rows, columns]]
+        places: list[AnyArray] = [self.x[columns], self.y[rows], self.depth[rows, columns]]
         return np.stack(places, axis=-1).astype(np.float32)
 
     @property
@@ -100,7 +106,7 @@ def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
     return build_front_surface(volume, directions[..., 2], fraction)
 
 
-def build_front_surface(volume: Volume, normals: NDArray[Any], fraction: float) -> FrontSurface:
+def build_front_surface(volume: Volume, normals: AnyArray, fraction: float) -> FrontSurface:
     """Put together the surface of the brightest voxels; `normals` (y, x, 3) of any length and side."""
     grid, magnitude = volume.grid, volume.magnitude
     albedo = magnitude.max(axis=0)
@@ -142,7 +148,7 @@ def _refine_peaks(magnitude: NDArray[np.floating], z: FloatArray) -> FloatArray:
     return np.asarray(z[peak] + np.clip(offset, -0.5, 0.5) * step)
 
 
-def _list_corners(values: NDArray[Any]) -> list[NDArray[Any]]:
+def _list_corners(values: AnyArray) -> list[AnyArray]:
     """Upper left, upper right, lower left and lower right of every square of four pixels."""
     return [values[:-1, :-1], values[:-1, 1:], values[1:, :-1], values[1:, 1:]]
 
@@ -178,7 +184,7 @@ class DirectionalLightCone:
         found = build_front_surface(volume, normals, fraction)
         return replace(found, source="directional light-cone transform")
 
-    def _deconvolve(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
+    def _deconvolve(self, scan: ConfocalScan, grid: Grid) -> Float32Array:
         """Return albedo times normal, (3, z, y, x)."""
         from scipy.fft import ifft2, irfft
 
@@ -200,13 +206,13 @@ class DirectionalLightCone:
 
 
 def _separate(
-    spectrum: NDArray[np.complex64],
+    spectrum: ComplexArray,
     scan: ConfocalScan,
     squares: float,
     shape: tuple[int, int, int],
     unit: float,
     floor: float,
-) -> NDArray[np.complex64]:
+) -> ComplexArray:
     """Spectra (3, ky, kx, w) of v_x, v_y and ``-z * v_z / unit``, by a Wiener filter; `unit`: m."""
     from scipy.fft import fft2
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from nlos.video import TransientVideo
 from nlos.volume import Volume
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.files import PICTURE_SUFFIXES, atomic_path, require_suffix
 from tofclip.notebook import letter_panels, save_figure
 from tofclip.units import MILLIMETRE
@@ -105,7 +106,7 @@ def _describe_imaging(volume: Volume) -> str:
     return ", ".join(said)
 
 
-def map_depths(volume: Volume) -> NDArray[np.float64]:
+def map_depths(volume: Volume) -> FloatArray:
     """Depth of every column's brightest voxel (y, x), m; NaN where that is weak at its depth."""
     from scipy.ndimage import maximum_filter1d
 
@@ -119,8 +120,8 @@ def map_depths(volume: Volume) -> NDArray[np.float64]:
 def _draw_picture(
     axes: Axes,
     title: str,
-    picture: NDArray[Any],
-    coordinates: tuple[NDArray[np.float64], NDArray[np.float64]],
+    picture: AnyArray,
+    coordinates: tuple[FloatArray, FloatArray],
     labels: tuple[str, str],
     brightest: float | None = 1.0,
 ) -> AxesImage:
@@ -133,14 +134,12 @@ def _draw_picture(
     return drawn
 
 
-def compute_extent(
-    right: NDArray[np.float64], down: NDArray[np.float64]
-) -> tuple[float, float, float, float]:
+def compute_extent(right: FloatArray, down: FloatArray) -> tuple[float, float, float, float]:
     """Left, right, lower and upper edge of a picture with axes right and down, m."""
     return (*_find_edges(right), *_find_edges(down)[::-1])
 
 
-def _find_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
+def _find_edges(axis: FloatArray) -> tuple[float, float]:
     """Outer edges of the first and the last voxel, m; a single voxel gets 1 mm."""
     half = (axis[-1] - axis[0]) / (2 * (axis.size - 1)) if axis.size > 1 else 0.5e-3
     return float(axis[0] - half), float(axis[-1] + half)

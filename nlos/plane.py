@@ -6,12 +6,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, ComplexArray, Float32Array, FloatArray, IndexArray
 from tofclip.errors import InputError, ShapeError
 
 if TYPE_CHECKING:
@@ -111,7 +110,7 @@ class PlaneField:
         Of the waves on the plane, rad/m: the band's, doubled for a confocal scan.
     """
 
-    values: NDArray[np.complex64]
+    values: ComplexArray
     plane: Plane
     wavenumbers: FloatArray
 
@@ -135,7 +134,7 @@ class VirtualPlane(Plane):
     fade: tuple[float, float] = (0.0, 0.0)  # width of the fade along y and x, m
 
     @property
-    def weights(self) -> NDArray[np.float32]:
+    def weights(self) -> Float32Array:
         """What each point stands for in an integral over the plane: area times fade, m^2, shape (y,
         x).
         """
@@ -246,7 +245,7 @@ class StraightPaths:
 
     @classmethod
     def find(
-        cls, points: NDArray[np.float64], plane: VirtualPlane, grid: Grid, tolerance: float
+        cls, points: FloatArray, plane: VirtualPlane, grid: Grid, tolerance: float
     ) -> StraightPaths | None:
         """Find the straight paths between wall points and voxels through a plane. `points` (n, 3):
         of the wall, m; `plane`: in front of them; `tolerance`: relative error allowed. Returns none
@@ -290,8 +289,8 @@ class WallLattice:
     x: FloatArray
     y: FloatArray
     # (points,), place of every wall point
-    row: NDArray[np.intp]
-    column: NDArray[np.intp]
+    row: IndexArray
+    column: IndexArray
 
     @classmethod
     def of(cls, points: FloatArray, evenness: float = EVENNESS_TOLERANCE) -> WallLattice:
@@ -328,13 +327,13 @@ class WallLattice:
         return places.size == self.x.size * self.y.size and bool(np.all(np.diff(places) == 1))
 
     @cached_property
-    def point_numbers(self) -> NDArray[np.intp]:
+    def point_numbers(self) -> IndexArray:
         """Number of the wall point in every place, in C order; one too many where none stands."""
         occupants = np.full(self.x.size * self.y.size, self.row.size)
         occupants[self.row * self.x.size + self.column] = np.arange(self.row.size)
         return occupants
 
-    def place(self, samples: NDArray[Any]) -> NDArray[Any]:
+    def place(self, samples: AnyArray) -> AnyArray:
         """Put phasors (points, frequencies), or signals (points, t), into their places, shape (y,
         x, ...); places without a point are 0.
         """
@@ -368,7 +367,7 @@ class PlanarWall:
 
 def _fit_lattice_axis(
     coordinates: FloatArray, name: str, evenness: float
-) -> tuple[FloatArray, NDArray[np.intp]]:
+) -> tuple[FloatArray, IndexArray]:
     """Even axis that all coordinates lie on, and the place of each."""
     ordered = np.sort(coordinates)
     gaps = np.diff(ordered)

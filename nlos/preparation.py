@@ -17,13 +17,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.illumination import is_confocal
 from nlos.method import PhasorMethod, PhasorPlan, PlannedGeometry, Progress
 from nlos.volume import Grid, Volume
-from tofclip.arrays import FloatArray, is_numpy, namespace
+from tofclip.arrays import AnyArray, Float32Array, FloatArray, IndexArray, is_numpy, namespace
 from tofclip.errors import InputError
 from tofclip.threads import split_blocks
 
@@ -247,7 +246,7 @@ class _Moveout:
         if len(self._places) * capture.axis.bins * BYTES_PER_READING <= MAX_KEPT_BYTES:
             self._kept = [self._find_bins(some) for some in self._blocks]
 
-    def read(self, signal: NDArray[Any]) -> NDArray[np.float32]:
+    def read(self, signal: AnyArray) -> Float32Array:
         """Return signals (t, ...) read at their pairs' paths, linear between bins; 0 outside."""
         read = np.zeros(signal.shape, np.float32)
         flat, recorded = (one.reshape(self._axis.bins, -1) for one in (read, signal))
@@ -260,7 +259,7 @@ class _Moveout:
             flat[:, own] = first + weight * (second - first)
         return read
 
-    def _find_bins(self, some: slice) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    def _find_bins(self, some: slice) -> tuple[IndexArray, Float32Array]:
         """Find the bin before each reading, as a place in (t, n) signals, and the weight of the
         next.
         """

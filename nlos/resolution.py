@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.band import VirtualPulse
 from nlos.capture import Capture
 from nlos.volume import Volume
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import InputError
 
 # Places along each axis at which the ideal image is computed.
@@ -65,7 +64,7 @@ def measure_point_spread(volume: Volume, point: Any | None = None) -> PeakWidths
     return PeakWidths(*(measure_fwhm(axis, line, peak) for axis, line, peak in lines))
 
 
-def measure_fwhm(axis: FloatArray, values: NDArray[Any], peak: int) -> float:
+def measure_fwhm(axis: FloatArray, values: AnyArray, peak: int) -> float:
     """Full width at half of ``values[peak]`` along an axis (n,), m; NaN where one side stays
     higher.
     """

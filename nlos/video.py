@@ -32,7 +32,7 @@ from nlos.phasor.plan import Hybrid, PlanarRSD, plan_groups, require_even_grid
 from nlos.phasor.propagate import choose_backend
 from nlos.phasor.to_depths import DepthPropagator
 from nlos.volume import AXES, Grid, Volume
-from tofclip.arrays import Array, FloatArray
+from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
@@ -88,7 +88,7 @@ INSTANTS_PER_BLOCK = 32
 SAMPLES_PER_SIGMA = 2
 NO_DELAY = np.zeros(2)
 
-FieldCallback = Callable[[int, slice, NDArray[np.complex64]], None]
+FieldCallback = Callable[[int, slice, ComplexArray], None]
 """Takes the index of a depth, some instants, and the field (instants, y, x) there."""
 
 
@@ -112,7 +112,7 @@ class TransientVideo:
         Values, times and grid disagree.
     """
 
-    values: NDArray[np.float32]
+    values: Float32Array
     times: FloatArray
     grid: Grid
     provenance: Mapping[str, Any] = field(default_factory=dict)
@@ -206,7 +206,7 @@ class TransientImaging:
         require_memory(4 * instants.size * grid.size, what, "ask for fewer, or for front views")
         values = np.empty((instants.size, *grid.shape), np.float32)
 
-        def accumulate(depth: int, some: slice, seen: NDArray[np.complex64]) -> None:
+        def accumulate(depth: int, some: slice, seen: ComplexArray) -> None:
             values[some, depth] = np.abs(seen)
 
         self._stream_fields(capture, grid, instants, accumulate, progress)
@@ -239,7 +239,7 @@ class TransientImaging:
         instants, joining = _validate_times(times), Lock()
         values = np.zeros((instants.size, *grid.shape[1:]), np.float32)
 
-        def accumulate(_: int, some: slice, seen: NDArray[np.complex64]) -> None:
+        def accumulate(_: int, some: slice, seen: ComplexArray) -> None:
             brightness = np.abs(seen)
             # depths are imaged by several threads, and each may be the brightest
             with joining:
@@ -289,7 +289,7 @@ class TransientImaging:
         weight = width / count / (np.sqrt(np.pi) * sigma)
         energy = np.zeros(grid.shape, np.float32)
 
-        def accumulate(depth: int, _: slice, seen: NDArray[np.complex64]) -> None:
+        def accumulate(depth: int, _: slice, seen: ComplexArray) -> None:
             energy[depth] += np.float32(weight) * np.sum(seen.real**2 + seen.imag**2, axis=0)
 
         self._stream_fields(capture, grid, instants, accumulate, progress)

@@ -8,9 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import Array, ComputeDevice, FloatArray, is_numpy, namespace, to_numpy
+from tofclip.arrays import (
+    AnyArray,
+    Array,
+    ComputeDevice,
+    Float32Array,
+    FloatArray,
+    is_numpy,
+    namespace,
+    to_numpy,
+)
 from tofclip.errors import InputError, ShapeError
 from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
 from tofclip.storage import Field, Record
@@ -209,8 +217,8 @@ class Projection:
         z of that voxel, m.
     """
 
-    brightness: NDArray[Any]
-    depth: NDArray[np.float64]
+    brightness: AnyArray
+    depth: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +265,7 @@ class Volume:
             raise InputError("a volume must not hold NaN or infinity")
         object.__setattr__(self, "values", values)
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> AnyArray:
         return np.asarray(to_numpy(self.values), dtype=dtype)
 
     def __getitem__(self, voxels: Any) -> Any:
@@ -289,7 +297,7 @@ class Volume:
         return replace(self, values=device.put(self.values))
 
     @property
-    def magnitude(self) -> NDArray[Any]:
+    def magnitude(self) -> AnyArray:
         """Brightness (z, y, x), not negative; a NumPy array wherever the values live."""
         return to_numpy(abs(self.values))
 
@@ -317,7 +325,7 @@ class Volume:
 
         return extract_surface(self, fraction)
 
-    def points(self, fraction: float = 0.3) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def points(self, fraction: float = 0.3) -> tuple[Float32Array, Float32Array]:
         """Positions (n, 3), m, and magnitudes (n,) of voxels from ``fraction`` (0..1) on."""
         from nlos.export import extract_points
 

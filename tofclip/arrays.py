@@ -26,6 +26,7 @@ T = TypeVar("T")
 
 AnyArray = NDArray[Any]
 BoolArray = NDArray[np.bool_]
+ComplexArray = NDArray[np.complex64]
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IndexArray = NDArray[np.intp]

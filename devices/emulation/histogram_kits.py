@@ -9,7 +9,7 @@ import threading
 import time
 import tty
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +30,14 @@ from devices.histogram_kits import (
     find_tmf_zones,
 )
 from devices.stream import StreamSource
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.units import SPEED_OF_LIGHT
 
 PEAK_COUNTS, BACKGROUND_COUNTS = 400.0, 4.0
 PULSE_S = 0.375e-9  # Standard deviation of the emulated pulse
 
 
-def format_tmf8828(counts: NDArray[Any], number: int, tick: int) -> list[bytes]:
+def format_tmf8828(counts: AnyArray, number: int, tick: int) -> list[bytes]:
     """Return the lines that a TMF8828's program sends for a frame; the inverse of `Tmf8828Parser`.
     `counts` (128, zones); `number`: of the frame; `tick`: 0.2 us. Returns with their ends.
     """
@@ -59,7 +60,7 @@ def format_tmf8828(counts: NDArray[Any], number: int, tick: int) -> list[bytes]:
     return lines
 
 
-def format_vl53l8(counts: NDArray[Any], number: int = 0, tick: int = 0) -> list[bytes]:
+def format_vl53l8(counts: AnyArray, number: int = 0, tick: int = 0) -> list[bytes]:
     """Return the lines that a VL53L8CH's program sends for counts (bins, zones)."""
     lines = [b"Ranging Results:\r\n"]
     for zone, column in enumerate(counts.T):
@@ -68,7 +69,7 @@ def format_vl53l8(counts: NDArray[Any], number: int = 0, tick: int = 0) -> list[
     return lines
 
 
-def compute_zone_ranges(zones: int) -> NDArray[np.float64]:
+def compute_zone_ranges(zones: int) -> FloatArray:
     """Return how far the emulated scene, an inclined wall, is in each zone, m."""
     return 0.5 + 1.0 * np.arange(zones) / zones
 

@@ -12,7 +12,6 @@ from functools import cached_property
 from time import monotonic, sleep
 
 import numpy as np
-from numpy.typing import NDArray
 
 from devices.address import Uri, option
 from devices.emulation.scenes import LineLight, draw_cells, simulate_line_light
@@ -28,6 +27,7 @@ from devices.linospad2 import (
 from devices.linospad2_kernels import ADDRESSES
 from devices.source import Info, Ledger
 from devices.stream import Feed, StreamOptions, StreamSource, Transfer
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 
 INSTRUMENT = "simulated LinoSPAD2"
@@ -54,12 +54,12 @@ class SimulatedBoard:
             )
 
     @cached_property
-    def _cumulative_photons(self) -> NDArray[np.float64]:
+    def _cumulative_photons(self) -> FloatArray:
         """Photons up to each cell of the light, in raster order."""
         return np.cumsum(self.light.photons)
 
     @cached_property
-    def _code_ends(self) -> NDArray[np.float64]:
+    def _code_ends(self) -> FloatArray:
         """Ends of all pixels' codes in one table that rises throughout, s: two periods apart."""
         begins = 2 * CLOCK_PERIOD_S * np.arange(PIXELS)
         return (self.calibration.code_ends + begins[:, np.newaxis]).ravel()

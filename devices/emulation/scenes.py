@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import Float32Array, FloatArray, IndexArray
 from tofclip.camera import Camera, SkewSweep
 from tofclip.shots import Streak
 from tofclip.simulate import (
@@ -40,8 +41,8 @@ class LineLight:
     """What falls on a line of pixels after each pulse of the laser, in one exposure."""
 
     # (rows, columns), expected photons, background included; row = instant, column = pixel
-    photons: NDArray[np.float64]
-    row_times: NDArray[np.float64]  # (rows,), middle of each row, s after the pulse
+    photons: FloatArray
+    row_times: FloatArray  # (rows,), middle of each row, s after the pulse
     camera: Camera  # what a calibration would know of the camera
     truth: GroundTruth  # what stands in front of it
 
@@ -50,8 +51,8 @@ class LineLight:
 class EmulatedLight:
     """What falls on the screen, and how it is swept."""
 
-    photons: NDArray[np.float64]  # (rows, columns), expected photons of each pixel in one exposure
-    row_times: NDArray[np.float64]  # (rows,), s
+    photons: FloatArray  # (rows, columns), expected photons of each pixel in one exposure
+    row_times: FloatArray  # (rows,), s
     full_scale: int = 65535  # reading at which a pixel saturates
     seed: int = 0
 
@@ -125,19 +126,19 @@ def simulate_light(scene: str) -> LineLight:
     return simulate_line_light() if scene == "small" else simulate_demonstration_light()
 
 
-def render_array_light() -> NDArray[np.float64]:
+def render_array_light() -> FloatArray:
     """Return the demonstration's reference view as an array of 512 x 512 pixels sees it, 0..1."""
     return _enlarge(np.nan_to_num(_render_truth().reflectance))
 
 
-def render_array_delays() -> NDArray[np.float64]:
+def render_array_delays() -> FloatArray:
     """Return when light comes back to the array's pixels, s; NaN where none does."""
     return _enlarge(_render_truth().range) * 2 / SPEED_OF_LIGHT
 
 
 def draw_cells(
-    random: np.random.Generator, cumulative: NDArray[np.float64], total: int, columns: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    random: np.random.Generator, cumulative: FloatArray, total: int, columns: int
+) -> tuple[IndexArray, IndexArray]:
     """Draw row and column of so many photons from light added up in raster order."""
     return np.divmod(
         np.searchsorted(cumulative, random.uniform(0, cumulative[-1], total), "right"), columns
@@ -156,7 +157,7 @@ def _render_truth() -> GroundTruth:
     return GroundTruth.from_scene(make_default_scene(), make_default_instrument())
 
 
-def _enlarge(picture: NDArray[np.float32]) -> NDArray[np.float64]:
+def _enlarge(picture: Float32Array) -> FloatArray:
     """Let 4 x 4 pixels of an array of 512 x 512 see each pixel of the reference view."""
     return np.asarray(np.kron(picture, np.ones((4, 4))), np.float64)
 

@@ -32,6 +32,7 @@ from devices.spad512 import (
     SpadOptions,
 )
 from devices.stream import StreamSource
+from tofclip.arrays import FloatArray
 from tofclip.errors import ProtocolError
 
 SUPPORTED_FAULTS = ("timeout", "short", "unplug", "corrupt", "stall")
@@ -68,11 +69,11 @@ class EmulatedSpadArray:
 
     def __init__(
         self,
-        photons: NDArray[np.float64],
+        photons: FloatArray,
         seed: int,
         pictures: int = FOREVER,
         faults: Sequence[Fault] = (),
-        delays: NDArray[np.float64] | None = None,
+        delays: FloatArray | None = None,
     ) -> None:
         self._photons, self._seed, self._left = photons, seed, pictures
         self._faults = index_faults(faults, SUPPORTED_FAULTS)
@@ -100,9 +101,7 @@ class EmulatedSpadArray:
         """Switch it off."""
         self._server.close()
 
-    def _gate_light(
-        self, light: NDArray[np.float64], gate: SpadOptions, number: int
-    ) -> NDArray[np.float64]:
+    def _gate_light(self, light: FloatArray, gate: SpadOptions, number: int) -> FloatArray:
         """Return what comes while the gate is open, of light that comes once in a laser's period."""
         opens = gate.opening_times[number % gate.gate_steps]
         width = gate.gate_width_ns * 1e-9

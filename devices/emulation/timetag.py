@@ -24,7 +24,6 @@ from functools import partial
 from time import monotonic, sleep
 
 import numpy as np
-from numpy.typing import NDArray
 
 from devices.address import Uri, option
 from devices.emulation.harness import FOREVER, REPLY_FAULTS, Fault
@@ -44,6 +43,7 @@ from devices.timetag import (
     open_on_backend,
 )
 from devices.timetag_codec import COUNTER_RANGE, LOST, RECORD_BYTES, RECORD_DTYPE, WRAP, pack_words
+from tofclip.arrays import IntArray
 from tofclip.errors import InputError
 
 MAX_TICK = (1 << 62) - 1  # A tick that never comes
@@ -116,7 +116,7 @@ class PulsedSceneStream:
             )
         self._photons_per_block = rate * BLOCK_TICKS / clock_hz
         self._seed, self._block = seed, 0
-        self._ticks: NDArray[np.int64] = np.empty(0, np.int64)
+        self._ticks: IntArray = np.empty(0, np.int64)
         self._words: ByteView = np.empty(0, np.uint8)
 
     def next_words(self, limit: int, last: int) -> ByteView:

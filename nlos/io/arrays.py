@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import FileFormatError
 from tofclip.files import require_bounded_dataset, translate_read_errors
 from tofclip.io.archive import Archive, ArchiveEntry, Entries, list_mat_entries
@@ -25,11 +25,11 @@ class NamedArrays(Archive):
         """What is wrong with the file."""
         return FileFormatError(self.path, problem)
 
-    def read_numbers(self, name: str) -> NDArray[Any]:
+    def read_numbers(self, name: str) -> AnyArray:
         """Return entry `name`, numbers of any shape but an empty one."""
         return self.array(name, *[None] * self._count_axes(name))
 
-    def read_time_last(self, name: str) -> NDArray[Any]:
+    def read_time_last(self, name: str) -> AnyArray:
         """Return signals (rows, columns, t); refuse rows and columns, two equal axes, after time."""
         signal = self.array(name, None, None, None)
         if signal.shape[1] == signal.shape[2] < signal.shape[0]:
@@ -39,7 +39,7 @@ class NamedArrays(Archive):
             )
         return signal
 
-    def read_coordinates(self, name: str) -> NDArray[np.float64]:
+    def read_coordinates(self, name: str) -> FloatArray:
         """Return entry `name`, an array (..., 3) of coordinates; NaN is allowed."""
         dimensions = max(1, self._count_axes(name))
         return self.array(name, *[None] * (dimensions - 1), 3).astype(np.float64)
@@ -96,7 +96,7 @@ def _list_hdf5_entries(path: Path, matlab: bool) -> Entries:
     return entries
 
 
-def _load_hdf5(path: Path, name: str, matlab: bool) -> NDArray[Any]:
+def _load_hdf5(path: Path, name: str, matlab: bool) -> AnyArray:
     import h5py
 
     with h5py.File(path, "r") as file:

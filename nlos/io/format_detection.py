@@ -23,11 +23,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.io import labs
 from nlos.io.arrays import NamedArrays, read_hdf5, read_matlab
+from tofclip.arrays import Float32Array, FloatArray
 from tofclip.errors import FileFormatError
 from tofclip.files import read_toml
 from tofclip.io.light_fields import read_exr_parts
@@ -195,7 +195,7 @@ def _parse_file_number(path: Path) -> tuple[list[int], str]:
     return [int(digits) for digits in re.findall(r"\d+", path.stem)], path.stem
 
 
-def _read_picture(path: Path) -> NDArray[np.float32]:
+def _read_picture(path: Path) -> Float32Array:
     """Brightness (column, t): mean of all channels but alpha and depth."""
     parts = read_exr_parts(path)
     channels = parts[0][1]
@@ -219,7 +219,7 @@ def _read_geometry(path: Path) -> Mapping[str, Any]:
 
 def _read_numbers(
     folder: Path, geometry: Mapping[str, Any], name: str, shape: tuple[int, ...]
-) -> NDArray[np.float64]:
+) -> FloatArray:
     try:
         values = np.array(geometry[name], dtype=np.float64)
     except (TypeError, ValueError):

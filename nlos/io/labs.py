@@ -14,14 +14,13 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.capture import Capture, remove_device_legs
 from nlos.io.arrays import NamedArrays, read_matlab
 from nlos.kernels import rebin, shift_signals
+from tofclip.arrays import AnyArray, Float32Array, FloatArray
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import translate_read_errors
 from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
@@ -30,7 +29,7 @@ from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
 MIN_Z_COSINE = 1 - 1e-6
 
 
-def rotate_to_scene(capture: Capture, towards_scene: NDArray[np.float64]) -> Capture:
+def rotate_to_scene(capture: Capture, towards_scene: FloatArray) -> Capture:
     """Turn all coordinates so that a direction (3,), from the wall into the hidden scene, becomes
     +z: by half a turn around y if it is -z; else the old z, upright in most programs, becomes -y.
     """
@@ -132,7 +131,7 @@ def _evaluate(text: str, known: Mapping[str, float]) -> float:
         return np.nan
 
 
-def _read_points(fields: NamedArrays, name: str, pairs: int) -> NDArray[np.float64]:
+def _read_points(fields: NamedArrays, name: str, pairs: int) -> FloatArray:
     """Points (pairs, 3), as they stand in the file of that name beside the signals."""
     path = fields.path.with_name(name)
     if not path.is_file():
@@ -197,7 +196,7 @@ def read_migration_data(fields: NamedArrays) -> Capture:
     return Capture(signal, wall, wall, MIGRATION_BIN_WIDTH_S)
 
 
-def _build_wall(rows: int, columns: int, half_width: float) -> NDArray[np.float64]:
+def _build_wall(rows: int, columns: int, half_width: float) -> FloatArray:
     x, y = np.meshgrid(
         np.linspace(-half_width, half_width, columns), np.linspace(-half_width, half_width, rows)
     )
@@ -226,9 +225,9 @@ def read_tal(fields: NamedArrays) -> Capture:
 
 def match_lasers_to_sensors(
     fields: NamedArrays,
-    signal: NDArray[Any],
-    sensor: NDArray[np.float64],
-    laser: NDArray[np.float64],
+    signal: AnyArray,
+    sensor: FloatArray,
+    laser: FloatArray,
     bin_width: float,
     start: float,
 ) -> Capture:
@@ -287,8 +286,8 @@ def read_numpy_archive(fields: NamedArrays) -> Capture:
 
 
 def resample_evenly(
-    fields: NamedArrays, signal: NDArray[Any], paths: NDArray[np.float64]
-) -> tuple[NDArray[Any], float, float]:
+    fields: NamedArrays, signal: AnyArray, paths: FloatArray
+) -> tuple[AnyArray, float, float]:
     """Put counts (t, ...) of bins about `paths` (t,), m, evenly spread over each, into even bins of
     their median width; no photon is lost or doubled. Returns with them the path of the first bin
     and from one to the next, m.
@@ -403,7 +402,7 @@ def read_rectified_data(fields: NamedArrays) -> Capture:
     return Capture(np.moveaxis(counts, 2, 0), wall, wall[row, column], fields.number("ts"))
 
 
-def _read_spots(fields: NamedArrays, name: str) -> NDArray[np.float64]:
+def _read_spots(fields: NamedArrays, name: str) -> FloatArray:
     """Points (n, 3), whichever way round they are stored."""
     points = np.atleast_2d(fields.read_numbers(name)).astype(np.float64)
     points = points.T if points.shape[0] == 3 and points.shape[1] != 3 else points
@@ -449,7 +448,7 @@ def read_zaragoza(fields: NamedArrays) -> Capture:
     return rotate_to_scene(capture, normal)
 
 
-def _add_up_bounces(fields: NamedArrays, first: bool) -> NDArray[np.float32]:
+def _add_up_bounces(fields: NamedArrays, first: bool) -> Float32Array:
     """Signal (t, lasers..., points...) of all colours and bounces; a lone laser has no axes."""
     data = fields.read_numbers("data")
     if data.ndim not in (CONFOCAL_AXES, EXHAUSTIVE_AXES):
@@ -466,7 +465,7 @@ def _add_up_bounces(fields: NamedArrays, first: bool) -> NDArray[np.float32]:
     return np.ascontiguousarray(signal[:, 0, 0] if lone else signal)
 
 
-def _read_point_grid(fields: NamedArrays, name: str, first: bool) -> NDArray[np.float64]:
+def _read_point_grid(fields: NamedArrays, name: str, first: bool) -> FloatArray:
     grid = fields.read_numbers(name).astype(np.float64)
     grid = np.moveaxis(grid, 0, -1) if first else grid
     if grid.shape[-1] != 3:

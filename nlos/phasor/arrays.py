@@ -9,12 +9,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.band import Band
 from nlos.capture import Capture
 from nlos.plane import WallLattice
-from tofclip.arrays import Array, ComputeDevice, namespace
+from tofclip.arrays import AnyArray, Array, ComputeDevice, FloatArray, namespace
 
 # Bytes of the largest array made at a time: on a processor, with its caches, and on a GPU.
 CPU_CHUNK_BYTES, GPU_CHUNK_BYTES = 8 << 20, 256 << 20
@@ -36,7 +35,7 @@ class ArrayLibrary:
         """The largest array to be made at a time; some four of its size live together."""
         return CPU_CHUNK_BYTES if "cpu" in str(self.device.device).lower() else GPU_CHUNK_BYTES
 
-    def put(self, values: NDArray[Any]) -> Array:
+    def put(self, values: AnyArray) -> Array:
         """Bring a NumPy array here, real and complex numbers in single precision."""
         single = {"f": np.float32, "c": np.complex64}.get(values.dtype.kind)
         return self.device.put(np.asarray(values, single))
@@ -51,7 +50,7 @@ class ArrayLibrary:
         return self.xp.exp(1j * self.xp.astype(angle, self.xp.complex64))
 
 
-def remove_whole_cycles(cycles: Any) -> NDArray[np.float64]:
+def remove_whole_cycles(cycles: Any) -> FloatArray:
     """Leave out whole cycles in double precision: the rest goes well into single."""
     values = np.asarray(cycles, np.float64)
     return np.asarray(values - np.round(values))
@@ -75,7 +74,7 @@ class BandTransform:
         return real + 1j * imaginary
 
 
-def get_traces(capture: Capture, some: slice | NDArray[Any]) -> Array:
+def get_traces(capture: Capture, some: slice | AnyArray) -> Array:
     """Return the signals (points, t) of some valid wall points, in the capture's own library."""
     library = ArrayLibrary(capture.device)
     flat = library.xp.reshape(capture.signal, (capture.axis.bins, -1))

@@ -26,7 +26,7 @@ from nlos.phasor.transfer import (
 )
 from nlos.plane import Plane, StraightPaths, axis_step
 from nlos.volume import Grid
-from tofclip.arrays import FloatArray
+from tofclip.arrays import ComplexArray, Float32Array, FloatArray, IntArray
 from tofclip.threads import split_blocks
 
 # Chebyshev nodes over the distances on a plane: for a band that turns by 25 periods across.
@@ -41,9 +41,9 @@ class Illumination:
     thirds of the terms of a Chebyshev expansion, and all real.
     """
 
-    coefficients: NDArray[np.float32]  # (frequencies, m), b, even functions first
+    coefficients: Float32Array  # (frequencies, m), b, even functions first
     even: int  # how many functions are even
-    table: NDArray[np.float32]  # (samples, m), f over `span`
+    table: Float32Array  # (samples, m), f over `span`
     span: FloatArray  # (2,), smallest and largest R, m; `split_illumination` has it about 0
 
 
@@ -99,8 +99,6 @@ def _build_continuation_matrix(odd: int) -> FloatArray:
     )
     return continued
 
-
-IntArray = NDArray[np.int64]
 
 # Of the error allowed, what weak plane waves that are left out may hold. Half of it or less is an
 # error of voxels: the rest lies on the window's edge, beyond most of them.
@@ -295,7 +293,7 @@ class InterpolatedBlock:
 
     depths: slice  # of the wanted depths
     nodes: slice  # of the computed ones
-    weights: NDArray[np.complex64]  # (depths, nodes)
+    weights: ComplexArray  # (depths, nodes)
 
 
 @dataclass(frozen=True, eq=False)

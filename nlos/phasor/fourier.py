@@ -13,8 +13,9 @@ import threading
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
+
+from tofclip.arrays import ComplexArray
 
 
 def _import_fftw() -> Any:
@@ -33,7 +34,6 @@ def _import_fftw() -> Any:
 
 pyfftw: Any = _import_fftw()
 
-ComplexArray = NDArray[np.complex64]
 
 # FFTW plans one transform at a time.
 PLANNING_LOCK = threading.Lock()

@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
@@ -54,7 +53,7 @@ from nlos.plane import (
     is_evenly_spaced,
 )
 from nlos.volume import Grid, Volume
-from tofclip.arrays import Array, FloatArray
+from tofclip.arrays import Array, Float32Array, FloatArray
 from tofclip.errors import InputError
 
 # Per voxel: a complex64 sum, and, at most, the images of the depths from which the others follow; and
@@ -183,7 +182,7 @@ class ReciprocalPlan(PhasorPlan):
         return Volume(total - without, self.grid, history)
 
 
-def find_distance(spot: FloatArray | None, grid: Grid) -> NDArray[np.float32]:
+def find_distance(spot: FloatArray | None, grid: Grid) -> Float32Array:
     """Distance of every voxel (z, y, x) from a laser spot, m; 1 without one."""
     if spot is None:
         return np.ones(grid.shape, np.float32)

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
@@ -27,7 +26,7 @@ from nlos.phasor.wall_to_plane_arrays import PortablePropagation
 from nlos.phasor.wall_to_plane_compiled import CompiledPropagation
 from nlos.plane import Plane, PlaneField, WallLattice
 from nlos.volume import Grid
-from tofclip.arrays import Array, FloatArray, is_numpy
+from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray, is_numpy
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks
 
@@ -172,12 +171,12 @@ def plan_wall_to_plane(
 
 def propagate_in_time(
     points: FloatArray,
-    traces: NDArray[np.float32],
+    traces: Float32Array,
     plane: Plane,
     band: Band,
     legs: int,
     progress: Progress = ignore_progress,
-) -> NDArray[np.complex64]:
+) -> ComplexArray:
     """Return the phasors (y, x, frequencies) of transients (n, t) of points (n, 3), m, carried onto
     a plane bin by bin: earlier by their way there, `legs` times, linear between bins, an error of
     some 0.5 % for 15 bins per wavelength that grows with their square.

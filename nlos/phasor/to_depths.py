@@ -13,14 +13,13 @@ from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.method import Progress, ignore_progress
 from nlos.phasor.arrays import ArrayLibrary, remove_whole_cycles
 from nlos.phasor.depth_steps import DepthInterpolation, DiffractionPlan, Illumination
 from nlos.phasor.to_depths_compiled import LaserSource
 from nlos.phasor.to_depths_kernels import TAPS
-from tofclip.arrays import Array, FloatArray
+from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray
 from tofclip.threads import run_blocks, split_blocks, thread_count
 
 # Transfer functions and illuminations are kept for the next field if they take no more.
@@ -83,7 +82,7 @@ class DepthPropagator:
             values += weights[tap] * self.xp.take(nodes, node + tap, axis=1)
         return self.xp.take(values, wave, axis=1)
 
-    def transfer_nodes(self, depth: float, delay: FloatArray) -> NDArray[np.complex64]:
+    def transfer_nodes(self, depth: float, delay: FloatArray) -> ComplexArray:
         """Return the transfer function to a depth, m, at its nodes (nodes, frequencies)."""
         parts = self.plan.transfer.evaluate(depth - self.plan.plane.z, delay)
         nodes = np.empty((len(parts), parts.shape[2]), np.complex64)
@@ -323,7 +322,7 @@ class PortableDiffraction:
 
 def _stack_illuminations(
     lights: list[Illumination],
-) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+) -> tuple[ComplexArray, Float32Array]:
     """Coefficients (z, frequencies, m) and functions (z * samples, m); 0 for missing ones."""
     max_terms = max(light.coefficients.shape[1] for light in lights)
     coefficients = np.zeros((len(lights), len(lights[0].coefficients), max_terms), np.complex64)

@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.kernels import add_illuminated_terms, add_with_carrier
 from nlos.method import Progress, ignore_progress
@@ -41,10 +40,8 @@ from nlos.phasor.to_depths_kernels import (
 )
 from nlos.phasor.transfer import VECTOR_LENGTH, TransferFunction
 from nlos.plane import Plane
-from tofclip.arrays import FloatArray
+from tofclip.arrays import ComplexArray, Float32Array, FloatArray, IntArray
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
-
-IntArray = NDArray[np.int64]
 
 FREQUENCIES_PER_BLOCK = 4
 
@@ -55,7 +52,7 @@ class Interpolation(NamedTuple):
     begin: IntArray  # (groups,), first node
     # (groups + 1,), where a group's weights begin: a row of `weights` for each node
     offset: IntArray
-    weights: NDArray[np.float32]  # (some, LANES)
+    weights: Float32Array  # (some, LANES)
 
 
 class WaveGroups:
@@ -101,8 +98,8 @@ class WaveGroups:
         return Interpolation(begin, offset, shares)
 
     def to_plane_waves(
-        self, values: NDArray[np.complex64], plane: Plane, origin: tuple[float, float]
-    ) -> NDArray[np.float32]:
+        self, values: ComplexArray, plane: Plane, origin: tuple[float, float]
+    ) -> Float32Array:
         """Return ``sum_p values(p) * exp(-1j * q (r_p - origin)) / area`` of every wave q, 0 beyond
         their limits, of values (y, x, frequencies): (groups, ahead + frequencies, 2, MIRRORED,
         LANES). By matrix products: the plane's spacing need not fit the lattice.
@@ -142,9 +139,9 @@ class WaveGroups:
 class _AxisTransform:
     """Waves along an axis of evenly spaced points, about its middle: real, and half as many points."""
 
-    cosines: NDArray[np.float32]  # (waves, half the points)
-    sines: NDArray[np.float32]  # (waves, half the points)
-    turns: NDArray[np.complex64]  # (waves,), waves at the middle
+    cosines: Float32Array  # (waves, half the points)
+    sines: Float32Array  # (waves, half the points)
+    turns: ComplexArray  # (waves,), waves at the middle
 
     @classmethod
     def of(cls, axis: FloatArray, origin: float, step: float, reach: int) -> _AxisTransform:
@@ -159,7 +156,7 @@ class _AxisTransform:
         cosines, sines = (wave(phases).astype(np.float32) for wave in (np.cos, np.sin))
         return cls(cosines, sines, turns.astype(np.complex64))
 
-    def project(self, values: NDArray[np.complex64], count: int) -> list[NDArray[np.complex64]]:
+    def project(self, values: ComplexArray, count: int) -> list[ComplexArray]:
         """Sums of values (points, ...) with the first cosines, and sines, (count, ...)."""
         half = self.cosines.shape[1]
         before, after = values[:half], values[::-1][:half]
@@ -181,7 +178,7 @@ CACHE_BYTES = 1 << 19
 PRODUCT_SPEEDUP = 3
 
 
-WaveIndices = tuple[NDArray[np.int64], NDArray[np.int64]]
+WaveIndices = tuple[IntArray, IntArray]
 """Of plane waves along y and x, in arrays of one shape; these reach as far below 0 as above."""
 
 
@@ -256,13 +253,13 @@ class InverseTransform:
         carrier = np.exp(-2j * np.pi * shift / wide * np.arange(wanted[1]))
         self.carrier = carrier.astype(np.complex64)
         some = _count_per_batch(self.spare, terms)
-        self.spectra: NDArray[np.complex64] = allocate_zeros((some, self.spare + VECTOR_LENGTH))
+        self.spectra: ComplexArray = allocate_zeros((some, self.spare + VECTOR_LENGTH))
         cells = self.spectra[:, : self.spare].reshape(some, columns, tall)
         self._columns = cells[..., :high]
         self._lines = allocate_zeros((some, columns, tall))[..., :high]
         self._middle = allocate_zeros((some, wanted[0], _pad_to_vector(wide)))[..., :wide]
         self._rows = allocate_zeros((terms, wanted[0], _pad_to_vector(wide)))[..., :wide]
-        self.images: NDArray[np.complex64] = self._rows[..., : wanted[1]]
+        self.images: ComplexArray = self._rows[..., : wanted[1]]
         self._plans: dict[int, tuple[FourierPlan, FourierPlan]] = {}
 
     def transform(self, terms: slice) -> None:
@@ -297,9 +294,6 @@ def _count_per_batch(cells: int, terms: int) -> int:
 def _pad_to_vector(count: int) -> int:
     return -(-count // VECTOR_LENGTH) * VECTOR_LENGTH
 
-
-Field = NDArray[np.complex64]
-FloatParts = NDArray[np.float32]
 
 # Depths that a group of plane waves is propagated to while its spectrum is in cache.
 PLANES_PER_BLOCK = 2
@@ -391,8 +385,8 @@ class CompiledDiffraction:
 
     def add(
         self,
-        values: NDArray[np.complex64],
-        total: NDArray[np.complex64],
+        values: ComplexArray,
+        total: ComplexArray,
         progress: Progress = ignore_progress,
     ) -> None:
         """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r of `total` (z, y, x), of
@@ -423,7 +417,9 @@ class CompiledDiffraction:
                 lambda some: self._interpolate(blocks[some.start], computed, total), len(blocks), 1
             )
 
-    def _interpolate(self, block: InterpolatedBlock, computed: Field, total: Field) -> None:
+    def _interpolate(
+        self, block: InterpolatedBlock, computed: ComplexArray, total: ComplexArray
+    ) -> None:
         """Add some depths that follow from computed ones without the laser's carrier."""
         grid, source, part = self.plan.grid, self.source, total[block.depths]
         known = computed[block.nodes].reshape(block.nodes.stop - block.nodes.start, -1)
@@ -482,11 +478,11 @@ class _Workspace:
 
     def image(
         self,
-        spectrum: FloatParts,
+        spectrum: Float32Array,
         source: LaserSource,
         lights: list[Illumination],
         depths: FloatArray,
-        total: Field,
+        total: ComplexArray,
         without_carrier: bool,
     ) -> None:
         """Add depth planes to `total` (z, y, x), of plane waves, with or without the carrier."""
@@ -506,11 +502,11 @@ class _Workspace:
 
     def _propagate_terms(
         self,
-        spectrum: FloatParts,
+        spectrum: Float32Array,
         source: LaserSource,
         lights: list[Illumination],
         depths: FloatArray,
-    ) -> FloatParts:
+    ) -> Float32Array:
         """Return the plane waves of all terms, (depths, m, groups, 2, MIRRORED, LANES)."""
         zeros, between = self.groups.leading_zeros, self.interpolation
         max_terms = max(light.coefficients.shape[1] for light in lights)

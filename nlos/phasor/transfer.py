@@ -10,11 +10,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.phasor.to_depths_kernels import TAPS, find_interpolation_weights, sample_waves
 from nlos.plane import Plane, axis_step
-from tofclip.arrays import FloatArray
+from tofclip.arrays import Float32Array, FloatArray, IntArray
 
 Sides = tuple[float, float]
 
@@ -212,7 +211,7 @@ class TransferFunction:
         return radii, 2 * np.pi * radii * h / (1 + np.exp(-t))
 
     @cached_property
-    def bessel_matrix(self) -> NDArray[np.float32]:
+    def bessel_matrix(self) -> Float32Array:
         """``J_0(q * rho)`` with all weights, shape (nodes, radii)."""
         from scipy.special import j0
 
@@ -224,7 +223,7 @@ class TransferFunction:
         """Compute now the table that all evaluations share, before threads do; return its bytes."""
         return self.bessel_matrix.nbytes
 
-    def interpolation(self, lateral: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def interpolation(self, lateral: FloatArray) -> tuple[IntArray, Float32Array]:
         """Find lateral wavenumbers among the nodes: the first node to take, and the weights of
         `TAPS` from it on.
         """
@@ -232,9 +231,7 @@ class TransferFunction:
         find_interpolation_weights(lateral / self.node_step + TAPS // 2, node, weight)
         return node, weight
 
-    def evaluate(
-        self, distance: float, delay: FloatArray, leading_zeros: int = 0
-    ) -> NDArray[np.float32]:
+    def evaluate(self, distance: float, delay: FloatArray, leading_zeros: int = 0) -> Float32Array:
         """Return the transfer function over a distance, shape (nodes, 2, frequencies), real and
         imaginary parts.
 
@@ -259,7 +256,7 @@ class TransferFunction:
         )
         # the Hankel transform as one matrix product for all frequencies
         flat = self.bessel_matrix @ waves.reshape(radii.size, -1)
-        nodes: NDArray[np.float32] = flat.reshape(-1, *waves.shape[1:])
+        nodes: Float32Array = flat.reshape(-1, *waves.shape[1:])
         return nodes
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.phasor.fourier import FourierPlan, allocate_zeros, plan_transform
 from nlos.phasor.to_depths_kernels import transpose
@@ -28,15 +27,12 @@ from nlos.phasor.transfer import (
 )
 from nlos.phasor.wall_kernels import VECTOR_FLOATS
 from nlos.plane import Plane, StraightPaths, WallLattice, axis_step
-from tofclip.arrays import FloatArray
+from tofclip.arrays import ComplexArray, Float32Array, FloatArray, IntArray
 from tofclip.threads import run_blocks, split_blocks
 
 if TYPE_CHECKING:
     import finufft
 
-
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex64]
 
 # Neighbouring frequencies that share their functions of depth.
 FREQUENCIES_PER_GROUP = 6
@@ -97,7 +93,7 @@ class WallToPlanePlan:
     low_rank_transfer: LowRankTransfer  # from all depths
     # Where waves without negative indices lie among the nodes of the transfer functions: first node
     # (columns, rows) and the weights (columns, rows, taps) of those from it on.
-    node_interpolation: tuple[IntArray, NDArray[np.float32]]
+    node_interpolation: tuple[IntArray, Float32Array]
 
     @property
     def plane(self) -> Plane:
@@ -316,7 +312,7 @@ class LowRankTransfer:
         """Number of terms of every group."""
         return [vectors.shape[1] for vectors in self.combinations]
 
-    def terms(self, number: int) -> tuple[NDArray[np.float32], ComplexArray]:
+    def terms(self, number: int) -> tuple[Float32Array, ComplexArray]:
         """Return the terms of one group, ``K_k(q, d_p) ~ sum_m over_waves[k, q, m] * over_points[m,
         p]``: factors of waves (frequencies, nodes, n) at the nodes of the transfer functions, all
         real, then all imaginary parts, then 0; and factors of points (m, points).
@@ -415,7 +411,7 @@ class LatticeAnalysis:
         shapes = ((rows, wide), (rows, wide), (most, high), (terms * most, high))
         arrays = [allocate_zeros(shape) for shape in shapes]
         self._points, self._lines, self._middle = arrays[:3]
-        self._spectra: NDArray[np.complex64] = arrays[3]
+        self._spectra: ComplexArray = arrays[3]
         self._along_x = plan_transform(self._points, self._lines, axis=1)
         self._along_y: dict[int, FourierPlan] = {}
 
@@ -426,9 +422,7 @@ class LatticeAnalysis:
         needed = -(-(reach + 1) // COLUMN_STEP) * COLUMN_STEP
         return needed if 2 * needed < self._wide else self._wide
 
-    def spectra(
-        self, values: NDArray[np.complex64], weights: NDArray[np.complex64], reach: int
-    ) -> NDArray[np.complex64]:
+    def spectra(self, values: ComplexArray, weights: ComplexArray, reach: int) -> ComplexArray:
         """Analyse ``values * weights[m]``, values (points,) and weights (terms, points), up to an
         index along x; (terms, columns, rows), both in the order of Fourier transforms.
         """
@@ -497,9 +491,7 @@ class ScatteredAnalysis:
         self._tall, self._tolerance = tall, max(tolerance, 10 * float(np.finfo(np.float32).eps))
         self._plans: dict[tuple[int, int, int], finufft.Plan] = {}
 
-    def spectra(
-        self, values: NDArray[np.complex64], weights: NDArray[np.complex64], reach: int
-    ) -> NDArray[np.complex64]:
+    def spectra(self, values: ComplexArray, weights: ComplexArray, reach: int) -> ComplexArray:
         """Analyse ``values * weights[m]`` up to an index along x; see `LatticeAnalysis.spectra`."""
         # whole steps, so that neighbouring frequencies share a plan
         sizes = (
@@ -507,7 +499,7 @@ class ScatteredAnalysis:
             for largest in (reach + 1, (reach + 1) * self._tall + 1)
         )
         columns, rows = sizes
-        spectra: NDArray[np.complex64] = self._get_plan(len(weights), columns, rows).execute(
+        spectra: ComplexArray = self._get_plan(len(weights), columns, rows).execute(
             values * weights
         )
         return spectra.reshape(len(weights), columns, rows)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.method import Progress, ignore_progress
 from nlos.phasor.to_depths_compiled import choose_inverse
@@ -22,10 +21,8 @@ from nlos.phasor.wall_kernels import (
 )
 from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, has_finufft, plan_transforms
 from nlos.plane import Plane
-from tofclip.arrays import FloatArray
+from tofclip.arrays import ComplexArray, FloatArray
 from tofclip.threads import limit_blas_threads, run_blocks
-
-ComplexArray = NDArray[np.complex64]
 
 # Enough wall points to tell the strength of a frequency from.
 STRENGTH_POINTS = 1024
@@ -64,15 +61,13 @@ class CompiledPropagation:
         return propagate_direct(points, phasors, plane, self.waves.wavenumbers, progress)
 
 
-def estimate_strength(phasors: ComplexArray) -> NDArray[np.float64]:
+def estimate_strength(phasors: ComplexArray) -> FloatArray:
     """Estimate how strong phasors (points, frequencies) are at each frequency, relative to the
     strongest.
     """
     some = np.abs(phasors[:: len(phasors) // STRENGTH_POINTS + 1])
     energy = np.mean(some.astype(np.float64) ** 2, axis=0)
-    relative: NDArray[np.float64] = (
-        np.sqrt(energy / energy.max()) if energy.any() else np.ones(energy.size)
-    )
+    relative: FloatArray = np.sqrt(energy / energy.max()) if energy.any() else np.ones(energy.size)
     return relative
 
 

@@ -7,10 +7,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.band import Band
 from nlos.capture import Capture
@@ -30,15 +28,13 @@ from nlos.phasor.to_depths import PortableDiffraction
 from nlos.phasor.wall_to_plane_compiled import sum_spherical_waves
 from nlos.plane import axis_step
 from nlos.volume import Grid, Volume
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import InputError
 from tofclip.operators import Diagonal, LinearOperator, Stack
 from tofclip.solvers import Method as Prior
 from tofclip.solvers import Sparse
 from tofclip.solvers.fista import LightFieldVariation
 from tofclip.threads import limit_blas_threads
-
-Array = NDArray[Any]
 
 
 class HiddenToWall(LinearOperator):
@@ -65,27 +61,27 @@ class HiddenToWall(LinearOperator):
         # sqrt(G_k), and the area that a point of the virtual plane stands for
         self._strength = (np.sqrt(band.weights) * area).astype(self.dtype)
 
-    def _forward(self, block: Array) -> Array:
+    def _forward(self, block: AnyArray) -> AnyArray:
         return self._apply_per_frame(self._to_phasors, block)
 
-    def _adjoint(self, block: Array) -> Array:
+    def _adjoint(self, block: AnyArray) -> AnyArray:
         return self._apply_per_frame(self._to_volume, block)
 
-    def _to_phasors(self, volume: Array) -> Array:
+    def _to_phasors(self, volume: AnyArray) -> AnyArray:
         # the adjoint of a wave that runs out is one that runs in: conjugate, propagate, conjugate
         waves = self._depths.to_plane(volume).reshape(-1, self.wavenumbers.size).conj()
         plane = self.plane.points.reshape(-1, 3)
         phasors = sum_spherical_waves(self.points, plane, waves, self.wavenumbers).conj()
         return np.asarray(phasors * self._strength).view(np.float32).ravel()
 
-    def _to_volume(self, measurements: Array) -> Array:
+    def _to_volume(self, measurements: AnyArray) -> AnyArray:
         phasors = measurements.view(np.complex64).reshape(len(self.points), -1) * self._strength
         # the same sum with points and plane exchanged: a wave from r to s is one from s to r
         plane = self.plane.points.reshape(-1, 3)
         waves = sum_spherical_waves(plane, self.points, phasors, self.wavenumbers)
         return np.asarray(self._depths.to_volume(waves.reshape(*self.plane.shape, -1)))
 
-    def _apply_per_frame(self, work: Callable[[Array], Array], block: Array) -> Array:
+    def _apply_per_frame(self, work: Callable[[AnyArray], AnyArray], block: AnyArray) -> AnyArray:
         """Treat every frame alone: each is a volume, too large to gain from company."""
         # Depths and targets share the cores already: BLAS threads of its own would fight with ours.
         with limit_blas_threads():
@@ -108,7 +104,7 @@ class WallModel:
     capture: Capture  # of the plan's geometry
 
     @cached_property
-    def laser_distance(self) -> Array:
+    def laser_distance(self) -> AnyArray:
         """Mean distance of voxels (z, y, x) from the laser spots, m; 1 of a confocal scan."""
         distances = [find_distance(one.group.laser, self.plan.grid) for one in self.plan.groups]
         return np.asarray(np.mean(distances, axis=0))
@@ -123,7 +119,7 @@ class WallModel:
             parts.append(bare @ Diagonal(relative))
         return Stack(parts)
 
-    def measurements(self) -> Array:
+    def measurements(self) -> AnyArray:
         """Return the phasors over ``sqrt(G_k)``, as the operator gives them, (n, 1) float32."""
         strength = np.sqrt(self.plan.band.weights)
         parts = []

@@ -10,10 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.method import (
@@ -28,11 +26,9 @@ from nlos.method import (
 from nlos.preparation import remove_first_bounce
 from nlos.refinement.kernels import VOXELS_PER_RUN, add_backprojected_light, add_expected_light
 from nlos.volume import Grid, Volume
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, thread_count
-
-Array = NDArray[Any]
 
 # Photons of a bin; more are not counted one by one.
 MAX_COUNT = 1 << 22
@@ -64,7 +60,7 @@ class TimeOfFlight:
     # evenly, 2 for matte surfaces that face a matte wall; 1 lies between
     obliquity: int = 0
 
-    def compute_light(self, albedo: Array, voxels: Array, points: Array) -> Array:
+    def compute_light(self, albedo: AnyArray, voxels: AnyArray, points: AnyArray) -> AnyArray:
         """Return the light (m, bins) of voxels (n,), flat indices, at points (m,)."""
         light = np.empty((len(points), self._bins), np.float32)
         places, albedo = np.take(self._places, voxels, axis=1), np.asarray(albedo, np.float32)
@@ -78,8 +74,8 @@ class TimeOfFlight:
         return self.spread(light, self.response)
 
     def backproject(
-        self, values: Array, voxels: Array, points: Array, squared: bool = False
-    ) -> Array:
+        self, values: AnyArray, voxels: AnyArray, points: AnyArray, squared: bool = False
+    ) -> AnyArray:
         """Return what voxels (n,) see of values (m, bins): the adjoint of `compute_light`; of
         `squared` light and the inverse of the counts it is Fisher's information.
         """
@@ -104,13 +100,13 @@ class TimeOfFlight:
         return self.capture.axis.bins
 
     @cached_property
-    def _places(self) -> NDArray[np.float32]:
+    def _places(self) -> Float32Array:
         grid = self.grid
         z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
         return np.stack([x.ravel(), y.ravel(), z.ravel()]).astype(np.float32)
 
     @cached_property
-    def _scale(self) -> tuple[Array, np.float32, np.float32, int]:
+    def _scale(self) -> tuple[AnyArray, np.float32, np.float32, int]:
         """Extent of a voxel, path of the record's beginning, bins per metre, obliquity."""
         axes = (self.grid.x, self.grid.y, self.grid.z)
         cell = [float(np.median(np.diff(axis))) if axis.size > 1 else 0.0 for axis in axes]
@@ -118,12 +114,12 @@ class TimeOfFlight:
         start = np.float32(axis.start - axis.spacing / 2)
         return np.array(cell, np.float32), start, np.float32(1 / axis.spacing), self.obliquity
 
-    def _pairs(self, points: Array) -> tuple[Array, Array]:
+    def _pairs(self, points: AnyArray) -> tuple[AnyArray, AnyArray]:
         lasers = self.capture.lasers
         lasers = lasers if len(lasers) == 1 else lasers[points]
         return self.capture.points[points].astype(np.float32), lasers.astype(np.float32)
 
-    def spread(self, values: Array, response: FloatArray) -> Array:
+    def spread(self, values: AnyArray, response: FloatArray) -> AnyArray:
         """Convolve values (m, bins) with a response (n,) in time, whose middle is no delay."""
         from scipy.ndimage import convolve1d
 
@@ -138,8 +134,8 @@ class CountedPhotons:
     """What was counted, and where."""
 
     capture: Capture  # for the linear image: with the wall's own light blanked
-    counts: NDArray[np.float32]  # (points, bins), photons
-    observed: NDArray[np.bool_]  # (points, bins), bins whose counts are taken into account
+    counts: Float32Array  # (points, bins), photons
+    observed: BoolArray  # (points, bins), bins whose counts are taken into account
 
     @classmethod
     def of(cls, capture: Capture, blank: float = 0.0, ramp: float = 0.0) -> CountedPhotons:
@@ -168,7 +164,7 @@ class CountedPhotons:
         counted = np.where(observed, counts / float(lit.min()), 0).astype(np.float32)
         return cls(capture, counted, observed)
 
-    def hold_out(self, fraction: float, seed: int) -> tuple[CountedPhotons, NDArray[np.float32]]:
+    def hold_out(self, fraction: float, seed: int) -> tuple[CountedPhotons, Float32Array]:
         """Set some photons aside (points, bins) by chance: Poisson's law makes both parts
         independent.
         """
@@ -184,7 +180,9 @@ class CountedPhotons:
         return replace(self, capture=thinned, counts=kept), held
 
 
-def improve_background(background: Array, mean: float, ratios: Array, seen: Array) -> Array:
+def improve_background(
+    background: AnyArray, mean: float, ratios: AnyArray, seen: AnyArray
+) -> AnyArray:
     """One step of expectation maximisation of the background (n,), photons per bin, drawn to the
     `mean`; `ratios` (n, bins): counts over what is expected; `seen` (n,): bins that count.
     """
@@ -192,7 +190,7 @@ def improve_background(background: Array, mean: float, ratios: Array, seen: Arra
     return np.asarray(np.maximum(drawn / (seen + BACKGROUND_PHOTONS / mean), MIN_BACKGROUND))
 
 
-def fit_brightness(photons: CountedPhotons, light: Array) -> Array:
+def fit_brightness(photons: CountedPhotons, light: AnyArray) -> AnyArray:
     """Expected photons (points, bins) by the brightest likely light of a given shape."""
     counts, observed = photons.counts, photons.observed
     seen, lit = observed.sum(axis=1), float(light[observed].sum())
@@ -211,7 +209,7 @@ def fit_brightness(photons: CountedPhotons, light: Array) -> Array:
 
 
 def compare_likelihoods(
-    photons: Array, expected: Array, other: Array, observed: Array
+    photons: AnyArray, expected: AnyArray, other: AnyArray, observed: AnyArray
 ) -> tuple[float, float]:
     """Gain of the logarithm of the likelihood of photons (points, bins) by one expectation over
     another, where observed, nats, and the standard deviation that their noise gives it.
@@ -245,8 +243,8 @@ class PhotonFit:
         self,
         photons: CountedPhotons,
         model: TimeOfFlight,
-        voxels: Array,
-        albedo: Array,
+        voxels: AnyArray,
+        albedo: AnyArray,
         prior_weight: float,
     ) -> None:
         self.photons, self.model, self.voxels = photons, model, voxels
@@ -261,14 +259,14 @@ class PhotonFit:
         total = float(np.sum(self._sensitivity * albedo))
         self.albedo = (albedo * (half / total)).astype(np.float32)
         self.background = np.full(len(ones), half / max(self._seen.sum(), 1), np.float32)
-        self._penalty: Array = np.zeros(len(voxels), np.float32)
+        self._penalty: AnyArray = np.zeros(len(voxels), np.float32)
 
     @property
-    def expected_photons(self) -> Array:
+    def expected_photons(self) -> AnyArray:
         """Photons that every voxel sends to the wall, (n,)."""
         return self.albedo * self._sensitivity
 
-    def place(self, values: Array) -> Array:
+    def place(self, values: AnyArray) -> AnyArray:
         """Put values (n,) of the voxels into a volume (z, y, x)."""
         volume = np.zeros(self.model.grid.size, values.dtype)
         volume[self.voxels] = values
@@ -300,7 +298,7 @@ class PhotonFit:
         )
         self.passes += 1
 
-    def _improve_by(self, points: Array, subsets: int) -> float:
+    def _improve_by(self, points: AnyArray, subsets: int) -> float:
         """One step of expectation maximisation on some wall points; return their likelihood."""
         counts, observed = self.photons.counts[points], self.photons.observed[points]
         expected = self.expect(points)
@@ -316,7 +314,7 @@ class PhotonFit:
         )
         return float(np.sum(np.where(observed, counts * np.log(expected) - expected, 0)))
 
-    def expect(self, points: Array | None = None) -> Array:
+    def expect(self, points: AnyArray | None = None) -> AnyArray:
         """Return the photons expected at some wall points, all by default, (points, bins)."""
         points = self._everyone if points is None else points
         light = self.model.compute_light(self.albedo, self.voxels, points)
@@ -329,7 +327,7 @@ class PhotonFit:
         self.albedo *= np.float32(more)
         self.background *= np.float32(more)
 
-    def compute_sharpness(self) -> Array:
+    def compute_sharpness(self) -> AnyArray:
         """Return the root of Fisher's information (n,): over it, noise of a lone voxel's albedo."""
         known = np.where(self.photons.observed, 1 / self.expect(), 0)
         information = self.model.backproject(known, self.voxels, self._everyone, squared=True)
@@ -513,8 +511,8 @@ class PhotonPlan(Plan):
         return Volume(values, self.grid, {**capture.provenance, "imaging": settings})
 
     def _look_over(
-        self, photons: CountedPhotons, start: Array, report_pass: Callable[[], None]
-    ) -> tuple[PhotonFit, Array]:
+        self, photons: CountedPhotons, start: AnyArray, report_pass: Callable[[], None]
+    ) -> tuple[PhotonFit, AnyArray]:
         """Fit coarse voxels, choose the model by them, and return a fit of the fine voxels that
         hold light, and the linear image's light (points, bins).
         """
@@ -558,7 +556,7 @@ class PhotonPlan(Plan):
         return made, fit.model.compute_light(seen, fit.voxels, np.arange(len(photons.counts)))
 
 
-def judge(fit: PhotonFit, linear_light: Array, held: Array) -> tuple[float, float]:
+def judge(fit: PhotonFit, linear_light: AnyArray, held: AnyArray) -> tuple[float, float]:
     """Return the smaller gain of a fit, by photons held out, over light (points, bins) as bright as
     in the linear image and over background alone, and its standard deviation.
     """
@@ -568,7 +566,7 @@ def judge(fit: PhotonFit, linear_light: Array, held: Array) -> tuple[float, floa
     return min(compare_likelihoods(held, expected, ratio * o, photons.observed) for o in others)
 
 
-def show_with_beam(fit: PhotonFit, linear: Array) -> Array:
+def show_with_beam(fit: PhotonFit, linear: AnyArray) -> AnyArray:
     """Return the photons that voxels sent, as sharp as response and wall tell; where they decide
     nothing, voxels stand in the order of `linear`.
     """
