@@ -63,8 +63,7 @@ class BinAxis:
     @property
     def times(self) -> FloatArray:
         """Middle of each bin, s."""
-        times: FloatArray = self.start + np.arange(self.bins) * np.float64(self.bin_width)
-        return times
+        return self.start + np.arange(self.bins) * np.float64(self.bin_width)
 
     @property
     def shift_bins(self) -> float:

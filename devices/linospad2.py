@@ -262,8 +262,7 @@ class BoardCalibration(Storable):
     @property
     def code_begins(self) -> FloatArray:
         """Instant at which each code begins, s since the clock's tick, (256, 140)."""
-        begins: FloatArray = np.pad(self.code_ends[:, :-1], ((0, 0), (1, 0)))
-        return begins
+        return np.pad(self.code_ends[:, :-1], ((0, 0), (1, 0)))
 
     def times(self, records: Records) -> FloatArray:
         """Return when each photon came, s since its cycle began: the end of its code. ``time =

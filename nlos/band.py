@@ -171,8 +171,7 @@ class Band:
     @property
     def strength(self) -> FloatArray:
         """The pulse's weights relative to the largest, shape (frequencies,)."""
-        strength: FloatArray = self.weights / self.weights.max()
-        return strength
+        return self.weights / self.weights.max()
 
     def compute_phasors(self, traces: AnyArray) -> AnyArray:
         """Return the phasors P_k (points, frequencies) of signals (points, t), as precise as these."""

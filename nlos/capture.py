@@ -441,5 +441,4 @@ def _shift_earlier(signal: Float32Array, bins: FloatArray) -> Float32Array:
     # A shift by the whole record reads nothing but zeros.
     delay = np.nan_to_num(bins, nan=signal.shape[0] + 1.0).ravel()
     flat = np.ascontiguousarray(signal.reshape(signal.shape[0], -1))
-    shifted: Float32Array = shift_signals(flat, delay).reshape(signal.shape)
-    return shifted
+    return shift_signals(flat, delay).reshape(signal.shape)

@@ -109,7 +109,7 @@ def interpolate_axis(values: Float32Array, position: FloatArray, axis: int) -> F
     count = values.shape[axis]
     # the lattice is padded, so that a period's seam lies outside the image
     lower, upper = (np.take(values, index % count, axis) for index in (below, below + 1))
-    return np.asarray(lower + weight * (upper - lower))
+    return lower + weight * (upper - lower)
 
 
 def resample_to_grid(
@@ -283,7 +283,7 @@ def transform_paraboloid(
     delayed = table[whole[..., np.newaxis] * frequencies % shape[2]]
     # Impulses beyond the padded record would wrap around into it.
     height = (whole < shape[2] - 1) / np.sqrt(shape[0] * shape[1])
-    return np.asarray(delayed * ((1 - weight + weight * turn) * height[..., np.newaxis]))
+    return delayed * ((1 - weight + weight * turn) * height[..., np.newaxis])
 
 
 @dataclass(frozen=True)

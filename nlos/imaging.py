@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Generic
 
@@ -100,7 +100,7 @@ def find_settings(capture: Capture, wanted: Wanted) -> Wanted:
         # Which walls a method takes does not depend on the voxels: coarse ones are planned quickly.
         prepared = found.prepare(capture)
         scout, grid = find_scout(prepared, found) or (found, found.grid())
-        found = found.with_method(scout.plan_quickest(prepared, grid)[0])
+        found = _with_quickest(found, scout.plan_quickest(prepared, grid)[0])
     return found
 
 
@@ -109,9 +109,7 @@ def complete_settings(capture: Capture, wanted: Wanted) -> Wanted:
     # As recorded: midpoints would hide that lasers stand off the wall.
     analysis.require_plausible(choose_roles(capture))
     capture = choose_roles(join_near_lasers(capture))
-    found = wanted
-    if found.gate is None:
-        found = _complete(found, _find_gate(capture, found))
+    found = wanted if wanted.gate is not None else _find_gate(capture, wanted)
     gated = replace(found, bins_together=1).prepare(capture)
     if found.fade is None and analysis.find_lit_end(gated):
         fade = FADE_FRACTION * float(np.ptp(capture.axis.paths))
@@ -164,34 +162,42 @@ def _find_ends(grid: Grid) -> tuple[Limits, Limits, Limits]:
     return x, y, z
 
 
-Found = Iterator[tuple[str, Any, str]]
-"""Settings that a rule finds: name, value, and the reason, which may be empty."""
+def _with_quickest(settings: Wanted, method: str) -> Wanted:
+    return settings.with_found(
+        "method", method, "the quickest that takes this wall, laser and grid"
+    )
 
 
-def _complete(settings: Wanted, found: Found) -> Wanted:
-    """Take what a rule finds for what is not given."""
-    for name, value, reason in found:
-        if (given := getattr(settings, name)) is None or given is False:
-            settings = settings.with_found(name, value, reason)
-    return settings
-
-
-def _find_gate(capture: Capture, settings: Settings) -> Found:
+def _find_gate(capture: Capture, settings: Wanted) -> Wanted:
     bounce = analysis.find_first_bounce(capture)
     if bounce is None:
-        yield "gate", None, "no light of the wall's own is in the record"
-        return
+        return settings.with_found("gate", None, "no light of the wall's own is in the record")
     reason = f"the wall's own light is in the record, {bounce.ratio:.3g} times what follows; "
-    yield "gate", bounce.end, f"{reason}{bounce.end:.3g} m later it has faded"
-    yield "gate_ramp", GATE_RAMP_FRACTION * bounce.end, ""
-    yield "gate_found", True, ""
+    found = settings.with_found(
+        "gate", bounce.end, f"{reason}{bounce.end:.3g} m later it has faded"
+    )
+    found = found.with_found("gate_ramp", GATE_RAMP_FRACTION * bounce.end)
+    return found.with_found("gate_found", True)
 
 
 def _complete_voxels(gated: Capture, found: Wanted) -> Wanted:
     """Find the bins, the voxels and the box for the settings' wavelength."""
-    for rule in (_find_bins, _find_voxel):
-        found = _complete(found, rule(gated, found))
-    return _complete_box(gated, found)
+    wavelength, spacing = found.wavelength or math.nan, gated.axis.spacing
+    # whether the wall's lattice, not a virtual pulse, tells what is resolved
+    by_lattice = found.method in TRANSFORM_METHODS and gated.spacing < math.inf
+    finest = wavelength / BINS_PER_WAVELENGTH
+    reason = f"{BINS_PER_WAVELENGTH} bins per wavelength, or as recorded"
+    if by_lattice:
+        finest, reason = gated.spacing, "path per bin as neighbouring wall points are apart"
+    bins = max(1, min(int(finest / spacing + 1e-9), gated.axis.bins // 2))
+    found = found.with_found("bins_together", bins, reason)
+    voxel, reason = wavelength / VOXELS_PER_WAVELENGTH, "an eighth of the wavelength"
+    if by_lattice:
+        voxel = (found.bins_together or 1) * spacing * VOXEL_BIN_FRACTION
+        reason = "a third of the path of a bin"
+    extent = float(np.ptp(gated.points, axis=0).max())
+    found = found.with_found("voxel", max(voxel, extent / MAX_VOXELS_PER_SIDE), reason)
+    return _complete_box(gated, found.with_found("sigma", wavelength / SIGMAS_PER_WAVELENGTH))
 
 
 def _choose_by_pictures(gated: Capture, settings: Settings) -> tuple[float, str]:
@@ -266,33 +272,6 @@ def _sort_points(capture: Capture) -> IndexArray:
     return np.lexsort((capture.points + capture.lasers).T)
 
 
-def _by_lattice(capture: Capture, settings: Settings) -> bool:
-    """Whether the wall's lattice, not a virtual pulse, tells what is resolved."""
-    return settings.method in TRANSFORM_METHODS and capture.spacing < math.inf
-
-
-def _find_bins(capture: Capture, settings: Settings) -> Found:
-    if _by_lattice(capture, settings):
-        finest, reason = capture.spacing, "path per bin as neighbouring wall points are apart"
-    else:
-        finest = (settings.wavelength or math.nan) / BINS_PER_WAVELENGTH
-        reason = f"{BINS_PER_WAVELENGTH} bins per wavelength, or as recorded"
-    bins = min(int(finest / capture.axis.spacing + 1e-9), capture.axis.bins // 2)
-    yield "bins_together", max(1, bins), reason
-
-
-def _find_voxel(capture: Capture, settings: Settings) -> Found:
-    if _by_lattice(capture, settings):
-        path = (settings.bins_together or 1) * capture.axis.spacing
-        wanted, reason = path * VOXEL_BIN_FRACTION, "a third of the path of a bin"
-    else:
-        wanted = (settings.wavelength or math.nan) / VOXELS_PER_WAVELENGTH
-        reason = "an eighth of the wavelength"
-    extent = float(np.ptp(capture.points, axis=0).max())
-    yield "voxel", max(wanted, extent / MAX_VOXELS_PER_SIDE), reason
-    yield "sigma", (settings.wavelength or math.nan) / SIGMAS_PER_WAVELENGTH, ""
-
-
 def _complete_box(capture: Capture, settings: Wanted) -> Wanted:
     """Fill in what is not given of the box: the space in front of the wall that the record covers."""
     voxel = settings.voxel_size
@@ -306,8 +285,9 @@ def _complete_box(capture: Capture, settings: Wanted) -> Wanted:
             f"a box from z = {near:.4g} m on lies beyond the record, whose paths end at {last:.4g} m"
         )
     x, y, (first, last) = _find_ends(Grid.in_front_of(capture, voxel, near, settings.far))
-    ends = (("x", x, ""), ("y", y, ""), ("near", first, ""), ("far", last, ""))
-    completed = _complete(settings, iter(ends))
+    completed = settings
+    for name, value in (("x", x), ("y", y), ("near", first), ("far", last)):
+        completed = completed.with_found(name, value)
     # The longest path from a laser spot by way of the box to a wall point is one by way of corners.
     corners = np.array(np.meshgrid(*completed.box)).reshape(3, -1).T
     longest = sum(
@@ -331,17 +311,10 @@ BRIGHT_QUANTILE, MAX_DECOYS, DECOY_VOXELS = 0.999, 8, 1 << 15
 MIN_EVIDENCE = 1.35
 
 
-def measure_evidence(capture: Capture, plan: Plan, picture: Volume) -> float:
-    """How much brighter the brightest of a coarse picture is than that of decoys, the same capture
-    with its signals shuffled among the wall points; about 1 where there is nothing. Each depth
-    counts relative to the decoys': noise and the wall's glow fade with it.
-    """
-    own, decoys = measure_brightness(capture, plan, picture)
-    return own / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
-
-
 def measure_brightness(capture: Capture, plan: Plan, picture: Volume) -> tuple[float, list[float]]:
-    """Brightest of a picture, and of decoys; see `measure_evidence`."""
+    """Brightest of a coarse picture, and of decoys, the same capture with its signals shuffled among
+    the wall points. Each depth counts relative to the decoys': noise and the wall's glow fade with it.
+    """
     count = int(np.clip(DECOY_VOXELS // math.prod(picture.values.shape), 1, MAX_DECOYS))
     xp, places = namespace(capture.signal), np.flatnonzero(capture.valid)
     # Whatever order the points come in, the decoys are the same.
@@ -387,14 +360,17 @@ class PreparedImaging(Generic[Wanted]):
         return replace(volume, provenance={**volume.provenance, "imaging": described})
 
     def measure_evidence(self) -> float:
-        """How much brighter the coarse picture's brightest is than that of shuffled copies."""
+        """How much brighter the brightest of the coarse picture is than that of decoys; about 1 where
+        there is nothing.
+        """
         scouted = self.scouted
         if scouted is None:
             coarse = find_scout(self.capture, replace(self.settings, everywhere=False))
             settings, grid = coarse or (self.settings, self.grid)
             plan = settings.plan_quickest(self.capture, grid)[1]
             scouted = plan, plan.image(self.capture)
-        return measure_evidence(self.capture, *scouted)
+        own, decoys = measure_brightness(self.capture, *scouted)
+        return own / max(float(np.mean(decoys)), np.finfo(np.float64).tiny)
 
 
 def prepare_imaging(
@@ -412,7 +388,7 @@ def prepare_imaging(
     if scout is not None or found.method is None:
         coarse, grid = scout or (found, found.grid())
         quickest, plan = coarse.plan_quickest(capture, grid)
-        found = found if found.method else found.with_method(quickest)
+        found = _with_quickest(found, quickest)
     if scout is not None:
         scouted = plan, draw("looking over", plan, capture)
         found = find_bright_box(found, scouted[1])

@@ -145,8 +145,7 @@ def find_nearest_wall_point(wall: FloatArray, place: tuple[float, float]) -> Flo
     import numpy as np
 
     known = wall[np.isfinite(wall).all(axis=-1)]
-    spot: FloatArray = known[np.argmin(np.linalg.norm(known[:, :2] - place, axis=1))]
-    return spot
+    return known[np.argmin(np.linalg.norm(known[:, :2] - place, axis=1))]
 
 
 def _choose_time_axis(
@@ -214,7 +213,7 @@ class HiddenTruth:
         z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
         voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
         found, _ = cKDTree(self.positions).query(voxels, distance_upper_bound=reach)
-        return np.asarray(np.isfinite(found).reshape(grid.shape))
+        return np.isfinite(found).reshape(grid.shape)
 
 
 def compare_with_truth(volume: Volume, truth: HiddenTruth) -> dict[str, float]:

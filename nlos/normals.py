@@ -145,7 +145,7 @@ def _refine_peaks(magnitude: NDArray[np.floating], z: FloatArray) -> FloatArray:
     safe = np.where(curvature < 0, curvature, -np.inf)
     offset = np.where(peak == inner, (below - above) / (2 * safe), 0.0)
     step = float(np.median(np.diff(z)))
-    return np.asarray(z[peak] + np.clip(offset, -0.5, 0.5) * step)
+    return z[peak] + np.clip(offset, -0.5, 0.5) * step
 
 
 def _list_corners(values: AnyArray) -> list[AnyArray]:

@@ -149,8 +149,7 @@ def _fade_out(axis: FloatArray, width: float) -> FloatArray:
     """Return a raised cosine at both ends of an axis, 0 half a step outside of them."""
     half = axis_step(axis) / 2
     inward = np.minimum(axis - axis[0], axis[-1] - axis) + half
-    faded: FloatArray = (1 - np.cos(np.pi * np.minimum(inward / (width + half), 1))) / 2
-    return faded
+    return (1 - np.cos(np.pi * np.minimum(inward / (width + half), 1))) / 2
 
 
 # Least distance from wall to plane by which Fresnel zones are measured, in wavelengths: before a wall

@@ -232,7 +232,7 @@ def _path_of(confocal: FloatArray, squared: Any, along: Any) -> FloatArray:
     """Path by way of a pair of the points that a confocal pair sees at a path, m."""
     total = 4 * squared + confocal**2
     root = np.sqrt(np.maximum(total**2 - 16 * along * confocal**2, 0))
-    return np.asarray(np.sqrt((total + root) / 2))
+    return np.sqrt((total + root) / 2)
 
 
 class _Moveout:

@@ -106,4 +106,4 @@ def _compute_ideal_width(
 
 def _compute_path_lengths(wall: FloatArray, lasers: FloatArray, point: FloatArray) -> FloatArray:
     legs = (np.linalg.norm(ends - point, axis=1) for ends in (lasers, wall))
-    return np.asarray(sum(legs))
+    return sum(legs)

@@ -241,12 +241,12 @@ class Settings:
                 return name, plan
         return last, self.make_method(last).plan(capture, grid)
 
-    def with_method(self: Wanted, name: str) -> Wanted:
-        """Return the settings with the method ``name`` that was found to be the quickest."""
-        return self.with_found("method", name, "the quickest that takes this wall, laser and grid")
-
-    def with_found(self: Wanted, name: str, value: Any, reason: str) -> Wanted:
-        """Return the settings with the ``value`` that was found for ``name``, and the ``reason``."""
+    def with_found(self: Wanted, name: str, value: Any, reason: str = "") -> Wanted:
+        """Return the settings with the ``value`` that was found for ``name``, if it was not given, and
+        the ``reason``.
+        """
+        if (given := getattr(self, name)) is not None and given is not False:
+            return self
         reasons = {**self.reasons, name: reason} if reason else self.reasons
         return replace(self, **{name: value}, reasons=reasons)
 

@@ -29,7 +29,7 @@ from nlos.method import (
 )
 from nlos.phasor.arrays import ArrayLibrary
 from nlos.phasor.plan import Hybrid, PlanarRSD, plan_groups, require_even_grid
-from nlos.phasor.propagate import choose_backend
+from nlos.phasor.propagate import Backend
 from nlos.phasor.to_depths import DepthPropagator
 from nlos.volume import AXES, Grid, Volume
 from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray
@@ -318,7 +318,7 @@ class TransientImaging:
             )
         require_imageable(capture, grid)
         require_even_grid(grid)
-        (group,) = plan_groups(self.method, capture, grid, band, choose_backend(capture, band))
+        (group,) = plan_groups(self.method, capture, grid, band, Backend(band, capture))
         warn_of_aliasing(capture, band)
         depths = DepthPropagator(group.plane_to_depths, ArrayLibrary())
         spectrum = depths.to_waves(group.wall_to_plane(capture, ignore_progress, group.group))

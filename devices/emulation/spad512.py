@@ -95,7 +95,7 @@ class EmulatedSpadArray:
             turned = np.rot90(counts.astype(np.uint8), -exposure.codec.quarter_turns)
             return np.packbits(turned, axis=1).ravel()
         kind = "<u2" if exposure.codec.bits == 16 else "u1"
-        return np.asarray(counts.astype(kind).ravel().view(np.uint8))
+        return counts.astype(kind).ravel().view(np.uint8)
 
     def close(self) -> None:
         """Switch it off."""
@@ -108,7 +108,7 @@ class EmulatedSpadArray:
         since = (self._delays[:, : light.shape[1]] - opens) / GATE_EDGE_S
         passed = np.nan_to_num(ndtr(since) - ndtr(since - width / GATE_EDGE_S))
         ambient = AMBIENT_FRACTION * float(light.max(initial=0.0)) * width / LASER_PERIOD_S
-        return np.asarray(light * passed + ambient)
+        return light * passed + ambient
 
     def _serve_client(self, connection: Connection) -> None:
         connection.send(GREETING)

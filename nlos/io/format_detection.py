@@ -203,7 +203,7 @@ def _read_picture(path: Path) -> Float32Array:
     if not colours:
         names = ", ".join(channels)
         raise FileFormatError(path, f"holds the channels {names}, none of which is R, G, B or Y")
-    return np.asarray(np.mean(colours, axis=0, dtype=np.float32))
+    return np.mean(colours, axis=0, dtype=np.float32)
 
 
 def _read_geometry(path: Path) -> Mapping[str, Any]:

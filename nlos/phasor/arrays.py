@@ -53,7 +53,7 @@ class ArrayLibrary:
 def remove_whole_cycles(cycles: Any) -> FloatArray:
     """Leave out whole cycles in double precision: the rest goes well into single."""
     values = np.asarray(cycles, np.float64)
-    return np.asarray(values - np.round(values))
+    return values - np.round(values)
 
 
 class BandTransform:

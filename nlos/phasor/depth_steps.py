@@ -94,10 +94,7 @@ def _build_continuation_matrix(odd: int) -> FloatArray:
     series = (2 / len(angles)) * np.cos(np.outer(orders, angles))
     if not odd:
         series[0] /= 2
-    continued: FloatArray = (
-        np.cos(np.outer(np.arccos(np.linspace(-1, 1, TABLE_SAMPLES)), orders)) @ series
-    )
-    return continued
+    return np.cos(np.outer(np.arccos(np.linspace(-1, 1, TABLE_SAMPLES)), orders)) @ series
 
 
 # Of the error allowed, what weak plane waves that are left out may hold. Half of it or less is an

@@ -38,7 +38,6 @@ from nlos.phasor.propagate import (
     Diffraction,
     Propagation,
     WallToPlane,
-    choose_backend,
     plan_wall_to_plane,
     require_in_front,
     require_propagation,
@@ -234,7 +233,7 @@ def plan_waves(method: WaveMethod, capture: Capture, grid: Grid) -> WavePlan:
     require_imageable(capture, grid)
     require_even_grid(grid)
     band = choose_unaliased_band(capture, grid, method.pulse)
-    backend = choose_backend(capture, band)
+    backend = Backend(band, capture)
     groups = plan_groups(method, capture, grid, band, backend)
     settings = dict(method.settings)
     if isinstance(method, Hybrid):

@@ -1,12 +1,12 @@
-"""From a wall of any shape to a plane in front of it, by the kind of array that the signal is.
-
-`CompiledBackend` has compiled loops for NumPy's arrays; `PortableBackend` has matrix products for
-arrays of any library, which stay where they are. They have the same methods; what is computed, and
-in which order, is written once, in `nlos.phasor.plan`. `nlos.propagate` gives the field on a plane.
+"""From a wall of any shape to a plane in front of it, by the kind of array that the signal is: compiled
+loops for NumPy's arrays; matrix products for arrays of any other library, which stay where they are.
+What is computed, and in which order, is written once, in `nlos.phasor.plan`. `nlos.propagate` gives
+the field on a plane.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Literal, get_args
@@ -18,17 +18,24 @@ from nlos.capture import Capture
 from nlos.illumination import IlluminationGroup, build_waves, find_leg_bounds, group_by_illumination
 from nlos.method import Progress, ignore_progress, require_numpy_signal
 from nlos.phasor.arrays import ArrayLibrary, BandTransform, arrange_on_lattice, get_traces
+from nlos.phasor.depth_steps import DiffractionPlan
 from nlos.phasor.to_depths import PortableDiffraction
-from nlos.phasor.to_depths_compiled import CompiledDiffraction
+from nlos.phasor.to_depths_compiled import CompiledDiffraction, LaserSource
+from nlos.phasor.transfer import SphericalWaves
 from nlos.phasor.wall_kernels import shift_and_sum
-from nlos.phasor.wall_to_plane import WallBeforePlane
-from nlos.phasor.wall_to_plane_arrays import PortablePropagation
-from nlos.phasor.wall_to_plane_compiled import CompiledPropagation
+from nlos.phasor.wall_to_plane import WallBeforePlane, has_finufft, plan_transforms
+from nlos.phasor.wall_to_plane_arrays import DevicePropagation, sum_waves_on_device
+from nlos.phasor.wall_to_plane_compiled import (
+    STRENGTH_POINTS,
+    estimate_strength,
+    propagate_direct,
+    propagate_low_rank,
+)
 from nlos.plane import Plane, PlaneField, WallLattice
 from nlos.volume import Grid
-from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray, is_numpy
+from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray, is_numpy, to_numpy
 from tofclip.errors import InputError
-from tofclip.threads import run_blocks
+from tofclip.threads import limit_blas_threads, run_blocks
 
 Propagation = Literal["spectral", "time"]
 
@@ -41,54 +48,91 @@ frequencies) there.
 POINTS_PER_BLOCK = 64
 
 
-class CompiledBackend:
-    """Compiled loops on NumPy's arrays."""
+class SpectralPropagation:
+    """Phasors of wall points, carried onto a plane the faster way that keeps the tolerance: by direct
+    sums, or by Fourier transforms, whose terms are chosen for the spectrum of the first phasors that
+    come and stay for later ones. `waves`: from points; `library`: of the phasors, none for NumPy's.
+    """
 
-    propagate_phasors, plane_to_depths = CompiledPropagation, CompiledDiffraction
-    zeros = staticmethod(partial(np.zeros, dtype=np.complex64))
+    def __init__(
+        self,
+        geometry: WallBeforePlane,
+        waves: SphericalWaves,
+        tolerance: float,
+        library: ArrayLibrary | None,
+    ) -> None:
+        self.geometry, self.waves, self.tolerance = geometry, waves, tolerance
+        self.library = library
+        self._propagate: Callable[[Array, Progress], Array] | None = None
 
-    def __init__(self, band: Band) -> None:
-        self.band = band
+    def field(self, phasors: Array, progress: Progress = ignore_progress) -> Array:
+        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies); progress
+        counts its values.
+        """
+        self._propagate = self._propagate or self._choose(phasors)
+        return self._propagate(phasors, progress)
+
+    def _choose(self, phasors: Array) -> Callable[[Array, Progress], Array]:
+        geometry, waves, library = self.geometry, self.waves, self.library
+        some = slice(None, None, phasors.shape[0] // STRENGTH_POINTS + 1)
+        sample = phasors[some, :]
+        strength = estimate_strength(sample if library is None else to_numpy(sample))
+        scattered = library is None and has_finufft()
+        with limit_blas_threads():
+            plan = plan_transforms(geometry, waves, strength, self.tolerance, scattered)
+        if library is not None:
+            carry = partial(sum_waves_on_device, geometry, waves, library)
+            if plan is not None:
+                carry = DevicePropagation(plan, library).field
+
+            def carry_at_once(phasors: Array, progress: Progress) -> Array:
+                field = carry(phasors)
+                progress(math.prod(field.shape))
+                return field
+
+            return carry_at_once
+        if plan is not None:
+            return partial(propagate_low_rank, plan)
+        return lambda phasors, progress: propagate_direct(
+            geometry.points, phasors, geometry.plane, waves.wavenumbers, progress
+        )
+
+
+Diffraction = CompiledDiffraction | PortableDiffraction
+
+
+class Backend:
+    """What computes on a capture's arrays at the frequencies of a band."""
+
+    def __init__(self, band: Band, capture: Capture) -> None:
+        self.band, self.library = band, None
+        zeros: Callable[..., Array] = partial(np.zeros, dtype=np.complex64)
+        if not is_numpy(capture.signal):
+            self.library = library = ArrayLibrary(capture.device)
+            self._transform, zeros = BandTransform(band, capture.axis.bins, library), library.zeros
+        self.zeros = zeros
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
         """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
+        if self.library is not None:
+            return self._transform.of(get_traces(capture, group.indices))
         traces = capture.traces()
         own = traces if len(group.indices) == len(traces) else traces[group.indices]
         return np.asarray(self.band.compute_phasors(own), np.complex64)
 
     def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
         """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
-        return lattice.place(phasors)
-
-
-class PortableBackend:
-    """Matrix products on the arrays of any library, where a capture's signal lives."""
-
-    def __init__(self, band: Band, capture: Capture) -> None:
-        self.library = library = ArrayLibrary(capture.device)
-        self.zeros = library.zeros
-        self.propagate_phasors = partial(PortablePropagation, library=library)
-        self.plane_to_depths = partial(PortableDiffraction, library=library)
-        self._transform = BandTransform(band, capture.axis.bins, self.library)
-
-    def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
-        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
-        return self._transform.of(get_traces(capture, group.indices))
-
-    def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
-        """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
+        if self.library is None:
+            return lattice.place(phasors)
         xp = self.library.xp
         placed = arrange_on_lattice(xp.permute_dims(phasors, (1, 0)), lattice, self.library)
         return xp.permute_dims(placed, (1, 2, 0))
 
-
-Backend = CompiledBackend | PortableBackend
-Diffraction = CompiledDiffraction | PortableDiffraction
-
-
-def choose_backend(capture: Capture, band: Band) -> Backend:
-    """Return the backend of a capture's arrays, for the frequencies of a band."""
-    return CompiledBackend(band) if is_numpy(capture.signal) else PortableBackend(band, capture)
+    def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
+        """Return what carries fields from a plane to all depths, in the light of a source."""
+        if self.library is None:
+            return CompiledDiffraction(plan, source)
+        return PortableDiffraction(plan, source, self.library)
 
 
 def propagate(
@@ -132,7 +176,7 @@ def propagate(
     require_propagation(propagation)
     group, band = groups[0], Band(pulse, capture.axis)
     wall = WallBeforePlane.of(capture.points[group.indices], plane)
-    how = choose_backend(capture, band), propagation, tolerance
+    how = Backend(band, capture), propagation, tolerance
     carry = plan_wall_to_plane(capture, wall, group, band, *how)
     wavenumbers = group.legs * band.wavenumbers
     return PlaneField(carry(capture, ignore_progress, group), plane, wavenumbers)
@@ -161,7 +205,7 @@ def plan_wall_to_plane(
 
         return shift_and_sum
     waves = build_waves(group, band, continued=False)
-    propagated = backend.propagate_phasors(geometry, waves, tolerance)
+    propagated = SpectralPropagation(geometry, waves, tolerance, backend.library)
 
     def propagate_spectrum(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
         return propagated.field(backend.compute_phasors(one, group), progress)

@@ -8,18 +8,18 @@ needs the frequencies apart from the laser's wave (transient video).
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from nlos.method import Progress, ignore_progress
 from nlos.phasor.arrays import ArrayLibrary, remove_whole_cycles
-from nlos.phasor.depth_steps import DepthInterpolation, DiffractionPlan, Illumination
+from nlos.phasor.depth_steps import DepthInterpolation, DiffractionPlan
 from nlos.phasor.to_depths_compiled import LaserSource
 from nlos.phasor.to_depths_kernels import TAPS
-from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray
+from tofclip.arrays import Array, ComplexArray, FloatArray
 from tofclip.threads import run_blocks, split_blocks, thread_count
 
 # Transfer functions and illuminations are kept for the next field if they take no more.
@@ -118,26 +118,17 @@ class DepthPropagator:
         return self.library.put(node), weights, self.library.put(wave.ravel())
 
 
-@dataclass(frozen=True, eq=False)
-class _Axial:
-    """Of depths (z, 1, 1): distance along z from the spot, m, and the carrier's cycles over it."""
-
-    distance: Array
-    cycles: Array
-
-
-@dataclass(frozen=True, eq=False)
-class _DepthBlock:
+class _DepthBlock(NamedTuple):
     """What some neighbouring depths need, as arrays of the library."""
 
-    axial: _Axial
+    depths: FloatArray  # (z,), m, on this machine's processor
     transfer: Array  # (z, nodes, frequencies), at the nodes of the lateral wavenumber
     # (z, frequencies, m), of the illumination's functions, 0 where a depth has fewer
     coefficients: Array
     table: Array  # (z * samples, m), the functions themselves
-    first: Array  # (z, 1, 1), where each depth's samples begin in the table
-    # (z, 1, 1), of the axial distance in the table, and samples per metre
-    table_position: tuple[Array, Array]
+    samples: int
+    start: Array  # (z, 1, 1), of the axial distance in the table
+    per_metre: Array  # (z, 1, 1), samples
 
 
 class PortableDiffraction:
@@ -178,15 +169,14 @@ class PortableDiffraction:
         for some in self._block_slices:
             block = self._get_block(some)
             field = self._illuminate(block, waves)
-            computed[some, ...] += field if between else field * self._carrier(block.axial)
+            computed[some, ...] += field if between else field * self._carrier(block.depths)
             done = wanted * some.stop // count - wanted * some.start // count
             progress(done * total.shape[1] * total.shape[2])
         for part in between:
             nodes, weights = computed[part.nodes, ...], self.library.put(part.weights)
             found = weights @ xp.reshape(nodes, (nodes.shape[0], -1))
-            axial = self._measure_axially(self.plan.grid.z[part.depths])
             found = xp.reshape(found, (-1, *total.shape[1:]))
-            total[part.depths, ...] += found * self._carrier(axial)
+            total[part.depths, ...] += found * self._carrier(self.plan.grid.z[part.depths])
 
     def to_volume(self, values: Array) -> Array:
         """Return the real part (z, y, x) of what `add` gives for a field (y, x, frequencies)."""
@@ -195,7 +185,7 @@ class PortableDiffraction:
 
         def process_block(turn: slice) -> None:
             block = self._get_block(planes[turn.start])
-            field = self._illuminate(block, waves) * self._carrier(block.axial)
+            field = self._illuminate(block, waves) * self._carrier(block.depths)
             parts[turn.start] = self.library.xp.real(field)
 
         run_blocks(process_block, len(planes), size=1)
@@ -211,7 +201,7 @@ class PortableDiffraction:
             total: Any = 0
             for some in planes[own]:
                 block = self._get_block(some)
-                lit = volume[some, ...] * xp.conj(self._carrier(block.axial))
+                lit = volume[some, ...] * xp.conj(self._carrier(block.depths))
                 terms = self.waves.to_images_adjoint(lit[:, None, ...] * self._functions(block))
                 waves = terms @ xp.conj(xp.permute_dims(block.coefficients, (0, 2, 1)))
                 waves *= xp.conj(self.waves.transfer(block.transfer))
@@ -232,28 +222,36 @@ class PortableDiffraction:
         """The functions f_m of the illumination at every voxel (z, m, y, x), from tables."""
         if self.source.laser is None:
             return 1.0
-        xp, (start, per_metre) = self.library.xp, block.table_position
-        position = xp.clip(start + self._extra_distance(block.axial) * per_metre, 0.0, None)
-        samples = block.table.shape[0] // block.first.shape[0]
+        xp, samples = self.library.xp, block.samples
+        extra = self._extra_distance(self.library.put(self._measure_ahead(block.depths)))
+        position = xp.clip(block.start + extra * block.per_metre, 0.0, None)
         before = xp.clip(xp.astype(position, xp.int64), None, samples - 2)
         weight = (position - xp.astype(before, position.dtype))[:, None, :, :]
-        index = xp.reshape(before + block.first, (-1,))
+        first = self.library.put(samples * np.arange(block.depths.size)[:, np.newaxis, np.newaxis])
+        index = xp.reshape(before + first, (-1,))
         rows = (xp.take(block.table, some, axis=0) for some in (index, index + 1))
         shaped = (xp.reshape(row, (*before.shape, -1)) for row in rows)
         here, there = (xp.permute_dims(one, (0, 3, 1, 2)) for one in shaped)
         return here + weight * (there - here)
 
-    def _extra_distance(self, axial: _Axial) -> Array:
+    def _measure_ahead(self, depths: FloatArray) -> FloatArray:
+        """Distance of depths along z from the spot (z, 1, 1), m."""
+        return np.abs(depths - self.source.position[2])[:, np.newaxis, np.newaxis]
+
+    def _extra_distance(self, ahead: Array) -> Array:
         """Path from the spot less its part along z (z, y, x), m: with finer digits than it."""
         across = self._lateral_distance_squared
-        return across / (self.library.xp.sqrt(across + axial.distance**2) + axial.distance)
+        return across / (self.library.xp.sqrt(across + ahead**2) + ahead)
 
-    def _carrier(self, axial: _Axial) -> Array:
+    def _carrier(self, depths: FloatArray) -> Array:
         """Carrier of the laser's wave at every voxel, (z, y, x); 1 without one."""
+        ahead, wavenumber = self._measure_ahead(depths), self.source.centre_wavenumber / (2 * np.pi)
+        distance = self.library.put(ahead)
         if self.source.laser is None:
-            return self.library.xp.ones_like(axial.distance)
-        wavenumber = self.source.centre_wavenumber / (2 * np.pi)
-        return self.library.exp_cycles(axial.cycles + self._extra_distance(axial) * wavenumber)
+            return self.library.xp.ones_like(distance)
+        # whole cycles are taken off before single precision would lose the fraction
+        cycles = self.library.put(remove_whole_cycles(wavenumber * ahead))
+        return self.library.exp_cycles(cycles + self._extra_distance(distance) * wavenumber)
 
     @cached_property
     def _computed_depths(self) -> DepthInterpolation:
@@ -292,44 +290,25 @@ class PortableDiffraction:
                 nodes[i] = self.waves.transfer_nodes(float(depths[i]), delay)
 
         run_blocks(plan, depths.size, size=1)
-        coefficients, table = _stack_illuminations(lights)
-        put, axial = self.library.put, self._measure_axially(depths)
-        starts, ends = np.array([light.span for light in lights]).T[..., np.newaxis, np.newaxis]
+        max_terms = max(light.coefficients.shape[1] for light in lights)
         samples = len(lights[0].table)
+        shape = len(lights), len(lights[0].coefficients), max_terms
+        coefficients = np.zeros(shape, np.complex64)
+        table = np.zeros((len(lights), samples, max_terms), np.float32)
+        for i, light in enumerate(lights):
+            count = light.coefficients.shape[1]
+            coefficients[i, :, :count], table[i, :, :count] = light.coefficients, light.table
+            # odd functions carry a factor 1j
+            coefficients[i, :, light.even : count] *= 1j
+        starts, ends = np.array([light.span for light in lights]).T[..., np.newaxis, np.newaxis]
         per_metre = (samples - 1) / np.maximum(ends - starts, 1e-12)
-        ahead = self._measure_ahead(depths)[:, np.newaxis, np.newaxis]
-        position = put((ahead - starts) * per_metre), put(per_metre)
-        first = put(samples * np.arange(depths.size)[:, np.newaxis, np.newaxis])
-        tables = put(np.stack(nodes)), put(coefficients), put(table)
-        return _DepthBlock(axial, *tables, first, position)
-
-    def _measure_ahead(self, depths: FloatArray) -> FloatArray:
-        return np.abs(depths - (0.0 if self.source.laser is None else self.source.laser[2]))
-
-    def _measure_axially(self, depths: FloatArray) -> _Axial:
-        ahead = self._measure_ahead(depths)[:, np.newaxis, np.newaxis]
-        # whole cycles are taken off before single precision would lose the fraction
-        cycles = remove_whole_cycles(self.source.centre_wavenumber / (2 * np.pi) * ahead)
-        return _Axial(self.library.put(ahead), self.library.put(cycles))
+        start, put = (self._measure_ahead(depths) - starts) * per_metre, self.library.put
+        tables = put(np.stack(nodes)), put(coefficients), put(table.reshape(-1, max_terms))
+        return _DepthBlock(depths, *tables, samples, put(start), put(per_metre))
 
     @cached_property
     def _lateral_distance_squared(self) -> Array:
         """Squared distance of columns of voxels from the spot across, (1, y, x), m^2."""
-        laser = np.zeros(3) if self.source.laser is None else self.source.laser
+        laser = self.source.position
         y, x = self.plan.grid.y[:, np.newaxis] - laser[1], self.plan.grid.x - laser[0]
         return self.library.put((y**2 + x**2)[np.newaxis])
-
-
-def _stack_illuminations(
-    lights: list[Illumination],
-) -> tuple[ComplexArray, Float32Array]:
-    """Coefficients (z, frequencies, m) and functions (z * samples, m); 0 for missing ones."""
-    max_terms = max(light.coefficients.shape[1] for light in lights)
-    coefficients = np.zeros((len(lights), len(lights[0].coefficients), max_terms), np.complex64)
-    table = np.zeros((len(lights), len(lights[0].table), max_terms), np.float32)
-    for i, light in enumerate(lights):
-        count = light.coefficients.shape[1]
-        coefficients[i, :, :count], table[i, :, :count] = light.coefficients, light.table
-        # odd functions carry a factor 1j
-        coefficients[i, :, light.even : count] *= 1j
-    return coefficients, table.reshape(-1, max_terms)

@@ -62,8 +62,7 @@ class Window:
 
         ramp = (radii - self.inner_radius) / (self.outer_radius - self.inner_radius)
         # erfc has a spectrum that falls like a Gaussian: little ringing at the window's edge
-        falling: FloatArray = np.where(ramp <= 1, erfc(self.steepness * (2 * ramp - 1)) / 2, 0)
-        return falling
+        return np.where(ramp <= 1, erfc(self.steepness * (2 * ramp - 1)) / 2, 0)
 
     @property
     def without_cut(self) -> Window:
@@ -256,8 +255,7 @@ class TransferFunction:
         )
         # the Hankel transform as one matrix product for all frequencies
         flat = self.bessel_matrix @ waves.reshape(radii.size, -1)
-        nodes: Float32Array = flat.reshape(-1, *waves.shape[1:])
-        return nodes
+        return flat.reshape(-1, *waves.shape[1:])
 
 
 # Nodes that tell how strong waves are, without interpolation between them.
@@ -293,5 +291,4 @@ def find_lateral_limits(
     counts = density >= density.ravel()[order[min(left_out, order.size - 1)]]
     last = lateral.size - 1 - np.argmax(counts[::-1], axis=0)
     farthest = np.where(counts.any(axis=0), last, 1)
-    limits: FloatArray = np.maximum.accumulate(lateral[np.maximum(farthest, 1)])
-    return limits
+    return np.maximum.accumulate(lateral[np.maximum(farthest, 1)])

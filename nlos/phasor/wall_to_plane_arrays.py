@@ -4,67 +4,23 @@ of `nlos.phasor.wall_to_plane_compiled`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
 
 from nlos.kernels import MIN_DISTANCE_M
-from nlos.method import Progress, ignore_progress
 from nlos.phasor.arrays import ArrayLibrary, arrange_on_lattice
 from nlos.phasor.to_depths_kernels import TAPS
 from nlos.phasor.transfer import SphericalWaves
-from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, plan_transforms
-from nlos.phasor.wall_to_plane_compiled import STRENGTH_POINTS, estimate_strength
-from tofclip.arrays import Array, to_numpy
+from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan
+from tofclip.arrays import Array
 from tofclip.threads import split_blocks
 
-Propagator = Callable[[Array], Array]
-"""From phasors (n, frequencies) to the field (y, x, frequencies), complex64."""
 
-
-class PortablePropagation:
-    """``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, within a tolerance,
-    by Fourier matrices with the terms of `nlos.phasor.wall_to_plane`, chosen for the spectrum of
-    the first phasors that come, or by direct sums.
-
-    Memory beyond phasors and result: some 8 bytes per wall point, term and six frequencies (20 MB
-    for 128 x 128 points and 120 frequencies), and four chunks (`ArrayLibrary.chunk_bytes`).
+class DevicePropagation:
+    """A wall in relief by Fourier matrices: every term is one flat wall; see
+    `nlos.phasor.wall_to_plane_compiled`. Memory beyond phasors and result: some 8 bytes per wall point,
+    term and six frequencies (20 MB for 128 x 128 points and 120 frequencies), and four chunks
+    (`ArrayLibrary.chunk_bytes`).
     """
-
-    def __init__(
-        self,
-        geometry: WallBeforePlane,
-        waves: SphericalWaves,
-        tolerance: float,
-        library: ArrayLibrary,
-    ) -> None:
-        self.geometry, self.waves, self.tolerance = geometry, waves, tolerance
-        self.library = library
-        self._propagate: Propagator | None = None
-
-    def field(self, phasors: Array, progress: Progress = ignore_progress) -> Array:
-        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64;
-        progress counts its values, all at once.
-        """
-        if self._propagate is None:
-            self._propagate = self._choose_propagator(phasors)
-        field = self._propagate(phasors)
-        progress(field.shape[0] * field.shape[1] * field.shape[2])
-        return field
-
-    def _choose_propagator(self, phasors: Array) -> Propagator:
-        some = np.arange(0, phasors.shape[0], phasors.shape[0] // STRENGTH_POINTS + 1)
-        sample = to_numpy(self.library.xp.take(phasors, self.library.put(some), axis=0))
-        strength = estimate_strength(sample)
-        plan = plan_transforms(self.geometry, self.waves, strength, self.tolerance)
-        if plan is not None:
-            return _LowRankPropagator(plan, self.library).field
-        return partial(_propagate_direct, self.geometry, self.waves, self.library)
-
-
-class _LowRankPropagator:
-    """A wall in relief: every term is one flat wall; see `nlos.phasor.wall_to_plane_compiled`."""
 
     def __init__(self, plan: WallToPlanePlan, library: ArrayLibrary) -> None:
         self.plan, self.library, put = plan, library, library.put
@@ -109,6 +65,7 @@ class _LowRankPropagator:
                 self._groups.append((frequencies, at_points, put(at_nodes[some])))
 
     def field(self, phasors: Array) -> Array:
+        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies)."""
         xp = self.library.xp
         field = self.library.zeros((*self.plan.plane.shape, phasors.shape[1]))
         (from_y, from_x), (to_y, to_x) = self._from_wall, self._to_plane
@@ -126,7 +83,7 @@ class _LowRankPropagator:
         return field
 
 
-def _propagate_direct(
+def sum_waves_on_device(
     geometry: WallBeforePlane, waves: SphericalWaves, library: ArrayLibrary, phasors: Array
 ) -> Array:
     """Every wall point's spherical wave, summed; see `nlos.phasor.wall_to_plane_compiled`."""

@@ -12,14 +12,13 @@ import numpy as np
 
 from nlos.method import Progress, ignore_progress
 from nlos.phasor.to_depths_compiled import choose_inverse
-from nlos.phasor.transfer import SphericalWaves
 from nlos.phasor.wall_kernels import (
     FREQUENCY_STEPS,
     TARGET_LANES,
     add_low_rank_terms,
     add_spherical_waves,
 )
-from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, has_finufft, plan_transforms
+from nlos.phasor.wall_to_plane import WallToPlanePlan
 from nlos.plane import Plane
 from tofclip.arrays import ComplexArray, FloatArray
 from tofclip.threads import limit_blas_threads, run_blocks
@@ -30,45 +29,12 @@ STRENGTH_POINTS = 1024
 LANE_GROUPS_PER_BLOCK = 4
 
 
-class CompiledPropagation:
-    """Phasors of wall points, carried onto a plane the faster way that keeps the tolerance.
-
-    The terms of the Fourier transforms are chosen for the spectrum of the first phasors that come;
-    they stay for later ones, so that a sequence of like signals is planned once.
-
-    `waves`: from points; `tolerance`: relative error allowed.
-    """
-
-    def __init__(self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float) -> None:
-        self.geometry, self.waves, self.tolerance = geometry, waves, tolerance
-        self._plan: WallToPlanePlan | None = None
-        self._planned = False
-
-    def field(self, phasors: ComplexArray, progress: Progress = ignore_progress) -> ComplexArray:
-        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies); progress
-        counts its values.
-        """
-        if not self._planned:
-            strength, scattered = estimate_strength(phasors), has_finufft()
-            with limit_blas_threads():
-                self._plan = plan_transforms(
-                    self.geometry, self.waves, strength, self.tolerance, scattered
-                )
-            self._planned = True
-        if self._plan is not None:
-            return propagate_low_rank(self._plan, phasors, progress)
-        points, plane = self.geometry.points, self.geometry.plane
-        return propagate_direct(points, phasors, plane, self.waves.wavenumbers, progress)
-
-
 def estimate_strength(phasors: ComplexArray) -> FloatArray:
     """Estimate how strong phasors (points, frequencies) are at each frequency, relative to the
     strongest.
     """
-    some = np.abs(phasors[:: len(phasors) // STRENGTH_POINTS + 1])
-    energy = np.mean(some.astype(np.float64) ** 2, axis=0)
-    relative: FloatArray = np.sqrt(energy / energy.max()) if energy.any() else np.ones(energy.size)
-    return relative
+    energy = np.mean(np.abs(phasors).astype(np.float64) ** 2, axis=0)
+    return np.sqrt(energy / energy.max()) if energy.any() else np.ones(energy.size)
 
 
 def propagate_low_rank(

@@ -79,7 +79,7 @@ class HiddenToWall(LinearOperator):
         # the same sum with points and plane exchanged: a wave from r to s is one from s to r
         plane = self.plane.points.reshape(-1, 3)
         waves = sum_spherical_waves(plane, self.points, phasors, self.wavenumbers)
-        return np.asarray(self._depths.to_volume(waves.reshape(*self.plane.shape, -1)))
+        return self._depths.to_volume(waves.reshape(*self.plane.shape, -1))
 
     def _apply_per_frame(self, work: Callable[[AnyArray], AnyArray], block: AnyArray) -> AnyArray:
         """Treat every frame alone: each is a volume, too large to gain from company."""
@@ -107,7 +107,7 @@ class WallModel:
     def laser_distance(self) -> AnyArray:
         """Mean distance of voxels (z, y, x) from the laser spots, m; 1 of a confocal scan."""
         distances = [find_distance(one.group.laser, self.plan.grid) for one in self.plan.groups]
-        return np.asarray(np.mean(distances, axis=0))
+        return np.mean(distances, axis=0)
 
     def operator(self) -> LinearOperator:
         """Return the operator from albedo over `laser_distance` (z, y, x) to `measurements`."""

@@ -187,7 +187,7 @@ def improve_background(
     `mean`; `ratios` (n, bins): counts over what is expected; `seen` (n,): bins that count.
     """
     drawn = background * ratios.sum(axis=1) + BACKGROUND_PHOTONS
-    return np.asarray(np.maximum(drawn / (seen + BACKGROUND_PHOTONS / mean), MIN_BACKGROUND))
+    return np.maximum(drawn / (seen + BACKGROUND_PHOTONS / mean), MIN_BACKGROUND)
 
 
 def fit_brightness(photons: CountedPhotons, light: AnyArray) -> AnyArray:
@@ -205,7 +205,7 @@ def fit_brightness(photons: CountedPhotons, light: AnyArray) -> AnyArray:
         mean = float(np.sum(background * ratios.sum(axis=1))) / max(int(seen.sum()), 1)
         background = improve_background(background, mean, ratios, seen)
         expected = scale * light + background[:, np.newaxis]
-    return np.asarray(np.maximum(expected, MIN_BACKGROUND))
+    return np.maximum(expected, MIN_BACKGROUND)
 
 
 def compare_likelihoods(
@@ -331,7 +331,7 @@ class PhotonFit:
         """Return the root of Fisher's information (n,): over it, noise of a lone voxel's albedo."""
         known = np.where(self.photons.observed, 1 / self.expect(), 0)
         information = self.model.backproject(known, self.voxels, self._everyone, squared=True)
-        return np.asarray(np.sqrt(np.maximum(information, 0)))
+        return np.sqrt(np.maximum(information, 0))
 
     def with_likeliest_model(self, sigmas: tuple[float, ...]) -> PhotonFit:
         """Return the same fit with the response, of `sigmas` in bins, and the obliquity that are
@@ -378,7 +378,7 @@ def compute_beam(fit: PhotonFit) -> FloatArray:
     # Response and even spread over a bin, of 1 / sqrt(12), add in squares.
     path = spacing * np.hypot(fit.response_sigma, 12**-0.5)
     slopes = np.sqrt(np.average(gradients**2, axis=0, weights=np.broadcast_to(light, len(back))))
-    return np.asarray(path / np.maximum(slopes[::-1], 1e-3))
+    return path / np.maximum(slopes[::-1], 1e-3)
 
 
 def build_response(sigma: float) -> FloatArray:
@@ -389,7 +389,7 @@ def build_response(sigma: float) -> FloatArray:
 
     reach = int(np.ceil(4 * sigma))
     response = np.diff(ndtr((np.arange(-reach, reach + 2) - 0.5) / sigma))
-    return np.asarray(response / response.sum())
+    return response / response.sum()
 
 
 # Parts of the wall that the albedo is improved by in turns, at first.

@@ -84,7 +84,7 @@ def compute_wall_normals(wall: FloatArray) -> FloatArray:
 def _relief_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
     hills = np.sin(3 * x + 0.7) * np.cos(2.5 * y - 0.4) + 0.5 * np.sin(5 * y + 2 * x)
     low, high = float(hills.min()), float(hills.max())
-    return np.asarray(RELIEF_DEPTH_M * ((hills - low) / (high - low) - 0.5))
+    return RELIEF_DEPTH_M * ((hills - low) / (high - low) - 0.5)
 
 
 def _plates_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:

@@ -27,8 +27,8 @@ from scenes import (
 )
 
 import nlos.backprojection
+import nlos.phasor.propagate
 import nlos.phasor.to_depths
-import nlos.phasor.wall_to_plane_arrays
 from nlos import (
     Backprojection,
     Capture,
@@ -386,7 +386,7 @@ def test_fields_stay_on_their_device(
         sizes.append(array.size)
         return elsewhere.fetch(array)
 
-    monkeypatch.setattr(nlos.phasor.wall_to_plane_arrays, "to_numpy", fetch)
+    monkeypatch.setattr(nlos.phasor.propagate, "to_numpy", fetch)
     monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: faster)
     wall = planar_wall(9, 11) if faster is None else curved_wall(9, 11)
     capture = mask(see([HIDDEN], wall, laser), (2, 3))

@@ -22,7 +22,7 @@ from scenes import (
     shaped_wall,
 )
 
-import nlos.phasor.wall_to_plane_compiled
+import nlos.phasor.propagate
 from nlos import Capture, Grid, Hybrid, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
@@ -213,9 +213,7 @@ def test_scattered_points_take_it_where_it_is_faster_and_installed(
     errors = {}
     for faster, installed in ((True, True), (True, False), (False, True)):
         monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_, f=faster: f)
-        monkeypatch.setattr(
-            nlos.phasor.wall_to_plane_compiled, "has_finufft", lambda there=installed: there
-        )
+        monkeypatch.setattr(nlos.phasor.propagate, "has_finufft", lambda there=installed: there)
         errors[faster, installed] = relative_error(propagate(capture, FINE, PULSE).values, exact)
     assert 1e-5 < errors[True, True] < 1e-2
     assert errors[True, False] == errors[False, True] == 0
