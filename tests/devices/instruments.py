@@ -2,11 +2,7 @@
 taggers with other habits.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from time import monotonic, sleep
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +13,7 @@ from devices.emulation.timetag import (
     EmulationOptions,
     PoissonStream,
 )
-from devices.source import Batch, Codec, Info, Ledger, Records, Source, as_bytes
+from devices.source import Info, Ledger, as_bytes
 from devices.stream import Transfer
 from devices.timetag_codec import TimeTagCodec
 from tofclip.errors import DeviceTimeoutError
@@ -25,9 +21,7 @@ from tofclip.errors import DeviceTimeoutError
 TAGS = TimeTagCodec()
 
 
-def make_tagger(
-    base: type[EmulatedTimeTagger] = EmulatedTimeTagger, seed: int = 1, **unlike: Any
-) -> Any:
+def make_tagger(base=EmulatedTimeTagger, seed=1, **unlike):
     """Return an emulated time tagger whose habits (attributes of its class) or options differ."""
     options = {name: unlike.pop(name) for name in list(unlike) if name in EmulationOptions.names()}
     rate = options.pop("rate", 1e6)
@@ -35,7 +29,7 @@ def make_tagger(
     return type("Tagger", (base,), unlike)(light, EmulationOptions(**options), "T1")
 
 
-def true_records(seed: int, count: int, resets: int = 0, rate: float = 1e6) -> Records:
+def true_records(seed, count, resets=0, rate=1e6):
     """Return what a `make_tagger` sees after its counter was reset so often."""
     words = PoissonStream(rate, CLOCK_HZ, seed + 100_000 * resets).next_words(count, MAX_TICK)
     return TAGS.decode(as_bytes(words), TAGS.start).records
@@ -46,32 +40,30 @@ class RepeatingFeed:
 
     info, calibration = Info("pieces"), None
 
-    def __init__(
-        self, codec: Codec, make: Callable[[int], bytes], pieces: int, interval: float = 0.0
-    ) -> None:
+    def __init__(self, codec, make, pieces, interval=0.0):
         self.codec, self.ledger = codec, Ledger()
         self._make, self._pieces, self._interval, self._number = make, pieces, interval, 0
 
-    def start(self) -> None:
+    def start(self):
         self._began = monotonic()
 
-    def pull(self, timeout: float) -> Transfer | None:
+    def pull(self, timeout):
         if self._number >= self._pieces:
             return None
         self._number += 1
         sleep(max(0.0, self._began + self._number * self._interval - monotonic()))
         return Transfer(memoryview(self._make(self._number - 1)), taken_at=monotonic())
 
-    def stop(self) -> None:
+    def stop(self):
         self._pieces = 0
 
-    def close(self) -> None:
+    def close(self):
         """Hold nothing."""
 
 
-def take(source: Source, records: int) -> list[Any]:
+def take(source, records):
     """Read so many records at least."""
-    found: list[Any] = []
+    found = []
     while len(found) < records:
         batch = source.read(10)
         assert batch is not None
@@ -79,7 +71,7 @@ def take(source: Source, records: int) -> list[Any]:
     return found
 
 
-def read_gaps(source: Source, records: int) -> list[bool]:
+def read_gaps(source, records):
     """Read so many records; return of each batch whether something is missing before it."""
     gaps = []
     while source.stats.delivered < records:
@@ -89,7 +81,7 @@ def read_gaps(source: Source, records: int) -> list[bool]:
     return gaps
 
 
-def finish(source: Source) -> None:
+def finish(source):
     """Stop, read the rest and close; the accounts balance."""
     source.drain()
     source.close()
@@ -97,7 +89,7 @@ def finish(source: Source) -> None:
     assert source.stats.unread == 0
 
 
-def read_until_dark(source: Source, patience: float = 0.3) -> list[Batch]:
+def read_until_dark(source, patience=0.3):
     """Read until nothing more comes, then stop and read the rest."""
     found = []
     try:
@@ -109,6 +101,6 @@ def read_until_dark(source: Source, patience: float = 0.3) -> list[Batch]:
     return found
 
 
-def joined(batches: list[Batch]) -> Any:
+def joined(batches):
     """Return all time tags of batches."""
     return np.concatenate([np.empty(0, TAGS.dtype), *(batch.records for batch in batches)])

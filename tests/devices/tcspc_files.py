@@ -1,25 +1,20 @@
 """Files of photon-counting electronics, written byte by byte or by the libraries' own writers."""
 
-from __future__ import annotations
-
 import struct
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 RESOLUTION = 32e-12
 PERIOD = 25e-9
 
 
-def make_decays() -> NDArray[np.uint16]:
+def make_decays():
     """Counts of two channels in 200 bins, (channels, bins)."""
     decay = 20 * np.exp(-np.arange(200) / 30)
     return np.random.default_rng(2).poisson([decay, np.roll(decay, 40)]).astype(np.uint16)
 
 
-def write_ptu(path: Path, decays: NDArray[Any]) -> None:
+def write_ptu(path, decays):
     """One pixel of an image."""
     import ptufile
 
@@ -28,26 +23,26 @@ def write_ptu(path: Path, decays: NDArray[Any]) -> None:
     ptufile.imwrite(path, image, **options)
 
 
-def tag(name: str, number: int, kind: int, value: bytes) -> bytes:
+def tag(name, number, kind, value):
     return struct.pack("<32siI8s", name.encode(), number, kind, value)
 
 
-def integer(name: str, value: int, number: int = -1) -> bytes:
+def integer(name, value, number=-1):
     return tag(name, number, 0x10000008, struct.pack("<q", value))
 
 
-def real(name: str, value: float) -> bytes:
+def real(name, value):
     return tag(name, -1, 0x20000008, struct.pack("<d", value))
 
 
 TAGS_END = tag("Header_End", -1, 0xFFFF0008, bytes(8))
 
 
-def write_phu(path: Path, decays: NDArray[Any]) -> None:
+def write_phu(path, decays):
     """Header, tags, histograms of uint32."""
     channels, bins = decays.shape
 
-    def content(offset: int) -> bytes:
+    def content(offset):
         tags = [
             integer("Measurement_Mode", 0),
             integer("Measurement_SubMode", 1),
@@ -65,7 +60,7 @@ def write_phu(path: Path, decays: NDArray[Any]) -> None:
     path.write_bytes(content(len(content(0))) + decays.astype("<u4").tobytes())
 
 
-def write_sdt(path: Path, decays: NDArray[Any]) -> None:
+def write_sdt(path, decays):
     """One block for each channel: (channels, bins), or images (channels, rows, columns, bins)."""
     import sdtfile
 
@@ -101,12 +96,12 @@ T2_OVERFLOW = 1 << 25
 
 
 def write_ptu_t2(
-    path: Path,
-    pulses: NDArray[Any],
-    photons: NDArray[Any],
-    markers: NDArray[Any] | None = None,
-    scan: dict[str, float] | None = None,
-) -> None:
+    path,
+    pulses,
+    photons,
+    markers=None,
+    scan=None,
+):
     """Events tagged by absolute times, as HydraHarps do (version 2): ticks of the laser's `pulses`,
     ticks and channels (from 0) of the `photons`, ticks and bits of the `markers` (by default one with
     every tenth pulse); `scan`: tags of a scanner's picture.
@@ -119,7 +114,7 @@ def write_ptu_t2(
     marks = special | markers[:, 1] << 25
     words = np.concatenate([np.full(len(pulses), special), marks, photons[:, 1] << 25])
     order = np.argsort(ticks, kind="stable")
-    found: list[int] = []
+    found = []
     turns = 0
     for tick, word in zip(ticks[order].tolist(), words[order].tolist(), strict=True):
         if tick // T2_OVERFLOW > turns:

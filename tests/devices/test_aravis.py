@@ -2,12 +2,9 @@
 stand-in for the library whose frames can be lost, torn and renumbered.
 """
 
-from __future__ import annotations
-
 import sys
 from collections import deque
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +14,6 @@ import devices
 from devices.aravis import UNNUMBERED, find_cameras, load_aravis
 from devices.emulation.aravis import EmulatedCamera
 from devices.emulation.scenes import EmulatedLight, draw_exposure, simulate_line_light
-from devices.source import Stats
 from devices.transients import read_photons, read_transient, read_transients
 from tofclip.errors import (
     DeviceDisconnectedError,
@@ -32,14 +28,14 @@ from tofclip.sequences.streaming import stream_clouds
 
 
 @pytest.fixture
-def aravis() -> Any:
+def aravis():
     try:
         return load_aravis()
     except MissingDependencyError as fault:
         pytest.skip(str(fault))
 
 
-def test_the_emulated_camera_loses_nothing(aravis: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_emulated_camera_loses_nothing(aravis, monkeypatch):
     """Pictures of 128 KiB, so that the system's buffer holds one while this process must wait."""
     monkeypatch.setattr(
         EmulatedCamera, "prepare", lambda self, camera: camera.set_region(0, 0, 256, 256)
@@ -58,21 +54,19 @@ def test_the_emulated_camera_loses_nothing(aravis: Any, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("lost_per_thousand", [3, 100])
-def test_frames_with_missing_packets_are_counted(
-    aravis: Any, lost_per_thousand: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_with_missing_packets_are_counted(aravis, lost_per_thousand, monkeypatch):
     """Of a frame's 211 packets few are lost, or one in ten, so that none is whole; where the first
     one is lost, the frame comes without an identifier.
     """
-    sent: list[int] = []
+    sent = []
     picture = EmulatedLight.of(simulate_line_light(), 1).draw_frame(0)
 
-    def draw_and_note(self: EmulatedLight, number: int) -> Any:
+    def draw_and_note(self, number):
         sent.append(number)
         return picture
 
     monkeypatch.setattr(EmulatedLight, "draw_frame", draw_and_note)
-    numbers: list[int] = []
+    numbers = []
     address = f"sim+aravis://?scene=small&frame_rate=60&lost_per_thousand={lost_per_thousand}"
     with devices.open(address) as source:
         while len(sent) < 60:
@@ -97,10 +91,10 @@ def test_frames_with_missing_packets_are_counted(
 class StandInBuffer(SimpleNamespace):
     """A frame as Aravis hands it over: every ``get_...`` returns what it was made with."""
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         return lambda: vars(self)[name.removeprefix("get_")]
 
-    def set_frame_id(self, frame_id: int) -> None:
+    def set_frame_id(self, frame_id):
         self.frame_id = frame_id
 
 
@@ -114,8 +108,8 @@ class StandInLibrary:
     GvStreamSocketBuffer = SimpleNamespace(FIXED="fixed")
     Buffer = SimpleNamespace(new_allocate=lambda payload: StandInBuffer())
 
-    def __init__(self, pictures: np.ndarray, frames: list[StandInBuffer]) -> None:
-        self.reported: dict[str, Any] = {}
+    def __init__(self, pictures, frames):
+        self.reported = {}
         self.underruns = self.gone_for = 0
         self._frames = frames
         self.Camera = SimpleNamespace(new=self._open)
@@ -132,13 +126,13 @@ class StandInLibrary:
             "get_frame_rate": 10.0,
         }
 
-    def _open(self, place: str | None) -> StandInLibrary:
+    def _open(self, place):
         if self.gone_for:
             self.gone_for -= 1
             raise RuntimeError("No camera found")
         return self
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         if name in self.answers:
             return lambda: self.answers[name]
         if name == "set_property":
@@ -149,28 +143,28 @@ class StandInLibrary:
             return lambda: self.reported.__setitem__(name, True)
         raise AttributeError(name)
 
-    def get_exposure_time(self) -> float:
+    def get_exposure_time(self):
         if self.gone_for:
             raise RuntimeError("timeout")
         return 1000.0
 
-    def create_stream(self, *nothing: None) -> StandInLibrary:
+    def create_stream(self, *nothing):
         self._waiting = deque(StandInBuffer(**vars(frame)) for frame in self._frames)
         return self
 
-    def push_buffer(self, buffer: StandInBuffer) -> None:
+    def push_buffer(self, buffer):
         pass
 
-    def timeout_pop_buffer(self, wait_us: int) -> StandInBuffer | None:
+    def timeout_pop_buffer(self, wait_us):
         return self._waiting.popleft() if self._waiting else None
 
-    def get_info_uint64_by_name(self, name: str) -> int:
+    def get_info_uint64_by_name(self, name):
         return self.underruns
 
 
 @pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> Any:
-    def make(pictures: np.ndarray, ids: list[int], torn: tuple[int, ...] = ()) -> StandInLibrary:
+def stand_in(monkeypatch):
+    def make(pictures, ids, torn=()):
         frames = [
             StandInBuffer(
                 frame_id=frame_id,
@@ -187,7 +181,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> Any:
     return make
 
 
-def read_numbers(address: str, frames: int) -> tuple[list[int], Stats]:
+def read_numbers(address, frames):
     with devices.open(address) as source:
         numbers = [int(frame["number"]) for frame in take(source, frames)]
         finish(source)
@@ -197,7 +191,7 @@ def read_numbers(address: str, frames: int) -> tuple[list[int], Stats]:
 SMALL = np.arange(24, dtype=np.uint16).reshape(2, 3, 4)
 
 
-def test_identifiers_tell_what_is_missing(stand_in: Any) -> None:
+def test_identifiers_tell_what_is_missing(stand_in):
     """Across the end of 16 bits; one comes late, one is torn, two found no buffer."""
     library = stand_in(SMALL, [65533, 65535, 1, 65534, 4, 5, 8], torn=(4,))
     library.underruns = 2
@@ -210,7 +204,7 @@ def test_identifiers_tell_what_is_missing(stand_in: Any) -> None:
     assert library.reported["stop_acquisition"]
 
 
-def test_a_frame_without_its_first_packet_is_counted_once(stand_in: Any) -> None:
+def test_a_frame_without_its_first_packet_is_counted_once(stand_in):
     """Aravis leaves it the identifier that its buffer had, so that the next frame tells."""
     unknown = UNNUMBERED
     ids = [unknown, 2, unknown, 4, unknown, unknown, 8, 9, unknown]
@@ -221,7 +215,7 @@ def test_a_frame_without_its_first_packet_is_counted_once(stand_in: Any) -> None
     assert stats.acquired == 10
 
 
-def test_packets_without_a_buffer_are_counted_as_frames(stand_in: Any) -> None:
+def test_packets_without_a_buffer_are_counted_as_frames(stand_in):
     """A picture takes three packets: 10 of those that found no buffer are four frames, no more."""
     library = stand_in(SMALL, [1, 3, 9])
     library.answers["is_gv_device"], library.underruns = True, 10
@@ -229,7 +223,7 @@ def test_packets_without_a_buffer_are_counted_as_frames(stand_in: Any) -> None:
     assert (stats.dropped_host, stats.lost_device) == (4, 2)
 
 
-def test_a_streak_picture_has_its_rows_in_time(stand_in: Any) -> None:
+def test_a_streak_picture_has_its_rows_in_time(stand_in):
     """The address says how long they take; when the first one is swept, the time zero does."""
     light = simulate_line_light()
     shot = draw_exposure(light, 1)
@@ -240,7 +234,7 @@ def test_a_streak_picture_has_its_rows_in_time(stand_in: Any) -> None:
     np.testing.assert_allclose(np.diff(streak.times), np.diff(shot.times), rtol=1e-9)
 
 
-def test_each_streak_picture_of_the_emulated_camera_becomes_a_cloud(aravis: Any) -> None:
+def test_each_streak_picture_of_the_emulated_camera_becomes_a_cloud(aravis):
     """Over the network protocol: the clouds are those of the pictures that it drew."""
     shots = read_transients("sim+aravis://?scene=small&frame_rate=10&seed=1&policy=block")
     light = EmulatedLight.of(simulate_line_light(), 1)
@@ -258,7 +252,7 @@ def test_each_streak_picture_of_the_emulated_camera_becomes_a_cloud(aravis: Any)
     assert any(np.array_equal(first.counts, light.draw_frame(n)) for n in range(65400, 65420))
 
 
-def test_gated_frames_become_photons_in_time(stand_in: Any) -> None:
+def test_gated_frames_become_photons_in_time(stand_in):
     pictures = np.arange(4 * 24, dtype=np.uint16).reshape(4, 4, 6)
     # Of the first scan a frame is lost: it is left out, and the second one counts.
     stand_in(pictures[[0, 1, 3, 0, 1, 2, 3]], [1, 2, 4, 5, 6, 7, 8])
@@ -268,7 +262,7 @@ def test_gated_frames_become_photons_in_time(stand_in: Any) -> None:
     np.testing.assert_allclose(counted.times, 1e-9 * (0.5 + np.arange(4)))
 
 
-def test_a_camera_that_goes_away(stand_in: Any) -> None:
+def test_a_camera_that_goes_away(stand_in):
     library = stand_in(SMALL, [1, 2])
     with devices.open("aravis://?timeout_s=0.1&reconnect_s=0.2") as source:
         take(source, 2)
@@ -283,7 +277,7 @@ def test_a_camera_that_goes_away(stand_in: Any) -> None:
     assert source.stats.is_balanced
 
 
-def test_what_cannot_be_opened(stand_in: Any) -> None:
+def test_what_cannot_be_opened(stand_in):
     library = stand_in(SMALL, [])
     library.answers["get_pixel_format_as_string"] = "BayerRG8"
     with pytest.raises(InputError, match="choose pixel_format"):
@@ -293,7 +287,7 @@ def test_what_cannot_be_opened(stand_in: Any) -> None:
         devices.open("aravis://10.0.0.9")
 
 
-def test_without_the_library_one_line_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_library_one_line_names_it(monkeypatch):
     load_aravis.cache_clear()
     monkeypatch.setattr("devices.aravis.SYSTEM_PACKAGES", ())
     monkeypatch.setitem(sys.modules, "gi", None)

@@ -1,9 +1,5 @@
 """Codecs: a contract that all of them keep, then each one's words against words written by hand."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -29,12 +25,12 @@ TAGS = TimeTagCodec()
 Stream = tuple[Codec, Records]
 
 
-def tags_of(*rows: tuple[int, int, int]) -> Records:
+def tags_of(*rows):
     return np.array([*rows], RECORD_DTYPE)
 
 
 @st.composite
-def draw_tags(draw: st.DrawFn) -> Stream:
+def draw_tags(draw):
     """Steps from zero to several wraps, strobes and deltas, losses."""
     steps = st.one_of(
         st.integers(0, 1000),
@@ -53,7 +49,7 @@ def draw_tags(draw: st.DrawFn) -> Stream:
 
 
 @st.composite
-def draw_stamps(draw: st.DrawFn) -> Stream:
+def draw_stamps(draw):
     """Time stamps that a stream of LinoSPAD2 can hold."""
     codec = LinoSpad2Codec(
         draw(st.sampled_from(FIRMWARES)), draw(st.integers(1, 6)), draw(st.booleans())
@@ -72,7 +68,7 @@ def draw_stamps(draw: st.DrawFn) -> Stream:
 
 
 @st.composite
-def draw_frames(draw: st.DrawFn) -> Stream:
+def draw_frames(draw):
     """Up to five frames with rising numbers, some of them large."""
     bits = draw(st.sampled_from([1, 8, 16, 32]))
     codec = FrameCodec(draw(st.integers(1, 5)), draw(st.integers(1, 4)) * 8, bits)
@@ -89,7 +85,7 @@ DRAWN = {"timetag": draw_tags(), "linospad2": draw_stamps(), "frames": draw_fram
 
 @pytest.mark.parametrize("name", CODECS)
 @given(data=st.data())
-def test_a_stream_comes_back_wherever_it_is_cut(name: str, data: st.DataObject) -> None:
+def test_a_stream_comes_back_wherever_it_is_cut(name, data):
     codec, records = data.draw(DRAWN[name])
     stream = as_bytes(codec.encode(records))
     assert codec.count_complete_bytes(stream) == len(stream)
@@ -130,7 +126,7 @@ COUNTED, PLAIN = LinoSpad2Codec(timestamps=2, counter=True), LinoSpad2Codec(time
         (FrameCodec(1, 8, 1), [(0, [[0, 0, 0, 0, 0, 0, 0, 2]])], "0 or 1"),
     ],
 )
-def test_records_that_no_instrument_sends(codec: Codec, rows: list[Any], said: str) -> None:
+def test_records_that_no_instrument_sends(codec, rows, said):
     with pytest.raises(InputError, match=said):
         codec.encode(np.array(rows, codec.dtype))
     with pytest.raises(InputError, match="one-dimensional"):
@@ -152,7 +148,7 @@ def test_records_that_no_instrument_sends(codec: Codec, rows: list[Any], said: s
         ("frames", (8, 8, 12), "bits, not 12"),
     ],
 )
-def test_impossible_settings_are_refused(name: str, settings: tuple[Any, ...], said: str) -> None:
+def test_impossible_settings_are_refused(name, settings, said):
     with pytest.raises(InputError, match=said):
         CODECS[name](*settings)
 
@@ -161,7 +157,7 @@ def test_impossible_settings_are_refused(name: str, settings: tuple[Any, ...], s
 
 
 @given(st.binary(max_size=600), st.booleans())
-def test_any_bytes_decode_to_valid_tags(raw: bytes, after_loss: bool) -> None:
+def test_any_bytes_decode_to_valid_tags(raw, after_loss):
     words = as_bytes(raw)[: TAGS.count_complete_bytes(as_bytes(raw))]
     found = TAGS.decode(words, TAGS.start, after_loss)
     assert len(found.records) + found.malformed == TAGS.count_records(words)
@@ -172,7 +168,7 @@ def test_any_bytes_decode_to_valid_tags(raw: bytes, after_loss: bool) -> None:
     assert np.all(found.records["channels"] <= 15)
 
 
-def test_a_tag_written_by_hand() -> None:
+def test_a_tag_written_by_hand():
     word = bytes.fromhex("a5 23 45 67 89 ab")  # 101 00101...: unused bits 00101 are set
     assert TAGS.decode(as_bytes(word), TAGS.start).malformed == 1
     word = bytes.fromhex("a0 93 45 67 89 ab")  # lost, delta, channels 1001, counter 0x3456789ab
@@ -182,12 +178,12 @@ def test_a_tag_written_by_hand() -> None:
 
 
 @pytest.mark.parametrize("word", ["00 00 00 00 00 05", "1f 10 00 00 00 05", "01 10 00 00 00 05"])
-def test_impossible_words_are_malformed(word: str) -> None:
+def test_impossible_words_are_malformed(word):
     found = TAGS.decode(as_bytes(bytes.fromhex(word)), TAGS.start)
     assert (len(found.records), found.malformed) == (0, 1)
 
 
-def test_the_counter_is_unwrapped_at_every_mark() -> None:
+def test_the_counter_is_unwrapped_at_every_mark():
     full = COUNTER_RANGE
     records = mark_wraps(tags_of((full - 1, 1, 0), (full + 5, 2, 0), (4 * full, 4, 0)))
     assert records.tolist() == [
@@ -203,7 +199,7 @@ def test_the_counter_is_unwrapped_at_every_mark() -> None:
     assert len(mark_wraps(tags_of())) == 0
 
 
-def tag_words(*rows: tuple[int, int]) -> bytes:
+def tag_words(*rows):
     """Words of channel 1 at the given counters, with the given flags."""
     return b"".join((flags << 45 | 1 << 36 | counter).to_bytes(6, "big") for counter, flags in rows)
 
@@ -226,15 +222,13 @@ def tag_words(*rows: tuple[int, int]) -> bytes:
         ),
     ],
 )
-def test_only_what_may_have_wrapped_is_taken_for_a_wrap(
-    rows: list[tuple[int, int]], after_loss: bool, expected: list[int]
-) -> None:
+def test_only_what_may_have_wrapped_is_taken_for_a_wrap(rows, after_loss, expected):
     found = TAGS.decode(as_bytes(tag_words(*rows)), TAGS.start, after_loss)
     assert found.records["time_ticks"].tolist() == expected
     assert found.malformed == len(rows) - len(expected)
 
 
-def test_a_loss_between_two_pieces_may_hide_a_wrap() -> None:
+def test_a_loss_between_two_pieces_may_hide_a_wrap():
     before = TAGS.decode(as_bytes(tag_words((COUNTER_RANGE - 10, 0))), TAGS.start)
     after = as_bytes(tag_words((7, 0)))
     found = TAGS.decode(after, before.state, after_loss=True).records
@@ -245,7 +239,7 @@ def test_a_loss_between_two_pieces_may_hide_a_wrap() -> None:
 # LinoSPAD2's
 
 
-def stamp_words(codec: LinoSpad2Codec, cycles: int) -> Any:
+def stamp_words(codec, cycles):
     return np.zeros((cycles, codec.cycle_words), "<u4")
 
 
@@ -259,7 +253,7 @@ def stamp_words(codec: LinoSpad2Codec, cycles: int) -> Any:
         ("2212s", 63, 1, 127),
     ],
 )
-def test_stamps_written_by_hand(firmware: str, converter: int, address: int, pixel: int) -> None:
+def test_stamps_written_by_hand(firmware, converter, address, pixel):
     codec = LinoSpad2Codec(firmware, timestamps=3)
     stream = stamp_words(codec, 2)
     stream[1, converter * 3 + 2] = 1 << 31 | address << 28 | 1234567
@@ -269,7 +263,7 @@ def test_stamps_written_by_hand(firmware: str, converter: int, address: int, pix
     assert (found.malformed, found.state) == (0, 12)
 
 
-def test_the_absolute_counter_is_two_words_low_first() -> None:
+def test_the_absolute_counter_is_two_words_low_first():
     codec = LinoSpad2Codec(timestamps=2, counter=True)
     stream = stamp_words(codec, 1)
     stream[0, :3] = [0x89ABCDEF, 0x01234567, 1 << 31 | 7]
@@ -278,7 +272,7 @@ def test_the_absolute_counter_is_two_words_low_first() -> None:
     assert (found["code"].tolist(), found["pixel"].tolist()) == ([7], [0])
 
 
-def test_stamps_of_the_converter_without_pixels_are_malformed() -> None:
+def test_stamps_of_the_converter_without_pixels_are_malformed():
     codec = LinoSpad2Codec(timestamps=4)
     stream = stamp_words(codec, 3)
     stream[1, 0] = stream[2, 64 * 4 : 64 * 4 + 2] = 1 << 31 | 5
@@ -287,7 +281,7 @@ def test_stamps_of_the_converter_without_pixels_are_malformed() -> None:
     assert (len(found.records), found.malformed, codec.count_records(data)) == (1, 2, 3)
 
 
-def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_change_nothing(monkeypatch):
     codec, random = LinoSpad2Codec(timestamps=20), np.random.default_rng(1)
     stream = random.integers(0, 1 << 32, (1500, codec.cycle_words), dtype=np.uint64).astype("<u4")
     found = []
@@ -303,7 +297,7 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 # Cameras'
 
 
-def test_pixels_lie_where_they_should() -> None:
+def test_pixels_lie_where_they_should():
     codec = FrameCodec(2, 8, 1)
     found = codec.decode(as_bytes(codec.pack_frame(5, bytes([0b10000001, 0b00001111]))), 4).records
     assert found["counts"].tolist() == [[[1, 0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 1, 1, 1, 1]]]
@@ -312,7 +306,7 @@ def test_pixels_lie_where_they_should() -> None:
     assert found["counts"].tolist() == [[[0x201, 0x403]]]
 
 
-def test_a_frame_that_comes_again_is_malformed() -> None:
+def test_a_frame_that_comes_again_is_malformed():
     codec = FrameCodec(1, 1, 8)
     data = b"".join(codec.pack_frame(number, b"x") for number in (3, 3, 2, 4, 1, 9))
     found = codec.decode(as_bytes(data), 2)

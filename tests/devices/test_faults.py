@@ -5,16 +5,13 @@ Accounts balance by construction, so balancing alone says nothing: those of the 
 compared with what the emulator knows.
 """
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from time import monotonic
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,8 +24,8 @@ from devices.emulation.scenes import EmulatedLight
 from devices.emulation.spad512 import EmulatedSpadArray
 from devices.emulation.timetag import GroundTruth
 from devices.frames import FrameCodec
-from devices.source import Batch, OverflowPolicy, Source, Stats
-from devices.stream import StreamOptions, StreamSource, Transfer
+from devices.source import Batch, Stats
+from devices.stream import StreamOptions, StreamSource
 from devices.timetag import SendWindow
 from tofclip.errors import (
     BufferOverflowError,
@@ -48,7 +45,7 @@ PERMANENT = 1_000_000
 FATAL = {"corrupt", "overflow", "stall"}
 """After these a stream of pictures cannot be trusted any more: reading ends with an exception."""
 
-FINE: dict[str, float] = {"timeout": 0.3, "short": 0.2, "unplug": 0.2}
+FINE = {"timeout": 0.3, "short": 0.2, "unplug": 0.2}
 STREAK_KINDS = FINE | {"lost": 0.2, "corrupt": 0.05, "overflow": 0.05}
 ARRAY_KINDS = FINE | {"corrupt": 0.15, "stall": 0.15}
 """How often each kind of fault is drawn."""
@@ -69,9 +66,7 @@ class Outcome:
     seconds: float = float("inf")
 
 
-def read_script(
-    source: Source, outcome: Outcome, is_over: Callable[[], bool], is_rest_read: bool
-) -> None:
+def read_script(source, outcome, is_over, is_rest_read):
     """Read until it is over, and the rest that waits if wanted; stop, and enter how it ended."""
     began = monotonic()
     try:
@@ -89,7 +84,7 @@ def read_script(
     outcome.stats, outcome.seconds = source.stats, monotonic() - began
 
 
-def draw_tagger_script(seed: int) -> list[Fault]:
+def draw_tagger_script(seed):
     """Draw up to six faults of any kind, at most one for a transfer."""
     random = np.random.default_rng(seed)
     faults = []
@@ -106,13 +101,13 @@ def draw_tagger_script(seed: int) -> list[Fault]:
     return faults
 
 
-def run_tagger(faults: Sequence[Fault], seed: int) -> Outcome:
+def run_tagger(faults, seed):
     """Read a time tagger until it is dark or fails, under a watchdog."""
     options = {"records": RECORDS, "transfer_kib": 0.5, "reconnect_s": 2}
     instrument = make_tagger(seed=seed, faults=tuple(faults), **options)
     outcome = Outcome(faults, truth=instrument.truth)
 
-    def read() -> None:
+    def read():
         is_over = lambda: bool(instrument.truth.registered >= RECORDS)  # noqa: E731
         read_script(instrument.open_driver(), outcome, is_over, is_rest_read=True)
 
@@ -123,7 +118,7 @@ def run_tagger(faults: Sequence[Fault], seed: int) -> Outcome:
     return outcome
 
 
-def expect_fault(script: Sequence[Fault]) -> type[DeviceError] | None:
+def expect_fault(script):
     """Return the exception that must end a run, which nothing but a lasting stall or absence does."""
     stalls = {fault.transfer for fault in script if fault.kind == "stall"}
     for fault in script:
@@ -134,13 +129,13 @@ def expect_fault(script: Sequence[Fault]) -> type[DeviceError] | None:
     return None
 
 
-def is_among(ticks: Any, known: Any) -> bool:
+def is_among(ticks, known):
     """Whether every tick is one of those known, which rise."""
     places = np.searchsorted(known, ticks).clip(max=len(known) - 1)
     return bool(np.all(known[places] == ticks))
 
 
-def require_tagger_account(seed: int, outcome: Outcome) -> None:
+def require_tagger_account(seed, outcome):
     """What came and what was reported is what happened; nothing is made up or out of order."""
     stats, truth = outcome.stats, outcome.truth
     assert type(outcome.fault) is (expect_fault(outcome.faults) or type(None)), outcome.faults
@@ -168,7 +163,7 @@ def require_tagger_account(seed: int, outcome: Outcome) -> None:
         last, after_gap = ticks[-1], False
 
 
-def run_pictures(seed: int) -> Outcome:
+def run_pictures(seed):
     """Run a script of up to five faults among the first requests: a streak camera for odd seeds, an
     array for even ones. The very first request, with which a source opens, goes well.
     """
@@ -180,7 +175,7 @@ def run_pictures(seed: int) -> Outcome:
         for place, number in zip(places, drawn, strict=True)
     ]
     if seed % 2:
-        server: Any = EmulatedStreakCamera(SCREEN, 200, faults=faults)
+        server = EmulatedStreakCamera(SCREEN, 200, faults=faults)
         port, data_port = server.ports
         values = f"data_port={data_port}&timeout_s=0.5&buffers=8&mcp_gain=9"
         address = f"remoteex://{HOST}:{port}?{values}"
@@ -195,7 +190,7 @@ def run_pictures(seed: int) -> Outcome:
     return outcome
 
 
-def is_right(outcome: Outcome) -> bool:
+def is_right(outcome):
     """Whether nothing of pictures is unaccounted for, the tube is safe, and only a fatal fault has
     ended the stream.
     """
@@ -205,20 +200,20 @@ def is_right(outcome: Outcome) -> bool:
     return is_balanced and is_safe and (outcome.fault is None or is_allowed)
 
 
-def run_at_once(run: Callable[..., Outcome], *arguments: Any) -> list[Outcome]:
+def run_at_once(run, *arguments):
     """Run scripts, some at once: they wait most of the time."""
     with ThreadPoolExecutor(12) as pool:
         return list(pool.map(run, *arguments))
 
 
-def sample(count: int) -> pytest.MarkDecorator:
+def sample(count):
     """Try so many seeds with every commit, and up to a thousand at night."""
     rest = pytest.param(range(count, 1000), marks=pytest.mark.nightly)
     return pytest.mark.parametrize("seeds", [range(count), rest], ids=["sample", "rest"])
 
 
 @pytest.fixture(autouse=True)
-def own_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def own_time(monkeypatch):
     """Let the driver measure rates by its own work: the emulated instrument's time runs as fast as it
     is read, and packets would get smaller while other programs have the processor.
     """
@@ -226,14 +221,14 @@ def own_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @sample(120)
-def test_random_faults_of_a_time_tagger(seeds: range) -> None:
+def test_random_faults_of_a_time_tagger(seeds):
     outcomes = run_at_once(run_tagger, map(draw_tagger_script, seeds), seeds)
     for seed, outcome in zip(seeds, outcomes, strict=True):
         require_tagger_account(seed, outcome)
 
 
 @sample(48)
-def test_random_faults_of_cameras(seeds: range) -> None:
+def test_random_faults_of_cameras(seeds):
     """All kinds of faults came up, some streams went on after a cable was pulled, some ended."""
     outcomes = run_at_once(run_pictures, seeds)
     assert [outcome for outcome in outcomes if not is_right(outcome)] == []
@@ -244,13 +239,13 @@ def test_random_faults_of_cameras(seeds: range) -> None:
     assert sum(one.stats.lost_device > 0 for one in outcomes) > 3
 
 
-def test_short_transfers_single_stalls_and_timeouts_lose_nothing() -> None:
+def test_short_transfers_single_stalls_and_timeouts_lose_nothing():
     stats = run_tagger(Fault.parse("short@3:7,stall@5,timeout@8,short@9:1"), 1).stats
     assert (stats.delivered, stats.malformed, stats.lost_device) == (RECORDS, 0, 0)
     assert stats.timeouts >= 1
 
 
-def test_the_stream_goes_on_after_it_was_unplugged() -> None:
+def test_the_stream_goes_on_after_it_was_unplugged():
     outcome = run_tagger(Fault.parse("unplug@10:2"), 2)
     gaps = [batch for batch in outcome.batches if batch.after_gap]
     assert (outcome.fault, len(gaps), outcome.stats.reconnects) == (None, 1, 1)
@@ -260,7 +255,7 @@ def test_the_stream_goes_on_after_it_was_unplugged() -> None:
     assert (outcome.stats.acquired, outcome.stats.malformed) == (RECORDS, 1)
 
 
-def test_an_instrument_that_lost_its_power_begins_anew() -> None:
+def test_an_instrument_that_lost_its_power_begins_anew():
     outcome = run_tagger(Fault.parse("powerloss@10:1"), 3)
     gap = next(batch for batch in outcome.batches if batch.after_gap)
     assert outcome.stats.reconnects == 1
@@ -277,14 +272,14 @@ def test_an_instrument_that_lost_its_power_begins_anew() -> None:
         ("stall@10:2", DeviceStalledError, "stalled"),
     ],
 )
-def test_gone_for_good(script: str, fault: type[DeviceError], said: str) -> None:
+def test_gone_for_good(script, fault, said):
     outcome = run_tagger(Fault.parse(script), 4)
     assert type(outcome.fault) is fault
     assert said in str(outcome.fault)
     assert outcome.stats.delivered == 10 * 512 // 6  # all that came before was read first
 
 
-def test_losses_are_told_apart() -> None:
+def test_losses_are_told_apart():
     outcome = run_tagger(Fault.parse("lost@4:50,overflow@8,corrupt@12:9"), 5)
     stats = outcome.stats
     assert stats.acquired == RECORDS
@@ -298,12 +293,12 @@ PICTURES = 80
 MEBIBYTE = FrameCodec(1024, 1024, 8)
 
 
-def make_picture(number: int) -> bytes:
+def make_picture(number):
     return MEBIBYTE.pack_frame(number, bytes(MEBIBYTE.pixel_bytes))
 
 
 @pytest.mark.parametrize("policy", ["block", "drop_oldest", "fail", "newest"])
-def test_a_reader_64_mib_behind(policy: OverflowPolicy) -> None:
+def test_a_reader_64_mib_behind(policy):
     """What it gets, what is reported to it, and that the age is among it."""
     feed, is_newest = RepeatingFeed(MEBIBYTE, make_picture, PICTURES), policy == "newest"
     source = StreamSource(feed, StreamOptions(64.0, "block" if is_newest else policy))
@@ -337,16 +332,16 @@ def test_a_reader_64_mib_behind(policy: OverflowPolicy) -> None:
 class ClosingFeed(RepeatingFeed):
     """Closes its own source with its third picture, as the collector may on the reader's thread."""
 
-    source: Future[StreamSource] = Future()
+    source = Future()
 
-    def pull(self, timeout: float) -> Transfer | None:
+    def pull(self, timeout):
         source = self.source.result()
         if self._number == 3:
             source.close()
         return super().pull(timeout)
 
 
-def test_a_source_that_is_closed_on_its_own_thread_ends_as_any_other() -> None:
+def test_a_source_that_is_closed_on_its_own_thread_ends_as_any_other():
     source = StreamSource(ClosingFeed(MEBIBYTE, make_picture, PICTURES))
     ClosingFeed.source.set_result(source)
     while source._ring.get(5.0) is not None:

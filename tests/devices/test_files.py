@@ -2,8 +2,6 @@
 markers of lines and frames, PHU, SDT, TTBIN), and streak images.
 """
 
-from __future__ import annotations
-
 import io
 import struct
 import sys
@@ -12,7 +10,6 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,10 +34,10 @@ Write = Callable[[str], Path]
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Write:
+def write(tmp_path):
     """Write the decays as a PTU, a PHU or an SDT, or a streak image of six rows with a time axis."""
 
-    def write(kind: str) -> Path:
+    def write(kind):
         path = tmp_path / f"run.{kind}"
         if kind == "img":
             text = (
@@ -56,13 +53,13 @@ def write(tmp_path: Path) -> Write:
     return write
 
 
-def read_all(address: object) -> tuple[Any, Any]:
+def read_all(address):
     """Return all records of a source, and its calibration."""
     with devices.open(f"file://{address}") as source:
         return np.concatenate([batch.records for batch in source]), source.calibration
 
 
-def test_photons_of_a_ptu(write: Write) -> None:
+def test_photons_of_a_ptu(write):
     records, known = read_all(write("ptu"))
     assert records.dtype == PHOTON_DTYPE
     for channel, decay in enumerate(DECAYS):
@@ -78,7 +75,7 @@ def test_photons_of_a_ptu(write: Write) -> None:
 
 
 @pytest.mark.parametrize("kind", ["phu", "sdt"])
-def test_histograms_become_a_streak_image(write: Write, kind: str) -> None:
+def test_histograms_become_a_streak_image(write, kind):
     path = write(kind)
     streak = read_transient(f"file://{path}")
     np.testing.assert_array_equal(streak.counts, DECAYS.T)
@@ -86,7 +83,7 @@ def test_histograms_become_a_streak_image(write: Write, kind: str) -> None:
     assert read_transient(f"file://{path}", bin_width=1e-12).times[1] == pytest.approx(1e-12)
 
 
-def test_a_picture_is_one_frame(write: Write) -> None:
+def test_a_picture_is_one_frame(write):
     path, counts = write("img"), np.arange(24).reshape(6, 4)
     with devices.open(f"file://{path}") as source:
         assert source.stats.unread == 1
@@ -101,7 +98,7 @@ def test_a_picture_is_one_frame(write: Write) -> None:
     np.testing.assert_array_equal(streak.times, times)
 
 
-def test_pictures_without_a_time_axis(tmp_path: Path) -> None:
+def test_pictures_without_a_time_axis(tmp_path):
     path = tmp_path / "plain.tif"
     tifffile.imwrite(path, np.ones((3, 5), np.uint16))
     assert read_all(path)[1] is None
@@ -109,14 +106,14 @@ def test_pictures_without_a_time_axis(tmp_path: Path) -> None:
     assert streak.times[2] == pytest.approx(2e-12)
 
 
-def test_recorded_pictures(shared_data: Path) -> None:
+def test_recorded_pictures(shared_data):
     with devices.open(f"file://{shared_data}/devices/streak/operate_mode.img") as source:
         assert next(source).records["counts"].shape == (1, 512, 672)
         assert source.info.details["camera"] == "Orca R2"
 
 
 @pytest.mark.parametrize("kind", ["ptu", "phu", "sdt", "img"])
-def test_what_every_file_refuses(write: Write, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_every_file_refuses(write, kind, monkeypatch):
     path = write(kind)
     with devices.open(f"file://{path}") as source, pytest.raises(InputError, match="no number"):
         source.seek(10**9)
@@ -150,12 +147,12 @@ def test_what_every_file_refuses(write: Write, kind: str, monkeypatch: pytest.Mo
     ],
 )
 def test_histograms_that_cannot_be(
-    write: Write,
-    lengths: tuple[int, ...],
-    resolution: float,
-    problem: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    write,
+    lengths,
+    resolution,
+    problem,
+    monkeypatch,
+):
     blocks = [np.ones(length) for length in lengths]
     monkeypatch.setattr(files, "read_sdt_blocks", lambda path: (blocks, resolution))
     with pytest.raises(FileFormatError, match=problem):
@@ -163,9 +160,7 @@ def test_histograms_that_cannot_be(
 
 
 @pytest.mark.parametrize("pieces", [1, 7, 40])
-def test_a_ptu_is_the_same_in_pieces(
-    write: Write, pieces: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_ptu_is_the_same_in_pieces(write, pieces, monkeypatch):
     """Photons that are read a piece at a time, as of a file that does not fit into memory."""
     path = write("ptu")
     whole, _ = read_all(path)
@@ -182,9 +177,7 @@ PULSES = 500 + 400_000 * np.arange(300)  # 120 us: over three overflows of 34 us
 
 
 @pytest.mark.parametrize("chunk", [13, 1 << 20])
-def test_photons_of_a_file_in_t2_mode(
-    tmp_path: Path, chunk: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photons_of_a_file_in_t2_mode(tmp_path, chunk, monkeypatch):
     """Times from the last pulse before each photon, over overflows and pieces."""
     monkeypatch.setattr("tofclip.io.tcspc.CHUNK_EVENTS", chunk)
     random, path = np.random.default_rng(3), tmp_path / "t2.ptu"
@@ -203,7 +196,7 @@ def test_photons_of_a_file_in_t2_mode(
         devices.open(f"file://{path}?sync=9")
 
 
-def test_the_pulses_channel_reaches_a_file_that_is_recovered(tmp_path: Path) -> None:
+def test_the_pulses_channel_reaches_a_file_that_is_recovered(tmp_path):
     """Of a time tagger's recording ``sync`` says how photons are put together, of a PTU how it is read."""
     pulses = np.stack([PULSES + 1, np.full(300, 1)], axis=1)
     photons = np.array([[PULSES[7] + 500, 0], [PULSES[9] + 900, 0]])
@@ -218,16 +211,16 @@ def test_the_pulses_channel_reaches_a_file_that_is_recovered(tmp_path: Path) -> 
 class StandInReader:
     """Their reader of files; the file is an array: time in ps, channel, type and tags that were lost."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path):
         self._tags, self._next = np.load(path), 0
 
-    def getConfiguration(self) -> str:
+    def getConfiguration(self):
         return "{}"
 
-    def hasData(self) -> bool:
+    def hasData(self):
         return self._next < len(self._tags)
 
-    def getData(self, tags: int) -> SimpleNamespace:
+    def getData(self, tags):
         found, self._next = self._tags[self._next : self._next + tags], self._next + tags
         return SimpleNamespace(
             getTimestamps=lambda: found[:, 0].copy(),
@@ -238,7 +231,7 @@ class StandInReader:
 
 
 @pytest.fixture
-def ttbin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def ttbin(tmp_path, monkeypatch):
     """A file with pulses on channel 2 and photons on rising edges of 1 and falling ones of 3; the
     pulse of each photon, how long after it it came, and its channel.
     """
@@ -260,7 +253,7 @@ def ttbin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @pytest.mark.parametrize("chunk", [100, 1 << 20])
-def test_photons_of_a_ttbin(ttbin: Any, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photons_of_a_ttbin(ttbin, chunk, monkeypatch):
     monkeypatch.setattr(files, "SWABIAN_CHUNK_TAGS", chunk)
     path, own, delay, channel = ttbin
     with devices.open(f"file://{path}?sync=2") as source:
@@ -279,7 +272,7 @@ def test_photons_of_a_ttbin(ttbin: Any, chunk: int, monkeypatch: pytest.MonkeyPa
     np.testing.assert_allclose(streak.counts.sum(axis=0), [sum(channel == -3), sum(channel == 1)])
 
 
-def test_a_ttbin_that_cannot_be_read(ttbin: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ttbin_that_cannot_be_read(ttbin, monkeypatch):
     path = ttbin[0]
     with pytest.raises(InputError, match="name the channel of the laser's pulses: sync=1"):
         devices.open(f"file://{path}")
@@ -290,9 +283,7 @@ def test_a_ttbin_that_cannot_be_read(ttbin: Any, monkeypatch: pytest.MonkeyPatch
         devices.open(f"file://{path}?sync=2")
 
 
-def test_what_swabians_own_library_says_of_a_damaged_file(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_what_swabians_own_library_says_of_a_damaged_file(tmp_path, capfd):
     pytest.importorskip("Swabian.TimeTagger")
     (tmp_path / "run.ttbin").write_bytes(b"SITT" + bytes(500))
     with pytest.raises(FileFormatError, match="Incorrect Header"):
@@ -304,7 +295,7 @@ def test_what_swabians_own_library_says_of_a_damaged_file(
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_pictures_of_an_sdt_keep_their_shape(tmp_path: Path, channels: int) -> None:
+def test_pictures_of_an_sdt_keep_their_shape(tmp_path, channels):
     cube, path = np.random.default_rng(1).poisson(2, (channels, 4, 6, 50)), tmp_path / "image.sdt"
     tcspc_files.write_sdt(path, cube.astype(np.uint16))
     found = read_photons(path)
@@ -317,7 +308,7 @@ def test_pictures_of_an_sdt_keep_their_shape(tmp_path: Path, channels: int) -> N
     np.testing.assert_array_equal(records["histogram"].reshape(cube.shape), cube)
 
 
-def pack_sdt(path: Path, data: bytes, compression: int = zipfile.ZIP_DEFLATED) -> None:
+def pack_sdt(path, data, compression=zipfile.ZIP_DEFLATED):
     """Write a file of one block that is a ZIP archive of `data`, as newer programs do."""
     tcspc_files.write_sdt(path, np.ones((1, 50), np.uint16))
     layout = np.dtype(sdtfile.sdtfile.BLOCK_HEADER).newbyteorder("<")
@@ -331,7 +322,7 @@ def pack_sdt(path: Path, data: bytes, compression: int = zipfile.ZIP_DEFLATED) -
     path.write_bytes(whole[: -100 - layout.itemsize] + block.tobytes() + archive.getvalue())
 
 
-def test_packed_blocks_are_read_and_take_no_more_than_they_hold(tmp_path: Path) -> None:
+def test_packed_blocks_are_read_and_take_no_more_than_they_hold(tmp_path):
     path, counts = tmp_path / "run.sdt", np.arange(50, dtype="<u2")
     pack_sdt(path, counts.tobytes())
     np.testing.assert_array_equal(read_transient(f"file://{path}").counts[:, 0], counts)
@@ -351,7 +342,7 @@ def test_packed_blocks_are_read_and_take_no_more_than_they_hold(tmp_path: Path) 
             tracemalloc.stop()
 
 
-def test_a_picture_in_t3_mode(tmp_path: Path) -> None:
+def test_a_picture_in_t3_mode(tmp_path):
     cube = np.random.default_rng(1).poisson(2, (2, 3, 4, 2, 60)).astype(np.uint16)
     options = {"global_resolution": PERIOD, "tcspc_resolution": RESOLUTION, "pixel_time": 1e-4}
     ptufile.imwrite(tmp_path / "t3.ptu", cube, **options)
@@ -364,7 +355,7 @@ def test_a_picture_in_t3_mode(tmp_path: Path) -> None:
 
 ROWS, COLUMNS, FRAMES = 5, 7, 3
 PERIOD_TICKS, PIXEL_TICKS = 50_000, 200_000
-SCAN: dict[str, float] = {
+SCAN = {
     "ImgHdr_Dimensions": 3,
     "ImgHdr_PixX": COLUMNS,
     "ImgHdr_PixY": ROWS,
@@ -379,7 +370,7 @@ class Scan:
     the true pixel and delay of each photon in a line.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         self.path = path
         random, line = np.random.default_rng(5), COLUMNS * PIXEL_TICKS
         begin = 30_000 + np.arange(FRAMES * ROWS) * (line + 400_000)
@@ -395,14 +386,14 @@ class Scan:
         self.y, self.delay = own[inside] % ROWS, time[inside] % PERIOD_TICKS
         self.x = (time - begin[own])[inside] // PIXEL_TICKS
 
-    def write(self, **tags: float) -> Path:
+    def write(self, **tags):
         """Write a file with these tags besides those of the scan."""
         tcspc_files.write_ptu_t2(
             self.path, self.pulses, self.photons, self.markers, {**SCAN, **tags}
         )
         return self.path
 
-    def require_pixels(self, found: Any, x: Any) -> None:
+    def require_pixels(self, found, x):
         """Require as many photons in each pixel as there were."""
         expected = np.zeros((ROWS, COLUMNS), int)
         np.add.at(expected, (self.y, x), 1)
@@ -411,15 +402,13 @@ class Scan:
 
 
 @pytest.fixture
-def scan(tmp_path: Path) -> Scan:
+def scan(tmp_path):
     return Scan(tmp_path / "scan.ptu")
 
 
 @pytest.mark.parametrize("chunk", [333, 1 << 20])
 @pytest.mark.parametrize("dwell_ms", [0.0, PIXEL_TICKS * T2_TICK * 1e3])
-def test_markers_make_a_picture_of_a_file_in_t2_mode(
-    scan: Scan, dwell_ms: float, chunk: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_markers_make_a_picture_of_a_file_in_t2_mode(scan, dwell_ms, chunk, monkeypatch):
     """Pixels by the markers where lines begin and end, or by the dwell time that the file gives."""
     monkeypatch.setattr("tofclip.io.tcspc.CHUNK_EVENTS", chunk)
     path = scan.write(ImgHdr_TimePerPixel=dwell_ms)
@@ -434,7 +423,7 @@ def test_markers_make_a_picture_of_a_file_in_t2_mode(
     assert described["arrays"]["x"] == f"{len(scan.x)} uint16"
 
 
-def test_every_other_line_of_a_scan_both_ways_is_turned(scan: Scan) -> None:
+def test_every_other_line_of_a_scan_both_ways_is_turned(scan):
     found = read_photons(scan.write(ImgHdr_BiDirect=1))
     scan.require_pixels(found, np.where(scan.y % 2, COLUMNS - 1 - scan.x, scan.x))
 
@@ -448,13 +437,13 @@ def test_every_other_line_of_a_scan_both_ways_is_turned(scan: Scan) -> None:
         ("LineStop", 4, "no markers where lines end"),
     ],
 )
-def test_scans_that_cannot_be_put_together(scan: Scan, name: str, value: float, said: str) -> None:
+def test_scans_that_cannot_be_put_together(scan, name, value, said):
     path = scan.write(**{f"ImgHdr_{name}": value})
     with pytest.raises(FileFormatError, match=said):
         read_photons(path)
 
 
-def test_events_beyond_2_gib(tmp_path: Path) -> None:
+def test_events_beyond_2_gib(tmp_path):
     """A sparse file: photons are written where it has 2.5 GiB already, and read from there."""
     path = tmp_path / "large.ptu"
     tcspc_files.write_ptu(path, np.ones((1, 20), np.uint16))

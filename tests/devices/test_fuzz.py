@@ -6,8 +6,6 @@ says. In the suite it is a sample, small where a target is slow; ``python
 tests/devices/test_fuzz.py 100000`` shares that number of mutations out evenly and prints a table.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -15,10 +13,9 @@ import tempfile
 import time
 import tracemalloc
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import h5py
@@ -45,9 +42,8 @@ from devices.remoteex import (
     parse_data_length,
     parse_integer,
 )
-from devices.source import Codec, Gap, as_bytes
+from devices.source import Gap, as_bytes
 from devices.spad512 import Spad512Feed, SpadOptions
-from devices.stream import Feed
 from devices.tcp import TcpLink
 from devices.timetag_codec import RECORD_DTYPE, TimeTagCodec, mark_wraps
 from devices.transients import read_transient
@@ -85,15 +81,15 @@ class Target:
     room: int = 1 << 16
     notices_all: bool = False
 
-    def bound(self, length: int) -> int:
+    def bound(self, length):
         """Bytes that decoding an input of `length` bytes may take at most."""
         return self.room + 32 * length
 
 
-def stream(codec: Codec, *seeds: bytes) -> Target:
+def stream(codec, *seeds):
     """A codec, fed as by a stream: as much as is whole, after a loss, from any state."""
 
-    def decode(data: bytes) -> None:
+    def decode(data):
         view = as_bytes(data)
         view = view[: codec.count_complete_bytes(view)]
         found = codec.decode(view, codec.start)
@@ -104,14 +100,14 @@ def stream(codec: Codec, *seeds: bytes) -> Target:
     return Target(decode, seeds)
 
 
-def time_tags() -> Target:
+def time_tags():
     records = np.zeros(200, RECORD_DTYPE)
     records["time_ticks"], records["channels"] = np.arange(200) << 30, 5
     codec = TimeTagCodec()
     return stream(codec, codec.encode(mark_wraps(records)), b"")
 
 
-def line_sensor(counter: bool) -> Target:
+def line_sensor(counter):
     codec, random = LinoSpad2Codec("2212s", 3, counter), np.random.default_rng(1)
     records = np.zeros(60, codec.dtype)
     records["cycle"], records["pixel"] = np.arange(60) // 20, random.permutation(256)[:60]
@@ -119,21 +115,21 @@ def line_sensor(counter: bool) -> Target:
     return stream(codec, codec.encode(codec.sort_stamps(records)), b"")
 
 
-def frames(bits: int) -> Target:
+def frames(bits):
     codec = FrameCodec(6, 8, bits)
     records = np.zeros(5, codec.dtype)
     records["number"] = np.arange(5) * 3
     return stream(codec, codec.encode(records), b"")
 
 
-def itex() -> Target:
+def itex():
     text = '[Scaling],ScalingXScalingFile="",ScalingYUnit="ns",ScalingYScalingFile=""'
     tables = {"X": np.arange(9, dtype=np.float32), "Y": np.arange(7, dtype=np.float32)}
     seeds = [encode_itex(np.ones((7, 9), dtype), text, tables) for dtype in ("u1", "<u2", "<u4")]
     return Target(hamamatsu.decode_itex, tuple(seeds))
 
 
-def hpdta_text() -> Target:
+def hpdta_text():
     seed = b'[Scaling],ScalingYUnit="ns",ScalingYType=1,ScalingYScale=0.3,ScalingYScalingFile="Other"[Camera],Type=1'
     parse = hamamatsu.parse_text
     return Target(
@@ -141,8 +137,8 @@ def hpdta_text() -> Target:
     )
 
 
-def answers() -> Target:
-    def decode(data: bytes) -> None:
+def answers():
+    def decode(data):
         answer = Answer.decode(data)
         assert parse_data_length(answer) >= 0
         if answer.code is AnswerCode.DONE:
@@ -152,12 +148,12 @@ def answers() -> Target:
     return Target(decode, (b"0,ImgRingBufferGet,672,508,2,0,14,99", b"4,LiveMonitor,RingBuffer,7"))
 
 
-def recording() -> Target:
+def recording():
     payload = time_tags().seeds[0]
     sizes = 200, len(payload), zlib.crc32(payload)
     blocks = [Block(BlockKind.PIECE, gap, 5, *sizes).pack() + payload for gap in Gap]
 
-    def decode(data: bytes) -> None:
+    def decode(data):
         fetch = lambda position, length: data[position : position + length]  # noqa: E731
         reader = BlockReader(Path("run.h5"), fetch, len(data))
         for entry in reader:
@@ -170,27 +166,27 @@ def recording() -> Target:
 class Replayed(TcpLink):
     """Stands in for a connection: says what it was given, then hangs up."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data):
         self.name, self._buffer = "replayed", bytearray(data)
 
-    def send(self, data: bytes, timeout: float) -> None:
+    def send(self, data, timeout):
         pass
 
-    def close(self) -> None:
+    def close(self):
         pass
 
-    def discard_available(self) -> int:
+    def discard_available(self):
         return 0  # nothing comes before it is asked for
 
-    def _fill_buffer(self, deadline: float, timeout: float) -> None:
+    def _fill_buffer(self, deadline, timeout):
         raise DeviceDisconnectedError("the replay is over")
 
 
-def connect_to(*links: Replayed) -> Callable[..., Replayed]:
+def connect_to(*links):
     """Connect to each once; then nobody is there any more."""
     left = list(links)
 
-    def connect(*place: object) -> Replayed:
+    def connect(*place):
         if not left:
             raise DeviceDisconnectedError("it stays away")
         return left.pop(0)
@@ -198,7 +194,7 @@ def connect_to(*links: Replayed) -> Callable[..., Replayed]:
     return connect
 
 
-def converse(feed: Feed, pulls: int) -> None:
+def converse(feed, pulls):
     """Open and close what opens."""
     assert feed.calibration is None or feed.info.instrument
     try:
@@ -208,7 +204,7 @@ def converse(feed: Feed, pulls: int) -> None:
         feed.close()
 
 
-def remoteex_session() -> Target:
+def remoteex_session():
     """A whole conversation: greetings, the start, messages, pictures, a table; then the end,
     whatever comes.
     """
@@ -222,7 +218,7 @@ def remoteex_session() -> Target:
     data = b"RemoteEx Data Ready\r" + picture + np.arange(4, dtype="<f4").tobytes() + picture
     border = b"<border>"
 
-    def decode(both: bytes) -> None:
+    def decode(both):
         connect = connect_to(*(Replayed(part) for part in both.partition(border)[::2]))
         options = StreakOptions(reconnect_s=0, timeout_s=0.01)
         with mock.patch("devices.remoteex.TcpLink", side_effect=connect):
@@ -231,16 +227,16 @@ def remoteex_session() -> Target:
     return Target(decode, (said + border + data,), slowness=5)
 
 
-def spad512_session() -> Target:
+def spad512_session():
     """Greeting, two requests of two pictures, the end."""
     options = SpadOptions(images=2, width=4, timeout_s=1e-9, reconnect_s=0)
     pictures = bytes(range(256)) * (options.codec.pixel_bytes * 2 // 256)
 
-    def decode(data: bytes) -> None:
+    def decode(data):
         texts = [b"hello", b"", b"system", b"", b"off", b""]
 
         class Server(Replayed):
-            def read_available(self, limit: int, timeout: float) -> bytes:
+            def read_available(self, limit, timeout):
                 text = texts.pop(0) if texts else super().read_available(limit, timeout)
                 if not text:
                     raise DeviceTimeoutError("it is quiet")
@@ -256,17 +252,17 @@ def spad512_session() -> Target:
     return Target(decode, ((pictures + b"DONE") * 2,), slowness=5)
 
 
-def make_path(name: str) -> Path:
+def make_path(name):
     """Return where a file of that name can be written, in a folder of its own."""
     path = Path(FOLDER.name, name.replace(".", "_"), name)
     path.parent.mkdir()
     return path
 
 
-def sidecar() -> Target:
+def sidecar():
     path = make_path("run.toml")
 
-    def decode(data: bytes) -> None:
+    def decode(data):
         path.write_bytes(data)
         read_sidecar(path.with_suffix(".dat"))
 
@@ -275,23 +271,23 @@ def sidecar() -> Target:
 
 
 def file(
-    name: str,
-    write: Callable[[Path], Any],
-    *read: Callable[[Path], Any],
-    other: Callable[[Path], Any] | None = None,
-    notices_all: bool = False,
-    slowness: int = 20,
-) -> Callable[[], Target]:
+    name,
+    write,
+    *read,
+    other=None,
+    notices_all=False,
+    slowness=20,
+):
     """A format: a name with the suffix that readers expect, what writes a sound file (or an `other`
     one), and readers, of which all are tried; what the first raises is raised.
     """
 
-    def make() -> Target:
+    def make():
         path = make_path(name)
 
-        def decode(data: bytes) -> None:
+        def decode(data):
             path.write_bytes(data)
-            faults: list[Exception] = []
+            faults = []
             for reader in read:
                 try:
                     reader(path)
@@ -324,76 +320,76 @@ STREAKS = (read_streak, outline_streak_file)
 HPDTA_TEXT = '[Application],Date="x"[Scaling],ScalingYUnit="ns",ScalingYType=1,ScalingYScale=0.3'
 
 
-def write_itex(path: Path) -> None:
+def write_itex(path):
     text = '[Scaling],ScalingYUnit="ns",ScalingYScalingFile=""'
     path.write_bytes(encode_itex(COUNTS, text, {"Y": np.arange(12, dtype=np.float32)}))
 
 
-def write_lift(path: Path) -> None:
+def write_lift(path):
     rectify = {f"rectify_norm_{axes}": np.eye(3) for axes in ("xy", "uv")}
     rectify |= {f"rectify_poly_{axis}": np.ones(6) for axis in "uv"}
     lens = {"lens_centre_px": np.linspace(4, 12, 3), "lens_angle_deg": np.linspace(80, 100, 3)}
     flags = {"resample_flag": 1, "image_inverted_flag": 0, "rectify_kind": "polynomial2"}
     sizes = {"region_size_px": 4.0, "dt_s": 1e-12}
-    np.savez_compressed(path, streak_raw=COUNTS, **rectify, **lens, **flags, **sizes)  # type: ignore[arg-type]
+    np.savez_compressed(path, streak_raw=COUNTS, **rectify, **lens, **flags, **sizes)
 
 
-def write_tal(path: Path) -> None:
+def write_tal(path):
     with h5py.File(path, "w", libver="v110") as opened:
         opened["H"], opened["H_format"] = CAPTURE.signal, np.array([1])
         opened["sensor_grid_xyz"], opened["laser_grid_xyz"] = CAPTURE.wall, np.zeros((1, 1, 3))
         opened["delta_t"] = 0.003
 
 
-def write_mat_struct(path: Path) -> None:
+def write_mat_struct(path):
     scene = {"data": np.ones((6, 1, 8)), "laserPos": POINTS[:6], "cameraPos": POINTS[:1]}
-    scene |= {"laserOrigin": np.ones(3), "cameraOrigin": np.ones(3), "deltat": 0.1}  # type: ignore[dict-item]
+    scene |= {"laserOrigin": np.ones(3), "cameraOrigin": np.ones(3), "deltat": 0.1}
     scipy.io.savemat(path, {"dataset": scene})
 
 
-def write_mat_cells(path: Path) -> None:
+def write_mat_cells(path):
     cells = np.empty((2, 3), dtype=object)
     for place in np.ndindex(2, 3):
         cells[place] = np.arange(4.0)
     scipy.io.savemat(path, {"spad": cells, "bin_width_ps": 50.0}, do_compression=True)
 
 
-def write_npz_capture(path: Path) -> None:
+def write_npz_capture(path):
     np.savez(path, H=CAPTURE.signal, wall_xyz=CAPTURE.wall, laser_xyz=np.zeros(3), delta_t_s=1e-11)
 
 
-def write_npz_light_field(path: Path) -> None:
+def write_npz_light_field(path):
     pictures = (255 * VIEWS.reshape(2, 2, 6, 5)).astype(np.uint8)
     np.savez_compressed(path, lf=pictures, scale=1 / 255, u=np.arange(2), v=np.arange(2))
 
 
-def write_pages(path: Path) -> None:
+def write_pages(path):
     pages = np.moveaxis(CUBE, 2, 0)
     tifffile.imwrite(path, pages, compression="zlib", photometric="minisblack")
 
 
-def write_hpdta(path: Path) -> None:
+def write_hpdta(path):
     tifffile.imwrite(path, COUNTS, description=HPDTA_TEXT, metadata=None)
 
 
-def write_tiff(path: Path) -> None:
+def write_tiff(path):
     tifffile.imwrite(path, COUNTS, compression="zlib")
 
 
-def write_png(path: Path) -> None:
+def write_png(path):
     Image.fromarray((255 * VIEWS[0]).astype(np.uint8)).save(path)
 
 
-def read_cube(path: Path) -> None:
+def read_cube(path):
     describe_photons(path)
     read_photons(path, 50e-12, "yxt")
 
 
-def read_folder(path: Path) -> None:
+def read_folder(path):
     read_light_field(path.parent)
 
 
-def count_file(suffix: str) -> Callable[[], Target]:
+def count_file(suffix):
     write = getattr(tcspc_files, f"write_{suffix}")
     decays = tcspc_files.make_decays()
     return file(
@@ -404,14 +400,14 @@ def count_file(suffix: str) -> Callable[[], Target]:
     )
 
 
-def cloud_file(suffix: str) -> Callable[[], Target]:
+def cloud_file(suffix):
     # pages of an E57 have 1024 bytes, each with its CRC-32C
     is_checked = suffix == "e57"
     readers = (PointCloud.load, PointCloud.read_outline)
     return file(f"a.{suffix}", CLOUD.save, *readers, notices_all=is_checked)
 
 
-TARGETS: dict[str, Callable[[], Target]] = {
+TARGETS = {
     "RemoteEx sessions": remoteex_session,
     "SPAD512 sessions": spad512_session,
     "LinoSPAD2 sidecars": sidecar,
@@ -455,7 +451,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
 }
 
 
-def mutations(seeds: tuple[bytes, ...], random: np.random.Generator) -> Iterator[bytes]:
+def mutations(seeds, random):
     """Damage inputs for ever: bits flipped, bytes replaced, pieces cut, repeated, moved, filled and
     invented.
     """
@@ -466,7 +462,7 @@ def mutations(seeds: tuple[bytes, ...], random: np.random.Generator) -> Iterator
         yield bytes(data)
 
 
-def _damage(data: bytearray, random: np.random.Generator) -> None:
+def _damage(data, random):
     kind, length = random.integers(7), len(data)
     at = int(random.integers(length)) if length else 0
     size = int(random.integers(1, 17))
@@ -486,7 +482,7 @@ def _damage(data: bytearray, random: np.random.Generator) -> None:
         data[at:at] = random.bytes(size)
 
 
-def attack(target: Target, count: int) -> tuple[int, int]:
+def attack(target, count):
     """Decode so many damaged inputs; return how many were refused, and most bytes taken.
 
     An AssertionError shows an exception that is not ours, or too much memory, with the input that
@@ -525,8 +521,8 @@ def attack(target: Target, count: int) -> tuple[int, int]:
     ids=["sample", "all"],
 )
 def test_damaged_input_raises_only_our_own_errors_and_takes_little_memory(
-    words: tuple[str, ...],
-) -> None:
+    words,
+):
     """In a process of its own: threads that other libraries leave behind take memory as well."""
     command = [sys.executable, __file__, *words]
     done = subprocess.run(command, capture_output=True, text=True, timeout=3600, check=False)
@@ -534,7 +530,7 @@ def test_damaged_input_raises_only_our_own_errors_and_takes_little_memory(
     assert [line[:24].strip() for line in done.stdout.splitlines()[1:]] == list(TARGETS)
 
 
-def main(total: int, is_sample: bool) -> None:
+def main(total, is_sample):
     """Attack every target and print what came of it; of a sample, slow targets get less."""
     # OpenEXR's library prints what it thinks of a file, past Python's streams.
     sys.stdout, sys.stderr = (os.fdopen(os.dup(number), "w", buffering=1) for number in (1, 2))

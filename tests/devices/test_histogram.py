@@ -1,15 +1,9 @@
 """Histograms of photons, against sums over each bin's overlap with each photon's interval."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given
-from numpy.typing import NDArray
 
 from devices.files import PHOTON_DTYPE
 from devices.histogram import BinAxis, BinHistogram, StampHistogram, TagHistogram
@@ -27,7 +21,7 @@ from tofclip.threads import THREADS_VARIABLE
 PS = 1e-12
 
 
-def overlaps(first: NDArray[Any], last: NDArray[Any], axis: BinAxis) -> NDArray[Any]:
+def overlaps(first, last, axis):
     """Share of each interval in each bin, (photons, bins), straight from the definition; all
     periods added up.
     """
@@ -51,9 +45,7 @@ axes = st.builds(
 
 
 @given(axes, st.integers(0, 2**32 - 1), st.sampled_from([5 * PS, 250 * PS, 5000 * PS]))
-def test_times_are_shared_out_over_the_bins_they_cover(
-    axis: BinAxis, seed: int, resolution: float
-) -> None:
+def test_times_are_shared_out_over_the_bins_they_cover(axis, seed, resolution):
     random = np.random.default_rng(seed)
     photons = np.zeros(40, PHOTON_DTYPE)
     photons["channel"] = pixels = random.integers(0, 3, 40)
@@ -69,7 +61,7 @@ def test_times_are_shared_out_over_the_bins_they_cover(
 
 
 @pytest.fixture(scope="module")
-def board() -> BoardCalibration:
+def board():
     """Codes of very uneven widths, some of them empty, and pixels out of step."""
     random, shape = np.random.default_rng(3), (256, CODES_PER_PERIOD)
     ends = np.cumsum(random.uniform(0, 2, shape) * (random.random(shape) < 0.9), axis=1)
@@ -77,7 +69,7 @@ def board() -> BoardCalibration:
     return BoardCalibration(ends, random.uniform(-6e-9, 4e-9, 256), np.array([17, 200]))
 
 
-def stamps_at(times: NDArray[Any], pixels: NDArray[Any], board: BoardCalibration) -> NDArray[Any]:
+def stamps_at(times, pixels, board):
     """What the board stamps on photons that come at `times`, s since the cycle began."""
     local = times - board.offsets[pixels]
     periods, phase = np.divmod(local, CLOCK_PERIOD_S)
@@ -92,9 +84,7 @@ def stamps_at(times: NDArray[Any], pixels: NDArray[Any], board: BoardCalibration
 
 
 @pytest.mark.parametrize("period", [None, 25e-9, 17.3e-9])
-def test_stamps_are_shared_out_over_their_codes(
-    board: BoardCalibration, period: float | None
-) -> None:
+def test_stamps_are_shared_out_over_their_codes(board, period):
     random = np.random.default_rng(5)
     pixels = random.integers(0, 256, 500)
     records = stamps_at(random.uniform(10e-9, 120e-9, 500), pixels, board)
@@ -112,7 +102,7 @@ def test_stamps_are_shared_out_over_their_codes(
     np.testing.assert_allclose(histogram.counts.sum(), expected.sum(), rtol=1e-5)
 
 
-def test_even_light_gives_even_bins_whatever_the_codes(board: BoardCalibration) -> None:
+def test_even_light_gives_even_bins_whatever_the_codes(board):
     """Uncorrected, the ripple is as deep as the codes are uneven; corrected, only the photons' own
     noise remains.
     """
@@ -132,9 +122,7 @@ def test_even_light_gives_even_bins_whatever_the_codes(board: BoardCalibration) 
     assert corrected.counts[:, 40].sum() == pytest.approx(photons, rel=1e-6)
 
 
-def test_stamps_with_a_counter_and_in_pieces(
-    board: BoardCalibration, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stamps_with_a_counter_and_in_pieces(board, monkeypatch):
     random = np.random.default_rng(9)
     pixels = random.integers(0, 256, 200_000)
     plain = np.zeros(200_000, STAMP_DTYPE)
@@ -154,11 +142,11 @@ def test_stamps_with_a_counter_and_in_pieces(
     np.testing.assert_allclose(pieces.counts, whole.counts, atol=1e-6)
 
 
-def tags(rows: list[tuple[int, int, int]]) -> NDArray[Any]:
+def tags(rows):
     return np.array(rows, RECORD_DTYPE)
 
 
-def test_tags_count_from_the_last_pulse() -> None:
+def test_tags_count_from_the_last_pulse():
     histogram = TagHistogram(BinAxis(1e-9, 10, 0.5e-9), 0, (2, 1), 1e-9)
     rows = [
         (3, 0b100, 0),  # before the first pulse
@@ -177,7 +165,7 @@ def test_tags_count_from_the_last_pulse() -> None:
     np.testing.assert_allclose(histogram.counts, expected, atol=1e-9)
 
 
-def test_tags_after_a_gap_wait_for_the_next_pulse() -> None:
+def test_tags_after_a_gap_wait_for_the_next_pulse():
     histogram = TagHistogram(BinAxis(1e-9, 10), 3, (0,), 1e-9)
     histogram.add(tags([(10, 0b1000, 0)]))
     histogram.add(tags([(12, 1, 0)]))
@@ -186,7 +174,7 @@ def test_tags_after_a_gap_wait_for_the_next_pulse() -> None:
     assert histogram.counts.sum() == pytest.approx(2)
 
 
-def test_tags_on_threads_know_the_pulse_before_their_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tags_on_threads_know_the_pulse_before_their_piece(monkeypatch):
     """Pulses are so rare that a piece may hold none."""
     random = np.random.default_rng(4)
     records = np.zeros(300_000, RECORD_DTYPE)
@@ -205,7 +193,7 @@ def test_tags_on_threads_know_the_pulse_before_their_piece(monkeypatch: pytest.M
     assert found[0].sum() == pytest.approx(300_000 - 5, abs=1)
 
 
-def test_the_sum_is_a_streak_image_that_does_not_trust_hot_pixels(board: BoardCalibration) -> None:
+def test_the_sum_is_a_streak_image_that_does_not_trust_hot_pixels(board):
     histogram = StampHistogram(BinAxis(20 * PS, 100, 1e-9, 25e-9), board)
     pixels = np.arange(256)
     histogram.add(stamps_at(np.full(256, 27e-9), pixels, board))
@@ -246,6 +234,6 @@ LONG_AXIS = BinAxis(1e-9, 1 << 20)
         ),
     ],
 )
-def test_what_cannot_be_is_refused(attempt: Callable[[], object], said: str) -> None:
+def test_what_cannot_be_is_refused(attempt, said):
     with pytest.raises(InputError, match=said):
         attempt()

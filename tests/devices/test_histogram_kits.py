@@ -2,10 +2,7 @@
 pseudo-terminal.
 """
 
-from __future__ import annotations
-
 import sys
-from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
@@ -20,11 +17,11 @@ from devices.emulation.histogram_kits import (
     format_vl53l8,
 )
 from devices.histogram_kits import (
-    KitFrame,
     Tmf8828Options,
     Tmf8828Parser,
     Vl53l8Options,
     Vl53l8Parser,
+    find_tmf_zones,
 )
 from devices.transients import read_photons
 from tofclip.errors import (
@@ -37,21 +34,21 @@ from tofclip.units import SPEED_OF_LIGHT
 pytest.importorskip("serial", reason="histogram kits need pyserial")
 
 
-def make_tmf_parser(zones: int = 64) -> Tmf8828Parser:
+def make_tmf_parser(zones=64):
     return Tmf8828Parser(Tmf8828Options(bin_ps=250, zones=zones))
 
 
-def parse(parser: Tmf8828Parser | Vl53l8Parser, lines: list[bytes]) -> list[KitFrame]:
+def parse(parser, lines):
     found = [parser.parse_line(line.rstrip()) for line in lines]
     return [frame for frame in found if frame is not None]
 
 
-def draw_counts(zones: int, seed: int, bins: int = 128) -> Any:
+def draw_counts(zones, seed, bins=128):
     return np.random.default_rng(seed).integers(0, 1 << 24, (bins, zones)).astype(np.uint32)
 
 
 @pytest.mark.parametrize("zones", [64, 9])
-def test_three_bytes_of_every_bin_come_together(zones: int) -> None:
+def test_three_bytes_of_every_bin_come_together(zones):
     parser = make_tmf_parser(zones)
     for number, seed in enumerate((1, 2, 3)):
         counts = draw_counts(zones, seed)
@@ -60,7 +57,13 @@ def test_three_bytes_of_every_bin_come_together(zones: int) -> None:
         assert (frame.missing, frame.stamp) == (0, pytest.approx(1e-3))
 
 
-def test_halves_that_are_both_numbered_from_0() -> None:
+def test_zones_lie_where_the_makers_programs_put_them():
+    """The eight channels of the first half of the first capture, in pixels of 8 x 8."""
+    assert find_tmf_zones(64)[:8].tolist() == [56, 60, 40, 44, 24, 28, 8, 12]
+    assert sorted(find_tmf_zones(64)) == list(range(64))
+
+
+def test_halves_that_are_both_numbered_from_0():
     counts = draw_counts(64, 4)
     lines = []
     for line in format_tmf8828(counts, 0, 0):
@@ -73,7 +76,7 @@ def test_halves_that_are_both_numbered_from_0() -> None:
     assert frame.stamp is None
 
 
-def test_what_is_missing_is_told() -> None:
+def test_what_is_missing_is_told():
     """A line torn, frames not sent, and the beginning missed."""
     parser = make_tmf_parser()
     frames = [format_tmf8828(draw_counts(64, seed), seed, 1) for seed in range(70)]
@@ -89,13 +92,13 @@ def test_what_is_missing_is_told() -> None:
 
 
 @given(st.binary(max_size=300))
-def test_any_line_is_survived(line: bytes) -> None:
+def test_any_line_is_survived(line):
     for parser in (make_tmf_parser(), Vl53l8Parser(Vl53l8Options())):
         for head in (b"", b"#Raw,65,3,", b"#Obj,65,3,", b"Aggregate ", b"Aggregate 0, Bins: "):
             parser.parse_line(head + line)
 
 
-def test_compact_histograms_of_each_zone() -> None:
+def test_compact_histograms_of_each_zone():
     parser = Vl53l8Parser(Vl53l8Options())
     counts = draw_counts(16, 5, 24) % 100_000
     lines = [b"Zone 3: No target\r\n", *format_vl53l8(counts), *format_vl53l8(counts)[:9]]
@@ -120,9 +123,7 @@ def test_compact_histograms_of_each_zone() -> None:
         ("sim+vl53l8://?seed=1&rate=100&shape=2x8", (24, 2, 8)),
     ],
 )
-def test_the_peak_of_each_zone_is_where_the_wall_is(
-    address: str, shape: tuple[int, int, int]
-) -> None:
+def test_the_peak_of_each_zone_is_where_the_wall_is(address, shape):
     counted = read_photons(f"{address}&scans=3")
     assert counted.counts.shape == shape
     zones = shape[1] * shape[2]
@@ -132,7 +133,7 @@ def test_the_peak_of_each_zone_is_where_the_wall_is(
     assert counted.to_image().photons > 100 * zones
 
 
-def test_every_frame_is_accounted_for() -> None:
+def test_every_frame_is_accounted_for():
     with devices.open("sim+tmf8828://?seed=1&rate=200&torn=4&lost=5") as source:
         frames = take(source, 12)
         info = source.info.as_dict()
@@ -145,17 +146,17 @@ def test_every_frame_is_accounted_for() -> None:
     assert info["zones"] == 64
 
 
-def test_a_kit_that_is_unplugged() -> None:
+def test_a_kit_that_is_unplugged():
     with devices.open("sim+tmf8828://?seed=1&rate=100&reconnect_s=0.2") as source:
         take(source, 2)
-        source._release()  # type: ignore[attr-defined]
+        source._release()
         with pytest.raises(DeviceDisconnectedError, match="no answer came"):
             take(source, 1000)
     assert source.stats.is_balanced
     assert source.stats.delivered >= 2
 
 
-def test_what_cannot_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_opened(monkeypatch):
     with pytest.raises(DeviceNotFoundError, match="is the kit connected"):
         devices.open("vl53l8:///nowhere")
     monkeypatch.setitem(sys.modules, "serial", None)

@@ -1,23 +1,17 @@
 """LinoSPAD2's calibration, and its recordings and simulations as sources."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import devices
 from devices import linospad2
 from devices.emulation.linospad2 import SimulatedBoard, draw_uneven_calibration
-from devices.emulation.scenes import LineLight, make_line_instrument, simulate_line_light
+from devices.emulation.scenes import make_line_instrument, simulate_line_light
 from devices.histogram import BinAxis, StampHistogram
 from devices.linospad2 import BoardCalibration, LinoSpad2Codec, load_calibration, read_sidecar
-from devices.source import Source
 from devices.transients import read_transient
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
@@ -30,16 +24,16 @@ SIDECAR = 'firmware = "2212s"\ntimestamps_per_cycle = 24\nabsolute_counter = tru
 
 
 @pytest.fixture(scope="module")
-def uneven() -> BoardCalibration:
+def uneven():
     return replace(draw_uneven_calibration(7), hot_pixels=np.array([15, 231]))
 
 
 @pytest.fixture(scope="module")
-def light() -> LineLight:
+def light():
     return simulate_line_light()
 
 
-def write_tables(folder: Path, board: BoardCalibration) -> str:
+def write_tables(folder, board):
     """Write a board's tables, in ps, and return the lines that name them."""
     table = np.column_stack([np.arange(256), board.code_ends * 1e12])
     np.savetxt(folder / "codes.csv", table, delimiter=",", header="codes", comments="")
@@ -48,7 +42,7 @@ def write_tables(folder: Path, board: BoardCalibration) -> str:
     return 'code_table = "codes.csv"\noffset_table = "offsets.npy"\nhot_pixels = "hot.txt"\n'
 
 
-def test_times_follow_the_formula(uneven: BoardCalibration) -> None:
+def test_times_follow_the_formula(uneven):
     records, random = np.zeros(1000, LinoSpad2Codec().dtype), np.random.default_rng(2)
     records["pixel"] = random.integers(0, 256, 1000)
     records["code"] = random.integers(0, 1 << 28, 1000)
@@ -65,7 +59,7 @@ def test_times_follow_the_formula(uneven: BoardCalibration) -> None:
 
 @pytest.mark.parametrize(("board", "hot"), [("NL11_#33_2212b", 66), ("B7d_#28_2212s", 37)])
 @pytest.mark.nightly
-def test_recorded_boards(shared_data: Path, light: LineLight, board: str, hot: int) -> None:
+def test_recorded_boards(shared_data, light, board, hot):
     """Measured unevenness of two boards: codes up to 112 ps wide, pixels out of step by 11 ns, ten
     of them hot. They see the scene with their own tables only.
     """
@@ -97,7 +91,7 @@ def test_recorded_boards(shared_data: Path, light: LineLight, board: str, hot: i
     assert errors[1] > 0.05
 
 
-def test_a_calibration_survives_storage(uneven: BoardCalibration, tmp_path: Path) -> None:
+def test_a_calibration_survives_storage(uneven, tmp_path):
     for board in (uneven, BoardCalibration.ideal()):
         board.to_record().save(tmp_path / "board.h5")
         found = BoardCalibration.from_record(type(board.to_record()).load(tmp_path / "board.h5"))
@@ -115,19 +109,19 @@ def test_a_calibration_survives_storage(uneven: BoardCalibration, tmp_path: Path
         ({"hot_pixels": np.array([256])}, "hot pixels must lie within"),
     ],
 )
-def test_impossible_tables_are_refused(change: dict[str, Any], problem: str) -> None:
+def test_impossible_tables_are_refused(change, problem):
     with pytest.raises((ShapeError, InputError), match=problem):
         replace(BoardCalibration.ideal(), **change)
 
 
 @pytest.fixture
-def recording(tmp_path: Path, uneven: BoardCalibration) -> Path:
+def recording(tmp_path, uneven):
     """A recording's name, with all its companions; the recording itself is not needed here."""
     write_tables(tmp_path, uneven)
     return tmp_path / "run.dat"
 
 
-def test_sidecars_say_all_or_the_least(recording: Path, uneven: BoardCalibration) -> None:
+def test_sidecars_say_all_or_the_least(recording, uneven):
     tables = write_tables(recording.parent, uneven)
     rest = 'board = "B7d"\nlaser_period_ps = 25000\ncamera = "camera.h5"\n'
     recording.with_suffix(".toml").write_text(SIDECAR + tables + rest)
@@ -168,7 +162,7 @@ def test_sidecars_say_all_or_the_least(recording: Path, uneven: BoardCalibration
         ("#" * (1 << 20) + "\n", "larger than any TOML"),
     ],
 )
-def test_sidecars_that_say_nothing_useful(recording: Path, text: str | None, problem: str) -> None:
+def test_sidecars_that_say_nothing_useful(recording, text, problem):
     with open(recording.parent / "large", "wb") as file:
         file.truncate(1 << 30)
     if text is not None:
@@ -178,7 +172,7 @@ def test_sidecars_that_say_nothing_useful(recording: Path, text: str | None, pro
 
 
 @pytest.mark.parametrize("shape", [b"(9256000000000,), }", b"(256,            }"])
-def test_a_table_whose_header_lies(recording: Path, shape: bytes) -> None:
+def test_a_table_whose_header_lies(recording, shape):
     """It claims more than the file holds, or is cut off."""
     path = recording.parent / "offsets.npy"
     path.write_bytes(path.read_bytes().replace(b"(256,), }".ljust(len(shape)), shape))
@@ -187,7 +181,7 @@ def test_a_table_whose_header_lies(recording: Path, shape: bytes) -> None:
 
 
 @pytest.fixture
-def stamps(tmp_path: Path, light: LineLight, monkeypatch: pytest.MonkeyPatch) -> Path:
+def stamps(tmp_path, light, monkeypatch):
     """Twenty cycles, read five at a time, with a sidecar that names laser and camera."""
     monkeypatch.setattr(linospad2, "PIECE_BYTES", 5 * CODEC.unit_bytes)
     board = SimulatedBoard(light, draw_uneven_calibration(3), CODEC, 300, 3)
@@ -200,12 +194,12 @@ def stamps(tmp_path: Path, light: LineLight, monkeypatch: pytest.MonkeyPatch) ->
     return path
 
 
-def records_of(source: Source) -> NDArray[Any]:
+def records_of(source):
     return np.concatenate([batch.records for batch in source])
 
 
 @pytest.mark.parametrize("scheme", ["linospad2", "file"])
-def test_a_recording_gives_every_stamp(stamps: Path, scheme: str) -> None:
+def test_a_recording_gives_every_stamp(stamps, scheme):
     expected = CODEC.decode(np.frombuffer(stamps.read_bytes(), np.uint8), 0).records
     with devices.open(f"{scheme}://{stamps}") as source:
         np.testing.assert_array_equal(records_of(source), expected)
@@ -217,7 +211,7 @@ def test_a_recording_gives_every_stamp(stamps: Path, scheme: str) -> None:
     assert Camera.from_record(known.child("camera", "camera")).slit_width_px == 256
 
 
-def test_a_recording_that_was_cut_off(stamps: Path) -> None:
+def test_a_recording_that_was_cut_off(stamps):
     with devices.open(f"linospad2://{stamps}") as source:
         whole = records_of(source)
     stamps.write_bytes(stamps.read_bytes()[:-10])
@@ -233,7 +227,7 @@ def test_a_recording_that_was_cut_off(stamps: Path) -> None:
         devices.open(f"linospad2://{stamps}")
 
 
-def test_a_recording_becomes_the_scene(tmp_path: Path, light: LineLight) -> None:
+def test_a_recording_becomes_the_scene(tmp_path, light):
     """Words in a file, a sidecar, a laser's period and a camera: everything that a real board would
     leave.
     """
@@ -253,7 +247,7 @@ def test_a_recording_becomes_the_scene(tmp_path: Path, light: LineLight) -> None
     assert figures["share_within_one_bin"] > 0.9
 
 
-def test_a_simulations_cycles_are_what_was_asked_for() -> None:
+def test_a_simulations_cycles_are_what_was_asked_for():
     address = "sim+linospad2://?seed=5&cycles=3&photons=2000&counter=1&firmware=2212s"
     with devices.open(address) as source:
         found = records_of(source)
@@ -263,7 +257,7 @@ def test_a_simulations_cycles_are_what_was_asked_for() -> None:
     assert np.unique(found["counter"]).tolist() == [0, 533333, 1066667]
 
 
-def test_a_cycle_that_is_full_keeps_the_first_stamps(light: LineLight) -> None:
+def test_a_cycle_that_is_full_keeps_the_first_stamps(light):
     codec, board = LinoSpad2Codec(timestamps=4), draw_uneven_calibration(0)
     data = np.frombuffer(SimulatedBoard(light, board, codec, 256, 1).encode_cycle(0), np.uint8)
     assert 100 < codec.count_records(data) < 256
@@ -271,7 +265,7 @@ def test_a_cycle_that_is_full_keeps_the_first_stamps(light: LineLight) -> None:
     assert nearly_dark.encode_cycle(0) == bytes(CODEC.unit_bytes)
 
 
-def test_in_real_time_a_cycle_takes_its_time(light: LineLight) -> None:
+def test_in_real_time_a_cycle_takes_its_time(light):
     began = time.monotonic()
     with devices.open("sim+linospad2://?cycles=30&photons=10&timestamps=4&pace=realtime") as source:
         records_of(source)

@@ -2,16 +2,12 @@
 instrument's clock estimated from messages that are delayed, and a connection that misbehaves.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import resource
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
@@ -27,7 +23,6 @@ from devices.source import (
     OVERFLOW_POLICIES,
     Gap,
     Ledger,
-    OverflowPolicy,
     Piece,
     RingBuffer,
     Stats,
@@ -53,19 +48,19 @@ class RingMachine(RuleBasedStateMachine):
     """
 
     @initialize(policy=st.sampled_from(OVERFLOW_POLICIES), capacity=st.sampled_from([10, 30]))
-    def begin(self, policy: OverflowPolicy, capacity: int) -> None:
+    def begin(self, policy, capacity):
         self.policy, self.capacity, self.ledger = policy, capacity, Ledger()
         self.ring = RingBuffer(capacity, policy, self.ledger)
-        self.held: list[tuple[int, Gap, int]] = []  # name, gap, records
+        self.held = []  # name, gap, records
         self.counts = dict.fromkeys(("acquired", "delivered", "dropped", "lost"), 0)
         self.names, self.has_failed = 0, False
 
-    def has_room(self) -> bool:
+    def has_room(self):
         return not self.held or 10 * len(self.held) + 10 <= self.capacity
 
     @precondition(lambda self: not self.has_failed)
     @rule(records=st.integers(1, 5), gap=st.sampled_from(Gap))
-    def put(self, records: int, gap: Gap) -> None:
+    def put(self, records, gap):
         if self.policy == "block" and not self.has_room():
             return  # would wait
         self.counts["acquired"] += records
@@ -86,7 +81,7 @@ class RingMachine(RuleBasedStateMachine):
             self.held[0] = (name, max(gap, lost_gap, Gap.LOSS), kept)
 
     @rule(malformed=st.integers(0, 1))
-    def take(self, malformed: int) -> None:
+    def take(self, malformed):
         if not self.held:
             fault = BufferOverflowError if self.has_failed else DeviceTimeoutError
             with pytest.raises(fault):
@@ -100,13 +95,13 @@ class RingMachine(RuleBasedStateMachine):
         self.counts["delivered"] += records
 
     @rule(records=st.integers(0, 9))
-    def lose(self, records: int) -> None:
+    def lose(self, records):
         self.ledger.lose(records)
         self.counts["lost"] += records
         self.counts["acquired"] += records
 
     @invariant()
-    def accounts_balance(self) -> None:
+    def accounts_balance(self):
         stats, counts = self.ledger.stats, self.counts
         assert stats.is_balanced
         assert stats.acquired == counts["acquired"]
@@ -119,29 +114,7 @@ TestRing = RingMachine.TestCase
 TestRing.settings = settings(stateful_step_count=30)
 
 
-@pytest.mark.parametrize(
-    ("capacity", "gaps", "left"),
-    [
-        (10, [Gap.RESTART, Gap.NONE], [Gap.RESTART]),
-        (20, [Gap.NONE, Gap.RESTART, Gap.NONE], [Gap.RESTART, Gap.NONE]),
-        (20, [Gap.NONE, Gap.NONE, Gap.NONE], [Gap.LOSS, Gap.NONE]),
-        (1, [Gap.NONE], [Gap.NONE]),  # one piece always fits
-    ],
-)
-def test_a_restart_stays_one_whatever_is_dropped(
-    capacity: int, gaps: list[Gap], left: list[Gap]
-) -> None:
-    ring = RingBuffer(capacity, "drop_oldest", Ledger())
-    for gap in gaps:
-        ring.put(Piece(bytes(10), 1, gap))
-    ring.end()
-    found = []
-    while (piece := ring.get(SOON)) is not None:
-        found.append(piece.gap)
-    assert found == left
-
-
-def test_a_writer_waits_for_room_or_the_end() -> None:
+def test_a_writer_waits_for_room_or_the_end():
     ledger = Ledger()
     ring = RingBuffer(10, "block", ledger)
     ring.put(Piece(b"0" * 10, 1))
@@ -157,7 +130,7 @@ def test_a_writer_waits_for_room_or_the_end() -> None:
     assert [ring.get(SOON) is not None for _ in range(3)] == [True, True, False]
 
 
-def test_the_first_fault_counts() -> None:
+def test_the_first_fault_counts():
     ring = RingBuffer(10, "block", Ledger())
     for said in ("first", "second"):
         ring.fail(DeviceDisconnectedError(said))
@@ -165,7 +138,7 @@ def test_the_first_fault_counts() -> None:
         ring.get(SOON)
 
 
-def test_every_change_moves_records_between_accounts() -> None:
+def test_every_change_moves_records_between_accounts():
     ledger = Ledger()
     ledger.receive(10)
     ledger.deliver(4, 1)
@@ -178,17 +151,17 @@ def test_every_change_moves_records_between_accounts() -> None:
     assert ledger.stats.is_balanced
 
 
-def test_changes_at_the_same_time_all_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changes_at_the_same_time_all_count(monkeypatch):
     """Another thread gets its turn between reading the accounts and writing them."""
 
-    def replace_slowly(stats: Stats, **changes: Any) -> Stats:
+    def replace_slowly(stats, **changes):
         time.sleep(1e-3)
         return dataclasses.replace(stats, **changes)
 
     monkeypatch.setattr("devices.source.replace", replace_slowly)
     ledger, started = Ledger(), threading.Barrier(4)
 
-    def enter() -> None:
+    def enter():
         started.wait()
         for _ in range(5):
             ledger.receive(1)
@@ -202,8 +175,8 @@ def test_changes_at_the_same_time_all_count(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("method", ["pull", "close"])
-def test_a_reader_thread_never_dies_silently(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
+def test_a_reader_thread_never_dies_silently(method, monkeypatch):
+    def fail(*_):
         raise ZeroDivisionError("of an unforeseen kind")
 
     monkeypatch.setattr(f"devices.timetag.TimeTaggerFeed.{method}", fail)
@@ -214,7 +187,7 @@ def test_a_reader_thread_never_dies_silently(method: str, monkeypatch: pytest.Mo
     source.close()
 
 
-def test_the_least_delay_remains_in_the_estimate_and_nothing_else() -> None:
+def test_the_least_delay_remains_in_the_estimate_and_nothing_else():
     random, clock = np.random.default_rng(0), InstrumentClock()
     assert clock.to_host(1.0) == 0.0  # nothing known yet
     delays = 0.002 + random.exponential(0.05, 500)
@@ -223,7 +196,7 @@ def test_the_least_delay_remains_in_the_estimate_and_nothing_else() -> None:
     assert clock.to_host(2.5) == pytest.approx(1002.5 + delays.min())
 
 
-def test_quartzes_that_part_are_followed() -> None:
+def test_quartzes_that_part_are_followed():
     clock, drift = InstrumentClock(), 50e-6
     for second in range(600):
         clock.observe(second * (1 + drift), second + 0.001)
@@ -245,9 +218,7 @@ LATE = [(0.0, 1.0), (WINDOW_S, WINDOW_S + 1.5)]
         ([*LATE, (2 * WINDOW_S + 1, 2 * WINDOW_S + 2.8)], (80.0, 81.5)),
     ],
 )
-def test_what_a_clock_forgets(
-    messages: list[tuple[float, float]], asked: tuple[float, float]
-) -> None:
+def test_what_a_clock_forgets(messages, asked):
     clock = InstrumentClock()
     for stamp, arrived_at in messages:
         clock.observe(stamp, arrived_at)
@@ -258,7 +229,7 @@ Ends = tuple[TcpLink, socket.socket]
 
 
 @pytest.fixture
-def ends() -> Iterator[Ends]:
+def ends():
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
         TcpLink("127.0.0.1", server.getsockname()[1], LONG) as link,
@@ -267,7 +238,7 @@ def ends() -> Iterator[Ends]:
         yield link, other
 
 
-def test_messages_are_cut_where_they_end(ends: Ends) -> None:
+def test_messages_are_cut_where_they_end(ends):
     link, other = ends
     other.sendall(b"RemoteEx Ready\r0,App")
     assert link.read_until(b"\r", 100, LONG) == b"RemoteEx Ready"
@@ -278,7 +249,7 @@ def test_messages_are_cut_where_they_end(ends: Ends) -> None:
     assert other.recv(10) == b"x"
 
 
-def test_what_came_before_a_timeout_is_kept(ends: Ends) -> None:
+def test_what_came_before_a_timeout_is_kept(ends):
     link, other = ends
     other.sendall(b"half")
     with pytest.raises(DeviceTimeoutError):
@@ -291,7 +262,7 @@ def test_what_came_before_a_timeout_is_kept(ends: Ends) -> None:
         link.read_available(1, SOON)
 
 
-def test_lengths_from_the_wire_are_bounded(ends: Ends) -> None:
+def test_lengths_from_the_wire_are_bounded(ends):
     link, other = ends
     for length in (-1, 11, 1 << 60):
         with pytest.raises(ProtocolError, match="at most 10"):
@@ -301,7 +272,7 @@ def test_lengths_from_the_wire_are_bounded(ends: Ends) -> None:
         link.read_until(b"\r", 100, LONG)
 
 
-def test_a_server_that_leaves_or_is_not_there(ends: Ends) -> None:
+def test_a_server_that_leaves_or_is_not_there(ends):
     link, other = ends
     other.close()
     with pytest.raises(DeviceDisconnectedError, match="closed"):
@@ -323,21 +294,21 @@ MAX_GROWTH_MIB = 32.0
 class MemoryWatch:
     """Looks at this process' memory once a second, after a quarter of the time."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self._next, self.sizes = MINUTE_S / 4, list[float]()
 
-    def look(self, passed: float) -> None:
+    def look(self, passed):
         if passed >= self._next:
             self._next = passed + 1.0
             pages = int(Path("/proc/self/statm").read_text().split()[1])
             self.sizes.append(pages * resource.getpagesize() / (1 << 20))
 
-    def require_steady(self) -> None:
+    def require_steady(self):
         assert max(self.sizes) - self.sizes[0] < MAX_GROWTH_MIB
 
 
 @pytest.mark.nightly
-def test_a_minute_of_linospad2_at_half_rate_drops_nothing() -> None:
+def test_a_minute_of_linospad2_at_half_rate_drops_nothing():
     """The instrument reaches 50 million stamps a second."""
     rate, codec, random = 25e6, LinoSpad2Codec(), np.random.default_rng(0)
     words = random.integers(0, 1 << 31, (80, codec.cycle_words), dtype=np.uint32)
@@ -346,7 +317,7 @@ def test_a_minute_of_linospad2_at_half_rate_drops_nothing() -> None:
     size, data = 8 * codec.unit_bytes, memoryview(words.astype("<u4").tobytes())
     interval = codec.count_records(as_bytes(data)) / 10 / rate
     codec.decode(as_bytes(data), codec.start)  # loops are compiled before the clock runs
-    make: Callable[[int], Any] = lambda number: data[number % 10 * size :][:size]  # noqa: E731
+    make = lambda number: data[number % 10 * size :][:size]  # noqa: E731
     feed = RepeatingFeed(codec, make, int(MINUTE_S / interval), interval)
     watch, began, read = MemoryWatch(), time.monotonic(), 0
     with StreamSource(feed, StreamOptions(policy="drop_oldest")) as source:
@@ -359,7 +330,7 @@ def test_a_minute_of_linospad2_at_half_rate_drops_nothing() -> None:
 
 
 @pytest.mark.nightly
-def test_a_minute_of_time_tags_at_half_rate_drops_nothing() -> None:
+def test_a_minute_of_time_tags_at_half_rate_drops_nothing():
     bytes_per_second, watch = 75e6, MemoryWatch()
     rate = bytes_per_second / RECORD_BYTES
     source = devices.open(f"sim+timetag://?seed=1&pace=realtime&rate={rate}")

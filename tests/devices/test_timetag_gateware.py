@@ -4,8 +4,6 @@ The gateware (github.com/bgamari/timetag-fpga, GPL) is not part of this project.
 somewhere, name the folder in TOFCLIP_TIMETAG_FPGA, and install Icarus Verilog (``iverilog``).
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -37,12 +35,12 @@ class Eavesdropper(EmulatedTimeTagger):
 
     heard: ClassVar[list[bytes]] = []
 
-    def receive(self, endpoint: int, data: bytes) -> None:
+    def receive(self, endpoint, data):
         self.heard.append(data)
         super().receive(endpoint, data)
 
 
-def driver_commands() -> tuple[list[bytes], list[bytes]]:
+def driver_commands():
     """Return what the driver sends to begin an acquisition, and to end it and count."""
     instrument = make_tagger(Eavesdropper, stale_replies=0, jammed_bytes=0, old_records=0, heard=[])
     tagger = TimeTagger(UsbLink(USB_IDENTITY, "", VirtualUsb(instrument)))
@@ -54,9 +52,9 @@ def driver_commands() -> tuple[list[bytes], list[bytes]]:
     return instrument.heard[:beginning], instrument.heard[beginning:]
 
 
-def simulate(folder: Path, beginning: list[bytes], ending: list[bytes]) -> tuple[int, bytes]:
+def simulate(folder, beginning, ending):
     """Return how many records the gateware counted, and the bytes that it delivered."""
-    lines: list[str] = []
+    lines = []
     for number, command in enumerate([*beginning, *ending], 1):
         lines += [f"0 {byte:02x}" for byte in command]
         lines.append(f"1 {PHOTONS if number == len(beginning) else 0:x}")
@@ -79,7 +77,7 @@ def simulate(folder: Path, beginning: list[bytes], ending: list[bytes]) -> tuple
     return counts[-1], delivered
 
 
-def test_what_the_gateware_counts_is_delivered(tmp_path: Path) -> None:
+def test_what_the_gateware_counts_is_delivered(tmp_path):
     counted, delivered = simulate(tmp_path, *driver_commands())
     found = TAGS.decode(as_bytes(delivered), TAGS.start)
     assert counted == PHOTONS
@@ -88,7 +86,7 @@ def test_what_the_gateware_counts_is_delivered(tmp_path: Path) -> None:
     assert set(found.records["channels"]) == {1, 2, 4, 8}
 
 
-def test_a_memory_that_is_held_empty_delivers_nothing(tmp_path: Path) -> None:
+def test_a_memory_that_is_held_empty_delivers_nothing(tmp_path):
     """Without the command that lets it fill again: the gateware is one that can fail us."""
     release = COMMAND.pack(0xAA, 1, Register.CLEAR, 0)
     beginning, ending = driver_commands()

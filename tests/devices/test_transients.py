@@ -1,7 +1,5 @@
 """From an address to a streak image."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 
@@ -9,8 +7,8 @@ import numpy as np
 import pytest
 
 from devices import transients
-from devices.address import Options, Uri, option
-from devices.source import Batch, Info, Records, Source, Stats
+from devices.address import Options, option
+from devices.source import Batch, Info, Source, Stats
 from devices.timetag_codec import RECORD_DTYPE
 from devices.transients import read_transient, read_transients
 from tofclip.errors import InputError, MissingTimeAxisError
@@ -20,37 +18,37 @@ from tofclip.storage import Field, Record
 class Canned(Source):
     """Gives what a test has put into it."""
 
-    def __init__(self, batches: list[Batch], calibration: Record | None = None) -> None:
+    def __init__(self, batches, calibration=None):
         self._batches, self._calibration = list(batches), calibration
 
     info = Info("canned")
     stats = Stats()
     calibration = property(lambda self: self._calibration)
 
-    def read(self, timeout: float = 0.0) -> Batch | None:
+    def read(self, timeout=0.0):
         return self._batches.pop(0) if self._batches else None
 
-    def close(self) -> None:
+    def close(self):
         self._batches.clear()
 
 
 @pytest.fixture
-def canned(monkeypatch: pytest.MonkeyPatch) -> type[Canned]:
+def canned(monkeypatch):
     """Let canned:// open the source that was made last."""
 
     class Last(Canned):
-        def __init__(self, batches: list[Batch], calibration: Record | None = None) -> None:
+        def __init__(self, batches, calibration=None):
             super().__init__(batches, calibration)
             monkeypatch.setattr(transients.registry, "open_parsed", lambda uri: self)
 
     return Last
 
 
-def tags(rows: list[tuple[int, int, int]]) -> Records:
+def tags(rows):
     return np.array(rows, RECORD_DTYPE)
 
 
-def test_tags_of_two_channels(canned: type[Canned]) -> None:
+def test_tags_of_two_channels(canned):
     before, after = tags([(0, 1, 0), (3, 2, 0)]), tags([(9, 4, 0), (10, 1, 0), (12, 4, 0)])
     canned(
         [Batch(before), Batch(after, 2, after_gap=True)],
@@ -65,14 +63,14 @@ def test_tags_of_two_channels(canned: type[Canned]) -> None:
     np.testing.assert_allclose(streak.times, 0.5e-9 + np.arange(5) * 1e-9, rtol=1e-12)
 
 
-def frames(*numbers: int) -> Records:
+def frames(*numbers):
     records = np.zeros(len(numbers), [("number", "<i8"), ("counts", "<u2", (3, 4))])
     records["number"] = numbers
     records["counts"] = np.array(numbers)[:, None, None]
     return records
 
 
-def test_frames_are_added_up(canned: type[Canned]) -> None:
+def test_frames_are_added_up(canned):
     times = np.array([0.0, 1e-12, 3e-12])
     batches = [Batch(frames(1, 2)), Batch(frames(5, 7)), Batch(frames(100))]
     batches[0].records["counts"][0, 2, 3] = 65535
@@ -95,16 +93,22 @@ def test_frames_are_added_up(canned: type[Canned]) -> None:
     ]
 
 
+def test_shots_are_counted_on_where_an_instrument_begins_anew(canned):
+    canned([Batch(frames(3, 4)), Batch(frames(1, 2), 2, after_gap=True)])
+    stream = read_transients("canned://")
+    assert [stream.stamp.number for _ in stream] == [3, 4, 6, 7]
+
+
 def test_a_source_s_own_values_are_not_taken_for_how_to_gather(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     @dataclass(frozen=True)
     class OwnOptions(Options):
         frames: int = option(1)
 
-    own: list[int] = []
+    own = []
 
-    def open_own(uri: Uri) -> Canned:
+    def open_own(uri):
         own.append(OwnOptions.from_uri(uri).frames)
         return Canned([Batch(frames(1, 2))])
 
@@ -117,7 +121,7 @@ def test_a_source_s_own_values_are_not_taken_for_how_to_gather(
         read_transient("own://?second=5")
 
 
-def test_where_it_came_from_is_told() -> None:
+def test_where_it_came_from_is_told():
     address = "sim+linospad2://?seed=4&cycles=2&photons=500"
     streak = read_transient(address + "&bins=600")
     assert streak.source == address + "&bins=600"
@@ -129,7 +133,7 @@ def test_where_it_came_from_is_told() -> None:
     assert read_transient(address).counts.shape == (1250, 256)  # the laser's 25 ns in bins of 20 ps
 
 
-def test_sources_that_give_no_transient(canned: type[Canned]) -> None:
+def test_sources_that_give_no_transient(canned):
     canned([])
     with pytest.raises(InputError, match="ended before it gave anything"):
         read_transient("canned://")
@@ -142,7 +146,7 @@ def test_sources_that_give_no_transient(canned: type[Canned]) -> None:
             read_transient(f"canned://{values}", bin_width=1.0)
 
 
-def test_a_slow_viewer_gets_the_newest_picture_and_is_told_of_the_others() -> None:
+def test_a_slow_viewer_gets_the_newest_picture_and_is_told_of_the_others():
     stream = read_transients("sim+remoteex://?seed=2&scene=small&frame_rate=100")
     next(stream)
     assert stream.is_live

@@ -1,7 +1,5 @@
 """Every fault of the USB as an exception of ours, through pyusb's own code."""
 
-from __future__ import annotations
-
 import array
 import errno
 import sys
@@ -34,15 +32,15 @@ OUT, IN = 0x02, 0x86
 class Echo(VirtualDevice):
     """Sends back what it got; raises what it is asked to raise, once each."""
 
-    def __init__(self, serial: str = "A1", identity: UsbIdentity = KIND) -> None:
+    def __init__(self, serial="A1", identity=KIND):
         super().__init__(identity, ("makers", "echo", serial), (OUT, IN))
         self.got = b""
-        self.faults: list[int] = []
+        self.faults = []
 
-    def receive(self, endpoint: int, data: bytes) -> None:
+    def receive(self, endpoint, data):
         self.got += data
 
-    def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
+    def fill(self, endpoint, buffer, timeout):
         if self.faults:
             number = self.faults.pop(0)
             if number == errno.EPIPE:
@@ -55,23 +53,23 @@ class Echo(VirtualDevice):
         return length
 
 
-def linked(*instruments: VirtualDevice, serial: str = "") -> UsbLink:
+def linked(*instruments, serial=""):
     return UsbLink(KIND, serial, VirtualUsb(*instruments))
 
 
-def received(link: UsbLink) -> bytes:
+def received(link):
     buffer = array.array("B", bytes(64))
     return buffer[: link.read(IN, buffer, 0.1)].tobytes()
 
 
-def test_bytes_go_out_and_come_in() -> None:
+def test_bytes_go_out_and_come_in():
     link = linked(Echo())
     link.write(OUT, b"hello", 0.1)
     assert (link.serial, received(link)) == ("A1", b"hello")
     link.close()
 
 
-def test_the_serial_number_chooses() -> None:
+def test_the_serial_number_chooses():
     first, second = Echo("A1"), Echo("B2")
     assert linked(first, second, serial="B2").serial == "B2"
     with pytest.raises(DeviceNotFoundError, match=r"several.*say which: A1, B2"):
@@ -85,14 +83,14 @@ def test_the_serial_number_chooses() -> None:
     assert linked(Echo("")).serial == ""
 
 
-def test_another_program_holds_it() -> None:
+def test_another_program_holds_it():
     instrument = Echo()
     instrument.is_claimed_elsewhere = True
     with pytest.raises(DeviceBusyError, match="another program"):
         linked(instrument)
 
 
-def test_no_permission_shows_the_rule_to_add() -> None:
+def test_no_permission_shows_the_rule_to_add():
     instrument = Echo()
     instrument.is_accessible = False
     with pytest.raises(DevicePermissionError) as caught:
@@ -114,7 +112,7 @@ def test_no_permission_shows_the_rule_to_add() -> None:
         (errno.ENOMEM, DeviceError),
     ],
 )
-def test_faults_of_a_transfer(number: int, expected: type[DeviceError]) -> None:
+def test_faults_of_a_transfer(number, expected):
     instrument = Echo()
     link = linked(instrument)
     instrument.faults = [number]
@@ -123,7 +121,7 @@ def test_faults_of_a_transfer(number: int, expected: type[DeviceError]) -> None:
     assert type(caught.value) is expected
 
 
-def test_a_stall_is_cleared_once() -> None:
+def test_a_stall_is_cleared_once():
     instrument = Echo()
     link = linked(instrument)
     link.write(OUT, b"x", 0.1)
@@ -134,7 +132,7 @@ def test_a_stall_is_cleared_once() -> None:
         received(link)
 
 
-def test_an_unplugged_instrument_is_found_again() -> None:
+def test_an_unplugged_instrument_is_found_again():
     instrument = Echo()
     link = linked(instrument, Echo("B2"), serial="A1")
     instrument.faults = [errno.ENODEV]
@@ -149,7 +147,7 @@ def test_an_unplugged_instrument_is_found_again() -> None:
     link.close()
 
 
-def test_a_partial_write_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_partial_write_is_no_success(monkeypatch):
     link = linked(Echo())
     monkeypatch.setattr(VirtualUsb, "bulk_write", lambda *_: 2)
     with pytest.raises(DeviceTimeoutError, match="only 2 of 5"):
@@ -157,9 +155,9 @@ def test_a_partial_write_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_device_is_configured_and_taken_from_a_kernels_driver(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    done: list[tuple[str, int]] = []
+    monkeypatch,
+):
+    done = []
     for name, answer in (("get_configuration", 0), ("is_kernel_driver_active", True)):
         monkeypatch.setattr(VirtualUsb, name, lambda *_, answer=answer: answer)
     for name in ("set_configuration", "detach_kernel_driver"):
@@ -169,7 +167,7 @@ def test_a_device_is_configured_and_taken_from_a_kernels_driver(
     assert sorted(done) == [("detach_kernel_driver", 0), ("set_configuration", 1)]
 
 
-def test_no_usb_library(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_usb_library(monkeypatch):
     assert system_backend() is not None  # the system has one
     monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda **_: None)
     with pytest.raises(UsbBackendError, match="libusb-package"):
@@ -182,7 +180,7 @@ def test_no_usb_library(monkeypatch: pytest.MonkeyPatch) -> None:
         system_backend()
 
 
-def test_exceptions_that_pyusb_disguises() -> None:
+def test_exceptions_that_pyusb_disguises():
     with pytest.raises(UsbBackendError), translate_errors(KIND):
         raise usb.core.NoBackendError("No backend available")
     with pytest.raises(DeviceError, match="cannot do that"), translate_errors(KIND):
@@ -191,7 +189,7 @@ def test_exceptions_that_pyusb_disguises() -> None:
         raise ValueError("a defect")
 
 
-def test_instruments_are_discovered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_instruments_are_discovered(monkeypatch):
     shut = Echo("S9")
     shut.is_accessible = False
     bus = VirtualUsb(Echo("A1"), shut, Echo("", BARE_CHIP_IDENTITY))
@@ -210,9 +208,7 @@ def test_instruments_are_discovered(monkeypatch: pytest.MonkeyPatch) -> None:
     ("bus", "said"),
     [([Echo("", BARE_CHIP_IDENTITY)], "without firmware"), ([], "04b4:1004 is connected")],
 )
-def test_a_chip_without_firmware_is_told_from_nothing(
-    bus: list[Echo], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chip_without_firmware_is_told_from_nothing(bus, said, monkeypatch):
     monkeypatch.setattr(timetag, "system_backend", lambda: VirtualUsb(*bus))
     with pytest.raises(DeviceNotFoundError, match=said):
         open_timetag(Uri.parse("timetag://"))

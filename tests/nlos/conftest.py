@@ -1,19 +1,15 @@
-from __future__ import annotations
-
 import warnings
-from collections.abc import Iterator
 
 import pytest
 from scenes import AXIS, HIDDEN, JITTER, planar_wall
 
-from nlos import Capture
 from nlos.illumination import AliasingWarning
 from nlos.simulate import PointScene
 from tofclip.threads import limit_blas_threads
 
 
 @pytest.fixture(autouse=True)
-def _small_scenes() -> Iterator[None]:
+def _small_scenes():
     """Small matrices gain nothing from threads, which on a busy machine wait for each other; and
     small walls are coarse ones, of which `test_capture.py` holds what is said.
     """
@@ -23,6 +19,6 @@ def _small_scenes() -> Iterator[None]:
 
 
 @pytest.fixture
-def capture() -> Capture:
+def capture():
     """One hidden point before a planar wall, one laser spot."""
     return PointScene([HIDDEN]).simulate_capture(planar_wall(), [0.12, 0.05, 0.0], AXIS, JITTER)

@@ -1,10 +1,5 @@
 """Frames of a camera that looks at a relay wall."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from tofclip.camera import Camera
@@ -18,21 +13,19 @@ HIDDEN = (-0.12, 0.08, 0.3)
 ROW_OFFSET, COLUMN_OFFSET, DELAY_BINS = 2, 3, 40
 
 
-def wall_of(rows: int, columns: int) -> np.ndarray:
+def wall_of(rows, columns):
     x, y = np.meshgrid(np.linspace(-0.3, 0.3, columns), np.linspace(-0.25, 0.25, rows))
     return np.stack([x, y, 0.03 * np.sin(9 * x)], axis=-1)
 
 
-def relay_wall(wall: np.ndarray, without: str = "", **changes: Any) -> Record:
+def relay_wall(wall, without="", **changes):
     offsets = {"row_offset": ROW_OFFSET, "column_offset": COLUMN_OFFSET}
     fields = {"wall": Field(wall, "m"), "camera": Field(CAMERA, "m"), "laser": Field(LASER, "m")}
     fields.pop(without, None)
     return Record("relay_wall", fields, {**offsets, "receive_delay_bins": DELAY_BINS, **changes})
 
 
-def frames_of(
-    values: np.ndarray, attachments: Mapping[str, Record], times: np.ndarray | None = None
-) -> Frames:
+def frames_of(values, attachments, times=None):
     camera = Camera([50.0], [0.0], values.shape[1:], 100)
     times = BIN_WIDTH * np.arange(len(values)) if times is None else times
     shot = {"shot": 7}
@@ -41,7 +34,7 @@ def frames_of(
     )
 
 
-def see_by_camera(wall: np.ndarray, bins: int = 800) -> np.ndarray:
+def see_by_camera(wall, bins=800):
     """Frames of the hidden point with every wall point late by its own leg to the
     camera, drawn without any shifting; the record begins `DELAY_BINS` bins after light of path 0
     would have arrived by way of the laser spot.

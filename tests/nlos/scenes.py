@@ -1,15 +1,11 @@
 """Walls and hidden points that the tests of imaging around corners share, and how alike fields are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from nlos import Capture, Grid
+from nlos import Grid
 from nlos.capture import TimeAxis
 from nlos.simulate import PointScene
 from tofclip.arrays import to_numpy
@@ -30,20 +26,20 @@ SHAPED_POINTS = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4], [
 SHAPED_JITTER, SHAPED_AXIS = 60e-12, TimeAxis(512, 32e-12)
 
 
-def planar_wall(rows: int = 17, columns: int = 21) -> NDArray[np.float64]:
+def planar_wall(rows=17, columns=21):
     """A wall of 1.2 m x 1 m at z = 0, rows downwards."""
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, columns), np.linspace(-0.5, 0.5, rows))
     return np.stack([x, y, np.zeros_like(x)], axis=-1)
 
 
-def curved_wall(rows: int = 17, columns: int = 21) -> NDArray[np.float64]:
+def curved_wall(rows=17, columns=21):
     """A cylinder about the vertical, bulging 7 cm towards the scene, with ripples of 1.5 cm."""
     wall = planar_wall(rows, columns)
     wall[..., 2] = 0.07 - 0.2 * wall[..., 0] ** 2 + 0.015 * np.cos(7 * wall[..., 1])
     return wall
 
 
-def shaped_wall(shape: str, count: int) -> NDArray[np.float64]:
+def shaped_wall(shape, count):
     """A wall of 2 m x 2 m: planar, a cylinder of radius 2.5 m, waves of 0.1 m, relief of 0.3 m, or
     two plates.
     """
@@ -62,13 +58,13 @@ def shaped_wall(shape: str, count: int) -> NDArray[np.float64]:
 
 
 def see(
-    points: Any,
-    wall: NDArray[np.float64],
-    laser: Any,
-    axis: TimeAxis = AXIS,
-    jitter: float = JITTER,
-    albedo: Any = None,
-) -> Capture:
+    points,
+    wall,
+    laser,
+    axis=AXIS,
+    jitter=JITTER,
+    albedo=None,
+):
     """Hidden points seen from a wall that is lit at one spot, at several (n, 3) one after the other,
     confocally, or at another spot for every wall point (paired).
     """
@@ -81,45 +77,44 @@ def see(
     return PointScene(points, albedo).simulate_capture(wall, laser, axis, jitter)
 
 
-def see_shaped(shape: str, count: int, laser: Any = SHAPED_SPOT) -> Capture:
+def see_shaped(shape, count, laser=SHAPED_SPOT):
     """Four hidden points seen from a wall of 2 m x 2 m."""
     return see(SHAPED_POINTS, shaped_wall(shape, count), laser, SHAPED_AXIS, SHAPED_JITTER)
 
 
-def voxels_of(grid: Grid) -> NDArray[np.float64]:
+def voxels_of(grid):
     """Positions of all voxels, (z, y, x, 3), m."""
     z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
     return np.stack([x, y, z], axis=-1)
 
 
-def around(point: Any, half: float = 0.12, voxel: float = 0.04) -> Grid:
+def around(point, half=0.12, voxel=0.04):
     """Voxels about a point, which is the middle one."""
     steps = voxel * np.arange(-round(half / voxel), round(half / voxel) + 1)
     return Grid(*(c + steps for c in point))
 
 
-def distance_to_nearest(grid: Grid, points: Any) -> NDArray[np.float64]:
+def distance_to_nearest(grid, points):
     """From every voxel (z, y, x) to the nearest of some points, m."""
-    distances: NDArray[np.float64] = cKDTree(np.asarray(points)).query(voxels_of(grid))[0]
-    return distances
+    return cKDTree(np.asarray(points)).query(voxels_of(grid))[0]
 
 
-def energy_fraction(values: NDArray[Any], near: NDArray[np.bool_]) -> float:
+def energy_fraction(values, near):
     """Energy of some voxels over that of all."""
     energy = np.abs(values).astype(np.float64) ** 2
     return float(energy[near].sum() / energy.sum())
 
 
-def relative_error(found: Any, expected: NDArray[Any]) -> float:
+def relative_error(found, expected):
     return float(np.linalg.norm(to_numpy(found) - expected) / np.linalg.norm(expected))
 
 
-def scaled_error(found: NDArray[Any], expected: NDArray[Any]) -> float:
+def scaled_error(found, expected):
     """Relative difference after one scale factor."""
     return relative_error(np.vdot(found, expected) / np.vdot(found, found) * found, expected)
 
 
-def find_refusal(method: Any, capture: Capture, grid: Grid) -> str:
+def find_refusal(method, capture, grid):
     """Return the reason that a plan is refused for; empty if it is not."""
     try:
         method.plan(capture, grid)
@@ -128,7 +123,7 @@ def find_refusal(method: Any, capture: Capture, grid: Grid) -> str:
     return ""
 
 
-def reorder(capture: Capture, kept: Any, earlier: float = 0.0) -> Capture:
+def reorder(capture, kept, earlier=0.0):
     """Some of a capture's points in another order, of a record that begins so much path earlier."""
     bins = round(earlier / capture.axis.spacing)
     signal = np.pad(capture.signal.reshape(capture.axis.bins, -1)[:, kept], ((bins, 0), (0, 0)))

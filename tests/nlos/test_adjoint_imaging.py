@@ -1,7 +1,3 @@
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from scenes import HIDDEN, find_refusal, see
@@ -28,7 +24,7 @@ BEHIND, SPOT = Grid(GRID.x, GRID.y, GRID.z - 2), np.zeros(3)
 EMPTY = Volume(np.zeros(GRID.shape, np.float32), GRID)
 
 
-def test_with_every_point_read_for_itself_nothing_is_lost() -> None:
+def test_with_every_point_read_for_itself_nothing_is_lost():
     """An identity matrix is unitary: its adjoint is its inverse (Eq. 22 and the sentence after it)."""
     import scipy.sparse
 
@@ -43,7 +39,7 @@ def test_with_every_point_read_for_itself_nothing_is_lost() -> None:
 
 
 @pytest.mark.parametrize("method", [None, LinearInverse()])
-def test_few_projections_still_show_a_point(method: LinearInverse | None) -> None:
+def test_few_projections_still_show_a_point(method):
     compressed = CompressedCapture.of(SCENE, build_tomography(24, 0.25))
     assert compressed.measurements.shape == (6 * 24, 256)
     imaging = AdjointImaging(SOLVER) if method is None else AdjointImaging(SOLVER, method)
@@ -56,7 +52,7 @@ def test_few_projections_still_show_a_point(method: LinearInverse | None) -> Non
     assert volume.provenance["recovery"]["readings"] == 144
 
 
-def test_masked_wall_points_are_read_as_dark() -> None:
+def test_masked_wall_points_are_read_as_dark():
     wall, signal = SCENE.wall.copy(), SCENE.signal.copy()
     wall[3, 4] = np.nan
     signal[:, 3, 4] = np.nan
@@ -84,7 +80,7 @@ MEASURED = FITTING.measurements
         (lambda: AdjointImaging(SOLVER).reconstruct(FITTING, BEHIND), "behind"),
     ],
 )
-def test_what_does_not_fit_is_refused(attempt: Any, message: str) -> None:
+def test_what_does_not_fit_is_refused(attempt, message):
     with pytest.raises(InputError, match=message):
         attempt()
     assert "behind" in find_refusal(AdjointImaging(SOLVER), FITTING, BEHIND)
@@ -92,15 +88,15 @@ def test_what_does_not_fit_is_refused(attempt: Any, message: str) -> None:
 
 @pytest.mark.nightly
 def test_the_study_on_a_small_office_reaches_the_papers_finding(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     monkeypatch.setattr(study_module, "EXPOSURES", {"20 ms": 19.0, "1 ms": 6.0})
     wall = build_relay_wall("planar", 48)
     capture = build_office(0.15).simulate_capture(
         wall, [0.0, 0.0, 0.0], TimeAxis(256, 64e-12), 60e-12
     )
     grid = Grid.box((-1, 1), (-1, 1), (0.9, 2.1), 0.1)
-    steps: list[int] = []
+    steps = []
     outcome = measure_agreement(capture, grid, PlanarRSD(0.24, 5.0), 1, steps.append)
     assert sum(steps) == 4
     found = {row.labels: row.mean for row in outcome.rows}
@@ -119,17 +115,17 @@ def test_the_study_on_a_small_office_reaches_the_papers_finding(
 
 
 def test_reference_and_compressed_measurements_are_of_independent_photons(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     """Noise that both share correlates their images however poor the recovery is."""
-    exposed: dict[str, np.ndarray] = {}
+    exposed = {}
 
     class Spy(Backprojection):
-        def reconstruct(self, capture: Capture, grid: Grid, *rest: object) -> Volume:
+        def reconstruct(self, capture, grid, *rest):
             exposed.setdefault("reference" if "clean" in exposed else "clean", capture.signal)
             return EMPTY
 
-    def compress(capture: Capture, _: object) -> None:
+    def compress(capture, _):
         exposed["compressed"] = capture.signal
 
     monkeypatch.setattr(study_module, "EXPOSURES", {"20 ms": 19.0})

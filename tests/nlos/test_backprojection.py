@@ -1,7 +1,5 @@
 """Back-projection, with a virtual pulse or with a Laplacian, against sums written out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +32,7 @@ GRID = Grid.box((-0.25, 0.35), (-0.4, 0.2), (0.45, 0.8), 0.05)
 
 @pytest.mark.parametrize("laser", ["single", "confocal", "paired"])
 @pytest.mark.parametrize("cycles", [3, 5])
-def test_it_equals_the_exact_sum_over_frequencies(laser: str, cycles: float) -> None:
+def test_it_equals_the_exact_sum_over_frequencies(laser, cycles):
     capture = see([HIDDEN, (-0.2, 0.1, 0.75)], curved_wall(9, 12), laser, AXIS, JITTER, [1.0, 0.6])
     method = replace(METHOD, cycles=cycles)
     found = method.phasor_field(capture, GRID).values
@@ -46,8 +44,8 @@ def test_it_equals_the_exact_sum_over_frequencies(laser: str, cycles: float) -> 
 
 
 def test_the_volume_may_be_cut_into_pieces_and_the_signal_be_in_double_precision(
-    capture: Capture,
-) -> None:
+    capture,
+):
     whole = METHOD.phasor_field(capture, GRID).values
     double = replace(capture, signal=capture.signal.astype(np.float64))
     assert np.array_equal(METHOD.phasor_field(double, GRID).values, whole)
@@ -57,23 +55,21 @@ def test_the_volume_may_be_cut_into_pieces_and_the_signal_be_in_double_precision
 
 
 @pytest.mark.parametrize("confocal", [False, True])
-def test_small_batches_of_wall_points_add_up(
-    confocal: bool, capture: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_small_batches_of_wall_points_add_up(confocal, capture, monkeypatch):
     same_spot = replace(capture, laser=capture.wall if confocal else capture.laser)
     whole = METHOD.phasor_field(same_spot, GRID).values
     monkeypatch.setattr(nlos.backprojection, "TABLE_BYTES", 1)
     assert relative_error(METHOD.phasor_field(same_spot, GRID).values, whole) < 1e-5
 
 
-def test_voxels_on_the_wall_stay_finite_and_those_beyond_the_record_dark(capture: Capture) -> None:
+def test_voxels_on_the_wall_stay_finite_and_those_beyond_the_record_dark(capture):
     far = Grid.box((-0.2, 0.2), (-0.2, 0.2), (5.0, 5.2), 0.1)
     assert np.all(METHOD.reconstruct(capture, far).values == 0)
     touching = Grid(planar_wall()[0, :, 0], planar_wall()[:, 0, 1], [0.0, 0.1])
     assert np.all(np.isfinite(METHOD.reconstruct(capture, touching).values))
 
 
-def test_a_long_path_keeps_its_phase_in_float32() -> None:
+def test_a_long_path_keeps_its_phase_in_float32():
     """A record that begins 300 m down the path: phases of 15 000 rad, of which float32 keeps less
     than 1e-3.
     """
@@ -87,9 +83,7 @@ def test_a_long_path_keeps_its_phase_in_float32() -> None:
 
 
 @pytest.mark.parametrize(("falloff", "obliquity"), [(0, 0), (1, 1), (2, 0.5)])
-def test_weights_are_powers_of_distance_and_direction(
-    falloff: float, obliquity: float, capture: Capture
-) -> None:
+def test_weights_are_powers_of_distance_and_direction(falloff, obliquity, capture):
     """One wall point at a time, so that the weight is a factor of the whole field."""
     weighted = replace(METHOD, weighting=Weighting(falloff, obliquity))
     signal = np.zeros_like(capture.signal)
@@ -103,7 +97,7 @@ def test_weights_are_powers_of_distance_and_direction(
     assert relative_error(found, expected) < 1e-5  # products of float32
 
 
-def test_all_lasers_of_a_grid_are_summed_as_if_each_were_alone() -> None:
+def test_all_lasers_of_a_grid_are_summed_as_if_each_were_alone():
     wall = curved_wall(7, 8)
     lasers = np.array([[SPOTS[0], [-0.2, 0.1, 0.0]], [[0.0, -0.3, 0.0], [0.3, 0.3, 0.0]]])
     alone = [see([HIDDEN], wall, spot) for spot in lasers.reshape(-1, 3)]
@@ -119,7 +113,7 @@ def test_all_lasers_of_a_grid_are_summed_as_if_each_were_alone() -> None:
 # --- filtered back-projection
 
 
-def test_unfiltered_signals_are_read_between_bins_and_nowhere_else() -> None:
+def test_unfiltered_signals_are_read_between_bins_and_nowhere_else():
     """One wall point, one voxel: the signal at the path between them, interpolated by hand."""
     wall = np.array([[0.0, 0, 0], [5.0, 0, 0]])
     signal = np.random.default_rng(1).uniform(1, 2, (AXIS.bins, 2)).astype(np.float32)
@@ -128,7 +122,7 @@ def test_unfiltered_signals_are_read_between_bins_and_nowhere_else() -> None:
     depths = 0.2 + 0.01 * np.arange(120)
     path = depths + np.hypot(depths, 0.2)
 
-    def unfiltered(traces: np.ndarray) -> Waveforms:
+    def unfiltered(traces):
         values = np.pad(traces, ((0, 0), (1, 2))).astype(np.complex64)
         return Waveforms(values, AXIS.start - AXIS.spacing, AXIS.spacing)
 
@@ -142,7 +136,7 @@ def test_unfiltered_signals_are_read_between_bins_and_nowhere_else() -> None:
     assert np.all(found[far] == 0)
 
 
-def test_the_laplacian_is_that_of_metres() -> None:
+def test_the_laplacian_is_that_of_metres():
     """Of a quadratic volume it is a constant, whatever the voxels' shape."""
     grid = Grid(0.01 * np.arange(41), 0.008 * np.arange(51), 0.005 * np.arange(81))
     values = (voxels_of(grid) ** 2 @ np.array([3, 5, 7])).astype(np.float32)
@@ -153,6 +147,6 @@ def test_the_laplacian_is_that_of_metres() -> None:
     assert flat == pytest.approx(-(0.02**2) * 2 * 12, rel=0.01)
 
 
-def test_uneven_voxels_are_refused(capture: Capture) -> None:
+def test_uneven_voxels_are_refused(capture):
     uneven = Grid([0.0, 0.1, 0.3], [0.0, 0.1], [0.5, 0.6])
     assert "evenly spaced voxels" in find_refusal(FilteredBackprojection(0.05), capture, uneven)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ AXIS = TimeAxis(bins=300, bin_width=16e-12, start=0.7)
 PULSE = VirtualPulse(0.125, 3)
 
 
-def waveform_of(signal: np.ndarray, band: Band) -> tuple[np.ndarray, np.ndarray]:
+def waveform_of(signal, band):
     waveforms = band.waveforms(band.compute_phasors(signal[None]))
     paths = waveforms.start + waveforms.spacing * np.arange(waveforms.values.shape[1])
     return paths, waveforms.values[0]
@@ -19,7 +17,7 @@ def waveform_of(signal: np.ndarray, band: Band) -> tuple[np.ndarray, np.ndarray]
 
 @pytest.mark.parametrize("cycles", [3, 5, 8])
 @pytest.mark.parametrize("place", [0, 120, 299])
-def test_an_impulse_becomes_the_virtual_pulse(place: int, cycles: float) -> None:
+def test_an_impulse_becomes_the_virtual_pulse(place, cycles):
     """At the ends of the record as well: nothing wraps around."""
     pulse = VirtualPulse(0.125, cycles)
     signal = np.zeros(AXIS.bins)
@@ -39,7 +37,7 @@ def test_an_impulse_becomes_the_virtual_pulse(place: int, cycles: float) -> None
     assert np.max(np.abs(found[np.abs(distance) > 4.5 * pulse.sigma])) < 3e-4 * height
 
 
-def test_phasors_are_the_weighted_fourier_sum_of_their_definition() -> None:
+def test_phasors_are_the_weighted_fourier_sum_of_their_definition():
     band = Band(PULSE, AXIS)
     signal = np.random.default_rng(3).normal(size=(2, AXIS.bins))
     kernel = np.exp(-1j * np.outer(AXIS.paths, band.wavenumbers))
@@ -59,12 +57,12 @@ def test_phasors_are_the_weighted_fourier_sum_of_their_definition() -> None:
         *((0.1, cycles, "virtual pulse must be a positive") for cycles in (0, np.inf)),
     ],
 )
-def test_what_is_no_band_is_refused(wavelength: float, cycles: float, message: str) -> None:
+def test_what_is_no_band_is_refused(wavelength, cycles, message):
     with pytest.raises(InputError, match=message):
         Band(VirtualPulse(wavelength, cycles), AXIS)
 
 
-def test_tails_too_small_for_normal_numbers_change_nothing() -> None:
+def test_tails_too_small_for_normal_numbers_change_nothing():
     """Simulated pulses fade to 1e-38 and below, which a processor multiplies ten times as slowly."""
     random, band = np.random.default_rng(0), Band(VirtualPulse(0.125, 3), AXIS)
     signal = random.normal(size=(6, AXIS.bins)).astype(np.float32)

@@ -1,10 +1,7 @@
 """Captures: what they hold and refuse, how fine their walls are, and how frames become one."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,11 +35,11 @@ METHOD = Backprojection(0.2, 5)
 SPACING = SPEED_OF_LIGHT * BIN_WIDTH
 
 
-def capture_of(wall: np.ndarray, laser: object = (0.1, 0.0, 0.0)) -> Capture:
+def capture_of(wall, laser=(0.1, 0.0, 0.0)):
     return Capture(np.ones((300, *wall.shape[:-1])), wall, laser, 16e-12)
 
 
-def test_points_and_traces_agree_and_leave_masked_points_out() -> None:
+def test_points_and_traces_agree_and_leave_masked_points_out():
     wall, signal = WALL.copy(), SIGNAL.copy()
     wall[1, 2, 0], signal[:, 1, 2] = np.nan, np.inf
     capture = Capture(signal, wall, [0, 0, 0], 1e-12)
@@ -55,7 +52,7 @@ def test_points_and_traces_agree_and_leave_masked_points_out() -> None:
     assert capture.traces().flags.c_contiguous
 
 
-def test_lasers_follow_the_points() -> None:
+def test_lasers_follow_the_points():
     laser = WALL + 0.1
     laser[0, 0, 1] = np.nan
     paired = Capture(SIGNAL, WALL, laser, 1e-12)
@@ -65,13 +62,13 @@ def test_lasers_follow_the_points() -> None:
 
 
 @pytest.mark.parametrize("start", [0.0, 0.2, -1.3])
-def test_the_first_bin_is_at_the_start_of_the_record(start: float) -> None:
+def test_the_first_bin_is_at_the_start_of_the_record(start):
     axis = Capture(SIGNAL, WALL, [0, 0, 0], 1e-10, start).axis
     assert axis.paths == pytest.approx(start + SPEED_OF_LIGHT * 1e-10 * np.arange(5))
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float64, bool])
-def test_counts_of_any_type_become_float32(dtype: type) -> None:
+def test_counts_of_any_type_become_float32(dtype):
     capture = Capture(np.ones((5, 3, 4), dtype), WALL, WALL, 1e-12)
     assert capture.signal.dtype == np.float32
     assert np.all(capture.signal == 1)
@@ -104,7 +101,7 @@ def test_counts_of_any_type_become_float32(dtype: type) -> None:
         ({"start": np.inf}, "path length of bin 0"),
     ],
 )
-def test_what_is_no_capture_is_refused_in_one_line(changes: dict[str, Any], message: str) -> None:
+def test_what_is_no_capture_is_refused_in_one_line(changes, message):
     given = {"signal": SIGNAL, "wall": planar_wall(3, 4), "laser": [0, 0, 0], "bin_width": 1e-12}
     with pytest.raises(InputError, match=message) as refused:
         Capture(**{**given, **changes})
@@ -112,7 +109,7 @@ def test_what_is_no_capture_is_refused_in_one_line(changes: dict[str, Any], mess
     assert "\n" not in str(refused.value)
 
 
-def test_a_laser_a_little_behind_a_curved_wall_is_no_fault() -> None:
+def test_a_laser_a_little_behind_a_curved_wall_is_no_fault():
     assert replace(capture_of(planar_wall()), laser=[0, 0, -0.3]).lasers[0, 2] == -0.3
 
 
@@ -125,14 +122,14 @@ def test_a_laser_a_little_behind_a_curved_wall_is_no_fault() -> None:
     compressed=st.booleans(),
 )
 def test_files_give_back_what_was_saved(
-    tmp_path_factory: pytest.TempPathFactory,
-    wall_shape: tuple[int, ...],
-    bins: int,
-    confocal: bool,
-    start: float,
-    bin_width: float,
-    compressed: bool,
-) -> None:
+    tmp_path_factory,
+    wall_shape,
+    bins,
+    confocal,
+    start,
+    bin_width,
+    compressed,
+):
     random, made = np.random.default_rng(0), {"made": "here"}
     wall, signal = random.normal(size=(*wall_shape, 3)), random.normal(size=(bins, *wall_shape))
     saved = Capture(signal, wall, wall if confocal else [1, 2, 3], bin_width, start, made)
@@ -147,7 +144,7 @@ def test_files_give_back_what_was_saved(
 # --- how fine a wall is
 
 
-def test_the_spacing_is_that_of_neighbours_however_they_are_listed() -> None:
+def test_the_spacing_is_that_of_neighbours_however_they_are_listed():
     wall = planar_wall(11, 13)  # 10 cm by 10 cm
     assert capture_of(wall).spacing == pytest.approx(0.1)
     assert capture_of(wall.reshape(-1, 3)[::-1]).spacing == pytest.approx(0.1)
@@ -164,7 +161,7 @@ def test_the_spacing_is_that_of_neighbours_however_they_are_listed() -> None:
     ("waves_apart", "confocal", "warned"),
     [(0.45, False, False), (0.55, False, True), (0.3, True, True), (0.2, True, False)],
 )
-def test_a_coarse_wall_is_warned_of(waves_apart: float, confocal: bool, warned: bool) -> None:
+def test_a_coarse_wall_is_warned_of(waves_apart, confocal, warned):
     shortest = 2 * np.pi / Band(METHOD.pulse, capture_of(planar_wall()).axis).wavenumbers[-1]
     wall = planar_wall() * (waves_apart * shortest / 0.06)
     wall[..., 1] *= 0.96  # rows are 6.25 cm apart, columns 6 cm
@@ -176,7 +173,7 @@ def test_a_coarse_wall_is_warned_of(waves_apart: float, confocal: bool, warned: 
     assert all("too coarse for waves of" in str(w.message) for w in caught)
 
 
-def test_an_exhaustive_capture_pairs_every_laser_with_every_point() -> None:
+def test_an_exhaustive_capture_pairs_every_laser_with_every_point():
     wall, lasers = planar_wall(3, 4), np.arange(6.0).reshape(2, 3) / 10
     signal = np.random.default_rng(1).normal(size=(5, 2, 3, 4))
     capture = Capture.exhaustive(signal, wall, lasers, 16e-12, 0.3, {"shot": 7})
@@ -199,7 +196,7 @@ def test_an_exhaustive_capture_pairs_every_laser_with_every_point() -> None:
 # --- frames of a camera that looks at the wall
 
 
-def test_frames_become_a_capture_that_shows_the_hidden_point_where_it_is() -> None:
+def test_frames_become_a_capture_that_shows_the_hidden_point_where_it_is():
     wall, late = wall_of(15, 19), 3e-10
     frames = frames_of(see_by_camera(wall), {"relay_wall": relay_wall(wall)})
     capture = Capture.from_frames(frames)
@@ -218,7 +215,7 @@ def test_frames_become_a_capture_that_shows_the_hidden_point_where_it_is() -> No
     assert moved.start == pytest.approx(SPEED_OF_LIGHT * (late + DELAY_BINS * BIN_WIDTH))
 
 
-def test_whole_bins_are_moved_exactly_and_what_lies_outside_is_zero() -> None:
+def test_whole_bins_are_moved_exactly_and_what_lies_outside_is_zero():
     wall = np.zeros((5, 3))
     wall[:, 2] = np.array([0, 2, -3, np.nan, 100]) * SPACING
     values = np.arange(1.0, 9.0) ** 2
@@ -234,7 +231,7 @@ def test_whole_bins_are_moved_exactly_and_what_lies_outside_is_zero() -> None:
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_both_legs_to_the_device_are_taken_off(moving: bool) -> None:
+def test_both_legs_to_the_device_are_taken_off(moving):
     wall = wall_of(9, 11)
     laser = wall[:, ::-1] if moving else LASER
     source, start = np.array([0.4, -0.2, 1.3]), 2.0
@@ -268,9 +265,7 @@ UNEVEN = BIN_WIDTH * np.array([0, 1, 2.1, 3])
         (relay_wall(wall_of(4, 4)), UNEVEN, InputError, "evenly"),
     ],
 )
-def test_frames_that_are_no_capture_say_why(
-    attached: Record | None, times: np.ndarray | None, error: type, message: str
-) -> None:
+def test_frames_that_are_no_capture_say_why(attached, times, error, message):
     attachments = {} if attached is None else {"relay_wall": attached}
     with pytest.raises(error, match=message):
         Capture.from_frames(frames_of(np.ones((4, 9, 10)), attachments, times))
@@ -284,8 +279,6 @@ def test_frames_that_are_no_capture_say_why(
         ((5, 2), (2, 3), CAMERA, [0, 0], "laser position"),
     ],
 )
-def test_unwarping_checks_what_it_is_given(
-    signal: Any, wall: Any, camera: Any, laser: Any, message: str
-) -> None:
+def test_unwarping_checks_what_it_is_given(signal, wall, camera, laser, message):
     with pytest.raises(InputError, match=message):
         unwarp_signal(np.ones(signal), np.zeros(wall), camera, laser, BIN_WIDTH)

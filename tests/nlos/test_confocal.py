@@ -1,20 +1,16 @@
 """The light-cone transform and f-k migration of confocal scans."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import around, distance_to_nearest, find_refusal, relative_error, see
+from scenes import around, distance_to_nearest, find_refusal, relative_error, scaled_error, see
 
 from nlos import Capture, FKMigration, Grid, LightCone
 from nlos.capture import TimeAxis
 from nlos.confocal import apply_wiener_filter
-from nlos.kernels import rebin
 from tofclip.errors import InputError
 
 # Odd and unequal sizes; path per bin about the wall's step.
@@ -27,16 +23,16 @@ Transform = LightCone | FKMigration
 named = pytest.mark.parametrize("method", [LightCone(), FKMigration()], ids=["lightcone", "fk"])
 
 
-def wall_at(depth: float = 0.0) -> np.ndarray:
+def wall_at(depth=0.0):
     x, y = np.meshgrid(X, Y)
     return np.stack([x, y, np.full_like(x, depth)], axis=-1)
 
 
-def confocal(points: Any = (HIDDEN,), wall: Any = None, axis: TimeAxis = AXIS) -> Capture:
+def confocal(points=(HIDDEN,), wall=None, axis=AXIS):
     return see(points, wall_at() if wall is None else wall, "confocal", axis, 40e-12)
 
 
-def near(point: Any = HIDDEN, half: float = 0.12, voxel: float = VOXEL) -> Grid:
+def near(point=HIDDEN, half=0.12, voxel=VOXEL):
     return around(point, half, voxel)
 
 
@@ -44,16 +40,14 @@ def near(point: Any = HIDDEN, half: float = 0.12, voxel: float = VOXEL) -> Grid:
 @named
 @settings(max_examples=8)
 @given(x=st.floats(-0.35, 0.35), y=st.floats(-0.3, 0.3), z=st.floats(0.45, 0.9))
-def test_a_hidden_point_comes_back_where_it_is(
-    method: Transform, x: float, y: float, z: float
-) -> None:
+def test_a_hidden_point_comes_back_where_it_is(method, x, y, z):
     volume = method.reconstruct(confocal([[x, y, z]]), near((x, y, z)))
     assert volume.values.dtype == np.float32
     assert volume.find_brightest() == pytest.approx((x, y, z), abs=STEP)
 
 
 @named
-def test_two_points_keep_their_sides_and_depths(method: Transform) -> None:
+def test_two_points_keep_their_sides_and_depths(method):
     points = np.array([(0.25, -0.15, 0.5), (-0.2, 0.25, 0.75)])
     grid = Grid.box((-0.5, 0.5), (-0.4, 0.4), (0.4, 0.9), VOXEL)
     volume = method.reconstruct(confocal(points), grid)
@@ -65,7 +59,7 @@ def test_two_points_keep_their_sides_and_depths(method: Transform) -> None:
 
 
 @named
-def test_equal_points_at_two_depths_are_equally_bright(method: Transform) -> None:
+def test_equal_points_at_two_depths_are_equally_bright(method):
     """Brightness falls by 4 powers of the distance: 0.5 m and 0.8 m differ 6.6-fold before the
     weights undo it. What is left is the cone that the wall fills.
     """
@@ -84,7 +78,7 @@ def test_equal_points_at_two_depths_are_equally_bright(method: Transform) -> Non
 
 
 @named
-def test_the_weights_undo_exactly_four_powers_of_the_distance(method: Transform) -> None:
+def test_the_weights_undo_exactly_four_powers_of_the_distance(method):
     """As if brightness had not fallen at all: the same image from signals times distance^4."""
     assert method.falloff == 4
     capture, grid = confocal([HIDDEN, (0.0, 0.1, 0.45)]), near(HIDDEN, 0.3, 0.03)
@@ -96,8 +90,8 @@ def test_the_weights_undo_exactly_four_powers_of_the_distance(method: Transform)
 
 @named
 def test_the_order_of_points_the_walls_plane_the_start_and_a_little_noise_do_not_matter(
-    method: Transform,
-) -> None:
+    method,
+):
     capture, grid = confocal(), near()
     expected = method.reconstruct(capture, grid).values
     moved = confocal([HIDDEN + np.array([0, 0, 0.3])], wall_at(0.3))
@@ -120,8 +114,9 @@ def test_the_order_of_points_the_walls_plane_the_start_and_a_little_noise_do_not
         assert relative_error(method.reconstruct(listed, grid).values, expected) <= error
     for start in (20.4, -10.0):  # between bins, before the laser
         axis = TimeAxis(AXIS.bins, AXIS.bin_width, start * AXIS.spacing)
-        volume = method.reconstruct(confocal(axis=axis), grid)
-        assert volume.find_brightest() == pytest.approx(HIDDEN, abs=STEP)
+        found = method.reconstruct(confocal(axis=axis), grid).values
+        # as between the bins of the light itself, two thirds of a bin wide
+        assert scaled_error(found, expected) < 0.2
     wall = wall_at()
     wall[3:5, 20:22] = np.nan  # of 594 points 4 are dark
     masked = method.reconstruct(replace(capture, wall=wall, laser=wall), grid)
@@ -129,7 +124,7 @@ def test_the_order_of_points_the_walls_plane_the_start_and_a_little_noise_do_not
 
 
 @named
-def test_half_a_wall_beyond_the_wall_is_seen_and_no_more(method: Transform) -> None:
+def test_half_a_wall_beyond_the_wall_is_seen_and_no_more(method):
     outside = (0.6, 0.0, 0.6)
     volume = method.reconstruct(confocal([outside]), near(outside))
     # Seen from one side only, the point is smeared along the ray.
@@ -156,9 +151,7 @@ TWICE[0, 1] = TWICE[0, 0]
         (wall_at(), wall_at()[::-1], "confocal scan is needed"),
     ],
 )
-def test_what_is_no_confocal_lattice_is_refused(
-    method: Transform, wall: np.ndarray, laser: np.ndarray, reason: str
-) -> None:
+def test_what_is_no_confocal_lattice_is_refused(method, wall, laser, reason):
     capture = replace(confocal(), wall=wall, laser=laser)
     assert reason in find_refusal(method, capture, near())
     with pytest.raises(InputError, match=reason):
@@ -167,7 +160,7 @@ def test_what_is_no_confocal_lattice_is_refused(
 
 
 @named
-def test_ten_gigabytes_are_refused_before_they_are_allocated(method: Transform) -> None:
+def test_ten_gigabytes_are_refused_before_they_are_allocated(method):
     x, y = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-1, 1, 80))
     wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
     # A record that starts 200 m late has as many empty bins before it.
@@ -176,15 +169,7 @@ def test_ten_gigabytes_are_refused_before_they_are_allocated(method: Transform) 
     assert "GiB allowed" in find_refusal(method, capture, grid)
 
 
-def test_rebinning_keeps_the_sum() -> None:
-    edges, values = np.array([0.0, 1.0, 4.0, 9.0]), np.array([2.0, 9.0, 35.0])
-    found = rebin(values, edges, np.linspace(0, 9, 7))
-    assert found.sum() == pytest.approx(values.sum())
-    assert found[0] == pytest.approx(2 + 9 * 0.5 / 3)
-    assert not rebin(values, edges, np.array([9.0, 10.0])).any()
-
-
-def test_the_light_cone_transform_reads_depths_to_a_fraction_of_a_bin() -> None:
+def test_the_light_cone_transform_reads_depths_to_a_fraction_of_a_bin():
     """A sample of u = z^2 is the mean over an interval and stands for its middle: half a sample is
     more than half a bin near the wall.
     """
@@ -202,7 +187,7 @@ def test_the_light_cone_transform_reads_depths_to_a_fraction_of_a_bin() -> None:
     assert abs(np.mean(errors)) < 0.2 * axis.spacing / 2
 
 
-def test_the_filter_is_wiener_s() -> None:
+def test_the_filter_is_wiener_s():
     random = np.random.default_rng(0)
     quarter = random.standard_normal((3, 3, 4)) + 1j * random.standard_normal((3, 3, 4))
     spectrum = np.ones((4, 4, 4), np.complex64)
@@ -212,7 +197,7 @@ def test_the_filter_is_wiener_s() -> None:
     np.testing.assert_allclose(spectrum[3, 3], expected[1, 1], rtol=1e-5)
 
 
-def test_migration_keeps_the_sign_of_signals_below_the_background() -> None:
+def test_migration_keeps_the_sign_of_signals_below_the_background():
     """A wave of opposite signs on the two halves of the wall cancels in the middle."""
     wall = wall_at() - [X.mean(), 0, 0]
     capture, sides = confocal([(0.0, Y[11], 0.6)], wall), np.sign(np.round(wall[..., 0], 9))

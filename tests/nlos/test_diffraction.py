@@ -2,13 +2,10 @@
 there and back, progress, and what they refuse.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -46,18 +43,18 @@ METHOD, HYBRID = PlanarRSD(wavelength=0.125, cycles=3), Hybrid(wavelength=0.25, 
 SHAPED = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.85, 12), [0.62, 0.8, 1.0, 1.1, 1.45])
 
 
-def scene(laser: Any = SPOTS[0], wall: np.ndarray | None = None) -> Capture:
+def scene(laser=SPOTS[0], wall=None):
     wall = planar_wall() if wall is None else wall
     return see(THREE_POINTS, wall, laser, LONG, JITTER, [1.0, 0.6, 0.3])
 
 
 @cache
-def truth(shape: str) -> tuple[Capture, np.ndarray]:
+def truth(shape):
     capture = see_shaped(shape, 25)
     return capture, compute_exact_phasor_field(capture, SHAPED, HYBRID.pulse).values
 
 
-def test_propagation_in_time_shows_the_same_points() -> None:
+def test_propagation_in_time_shows_the_same_points():
     wall = shaped_wall("relief", 11)
     capture = see(SHAPED_POINTS[:1], wall, SHAPED_SPOT, TimeAxis(1024, 16e-12), SHAPED_JITTER)
     grid = Grid(np.linspace(0.1, 0.5, 5), np.linspace(-0.4, 0.0, 5), [0.9, 1.0, 1.1])
@@ -67,7 +64,7 @@ def test_propagation_in_time_shows_the_same_points() -> None:
     assert in_time.provenance["imaging"]["propagation"] == "time"
 
 
-def test_the_plane_may_stand_elsewhere_and_before_it_voxels_stay_sensible() -> None:
+def test_the_plane_may_stand_elsewhere_and_before_it_voxels_stay_sensible():
     capture, exact = truth("planar")
     moved = replace(HYBRID, plane_z=0.7)
     assert moved.plan(capture, SHAPED).plane.z == 0.7
@@ -105,15 +102,13 @@ UNEVEN_VOXELS = Grid([0.0, 0.1, 0.3], GRID.y, GRID.z)
         ),
     ],
 )
-def test_what_cannot_be_imaged_is_refused(
-    method: PlanarRSD | Hybrid, capture: Capture, grid: Grid, reason: str
-) -> None:
+def test_what_cannot_be_imaged_is_refused(method, capture, grid, reason):
     assert reason in find_refusal(method, capture, grid)
     with pytest.raises(InputError, match=reason):
         method.reconstruct(capture, grid)
 
 
-def test_too_many_plane_waves_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_plane_waves_are_refused(monkeypatch):
     monkeypatch.setattr(nlos.method, "MEMORY_LIMIT_BYTES", 1 << 16)
     assert "plane waves" in find_refusal(METHOD, scene(), GRID)
 
@@ -126,7 +121,7 @@ def test_too_many_plane_waves_are_refused(monkeypatch: pytest.MonkeyPatch) -> No
         (([0.0, 1.0], [0.0, 1.0], np.inf), "finite z"),
     ],
 )
-def test_planes_are_checked(axes: Any, message: str) -> None:
+def test_planes_are_checked(axes, message):
     with pytest.raises(InputError, match=message):
         Plane(*axes)
     assert Plane([0.0, 1.0], [0.0, 2.0, 4.0], 0.5).points[2, 1].tolist() == [1.0, 4.0, 0.5]
@@ -135,7 +130,7 @@ def test_planes_are_checked(axes: Any, message: str) -> None:
 # --- transforms
 
 
-def test_both_ways_back_from_the_spectrum_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_ways_back_from_the_spectrum_agree(monkeypatch):
     for grid in (
         GRID,
         Grid(GRID.x[::4], GRID.y[::3], GRID.z),
@@ -150,7 +145,7 @@ def test_both_ways_back_from_the_spectrum_agree(monkeypatch: pytest.MonkeyPatch)
         assert all(relative_error(field, fields[0]) < 1e-5 for field in fields)
 
 
-def test_images_without_fftw(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_without_fftw(monkeypatch):
     monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
     cases = (METHOD, scene(), GRID), (HYBRID, truth("relief")[0], SHAPED)
     fields = [method.phasor_field(*rest).values for method, *rest in cases]
@@ -159,7 +154,7 @@ def test_images_without_fftw(monkeypatch: pytest.MonkeyPatch) -> None:
         assert relative_error(method.phasor_field(*rest).values, expected) < 1e-5
 
 
-def test_transforms_load_neither_dask_nor_pandas() -> None:
+def test_transforms_load_neither_dask_nor_pandas():
     pytest.importorskip("pyfftw")
     code = (
         "import sys, nlos.phasor.fourier as plans;"
@@ -177,9 +172,7 @@ def test_transforms_load_neither_dask_nor_pandas() -> None:
     ids=["single", "ahead", "confocal"],
 )
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
-def test_interpolated_depths_are_those_that_are_computed(
-    laser: Any, tolerance: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interpolated_depths_are_those_that_are_computed(laser, tolerance, monkeypatch):
     """Signals of noise: light from everywhere at any time; depths an eighth of a wavelength apart."""
     grid = Grid(np.linspace(-0.3, 0.4, 5), np.linspace(-0.4, 0.2, 4), 0.4 + np.arange(32) / 64)
     signal = np.random.default_rng(1).normal(size=(LONG.bins, 17, 21)).astype(np.float32)

@@ -3,13 +3,9 @@ points, linearity, progress and history; and what none can image is refused in o
 what to do.
 """
 
-from __future__ import annotations
-
 import itertools
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -48,7 +44,7 @@ SPOT = [0.1, 0.05, 0.0]
 GRID = Grid.box((-0.2, 0.2), (-0.2, 0.2), (0.4, 0.6), 0.05)
 CONFOCAL = LightCone | FKMigration
 
-PULSED: dict[str, Callable[[float], Any]] = {
+PULSED = {
     "backprojection": Backprojection,
     "rsd": PlanarRSD,
     "hybrid": Hybrid,
@@ -61,7 +57,7 @@ every_method = pytest.mark.parametrize("method", EVERY.values(), ids=EVERY.keys(
 pulsed_methods = pytest.mark.parametrize("make", PULSED.values(), ids=PULSED.keys())
 
 PULSE = {"wavelength_m": 0.125, "cycles": 3.0}
-SETTINGS: dict[str, tuple[Any, dict[str, Any]]] = {
+SETTINGS = {
     "backprojection": (Backprojection(0.125), PULSE),
     "rsd": (PlanarRSD(0.125), {**PULSE, "tolerance": 1e-2}),
     "hybrid": (
@@ -76,30 +72,30 @@ SETTINGS: dict[str, tuple[Any, dict[str, Any]]] = {
 imagers = pytest.mark.parametrize("name", SETTINGS)
 
 
-def see_point(name: str) -> Capture:
+def see_point(name):
     """A hidden point before a planar wall."""
     return see([HIDDEN], planar_wall(), "confocal" if is_confocal(SETTINGS[name][0]) else SPOT)
 
 
-def is_confocal(method: Any) -> bool:
+def is_confocal(method):
     return isinstance(method, CONFOCAL)
 
 
-def see_nothing(method: Any, wall: np.ndarray | None = None, signal: float = 0.0) -> Capture:
+def see_nothing(method, wall=None, signal=0.0):
     """An even capture, confocal for those that need it."""
     wall = planar_wall(9, 11) if wall is None else wall
     even = np.full((AXIS.bins, *wall.shape[:-1]), signal)
     return Capture(even, wall, wall if is_confocal(method) else SPOT, AXIS.bin_width, AXIS.start)
 
 
-def imaging(method: Any) -> Callable[[Capture, Grid], Any]:
+def imaging(method):
     """What a user calls to have an image."""
     if isinstance(method, TransientImaging):
         return lambda capture, grid: method.image_gate(capture, grid, 1e-9, 2e-9)
     return lambda capture, grid: method.reconstruct(capture, grid)
 
 
-def refusal(method: Any, capture: Capture, grid: Grid) -> str:
+def refusal(method, capture, grid):
     """The reason given, which has to be one line, and the same whether asked or not."""
     with pytest.raises(InputError) as caught:
         imaging(method)(capture, grid)
@@ -125,9 +121,7 @@ def refusal(method: Any, capture: Capture, grid: Grid) -> str:
 )
 @settings(max_examples=8)
 @given(x=st.floats(-0.4, 0.4), y=st.floats(-0.35, 0.35), z=st.floats(0.4, 0.9))
-def test_any_hidden_point_comes_back_where_it_is(
-    name: str, curved: bool, laser: str, x: float, y: float, z: float
-) -> None:
+def test_any_hidden_point_comes_back_where_it_is(name, curved, laser, x, y, z):
     """Transforms of confocal scans: see `test_confocal.py`."""
     # Pairs that are mirrored images of each other see few points sharply.
     point = HIDDEN if laser == "paired" else (x, y, z)
@@ -141,7 +135,7 @@ def test_any_hidden_point_comes_back_where_it_is(
 
 
 @imagers
-def test_masked_points_and_the_order_of_the_others_do_not_matter(name: str) -> None:
+def test_masked_points_and_the_order_of_the_others_do_not_matter(name):
     method, capture = SETTINGS[name][0], see_point(name)
     wall, signal = capture.wall.copy(), capture.signal.copy()
     wall[3, 5] = wall[0, 0, 1] = np.nan
@@ -157,7 +151,7 @@ def test_masked_points_and_the_order_of_the_others_do_not_matter(name: str) -> N
 
 
 @pytest.mark.parametrize("name", ["backprojection", "rsd", "hybrid"])
-def test_fields_are_linear_in_the_signal(name: str) -> None:
+def test_fields_are_linear_in_the_signal(name):
     method, capture, random = SETTINGS[name][0], see_point(name), np.random.default_rng(4)
     first, second = (
         replace(capture, signal=random.normal(size=capture.signal.shape)) for _ in range(2)
@@ -170,14 +164,14 @@ def test_fields_are_linear_in_the_signal(name: str) -> None:
 
 
 @imagers
-def test_progress_counts_the_cost_and_may_interrupt_and_the_volume_remembers(name: str) -> None:
+def test_progress_counts_the_cost_and_may_interrupt_and_the_volume_remembers(name):
     (method, settings), capture = SETTINGS[name], replace(see_point(name), provenance={"shot": 7})
-    done: list[int] = []
+    done = []
     volume = method.reconstruct(capture, GRID, done.append)
     assert sum(done) == method.plan(capture, GRID).cost
     assert volume.provenance == {"shot": 7, "imaging": {"method": name, **settings}}
 
-    def interrupt(_: int) -> None:
+    def interrupt(_):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -185,7 +179,7 @@ def test_progress_counts_the_cost_and_may_interrupt_and_the_volume_remembers(nam
 
 
 @every_method
-def test_what_none_can_image_is_refused(method: Any) -> None:
+def test_what_none_can_image_is_refused(method):
     capture, behind = see_nothing(method), Grid(GRID.x, GRID.y, GRID.z - 0.8)
     lone = see_nothing(method, planar_wall(9, 11)[:1, :1])
     assert "one wall point cannot locate anything" in refusal(method, lone, GRID)
@@ -195,7 +189,7 @@ def test_what_none_can_image_is_refused(method: Any) -> None:
     assert "use larger voxels or a smaller box" in reason
 
 
-def large_grid(size_gib: float) -> Grid:
+def large_grid(size_gib):
     """So much at 12 bytes a voxel, evenly spaced, within the record."""
     across, along = (
         np.linspace(*ends, round((size_gib * 2**30 / 12) ** (1 / 3)))
@@ -204,7 +198,7 @@ def large_grid(size_gib: float) -> Grid:
     return Grid(across, across, along)
 
 
-def test_too_many_voxels_for_an_iteration() -> None:
+def test_too_many_voxels_for_an_iteration():
     # A volume of 3 GiB is imaged at once, but not with the dozen volumes that a solver holds.
     method = EVERY["refinement"]
     assert not find_refusal(Hybrid(0.4), see_nothing(method), large_grid(3))
@@ -212,7 +206,7 @@ def test_too_many_voxels_for_an_iteration() -> None:
 
 
 @pulsed_methods
-def test_an_empty_band(make: Callable[[float], Any]) -> None:
+def test_an_empty_band(make):
     method = make(2 * AXIS.spacing)
     reason = refusal(method, see_nothing(method), Grid(GRID.x, GRID.y, [0.4]))
     assert reason.startswith("empty band: time bins of")
@@ -220,7 +214,7 @@ def test_an_empty_band(make: Callable[[float], Any]) -> None:
 
 
 @pulsed_methods
-def test_a_wall_that_is_too_coarse_is_warned_of_in_one_line(make: Callable[[float], Any]) -> None:
+def test_a_wall_that_is_too_coarse_is_warned_of_in_one_line(make):
     method, grid = make(0.15), Grid.box((0, 0.05), (0, 0.05), (0.4, 0.45), 0.025)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -251,6 +245,6 @@ def test_a_wall_that_is_too_coarse_is_warned_of_in_one_line(make: Callable[[floa
         *((Weighting, {"falloff": 1, "obliquity": o}, "weights") for o in (-1, np.inf)),
     ],
 )
-def test_settings_are_checked_at_once(make: Any, arguments: dict[str, Any], message: str) -> None:
+def test_settings_are_checked_at_once(make, arguments, message):
     with pytest.raises(InputError, match=message):
         make(**arguments)

@@ -2,11 +2,8 @@
 no scale factor fitted: amplitude and phase are those of the definition.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -59,21 +56,21 @@ class Case:
     fraction: float = 1.0
 
 
-def see_planar(laser: Any, points: Any = THREE_POINTS, axis: TimeAxis = LONG) -> Capture:
+def see_planar(laser, points=THREE_POINTS, axis=LONG):
     return see(points, planar_wall(), laser, axis, JITTER, [1.0, 0.6, 0.3][: len(points)])
 
 
-def see_scan(wall: np.ndarray, laser: Any, bins: int = 640, points: Any = SHAPED_POINTS) -> Capture:
+def see_scan(wall, laser, bins=640, points=SHAPED_POINTS):
     return see(points, wall, laser, TimeAxis(bins, 32e-12), SHAPED_JITTER)
 
 
-def see_behind(shape: str, grid: Grid) -> Capture:
+def see_behind(shape, grid):
     """Two hidden points towards the corners of a grid."""
     hidden = [[grid.x[2], grid.y[-2], grid.z[0]], [grid.x[-1], grid.y[0], grid.z[1]]]
     return see_scan(shaped_wall(shape, 32), SHAPED_SPOT, 700, hidden)
 
 
-def list_cases() -> Iterator[Any]:
+def list_cases():
     for name, laser in (("single", SPOTS[0]), ("two spots", SPOTS), ("confocal", "confocal")):
         yield f"rsd, {name}", Case(RSD, lambda laser=laser: see_planar(laser))
     # Points two wavelengths apart: the spectrum repeats itself inside the waves that travel.
@@ -128,7 +125,7 @@ CASES = dict(list_cases())
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_field_is_the_exact_sum_within_the_tolerance(name: str) -> None:
+def test_the_field_is_the_exact_sum_within_the_tolerance(name):
     case = CASES[name]
     capture = case.see()
     exact = compute_exact_phasor_field(capture, case.grid, case.method.pulse).values

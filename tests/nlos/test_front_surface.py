@@ -1,17 +1,14 @@
 """Surfaces with normals: depth, albedo and direction of what is seen from the wall."""
 
-from __future__ import annotations
-
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scenes import planar_wall, voxels_of
 
-from nlos import Capture, Grid, PlanarRSD, Volume
+from nlos import Grid, PlanarRSD, Volume
 from nlos.capture import TimeAxis
-from nlos.normals import DirectionalLightCone, FrontSurface, find_front_surface
+from nlos.normals import DirectionalLightCone, find_front_surface
 from nlos.simulate import HiddenScene, Surface
 from tofclip.errors import InputError
 
@@ -21,7 +18,7 @@ GRID = Grid.box((-0.25, 0.35), (-0.35, 0.25), (0.5, 0.9), 0.02)
 
 
 @cache
-def tilted(turn: float, confocal: bool) -> Capture:
+def tilted(turn, confocal):
     """A matte square of 0.4 m, turned about y by so many degrees."""
     angle = np.radians(turn)
     u, v = 0.2 * np.array([np.cos(angle), 0, np.sin(angle)]), np.array([0, 0.2, 0])
@@ -32,7 +29,7 @@ def tilted(turn: float, confocal: bool) -> Capture:
     return HiddenScene([square]).simulate_capture(WALL, laser, TimeAxis(200, 50e-12), 60e-12)
 
 
-def find_surface(turn: float, confocal: bool) -> FrontSurface:
+def find_surface(turn, confocal):
     capture = tilted(turn, confocal)
     if confocal:
         return DirectionalLightCone().find_front_surface(capture, GRID, 0.4)
@@ -41,7 +38,7 @@ def find_surface(turn: float, confocal: bool) -> FrontSurface:
 
 @pytest.mark.parametrize("confocal", [True, False])
 @pytest.mark.parametrize("turn", [0.0, 30.0, -30.0])
-def test_a_tilted_square_has_its_depth_and_direction(turn: float, confocal: bool) -> None:
+def test_a_tilted_square_has_its_depth_and_direction(turn, confocal):
     found, angle = find_surface(turn, confocal), np.radians(turn)
     x, y, z = found.points.T
     inner = (np.abs(x - CENTRE[0]) < 0.1) & (np.abs(y - CENTRE[1]) < 0.1)
@@ -56,7 +53,7 @@ def test_a_tilted_square_has_its_depth_and_direction(turn: float, confocal: bool
     assert np.median(errors) < 12
 
 
-def test_a_surface_is_written_with_normals(tmp_path: Path) -> None:
+def test_a_surface_is_written_with_normals(tmp_path):
     import pyvista
 
     found = find_surface(30.0, True)
@@ -83,12 +80,12 @@ DARK, FLAT = Volume(np.zeros(GRID.shape), GRID), Grid(GRID.x, GRID.y, GRID.z[:2]
         (DARK, 1.5, "a fraction from 0 to 1"),
     ],
 )
-def test_what_shows_no_surface_is_refused(volume: Volume, fraction: float, reason: str) -> None:
+def test_what_shows_no_surface_is_refused(volume, fraction, reason):
     with pytest.raises(InputError, match=reason):
         find_front_surface(volume, fraction)
 
 
-def test_a_sphere_has_its_normals() -> None:
+def test_a_sphere_has_its_normals():
     """A bright shell about a centre: brightness changes most towards it."""
     centre, radius = CENTRE + np.array([0, 0, 0.15]), 0.3
     away = voxels_of(GRID) - centre

@@ -1,7 +1,5 @@
 """Scans of many laser spots: several fields added up, and roles swapped."""
 
-from __future__ import annotations
-
 import tracemalloc
 from functools import cache
 
@@ -22,13 +20,13 @@ GRID = Grid.box((-0.4, 0.4), (-0.4, 0.4), (0.55, 1.0), 0.04)
 LASERS = np.array([[0.1, 0.05, 0.0], [-0.15, 0.2, 0.0]])
 
 
-def lattice(points: int, curved: bool = False) -> np.ndarray:
+def lattice(points, curved=False):
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, points), np.linspace(-0.5, 0.5, points))
     return np.stack([x, y, 0.1 * x**2 if curved else 0 * x], axis=-1)
 
 
 @cache
-def exhaustive(kind: str, points: int = 16) -> Capture:
+def exhaustive(kind, points=16):
     """Two spots, each seen by all points of a wall; or all points lit in turns, seen by two."""
     wall = lattice(points, "curved" in kind)
     signals = [SCENE.simulate_capture(wall, spot, AXIS, JITTER).signal for spot in LASERS]
@@ -40,7 +38,7 @@ def exhaustive(kind: str, points: int = 16) -> Capture:
 
 
 @pytest.mark.parametrize("kind", ["planar", "curved", "planar, scanned", "curved, scanned"])
-def test_many_spots_show_what_backprojection_shows(kind: str) -> None:
+def test_many_spots_show_what_backprojection_shows(kind):
     capture = exhaustive(kind)
     method = Hybrid(WAVELENGTH) if "curved" in kind else PlanarRSD(WAVELENGTH)
     exact = Backprojection(WAVELENGTH).reconstruct(capture, GRID)
@@ -50,7 +48,7 @@ def test_many_spots_show_what_backprojection_shows(kind: str) -> None:
     assert found.provenance["imaging"]["method"] in ("rsd", "hybrid")
 
 
-def test_spots_that_light_the_same_wall_share_one_plan() -> None:
+def test_spots_that_light_the_same_wall_share_one_plan():
     plan = PlanarRSD(WAVELENGTH).plan(exhaustive("planar"), GRID)
     assert plan.images == 2
     assert plan.groups[0].plane_to_depths is plan.groups[1].plane_to_depths
@@ -61,7 +59,7 @@ def test_spots_that_light_the_same_wall_share_one_plan() -> None:
 
 
 @pytest.mark.parametrize("spots", [1, 2, 4])
-def test_a_plan_keeps_no_more_than_it_announces_however_many_spots(spots: int) -> None:
+def test_a_plan_keeps_no_more_than_it_announces_however_many_spots(spots):
     """Each spot is seen by a part of the wall of its own, and so has a plane of its own."""
     wall = lattice(20, curved=True).reshape(-1, 3)
     lasers = np.outer(np.arange(len(wall)) * spots // len(wall), [0.05, 0.02, 0.0])
@@ -80,7 +78,7 @@ def test_a_plan_keeps_no_more_than_it_announces_however_many_spots(spots: int) -
     assert most < 2 * plan.memory_bytes
 
 
-def test_a_scan_by_the_laser_is_imaged_by_default() -> None:
+def test_a_scan_by_the_laser_is_imaged_by_default():
     capture = exhaustive("planar, scanned")
     settings = settings_for(capture, wavelength=WAVELENGTH)
     # 512 pairs for two images, as if the two detectors were the laser spots.
@@ -93,7 +91,7 @@ def test_a_scan_by_the_laser_is_imaged_by_default() -> None:
     assert found.x == pytest.approx((-0.5, 0.5), abs=0.05)
 
 
-def test_a_lone_detector_is_not_the_brightest() -> None:
+def test_a_lone_detector_is_not_the_brightest():
     """Its own surroundings are near every pair; as a laser spot it shows what is hidden."""
     capture = exhaustive("planar, scanned")
     one = Capture(capture.signal[..., :1], capture.wall[:, :, :1], capture.laser[:, :, :1], 32e-12)
@@ -106,7 +104,7 @@ def test_a_lone_detector_is_not_the_brightest() -> None:
     assert method.reconstruct(counts, grid).find_brightest()[2] == pytest.approx(0.01)
 
 
-def test_scans_by_the_laser_are_refined() -> None:
+def test_scans_by_the_laser_are_refined():
     capture, grid = exhaustive("planar, scanned", 8), Grid(GRID.x[::2], GRID.y[::2], GRID.z[::2])
     longer = Hybrid(2 * WAVELENGTH)
     shot = longer.reconstruct(capture, grid)

@@ -1,7 +1,5 @@
 """Settings found from a capture: the gate, the wavelength, the voxels, the box, the method."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -22,12 +20,12 @@ HIDDEN = [[0.05, -0.1, 0.8]]
 AXIS = TimeAxis(400, 16e-12)
 
 
-def clean(confocal: bool = True) -> Capture:
+def clean(confocal=True):
     laser = WALL if confocal else [0.0, 0.0, 0.0]
     return see(HIDDEN, WALL, laser, AXIS, 40e-12, [400.0])
 
 
-def with_glare(capture: Capture, peak: float, fades: float = 0.05) -> Capture:
+def with_glare(capture, peak, fades=0.05):
     """Add the wall's own light, which fades by e over so much path."""
     direct = np.linalg.norm(capture.wall - capture.laser, axis=-1)
     late = capture.axis.paths[:, None, None] - direct
@@ -37,7 +35,7 @@ def with_glare(capture: Capture, peak: float, fades: float = 0.05) -> Capture:
 
 @pytest.mark.parametrize("confocal", [True, False])
 @pytest.mark.parametrize("peak", [2.0, 1000.0])
-def test_the_walls_own_light_is_recognised_and_gated(confocal: bool, peak: float) -> None:
+def test_the_walls_own_light_is_recognised_and_gated(confocal, peak):
     bounce = find_first_bounce(with_glare(clean(confocal), peak))
     assert bounce is not None
     settings = settings_for(with_glare(clean(confocal), peak))
@@ -48,7 +46,7 @@ def test_the_walls_own_light_is_recognised_and_gated(confocal: bool, peak: float
     assert volume.find_brightest() == pytest.approx(HIDDEN[0], abs=0.06)
 
 
-def lit_late(hidden: float, confocal: bool, peak: float = 0.0, fades: float = 1.0) -> Capture:
+def lit_late(hidden, confocal, peak=0.0, fades=1.0):
     """Every wall point sees light of brightness 1 that much path (m) after the wall's own."""
     axis, laser = TimeAxis(1700, 3e-12), WALL if confocal else np.zeros(3)
     late = axis.paths[:, None, None] - np.linalg.norm(WALL - laser, axis=-1)
@@ -65,9 +63,7 @@ begin.
 
 @pytest.mark.parametrize("confocal", [True, False])
 @pytest.mark.parametrize("peak", [10.0, 1000.0])
-def test_the_gate_ends_where_the_walls_light_is_a_tenth_of_what_follows(
-    confocal: bool, peak: float
-) -> None:
+def test_the_gate_ends_where_the_walls_light_is_a_tenth_of_what_follows(confocal, peak):
     for fades in np.linspace(0.04, 0.06, 5):
         bounce = find_first_bounce(lit_late(1.2, confocal, peak, fades))
         assert bounce is not None
@@ -78,8 +74,8 @@ def test_the_gate_ends_where_the_walls_light_is_a_tenth_of_what_follows(
 
 @pytest.mark.parametrize("depth", [0.5, 0.8, 1.3])
 def test_the_wavelength_is_the_shortest_that_the_wall_samples_at_the_hidden_depth(
-    depth: float,
-) -> None:
+    depth,
+):
     """A flash, of all waves alike: 20 % of the pulse's may be finer than the wall samples."""
     wall = planar_wall(32, 32) * 0.6
     # 0.6 mm of path, and light of 1 mm, that all waves of centimetres are alike in.
@@ -97,7 +93,7 @@ def test_the_wavelength_is_the_shortest_that_the_wall_samples_at_the_hidden_dept
     assert 0.95 * expected < found < 1.06 * expected
 
 
-def test_nothing_is_gated_where_the_wall_is_dark() -> None:
+def test_nothing_is_gated_where_the_wall_is_dark():
     assert find_first_bounce(clean()) is None
     settings = settings_for(clean())
     assert (settings.gate, settings.gate_found) == (None, False)
@@ -106,7 +102,7 @@ def test_nothing_is_gated_where_the_wall_is_dark() -> None:
     assert settings_for(clean(), wavelength=0.3).wavelength == 0.3
 
 
-def test_a_record_that_begins_amid_the_walls_own_light_is_gated_alike() -> None:
+def test_a_record_that_begins_amid_the_walls_own_light_is_gated_alike():
     capture = with_glare(clean(), 2.0)
     late = replace(capture, signal=capture.signal[20:], start=20 * AXIS.spacing)
     whole, cut = find_first_bounce(capture), find_first_bounce(late)
@@ -118,7 +114,7 @@ def test_a_record_that_begins_amid_the_walls_own_light_is_gated_alike() -> None:
     assert find_first_bounce(hidden) is None
 
 
-def test_what_comes_before_the_walls_own_light_can_is_noise() -> None:
+def test_what_comes_before_the_walls_own_light_can_is_noise():
     """Recovered frames are not dark before: their noise is no light of the wall's."""
     capture = clean(confocal=False)
     early = capture.axis.paths[:, None, None] < np.linalg.norm(WALL, axis=-1) - 0.15
@@ -126,7 +122,7 @@ def test_what_comes_before_the_walls_own_light_can_is_noise() -> None:
     assert find_first_bounce(replace(capture, signal=capture.signal + noise)) is None
 
 
-def test_background_is_not_the_walls_own_light() -> None:
+def test_background_is_not_the_walls_own_light():
     """Few counts before anything else, of which some are the first: nothing fades after them."""
     capture = clean(confocal=False)
     for seed in range(5):
@@ -135,7 +131,7 @@ def test_background_is_not_the_walls_own_light() -> None:
 
 
 @pytest.mark.nightly
-def test_noise_makes_the_wave_longer_and_nothing_makes_it_jump() -> None:
+def test_noise_makes_the_wave_longer_and_nothing_makes_it_jump():
     """From photons whose spectrum tells the wave to so few that pictures have to."""
     random, light = np.random.default_rng(1), clean().signal / clean().signal.max()
     found = []
@@ -149,7 +145,7 @@ def test_noise_makes_the_wave_longer_and_nothing_makes_it_jump() -> None:
     assert "picture" in found[2].reasons["wavelength"]
 
 
-def test_transforms_see_the_lattice_whatever_the_wavelength() -> None:
+def test_transforms_see_the_lattice_whatever_the_wavelength():
     by_wave, by_lattice = (
         complete_settings(clean(), Settings()),
         complete_settings(clean(), Settings(method="fk")),
@@ -160,7 +156,7 @@ def test_transforms_see_the_lattice_whatever_the_wavelength() -> None:
     assert by_lattice.voxel == pytest.approx(bins * AXIS.spacing / 3)
 
 
-def test_a_bright_wall_is_noticed() -> None:
+def test_a_bright_wall_is_noticed():
     """Nearer than half a wavelength to a wall point."""
     x, y, _ = clean().points[100]
     grid = Grid([x, x + 0.2], [y], [0.01, 0.045, 0.055, 0.07, 0.09, 0.5])
@@ -171,15 +167,13 @@ def test_a_bright_wall_is_noticed() -> None:
 
 
 @pytest.mark.parametrize(("confocal", "seed"), [(True, 1), (False, 2)])
-def test_evidence_separates_a_scene_from_noise_and_from_a_shuffled_record(
-    confocal: bool, seed: int
-) -> None:
+def test_evidence_separates_a_scene_from_noise_and_from_a_shuffled_record(confocal, seed):
     counts = add_poisson_noise(clean(confocal), 300, 0.5, seed)
     random, signal = np.random.default_rng(seed), counts.signal
     shuffled = random.permutation(signal.reshape(400, -1), axis=1).reshape(signal.shape)
     noise = random.poisson(0.5, signal.shape)
 
-    def judge(capture: Capture) -> float:
+    def judge(capture):
         return prepare_imaging(capture, Settings()).measure_evidence()
 
     assert judge(counts) > 2 * MIN_EVIDENCE
@@ -187,7 +181,7 @@ def test_evidence_separates_a_scene_from_noise_and_from_a_shuffled_record(
     assert judge(replace(counts, signal=noise)) < MIN_EVIDENCE
 
 
-def test_settings_do_not_hang_on_the_order_of_points_or_the_seed() -> None:
+def test_settings_do_not_hang_on_the_order_of_points_or_the_seed():
     random, found = np.random.default_rng(3), []
     everyone = np.arange(clean().valid.size)
     shuffled, fewer = random.permutation(everyone), everyone[everyone % 100 > 0]
@@ -199,7 +193,7 @@ def test_settings_do_not_hang_on_the_order_of_points_or_the_seed() -> None:
     assert max(found) < 1.1 * min(found)
 
 
-def test_pictures_choose_where_noise_is_coloured_in_any_order_of_points() -> None:
+def test_pictures_choose_where_noise_is_coloured_in_any_order_of_points():
     """Noise that neighbouring bins share, as of recovered frames."""
     counts = add_poisson_noise(clean(), 100, 0.5, 0)
     counts = replace(counts, signal=counts.signal + 0.25 * np.roll(counts.signal, 1, axis=0))
@@ -212,7 +206,7 @@ def test_pictures_choose_where_noise_is_coloured_in_any_order_of_points() -> Non
     assert one.wavelength == two.wavelength
 
 
-def test_reconstructing_says_what_was_found_and_why() -> None:
+def test_reconstructing_says_what_was_found_and_why():
     volume = reconstruct(add_poisson_noise(clean(), 300, 0.5, seed=1))
     assert volume.find_brightest() == pytest.approx(HIDDEN[0], abs=0.03)
     imaging = volume.provenance["imaging"]
@@ -222,7 +216,7 @@ def test_reconstructing_says_what_was_found_and_why() -> None:
     assert measure_point_spread(volume).x == pytest.approx(widths["x"], rel=0.2)
 
 
-def test_the_box_before_a_wall_with_relief_begins_by_its_middle() -> None:
+def test_the_box_before_a_wall_with_relief_begins_by_its_middle():
     """Of 30 cm of relief, the hindmost points see things that the foremost ones' gate blanks."""
     wall = WALL.copy()
     wall[..., 2] = 0.3 * (wall[..., 0] > 0)
@@ -261,9 +255,7 @@ def test_the_box_before_a_wall_with_relief_begins_by_its_middle() -> None:
         ({"wall": np.zeros((24, 24, 3)), "laser": np.zeros(3)}, {}, "stand in one place"),
     ],
 )
-def test_what_no_picture_can_come_of_is_refused_in_one_line(
-    changes: dict[str, object], given: dict[str, float], reason: str
-) -> None:
+def test_what_no_picture_can_come_of_is_refused_in_one_line(changes, given, reason):
     with pytest.raises(InputError, match=reason) as refused:
         settings_for(replace(clean(confocal=False), **changes), **given)
     assert "\n" not in str(refused.value)

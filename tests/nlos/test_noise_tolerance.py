@@ -1,7 +1,5 @@
 """Noise comes from everywhere at any time, by grazing ways too: there tolerances are hardest to keep."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +15,7 @@ from scenes import (
     shaped_wall,
 )
 
-from nlos import Capture, Grid, Hybrid, PlanarRSD
+from nlos import Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
 
 # As wide as the wall, so that voxels and points stand in opposite corners; so many depths that some
@@ -32,7 +30,7 @@ NOISE, COUNTS, POINTS_AND_COUNTS = "noise of mean 0", "counts of a background", 
 PHOTONS, BACKGROUND = 20.0, 5.0
 
 
-def count_photons(background: str, light: np.ndarray) -> np.ndarray:
+def count_photons(background, light):
     """Signals of the shape of the light of some hidden points."""
     random, bright = np.random.default_rng(1), PHOTONS * light / np.nanmax(light)
     if background == NOISE:
@@ -40,7 +38,7 @@ def count_photons(background: str, light: np.ndarray) -> np.ndarray:
     return random.poisson(BACKGROUND + (bright if background == POINTS_AND_COUNTS else 0 * bright))
 
 
-def see_noise(shape: str, count: int, bins: int, background: str, scan: str = "single") -> Capture:
+def see_noise(shape, count, bins, background, scan="single"):
     """Counts of light that four hidden points send to a wall, or of none, or noise alone."""
     wall = shaped_wall(shape, count)
     spot = wall if scan == "confocal" else SHAPED_SPOT
@@ -49,9 +47,7 @@ def see_noise(shape: str, count: int, bins: int, background: str, scan: str = "s
     return replace(capture, signal=count_photons(background, light).astype(np.float32))
 
 
-def list_errors(
-    method: type[PlanarRSD] | type[Hybrid], capture: Capture, grid: Grid, wavelength: float
-) -> list[float]:
+def list_errors(method, capture, grid, wavelength):
     """Errors against the plain sum over the record and the silence after it, as multiples of what
     tolerances of 1e-2 and 1e-3 allow.
     """
@@ -75,9 +71,7 @@ NARROWEST = (PlanarRSD, "planar", "confocal"), (Hybrid, "wavy", "confocal")
         for one in ((method, shape, scan) for shape, method in WALLS for scan in WAVELENGTHS)
     ],
 )
-def test_a_tolerance_is_kept(
-    method: type[PlanarRSD] | type[Hybrid], shape: str, scan: str, bins: int
-) -> None:
+def test_a_tolerance_is_kept(method, shape, scan, bins):
     for background in (NOISE, COUNTS, POINTS_AND_COUNTS) if bins == LONG else (NOISE,):
         capture = see_noise(shape, 24, bins, background, scan)
         errors = list_errors(method, capture, GRID, WAVELENGTHS[scan])
@@ -87,9 +81,7 @@ def test_a_tolerance_is_kept(
 @pytest.mark.parametrize(
     ("shape", "method"), [pytest.param(*WALLS[0], marks=pytest.mark.nightly), ("cylinder", Hybrid)]
 )
-def test_a_tolerance_is_kept_where_many_depths_are_interpolated(
-    shape: str, method: type[PlanarRSD] | type[Hybrid]
-) -> None:
+def test_a_tolerance_is_kept_where_many_depths_are_interpolated(shape, method):
     capture = see_noise(shape, 24, SHORT, POINTS_AND_COUNTS)
     assert max(list_errors(method, capture, FINE_DEPTHS, WAVELENGTHS["single"])) < 1
 
@@ -97,9 +89,7 @@ def test_a_tolerance_is_kept_where_many_depths_are_interpolated(
 @pytest.mark.nightly
 @pytest.mark.parametrize("scan", WAVELENGTHS)
 @pytest.mark.parametrize(("shape", "method"), WALLS)
-def test_a_tolerance_is_kept_on_64_x_64_points(
-    shape: str, method: type[PlanarRSD] | type[Hybrid], scan: str
-) -> None:
+def test_a_tolerance_is_kept_on_64_x_64_points(shape, method, scan):
     grid = Grid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 7), [0.6, 0.75, 1.6])
     wavelength = {"single": 0.125, "confocal": 0.25}[scan]
     for background in (NOISE, POINTS_AND_COUNTS):

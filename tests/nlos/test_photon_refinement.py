@@ -1,16 +1,13 @@
 """`--refine photons`: albedo by the statistics of counts and the time of flight."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
 from scenes import distance_to_nearest, energy_fraction, planar_wall, see
 
-from nlos import Capture, Grid, Hybrid, Volume
+from nlos import Capture, Grid, Hybrid
 from nlos.capture import TimeAxis
 from nlos.refinement.photons import (
     HELD_OUT_FRACTION,
@@ -41,27 +38,27 @@ BACKGROUND = 0.02
 
 
 @cache
-def expected(wall: str, scene: str, points: int) -> Capture:
+def expected(wall, scene, points):
     """Light of five points, or of two letters, before noise; one laser spot."""
     hidden = PointScene(POINTS) if scene == "points" else letters()
     return hidden.simulate_capture(build_relay_wall(wall, points), np.zeros(3), AXIS, 20e-12)
 
 
 @cache
-def letters() -> HiddenScene:
+def letters():
     height = 0.6
     left = Surface.letters("L", (-0.3, 0.0, 0.8), height, 0.02)
     return HiddenScene([left, Surface.letters("N", (0.3, 0.0, 1.0), height, 0.02)])
 
 
-def count(wall: str, scene: str, photons: float, points: int, seed: int) -> Capture:
+def count(wall, scene, photons, points, seed):
     """Draw counts: so many photons of hidden things per wall point of 64 x 64, and background."""
     light = expected(wall, scene, points)
     peak = photons * 64**2 * float(light.signal.max()) / float(light.signal.sum(dtype=float))
     return add_poisson_noise(light, peak, BACKGROUND, seed)
 
 
-def mask_of(scene: str, grid: Grid) -> np.ndarray:
+def mask_of(scene, grid):
     """Voxels within 4 cm of a point, or that hold a piece of a letter."""
     if scene == "points":
         return distance_to_nearest(grid, POINTS) <= 0.04
@@ -72,7 +69,7 @@ def mask_of(scene: str, grid: Grid) -> np.ndarray:
     return mask
 
 
-def score_brightest(volume: Volume, occupied: np.ndarray) -> float:
+def score_brightest(volume, occupied):
     """Of the K brightest voxels, the fraction that is occupied, where K voxels are."""
     brightest = np.argsort(-volume.magnitude, axis=None, kind="stable")
     return float(np.mean(occupied.ravel()[brightest[: np.count_nonzero(occupied)]]))
@@ -80,7 +77,7 @@ def score_brightest(volume: Volume, occupied: np.ndarray) -> float:
 
 @pytest.mark.parametrize("obliquity", [0, 2])
 @pytest.mark.parametrize("laser", ["spot", "confocal"])
-def test_light_and_backprojection_are_adjoint(obliquity: int, laser: str) -> None:
+def test_light_and_backprojection_are_adjoint(obliquity, laser):
     wall, random = build_relay_wall("wavy", 6), np.random.default_rng(1)
     spot = wall if laser == "confocal" else np.array([0.1, 0.0, -0.1])
     capture = Capture(np.zeros((200, 6, 6)), wall, spot, 40e-12, 1.2)
@@ -94,7 +91,7 @@ def test_light_and_backprojection_are_adjoint(obliquity: int, laser: str) -> Non
     assert np.sum(light * values) == pytest.approx(np.sum(albedo * back), rel=1e-5)
 
 
-def test_a_small_voxels_light_is_that_of_a_point() -> None:
+def test_a_small_voxels_light_is_that_of_a_point():
     capture = expected("cylinder", "points", 8)
     x, y, z = POINTS[1]
     grid = Grid(x + np.array([0.0, 1e-3]), y + np.array([0.0, 1e-3]), z + np.array([0.0, 1e-3]))
@@ -109,7 +106,7 @@ def test_a_small_voxels_light_is_that_of_a_point() -> None:
 
 
 @pytest.mark.parametrize("wall", ["planar", "cylinder"])
-def test_few_photons_show_points(wall: str) -> None:
+def test_few_photons_show_points(wall):
     """1.15 photons per wall point of 64 x 64, on 16 x 16 points: as many in all."""
     near = mask_of("points", COARSE)
     capture = count(wall, "points", 1.15, 16, seed=0)
@@ -125,7 +122,7 @@ def test_few_photons_show_points(wall: str) -> None:
     assert history["photons_of_hidden_things"] == pytest.approx(1.15 * 64**2, rel=0.2)
 
 
-def test_few_photons_show_letters() -> None:
+def test_few_photons_show_letters():
     mask = mask_of("letters", COARSE)
     capture = count("planar", "letters", 5.7, 16, seed=1)
     refined = PhotonRefinement(LINEAR, iterations=4).reconstruct(capture, COARSE)
@@ -138,7 +135,7 @@ def test_few_photons_show_letters() -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("wall", ["planar", "cylinder"])
 @pytest.mark.parametrize(("photons", "least"), [(1147, 0.63), (5.7, 0.5), (1.15, 0.2)])
-def test_points_at_all_levels(wall: str, photons: float, least: float) -> None:
+def test_points_at_all_levels(wall, photons, least):
     near = mask_of("points", FINE)
     for seed in range(5):
         capture = count(wall, "points", photons, 64, seed)
@@ -148,7 +145,7 @@ def test_points_at_all_levels(wall: str, photons: float, least: float) -> None:
         assert score_brightest(refined, near) >= linear
 
 
-def test_background_alone_shows_the_linear_image() -> None:
+def test_background_alone_shows_the_linear_image():
     """Noise is explained best by no scene at all: photons that were set aside tell."""
     light = expected("planar", "points", 16)
     for seed in range(2):
@@ -159,7 +156,7 @@ def test_background_alone_shows_the_linear_image() -> None:
         assert np.array_equal(refined.values, LINEAR.reconstruct(capture, SMALL).values)
 
 
-def test_photons_set_aside_know_nothing_of_the_others() -> None:
+def test_photons_set_aside_know_nothing_of_the_others():
     capture = count("planar", "points", 20, 16, seed=0)
     photons = CountedPhotons.of(capture)
     kept, held = photons.hold_out(0.25, seed=1)
@@ -170,7 +167,7 @@ def test_photons_set_aside_know_nothing_of_the_others() -> None:
     assert abs(held.sum() - total / 4) < 4 * np.sqrt(total * 3 / 16)
 
 
-def test_brightness_of_known_light_is_found() -> None:
+def test_brightness_of_known_light_is_found():
     capture = count("planar", "points", 20, 16, seed=0)
     photons, light = CountedPhotons.of(capture), expected("planar", "points", 16).traces()
     found = fit_brightness(photons, light)
@@ -182,7 +179,7 @@ def test_brightness_of_known_light_is_found() -> None:
     assert gain > 10 * noise > 0
 
 
-def test_the_walls_own_light_is_left_out_of_account() -> None:
+def test_the_walls_own_light_is_left_out_of_account():
     """Glare in the first 0.2 m after the direct path changes nothing but what it blanks."""
     capture = count("planar", "points", 20, 16, seed=2)
     direct = np.linalg.norm(capture.wall - capture.laser, axis=-1)
@@ -201,7 +198,7 @@ def test_the_walls_own_light_is_left_out_of_account() -> None:
         (lambda signal: 0 * signal, "every signal is 0"),
     ],
 )
-def test_what_is_not_counted_is_refused(change: Any, reason: str) -> None:
+def test_what_is_not_counted_is_refused(change, reason):
     capture = count("planar", "points", 20, 8, seed=0)
     with pytest.raises(InputError, match=reason) as refused:
         CountedPhotons.of(replace(capture, signal=change(capture.signal)))
@@ -217,7 +214,7 @@ SHORT, WALL = TimeAxis(256, 32e-12), planar_wall(8, 8)
 GRID = Grid(np.linspace(-0.4, 0.4, 9), np.linspace(-0.4, 0.4, 9), np.linspace(0.5, 1.0, 6))
 
 
-def make_fit(wall: np.ndarray, grid: Grid, albedo: np.ndarray, sigma: float = 0.0) -> PhotonFit:
+def make_fit(wall, grid, albedo, sigma=0.0):
     """A fit that explains the photons of this albedo, without noise, and of a background."""
     capture = Capture(np.ones((SHORT.bins, *wall.shape[:2])), wall, wall, SHORT.bin_width)
     model = TimeOfFlight(capture, grid, build_response(sigma))
@@ -228,14 +225,14 @@ def make_fit(wall: np.ndarray, grid: Grid, albedo: np.ndarray, sigma: float = 0.
     return PhotonFit(photons, model, voxels, np.maximum(albedo, 1e-3), 0.0)
 
 
-def point_albedo(grid: Grid, *places: tuple[float, float, float]) -> np.ndarray:
+def point_albedo(grid, *places):
     albedo = np.zeros(grid.shape)
     for place in places:
         albedo[grid.find_nearest(place)] = 1
     return albedo.ravel()
 
 
-def test_photons_set_aside_prefer_the_fit_that_is_as_bright_as_the_scene() -> None:
+def test_photons_set_aside_prefer_the_fit_that_is_as_bright_as_the_scene():
     fit = make_fit(WALL, GRID, point_albedo(GRID, (0.1, 0.0, 0.7), (-0.2, 0.2, 0.9)))
     fit.improve(1)
     # What the kept photons are of is what this fit expects; of all photons a tenth was set aside.
@@ -249,7 +246,7 @@ def test_photons_set_aside_prefer_the_fit_that_is_as_bright_as_the_scene() -> No
     assert max(gains, key=lambda scale: gains[scale]) == 1.0
 
 
-def test_what_voxels_pay_does_not_depend_on_the_parts_of_the_wall() -> None:
+def test_what_voxels_pay_does_not_depend_on_the_parts_of_the_wall():
     """Subsets are quicker, and end at the same light."""
     ends = []
     for subsets in (1, 4):
@@ -266,7 +263,7 @@ def test_what_voxels_pay_does_not_depend_on_the_parts_of_the_wall() -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.0, 2.0])
-def test_a_point_is_as_sharp_as_response_bin_and_wall_make_it(sigma: float) -> None:
+def test_a_point_is_as_sharp_as_response_bin_and_wall_make_it(sigma):
     """Two rings of wall points about a point's foot, each lit where it is seen: paths of 2 *
     hypot(radius, depth), whose light falls with the fourth power of the distance.
     """

@@ -2,11 +2,7 @@
 to end, in little memory, and with one plan for many captures.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -63,28 +59,28 @@ SHAPED = Grid.box((-0.7, 0.6), (-0.5, 0.5), (0.7, 1.1), (0.13, 0.11, 0.1))
 RSD, HYBRID, BACKPROJECTION = PlanarRSD(0.125), Hybrid(0.4), Backprojection(0.15)
 
 
-def see_planar(laser: Any = SPOTS[0]) -> Capture:
+def see_planar(laser=SPOTS[0]):
     return see(THREE_POINTS, planar_wall(), laser, LONG, JITTER, [1.0, 0.6, 0.3])
 
 
-def see_curved(laser: str) -> Capture:
+def see_curved(laser):
     return see([HIDDEN, (-0.2, 0.1, 0.5)], curved_wall(9, 11), laser)
 
 
-def mask(capture: Capture, *places: tuple[int, int]) -> Capture:
+def mask(capture, *places):
     wall = capture.wall.copy()
     for place in places:
         wall[place] = np.nan
     return replace(capture, wall=wall)
 
 
-def shuffle(capture: Capture) -> Capture:
+def shuffle(capture):
     """The same wall points as a list in any order."""
     order = np.random.default_rng(5).permutation(len(capture.points))
     return replace(capture, wall=capture.points[order], signal=capture.traces().T[:, order])
 
 
-def scatter(capture: Capture) -> Capture:
+def scatter(capture):
     """Move the wall points about, so that they stand above no lattice."""
     wall, confocal = capture.wall.copy(), capture.laser.ndim > 1
     wall[..., :2] += np.random.default_rng(1).uniform(-0.05, 0.05, (*wall.shape[:-1], 2))
@@ -107,7 +103,7 @@ class Case:
     faster: bool | None = None  # what is said of Fourier transforms from the wall to the plane
 
 
-def list_cases() -> Iterator[tuple[str, Case]]:
+def list_cases():
     for name, laser in (("single", SPOTS[0]), ("two spots", SPOTS), ("confocal", "confocal")):
         strict = replace(RSD, tolerance=1e-3 if name == "single" else 1e-2)
         yield f"rsd, {name}", Case(strict, see_planar(laser), GRID, 1e-5)
@@ -146,7 +142,7 @@ CASES = dict(list_cases())
 
 
 @pytest.fixture
-def case(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Case:
+def case(request, monkeypatch):
     """Walls as small as those of these tests would all go by direct sums."""
     case = CASES[request.param]
     if case.faster is not None:
@@ -155,7 +151,7 @@ def case(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Cas
 
 
 @pytest.mark.parametrize("case", CASES, indirect=True)
-def test_the_field_is_that_of_the_compiled_loops(case: Case) -> None:
+def test_the_field_is_that_of_the_compiled_loops(case):
     """By PyTorch; `test_fields_stay_on_their_device` compares those of a stricter library."""
     moved = case.capture.on(find_device("torch"))
     found = case.method.phasor_field(moved, case.grid)
@@ -167,8 +163,8 @@ def test_the_field_is_that_of_the_compiled_loops(case: Case) -> None:
 
 
 def test_the_field_on_a_plane_is_that_of_the_compiled_loops(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
     capture = see_shaped("cylinder", 12)
     plane = HYBRID.plan(capture, SHAPED).plane
@@ -185,7 +181,7 @@ def test_the_field_on_a_plane_is_that_of_the_compiled_loops(
 
 
 @libraries
-def test_a_volume_looks_the_same_wherever_it_lives(library: str, tmp_path: Path) -> None:
+def test_a_volume_looks_the_same_wherever_it_lives(library, tmp_path):
     expected = RSD.reconstruct(see_planar(), GRID)
     found = RSD.reconstruct(see_planar().on(find_device(library)), GRID)
     here = found.on(ComputeDevice())
@@ -204,9 +200,7 @@ def test_a_volume_looks_the_same_wherever_it_lives(library: str, tmp_path: Path)
 
 
 @libraries
-def test_a_capture_is_checked_stored_and_prepared_where_it_lives(
-    library: str, tmp_path: Path
-) -> None:
+def test_a_capture_is_checked_stored_and_prepared_where_it_lives(library, tmp_path):
     capture, device = see_planar(), find_device(library)
     moved = capture.on(device)
     assert moved.device == device
@@ -230,7 +224,7 @@ def test_a_capture_is_checked_stored_and_prepared_where_it_lives(
         np.testing.assert_allclose(to_numpy(found.signal), expected.signal, rtol=1e-6, atol=1e-6)
 
 
-PREPARATIONS: tuple[Callable[[Capture], Capture], ...] = (
+PREPARATIONS = (
     lambda capture: crop_capture(capture, 0.495, 0.805),
     lambda capture: rebin_capture(capture, 8),
     lambda capture: remove_first_bounce(capture, 0.25),
@@ -243,7 +237,7 @@ PREPARATIONS: tuple[Callable[[Capture], Capture], ...] = (
 @pytest.mark.parametrize(
     "case", ["rsd, single", "hybrid, spots, True", "hybrid, spots, False"], indirect=True
 )
-def test_what_is_planned_images_many_captures(library: str, case: Case) -> None:
+def test_what_is_planned_images_many_captures(library, case):
     first = case.capture
     other = replace(first, signal=0.7 * first.signal[:, ::-1])
     device = find_device(library)
@@ -255,7 +249,7 @@ def test_what_is_planned_images_many_captures(library: str, case: Case) -> None:
         assert found.provenance == expected.provenance
 
 
-def test_what_is_planned_refuses_other_captures() -> None:
+def test_what_is_planned_refuses_other_captures():
     capture = see_planar().on(find_device("torch"))
     plan = RSD.plan(capture, GRID)
     for other, reason in (
@@ -270,9 +264,7 @@ def test_what_is_planned_refuses_other_captures() -> None:
 
 @pytest.mark.parametrize("kept", [1 << 30, 0])
 @pytest.mark.parametrize("name", ["rsd, single", "hybrid, transforms, wavy", "hybrid, direct, 1"])
-def test_little_memory_means_smaller_pieces(
-    name: str, kept: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_little_memory_means_smaller_pieces(name, kept, monkeypatch):
     """Every depth alone, and planned anew for every capture where no tables may be kept."""
     case, counted = CASES[name], list[int]()
     monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: case.faster)
@@ -289,16 +281,14 @@ def test_little_memory_means_smaller_pieces(
 
 
 @pytest.mark.parametrize("laser", ["single", "paired"])
-def test_pieces_of_a_backprojection_make_up_the_whole_and_progress_counts_them(
-    laser: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pieces_of_a_backprojection_make_up_the_whole_and_progress_counts_them(laser, monkeypatch):
     capture = see_curved(laser).on(find_device("array_api_strict"))
     layer = Grid(UNEVEN.x, UNEVEN.y, UNEVEN.z[1:2])
     whole = to_numpy(BACKPROJECTION.phasor_field(capture, layer).values)
     for table, pairs in ((1 << 20, 7), (1, 1 << 20)):
         monkeypatch.setattr(nlos.backprojection, "DEVICE_TABLE_BYTES", table)
         monkeypatch.setattr(ArrayLibrary, "chunk_bytes", pairs * BYTES_PER_PAIR)
-        counted: list[int] = []
+        counted = []
         found = BACKPROJECTION.phasor_field(capture, layer, counted.append).values
         assert relative_error(found, whole) < 1e-6
         assert sum(counted) == len(capture.points) * layer.size
@@ -318,14 +308,14 @@ def test_pieces_of_a_backprojection_make_up_the_whole_and_progress_counts_them(
         ("single", Hybrid(0.4, propagation="time")),
     ],
 )
-def test_methods_of_compiled_loops_refuse_in_one_line(laser: str, method: Any) -> None:
+def test_methods_of_compiled_loops_refuse_in_one_line(laser, method):
     reason = find_refusal(method, see_planar(laser).on(find_device("torch")), GRID)
     assert "NumPy arrays only" in reason
     assert "\n" not in reason
     assert "NumPy" not in find_refusal(method, see_planar(laser), GRID)
 
 
-def test_other_steps_of_compiled_loops_refuse_too() -> None:
+def test_other_steps_of_compiled_loops_refuse_too():
     capture, spot = see_planar().on(find_device("torch")), np.zeros(3)
     plane = HYBRID.plan(see_planar(), GRID).plane
     for attempt, reason in (
@@ -335,7 +325,7 @@ def test_other_steps_of_compiled_loops_refuse_too() -> None:
         (lambda: remove_device_legs(capture, spot, spot), "unwarping works on NumPy arrays"),
         (lambda: add_poisson_noise(capture, 10), "drawing photons works on NumPy arrays"),
         (
-            lambda: CompressedCapture(capture.signal, None, capture.wall, spot, 1e-11),  # type: ignore[arg-type]
+            lambda: CompressedCapture(capture.signal, None, capture.wall, spot, 1e-11),
             "compressed measurements works on NumPy arrays",
         ),
     ):
@@ -346,16 +336,16 @@ def test_other_steps_of_compiled_loops_refuse_too() -> None:
 class StrictDevice:
     """A device of array-api-strict that mixes with no other, and gives NumPy nothing."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.library = pytest.importorskip("array_api_strict")
         self.device = ComputeDevice("array_api_strict", self.library.Device("device1"))
 
-    def fetch(self, array: Any) -> np.ndarray:
+    def fetch(self, array):
         return np.asarray(array.to_device(self.library.Device("CPU_DEVICE")))
 
 
 @pytest.fixture
-def elsewhere() -> StrictDevice:
+def elsewhere():
     return StrictDevice()
 
 
@@ -373,16 +363,16 @@ SMALL = Grid(np.arange(-0.3, 0.3, 0.1), np.arange(-0.2, 0.3, 0.1), [0.5, 0.6, 0.
     ],
 )
 def test_fields_stay_on_their_device(
-    method: Any,
-    laser: str,
-    faster: bool | None,
-    agreement: float,
-    elsewhere: StrictDevice,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    sizes: list[int] = []
+    method,
+    laser,
+    faster,
+    agreement,
+    elsewhere,
+    monkeypatch,
+):
+    sizes = []
 
-    def fetch(array: Any) -> np.ndarray:
+    def fetch(array):
         sizes.append(array.size)
         return elsewhere.fetch(array)
 
@@ -398,7 +388,7 @@ def test_fields_stay_on_their_device(
     assert all(size < 1024 * 100 for size in sizes)
 
 
-def test_preparation_stays_on_its_device(elsewhere: StrictDevice) -> None:
+def test_preparation_stays_on_its_device(elsewhere):
     capture = mask(see_planar(), (2, 3))
     for prepare in PREPARATIONS:
         found = elsewhere.fetch(prepare(capture.on(elsewhere.device)).signal)
@@ -406,7 +396,7 @@ def test_preparation_stays_on_its_device(elsewhere: StrictDevice) -> None:
 
 
 @pytest.mark.parametrize("method", [RSD, HYBRID, BACKPROJECTION])
-def test_pytorch_differentiates_through_it(method: Any) -> None:
+def test_pytorch_differentiates_through_it(method):
     find_device("torch")
     import torch
 

@@ -2,8 +2,6 @@
 confocal scan at their midpoints.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -32,7 +30,7 @@ SIGNAL = np.random.default_rng(3).normal(size=(100, 3))
 CAPTURE = Capture(SIGNAL, THREE, [0.0, 0, 0], SPACING / SPEED_OF_LIGHT, 0.2, {"shot": 7})
 
 
-def test_cropping_keeps_every_bin_at_its_path() -> None:
+def test_cropping_keeps_every_bin_at_its_path():
     kept = crop_capture(CAPTURE, 0.395, 0.605)
     assert kept.axis.paths == pytest.approx(np.arange(0.40, 0.606, 0.01))
     assert np.array_equal(kept.signal, CAPTURE.signal[20:41])
@@ -41,7 +39,7 @@ def test_cropping_keeps_every_bin_at_its_path() -> None:
         crop_capture(CAPTURE, 2, 3)
 
 
-def test_bins_put_together_stand_for_their_middle() -> None:
+def test_bins_put_together_stand_for_their_middle():
     few = rebin_capture(CAPTURE, 8)
     assert few.signal.shape == (12, 3)
     assert few.signal[2] == pytest.approx(CAPTURE.signal[16:24].sum(axis=0), rel=1e-5)
@@ -53,7 +51,7 @@ def test_bins_put_together_stand_for_their_middle() -> None:
             rebin_capture(CAPTURE, factor)
 
 
-def test_the_first_bounce_comes_later_far_from_the_laser() -> None:
+def test_the_first_bounce_comes_later_far_from_the_laser():
     gated = remove_first_bounce(CAPTURE, 0.25)
     assert np.all(gated.signal[CAPTURE.axis.paths < 0.2501, 0] == 0)
     assert np.array_equal(gated.signal[6:, 0], CAPTURE.signal[6:, 0])
@@ -69,12 +67,12 @@ WALL = planar_wall(24, 24) * 0.6
 AXIS = TimeAxis(400, 16e-12)
 
 
-def see_one(wall: np.ndarray = WALL, laser: object = None) -> Capture:
+def see_one(wall=WALL, laser=None):
     laser = wall if laser is None else laser
     return see([[0.05, -0.1, 0.8]], wall, laser, AXIS, 40e-12, [400.0])
 
 
-def test_the_ends_of_the_record_are_soft() -> None:
+def test_the_ends_of_the_record_are_soft():
     flat = replace(see_one(), signal=np.ones_like(see_one().signal))
     gated = remove_first_bounce(flat, 0.3, 0.2).signal[:, 3, 3]
     assert gated.min() == 0
@@ -91,7 +89,7 @@ def test_the_ends_of_the_record_are_soft() -> None:
             fade_record_end(flat, bad)
 
 
-def test_a_picture_is_mirrored_along_an_axis() -> None:
+def test_a_picture_is_mirrored_along_an_axis():
     grid = Grid.box((-0.3, 0.3), (-0.3, 0.3), (0.7, 0.9), 0.05)
     for axis, expected in (("x", (-0.05, -0.1)), ("y", (0.05, 0.1))):
         found = PlanarRSD(0.2).reconstruct(flip_capture(see_one(), axis), grid).find_brightest()
@@ -107,7 +105,7 @@ HIDDEN = [[0.1, -0.2, 0.7], [-0.2, 0.1, 0.9]]
 GRID = Grid.box((-0.4, 0.4), (-0.4, 0.4), (0.55, 1.0), 0.04)
 
 
-def see_pairs(apart: float | None, points: int = 24) -> Capture:
+def see_pairs(apart, points=24):
     """Two points seen from a wall of 1 m x 1 m whose lasers are so far apart, m, or mirrored."""
     wall = planar_wall(points, points) * [1 / 1.2, 1, 1]
     lasers = wall[::-1] if apart is None else wall + np.array([apart, 0, 0])
@@ -115,7 +113,7 @@ def see_pairs(apart: float | None, points: int = 24) -> Capture:
 
 
 @pytest.mark.parametrize(("apart", "error"), [(1e-7, 0.02), (1e-3, 0.05), (15e-3, 0.1)])
-def test_a_laser_near_its_detector_is_confocal(apart: float, error: float) -> None:
+def test_a_laser_near_its_detector_is_confocal(apart, error):
     lasers = WALL + np.array([apart, 0, 0])
     capture = see_one(laser=lasers)
     settings = settings_for(capture)
@@ -128,7 +126,7 @@ def test_a_laser_near_its_detector_is_confocal(apart: float, error: float) -> No
     assert scaled_error(fast, exact.values) < error
 
 
-def test_a_small_walls_lasers_may_be_two_centimetres_away() -> None:
+def test_a_small_walls_lasers_may_be_two_centimetres_away():
     small = replace(see_one(), wall=WALL / 2, laser=WALL / 2 + np.array([0.019, 0, 0]))
     joined = join_near_lasers(small)
     assert np.array_equal(joined.laser, joined.wall)
@@ -137,7 +135,7 @@ def test_a_small_walls_lasers_may_be_two_centimetres_away() -> None:
 
 
 @pytest.mark.parametrize(("apart", "error"), [(0.05, 0.02), (0.12, 0.05)])
-def test_pairs_a_decimetre_apart_are_imaged_at_their_midpoint(apart: float, error: float) -> None:
+def test_pairs_a_decimetre_apart_are_imaged_at_their_midpoint(apart, error):
     capture = see_pairs(apart)
     joined = join_near_lasers(capture)
     assert np.array_equal(joined.laser, joined.wall)
@@ -150,7 +148,7 @@ def test_pairs_a_decimetre_apart_are_imaged_at_their_midpoint(apart: float, erro
     assert settings_for(capture, wavelength=WAVELENGTH).method == "rsd"
 
 
-def test_paths_of_pairs_are_found_once_for_many_captures(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_of_pairs_are_found_once_for_many_captures(monkeypatch):
     capture = see_pairs(0.1, 12)
     kept = MidpointJoin(capture)
     monkeypatch.setattr(preparation, "MAX_KEPT_BYTES", 0)  # found again every time
@@ -169,7 +167,7 @@ def test_paths_of_pairs_are_found_once_for_many_captures(monkeypatch: pytest.Mon
         kept.join(replace(capture, start=0.1))
 
 
-def test_pairs_far_apart_stay_as_they_are() -> None:
+def test_pairs_far_apart_stay_as_they_are():
     mirrored = see_pairs(None, 16)
     assert join_near_lasers(mirrored) is mirrored
     assert settings_for(mirrored, wavelength=WAVELENGTH).method == "backprojection"
@@ -177,7 +175,7 @@ def test_pairs_far_apart_stay_as_they_are() -> None:
     assert join_near_lasers(fine) is fine
 
 
-def test_counts_of_near_pairs_are_refined_as_they_are() -> None:
+def test_counts_of_near_pairs_are_refined_as_they_are():
     counts = np.random.default_rng(0).poisson(see_pairs(0.1, 12).signal * 0.2 + 0.01)
     capture = replace(see_pairs(0.1, 12), signal=counts.astype(np.float32))
     settings = settings_for(capture, wavelength=WAVELENGTH)

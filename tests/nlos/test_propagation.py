@@ -2,12 +2,8 @@
 against the definition or the direct sum; and the plane that the hybrid method chooses.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,13 +19,13 @@ from scenes import (
 )
 
 import nlos.phasor.propagate
-from nlos import Capture, Grid, Hybrid, propagate
+from nlos import Grid, Hybrid, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
 from nlos.illumination import build_waves, group_by_illumination
 from nlos.phasor import wall_to_plane
 from nlos.phasor.transfer import Offsets, SphericalWaves, find_min_periods
-from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, plan_transforms
+from nlos.phasor.wall_to_plane import WallBeforePlane, plan_transforms
 from nlos.phasor.wall_to_plane_compiled import (
     estimate_strength,
     propagate_direct,
@@ -49,12 +45,12 @@ FINE = Plane(np.linspace(-1.2, 1.3, 40), np.linspace(-1.1, 1.0, 33), 0.4)
 
 
 @pytest.fixture
-def always(monkeypatch: pytest.MonkeyPatch) -> None:
+def always(monkeypatch):
     """Walls as small as those of these tests would go by direct sums."""
     monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
 
 
-def definition(capture: Capture, plane: Plane = PLANE) -> np.ndarray:
+def definition(capture, plane=PLANE):
     """The field on the plane, summed term by term in float64."""
     band = Band(PULSE, capture.axis)
     legs = 2 if len(capture.lasers) > 1 else 1
@@ -65,7 +61,7 @@ def definition(capture: Capture, plane: Plane = PLANE) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_the_spectral_field_is_the_definition(shape: str) -> None:
+def test_the_spectral_field_is_the_definition(shape):
     capture = see_shaped(shape, 17)
     field = propagate(capture, PLANE, PULSE)
     assert field.values.shape == (11, 14, field.wavenumbers.size)
@@ -76,20 +72,20 @@ def test_the_spectral_field_is_the_definition(shape: str) -> None:
     assert relative_error(corner, field.values[:2, :2]) < 4e-5  # fewer than the loops take at once
 
 
-def test_confocal_waves_run_at_doubled_wavenumbers() -> None:
+def test_confocal_waves_run_at_doubled_wavenumbers():
     capture = see_shaped("wavy", 13, "confocal")
     field = propagate(capture, PLANE, PULSE)
     assert field.wavenumbers == pytest.approx(2 * Band(PULSE, capture.axis).wavenumbers)
     assert relative_error(field.values, definition(capture)) < 4e-5
 
 
-def error_in_time(shape: str, count: int, laser: Any, bin_width: float) -> float:
+def error_in_time(shape, count, laser, bin_width):
     axis = TimeAxis(round(512 * 32e-12 / bin_width), bin_width)
     capture = see([[0.2, 0.1, 1.0]], shaped_wall(shape, count), laser, axis, SHAPED_JITTER)
     return relative_error(propagate(capture, PLANE, PULSE, "time").values, definition(capture))
 
 
-def test_propagation_in_time_arrives_at_the_same_field_and_grows_exact_with_finer_bins() -> None:
+def test_propagation_in_time_arrives_at_the_same_field_and_grows_exact_with_finer_bins():
     for laser in (SHAPED_SPOT, "confocal"):
         # Linear interpolation loses (k * bin)^2 / 12 in the mean: 1.2 % at the carrier, 4 % at the
         # shortest wave.
@@ -101,7 +97,7 @@ def test_propagation_in_time_arrives_at_the_same_field_and_grows_exact_with_fine
 
 
 @pytest.mark.parametrize("propagation", ["spectral", "time"])
-def test_pieces_of_a_wall_add_up(propagation: str) -> None:
+def test_pieces_of_a_wall_add_up(propagation):
     capture = see_shaped("plates", 15)
     left, right = (
         replace(capture, wall=np.where((capture.wall[..., :1] < 0) == side, capture.wall, np.nan))
@@ -117,28 +113,26 @@ def test_pieces_of_a_wall_add_up(propagation: str) -> None:
 
 
 @cache
-def phasors(count: int) -> np.ndarray:
+def phasors(count):
     """Independent numbers: no symmetry of a scene hides an error."""
     random = np.random.default_rng(2)
     values = random.normal(size=(count, K.size)) + 1j * random.normal(size=(count, K.size))
     return (values * BAND.weights / BAND.weights.max()).astype(np.complex64)
 
 
-def points_of(shape: str, count: int = 32) -> np.ndarray:
+def points_of(shape, count=32):
     wall = shaped_wall(shape, count)
     return wall[np.isfinite(wall).all(axis=-1)]
 
 
-def make_plan(
-    points: np.ndarray, plane: Plane, tolerance: float, strength: np.ndarray = BAND.weights
-) -> WallToPlanePlan:
+def make_plan(points, plane, tolerance, strength=BAND.weights):
     wall = WallBeforePlane.of(points, plane)
     found = plan_transforms(wall, WAVES, strength, tolerance, scattered=wall.lattice is None)
     assert found is not None
     return found
 
 
-def list_clouds() -> Iterator[tuple[np.ndarray, Plane, tuple[float, ...]]]:
+def list_clouds():
     """Points, planes and tolerances; the first on a lattice, which may repeat its spectrum."""
     for shape in SHAPES:
         yield from ((points_of(shape), plane, (1e-2, 1e-3)) for plane in (FITTING, OTHER))
@@ -150,7 +144,7 @@ def list_clouds() -> Iterator[tuple[np.ndarray, Plane, tuple[float, ...]]]:
     yield np.random.default_rng(7).permutation(points_of("relief"))[:900], FITTING, (1e-2,)
 
 
-def list_scattered() -> Iterator[tuple[np.ndarray, Plane, tuple[float, ...]]]:
+def list_scattered():
     for plane in (FINE, Plane(FINE.x[::3], FINE.y[::4], 0.42)):
         yield CLOUD, plane, (1e-2, 1e-3)
     line = [np.linspace(-1, 1, 60) ** 3, np.full(60, 0.2), np.linspace(0, 0.3, 60)]
@@ -165,7 +159,7 @@ LATTICES, SCATTERED = list(list_clouds()), list(list_scattered())
 
 @pytest.mark.usefixtures("always")
 @pytest.mark.parametrize("number", range(len(LATTICES) + len(SCATTERED)))
-def test_it_is_the_direct_sum_within_the_tolerance(number: int) -> None:
+def test_it_is_the_direct_sum_within_the_tolerance(number):
     points, plane, tolerances = [*LATTICES, *SCATTERED][number]
     if number >= len(LATTICES):
         pytest.importorskip("finufft", reason="finufft is optional")
@@ -177,10 +171,10 @@ def test_it_is_the_direct_sum_within_the_tolerance(number: int) -> None:
         assert relative_error(found, exact) < tolerance
 
 
-def test_few_depths_take_few_terms(always: None) -> None:
+def test_few_depths_take_few_terms(always):
     """One for a planar wall, two for two plates, whatever their distance; more for a smooth relief."""
 
-    def counts(points: np.ndarray, tolerance: float = 1e-2) -> list[int]:
+    def counts(points, tolerance=1e-2):
         return make_plan(points, FITTING, tolerance).low_rank_transfer.term_counts
 
     assert set(counts(points_of("planar"))) == {1}
@@ -191,7 +185,7 @@ def test_few_depths_take_few_terms(always: None) -> None:
     assert set(counts(CLOUD * [1, 1, 0])) == {1}
 
 
-def test_silence_and_a_single_frequency_pass(always: None) -> None:
+def test_silence_and_a_single_frequency_pass(always):
     points = points_of("relief")
     values = np.zeros_like(phasors(len(points)))
     assert estimate_strength(values).tolist() == [1.0] * K.size
@@ -204,8 +198,8 @@ def test_silence_and_a_single_frequency_pass(always: None) -> None:
 
 
 def test_scattered_points_take_it_where_it_is_faster_and_installed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     """Else the direct sum is, which the field shows by its accuracy."""
     pytest.importorskip("finufft", reason="finufft is optional")
     capture = see(SHAPED_POINTS, CLOUD, SHAPED_SPOT, TimeAxis(512, 32e-12), SHAPED_JITTER)
@@ -222,7 +216,7 @@ def test_scattered_points_take_it_where_it_is_faster_and_installed(
 # --- the virtual plane
 
 
-def test_a_period_holds_a_plane_that_is_wider_than_the_windows() -> None:
+def test_a_period_holds_a_plane_that_is_wider_than_the_windows():
     """Many zones beside a small wall: the plane's own width decides."""
     sources = VirtualPlane(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), 0.2, (1.4, 1.4))
     axis = np.linspace(-0.1, 0.1, 3)
@@ -230,7 +224,7 @@ def test_a_period_holds_a_plane_that_is_wider_than_the_windows() -> None:
     assert find_min_periods(offsets, 1e-2) == pytest.approx((2.1, 2.1))
 
 
-def test_lattices_are_as_short_as_the_paths_allow() -> None:
+def test_lattices_are_as_short_as_the_paths_allow():
     """From the wall to a plane before it, and from there to depths as from a planar wall."""
     wall, axis = shaped_wall("relief", 64), np.linspace(-1, 1, 64)
     capture = see([[0, 0, 2.0]], wall, SHAPED_SPOT, TimeAxis(64, 32e-12), SHAPED_JITTER)

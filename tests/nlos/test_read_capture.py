@@ -2,11 +2,6 @@
 such files can fail.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import h5py
 import numpy as np
 import pytest
@@ -28,11 +23,11 @@ SPOT = np.array([0.12, 0.05, 0.0])
 SOURCE, EYE = np.array([0.3, -0.4, 1.5]), np.array([-0.6, 0.2, 1.8])
 
 
-def simulated(laser: Any = SPOT, wall: np.ndarray = WALL, axis: TimeAxis = AXIS) -> Capture:
+def simulated(laser=SPOT, wall=WALL, axis=AXIS):
     return see([HIDDEN], wall, laser, axis)
 
 
-def with_legs(capture: Capture, start: float) -> tuple[np.ndarray, float]:
+def with_legs(capture, start):
     """The same light as a device records it, drawn without any shifting."""
     path = sum(np.linalg.norm(capture.laser - end, axis=-1) for end in (SOURCE, HIDDEN))
     path = path + sum(np.linalg.norm(capture.wall - end, axis=-1) for end in (EYE, HIDDEN))
@@ -40,7 +35,7 @@ def with_legs(capture: Capture, start: float) -> tuple[np.ndarray, float]:
     return np.exp(-0.5 * ((paths.reshape(-1, *[1] * path.ndim) - path) / 0.012) ** 2), start
 
 
-def same(found: Capture, expected: Capture) -> None:
+def same(found, expected):
     assert np.array_equal(found.signal, expected.signal)
     assert found.wall == pytest.approx(expected.wall, nan_ok=True)
     assert found.laser == pytest.approx(expected.laser)
@@ -48,12 +43,12 @@ def same(found: Capture, expected: Capture) -> None:
     assert found.start == pytest.approx(expected.start, abs=1e-9)
 
 
-def shows_the_point(capture: Capture) -> None:
+def shows_the_point(capture):
     volume = Backprojection(0.2).reconstruct(capture, around(HIDDEN))
     assert volume.find_brightest() == pytest.approx(HIDDEN)
 
 
-def refused(path: Path, problem: str, error: type = FileFormatError) -> None:
+def refused(path, problem, error=FileFormatError):
     with pytest.raises(error, match=problem):
         read_capture(path)
 
@@ -61,7 +56,7 @@ def refused(path: Path, problem: str, error: type = FileFormatError) -> None:
 # --- our own
 
 
-def test_our_own_captures_keep_their_history(tmp_path: Path) -> None:
+def test_our_own_captures_keep_their_history(tmp_path):
     capture = Capture(simulated().signal, WALL, SPOT, AXIS.bin_width, AXIS.start, {"shot": 7})
     capture.save(tmp_path / "wall.h5")
     found = read_capture(tmp_path / "wall.h5")
@@ -69,7 +64,7 @@ def test_our_own_captures_keep_their_history(tmp_path: Path) -> None:
     assert found.provenance == {"shot": 7}
 
 
-def test_frames_with_a_wall_become_a_capture(tmp_path: Path) -> None:
+def test_frames_with_a_wall_become_a_capture(tmp_path):
     wall = wall_of(6, 7)
     frames_of(see_by_camera(wall), {"relay_wall": relay_wall(wall)}).save(tmp_path / "frames.h5")
     found = read_capture(tmp_path / "frames.h5")
@@ -81,7 +76,7 @@ def test_frames_with_a_wall_become_a_capture(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("laser", [SPOT, WALL], ids=["single", "confocal"])
-def test_a_numpy_archive(laser: np.ndarray, tmp_path: Path) -> None:
+def test_a_numpy_archive(laser, tmp_path):
     expected = simulated(laser)
     arrays = {
         "H": expected.signal,
@@ -96,7 +91,7 @@ def test_a_numpy_archive(laser: np.ndarray, tmp_path: Path) -> None:
     assert found.provenance["inputs"][0]["name"] == "a.npz"
 
 
-def test_the_recorded_archives(shared_data: Path) -> None:
+def test_the_recorded_archives(shared_data):
     capture = read_capture(shared_data / "nlos" / "otoole2018_diffuse_s.npz")
     assert capture.signal.shape == (2048, 64, 64)
     assert np.array_equal(capture.laser, capture.wall)
@@ -108,9 +103,7 @@ def test_the_recorded_archives(shared_data: Path) -> None:
 # --- y-tal
 
 
-def write_tal(
-    path: Path, capture: Capture, laser: np.ndarray, signal: np.ndarray | None = None, **more: Any
-) -> None:
+def write_tal(path, capture, laser, signal=None, **more):
     with h5py.File(path, "w") as file:
         file["H"] = capture.signal if signal is None else signal
         file["H_format"] = np.array([1], "i4")
@@ -122,7 +115,7 @@ def write_tal(
             file[name] = value
 
 
-def test_tal_single_confocal_and_exhaustive(tmp_path: Path) -> None:
+def test_tal_single_confocal_and_exhaustive(tmp_path):
     write_tal(tmp_path / "single.hdf5", simulated(), SPOT.reshape(1, 1, 3))
     same(read_capture(tmp_path / "single.hdf5"), simulated())
     write_tal(tmp_path / "confocal.hdf5", simulated(WALL), WALL)
@@ -136,7 +129,7 @@ def test_tal_single_confocal_and_exhaustive(tmp_path: Path) -> None:
     shows_the_point(found)
 
 
-def test_tal_with_the_ways_to_the_devices(tmp_path: Path) -> None:
+def test_tal_with_the_ways_to_the_devices(tmp_path):
     signal, start = with_legs(simulated(), 3.6)
     positions = {"laser_xyz": SOURCE, "sensor_xyz": EYE, "t_accounts_first_and_last_bounces": True}
     raw = Capture(signal, WALL, SPOT, AXIS.bin_width, start)
@@ -150,9 +143,7 @@ def test_tal_with_the_ways_to_the_devices(tmp_path: Path) -> None:
 TO_ZARAGOZA = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 
 
-def write_zaragoza(
-    path: Path, signal: np.ndarray, laser: np.ndarray, start: float, columns_first: bool
-) -> None:
+def write_zaragoza(path, signal, laser, start, columns_first):
     """Split the signal over 2 colours and 3 bounces; `signal` is (t, [lasers...,] points...)."""
     parts = np.array([0.5, 0.3, 0.2])[:, None] * np.array([0.25, 0.75])
     split = np.multiply.outer(parts, signal)  # (bounce, colour, t, ...)
@@ -176,7 +167,7 @@ def write_zaragoza(
 
 @pytest.mark.parametrize("columns_first", [True, False])
 @pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
-def test_zaragoza(kind: str, columns_first: bool, tmp_path: Path) -> None:
+def test_zaragoza(kind, columns_first, tmp_path):
     if kind == "confocal":
         laser = WALL
         signal, start = with_legs(simulated(WALL), 3.6)
@@ -197,8 +188,8 @@ def test_zaragoza(kind: str, columns_first: bool, tmp_path: Path) -> None:
     "direction", [(0, 0, 2.0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (0.6, 0, 0.8)]
 )
 def test_turning_makes_a_direction_z_and_keeps_distances(
-    direction: tuple[float, float, float],
-) -> None:
+    direction,
+):
     towards = np.array(direction) / np.linalg.norm(direction)
     # The scene stays in front: a hidden point at 0.5 along the direction has z = 0.5 afterwards.
     turned = rotate_to_scene(
@@ -215,7 +206,7 @@ def test_turning_makes_a_direction_z_and_keeps_distances(
 # --- MATLAB
 
 
-def write_matlab(path: Path, version: str, **variables: Any) -> None:
+def write_matlab(path, version, **variables):
     """Write MATLAB's own layout: version 5 by SciPy, 7.3 as HDF5 with reversed axes behind a header
     of 512 bytes.
     """
@@ -235,7 +226,7 @@ versions = pytest.mark.parametrize("version", ["5", "7.3"])
 
 
 @versions
-def test_light_cone_data(version: str, tmp_path: Path) -> None:
+def test_light_cone_data(version, tmp_path):
     # x falls along the first axis, as the authors' own script shows it.
     x, y = np.meshgrid(np.linspace(0.5, -0.5, 11), np.linspace(-0.5, 0.5, 11), indexing="ij")
     wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
@@ -248,7 +239,7 @@ def test_light_cone_data(version: str, tmp_path: Path) -> None:
 
 @versions
 @pytest.mark.parametrize("beside", [True, False])
-def test_migration_data(version: str, beside: bool, tmp_path: Path) -> None:
+def test_migration_data(version, beside, tmp_path):
     x, y = np.meshgrid(np.linspace(-1, 1, 14), np.linspace(-1, 1, 13))
     wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
     expected = simulated(wall, wall, TimeAxis(300, 32e-12))
@@ -268,7 +259,7 @@ def test_migration_data(version: str, beside: bool, tmp_path: Path) -> None:
     shows_the_point(found)
 
 
-def test_surface_optimisation_data(tmp_path: Path) -> None:
+def test_surface_optimisation_data(tmp_path):
     points = WALL.reshape(-1, 3)
     expected = simulated(points, points, TimeAxis(1500, 1.2e-3 / SPEED_OF_LIGHT))
     write_matlab(tmp_path / "a.mat", "5", transient=expected.signal.T, lighting=points)
@@ -277,7 +268,7 @@ def test_surface_optimisation_data(tmp_path: Path) -> None:
     shows_the_point(found)
 
 
-def test_pairs_with_their_points_beside(tmp_path: Path) -> None:
+def test_pairs_with_their_points_beside(tmp_path):
     points = WALL.reshape(-1, 3)
     lasers = points[::-1]
     expected = simulated(lasers, points, TimeAxis(300, 32e-12))
@@ -303,7 +294,7 @@ grid_hor_f = 63:-1:0;
 """
 
 
-def test_pairs_numbered_on_a_lattice(tmp_path: Path) -> None:
+def test_pairs_numbered_on_a_lattice(tmp_path):
     """Their second number grows to the left and their third upwards, seen from the wall."""
     left, up = (grid.ravel() for grid in np.meshgrid(np.arange(12), np.arange(9)))
     numbers = np.stack([0 * left, left, up], axis=-1)
@@ -329,7 +320,7 @@ def test_pairs_numbered_on_a_lattice(tmp_path: Path) -> None:
             read_capture(folder / "sub_Sig.mat")
 
 
-def test_general_pairs(tmp_path: Path) -> None:
+def test_general_pairs(tmp_path):
     lasers = WALL[::-1]
     expected = simulated(lasers, WALL, TimeAxis(300, 32e-12))
     write_matlab(tmp_path / "data_one.mat", "5", data=np.moveaxis(expected.signal, 0, 2))
@@ -345,7 +336,7 @@ def test_general_pairs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["t_s", "t_m"])
-def test_time_bins_that_are_named_one_by_one(name: str, tmp_path: Path) -> None:
+def test_time_bins_that_are_named_one_by_one(name, tmp_path):
     unit = SPEED_OF_LIGHT if name == "t_s" else 1.0
     file, fields = tmp_path / "a.npz", {"wall_xyz": WALL, "laser_xyz": SPOT}
     expected = simulated()
@@ -370,7 +361,7 @@ def test_time_bins_that_are_named_one_by_one(name: str, tmp_path: Path) -> None:
     refused(file, "so uneven")
 
 
-def test_archives_with_paths_and_several_lasers(tmp_path: Path) -> None:
+def test_archives_with_paths_and_several_lasers(tmp_path):
     expected = simulated()
     fields = {"H": expected.signal, "wall_xyz": WALL, "laser_xyz": SPOT}
     np.savez(tmp_path / "a.npz", **fields, delta_t_m=AXIS.spacing, t_start_m=AXIS.start)
@@ -384,7 +375,7 @@ def test_archives_with_paths_and_several_lasers(tmp_path: Path) -> None:
 
 
 @versions
-def test_phasor_field_data(version: str, tmp_path: Path) -> None:
+def test_phasor_field_data(version, tmp_path):
     points = WALL.reshape(-1, 3)
     listed = simulated(SPOT, points)
     # Their laser scans our wall points; our laser spot is where their camera looks.
@@ -413,7 +404,7 @@ def test_phasor_field_data(version: str, tmp_path: Path) -> None:
 
 
 @versions
-def test_rectified_data(version: str, tmp_path: Path) -> None:
+def test_rectified_data(version, tmp_path):
     x, y = np.meshgrid((np.arange(12) - 6) * 0.1, (np.arange(10) - 5) * 0.1)
     wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
     expected = simulated(wall[4, 7], wall, TimeAxis(300, 16e-12))
@@ -438,7 +429,7 @@ laser_m = [0.12, 0.05, 0.0]
 """
 
 
-def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
+def write_exr(path, channels):
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -447,7 +438,7 @@ def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
     ).write(str(path))
 
 
-def write_streaks(folder: Path, capture: Capture, geometry: str = GEOMETRY) -> None:
+def write_streaks(folder, capture, geometry=GEOMETRY):
     for row in range(capture.signal.shape[1]):
         brightness = capture.signal[:, row].T  # (column, t)
         # No leading zeros, as renderers number them: 10 comes after 9.
@@ -458,7 +449,7 @@ def write_streaks(folder: Path, capture: Capture, geometry: str = GEOMETRY) -> N
     (folder / "geometry.toml").write_text(geometry)
 
 
-def test_exr_streaks(tmp_path: Path) -> None:
+def test_exr_streaks(tmp_path):
     expected = simulated(wall=planar_wall(12, 9))
     write_streaks(tmp_path, expected)
     found = read_capture(tmp_path)
@@ -479,13 +470,13 @@ def test_exr_streaks(tmp_path: Path) -> None:
         ("bin_width_ps = ", "is not a TOML file"),
     ],
 )
-def test_exr_geometry_is_checked(geometry: str, problem: str, tmp_path: Path) -> None:
+def test_exr_geometry_is_checked(geometry, problem, tmp_path):
     write_streaks(tmp_path, simulated(wall=planar_wall(2, 3)), geometry)
     with pytest.raises(FileFormatError, match=problem):
         read_capture(tmp_path)
 
 
-def test_exr_folders_that_are_no_capture(tmp_path: Path) -> None:
+def test_exr_folders_that_are_no_capture(tmp_path):
     refused(tmp_path, "without EXR files")
     write_streaks(tmp_path, simulated(wall=planar_wall(3, 4)))
     (tmp_path / "geometry.toml").unlink()
@@ -503,14 +494,14 @@ def test_exr_folders_that_are_no_capture(tmp_path: Path) -> None:
 # --- damage
 
 
-def write_odd_zaragoza(path: Path) -> None:
+def write_odd_zaragoza(path):
     write_zaragoza(path, with_legs(simulated(WALL), 3.6)[0], WALL, 3.6, True)
     with h5py.File(path, "a") as file:
         del file["data"]
         file["data"] = np.ones((3, 4))
 
 
-def write(path: Path, content: Any) -> Path:
+def write(path, content):
     """Write bytes or named arrays, in the format of the name, or call what writes them."""
     if callable(content):
         content(path)
@@ -554,7 +545,7 @@ DISAGREEING = lambda path: write_tal(path, simulated(), WALL[:2])  # noqa: E731
         ("meas_10min.mat", {"meas": np.ones((3, 4, 5))}, r"no tof\.mat beside it"),
     ],
 )
-def test_what_is_no_capture_says_so(name: str, content: Any, problem: str, tmp_path: Path) -> None:
+def test_what_is_no_capture_says_so(name, content, problem, tmp_path):
     refused(write(tmp_path / name, content), problem)
     refused(tmp_path / "absent.h5", "no such file", StorageError)
 
@@ -575,7 +566,7 @@ TAL = lambda path: write_tal(path, RECORD, SPOT)  # noqa: E731
         ("seven.mat", LIGHT_CONE),
     ],
 )
-def test_truncated_files_are_refused(name: str, content: Any, tmp_path: Path) -> None:
+def test_truncated_files_are_refused(name, content, tmp_path):
     path = write(tmp_path / name, content)
     whole = path.read_bytes()
     for fraction in (0.3, 0.9):

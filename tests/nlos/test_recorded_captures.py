@@ -1,11 +1,7 @@
 """Recordings of other labs: letters that read the right way round, by every method."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +14,6 @@ from nlos import (
     Grid,
     LightCone,
     Settings,
-    Volume,
     settings_for,
 )
 from nlos.imaging import complete_settings
@@ -34,7 +29,7 @@ STREAK = "lift/nlos_LetterVI.npz"
 
 
 @pytest.fixture(scope="module")
-def letter(shared_data: Path) -> Capture:
+def letter(shared_data):
     """A confocal scan of a diffuse S, half a metre from the wall."""
     with np.load(shared_data / DIFFUSE) as stored:
         counts = stored["H"].astype(np.float32)[:1200]
@@ -44,12 +39,12 @@ def letter(shared_data: Path) -> Capture:
 
 
 @pytest.fixture(scope="module")
-def rebinned(shared_data: Path) -> Capture:
+def rebinned(shared_data):
     raw = read_capture(shared_data / DIFFUSE)
     return rebin_capture(remove_first_bounce(raw, FIRST_BOUNCE_BINS * raw.axis.spacing), 8)
 
 
-def require_s(volume: Volume, half: float, gain: float, bars: Any) -> None:
+def require_s(volume, half, gain, bars):
     """Bars of the S at y = -0.15, 0.05 and 0.25, joined on the right above the middle and on the
     left below it (an S seen in a mirror, because y points down here and up in that recording).
     `half`: of a row, m; `gain`: of the bars over the gaps.
@@ -68,7 +63,7 @@ def require_s(volume: Volume, half: float, gain: float, bars: Any) -> None:
 BARS = (-0.15, -0.06), (0.05, -0.06), (0.05, 0.15), (0.25, 0.15)
 
 
-def test_the_confocal_letter_s_stands_half_a_metre_from_the_wall(letter: Capture) -> None:
+def test_the_confocal_letter_s_stands_half_a_metre_from_the_wall(letter):
     grid = Grid.box((-0.3, 0.3), (-0.3, 0.35), (0.4, 0.62), 0.01)
     volume = Backprojection(0.04).reconstruct(letter, grid)
     assert 0.48 <= volume.find_brightest()[2] <= 0.52
@@ -76,7 +71,7 @@ def test_the_confocal_letter_s_stands_half_a_metre_from_the_wall(letter: Capture
 
 
 @pytest.mark.parametrize("method", [LightCone(), FKMigration()], ids=["lightcone", "fk"])
-def test_transforms_show_the_same_letter(method: Any, rebinned: Capture) -> None:
+def test_transforms_show_the_same_letter(method, rebinned):
     axis = np.linspace(-0.35, 0.35, 64)
     volume = method.reconstruct(rebinned, Grid(axis, axis, np.arange(0.36, 0.64, 0.005)))
     assert 0.49 <= volume.find_brightest()[2] <= 0.52
@@ -92,9 +87,7 @@ def test_transforms_show_the_same_letter(method: Any, rebinned: Capture) -> None
         (MANNEQUIN, False, 0.025, 0.06),
     ],
 )
-def test_settings_of_recorded_captures(
-    name: str, gated: bool, shortest: float, longest: float, shared_data: Path
-) -> None:
+def test_settings_of_recorded_captures(name, gated, shortest, longest, shared_data):
     """The wavelengths that look best by hand, and the gate of the authors: 0.72 m."""
     settings = settings_for(read_capture(shared_data / name))
     assert settings.gate_found == gated
@@ -111,9 +104,7 @@ def test_settings_of_recorded_captures(
         *(pytest.param(one, marks=pytest.mark.nightly) for one in (OUTDOOR, MANNEQUIN, STREAK)),
     ],
 )
-def test_settings_of_a_capture_do_not_hang_on_how_it_is_handed_over(
-    name: str, shared_data: Path, tmp_path: Path
-) -> None:
+def test_settings_of_a_capture_do_not_hang_on_how_it_is_handed_over(name, shared_data, tmp_path):
     recorded = read_capture(shared_data / name)
     if name == DIFFUSE:
         signal, wall = recorded.signal[:, :32, :32], recorded.wall[:32, :32]
@@ -147,7 +138,7 @@ def test_settings_of_a_capture_do_not_hang_on_how_it_is_handed_over(
             assert getattr(found, setting) == close, (change, setting)
 
 
-def test_the_outdoor_letter_reads_as_an_s(shared_data: Path) -> None:
+def test_the_outdoor_letter_reads_as_an_s(shared_data):
     """O'Toole's outdoor letter with no setting at all: an S, not its mirror image."""
     recorded = read_capture(shared_data / OUTDOOR)
     settings = settings_for(recorded, near=1.0, far=1.4)
@@ -161,7 +152,7 @@ def test_the_outdoor_letter_reads_as_an_s(shared_data: Path) -> None:
 
 
 @pytest.mark.parametrize("method", ["lct", "fk"])
-def test_transforms_show_no_stripes_at_their_own_voxels(method: str, shared_data: Path) -> None:
+def test_transforms_show_no_stripes_at_their_own_voxels(method, shared_data):
     """Front views at default voxels and at voxels of 2.5 mm are the same picture."""
     recorded = read_capture(shared_data / OUTDOOR)
     box = {"x": (-0.2, 0.2), "y": (-0.2, 0.2), "near": 1.0, "far": 1.35}

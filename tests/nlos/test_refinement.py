@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -15,7 +13,7 @@ from scenes import (
     see,
 )
 
-from nlos import Capture, Grid, Hybrid, Refinement, Volume
+from nlos import Grid, Hybrid, Refinement
 from nlos.capture import TimeAxis
 from nlos.illumination import choose_unaliased_band
 from nlos.refinement.l1 import WallModel, build_total_variation
@@ -36,7 +34,7 @@ LASERS = {"single": SPOT, "confocal": "confocal", "two spots": SPOTS}
 
 
 @cache
-def seen(laser: str) -> Capture:
+def seen(laser):
     """Three hidden points before a curved wall, 200 counts in the brightest bin."""
     wall = curved_wall(ROWS, COLUMNS)
     capture = see(HIDDEN, wall, LASERS[laser], AXIS, 60e-12, [1.0, 0.7, 1.0])
@@ -46,7 +44,7 @@ def seen(laser: str) -> Capture:
 DISTANCES = distance_to_nearest(GRID, HIDDEN)
 
 
-def likeness(volume: Volume) -> float:
+def likeness(volume):
     """Correlation with the hidden points, as wide as linear interpolation between voxels makes
     them.
     """
@@ -55,7 +53,7 @@ def likeness(volume: Volume) -> float:
 
 
 @pytest.mark.parametrize("laser", ["single", "confocal"])
-def test_refinement_beats_the_single_shot(laser: str) -> None:
+def test_refinement_beats_the_single_shot(laser):
     shot = HYBRID.reconstruct(seen(laser), GRID)
     refined = Refinement(HYBRID, Sparse(weight=2e-2, iterations=30)).reconstruct(seen(laser), GRID)
     assert refined.values.dtype == np.float32
@@ -78,7 +76,7 @@ def test_refinement_beats_the_single_shot(laser: str) -> None:
 
 
 @pytest.mark.nightly
-def test_an_even_surface_is_smooth_with_sharp_borders_under_total_variation() -> None:
+def test_an_even_surface_is_smooth_with_sharp_borders_under_total_variation():
     """A square of 36 cm, parallel to the wall, against the voxels that it fills."""
     scene = HiddenScene([Surface.rectangle([-0.05, 0.0, 0.7], (0.36, 0.36), 0.03)])
     light = scene.simulate_capture(planar_wall(ROWS, COLUMNS), [0.1, 0.0, 0.0], AXIS, 60e-12)
@@ -94,7 +92,7 @@ def test_an_even_surface_is_smooth_with_sharp_borders_under_total_variation() ->
 
 
 @pytest.mark.parametrize("laser", ["single", "confocal"])
-def test_the_adjoint_of_the_readings_is_the_real_part_of_the_hybrids_field(laser: str) -> None:
+def test_the_adjoint_of_the_readings_is_the_real_part_of_the_hybrids_field(laser):
     capture = seen(laser)
     model = WallModel(HYBRID.plan(capture, GRID), capture)
     gain = capture.axis.paths ** (3 if laser == "confocal" else 2)
@@ -105,7 +103,7 @@ def test_the_adjoint_of_the_readings_is_the_real_part_of_the_hybrids_field(laser
     assert relative_error(found, expected) < 2 * HYBRID.tolerance
 
 
-def test_a_voxels_phasors_are_those_of_the_formula() -> None:
+def test_a_voxels_phasors_are_those_of_the_formula():
     capture = seen("single")
     hybrid = replace(HYBRID, plane_z=0.3, tolerance=1e-3)
     band = choose_unaliased_band(capture, GRID, hybrid.pulse)
@@ -123,9 +121,9 @@ def test_a_voxels_phasors_are_those_of_the_formula() -> None:
     assert relative_error(found, expected.ravel()) < 5e-2
 
 
-def test_progress_counts_every_voxel_in_every_iteration() -> None:
+def test_progress_counts_every_voxel_in_every_iteration():
     small = Grid.box((-0.1, 0.1), (-0.1, 0.1), (0.6, 0.7), (0.05, 0.05, 0.04))
-    done: list[int] = []
+    done = []
     volume = Refinement(HYBRID, Sparse(iterations=3)).reconstruct(
         seen("single"), small, done.append
     )
@@ -133,7 +131,7 @@ def test_progress_counts_every_voxel_in_every_iteration() -> None:
     assert volume.provenance["imaging"]["stopped_because"] == "iterations done"
 
 
-def test_what_cannot_be_refined_is_refused() -> None:
+def test_what_cannot_be_refined_is_refused():
     capture, refinement = seen("single"), Refinement(HYBRID)
     coarse = Grid(GRID.x, GRID.y, np.arange(0.5, 1.0, 0.06))
     assert not find_refusal(refinement, capture, GRID)
@@ -146,7 +144,7 @@ def test_what_cannot_be_refined_is_refused() -> None:
 
 
 @pytest.mark.nightly
-def test_equal_points_near_the_laser_and_far_from_it_are_equally_bright() -> None:
+def test_equal_points_near_the_laser_and_far_from_it_are_equally_bright():
     """Light that reaches one of them has gone 1.8 times as far as that to the other."""
     grid = Grid.box((-0.4, 0.4), (-0.32, 0.32), (0.48, 0.92), (0.05, 0.05, 0.04))
     places = [(grid.x[9], grid.y[7], grid.z[1]), (grid.x[2], grid.y[2], grid.z[9])]

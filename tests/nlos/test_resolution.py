@@ -2,8 +2,6 @@
 pulse, and the energy that lies where they are.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
@@ -11,7 +9,7 @@ import pytest
 from scenes import distance_to_nearest, energy_fraction, planar_wall, see
 from scipy.optimize import brentq
 
-from nlos import Capture, Grid, Hybrid, PlanarRSD, Volume
+from nlos import Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
 from nlos.resolution import compute_diffraction_limit, measure_fwhm
 from nlos.simulate import add_poisson_noise, build_relay_wall
@@ -21,14 +19,14 @@ METHOD, HYBRID = PlanarRSD(WAVELENGTH, CYCLES, 1e-3), Hybrid(0.125, 4.24)
 SINC_HALF = float(brentq(lambda u: np.sin(np.pi * u) / (np.pi * u) - 0.5, 0.1, 0.9))
 
 
-def full_width_at_half_maximum(axis: np.ndarray, values: np.ndarray) -> float:
+def full_width_at_half_maximum(axis, values):
     fine = np.linspace(axis[0], axis[-1], 20001)
     bright = fine[np.interp(fine, axis, values) >= values.max() / 2]
     return float(bright[-1] - bright[0])
 
 
 @pytest.mark.parametrize("depth", [0.8, 1.2, 1.6])
-def test_a_point_is_as_wide_as_diffraction_and_the_pulse_make_it(depth: float) -> None:
+def test_a_point_is_as_wide_as_diffraction_and_the_pulse_make_it(depth):
     wall = planar_wall(51, 51)
     wall[..., :2] *= SIDE / 2 / np.array([0.6, 0.5])
     capture = see([[0.0, 0.0, depth]], wall, [0.0, 0.0, 0.0], TimeAxis(900, 16e-12))
@@ -45,13 +43,13 @@ def test_a_point_is_as_wide_as_diffraction_and_the_pulse_make_it(depth: float) -
     assert full_width_at_half_maximum(along, axial) == pytest.approx(pulse, rel=0.1)
 
 
-def test_a_width_is_read_between_samples() -> None:
+def test_a_width_is_read_between_samples():
     axis = np.arange(11.0)
     assert measure_fwhm(axis, 1 - np.abs(axis - 5) / 3, 5) == pytest.approx(3.0)
     assert measure_fwhm(2 * axis, np.exp2(-(((axis - 5) / 2) ** 2)), 5) == pytest.approx(8.0)
 
 
-def test_the_limit_is_the_width_of_the_sum_that_defines_it() -> None:
+def test_the_limit_is_the_width_of_the_sum_that_defines_it():
     """A wide wall, where it matters how light falls with distance."""
     x, y = np.meshgrid(np.linspace(-1, 1, 41), np.linspace(-1, 1, 41))
     wall, middle = np.stack([x, y, np.zeros_like(x)], axis=-1), np.array([0.0, 0.0, 0.4])
@@ -81,12 +79,12 @@ METHODS = {"planar": PlanarRSD(*PULSE), "cylinder": Hybrid(*PULSE)}
 
 
 @cache
-def see_five(wall: str) -> Capture:
+def see_five(wall):
     """Five hidden points, 64 x 64 wall points over 2 m, one laser spot, 512 bins of 32 ps."""
     return see(POINTS, build_relay_wall(wall, 64), [0.0, 0.0, 0.0], TimeAxis(512, 32e-12))
 
 
-def score(volume: Volume) -> tuple[float, float]:
+def score(volume):
     """Energy fraction of the voxels within 4 cm of the points, the usual measure for waves of some
     12 cm, and their mean magnitude over that of all others: a bright spot in the wrong place scores
     badly, however bright.
@@ -99,9 +97,7 @@ def score(volume: Volume) -> tuple[float, float]:
 @pytest.mark.parametrize(
     ("wall", "energy", "contrast"), [("planar", 0.3195, 66.5), ("cylinder", 0.2908, 59.2)]
 )
-def test_as_much_energy_as_ever_lies_at_the_hidden_points(
-    wall: str, energy: float, contrast: float
-) -> None:
+def test_as_much_energy_as_ever_lies_at_the_hidden_points(wall, energy, contrast):
     """With the noise of 20 counts in the brightest bin.
 
     The values are means over four seeds; the tolerances, five times the spread over them, 0.00023

@@ -1,11 +1,5 @@
 """Simulated walls, hidden points and surfaces, and the noise of photons, against formulas."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -31,7 +25,7 @@ WALL, SPOT = build_relay_wall("planar", 7, 1.0), np.array([0.1, -0.05, 0.0])
 CENTRE = np.array([0.12, -0.08, 0.55])
 
 
-def measure(capture: Capture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def measure(capture):
     """Brightness of every wall point, and mean and standard deviation of the path, m."""
     total = capture.signal.sum(axis=0)
     paths = capture.axis.paths.reshape(-1, *[1] * total.ndim)
@@ -43,7 +37,7 @@ def measure(capture: Capture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", WALLS)
-def test_walls_are_as_wide_as_asked_for(name: str) -> None:
+def test_walls_are_as_wide_as_asked_for(name):
     wall = build_relay_wall(name, 33, 1.6)
     assert wall.shape == (33, 33, 3)
     known = np.isfinite(wall).all(axis=-1)
@@ -54,7 +48,7 @@ def test_walls_are_as_wide_as_asked_for(name: str) -> None:
     assert known.all() == (name != "plates")
 
 
-def test_the_five_shapes() -> None:
+def test_the_five_shapes():
     assert np.all(build_relay_wall("planar")[..., 2] == 0)
     cylinder = build_relay_wall("cylinder", 65)
     radius = np.hypot(cylinder[..., 0], cylinder[..., 2] + 2.5)
@@ -70,7 +64,7 @@ def test_the_five_shapes() -> None:
     assert right[:, 0].min() - left[:, 0].max() > 0.19
 
 
-def test_normals_stand_on_the_wall_and_point_to_the_scene() -> None:
+def test_normals_stand_on_the_wall_and_point_to_the_scene():
     wall = build_relay_wall("cylinder", 41)
     expected = (wall + np.array([0, 0, 2.5])) * [1, 0, 1] / 2.5
     # Central differences of a circle; the edges are one-sided.
@@ -89,7 +83,7 @@ FINE = TimeAxis(bins=300, bin_width=10e-12, start=0.3)
 
 
 @pytest.mark.parametrize("laser", [np.array([0.1, 0.0, 0.0]), THREE])
-def test_light_arrives_after_its_path_with_inverse_squares(laser: np.ndarray) -> None:
+def test_light_arrives_after_its_path_with_inverse_squares(laser):
     capture = PointScene([POINT], [2.0]).simulate_capture(THREE, laser, FINE, 15e-12)
     outward, back = (np.linalg.norm(end - POINT, axis=-1) for end in (laser, THREE))
     total, centroid, spread = measure(capture)
@@ -101,7 +95,7 @@ def test_light_arrives_after_its_path_with_inverse_squares(laser: np.ndarray) ->
     assert spread == pytest.approx(np.full(3, expected), rel=1e-4)
 
 
-def test_points_add_up_and_masked_wall_points_are_dark() -> None:
+def test_points_add_up_and_masked_wall_points_are_dark():
     points, albedo = np.array([POINT, POINT + 0.1]), [1.0, 3.0]
     both, *parts = (
         PointScene(points[some], albedo[some]).simulate_capture(THREE, THREE[0], FINE, 15e-12)
@@ -118,22 +112,22 @@ def test_points_add_up_and_masked_wall_points_are_dark() -> None:
 # --- surfaces
 
 
-def facet(centre: np.ndarray = CENTRE, material: object = None, side: float = 0.001) -> Surface:
+def facet(centre=CENTRE, material=None, side=0.001):
     """A square so small that it is one point for the light."""
     return Surface.rectangle(centre, (side, side), 1.0, material)
 
 
-def look(*surfaces: Surface, laser: Any = SPOT, axis: TimeAxis = AXIS, wall: Any = WALL) -> Capture:
+def look(*surfaces, laser=SPOT, axis=AXIS, wall=WALL):
     return HiddenScene(surfaces).simulate_capture(wall, laser, axis, JITTER)
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
+def unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 @pytest.mark.parametrize("shape", ["planar", "cylinder"])
 @pytest.mark.parametrize("confocal", [False, True])
-def test_brightness_arrival_and_width_of_one_facet(shape: str, confocal: bool) -> None:
+def test_brightness_arrival_and_width_of_one_facet(shape, confocal):
     """The formula of `HiddenScene` for a Lambertian facet of 1 mm, written out with vectors."""
     wall = build_relay_wall(shape, 7, 1.0)
     normals = compute_wall_normals(wall)
@@ -154,7 +148,7 @@ def test_brightness_arrival_and_width_of_one_facet(shape: str, confocal: bool) -
     assert spread == pytest.approx(np.full((7, 7), width), rel=0.02)
 
 
-def test_light_that_arrives_before_or_after_the_record_is_left_out() -> None:
+def test_light_that_arrives_before_or_after_the_record_is_left_out():
     full = look(facet()).signal
     late = TimeAxis(AXIS.bins, AXIS.bin_width, AXIS.start + 175.5 * AXIS.spacing)
     part = look(facet(), axis=late).signal
@@ -164,7 +158,7 @@ def test_light_that_arrives_before_or_after_the_record_is_left_out() -> None:
     assert not look(facet(), axis=TimeAxis(10, AXIS.bin_width, 0.0)).signal.any()
 
 
-def test_a_plate_hides_what_stands_behind_it_from_where_it_stands_between() -> None:
+def test_a_plate_hides_what_stands_behind_it_from_where_it_stands_between():
     plate = Surface.rectangle([0.3, 0.0, 0.3], (0.2, 2.0), 0.05, Lambert(0.0))
     target, spot = facet(np.array([0.35, 0.0, 0.6])), np.array([-0.4, 0.0, 0.0])
     seen, blocked = (
@@ -183,7 +177,7 @@ def test_a_plate_hides_what_stands_behind_it_from_where_it_stands_between() -> N
     assert not look(target, plate, laser=[0.25, 0, 0]).signal.any()
 
 
-def test_the_back_of_a_surface_is_dark() -> None:
+def test_the_back_of_a_surface_is_dark():
     corners = CENTRE + 0.002 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0]])
     front, back = (Surface.mesh(corners, [face], 1.0) for face in ([0, 2, 1], [0, 1, 2]))
     assert front.normals[0] == pytest.approx([0, 0, -1])
@@ -191,7 +185,7 @@ def test_the_back_of_a_surface_is_dark() -> None:
     assert not look(back).signal.any()
 
 
-def test_a_retroreflector_shines_back_to_the_laser() -> None:
+def test_a_retroreflector_shines_back_to_the_laser():
     spread = 0.2
     lambert, retro = (
         look(facet(material=material)).signal.sum(axis=0)
@@ -202,7 +196,7 @@ def test_a_retroreflector_shines_back_to_the_laser() -> None:
     assert retro == pytest.approx(lambert * lobe * np.pi, rel=1e-3)
 
 
-def test_a_mesh_keeps_its_area_and_its_facets_are_small() -> None:
+def test_a_mesh_keeps_its_area_and_its_facets_are_small():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0.7, 0.2], [0, 0, 0]])
     surface = Surface.mesh(vertices, [[0, 1, 2], [0, 3, 1]], 0.1)  # the second has no area
     across = np.cross(vertices[1], vertices[2])
@@ -214,7 +208,7 @@ def test_a_mesh_keeps_its_area_and_its_facets_are_small() -> None:
     assert mean == pytest.approx(vertices[:3].mean(axis=0))
 
 
-def test_letters_read_from_left_to_right_and_from_top_to_bottom() -> None:
+def test_letters_read_from_left_to_right_and_from_top_to_bottom():
     surface = Surface.letters("F", [0.1, 0.2, 0.5], 0.4, 0.01)
     x, y, z = (surface.positions - [0.1, 0.2, 0.5]).T
     assert np.all(z == 0)
@@ -228,7 +222,7 @@ def test_letters_read_from_left_to_right_and_from_top_to_bottom() -> None:
     assert not np.any(np.linalg.norm(hole.positions[:, :2], axis=1) < 0.05)
 
 
-def test_meshes_are_read_from_files(tmp_path: Path) -> None:
+def test_meshes_are_read_from_files(tmp_path):
     (tmp_path / "one.obj").write_text("v 0 0 0.5\nv 0 0.2 0.5\nv 0.2 0 0.5\nf 1 2 3\n")
     surface = Surface.load(tmp_path / "one.obj", 0.05)
     assert surface.areas.sum() == pytest.approx(0.02)
@@ -247,12 +241,12 @@ def test_meshes_are_read_from_files(tmp_path: Path) -> None:
 # --- photons
 
 
-def flat(value: float = 0.25) -> Capture:
+def flat(value=0.25):
     wall = np.zeros((50, 3))
     return Capture(np.full((200, 50), value), wall, [0, 0, 0], 1e-12, provenance={"shot": 7})
 
 
-def test_counts_have_the_noise_of_photons() -> None:
+def test_counts_have_the_noise_of_photons():
     counts = add_poisson_noise(flat(), 20.0, 5.0, seed=3)
     assert counts.signal.mean() == pytest.approx(25, abs=4 * np.sqrt(25 / 1e4))
     # The variance of 10 000 Poisson variables of mean 25 is known to 1.4 %.
@@ -290,6 +284,6 @@ def test_counts_have_the_noise_of_photons() -> None:
         (lambda: add_poisson_noise(flat(0.0), 5), InputError, "not all dark"),
     ],
 )
-def test_nonsense_is_refused(build: Callable[[], Any], error: type, message: str) -> None:
+def test_nonsense_is_refused(build, error, message):
     with pytest.raises(error, match=message):
         build()

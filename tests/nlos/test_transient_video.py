@@ -1,8 +1,4 @@
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,16 +21,16 @@ GRID = Grid(np.linspace(-0.4, 0.4, 17), np.linspace(-0.4, 0.4, 17), [0.5, 0.6, 0
 METHODS = {"rsd": PlanarRSD(0.15, 4), "hybrid": Hybrid(0.15, 4)}
 
 
-def seen(method: str, points: np.ndarray = POINTS) -> Capture:
+def seen(method, points=POINTS):
     wall = planar_wall(19, 21) if method == "rsd" else curved_wall(19, 21)
     return see(points, wall, LASER, AXIS, 40e-12)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_hidden_point_lights_up_when_the_flash_reaches_it(method: str) -> None:
+def test_a_hidden_point_lights_up_when_the_flash_reaches_it(method):
     imaging, capture = TransientImaging(METHODS[method]), seen(method, POINTS[:1])
     times = ARRIVALS[0] + 100e-12 * np.arange(-16, 17)
-    done: list[int] = []
+    done = []
     video = imaging.video(capture, GRID, times, done.append)
     assert video.values.shape == (33, *GRID.shape)
     assert video.values.dtype == np.float32
@@ -55,7 +51,7 @@ def test_a_hidden_point_lights_up_when_the_flash_reaches_it(method: str) -> None
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_voxel_at_its_own_time_is_the_image_of_the_method(method: str) -> None:
+def test_every_voxel_at_its_own_time_is_the_image_of_the_method(method):
     imaging, capture = TransientImaging(METHODS[method]), seen(method)
     voxels = [(1, 4, 11), (4, 11, 4), (3, 8, 8), (0, 0, 16)]
     places = np.array([[GRID.x[x], GRID.y[y], GRID.z[z]] for z, y, x in voxels])
@@ -66,7 +62,7 @@ def test_every_voxel_at_its_own_time_is_the_image_of_the_method(method: str) -> 
         assert values[(i, *voxel)] == pytest.approx(image[voxel], abs=1e-2 * float(image.max()))
 
 
-def test_front_views_are_the_brightest_along_z(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_front_views_are_the_brightest_along_z(monkeypatch):
     monkeypatch.setattr(nlos.video, "INSTANTS_PER_BLOCK", 3)  # 7 instants in three pieces
     imaging, capture = TransientImaging(METHODS["hybrid"]), seen("hybrid")
     times = np.linspace(ARRIVALS[0], ARRIVALS[1], 7)
@@ -79,7 +75,7 @@ def test_front_views_are_the_brightest_along_z(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_gate_shows_what_lights_up_while_it_is_open(method: str) -> None:
+def test_a_gate_shows_what_lights_up_while_it_is_open(method):
     imaging, capture = TransientImaging(METHODS[method]), seen(method)
     around = 1.5 * METHODS[method].pulse.sigma / SPEED_OF_LIGHT
     image = METHODS[method].reconstruct(capture, GRID).values
@@ -92,14 +88,14 @@ def test_a_gate_shows_what_lights_up_while_it_is_open(method: str) -> None:
         assert gated.provenance["imaging"]["gate_opens_s"] == arrival - around
 
 
-def test_long_after_the_record_nothing_echoes() -> None:
+def test_long_after_the_record_nothing_echoes():
     imaging, capture = TransientImaging(METHODS["rsd"]), seen("rsd")
     late = imaging.video(capture, GRID, [ARRIVALS[0], 40e-9]).values
     # The band's edge, where the pulse's spectrum is cut at 1 %, rings that far.
     assert late[1].max() < 2e-2 * late[0].max()
 
 
-def test_a_video_comes_back_from_its_file(tmp_path: Path) -> None:
+def test_a_video_comes_back_from_its_file(tmp_path):
     imaging, capture = TransientImaging(METHODS["rsd"]), seen("rsd")
     for make in (imaging.video, imaging.front_views):
         video = make(capture, GRID, ARRIVALS)
@@ -111,7 +107,7 @@ def test_a_video_comes_back_from_its_file(tmp_path: Path) -> None:
         assert loaded.provenance["imaging"]["method"] == "transient imaging by PlanarRSD"
 
 
-def test_the_film_shows_the_point_where_it_is(tmp_path: Path) -> None:
+def test_the_film_shows_the_point_where_it_is(tmp_path):
     values = np.zeros((3, *GRID.shape), np.float32)
     values[1, 2, 3, 12] = 1.0  # y -0.25, x 0.2
     video = TransientVideo(values, 1e-9 * np.arange(3), GRID)
@@ -170,7 +166,7 @@ FILM = np.zeros((3, *GRID.shape), np.float32)
         (lambda _: DepthAverage(GRID, 0.0, 0), InputError, "1 capture or more"),
     ],
 )
-def test_what_cannot_be_filmed_is_refused(attempt: Any, error: type, message: str) -> None:
+def test_what_cannot_be_filmed_is_refused(attempt, error, message):
     with pytest.raises(error, match=message):
         attempt(seen("rsd"))
 
@@ -181,14 +177,14 @@ FAR_AXIS, FAR, CAPTURES, LONG_WAVES = TimeAxis(320, 40e-12), (0.1, -0.1, 1.4), 9
 DEEP = Grid.box((-0.4, 0.4), (-0.4, 0.4), (0.3, 1.5), 0.1)
 
 
-def see_moving(place: float) -> Capture:
+def see_moving(place):
     """A bright point near by that moves along x, and a faint one far away that stands still."""
     wall = planar_wall(12, 12) * [1 / 1.2, 1, 1]
     points = [place, 0.1, 0.4], FAR
     return see(points, wall, [0.0, 0.0, 0.0], FAR_AXIS, 60e-12, [1.0, 20.0])
 
 
-def test_far_things_stand_out_and_near_ones_leave_no_trail() -> None:
+def test_far_things_stand_out_and_near_ones_leave_no_trail():
     places = np.linspace(-0.3, 0.3, CAPTURES)
     plan = LONG_WAVES.plan(see_moving(0.0), DEEP)
     average = DepthAverage(DEEP, 0.0, CAPTURES)
@@ -213,7 +209,7 @@ def test_far_things_stand_out_and_near_ones_leave_no_trail() -> None:
     assert along[start] < 0.5 * along.max()
 
 
-def test_what_moves_far_away_is_as_bright_as_in_the_newest_capture_and_leaves_no_trail() -> None:
+def test_what_moves_far_away_is_as_bright_as_in_the_newest_capture_and_leaves_no_trail():
     places = np.linspace(-0.4, 0.4, CAPTURES)
     wall, random = planar_wall(12, 12) * [1 / 1.2, 1, 1], np.random.default_rng(0)
     plan = LONG_WAVES.plan(see_moving(0.0), DEEP)
@@ -229,7 +225,7 @@ def test_what_moves_far_away_is_as_bright_as_in_the_newest_capture_and_leaves_no
     assert averaged[there] < 0.3 * averaged[here]
 
 
-def test_the_nearest_depths_show_the_newest_capture_alone() -> None:
+def test_the_nearest_depths_show_the_newest_capture_alone():
     grid = Grid([0.0, 0.1], [0.0], [0.1, 0.5, 1.0])
     average = DepthAverage(grid, 0.0, 4)
     assert average.windows.tolist() == [1, 2, 4]

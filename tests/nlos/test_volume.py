@@ -1,10 +1,5 @@
 """Grids and volumes: their axes, files, pictures, and exports that other libraries open."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import matplotlib.image
 import numpy as np
 import pytest
@@ -22,13 +17,13 @@ FINE = Grid(0.1 + 0.02 * np.arange(7), -0.3 + 0.03 * np.arange(6), 0.5 + 0.01 * 
 metres = st.floats(-5, 5, allow_nan=False)
 
 
-def volume_with(value: complex = 3 - 4j, dtype: type = np.complex64) -> Volume:
+def volume_with(value=3 - 4j, dtype=np.complex64):
     values = np.zeros(GRID.shape, dtype)
     values[1, 0, 3], values[0, 2, 1] = value, 1
     return Volume(values, GRID, {"made": "here"})
 
 
-def ball() -> Volume:
+def ball():
     """A soft ball off the middle, brightest at one voxel, with a complex phase that must not
     matter.
     """
@@ -37,7 +32,7 @@ def ball() -> Volume:
     return Volume(values.astype(np.complex64), FINE)
 
 
-def dark(grid: Grid) -> Volume:
+def dark(grid):
     return Volume(np.zeros(grid.shape), grid)
 
 
@@ -45,9 +40,7 @@ def dark(grid: Grid) -> Volume:
 
 
 @given(ends=st.tuples(*[st.tuples(metres, metres)] * 3), voxel=st.floats(0.05, 2))
-def test_a_box_holds_evenly_spaced_voxels_of_the_size_asked_for(
-    ends: tuple[tuple[float, float], ...], voxel: float
-) -> None:
+def test_a_box_holds_evenly_spaced_voxels_of_the_size_asked_for(ends, voxel):
     sides = [tuple(sorted(pair)) for pair in ends]
     grid = Grid.box(*sides, voxel)
     for axis, (first, last) in zip((grid.x, grid.y, grid.z), sides, strict=True):
@@ -61,7 +54,7 @@ def test_a_box_holds_evenly_spaced_voxels_of_the_size_asked_for(
         assert np.isclose(axis[0] - first, last - axis[-1], atol=1e-9)
 
 
-def test_shapes_follow_z_y_x_and_a_side_of_whole_voxels_keeps_both_ends() -> None:
+def test_shapes_follow_z_y_x_and_a_side_of_whole_voxels_keeps_both_ends():
     grid = Grid(x=[0, 1, 2], y=[0, 1], z=[1, 2, 3, 4])
     assert (grid.shape, grid.size) == ((4, 2, 3), 24)
     assert grid.find_nearest((1.9, 0.2, 3.4)) == (2, 0, 2)
@@ -92,14 +85,14 @@ UNIT = (0, 1), (0, 1), (0, 1)
         (Grid.around, (dark(GRID), 0.1), "dark everywhere"),
     ],
 )
-def test_what_is_no_grid_is_refused(make: Any, arguments: tuple[Any, ...], message: str) -> None:
+def test_what_is_no_grid_is_refused(make, arguments, message):
     with pytest.raises(InputError, match=message):
         make(*arguments)
 
 
 def test_the_space_in_front_of_a_wall_is_as_wide_as_the_wall_and_as_deep_as_light_reaches(
-    capture: Capture,
-) -> None:
+    capture,
+):
     grid = Grid.in_front_of(capture, 0.05)
     assert grid.x[[0, -1]] == pytest.approx([-0.6, 0.6])
     assert grid.y[[0, -1]] == pytest.approx([-0.5, 0.5])
@@ -118,7 +111,7 @@ def test_the_space_in_front_of_a_wall_is_as_wide_as_the_wall_and_as_deep_as_ligh
         Grid.in_front_of(early, 0.05)
 
 
-def test_looking_closer_keeps_everything_bright_and_one_voxel_more() -> None:
+def test_looking_closer_keeps_everything_bright_and_one_voxel_more():
     coarse = Grid.box((-1, 1), (-1, 1), (0.5, 1.5), 0.1)
     values = np.zeros(coarse.shape, np.float32)
     values[4, 7, 12] = 1.0  # z 0.9, y -0.3, x 0.2
@@ -133,7 +126,7 @@ def test_looking_closer_keeps_everything_bright_and_one_voxel_more() -> None:
 # --- volumes
 
 
-def test_magnitude_brightest_voxel_and_maximum_projection() -> None:
+def test_magnitude_brightest_voxel_and_maximum_projection():
     volume = volume_with()
     assert volume.magnitude[1, 0, 3] == pytest.approx(5)
     assert volume.find_brightest() == pytest.approx((0.3, -0.2, 0.6))
@@ -143,7 +136,7 @@ def test_magnitude_brightest_voxel_and_maximum_projection() -> None:
     assert (projection.depth[0, 3], projection.depth[2, 1]) == (0.6, 0.5)
 
 
-def test_a_threshold_is_relative_to_the_brightest() -> None:
+def test_a_threshold_is_relative_to_the_brightest():
     kept = volume_with().threshold(0.5)
     assert np.count_nonzero(kept.values) == 1
     assert kept.values[1, 0, 3] == 3 - 4j
@@ -153,7 +146,7 @@ def test_a_threshold_is_relative_to_the_brightest() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex64, np.complex128])
-def test_files_give_back_what_was_saved(dtype: type, tmp_path: Path) -> None:
+def test_files_give_back_what_was_saved(dtype, tmp_path):
     saved = volume_with(2.5, dtype)
     saved.save(tmp_path / "volume.h5")
     loaded = Volume.load(tmp_path / "volume.h5")
@@ -164,7 +157,7 @@ def test_files_give_back_what_was_saved(dtype: type, tmp_path: Path) -> None:
     assert loaded.provenance == {"made": "here"}
 
 
-def test_values_fit_the_grid_and_are_finite() -> None:
+def test_values_fit_the_grid_and_are_finite():
     with pytest.raises(ShapeError, match="volume"):
         Volume(np.zeros((4, 3, 2)), GRID)
     with pytest.raises(InputError, match="NaN"):
@@ -194,16 +187,14 @@ def test_values_fit_the_grid_and_are_finite() -> None:
         ),
     ],
 )
-def test_what_a_volume_cannot_do_is_refused_before_a_file_is_made(
-    attempt: Any, message: str, tmp_path: Path
-) -> None:
+def test_what_a_volume_cannot_do_is_refused_before_a_file_is_made(attempt, message, tmp_path):
     with pytest.raises(InputError, match=message):
         attempt(volume_with(), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", [Volume, Capture, TransientVideo])
-def test_files_of_something_else_are_refused(kind: Any, tmp_path: Path) -> None:
+def test_files_of_something_else_are_refused(kind, tmp_path):
     Record("camera").save(tmp_path / "camera.h5")
     with pytest.raises(FileFormatError, match="holds a camera record, expected"):
         kind.load(tmp_path / "camera.h5")
@@ -213,13 +204,13 @@ def test_files_of_something_else_are_refused(kind: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mip.png", "mip.pdf", "mip.SVG"])
-def test_a_picture_is_written(name: str, tmp_path: Path) -> None:
+def test_a_picture_is_written(name, tmp_path):
     volume_with().save_picture(tmp_path / name)
     assert (tmp_path / name).stat().st_size > 5000
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_the_picture_has_x_to_the_right_and_y_down_in_metres(tmp_path: Path) -> None:
+def test_the_picture_has_x_to_the_right_and_y_down_in_metres(tmp_path):
     figure = _draw_figure(volume_with())
     titled = [axes for axes in figure.axes if axes.get_title()]
     panels = {axes.get_title().split()[1].strip(":"): axes for axes in titled}
@@ -247,12 +238,12 @@ def test_the_picture_has_x_to_the_right_and_y_down_in_metres(tmp_path: Path) -> 
     assert pixels[pixels.shape[0] - int(height), int(column)].min() > 0.6
 
 
-def test_flat_dark_and_single_voxel_volumes_can_be_drawn(tmp_path: Path) -> None:
+def test_flat_dark_and_single_voxel_volumes_can_be_drawn(tmp_path):
     for grid in (Grid([0.1], [0.2], [0.3]), Grid(np.linspace(-1, 1, 50), [0.0], [1.0]), GRID):
         dark(grid).save_picture(tmp_path / "dark.png")
 
 
-def test_depths_one_voxel_apart_have_nearly_one_colour() -> None:
+def test_depths_one_voxel_apart_have_nearly_one_colour():
     values = np.zeros((3, 3, 4))
     values[1, :, :2] = values[2, :, 2:] = 1
     figure = _draw_figure(Volume(values, Grid(GRID.x, GRID.y, [0.5, 0.6, 0.7])))
@@ -263,7 +254,7 @@ def test_depths_one_voxel_apart_have_nearly_one_colour() -> None:
 # --- exports, opened by libraries that share no code with the writers
 
 
-def test_vti_opens_in_vtk(tmp_path: Path) -> None:
+def test_vti_opens_in_vtk(tmp_path):
     pyvista, volume = pytest.importorskip("pyvista"), ball()
     volume.export(tmp_path / "a.vti")
     image = pyvista.read(tmp_path / "a.vti")
@@ -277,7 +268,7 @@ def test_vti_opens_in_vtk(tmp_path: Path) -> None:
     assert pyvista.read(tmp_path / "flat.vti").dimensions == (7, 6, 1)
 
 
-def test_ply_points_open_in_vtk(tmp_path: Path) -> None:
+def test_ply_points_open_in_vtk(tmp_path):
     pyvista = pytest.importorskip("pyvista")
     ball().export(tmp_path / "a.ply", fraction=0.5)
     xyz, brightness = ball().points(0.5)
@@ -287,7 +278,7 @@ def test_ply_points_open_in_vtk(tmp_path: Path) -> None:
     assert xyz[np.argmax(brightness)] == pytest.approx(ball().find_brightest())
 
 
-def test_exr_npz_and_csv_open(tmp_path: Path) -> None:
+def test_exr_npz_and_csv_open(tmp_path):
     OpenEXR, volume = pytest.importorskip("OpenEXR"), ball()
     for suffix in ("exr", "npz", "csv"):
         volume.export(tmp_path / f"a.{suffix}", fraction=0.9)
@@ -304,7 +295,7 @@ def test_exr_npz_and_csv_open(tmp_path: Path) -> None:
     assert rows["x_m"] == pytest.approx(volume.find_brightest()[0])
 
 
-def test_the_surface_encloses_the_ball(tmp_path: Path) -> None:
+def test_the_surface_encloses_the_ball(tmp_path):
     pyvista = pytest.importorskip("pyvista")
     fine = Grid(*(np.linspace(-0.2, 0.2, n) for n in (31, 35, 33)))
     centre = np.array([0.03, -0.02, 0.01])
@@ -320,7 +311,7 @@ def test_the_surface_encloses_the_ball(tmp_path: Path) -> None:
     assert read.volume == pytest.approx(4 / 3 * np.pi * half**3, rel=0.03)
 
 
-def test_the_depth_map_shows_a_weak_thing_behind_a_bright_one_and_no_noise() -> None:
+def test_the_depth_map_shows_a_weak_thing_behind_a_bright_one_and_no_noise():
     axis = 0.01 * np.arange(60)
     values = 0.05 * np.random.default_rng(1).random((60, 30, 30))
     values[15, 5:25, 5:10], values[45, 5:25, 20:25] = 1.0, 0.3
