@@ -64,7 +64,7 @@ class FourierPlan:
 def allocate_zeros(shape: tuple[int, ...]) -> ComplexArray:
     """Return zeros, complex64, aligned for vector instructions where FFTW is there."""
     zeros: Any = np.zeros if pyfftw is None else pyfftw.zeros_aligned
-    return zeros(shape, np.complex64)  # type: ignore[no-any-return]
+    return zeros(shape, np.complex64)
 
 
 def plan_transform(

@@ -82,11 +82,10 @@ class SpectralPropagation:
             plan = plan_transforms(geometry, waves, strength, self.tolerance, scattered)
         if library is not None:
             carry = partial(sum_waves_on_device, geometry, waves, library)
-            if plan is not None:
-                carry = DevicePropagation(plan, library).field
+            on_lattice = plan and DevicePropagation(plan, library).field
 
             def carry_at_once(phasors: Array, progress: Progress) -> Array:
-                field = carry(phasors)
+                field = (on_lattice or carry)(phasors)
                 progress(math.prod(field.shape))
                 return field
 
