@@ -165,12 +165,6 @@ def test_sweeps_by_hand(sweep: Sweep, rectified: tuple[float, float], raw: tuple
     assert tuple(map(float, found)) == pytest.approx(raw, abs=1e-12)
 
 
-@given(st.floats(0, 1000), st.floats(-100, 500))
-def test_no_skew_moves_nothing(row: float, column: float) -> None:
-    still = SkewSweep([100.0, 200.0, 300.0], np.zeros(3), np.zeros(3))
-    assert still.raw_position(np.array(row), np.array(column)) == (row, column)
-
-
 @every_sweep
 def test_rows_and_columns_of_a_sweep_broadcast(sweep: Sweep) -> None:
     rows, columns = np.arange(5.0), np.linspace(0, 400, 7)

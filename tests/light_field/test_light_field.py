@@ -28,7 +28,6 @@ from tofclip.light_field.views import (
     measure,
 )
 from tofclip.metrics import nmse
-from tofclip.recovery.light_field import ClipRecovery
 from tofclip.simulate.bodies import Body, Box, Lambertian, Rectangle, Specular, Sphere
 from tofclip.simulate.light_fields import (
     CameraArray,
@@ -180,7 +179,6 @@ CARD[14:18, 13:25] = 0.6
 # Rolled by whole pixels: no interpolation is shared with what is tested.
 MOVED = [np.roll(CARD, (int(SHEAR * v), int(SHEAR * u)), (0, 1)) for v, u in VIEWS]
 LIGHT_FIELD = LightField(np.stack(MOVED), VIEWS)
-each_encoder = pytest.mark.parametrize("encoder", ["line", "single-pixel"])
 
 
 def encode(encoder: str = "line", ratio: float = 1.0, seed: int = 0) -> ClipMeasurement:
@@ -195,38 +193,7 @@ def test_refocusing_at_the_cards_depth_makes_it_sharp():
     np.testing.assert_allclose(elsewhere, LIGHT_FIELD.pictures[6], atol=1e-6)
 
 
-@each_encoder
-def test_the_model_predicts_the_readings_of_the_true_views(encoder):
-    """A whole-pixel shear is exact for codes; for lines the shifted detector splits pixels where a shifted picture
-    does not, which on this scene of single pixels changes measurements by up to a quarter."""
-    camera = CameraSetup(encoder, 1.0, 3).camera(SHAPE, VIEWS)
-    measurements = encode(encoder, 1.0, 3).values
-    error, wrong = (
-        np.linalg.norm(camera.model(shear)(CARD) - measurements) for shear in (SHEAR, -SHEAR)
-    )
-    bound = 1e-5 if encoder == "single-pixel" else 0.25
-    assert error < bound * np.linalg.norm(measurements)
-    assert error < 0.5 * wrong
-
-
-@each_encoder
-def test_a_card_is_recovered_sharply_at_its_own_depth_only(encoder):
-    """Trial seeds gave 1 to 6 % in focus; out of focus the wrong model cannot explain the measurements."""
-    in_focus, beside = (
-        nmse(ClipRecovery(weight=0.02).recover(encode(encoder, 0.8), shear).picture, CARD)
-        for shear in (SHEAR, 0.0)
-    )
-    assert in_focus < 0.1
-    assert beside > 3 * in_focus
-
-
-def test_fewer_angles_than_views_leave_some_without():
-    camera = CameraSetup("line", 5 / 31, 0).camera(SHAPE, VIEWS)
-    assert len(camera.used_views) == len(set(camera.used_views)) == 5
-    assert camera.light_field_model().shape_in == (5, *SHAPE)
-
-
-@each_encoder
+@pytest.mark.parametrize("encoder", ["line", "single-pixel"])
 def test_a_measurement_survives_its_file(encoder, tmp_path):
     made = encode(encoder, 0.5, 7)
     made.save(tmp_path / "m.h5")
@@ -327,11 +294,6 @@ TWO = np.array([0.0, 1.0])
         lambda: LightField(np.full((9, 4, 4), np.nan), VIEWS),
         lambda: LightField(np.eye(9)[:, :, None], VIEWS[:4]),
         lambda: CameraSetup("nothing", 0.5, 0).camera(SHAPE, VIEWS),
-        lambda: CameraSetup("line", 1e-3, 0).camera(SHAPE, VIEWS),
-        lambda: CameraSetup("single-pixel", 1e-3, 0).camera(SHAPE, VIEWS),
-        lambda: CameraSetup("line", -1.0, 0).camera(SHAPE, VIEWS),
-        lambda: CameraSetup("line", 1.0, 0).camera(SHAPE, VIEWS).model(50.0),
-        lambda: CameraSetup("single-pixel", 1.0, 0).camera(SHAPE, VIEWS).model(50.0),
         lambda: corrupt_measurement(encode(), None, 1.5),
         lambda: corrupt_measurement(encode(), -1.0, 0.0),
         lambda: replace(encode(), values=encode().values[1:]).camera(),

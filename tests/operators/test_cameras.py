@@ -314,18 +314,6 @@ def test_neighbouring_angles_stand_for_the_whole_aperture(count, cycle):
     assert max(evenly) < 0.25 * min(randomly)
 
 
-def test_the_places_of_a_cycle_are_all_different():
-    """With cycle 8 each eighth of the ranked views is taken once in every eight angles."""
-    angles = np.arange(64) * np.pi / 64
-    _, owner = assign(True, angles, 0, 8)
-    v, u = np.array(GRID).T[:, :, None]
-    offset = u * np.cos(angles) + v * np.sin(angles)
-    rank = np.argsort(np.argsort(offset, axis=0, kind="stable"), axis=0, kind="stable")
-    eighth = rank[owner, np.arange(64)] * 8 // 64
-    # Each view is taken once only, so that a few must make do with a neighbouring eighth.
-    assert np.mean([len(set(eighth[k : k + 8])) for k in range(0, 64, 8)]) > 6.5
-
-
 def test_the_even_camera_measures_as_much_as_the_random_one():
     for ratio in (0.25, 1.0, 2.0):
         cameras = [kind((32, 32), GRID, ratio, 0) for kind in (LineCamera, EvenAngleLineCamera)]

@@ -278,6 +278,12 @@ def test_light_is_no_defect(clean) -> None:
     counts += np.random.default_rng(1).poisson(5, (200, 300)) * (np.arange(200) == 90)[:, None]
     photons = Streak(counts, np.arange(200) * 20e-12)
     assert find_defects(photons, PULSE_ROWS).count < 0.001 * np.count_nonzero(counts)
+    # slow light hardly changes from row to row: what is 2.7 times its neighbours is sharper
+    slow = 1000 * np.exp(-(((np.arange(200) - 100) / 20) ** 2))[:, np.newaxis]
+    struck = slow + np.random.default_rng(2).normal(10, 1, (200, 300))
+    struck[100, 150] = 2700
+    found = find_defects(Streak(struck.astype(np.float32)), PULSE_ROWS)
+    assert np.argwhere(found.pixels).tolist() == [[100, 150]]
 
 
 def test_a_plateau_is_the_sensors_limit_and_a_dim_shot_has_none(clean) -> None:

@@ -69,9 +69,10 @@ def test_a_slow_consumer_holds_the_source_back(worker):
     assert [item.number for item in stream] == list(range(1, 50))
 
 
-def test_slow_work_drops_the_oldest_where_that_is_wanted(worker):
+@pytest.mark.parametrize("queue_size", [1, 3])
+def test_slow_work_drops_the_oldest_where_that_is_wanted(worker, queue_size):
     source = count(20, STEP / 5)
-    items = list(run_in_order(source, slow, worker, at_once=1, policy="drop_oldest"))
+    items = list(run_in_order(source, slow, worker, 1, queue_size, "drop_oldest"))
     numbers = [item.number for item in items]
     assert numbers[-1] == 19  # the newest is never dropped
     assert numbers == sorted(numbers)

@@ -33,15 +33,11 @@ from tofclip.solvers.data_terms import estimate_robust_deviation
 from tofclip.solvers.direct import PATCH_COLUMNS, PATCH_ROWS, InverseTraces, order_by_patch
 from tofclip.solvers.fista import (
     FOLD_COUNT,
-    INITIAL_WEIGHT,
     MAX_WEIGHT_WORK,
     SINGLE_FOLD_RUNS,
-    WEIGHT_RATIO,
-    _search_downhill,
     assign_folds,
     choose_weight,
 )
-from tofclip.threads import LANES
 
 COUNTS = np.array([0.0, 1, 3, 20, 400, 1e4])
 DEVIATION = np.sqrt(COUNTS + 1)
@@ -304,25 +300,6 @@ def test_traces_are_the_pictures_seen_pixel_by_pixel(prepared, frames):
     assert np.all(found[:, [0, -1]] == -1)
 
 
-@pytest.mark.parametrize("frames", [1, LANES, 150])
-def test_weights_are_the_inverse_gram_matrix_times_the_measurements(prepared, frames):
-    measurements = readings(frames, frames, 170).astype(np.float32)
-    weights = prepared.weights(measurements)
-    matrix = prepared.operator.matrix.toarray().astype(np.float64)
-    mu = LinearInverse().damping * prepared.operator.squared_norm
-    expected = np.linalg.solve(matrix @ matrix.T + mu * np.eye(170), measurements)
-    # what no pixel falls on has no part in the pictures
-    unseen = matrix.sum(axis=1) == 0
-    assert 0 < unseen.sum() < 170
-    expected[unseen] = 0
-    # float32 sums of 170 products
-    bound = 170 * 6e-8 * np.abs(expected).max()
-    np.testing.assert_allclose(weights[:, :frames], expected, atol=bound)
-    assert not weights[:, frames:].any()
-    assert weights.shape[1] >= -(-frames // LANES) * LANES  # whole vectors
-    assert weights.ctypes.data % 64 == weights.strides[0] % 64 == 0
-
-
 def test_patches_hold_every_pixel_once_and_neighbours_together():
     order = order_by_patch((21, 37))
     np.testing.assert_array_equal(np.sort(order), np.arange(21 * 37))
@@ -346,21 +323,6 @@ def test_neighbours_are_left_out_together_and_many_runs_need_one_fold_only():
     np.testing.assert_array_equal(out.all(axis=1), out.any(axis=1))
     assert assign_folds(SINGLE_FOLD_RUNS, 1, 0).shape[1] == 1
     assert assign_folds(SINGLE_FOLD_RUNS - 1, 1, 0).shape[1] == FOLD_COUNT
-
-
-@pytest.mark.parametrize("lowest", [-3.4, -0.7, 0.0, 0.4, 4.2])
-def test_the_search_finds_the_lowest_point_of_a_parabola(lowest):
-    choice = _search_downhill(
-        lambda weight: 3 + (np.log(weight / INITIAL_WEIGHT) / np.log(WEIGHT_RATIO) - lowest) ** 2
-    )
-    assert choice.weight == pytest.approx(INITIAL_WEIGHT * WEIGHT_RATIO**lowest, rel=1e-6)
-    assert np.all(np.diff(choice.trial_weights) > 0)
-
-
-def test_an_error_that_only_falls_ends_the_search():
-    choice = _search_downhill(lambda weight: weight)
-    assert choice.trial_weights.size == 10
-    assert choice.weight == choice.trial_weights[0]
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.1])

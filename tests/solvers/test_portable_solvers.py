@@ -91,14 +91,6 @@ def test_pictures_are_those_of_the_compiled_loops(device, method, dtype):
 
 
 @every_method
-def test_a_lone_frame_without_a_mask(device, method):
-    measurements, _ = letters(1)
-    expected = method.recover(projection(), measurements).frames
-    found = method.recover(projection(), device.put(measurements)).frames
-    assert difference(to_numpy(found), expected) < 1e-5
-
-
-@every_method
 def test_pieces_make_no_difference(device, method, monkeypatch):
     """Memory for two frames at a time instead of for all five; sums over other numbers of frames
     round otherwise.
