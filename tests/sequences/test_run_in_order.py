@@ -69,10 +69,24 @@ def test_a_slow_consumer_holds_the_source_back(worker):
     assert [item.number for item in stream] == list(range(1, 50))
 
 
-@pytest.mark.parametrize("queue_size", [1, 3])
-def test_slow_work_drops_the_oldest_where_that_is_wanted(worker, queue_size):
+def test_the_oldest_of_those_that_wait_are_dropped(worker):
+    brought = threading.Event()
+
+    def source():
+        yield from range(6)
+        brought.set()
+
+    def work(value: int) -> int:
+        brought.wait(30)
+        return slow(value)
+
+    items = run_in_order(source(), work, worker, 1, queue_size=3, policy="drop_oldest")
+    assert [item.number for item in items] == [0, 3, 4, 5]
+
+
+def test_slow_work_drops_the_oldest_where_that_is_wanted(worker):
     source = count(20, STEP / 5)
-    items = list(run_in_order(source, slow, worker, 1, queue_size, "drop_oldest"))
+    items = list(run_in_order(source, slow, worker, at_once=1, policy="drop_oldest"))
     numbers = [item.number for item in items]
     assert numbers[-1] == 19  # the newest is never dropped
     assert numbers == sorted(numbers)
