@@ -219,9 +219,7 @@ def make_group(name: str) -> typer.Typer:
 
 
 def walk_verbs(group: VerbGroup) -> dict[str, TyperCommand]:
-    """Import every verb and return the commands by the words that call them, such as ``lidar scene``,
-    in the order of the help.
-    """
+    """Import every verb and return the commands by the words that call them, as in the help."""
     found: dict[str, TyperCommand] = {}
     for name in VERBS:
         command = group.load_verb(name)
@@ -233,9 +231,7 @@ def walk_verbs(group: VerbGroup) -> dict[str, TyperCommand]:
 
 
 def find_help(words: Sequence[str]) -> str | None:
-    """Return the help that words ask for and nothing else, without what typer parses options with,
-    which takes longer to import than all the rest.
-    """
+    """Return the help that words ask for; what parses options takes longer to import."""
     *names, last = words or ("",)
     if last not in HELP_OPTIONS or not names or any(name.startswith("-") for name in names):
         return None
@@ -444,9 +440,7 @@ def _keep_to_one_line(verbose: bool) -> Iterator[None]:
 
 
 class _CompileNotes(logging.Handler):
-    """Says once, on a terminal, why a first run takes longer, and anywhere what keeps compiled
-    loops from being kept.
-    """
+    """Says once, on a terminal, why a first run takes longer, and anywhere that no loop is kept."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -158,9 +158,7 @@ def setting(
     unit: str = "",
     written: str | None = None,
 ) -> Any:
-    """Declare a verb's own setting; its default None is found by the verb, or may be absent.
-    `shown`: the default in words; `unit`: that of SI; `written`: on the command line.
-    """
+    """Declare a verb's own setting, of an SI `unit`, `written` in another on the command line."""
     known = {"metavar": metavar, "help": meaning, "shown": shown, "choices": choices, "unit": unit}
     return dataclasses.field(default=default, metadata={**known, "written": written or unit})
 

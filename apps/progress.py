@@ -62,9 +62,7 @@ def show_activity(title: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def show_share(title: str, whole: float | None) -> Iterator[Callable[[float], None]]:
-    """Show a bar for a part of a whole, such as seconds that have passed; none
-    where the whole is not known.
-    """
+    """Show a bar for a part of a whole, such as seconds passed; none where that is not known."""
     if whole is None or not math.isfinite(whole):
         yield lambda _: None
         return
@@ -161,10 +159,7 @@ def run_with_progress(
     cluster: str | None,
     watch: Callable[[Report], object] = lambda _: None,
 ) -> Summary:
-    """Run the jobs that are not done yet, or all where results may be replaced, one after the other in
-    this process unless a cluster is named, with a bar that shows the time left; `watch` is called
-    with each report.
-    """
+    """Run the jobs that are not done yet under a bar; `watch` is called with reports."""
     from tofclip.sequences.jobs import run_jobs, select_unfinished
 
     if may_replace():
@@ -196,9 +191,7 @@ def resolve_device(device: str, cluster: str | None) -> str:
 def report_summary(
     summary: Summary, total: int, as_json: bool, out: Path, figures: Mapping[str, Any] | None = None
 ) -> None:
-    """Print the figures of a sequence and its failures. `total`: its jobs, those included that were
-    done by an earlier run; `figures`: further ones.
-    """
+    """Print the figures of a sequence and its failures; `total`: of all its jobs."""
     failed = {one.name: name_options(one.problem) for one in summary.failures}
     figures = {
         "results": summary.done,

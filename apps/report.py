@@ -77,10 +77,10 @@ def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | No
     _require_file_name(out)
     if suffixes:
         require_suffix(out, *suffixes)
-    if out.parent.exists() and not out.parent.is_dir():
-        raise StorageError(f"{out}: cannot be written: its folder is a file")
     if not out.parent.is_dir():
-        raise StorageError(f"{out}: cannot be written: the folder does not exist; create it first")
+        missing = "the folder does not exist; create it first"
+        said = "its folder is a file" if out.parent.exists() else missing
+        raise StorageError(f"{out}: cannot be written: {said}")
     if not os.access(out.parent, os.W_OK):
         raise StorageError(f"{out}: cannot be written: writing is not permitted there")
     require_apart([out], inputs)
@@ -100,9 +100,7 @@ def name_beside(out: Path, suffix: str) -> Path:
 
 
 def choose_preview(out: Path, preview: Path | None, inputs: Iterable[str | Path | None]) -> Path:
-    """Return where the picture of a result goes, by default beside the result, and refuse either
-    where it cannot be written.
-    """
+    """Return where the picture of a result goes, and refuse either that cannot be written."""
     preview, inputs = preview or name_beside(out, ".png"), list(inputs)
     require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
     require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
@@ -124,9 +122,7 @@ def make_folder(folder: Path) -> None:
 def build_provenance(
     settings: Mapping[str, Any], *inputs: Path, earlier: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Describe how a result came about, in plain values: options by name, checksums of the inputs,
-    and what is known about their own past.
-    """
+    """Describe how a result came about: options, checksums of the inputs, and their own past."""
     from tofclip.storage import collect_provenance
 
     plain = {
@@ -220,9 +216,7 @@ def _find_compared(figures: Mapping[str, Any]) -> list[str]:
 
 
 def _list_alike_entries(value: Any) -> dict[str, dict[str, Any]]:
-    """Return the entries of a list, by their numbers, or of a mapping that say the same of several
-    things, such as stages; none of anything else.
-    """
+    """Return the entries of a list or mapping that say the same of several things; else none."""
     if isinstance(value, list):
         value = {str(number): entry for number, entry in enumerate(value, start=1)}
     if not isinstance(value, dict) or len(value) < 2:
@@ -232,9 +226,7 @@ def _list_alike_entries(value: Any) -> dict[str, dict[str, Any]]:
 
 
 def _format_compared(things: Mapping[str, Mapping[str, Any]]) -> str:
-    """Put things side by side where they fit, a column for each, and below each other where there
-    are too many.
-    """
+    """Put things side by side where they fit, and below each other where there are too many."""
     cells = [["", *map(_format_name, things)]]
     cells += [
         [_format_name(figure), *(_format_value(thing[figure]) for thing in things.values())]

@@ -15,7 +15,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.benchmarks.harness import Prepare, PreparedCase
 from apps.benchmarks.nlos import RELIEF_M, make_scene
@@ -28,7 +27,7 @@ from apps.benchmarks.shots import (
 )
 from nlos import Backprojection, Capture, Hybrid, PlanarRSD
 from nlos.method import Method as Imaging
-from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy
+from tofclip.arrays import Array, ComputeDevice, Float32Array, namespace, parse_device, to_numpy
 from tofclip.camera import Camera
 from tofclip.lidar import depth
 from tofclip.shots import Frames
@@ -46,7 +45,7 @@ def find_device() -> ComputeDevice:
     return parse_device(os.environ.get(DEVICE_VARIABLE) or "torch:cpu")
 
 
-def make_cards(side: int) -> NDArray[np.float32]:
+def make_cards(side: int) -> Float32Array:
     """Pictures (side, side, frames) of 8 x 8 cards at random ranges."""
     random = np.random.default_rng(0)
     delay = np.arange(FRAMES) - random.uniform(0, FRAMES, (CARDS, CARDS, 1))
@@ -54,7 +53,7 @@ def make_cards(side: int) -> NDArray[np.float32]:
     return np.repeat(np.repeat(cards, side // CARDS, axis=0), side // CARDS, axis=1)
 
 
-def add_noise(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def add_noise(values: Float32Array) -> Float32Array:
     """Values with readout noise."""
     return values + NOISE * np.random.default_rng(1).standard_normal(values.shape, np.float32)
 
@@ -108,9 +107,7 @@ def prepare_ranging(side: int) -> PreparedCase:
 def prepare_imaging(
     make_method: Callable[[float], Imaging], relief: float, confocal: bool, side: int
 ) -> PreparedCase:
-    """A hidden volume from a simulated capture of a wall with some relief, m; `make_method`: from a
-    wavelength in m.
-    """
+    """A hidden volume of a wall with some relief, m, by a method made from a wavelength."""
     capture, grid, wavelength = make_scene(side, relief, confocal)
     method = make_method(wavelength)
 

@@ -26,9 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofclip import __version__
+from tofclip.arrays import AnyArray
 from tofclip.errors import InputError
 from tofclip.sequences.jobs import measure_peak_memory_bytes
 from tofclip.threads import THREADS_VARIABLE, thread_count
@@ -285,35 +285,30 @@ print("seconds", seconds)
 """
 
 
-def ask_peer(name: str, script: str, **arrays: Any) -> tuple[float, NDArray[Any] | None]:
-    """Run a script in the peers' Python on arrays: the seconds that its last lines report, and the
-    array that it saved, if any.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path, saved = Path(folder) / "arrays.npz", Path(folder) / "result.npy"
-        np.savez(path, **arrays)
-        seconds = run_peer(script, name, str(path), str(saved))
-        return seconds, np.load(saved) if saved.exists() else None
-
-
-def run_peer(script: str, name: str, *words: str) -> float:
-    """Run a script in the peers' Python and return the seconds that its last lines report."""
+def ask_peer(name: str, script: str, **arrays: Any) -> tuple[float, AnyArray | None]:
+    """Run a script in the peers' Python: the seconds that it reports, and its array."""
     python = os.environ.get(PEERS_VARIABLE)
     if not python:
         raise PeerUnavailableError(f"{name}: --peers names no Python that has it")
     clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    command = [python, "-c", script, *words]
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=False, env=clean, timeout=PEER_TIMEOUT_S
-        )
-    except subprocess.TimeoutExpired as fault:
-        raise PeerUnavailableError(f"{name}: takes more than {PEER_TIMEOUT_S} s") from fault
-    reported = [line.split() for line in done.stdout.splitlines() if line.startswith("seconds ")]
-    if done.returncode or not reported:
-        problem = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise PeerUnavailableError(f"{name}: {problem}")
-    return float(reported[-1][1])
+    with tempfile.TemporaryDirectory() as folder:
+        path, saved = Path(folder) / "arrays.npz", Path(folder) / "result.npy"
+        np.savez(path, **arrays)
+        command = [python, "-c", script, str(path), str(saved)]
+        try:
+            done = _run(command, clean, PEER_TIMEOUT_S)
+        except subprocess.TimeoutExpired as fault:
+            raise PeerUnavailableError(f"{name}: takes more than {PEER_TIMEOUT_S} s") from fault
+        reported = re.findall(r"^seconds (.+)$", done.stdout, re.M)
+        if done.returncode or not reported:
+            problem = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+            raise PeerUnavailableError(f"{name}: {problem}")
+        return float(reported[-1]), np.load(saved) if saved.exists() else None
+
+
+def _run(command: list[str], environment: Mapping[str, str], timeout: float) -> Any:
+    how: Any = {"capture_output": True, "text": True, "check": False}
+    return subprocess.run(command, env=environment, timeout=timeout, **how)
 
 
 # What has not begun by then is left out, so that a run has an end on any machine: twice what two
@@ -371,9 +366,7 @@ def _run_case(
 def _run_process(
     case: Case, extent: tuple[int, int], peers: str | None, remaining_s: list[float]
 ) -> dict[str, Any]:
-    """Figures of a fresh process for a size and a number of threads, or ``problem``: why there are
-    none. The time it took is taken off what remains.
-    """
+    """Figures of a fresh process for a size and threads, or ``problem``; its time is taken off."""
     if remaining_s[0] <= 0:
         return {"problem": f"left out: the others took {TOTAL_TIMEOUT_S} s"}
     longest = CASE_TIMEOUT_S + (PEER_TIMEOUT_S if peers else 0)  # what has begun may finish
@@ -385,9 +378,7 @@ def _run_process(
     environment = {**os.environ, THREADS_VARIABLE: str(extent[1]), PEERS_VARIABLE: peers or ""}
     began = time.monotonic()
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=False, env=environment, timeout=longest
-        )
+        done = _run(command, environment, longest)
     except subprocess.TimeoutExpired:
         return {"problem": f"took more than {longest:.0f} s"}
     finally:

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import scipy.fft
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from apps.benchmarks.harness import (
@@ -31,6 +30,7 @@ from apps.benchmarks.harness import (
     PreparedCase,
     ask_peer,
 )
+from tofclip.arrays import AnyArray, Float32Array
 from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field import LightField
@@ -76,9 +76,7 @@ def repeat_products(model: LinearOperator, number: int) -> Action:
 
 
 def prepare_recovery(encoder: str, weight: float | None, side: int) -> PreparedCase:
-    """One picture by total variation; the floor takes as many products as its last recovery needed.
-    The prior's weight None: chosen by cross-validation, as part of the work.
-    """
+    """One picture by total variation, at a weight or with its choice, against the last products."""
     light_field = render_scene(side)
     measurement = measure(light_field, CameraSetup(encoder, 0.5, 0))
     method = ClipRecovery(weight=weight)
@@ -97,9 +95,7 @@ LENSLESS_ITERATIONS, NOISE_FRACTION = 60, 1e-3
 
 
 def prepare_lensless(side: int) -> PreparedCase:
-    """A lensless camera's picture, dark in its outer half, by nonnegative least squares: the same
-    measurements, point-spread function and number of iterations as the peer's.
-    """
+    """A lensless camera's picture; readings and iterations are the peer's."""
     random = np.random.default_rng(0)
     speckle = np.maximum(gaussian_filter(random.standard_normal((side, side)), 1.0), 0) ** 3
     spread = (speckle / speckle.sum()).astype(np.float32)
@@ -114,7 +110,7 @@ def prepare_lensless(side: int) -> PreparedCase:
     method = Sparse(0.0, LENSLESS_ITERATIONS, gap=0.0)
 
     @cache
-    def ask() -> tuple[float, NDArray[Any] | None]:
+    def ask() -> tuple[float, AnyArray | None]:
         return ask_peer(
             "LenslessPiCam",
             LENSLESS_SCRIPT,
@@ -140,7 +136,7 @@ def prepare_lensless(side: int) -> PreparedCase:
     )
 
 
-def compute_scaled_nmse(picture: NDArray[np.float32], scene: NDArray[np.float32]) -> float:
+def compute_scaled_nmse(picture: Float32Array, scene: Float32Array) -> float:
     """Normalised squared error of a picture at its best scale: programs differ in theirs."""
     scale = float(np.vdot(picture, scene)) / float(np.vdot(picture, picture))
     return nmse(scale * picture, scene)

@@ -46,9 +46,7 @@ def make_scene(count: int, relief: float, confocal: bool = False) -> tuple[Captu
 
 
 def make_transforms(side: int, number: int) -> tuple[Action, float]:
-    """Inverse transforms of the doubled plane, a hundredth of `number` or more, and which fraction
-    of it that is.
-    """
+    """Some inverse transforms of the doubled plane, and which fraction of `number` they are."""
     threads = thread_count()
     each = max(1, number // (100 * threads))
     how = {"axes": (0, 1), "direction": "FFTW_BACKWARD", "flags": ("FFTW_MEASURE",)}
@@ -95,9 +93,7 @@ def prepare_propagation(count: int) -> PreparedCase:
 
 
 def prepare_confocal(method: Method, count: int) -> PreparedCase:
-    """A confocal scan of a planar wall; the floor is a transform of its doubled box, there and
-    back.
-    """
+    """A confocal scan of a planar wall; the floor transforms its doubled box, there and back."""
     wall = build_relay_wall("planar", count)
     capture = Capture(
         np.random.default_rng(0).random((BINS, count, count), np.float32), wall, wall, BIN_WIDTH_S

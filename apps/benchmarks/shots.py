@@ -11,9 +11,9 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.benchmarks.harness import ASTRA_SCRIPT, Peer, Prepare, PreparedCase, ask_peer
+from tofclip.arrays import Float32Array, FloatArray
 from tofclip.camera import Camera
 from tofclip.lidar import Pulse, depth
 from tofclip.lidar.photons import PhotonDetector, measure_accuracy
@@ -39,8 +39,8 @@ from tofclip.solvers import (
 from tofclip.threads import LANES, limit_blas_threads, run_blocks
 
 ITERATIONS = 30
-ANGLES_RAD: NDArray[np.float64] = np.radians(np.array([-44.0, -26.0, -12.5, 0.8, 22.0, 37.5, 48.0]))
-CENTRES_PX: NDArray[np.float64] = np.array([168.0 + 172.5 * view for view in range(7)])
+ANGLES_RAD: FloatArray = np.radians(np.array([-44.0, -26.0, -12.5, 0.8, 22.0, 37.5, 48.0]))
+CENTRES_PX: FloatArray = np.array([168.0 + 172.5 * view for view in range(7)])
 SLIT_WIDTH_PX = 1344
 SIDE_PX = 174
 DENSE_BLOCK_ROWS = 336  # of the dense matrix, which are read from memory once for all frames
@@ -51,17 +51,15 @@ def make_operator(side: int = SIDE_PX) -> LineProjection:
     return Camera(CENTRES_PX, ANGLES_RAD, (side, side), SLIT_WIDTH_PX).operator()
 
 
-def measurements(frames: int) -> NDArray[np.float32]:
+def measurements(frames: int) -> Float32Array:
     """Positive measurements with noise, (1344, frames); what they show does not change the work."""
     return np.abs(np.random.default_rng(0).standard_normal((SLIT_WIDTH_PX, frames))).astype(
         np.float32
     )
 
 
-def run_products(projection: LineProjection, data: NDArray[np.float32]) -> None:
-    """Multiply as often as a method iterates each way on every frame, in blocks on all threads,
-    nothing else.
-    """
+def run_products(projection: LineProjection, data: Float32Array) -> None:
+    """Multiply each way on every frame as often as a method iterates, nothing else."""
 
     def work(piece: slice) -> None:
         block = np.ones((*projection.shape_in, LANES), np.float32)
@@ -73,7 +71,7 @@ def run_products(projection: LineProjection, data: NDArray[np.float32]) -> None:
     run_blocks(work, data.shape[1])
 
 
-def run_adjoints(projection: LineProjection, data: NDArray[np.float32]) -> None:
+def run_adjoints(projection: LineProjection, data: Float32Array) -> None:
     """One product with the transpose for every frame of `data` (measurements, frames)."""
     block = np.ascontiguousarray(data[:, :LANES])
 
@@ -83,10 +81,8 @@ def run_adjoints(projection: LineProjection, data: NDArray[np.float32]) -> None:
     run_blocks(work, data.shape[1])
 
 
-def run_dense_products(projection: LineProjection, data: NDArray[np.float32]) -> None:
-    """A product with a dense matrix and one with the sparse transpose for every frame of `data`
-    (measurements, frames).
-    """
+def run_dense_products(projection: LineProjection, data: Float32Array) -> None:
+    """A product with a dense matrix and one with the sparse transpose for every frame of `data`."""
     matrix = np.eye(SLIT_WIDTH_PX, dtype=np.float32)
     weights = np.empty_like(data)
 
@@ -102,11 +98,11 @@ def run_dense_products(projection: LineProjection, data: NDArray[np.float32]) ->
 
 
 def prepare_recovery(
-    method: Method, floor: Callable[[LineProjection, NDArray[np.float32]], None], frames: int
+    method: Method, floor: Callable[[LineProjection, Float32Array], None], frames: int
 ) -> PreparedCase:
     """A method beside the products that it needs; the linear inverse is prepared beforehand."""
     projection, data = make_operator(), measurements(frames)
-    recover: Callable[[NDArray[np.float32]], object] = partial(method.recover, projection)
+    recover: Callable[[Float32Array], object] = partial(method.recover, projection)
     if isinstance(method, LinearInverse):
         recover = method.prepare(projection).recover
     return PreparedCase(lambda: recover(data), lambda: floor(projection, data), frames)
@@ -123,7 +119,7 @@ def prepare_projection(side: int) -> PreparedCase:
     return PreparedCase(lambda: model(picture), lambda: matrix @ flat, 1, peers)
 
 
-def time_radon(picture: NDArray[np.float32]) -> float:
+def time_radon(picture: Float32Array) -> float:
     """Seconds of scikit-image's projections of the picture at the seven angles."""
     from skimage import transform
 

@@ -73,9 +73,7 @@ class WholeDetail(DetailChooser):
 
 
 def make_echo_request(server: Any, answered: Callable[[], None]) -> Callable[[], None]:
-    """Return a function that asks the page to call back once all that was sent so far is drawn. It
-    reaches into viser's inner messages, which only a measurement may do.
-    """
+    """Have the page call back once all is drawn, by viser's inner messages: only to measure."""
     names = (f"tofclip-drawn-{number % 4}" for number in itertools.count())
 
     def receive(_: int, message: Any) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.figures.occlusion import draw_region
 from apps.figures.style import (
@@ -22,6 +21,7 @@ from apps.figures.style import (
     label_axes,
     make_figure,
 )
+from tofclip.arrays import AnyArray
 from tofclip.designs import find_inactive_region, list_footprints
 from tofclip.notebook import letter_panels
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
@@ -62,7 +62,7 @@ def make_calibration_figure(found: FocusCalibration) -> Figure:
     return figure
 
 
-def _draw_picture(axes: Axes, found: FocusCalibration, picture: NDArray[Any], title: str) -> None:
+def _draw_picture(axes: Axes, found: FocusCalibration, picture: AnyArray, title: str) -> None:
     first = max(0, int(found.line_rows_px.min()) - MARGIN_ROWS)
     last = min(picture.shape[0], int(found.line_rows_px.max()) + MARGIN_ROWS + 1)
     # The square root shows faint lines beside bright ones.
@@ -113,8 +113,8 @@ def _draw_dot_profile(axes: Axes, found: FocusCalibration, view: int) -> None:
 
 
 def _cut_window(
-    picture: NDArray[Any], row: int, column: int
-) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
+    picture: AnyArray, row: int, column: int
+) -> tuple[AnyArray, tuple[float, float, float, float]]:
     """Cut out the surroundings of a pixel, and say where their outer edges lie."""
     top, left = max(0, row - ZOOM_HALF_WIDTH_PX), max(0, column - ZOOM_HALF_WIDTH_PX)
     window = picture[top : row + ZOOM_HALF_WIDTH_PX + 1, left : column + ZOOM_HALF_WIDTH_PX + 1]
@@ -130,7 +130,7 @@ def make_range_calibration_figure(found: RangeFit, distances: Sequence[float]) -
     """Draw the fitted walk over what was measured, and the pictures of the pixels' own numbers."""
     known = found.calibration
     noise = float(np.nanmedian(known.offset_sigma)) / MILLIMETRE if known.offset_sigma.size else 0.0
-    pictures: list[tuple[NDArray[Any], str, str, dict[str, Any]]] = [
+    pictures: list[tuple[AnyArray, str, str, dict[str, Any]]] = [
         (known.offsets / MILLIMETRE, "offset", "mm", {"least_span": MIN_SPAN_SIGMA * noise}),
         (known.offset_sigma / MILLIMETRE, "its standard deviation", "mm", {"vmin": 0}),
         (known.response, "response", "relative to the mean", {"vmin": 0}),
@@ -181,8 +181,13 @@ def make_design_figure(reports: Mapping[str, DesignReport]) -> Figure:
         part.suptitle(f"{name}: {_describe(report)}", fontsize=SMALL_FONT_PT + 2)
         panels = part.subplots(2, 4)
         _draw_sensor(panels[0, 0], report)
-        _draw_singular_values(panels[0, 1], report)
         sight = report.sight
+        values = sight.singular_values / sight.singular_values[0]
+        panels[0, 1].semilogy(np.maximum(values, 1e-6), color=PREDICTED_COLOUR)
+        kept = sight.least / sight.singular_values[0]
+        panels[0, 1].axhline(kept, color="#999999", ls="--", lw=1)
+        panels[0, 1].set_ylim(1e-4, 1.5)
+        label_axes(panels[0, 1], "singular values (dashed: half kept)", "number", "relative")
         title = f"waves undetermined ({100 * sight.undetermined:.1f} %)"
         edges = (-0.5, 0.5, 0.5, -0.5)
         drawn = draw_image(panels[0, 2], sight.by_frequency, edges, vmin=0, vmax=1, cmap="magma")
@@ -230,14 +235,6 @@ def _draw_sensor(axes: Axes, report: DesignReport) -> None:
     axes.set_xlim(0, known.camera.slit_width_px)
     shared = 100 * report.figures["sensor_overlap"]
     label_axes(axes, f"views on the sensor, {shared:.0f} % shared", "column (px)", "picture px")
-
-
-def _draw_singular_values(axes: Axes, report: DesignReport) -> None:
-    values = report.sight.singular_values
-    axes.semilogy(np.maximum(values / values[0], 1e-6), color=PREDICTED_COLOUR)
-    axes.axhline(report.sight.least / values[0], color="#999999", ls="--", lw=1)
-    axes.set_ylim(1e-4, 1.5)
-    label_axes(axes, "singular values (dashed: half kept)", "number", "relative")
 
 
 def _draw_field(axes: Axes, report: DesignReport) -> None:

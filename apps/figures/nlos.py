@@ -129,9 +129,7 @@ LIT_THRESHOLD = 0.02
 
 
 def make_demo_figure(run: DemoRun) -> Figure:
-    """Draw the room from above, one row's streak, and the images: flat, hybrid, back-projection,
-    hybrid from above.
-    """
+    """Draw the room from above, one row's streak, and the images by all methods."""
     figure = make_figure(11, 5.6)
     panels = figure.subplots(2, 3)
     _draw_room(panels[0, 0], run)

@@ -28,9 +28,9 @@ from tofclip.units import MILLIMETRE, PICOSECOND
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
     from apps.occlusion.experiment import Experiment, ProbeResult
+    from tofclip.arrays import AnyArray
     from tofclip.occlusion import InactiveRegion
 
 
@@ -50,9 +50,7 @@ def make_region_figure(region: InactiveRegion) -> Figure:
 
 
 def draw_region(axes: Axes, region: InactiveRegion, least_reach: float = 0.0) -> None:
-    """Draw the region from above with seven views; z to the right, x upwards. `least_reach`: draw
-    at least so far behind the occluder, m.
-    """
+    """Draw the region from above, and at least `least_reach`, m, behind the occluder."""
     places = np.linspace(-0.5, 0.5, VIEW_COUNT) * region.baseline
     usual = ENDLESS_DEPTH_FACTOR * region.distance
     if region.is_bounded:
@@ -109,9 +107,7 @@ MIN_RELATIVE_LIGHT, CAPTION_LEVEL = 1e-4, 12.0
 
 
 def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult]) -> Figure:
-    """Draw the geometry, the returns in time, and what three cameras make of the target, beside the
-    truth. `probes`: small targets on the axis, drawn with a tick or a cross.
-    """
+    """Draw geometry, returns in time, and what three cameras see of the target."""
     figure = make_figure(13, 7)
     views, side = len(experiment.rig.array.views), experiment.settings.side_px
     pixels = " \N{MULTIPLICATION SIGN} ".join(map(str, (views, side, side)))
@@ -137,7 +133,7 @@ def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult])
     return figure
 
 
-def _select_pictures(experiment: Experiment) -> list[tuple[str, NDArray[Any], NDArray[Any] | None]]:
+def _select_pictures(experiment: Experiment) -> list[tuple[str, AnyArray, AnyArray | None]]:
     """Title, picture, and the truth it is compared with and scaled to; None: scaled to itself."""
     truth, separated = experiment.truth, experiment.separated
     everything = experiment.pictures[len(experiment.pictures) // 2].sum(axis=-1)
@@ -215,7 +211,7 @@ class FlashFrame(NamedTuple):
     time: float  # ps after the flash
     title: str
     # of the middle view and of the recovery, from 0 to 1
-    pictures: tuple[NDArray[Any], NDArray[Any]]
+    pictures: tuple[AnyArray, AnyArray]
 
 
 class _Film:
@@ -238,7 +234,7 @@ class _Film:
             axes.set(xticks=[], yticks=[])
             axes.set_title(name, fontsize=SMALL_FONT_PT + 2)
 
-    def add(self, pictures: Sequence[NDArray[Any]], title: str) -> None:
+    def add(self, pictures: Sequence[AnyArray], title: str) -> None:
         """Put pictures from 0 to 1 into their places, and draw the figure."""
         from PIL import Image
 
@@ -250,9 +246,7 @@ class _Film:
         self._drawn.append(Image.fromarray(np.asarray(drawn)[..., :3]))
 
     def save(self, path: Path, shown_ms: int, last_ms: int | None = None) -> None:
-        """Write it; where no time is given for the last picture, it runs there and back again, without
-        showing the ends twice.
-        """
+        """Write it; without a time for the last picture it runs there and back again."""
         first, *others = self._drawn if last_ms else [*self._drawn, *self._drawn[-2:0:-1]]
         duration = [*[shown_ms] * len(others), last_ms or shown_ms]
         with atomic_path(path) as temporary:
@@ -260,11 +254,7 @@ class _Film:
 
 
 def save_flash_film(experiment: Experiment, path: Path) -> None:
-    """Write a GIF: light reaches the occluder, then what stands behind it.
-
-    Each return is shown at its own brightness; the recovered pictures light up as the measurements
-    of their gates do.
-    """
+    """Write a GIF: light reaches the occluder, then what is behind, each at its own brightness."""
     film = _Film((8, 3.2), ("what one view sees", "ToF-CLIP"), experiment, columns=3)
     time = film.panels[-1]
     draw_history(time, experiment)
@@ -279,9 +269,7 @@ def save_flash_film(experiment: Experiment, path: Path) -> None:
 
 
 def save_walk_film(experiment: Experiment, path: Path, advance: Callable[[int], None]) -> None:
-    """Write a GIF: the target walks past behind the occluder, each step flashed, measured and
-    recovered again. Calls ``advance(1)`` after each of `WALK_STEPS`.
-    """
+    """Write a GIF: the target walks past behind the occluder, in `WALK_STEPS` steps."""
     names = ("one view, all its light", "one view, the second return", "ToF-CLIP", "truth")
     film = _Film((9.4, 2.9), names, experiment, columns=4, bottom=0.02)
     brightest = float(experiment.truth.max())

@@ -11,7 +11,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.figures.style import (
     DEPTH_COLOURMAP,
@@ -27,6 +26,7 @@ from apps.figures.style import (
     scatter_points,
     tone_map,
 )
+from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray
 from tofclip.camera import estimate_dark_level
 from tofclip.notebook import letter_panels
 from tofclip.units import MILLIMETRE, NANOSECOND, SPEED_OF_LIGHT
@@ -69,9 +69,7 @@ class Moment:
 
 
 def make_preview_figure(streak: Streak, frames: Frames) -> Figure:
-    """Draw a recovery. Where times are ranges, brightness is multiplied by range squared, so that
-    near and far surfaces of one kind look alike.
-    """
+    """Draw a recovery; where times are ranges, brightness is multiplied by range squared."""
     moments = choose_moments(frames)
     lines = math.ceil(len(moments) / PANEL_COLUMNS)
     height = OVERVIEW_INCHES + ROW_INCHES * lines
@@ -112,7 +110,7 @@ def choose_moments(frames: Frames) -> list[Moment]:
     return peaks if separate and len(peaks) >= PANEL_COLUMNS else _split_evenly(energy)
 
 
-def _find_peak_moments(energy: NDArray[np.float64]) -> list[Moment]:
+def _find_peak_moments(energy: FloatArray) -> list[Moment]:
     from scipy.ndimage import gaussian_filter1d
     from scipy.signal import find_peaks
 
@@ -126,7 +124,7 @@ def _find_peak_moments(energy: NDArray[np.float64]) -> list[Moment]:
     return [Moment(int(peaks[i]) - 1, int(edges[0, i]), int(edges[1, i])) for i in chosen]
 
 
-def _split_evenly(energy: NDArray[np.float64]) -> list[Moment]:
+def _split_evenly(energy: FloatArray) -> list[Moment]:
     share = np.cumsum(energy) / (energy.sum() or 1.0)
     cuts = np.searchsorted(share, np.linspace(0.01, 0.99, MAX_MOMENTS + 1)).clip(0, energy.size - 1)
     return [
@@ -136,20 +134,18 @@ def _split_evenly(energy: NDArray[np.float64]) -> list[Moment]:
 
 
 def _has_known_range(frames: Frames) -> bool:
-    """Whether time is range: not without a time zero, and not for a relay wall, whose light took
-    three bounces.
-    """
+    """Whether time is range: it has a zero, and is not of three bounces as from a wall."""
     return frames.camera.time_zero != 0 and "relay_wall" not in frames.attachments
 
 
-def _compute_compensation(frames: Frames) -> NDArray[np.float32]:
+def _compute_compensation(frames: Frames) -> Float32Array:
     """Factor of each frame that undoes the fall-off with range; 1 where it does not apply."""
     if _has_known_range(frames):
         return np.maximum(frames.ranges, 0).astype(np.float32) ** 2
     return np.ones(frames.times.size, np.float32)
 
 
-def _draw_distance(axes: Axes, brightness: NDArray[Any], frames: Frames) -> None:
+def _draw_distance(axes: Axes, brightness: AnyArray, frames: Frames) -> None:
     """When each pixel was brightest; dim ones have no say."""
     scale, meaning = (frames.times / NANOSECOND, "time (ns)")
     if _has_known_range(frames):
@@ -161,7 +157,7 @@ def _draw_distance(axes: Axes, brightness: NDArray[Any], frames: Frames) -> None
 
 
 def _draw_moments(
-    panels: NDArray[Any], brightness: NDArray[Any], moments: list[Moment], frames: Frames
+    panels: AnyArray, brightness: AnyArray, moments: list[Moment], frames: Frames
 ) -> None:
     """One averaged picture for each moment, scaled to its own brightness."""
     pictures = [brightness[moment.first : moment.last + 1].mean(axis=0) for moment in moments]
@@ -187,11 +183,11 @@ def _draw_moments(
         axes.tick_params(bottom=False, labelbottom=False)
 
 
-def _crop_to_bright(pictures: list[NDArray[Any]]) -> tuple[slice, slice]:
+def _crop_to_bright(pictures: list[AnyArray]) -> tuple[slice, slice]:
     """Rows and columns that hold everything bright in any picture, with a margin."""
     bright = np.any([picture >= CROP_THRESHOLD * picture.max() for picture in pictures], axis=0)
 
-    def surround(lit: NDArray[np.bool_]) -> slice:
+    def surround(lit: BoolArray) -> slice:
         first, last = np.flatnonzero(lit)[[0, -1]].tolist()
         return slice(max(0, first - CROP_MARGIN_PX), min(lit.size, last + CROP_MARGIN_PX + 1))
 
@@ -210,9 +206,7 @@ def make_demo_figure(
     truth: GroundTruth,
     compared: Frames,
 ) -> Figure:
-    """Draw streak image, brightness and range as seen by the camera; top and side view in metres;
-    range errors. `compared`: of the same shot, each frame recovered alone.
-    """
+    """Draw streak, brightness by two methods, range, cloud, and range errors."""
     figure = make_figure(12, 6)
     panels = figure.subplots(2, 4)
     title, look = "one shot, seven views", scale_brightness(streak.counts)
@@ -292,9 +286,7 @@ UNIT = "counts \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO} (m\N{SUPERSCRIPT
 def make_scene_figure(
     frames: Frames, cloud: PointCloud, objects: Sequence[DetectedObject]
 ) -> Figure:
-    """Draw a scene in the manner of the paper's Supplementary Figure 21. `cloud`: of these frames;
-    `objects`: numbered in the top view; the four with most points are shown at their ranges.
-    """
+    """Draw a scene as the paper's Supplementary Figure 21 does; four objects at their ranges."""
     figure = make_figure(12, 5.6)
     if frames.time_zero_note:
         figure.suptitle(f"ranges are right{frames.time_zero_note}", fontsize=SMALL_FONT_PT + 2)

@@ -14,16 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import MissingDependencyError, StorageError
 from tofclip.files import DISK_IS_FULL, atomic_path
 from tofclip.units import NANOSECOND
 
 if TYPE_CHECKING:
-    import numpy as np
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
-    from numpy.typing import NDArray
 
 BRIGHTNESS_COLOURMAP = "inferno"
 DEPTH_COLOURMAP = "viridis"
@@ -56,7 +55,7 @@ def add_panels(
     columns: int,
     band: tuple[float, float],
     room: tuple[float, float, float, float] = LABEL_ROOM_INCHES,
-) -> NDArray[Any]:
+) -> AnyArray:
     """Put a grid of panels, (rows, columns), across a figure, at places known beforehand.
 
     To search for places that fit around the labels takes longer than to draw a figure of many
@@ -80,9 +79,7 @@ def add_panels(
 
 
 def store_picture(picture: Path, place: Path) -> None:
-    """Store a picture at a place, which may be its own, for a page: a PNG of a page's width, a large
-    one in `FEWER_COLOURS`.
-    """
+    """Store a picture for a page, of a page's width and in `FEWER_COLOURS`."""
     from PIL import Image
 
     drawn = picture.read_bytes()
@@ -108,13 +105,11 @@ def store_picture(picture: Path, place: Path) -> None:
 
 def draw_image(
     axes: Axes,
-    picture: NDArray[Any],
+    picture: AnyArray,
     extent: tuple[float, float, float, float] | None = None,
     **look: Any,
 ) -> AxesImage:
-    """Draw a picture without smoothing over its pixels. `extent` (left, right, bottom, top): outer
-    edges in the axes' units; pixel numbers where absent.
-    """
+    """Draw a picture, its pixels as squares; `extent`: left, right, bottom, top."""
     axes.set_facecolor(EMPTY_COLOUR)
     return axes.imshow(
         picture, extent=extent, **{"cmap": BRIGHTNESS_COLOURMAP, "interpolation": "nearest", **look}
@@ -138,16 +133,14 @@ def add_colour_bar(axes: Axes, mapped: Any, meaning: str) -> None:
     bar.ax.tick_params(labelsize=SMALL_FONT_PT)
 
 
-def outer_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
-    """Outer edges of the first and the last pixel of an evenly spaced axis; a single pixel is as
-    wide as its unit.
-    """
+def outer_edges(axis: FloatArray) -> tuple[float, float]:
+    """Outer edges of the first and last pixel of an even axis; a single one is a unit wide."""
     half = (axis[-1] - axis[0]) / (2 * (axis.size - 1)) if axis.size > 1 else 0.5
     return float(axis[0] - half), float(axis[-1] + half)
 
 
 def draw_camera_picture(
-    axes: Axes, picture: NDArray[Any], title: str, meaning: str = "", **look: Any
+    axes: Axes, picture: AnyArray, title: str, meaning: str = "", **look: Any
 ) -> None:
     """Draw what a camera sees, with a colour scale beside it where its meaning is named."""
     drawn = draw_image(axes, picture, **look)
@@ -158,7 +151,7 @@ def draw_camera_picture(
 
 def draw_spread_picture(
     axes: Axes,
-    picture: NDArray[Any],
+    picture: AnyArray,
     title: str,
     meaning: str,
     least_span: float = 0.0,
@@ -178,8 +171,8 @@ def draw_spread_picture(
 
 def draw_streak(
     axes: Axes,
-    picture: NDArray[Any],
-    times: NDArray[np.float64],
+    picture: AnyArray,
+    times: FloatArray,
     title: str,
     meaning: str,
     **look: Any,
@@ -192,7 +185,7 @@ def draw_streak(
     add_colour_bar(axes, drawn, meaning)
 
 
-def scale_brightness(picture: NDArray[Any], gamma: float = 1.0) -> dict[str, Any]:
+def scale_brightness(picture: AnyArray, gamma: float = 1.0) -> dict[str, Any]:
     """How a picture is shown whose few brightest pixels do not darken the rest; with a `gamma` below
     1 far things stay visible beside near ones, and the colour scale says so.
     """
@@ -203,7 +196,7 @@ def scale_brightness(picture: NDArray[Any], gamma: float = 1.0) -> dict[str, Any
 
 
 def scatter_points(
-    axes: Axes, right: NDArray[Any], up: NDArray[Any], light: NDArray[Any], size: float = 1.5
+    axes: Axes, right: AnyArray, up: AnyArray, light: AnyArray, size: float = 1.5
 ) -> None:
     """Draw a cloud from one side, as bright as its points are, 0 to 1."""
     axes.set_facecolor(EMPTY_COLOUR)
@@ -211,10 +204,10 @@ def scatter_points(
     axes.scatter(right, up, c=light, s=size, **look)
 
 
-def tone_map(picture: NDArray[Any], gamma: float = 1.0) -> NDArray[Any]:
+def tone_map(picture: AnyArray, gamma: float = 1.0) -> AnyArray:
     """Scale brightness to 0..1 for the eye; a glint does not darken the rest."""
     top = (np.percentile(picture, WHITE_PERCENTILE) or picture.max() or 1.0) if picture.size else 1
-    toned: NDArray[Any] = np.clip(picture / top, 0, 1) ** gamma
+    toned: AnyArray = np.clip(picture / top, 0, 1) ** gamma
     return toned
 
 
@@ -262,9 +255,7 @@ class FilmWriter:
 
 @contextmanager
 def open_film(out: Path, rate: float) -> Iterator[FilmWriter]:
-    """Yield a film to add pictures to; the file appears whole or not at all. `rate`: pictures per
-    second.
-    """
+    """Yield a film to add pictures to, `rate` a second; the file appears whole or not at all."""
     with atomic_path(out) as temporary:
         film = FilmWriter(temporary, rate)
         try:

@@ -16,8 +16,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray
 from tofclip.errors import InputError
 from tofclip.light_field import LightField
 from tofclip.light_field.views import CameraSetup
@@ -51,7 +51,7 @@ from tofclip.simulate.patterns import (
 )
 from tofclip.solvers import TotalVariation
 
-Array = NDArray[Any]
+Bodies = tuple[Body, ...]
 
 VIEW_COUNT = 7
 MIDDLE_VIEW = (0.0, 0.0)
@@ -141,16 +141,14 @@ class Experiment:
 
     @property
     def expected_visible(self) -> bool:
-        """Whether the formula promises that the target's middle is seen, and a lamp gets there as
-        views do.
-        """
+        """Whether the formula promises the target's middle, and a lamp gets there as views do."""
         return (
             self.scene.behind > self.scene.region.length
             and self.settings.illumination != "co-located"
         )
 
     @cached_property
-    def pictures(self) -> Array:
+    def pictures(self) -> AnyArray:
         """What every view sees at every instant, without noise, (views, rows, columns, bins)."""
         return render_flash(
             PulsedScene((*self.scene.target, *self.scene.occluder), self.rig.lamps),
@@ -159,12 +157,15 @@ class Experiment:
         )
 
     @cached_property
-    def truth(self) -> Array:
+    def truth(self) -> AnyArray:
         """What the middle view would see of the target, were there no occluder, (rows, columns)."""
-        picture: Array = self._render_middle_view(self.scene.target, self.rig.array).sum(axis=-1)
+        return self._see_target(self.rig.array)
+
+    def _see_target(self, array: CameraArray) -> AnyArray:
+        picture: AnyArray = self._render_middle_view(self.scene.target, array).sum(axis=-1)
         return picture
 
-    def _render_middle_view(self, bodies: tuple[Body, ...], array: CameraArray) -> Any:
+    def _render_middle_view(self, bodies: Bodies, array: CameraArray) -> Any:
         scene = PulsedScene(bodies, self.rig.lamps)
         return render_flash_view(scene, array, self.time_axis, MIDDLE_VIEW)
 
@@ -174,7 +175,7 @@ class Experiment:
         clean = measure_views(self.pictures, self.rig, self.time_axis)
         return replace(clean, values=self._add_noise(clean.values, 1))
 
-    def _add_noise(self, light: Array, stream: int) -> Array:
+    def _add_noise(self, light: AnyArray, stream: int) -> AnyArray:
         """Light with photon noise, from a stream of random numbers of its own."""
         random = np.random.default_rng([self.settings.seed, stream])
         return add_poisson_noise(light, self.settings.photons / float(light.max()), random)
@@ -185,24 +186,22 @@ class Experiment:
         return separate_occluder(self.measurements)
 
     @cached_property
-    def single_view(self) -> Array:
-        """The target by the middle view alone, its pixels as many as the others' measurements;
-        occluder gated away.
-        """
+    def single_view(self) -> AnyArray:
+        """The target by the middle view, of as many pixels as measurements, gated."""
         seen = self._render_middle_view(
             (*self.scene.target, *self.scene.occluder), self._single_array
         )
         noisy = self._add_noise(seen, 2)
         gates = [one.bins for one in self.measurements.find_returns()]
-        picture: Array = noisy[..., gates[1]].sum(axis=-1) if len(gates) > 1 else 0 * noisy[..., 0]
+        picture: AnyArray = (
+            noisy[..., gates[1]].sum(axis=-1) if len(gates) > 1 else 0 * noisy[..., 0]
+        )
         return picture
 
     @cached_property
-    def single_view_truth(self) -> Array:
+    def single_view_truth(self) -> AnyArray:
         """What the single view would see of the target, were there no occluder."""
-        array = self._single_array
-        picture: Array = self._render_middle_view(self.scene.target, array).sum(axis=-1)
-        return picture
+        return self._see_target(self._single_array)
 
     @property
     def _single_array(self) -> CameraArray:
@@ -212,10 +211,8 @@ class Experiment:
         return replace(self.rig.array, image_shape=(side, side), focal_length_px=focal_length_px)
 
     @cached_property
-    def conventional(self) -> Array:
-        """All pixels of all views, without time of flight, refocused on the target, (rows,
-        columns).
-        """
+    def conventional(self) -> AnyArray:
+        """All pixels of all views without time of flight, refocused on the target."""
         noisy = self._add_noise(self.pictures.sum(axis=-1), 3)
         shear = float(self.rig.array.shear(self.scene.distance))
         return LightField(noisy, self.rig.array.views).refocus(shear)
@@ -239,8 +236,8 @@ class OcclusionScene:
 
     name: str
     title: str
-    occluder: tuple[Body, ...]
-    target: tuple[Body, ...]
+    occluder: Bodies
+    target: Bodies
     region: InactiveRegion  # of the occluder's solid part on the axis
     behind: float = TARGET_DEPTH_M  # from the occluder to the target, m
 
@@ -255,12 +252,12 @@ class OcclusionScene:
 
     def widen_occluder(self, width: float) -> OcclusionScene:
         """Return the scene with its occluder scaled about the axis until its solid part is as wide, m."""
-        factor = width / self.region.width
-        return replace(
-            self,
-            occluder=tuple(_scale_plate(body, factor) for body in self.occluder),
-            region=replace(self.region, width=width),
-        )
+        factor, plates = width / self.region.width, []
+        for body in self.occluder:
+            assert isinstance(body.shape, Rectangle)  # as all occluders are
+            shape = Rectangle(factor * body.shape.width, factor * body.shape.height)
+            plates.append(replace(body, shape=shape, centre=body.centre * (factor, factor, 1.0)))
+        return replace(self, occluder=tuple(plates), region=replace(self.region, width=width))
 
 
 def make_walking_scene(name: str) -> OcclusionScene:
@@ -288,7 +285,7 @@ def make_upright_bar(width: float, distance: float = OCCLUDER_DISTANCE_M) -> Bod
 def _make_plate(
     width: float,
     height: float,
-    pattern: NDArray[Any] | None = None,
+    pattern: AnyArray | None = None,
     x: float = 0.0,
     y: float = 0.0,
     z: float = OCCLUDER_DISTANCE_M,
@@ -297,13 +294,7 @@ def _make_plate(
     return Body(Rectangle(width, height), Lambertian(plain), np.array([x, y, z]))
 
 
-def _scale_plate(body: Body, factor: float) -> Body:
-    assert isinstance(body.shape, Rectangle)  # as all occluders are
-    shape = Rectangle(factor * body.shape.width, factor * body.shape.height)
-    return replace(body, shape=shape, centre=body.centre * (factor, factor, 1.0))
-
-
-def _make_figure() -> tuple[Body, ...]:
+def _make_figure() -> Bodies:
     """A mannequin, 36 mm tall."""
     skin = make_mottled_pattern(0.6, 0.95, 8, seed=3)
     parts = (  # trunk, arms, legs: width, height and place
@@ -319,15 +310,13 @@ def _make_figure() -> tuple[Body, ...]:
 V_SIDE_M, V_HEIGHT_M = 13e-3, 16e-3
 
 
-def _make_v_letter() -> tuple[Body, ...]:
-    """Supplementary Figure 14c: the axis meets the V where its strokes have joined, below 0.6 of
-    the height; at 0.75 it is 0.46 of its side wide.
-    """
+def _make_v_letter() -> Bodies:
+    """Supplementary Figure 14c: the axis meets the V below 0.6, where its strokes have joined."""
     pattern = cut_pattern(make_letter("V"), make_plain_pattern(OCCLUDER_REFLECTANCE))
     return (_make_plate(V_SIDE_M, V_HEIGHT_M, pattern, y=-0.25 * V_HEIGHT_M),)
 
 
-def _make_tree() -> tuple[Body, ...]:
+def _make_tree() -> Bodies:
     """A trunk with branches and rough bark."""
     bark = make_mottled_pattern(0.25, 0.85, 14, seed=5)
     branches = (  # side, height and tilt
@@ -349,10 +338,8 @@ def _make_tree() -> tuple[Body, ...]:
 SLAT_M = 1.6e-3
 
 
-def _make_trellis() -> tuple[Body, ...]:
-    """Slats at right angles with holes between them, standing on a corner: one of them crosses the
-    axis.
-    """
+def _make_trellis() -> Bodies:
+    """Slats at right angles with holes, standing on a corner: one of them crosses the axis."""
     pitch, side = 4e-3, 13.6e-3
     across = np.linspace(-side / 2, side / 2, 340)
     on_slat = abs((across + pitch / 2) % pitch - pitch / 2) < SLAT_M / 2
@@ -363,7 +350,7 @@ def _make_trellis() -> tuple[Body, ...]:
     return (_make_plate(side, side, lattice).rotate(np.pi / 4),)
 
 
-def _make_bush() -> tuple[Body, ...]:
+def _make_bush() -> Bodies:
     """Leaves at random between 48 and 52 mm, every one turned its own way; one hangs on the axis."""
     random = np.random.default_rng(7)
     down = np.linspace(0, np.pi, 40)
@@ -387,7 +374,7 @@ def _make_bush() -> tuple[Body, ...]:
     return tuple(hung)
 
 
-MakeBodies = Callable[[], tuple[Body, ...]]
+MakeBodies = Callable[[], Bodies]
 TARGETS: dict[str, MakeBodies] = {
     "word": lambda: (_make_plate(40e-3, 18e-3, make_text_pattern("CLIP", 0.9), z=TARGET_Z_M),),
     "disc": lambda: (_make_plate(24e-3, 24e-3, make_rings(3, 0.15, 0.95), z=TARGET_Z_M),),
@@ -443,8 +430,8 @@ class ProbeResult:
     # of the recovered picture with what the reference view would see without an occluder
     correlation: float
     views: int  # how many views got light from it
-    picture: Array  # (rows, columns)
-    truth: Array  # (rows, columns)
+    picture: AnyArray  # (rows, columns)
+    truth: AnyArray  # (rows, columns)
 
     @property
     def expected_visible(self) -> bool:
@@ -458,18 +445,16 @@ class ProbeResult:
 
 
 def probe_target(
-    occluder: tuple[Body, ...], region: InactiveRegion, factor: float, seed: int = 0
+    occluder: Bodies, region: InactiveRegion, factor: float, seed: int = 0
 ) -> ProbeResult:
-    """Put a target behind an occluder, at `factor` lengths of its region, which must have an end,
-    and try to recover it; `seed`: of the line angles and the photons.
-    """
+    """Try to recover a target at `factor` lengths of a region that has an end."""
     distance = region.distance + factor * region.length
     width = TARGET_WIDTH_FRACTION * region.width
     focal_length_px = distance * TARGET_PX / width
     setup = CameraSetup("line", 1.0, seed)
     rig = make_rig(region, PICTURE_PX, focal_length_px, distance, 2, setup)
-    letter = Lambertian(cut_pattern(make_letter("L"), make_plain_pattern(0.9)))
-    target = Body(Rectangle(width, width), letter, np.array([0.0, 0.0, distance]))
+    letter = cut_pattern(make_letter("L"), make_plain_pattern(0.9))
+    target = _make_plate(width, width, letter, z=distance)
     # one bin about the target's return that opens halfway from the occluder's
     near, far = rig.compute_flight_time(np.array([region.distance, distance]))
     gate = TimeAxis(float(far), float(min(far - near, MAX_GATE_S)), 1, PROBE_PULSE_FWHM_S)
@@ -485,7 +470,7 @@ def probe_target(
 
 
 def probe_with_fixed_camera(
-    occluder: tuple[Body, ...], region: InactiveRegion, factor: float, seeds: int
+    occluder: Bodies, region: InactiveRegion, factor: float, seeds: int
 ) -> list[ProbeResult]:
     """Put a board behind an occluder, and look at its middle with a camera that knows neither.
 
@@ -512,7 +497,11 @@ def probe_with_fixed_camera(
         BIN_WIDTH_S,
         PULSE_FWHM_S,
     )
-    board = _make_random_board(width, FIELD_OF_VIEW_RAD * distance, distance)
+    # random bright and dark cells, a column of them on the axis
+    side = FIELD_OF_VIEW_RAD * distance
+    columns = 2 * round(side / width / 2) + 1
+    cells = np.where(np.random.default_rng(0).random((BOARD_ROWS, columns)) < 0.5, 0.9, 0.1)
+    board = _make_plate(columns * width, side, cells, z=distance)
     # Light does not depend on what the seeds draw: it is cast once.
     pictures = render_flash(PulsedScene((board, *occluder), lamps), array, sweep)
     free = render_flash_view(PulsedScene((board,), lamps), array, sweep, (0.0, 0.0)).sum(axis=-1)
@@ -531,21 +520,8 @@ def probe_with_fixed_camera(
     return results
 
 
-def _make_random_board(cell_width: float, side: float, distance: float) -> Body:
-    """A board of random bright and dark cells; one column of them lies on the axis."""
-    columns = 2 * round(side / cell_width / 2) + 1
-    bright = np.random.default_rng(0).random((BOARD_ROWS, columns)) < 0.5
-    return Body(
-        Rectangle(columns * cell_width, side),
-        Lambertian(np.where(bright, 0.9, 0.1)),
-        np.array([0.0, 0.0, distance]),
-    )
-
-
-def _recover_target(rig: Rig, light: Array, brightest: float, seed: int) -> tuple[Array, int]:
-    """Recover from noisy measurements, blocked views left out; nothing where no view got
-    significant light.
-    """
+def _recover_target(rig: Rig, light: AnyArray, brightest: float, seed: int) -> tuple[AnyArray, int]:
+    """Recover, blocked views left out; nothing where no view got significant light."""
     camera, per_unit = rig.camera, PEAK_PHOTONS / brightest
     dark = BACKGROUND_PHOTONS / per_unit
     measurements = add_poisson_noise(

@@ -53,10 +53,7 @@ class WalkFrame:
 
 
 class WalkSource(Source):
-    """A person walks to and fro behind an occluder. Each step is flashed, measured and recovered as
-    fast as the machine can, at the occluder's width and the gate that the sliders say; the last 32
-    are kept.
-    """
+    """A person who walks behind an occluder, measured as fast as this machine can; sliders hold."""
 
     def __init__(self, scene: OcclusionScene, settings: ExperimentSettings) -> None:
         near, far = OCCLUDER_DISTANCE_M / MILLIMETRE, scene.distance / MILLIMETRE
@@ -137,9 +134,7 @@ def look_behind(experiment: Experiment, opens: float) -> WalkFrame:
 def separate_at(
     measurements: TimedMeasurements, opens: float
 ) -> tuple[Picture, Picture, tuple[float, float]]:
-    """Recover what sends light back before a gate opens, and after: two pictures (rows, columns),
-    dark where no light came, and the distances of both, m; `opens` for one that is dark.
-    """
+    """Recover what comes back before a gate opens, m, and after, and both distances."""
     returns = measurements.split_returns(opens)
     found = separate_occluder(measurements, returns=returns)
     if found.sees_target:
@@ -189,9 +184,7 @@ def _place_pictures(
 
 
 class GatedSource(Source):
-    """Recorded or live shots behind a time gate: what comes back from nearer than a slider says is
-    kept out of the cloud and of the picture.
-    """
+    """Shots behind a time gate: what comes back from nearer is kept out of cloud and picture."""
 
     def __init__(self, shots: Source) -> None:
         if not isinstance(shots, RecoveredSource):

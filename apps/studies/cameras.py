@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.studies.cases import Advance, Library, Outcome, Panel, Row, study
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.io.archive import Archive
 from tofclip.light_field import LightField
@@ -69,7 +69,7 @@ def recover_from_lines(
     shear: float,
     sensors: Sequence[SliceConvolution],
     weight: float | None = None,
-) -> tuple[NDArray[Any], float]:
+) -> tuple[AnyArray, float]:
     """Measure each view of a light field by a coded line of its own, and recover the picture that
     is in focus at one depth (supplement Eq. 21). `light_field`: as many views as there are sensors.
     Each view's own picture is measured, so that surfaces out of focus enter the measurements as
@@ -91,11 +91,9 @@ def recover_from_lines(
 
 
 def _tabulate_model(
-    sensors: Sequence[SliceConvolution], views: NDArray[np.float64], shear: float
+    sensors: Sequence[SliceConvolution], views: FloatArray, shear: float
 ) -> SparseMatrix:
-    """F(d) as a sparse matrix: most pictures of a line fall on few sensor pixels, and the choice of
-    a weight takes thousands of products.
-    """
+    """F(d) as a sparse matrix: the choice of a weight takes thousands of products."""
     import scipy.sparse
 
     shape = (sensors[0].shape_in[0], sensors[0].shape_in[1])
@@ -113,7 +111,7 @@ def _tabulate_model(
 
 def measure_lines(
     light_field: LightField, shear: float, seeds: int, lines: tuple[int, float]
-) -> tuple[tuple[float, ...], NDArray[Any]]:
+) -> tuple[tuple[float, ...], AnyArray]:
     """Recover a light field's picture through ten lines, a view for each, once for each seed of
     their codes: PSNR of each seed, dB, against shift-and-add, and the first seed's picture. `lines`:
     their width, n_p, and the angle up to which they turn to either side, rad.
@@ -128,7 +126,7 @@ def measure_lines(
     return tuple(compute_psnr_db(one, truth) for one in pictures), pictures[0]
 
 
-def compute_psnr_db(estimate: NDArray[Any], truth: NDArray[Any]) -> float:
+def compute_psnr_db(estimate: AnyArray, truth: AnyArray) -> float:
     """Peak signal-to-noise ratio in dB, relative to the brightest pixel of the truth."""
     error = float(np.mean((estimate.astype(np.float64) - truth) ** 2))
     if error == 0:
@@ -191,8 +189,8 @@ HAND_ITERATIONS = 200
 class DiffuserRecording:
     """What a diffuser put on an area sensor, and what it does to a point source."""
 
-    point_spread: NDArray[np.float64]  # (rows, columns), background taken off
-    measurements: NDArray[np.float64]  # (rows, columns), background taken off; any scale
+    point_spread: FloatArray  # (rows, columns), background taken off
+    measurements: FloatArray  # (rows, columns), background taken off; any scale
 
     def __post_init__(self) -> None:
         if self.point_spread.ndim != 2 or self.measurements.shape != self.point_spread.shape:
@@ -208,9 +206,7 @@ class DiffuserRecording:
 
 
 def read_diffuser_recording(path: str | Path) -> DiffuserRecording:
-    """Read an ``.npz`` with `psf` and `raw`, both (rows, columns) in counts, and one number
-    `background`.
-    """
+    """Read an ``.npz`` of `psf` and `raw`, (rows, columns) in counts, and a number `background`."""
     archive = Archive(path)
     background = float(archive.finite_array("background"))
     spread, measurements = (
@@ -232,7 +228,7 @@ def build_diffuser_model(recording: DiffuserRecording, pitch_px: int) -> LinearO
 
 def recover_diffuser_scene(
     recording: DiffuserRecording, pitch_px: int, iterations: int = HAND_ITERATIONS
-) -> tuple[NDArray[Any], float]:
+) -> tuple[AnyArray, float]:
     """Recover the scene with nonnegative total variation from every n-th pixel of either axis; an
     iteration takes 16 ms for a sensor of 300 x 400 pixels on one core. Returns the scene (2 rows,
     2 columns), since a PSF as large as the sensor brings light from there, and ``|A h - f| / |f|``
@@ -262,9 +258,7 @@ DISPLAY_THRESHOLD = 0.05  # of the brightest: where the picture is cut off
     recording=RECORDING,
 )
 def run_lensless_hand(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover the scene from every pixel, every second and every third on either axis; nothing here
-    is random.
-    """
+    """Recover the scene from every, every second and every third pixel; nothing is random."""
     recording = read_diffuser_recording(library.recording(RECORDING))
     recoveries = []
     for pitch in PITCHES_PX:

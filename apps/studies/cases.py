@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
-from tofclip.light_field import LightField
+from tofclip.light_field import FocalStack, LightField
 from tofclip.light_field.views import (
     CameraSetup,
     ClipMeasurement,
@@ -79,7 +79,7 @@ class Panel:
     """A picture (rows, columns) with its title; brightness from 0, or a map of shears in colours."""
 
     title: str
-    picture: NDArray[Any]
+    picture: AnyArray
     is_map: bool = False
 
 
@@ -146,7 +146,7 @@ class Library:
             self._cache[name] = self._make_light_field(name)
         return self._cache[name]
 
-    def render_unoccluded(self, name: str) -> NDArray[Any]:
+    def render_unoccluded(self, name: str) -> AnyArray:
         """Return what the reference view sees of an occlusion scene when its occluder is gone."""
         return render_view(remove_occluder(make_scene(name, self.array)), self.array, (0.0, 0.0))
 
@@ -177,9 +177,9 @@ class Library:
         return render_light_field(edited, self.array).light_field
 
 
-def find_reference_view(light_field: LightField) -> NDArray[Any]:
+def find_reference_view(light_field: LightField) -> AnyArray:
     """Return the picture of the view nearest to the middle of the aperture."""
-    picture: NDArray[Any] = light_field.pictures[np.argmin((light_field.views**2).sum(axis=1))]
+    picture: AnyArray = light_field.pictures[np.argmin((light_field.views**2).sum(axis=1))]
     return picture
 
 
@@ -226,8 +226,8 @@ class SolvedCase:
 
     case: Case
     percent: tuple[float, ...]  # NMSE of each seed
-    picture: NDArray[Any]  # (rows, columns), the first seed's
-    truth: NDArray[Any]  # (rows, columns), shift-and-add of the true views
+    picture: AnyArray  # (rows, columns), the first seed's
+    truth: AnyArray  # (rows, columns), shift-and-add of the true views
     weight: float  # of the first seed's prior
 
     def row(self) -> Row:
@@ -263,6 +263,16 @@ def solve_cases(
         return SolvedCase(case, percent, recovered[0].picture, truth, recovered[0].weight)
 
     return list(map_parallel(solve_case, cases))
+
+
+def recover_stack(
+    recovery: ClipRecovery, measurement: ClipMeasurement, shears: FloatArray
+) -> FocalStack:
+    """Recover the pictures refocused at some shears, on all cores."""
+    pictures = map_parallel(
+        lambda shear: recovery.recover(measurement, shear).picture, shears.tolist()
+    )
+    return FocalStack(np.stack(list(pictures)), shears)
 
 
 def measure_case(case: Case, library: Library, seed: int) -> ClipMeasurement:
@@ -372,7 +382,7 @@ def _solve_measurement(library: Library, cases: list[Case]) -> dict[str, BestFig
 
 
 def _try_presets(
-    case: Case, measurement: ClipMeasurement, truth: NDArray[Any], best: BestFigure
+    case: Case, measurement: ClipMeasurement, truth: AnyArray, best: BestFigure
 ) -> BestFigure:
     """Return the best of both presets and the figure so far."""
     recovery = ClipRecovery(data_term=case.data_term)

@@ -48,19 +48,6 @@ def build_office(spacing: float = 0.06) -> HiddenScene:
     return HiddenScene([*boards, *posts, seat, *legs, back, sign])
 
 
-def simulate_office(points: int = 96) -> Capture:
-    """Simulate the office without noise: one laser spot, a planar wall of 2 m, bins of 32 ps."""
-    wall = build_relay_wall("planar", points)
-    return build_office().simulate_capture(
-        wall, [0.0, 0.0, 0.0], TimeAxis(512, 32e-12, 0.0), 35e-12
-    )
-
-
-def build_office_grid() -> Grid:
-    """Voxels of 2.5 cm around the office."""
-    return Grid.box((-1.0, 1.0), (-1.0, 1.0), (0.9, 2.1), 0.025)
-
-
 def build_tomography(points: int, sampling_ratio: float) -> RadonProjection:
     """Line projections of a picture at ``sampling_ratio * points`` angles, evenly over half a turn:
     (points, points) to (angles * points,).
@@ -102,7 +89,9 @@ def find_expected_peak(capture: Capture, largest_count: float, seed: int) -> flo
 )
 def run_adjoint_imaging(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Image the office at every exposure and sampling ratio."""
-    capture, grid = simulate_office(), build_office_grid()
+    wall, bins = build_relay_wall("planar", 96), TimeAxis(512, 32e-12, 0.0)
+    capture = build_office().simulate_capture(wall, [0.0, 0.0, 0.0], bins, 35e-12)
+    grid = Grid.box((-1.0, 1.0), (-1.0, 1.0), (0.9, 2.1), 0.025)
     return measure_agreement(capture, grid, PlanarRSD(WAVELENGTH_M, CYCLES), seeds, advance)
 
 

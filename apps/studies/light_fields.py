@@ -9,10 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from math import isqrt
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.studies.cases import (
     BORDER_PX,
@@ -27,9 +25,11 @@ from apps.studies.cases import (
     find_reference_view,
     measure_case,
     read_cases,
+    recover_stack,
     solve_cases,
     study,
 )
+from tofclip.arrays import AnyArray, BoolArray
 from tofclip.light_field import FocalStack, LightField, estimate_depth_from_focus, make_focal_stack
 from tofclip.light_field.views import CameraSetup, measure
 from tofclip.metrics import nmse
@@ -80,7 +80,7 @@ def _recover_light_fields(
     return [[next(fields) for _ in range(seeds)] for _ in cases]
 
 
-def _tile_views(pictures: NDArray[Any]) -> NDArray[Any]:
+def _tile_views(pictures: AnyArray) -> AnyArray:
     """As many views as fill a square, in one picture, as they stand on the grid."""
     side, (_, rows, columns) = isqrt(len(pictures)), pictures.shape
     grid = pictures[: side * side].reshape(side, side, rows, columns)
@@ -170,7 +170,7 @@ TEXTURE_THRESHOLD = 0.2  # of the steepest slopes
 
 
 def compute_depth_accuracy(
-    found: NDArray[Any], true: NDArray[Any], picture: NDArray[Any], step: float
+    found: AnyArray, true: AnyArray, picture: AnyArray, step: float
 ) -> float:
     """Share of textured pixels whose shear is right to three quarters of the stack's step.
 
@@ -254,9 +254,7 @@ MATERIALS: Mapping[str, Callable[[Pattern], Lambertian]] = {
     steps=len(MATERIALS),
 )
 def run_glossy_plate(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover a plate of either kind from CLIP-1D at SR = 1; say how even its light is, and the
-    errors.
-    """
+    """Recover a plate of either kind by CLIP-1D at SR = 1; how even its light is, and errors."""
     from scipy.ndimage import binary_erosion
 
     rows, panels = [], []
@@ -308,19 +306,13 @@ def _recover_stack(field: LightField, seed: int, advance: Advance) -> FocalStack
     measurement = measure(field, CameraSetup("line", 1.0, seed))
     chosen = ClipRecovery().recover(measurement, PLATE_SHEAR)
     # One weight for all planes: depth from focus compares their contrast.
-    recovery = replace(ClipRecovery(), weight=chosen.weight)
-    pictures = map_parallel(
-        lambda shear: recovery.recover(measurement, float(shear)).picture, list(STACK_SHEARS)
-    )
-    stack = FocalStack(np.stack(list(pictures)), STACK_SHEARS)
+    stack = recover_stack(ClipRecovery(weight=chosen.weight), measurement, STACK_SHEARS)
     advance(1)
     return stack
 
 
-def _measure_unevenness(field: LightField, where: NDArray[np.bool_]) -> float:
-    """Standard deviation over the views, moved onto each other, relative to the mean; its mean
-    square root.
-    """
+def _measure_unevenness(field: LightField, where: BoolArray) -> float:
+    """Standard deviation over the views, moved onto each other, relative to the mean."""
     shape = (field.pictures.shape[1], field.pictures.shape[2])
     moved = np.stack(
         [

@@ -55,9 +55,7 @@ FIXED_WEIGHT = (
     has_best=True,
 )
 def run_black_occluders(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover what stands behind the occluder; shift-and-add is the truth, the bare target stands
-    beside it.
-    """
+    """Recover what stands behind; shift-and-add is the truth, the bare target stands beside it."""
     solved = solve_cases(read_cases("table7"), library, seeds, advance)
     rows, panels = [one.row() for one in solved], []
     for scene, own in groupby(solved, key=lambda one: one.case.scene):
@@ -87,9 +85,7 @@ def run_black_occluders(library: Library, seeds: int, advance: Advance) -> Outco
     steps=16,
 )
 def run_flash_occlusion(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Flash scenes behind occluders, gate, and recover with and without the model of what the
-    occluder hides.
-    """
+    """Flash, gate, and recover with and without the model of what the occluder hides."""
     side = min(library.array.image_shape)
     # the paper's: a mannequin behind a tree and a plate, a word behind a bush and a plate
     cases = read_cases("table7-flash")
@@ -161,9 +157,7 @@ class TargetPosition(NamedTuple):
     steps=(len(WIDTHS_MM) * len(DISTANCES_MM) + len(FIXED_CAMERA_BARS_MM)) * len(DISTANCE_FACTORS),
 )
 def run_inactive_region(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Put small targets behind bars of several widths and at several distances, inside the region
-    and beyond.
-    """
+    """Put small targets behind bars of several widths and distances, inside and beyond."""
     places = [
         TargetPosition(width, distance, factor)
         for width in WIDTHS_MM

@@ -22,13 +22,13 @@ from apps.studies.cases import (
     lay_out_lines,
     measure_case,
     read_cases,
+    recover_stack,
     solve_cases,
     study,
 )
 from tofclip.light_field import FocalStack, estimate_depth_from_focus, make_focal_stack
 from tofclip.recovery.light_field import ClipRecovery
 from tofclip.simulate.scenes import EDITS
-from tofclip.threads import map_parallel
 
 STACK_SHEARS = np.arange(-1.3, 0.61, 0.3)
 
@@ -127,9 +127,7 @@ def run_area_sensors(library: Library, seeds: int, advance: Advance) -> Outcome:
     steps=16,
 )
 def run_angle_assignment(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover with both ways of dealing; recorded light fields too where they are at hand, as
-    figures only.
-    """
+    """Recover with both ways of dealing; recorded light fields where they are at hand."""
     cases = []
     for case in read_cases("dealing"):
         _, _, recorded = case.scene.partition("data:")
@@ -162,15 +160,9 @@ def _represent(name: str, library: Library, seeds: int, advance: Advance) -> Out
 
 
 def _make_line(library: Library, line: Sequence[SolvedCase]) -> list[Panel]:
-    """The pictures of one camera and sampling ratio, with depth and all in focus from a stack of
-    recoveries.
-    """
+    """One camera's pictures at a sampling ratio, with depth and all in focus from a stack."""
     case, recovery = line[0].case, ClipRecovery(weight=line[0].weight)
-    measurement = measure_case(case, library, 0)
-    pictures = map_parallel(
-        lambda shear: recovery.recover(measurement, float(shear)).picture, list(STACK_SHEARS)
-    )
-    stack = FocalStack(np.stack(list(pictures)), STACK_SHEARS)
+    stack = recover_stack(recovery, measure_case(case, library, 0), STACK_SHEARS)
     title = f"{CAMERA_NAMES[case.encoder]} SR = {case.sampling_ratio:g}"
     return [*(one.panel(title) for one in line), *_make_depth_panels(stack)]
 

@@ -169,9 +169,7 @@ def write_page(results: Sequence[Result], folder: Path) -> Path:
 
 
 def render_section(result: Result, beside: str = "") -> str:
-    """Return a study's heading, command, table and picture in Markdown. `beside`: folder of the
-    picture; ends in a slash, or is empty.
-    """
+    """Return a study's section in Markdown; `beside`: its picture's folder."""
     names = ", ".join([result["name"], *result["also"]])
     has_best = "best_seconds" in result
     header = [*result["columns"], f"ours ({result['figure']})", "spread", "paper"]
@@ -343,9 +341,7 @@ def complete_best(result: Result, study: Study, library: Library, folder: Path) 
 def _run_study(
     study: Study, library: Library, seeds: int, folder: Path, advance: Advance
 ) -> Result:
-    """Run a study, and write its figure, its tables and, last, the file that marks it as
-    finished.
-    """
+    """Run a study, and write its figure, its tables and, last, what marks it as finished."""
     started = time.perf_counter()
     outcome = study.work(library, seeds if study.seeded else 1, advance)
     seconds = time.perf_counter() - started

@@ -11,9 +11,9 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.studies.cases import Advance, Library, Outcome, Panel, Row, study
+from tofclip.arrays import Float32Array
 from tofclip.camera import Camera, SkewSweep
 from tofclip.lidar import depth
 from tofclip.metrics import nmse
@@ -33,7 +33,6 @@ from tofclip.simulate.bodies import Body, Lambertian, Sphere
 from tofclip.simulate.demo import ANGLES_DEG, GAINS, LENSLET_PITCH_M, place_plate
 from tofclip.simulate.patterns import (
     TEXELS,
-    Pattern,
     cut_pattern,
     make_checkerboard,
     make_letter,
@@ -64,7 +63,7 @@ class Scored(NamedTuple):
     # those of `tofclip.simulate.score_returns`, ``image_nmse``, ``image_nmse_inner`` and
     # ``seconds`` of processor time
     figures: dict[str, float]
-    picture: NDArray[np.float32]  # (rows, columns), light of all instants
+    picture: Float32Array  # (rows, columns), light of all instants
 
 
 def make_small_instrument(photons: float, rays_per_pixel_side: int = 4) -> Instrument:
@@ -110,24 +109,16 @@ def make_slanted_scene() -> Scene:
     )
 
 
-def _make_wires() -> Pattern:
-    """Upright, level and slanted wires; nothing between them."""
+def make_wire_scene() -> Scene:
+    """Return upright, level and slanted wires of 1.4 pixels before a wall."""
     y, x = np.indices((TEXELS, TEXELS))
     width = TEXELS / 50 * 1.4  # texels; the plate is 50 pixels wide
     wires = [np.abs(x - place) < width / 2 for place in (30, 96, 160)]
     wires += [np.abs(y - place) < width / 2 for place in (50, 140)]
     wires.append(np.abs(x - y) < width / np.sqrt(2))
-    return np.where(np.any(wires, axis=0), 0.9, np.nan).astype(np.float32)
-
-
-def make_wire_scene() -> Scene:
-    """Return wires of 1.4 pixels before a wall."""
-    return Scene(
-        (
-            _place(_make_wires(), (0, 0), 50, 1.9),
-            _place(make_stripes(4, 0.3, 0.9), (0, 0), 56, 2.4),
-        )
-    )
+    drawn = np.where(np.any(wires, axis=0), 0.9, np.nan).astype(np.float32)
+    wall = _place(make_stripes(4, 0.3, 0.9), (0, 0), 56, 2.4)
+    return Scene((_place(drawn, (0, 0), 50, 1.9), wall))
 
 
 def make_gauze_scene() -> Scene:
@@ -155,9 +146,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 
 
 def make_scene_instrument(name: str, photons: float) -> Instrument:
-    """Return the instrument before which a scene of `SCENES` stands. `photons`: expected signal of
-    the brightest streak pixel.
-    """
+    """Return the instrument for a scene of `SCENES`; `photons` of the brightest streak pixel."""
     if name == "gauze":
         return make_small_instrument(photons, GAUZE_RAYS_PER_PIXEL_SIDE)
     return make_small_instrument(photons)

@@ -13,8 +13,7 @@ from apps.report import RECORD_SUFFIXES, build_provenance, report, require_writa
 from tofclip.errors import InputError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from tofclip.arrays import AnyArray
     from tofclip.light_field.views import ClipMeasurement
     from tofclip.recovery.light_field import AllInFocus, ClipRecovery
 
@@ -203,11 +202,9 @@ def _parse_weight(text: str) -> float | None:
 
 
 def _write_picture(
-    arrays: dict[str, NDArray[Any]], out: Path, measurement: Path, settings: dict[str, Any]
+    arrays: dict[str, AnyArray], out: Path, measurement: Path, settings: dict[str, Any]
 ) -> None:
-    """Write the picture; a PNG is scaled to the picture's own brightest pixel, the others keep the
-    values, and HDF5 keeps its shears as well.
-    """
+    """Write the picture: a PNG scaled to its brightest pixel, else its values."""
     import numpy as np
 
     from tofclip.files import atomic_path

@@ -70,9 +70,7 @@ def info(
 
 
 def describe_file(file: Path) -> dict[str, Any]:
-    """Describe our own records, streak images, point clouds, counted photons and ROS 2 bags by their
-    headers: their values may not fit into memory.
-    """
+    """Describe a file of any kind by its header: its values may not fit into memory."""
     from devices.linospad2 import LinoSpad2File
     from devices.transients import STAMPS_SUFFIX
     from tofclip.lidar import ros
@@ -133,7 +131,10 @@ def _format_tree(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
         if isinstance(value, list) and value and isinstance(value[0], Mapping):
             yield from _format_tree({name: dict(enumerate(value, start=1))}, depth)
         elif isinstance(value, Mapping) and "shape" in value:
-            yield f"{lead} {_format_field(value)}"
+            shape = " x ".join(map(str, value["shape"])) or "single value"
+            axes = f" ({', '.join(value['axes'])})" if value["axes"] else ""
+            values = f", {_format_values(value['values'])}" if "values" in value else ""
+            yield f"{lead} {shape}{axes} {value['type']}{values} {value['units']}".rstrip()
         elif isinstance(value, Mapping):
             yield lead
             yield from _format_tree(value, depth + 1)
@@ -150,13 +151,6 @@ def _format_plain(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     return "not known" if value is None else str(value)
-
-
-def _format_field(known: Mapping[str, Any]) -> str:
-    shape = " x ".join(map(str, known["shape"])) or "single value"
-    axes = f" ({', '.join(known['axes'])})" if known["axes"] else ""
-    values = f", {_format_values(known['values'])}" if "values" in known else ""
-    return f"{shape}{axes} {known['type']}{values} {known['units']}".rstrip()
 
 
 def _format_values(values: Any) -> str:

@@ -152,10 +152,7 @@ class ResultFiles:
         require_writable(self.settings, inputs=inputs)
 
     def is_up_to_date(self, source: Path) -> bool:
-        """Whether all are there and came from the capture as it is now.
-
-        Results of versions that did not note the capture's content have to be younger than it.
-        """
+        """Whether all are there and came from the capture as it is; without a note, if younger."""
         if not all(path.is_file() for path in self.paths):
             return False
         text = self.settings.read_text("utf-8", errors="replace")
@@ -172,9 +169,7 @@ def list_volume_suffixes() -> tuple[str, ...]:
 
 
 def note_content(source: Path) -> str:
-    """Return a comment for a TOML file by which a capture, or a folder of renderings, is known
-    again, whatever it is called and however old it is.
-    """
+    """Return a comment by which a capture, or a folder of renderings, is known again by content."""
     if not source.is_dir():
         return CONTENT_MARK + identify_file(source)
     files = sorted(path for path in source.rglob("*") if path.is_file())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -79,9 +80,7 @@ def is_capture_folder(source: Path) -> bool:
 
 
 def list_captures(folder: Path, may_be_empty: bool = False) -> list[Path]:
-    """List the captures of a folder: files that may hold one, and folders of renderings. One that is
-    waited for may be empty yet.
-    """
+    """List the captures of a folder; one that is waited for may be empty yet."""
     found = sorted(
         path
         for path in folder.iterdir()
@@ -123,9 +122,7 @@ def choose_methods(method: str | None, usual: Sequence[str]) -> Sequence[str]:
 
 
 def require_valid_settings(settings: Settings, methods: Sequence[str]) -> None:
-    """Refuse settings that no capture could make sense of, and those that none of the methods takes,
-    before any capture is read.
-    """
+    """Refuse settings of which nothing could be made, and those that none of the methods takes."""
     for name in sorted(_list_own_settings(METHODS.own) - _list_own_settings(methods)):
         if getattr(settings, name) is not None:
             by = ", ".join(one for one in METHODS.own if name in list_taken(one))
@@ -148,9 +145,7 @@ def _list_own_settings(methods: Iterable[str]) -> set[str]:
 def try_methods(
     found: Settings, methods: Iterable[str], capture: Capture, grid: Grid
 ) -> tuple[dict[str, int], dict[str, str]]:
-    """Return the memory, bytes, of methods that suit a capture, and why the others do not. A plan
-    checks the geometry without imaging, and so is cheap.
-    """
+    """Return the memory, bytes, of methods that suit a capture, and why others do not."""
     memory, refused = {}, {}
     for name in methods:
         try:
@@ -195,9 +190,7 @@ def prepare_imaging(
 
 
 def image_capture(title: str, plan: Plan, capture: Capture) -> Volume:
-    """Image the hidden scene under a progress bar that counts look-ups or voxels, whichever the
-    plan does.
-    """
+    """Image the hidden scene under a bar that counts look-ups or voxels."""
     with show_progress(title, plan.cost) as advance:
         return plan.image(capture, advance)
 
@@ -220,10 +213,7 @@ class MeasuredVolume:
 
 
 def measure_imaging(name: str, imaging: Method, capture: Capture, grid: Grid) -> MeasuredVolume:
-    """Image the hidden scene, and measure time and memory.
-
-    A few voxels are imaged first, so that loading the compiled loops is not counted.
-    """
+    """Image the hidden scene, and measure time and memory, without loading the compiled loops."""
     from nlos import Grid
 
     few = slice(WARM_UP_VOXELS)
@@ -239,9 +229,7 @@ def measure_imaging(name: str, imaging: Method, capture: Capture, grid: Grid) ->
 
 
 def _reset_peak_memory() -> int | None:
-    """Let the system forget the most memory that this program ever took; return what it takes now,
-    bytes.
-    """
+    """Let the system forget the most memory ever taken; return what is taken now, bytes."""
     # The C library keeps what was given back for later; what is taken from there again would not be
     # seen.
     with contextlib.suppress(AttributeError, OSError):
@@ -256,11 +244,11 @@ def _reset_peak_memory() -> int | None:
 def _read_process_memory(entry: str) -> int | None:
     """Return an entry of Linux's account of this program's memory, bytes."""
     try:
-        lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+        account = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
     except OSError:
         return None
-    found = next((line for line in lines if line.startswith(f"{entry}:")), None)
-    return None if found is None else int(found.split()[1]) * 1024
+    found = re.search(rf"^{entry}:\s+(\d+)", account, re.M)
+    return None if found is None else int(found[1]) * 1024
 
 
 WALL_SHAPE, WALL_POINTS = "cylinder", 64

@@ -174,9 +174,7 @@ def _check_stream(wanted: StreamSettings, follow_s: float, captures: int | None)
 
 
 def _read_captures(source: Path, follow_s: float) -> Iterator[Coming]:
-    """Read the captures of a folder in the order of their names, and those that come later; at last
-    say what cannot be read.
-    """
+    """Read a folder's captures by name, and later ones; at last say what cannot be read."""
     from nlos.io import read_capture
 
     if not is_capture_folder(source):

@@ -224,9 +224,7 @@ def find_doubt(
 def read_any_photons(
     file: str, bin_width: float | None, axes: str | None
 ) -> tuple[PhotonImage, Pulse | None, float]:
-    """Read a file or an instrument; return its photons, its response where it knows that, and the
-    time of its first bin, s.
-    """
+    """Read a file or an instrument: photons, response if known, time of the first bin, s."""
     from devices.transients import find_address
     from devices.transients import read_photons as read_instrument
     from tofclip.lidar.photons.files import read_photons
@@ -267,9 +265,7 @@ def choose_camera(
     field_of_view_deg: float,
     pulse_fwhm: float,
 ) -> Camera:
-    """Return a known camera, with another focal length if one is given, or a pinhole whose returns
-    are `pulse_fwhm` s wide.
-    """
+    """Return a known camera, or a pinhole of this response, s."""
     from tofclip.camera import Camera
 
     if known is not None:

@@ -454,9 +454,7 @@ def stream(
 def _read_shots(
     source: str, bin_width: float | None
 ) -> Iterator[LiveShot] | Iterator[LiveShot | TofclipError]:
-    """Shots of an instrument, a folder or a stack; in the place of one that cannot be read its
-    error, which lets those behind it go on.
-    """
+    """Shots of an instrument, a folder or a stack; errors in place of those that cannot be read."""
     from devices.transients import find_address, read_transients
     from tofclip.sequences import list_shots
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import html
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.viewer.look import PALETTE_SIZE, Scale, choose_ticks, load_palette
 from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.source import Limits
+from tofclip.arrays import AnyArray
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
 GRADIENT_STOPS, LABEL_MARGIN = 24, 0.04
@@ -114,11 +113,9 @@ BAR_COUNT, OUTSIDE_COLOUR = 64, (70, 76, 88)
 
 
 def render_histogram_html(
-    values: NDArray[Any], span: Limits, limits: Limits, scale: Scale | None
+    values: AnyArray, span: Limits, limits: Limits, scale: Scale | None
 ) -> str:
-    """Return bars of how many points have which value, in the colours of a scale; grey beyond the
-    limits. Their heights go with the square root of the numbers, so that a few points are seen.
-    """
+    """Return bars in a scale's colours, grey beyond limits; square roots, so that few are seen."""
     counts, edges = np.histogram(values, BAR_COUNT, span)
     middles = (edges[1:] + edges[:-1]) / 2
     blue = np.full((BAR_COUNT, 3), (62, 142, 208), np.uint8)

@@ -7,14 +7,13 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from apps.viewer.source import Limits, Picture, View
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, Float32Array, FloatArray
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 from tofclip.units import NANOSECOND
@@ -39,7 +38,7 @@ TURBO_ENDS = 0.09, 0.93
 
 # what points are coloured and filtered by: its unit, and how it is taken from a view, (n,); heights
 # count upwards from the camera, though y points down
-QUANTITIES: Mapping[str, tuple[str, Callable[[View], NDArray[Any]]]] = {
+QUANTITIES: Mapping[str, tuple[str, Callable[[View], AnyArray]]] = {
     "range": ("m", lambda view: view.cloud.range),
     "height": ("m", lambda view: -view.cloud.xyz[:, 1]),
     "intensity": ("counts", lambda view: view.cloud.intensity),
@@ -121,7 +120,7 @@ class Scale:
         unit = "mm" if self.factor > 1 else self.unit
         return f"{self.quantity} ({unit})" if unit else self.quantity
 
-    def colours(self, values: NDArray[Any]) -> NDArray[np.uint8]:
+    def colours(self, values: AnyArray) -> NDArray[np.uint8]:
         """Return red, green and blue, (n, 3); values beyond the limits get the outermost colours."""
         low, high = self.limits
         steps = PALETTE_SIZE - 1
@@ -154,7 +153,7 @@ def make_scale(view: View, colouring: Colouring) -> Scale:
     return Scale(colouring.quantity, unit, colouring.palette, scale, full_light)
 
 
-def _find_limits(values: NDArray[Any]) -> Limits:
+def _find_limits(values: AnyArray) -> Limits:
     """Limits of colours that show nearly all values, never equal."""
     if values.size == 0:
         return 0.0, 1.0
@@ -184,9 +183,7 @@ def format_length(length: float) -> str:
 
 
 def choose_ticks(scale: Scale, count: int = 6) -> tuple[list[tuple[float, str]], str]:
-    """Return about `count` round values of a scale, each with where it lies, 0 for the first colour
-    to 1 for the last; and the scale's title, in a unit in which the numbers are short.
-    """
+    """Return about `count` round values of a scale, where each lies from 0 to 1, and its title."""
     (low, high), factor = scale.limits, scale.factor
     values = choose_round_values(low * factor, high * factor, count)
     step = values[1] - values[0] if len(values) > 1 else (high - low) * factor
@@ -221,12 +218,12 @@ class Pick:
     pixel: tuple[int, int] | None = None  # row and column that saw it
     waveform: FloatArray | None = None  # (2, n), times of flight, s, and counts of that pixel
     # (k,), time of flight of every return that was found in that pixel and is shown, s
-    return_times: NDArray[Any] | None = None
+    return_times: AnyArray | None = None
 
     @property
-    def position(self) -> NDArray[np.float32]:
+    def position(self) -> Float32Array:
         """x, y, z in m."""
-        position: NDArray[np.float32] = self.point.xyz[0]
+        position: Float32Array = self.point.xyz[0]
         return position
 
     @property
@@ -245,9 +242,7 @@ class Pick:
         return "\n".join(lines)
 
 
-def find_point_on_ray(
-    xyz: NDArray[np.float32], origin: ArrayLike, direction: ArrayLike
-) -> int | None:
+def find_point_on_ray(xyz: Float32Array, origin: ArrayLike, direction: ArrayLike) -> int | None:
     """Return the number of the point (n, 3), m, that a ray from the eye hits, None where it hits
     none. Of the points that the ray misses closely the one nearest to the eye is meant; with none
     so close, the one missed by the smallest angle.
@@ -297,9 +292,7 @@ def _colour_brightness(picture: Picture, scale: Scale) -> Image:
 
 
 def _colour_depth(picture: Picture, scale: Scale) -> Image:
-    """Colour a picture of distances, m, by the scale where it is one of ranges, else by the palette of
-    ranges from the 1st to the 99th percentile; NaN becomes a dark grey.
-    """
+    """Colour distances, m, by a scale of ranges, else by percentiles; NaN is grey."""
     image = np.full((*picture.shape, 3), EMPTY_COLOUR, np.uint8)
     there = np.isfinite(picture)
     if there.any():
@@ -312,9 +305,7 @@ def _colour_depth(picture: Picture, scale: Scale) -> Image:
 
 
 def project_front(cloud: PointCloud) -> dict[str, Picture]:
-    """Return intensity and depth as seen from the origin along z, 128 x 128, of a cloud that has no
-    camera.
-    """
+    """Return intensity and depth from the origin along z of a cloud that has no camera."""
     depth = np.full((FRONT_SIDE_PX, FRONT_SIDE_PX), np.nan, np.float32)
     light = np.zeros_like(depth)
     if len(cloud) == 0:

@@ -227,9 +227,7 @@ Served = tuple["viser.ViserServer", str]  # a server and its address
 
 
 def serve_waiting(title: str, words: str, port: int | None = None, host: str = LOOPBACK) -> Served:
-    """Serve a page that says what is being done, until `Page` takes its place: browsers load it
-    meanwhile. `title`: of the source; `host`: an IP address of this computer.
-    """
+    """Serve a page that says what is being done, until `Page` takes its place."""
     server, address = start_server(port, host)
     _set_up_panel(server, title)
     say_waiting(server, words)

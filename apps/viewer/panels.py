@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.figures.style import DOTS_PER_INCH, make_figure
 from apps.viewer.html import render_histogram_html, render_scale_html, render_text_html
@@ -44,7 +43,7 @@ from apps.viewer.viewpoint import (
     move_camera,
     read_viewpoint,
 )
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, FloatArray
 from tofclip.lidar import PointCloud
 from tofclip.lidar.processing import fit_plane
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
@@ -98,7 +97,7 @@ class Handles:
         for handle in (self._slider, self._boxes):
             bind_user_input(handle, post, set_limits)
 
-    def show(self, values: NDArray[Any], limits: Limits, scale: Scale, coloured: bool) -> None:
+    def show(self, values: AnyArray, limits: Limits, scale: Scale, coloured: bool) -> None:
         """Bring it up to date. `scale`: says the unit; `coloured`: whether the bars have its colours."""
         known = values.size, values[:1].tobytes(), limits, scale.title, coloured and scale.palette
         if known == self._known:
@@ -364,9 +363,7 @@ class Controls:
 
 
 def mark_times(times: FloatArray) -> tuple[tuple[int, str], ...]:
-    """Return the frames, from 1, at round times of flight, with their times in ns, for a time line. `times`
-    (frames,): s; rising.
-    """
+    """Return the frames, from 1, at round times, with these in ns; `times` (frames,) rise, s."""
     in_ns = times / NANOSECOND
     places = choose_round_values(in_ns[0], in_ns[-1], MAX_TIME_MARKS)
     frames = np.abs(in_ns - places[:, np.newaxis]).argmin(axis=1)
@@ -398,9 +395,7 @@ PLOT_LOOK: Any = {
 def add_selection(
     server: viser.ViserServer, session: Session, post: Post, above: viser.PanelHandle
 ) -> Callable[[], None]:
-    """Listen to clicks on points. Returns what says which points are picked, in a panel that stays in
-    sight below the docked panel `above`.
-    """
+    """Listen to clicks on points; return what says which are picked, below the panel `above`."""
     scene, panel = server.scene, server.gui.add_panel()
     with panel.add_tab("picked point"):
         hint = "click a point; a second one gives their distance"
@@ -549,10 +544,8 @@ def add_export(
         gui.add_command(label, hotkey=key).on_trigger(act)
 
 
-def _encode_png(drawn: NDArray[Any], session: Session) -> bytes:
-    """Put a picture with a transparent ground on a dark one, as on the page, with the legend of its
-    colours below.
-    """
+def _encode_png(drawn: AnyArray, session: Session) -> bytes:
+    """Put a picture on a dark ground, as on the page, with the legend of its colours below."""
     opacity = drawn[..., 3:] / 255.0 if drawn.shape[-1] == 4 else 1.0
     flat = drawn[..., :3] * opacity + np.array(BACKGROUND) * (1 - opacity)
     rows, columns = flat.shape[:2]

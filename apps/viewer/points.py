@@ -13,12 +13,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.viewer.look import format_length
 from apps.viewer.session import DisplayedFrame, Section
 from apps.viewer.viewpoint import Box
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, Float32Array, FloatArray, IndexArray
 
 if TYPE_CHECKING:
     import viser
@@ -47,9 +46,7 @@ STILL_AFTER_S = 0.7
 
 @dataclass
 class FramePacer:
-    """Counts the frames of the last two seconds, and holds frames back so that none pile up in a
-    page: large clouds are sent less often.
-    """
+    """Counts frames of two seconds, and sends large clouds less often."""
 
     _next: float = 0.0
     _sent: deque[float] = field(default_factory=deque)
@@ -72,16 +69,12 @@ class FramePacer:
 
 @dataclass
 class DetailChooser:
-    """Says how many points of a large cloud are drawn, from how quickly browsers have drawn others;
-    the slowest browser decides.
-    """
+    """Says how many points are drawn, by how quickly the slowest browser has drawn others."""
 
     points_per_s: dict[int, float] = field(default_factory=dict)  # of each browser that was timed
 
     def count(self, points: int, moving: bool) -> int:
-        """Return how many points of a cloud are drawn. `points`: of the cloud; `moving`: whether
-        the view or the cloud moves, so that the next frame has to come soon.
-        """
+        """Return how many points of a cloud are drawn; fewer while view or cloud moves."""
         slowest = min(self.points_per_s.values(), default=0.0)
         drawable = int((MOVING_FRAME_S if moving else STILL_FRAME_S) * slowest)
         return min(points, max(drawable, MIN_DRAWN_POINTS))
@@ -107,10 +100,10 @@ class Points:
         self._drawn_moving = 0
         self._xyz = np.empty((0, 3), np.float32)
         self._colours: Any = None
-        self._opacities: NDArray[np.float32] | None = None  # of soft balls
+        self._opacities: Float32Array | None = None  # of soft balls
         self._points, self._size_m = 0, 0.0
         self._surface: Any = None
-        self._order: NDArray[np.intp] | None = None
+        self._order: IndexArray | None = None
         self._still: Any = None
         self._moving: Any = None
         self._moved_at, self._is_held = -np.inf, False
@@ -264,7 +257,7 @@ UPRIGHT, POINTING_INWARDS = (1.0, 0.0, 0.0, 0.0), (0.0, 0.5**0.5, -(0.5**0.5), 0
 
 
 def add_lines(
-    scene: Any, name: str, ends: NDArray[Any], colour: tuple[int, int, int], width_px: float = 1.0
+    scene: Any, name: str, ends: AnyArray, colour: tuple[int, int, int], width_px: float = 1.0
 ) -> Any:
     """Draw lines between ends (n, 2, 3), m."""
     points = ends.astype(np.float32)
@@ -278,7 +271,7 @@ def draw_furniture(server: viser.ViserServer, box: Box) -> Callable[[viser.Clien
     """
     scene: Any = server.scene
 
-    def add_label(name: str, text: str, place: NDArray[Any], anchor: str) -> Any:
+    def add_label(name: str, text: str, place: AnyArray, anchor: str) -> Any:
         return scene.add_label(name, text, position=place, anchor=anchor, font_screen_scale=0.9)
 
     drawn = [add_lines(scene, "/box", box.edges, BOX_COLOUR)]
@@ -375,7 +368,7 @@ class SectionPlane:
         """Whether there is something to drag."""
         return self._handle is not None
 
-    def show(self, point: NDArray[Any], normal: NDArray[Any], reach: float) -> None:
+    def show(self, point: AnyArray, normal: AnyArray, reach: float) -> None:
         """Draw the plane through a point; `reach`: half of the side of the square drawn, m."""
         self.hide()
         look: Any = {"depth_test": False, "scale": 0.4 * reach, "wxyz": turn_to(normal)}
@@ -401,7 +394,7 @@ class SectionPlane:
         return Section(normal, float(np.dot(normal, self._handle.position)), thickness)
 
 
-def turn_to(normal: NDArray[Any]) -> tuple[float, float, float, float]:
+def turn_to(normal: AnyArray) -> tuple[float, float, float, float]:
     """Return the quaternion w, x, y, z that turns the z axis to a direction of length 1."""
     x, y, z = normal if normal[2] >= 0 else -normal  # a plane has two normals
     length = float(np.sqrt(2 * (1 + z)))

@@ -26,6 +26,7 @@ from apps.viewer.look import (
 )
 from apps.viewer.source import Limits, Picture, Source, View
 from apps.viewer.viewpoint import Viewpoint
+from tofclip.arrays import BoolArray, Float32Array
 from tofclip.errors import FileFormatError, InputError
 
 
@@ -104,9 +105,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Filters:
-    """Limits of quantities by name, in their units and inclusive; a point must keep every one, and lie
-    within the section.
-    """
+    """Limits by quantity, inclusive; a point must keep every one, and lie within the section."""
 
     limits: Mapping[str, Limits] = field(default_factory=dict)
     section: Section | None = None
@@ -120,7 +119,7 @@ class Filters:
         """Return filters with other limits of a quantity."""
         return replace(self, limits={**self.limits, name: limits})
 
-    def select(self, view: View) -> NDArray[np.bool_]:
+    def select(self, view: View) -> BoolArray:
         """Return for each point whether it is shown, (n,)."""
         kept = np.ones(len(view.cloud), bool)
         for name, (low, high) in self.limits.items():
@@ -142,7 +141,7 @@ class DisplayedFrame(View):
     scale: Scale
     points: int  # of which some may be left out while frames pass
     whole: View  # before the filters
-    opacities: NDArray[np.float32] | None = None  # (n,) of soft balls
+    opacities: Float32Array | None = None  # (n,) of soft balls
 
 
 def render_frame(
@@ -172,9 +171,7 @@ def render_frame(
 
 
 class Session:
-    """A source being looked at. Not to be used by two threads at once. Public attributes may be set
-    at any time; `frame_at` then draws accordingly.
-    """
+    """A source being looked at, by one thread at a time; public attributes may be set."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -224,9 +221,7 @@ class Session:
         return float(np.linalg.norm(np.subtract(first, second)))
 
     def frame_at(self, now: float) -> DisplayedFrame:
-        """Return what is to be drawn at time `now`, s of a steady clock; the same object while
-        nothing changed.
-        """
+        """Return what is drawn at a time, s of a steady clock; the same object until a change."""
         frame = self.clock.tick(now)
         set_by_user = tuple(setting.value for setting in self.source.settings)
         # while frames pass, the next one has to come soon
@@ -242,9 +237,7 @@ class Session:
         return self.latest
 
     def pick(self, origin: ArrayLike, direction: ArrayLike) -> Pick | None:
-        """Choose the point that a ray hits, m; the last two choices are kept, and a miss forgets
-        them.
-        """
+        """Choose the point that a ray hits; the last two are kept, and a miss forgets them."""
         if self.latest is None:
             return None
         shown = self.latest
@@ -268,9 +261,7 @@ class Session:
         return pick
 
     def pictures(self, shown: DisplayedFrame) -> Mapping[str, Picture]:
-        """Return the flat pictures beside the scene; the scene itself seen from the front where
-        there are no others.
-        """
+        """Return the flat pictures beside the scene; without any, the scene from the front."""
         return self.source.pictures(shown.frame) or project_front(shown.cloud)
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray
 from tofclip.lidar import PointCloud
 from tofclip.lidar.cloud import OPTIONAL_COLUMNS
 from tofclip.units import SPEED_OF_LIGHT
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from nlos.export import Mesh
 
 Frame = TypeVar("Frame")
-Picture = NDArray[np.float32]  # (rows, columns)
+Picture = Float32Array  # (rows, columns)
 Limits = tuple[float, float]  # both inclusive
 NO_LIMITS: Limits = (-np.inf, np.inf)
 
@@ -36,7 +36,7 @@ class View:
     pixels: NDArray[np.int32] | None = None  # (n, 2), row and column that saw each point
     surface: Mesh | None = None  # drawn instead of the points
     # (n,) points that are not due are not shown, though they count for the colours; all by default
-    due: NDArray[np.bool_] | None = None
+    due: BoolArray | None = None
     # (n,) number of the source, from 1, where several are in one view
     layers: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
     # of the brightest; below 1 points are soft balls, the clearer the fainter they are
@@ -47,7 +47,7 @@ class View:
     caption: str = ""  # of which frames the points are, where that is not the one frame
     notes: tuple[str, ...] = ()  # what has to be known about this view
 
-    def select(self, chosen: NDArray[Any]) -> Self:
+    def select(self, chosen: AnyArray) -> Self:
         """Return a view of some of the points, by mask or by numbers."""
         pixels = None if self.pixels is None else self.pixels[chosen]
         due = None if self.due is None else self.due[chosen]
@@ -153,27 +153,21 @@ class Source(abc.ABC):
         return Inflow()
 
     def pictures(self, number: int) -> Mapping[str, Picture]:
-        """Return pictures of frame `number` by name: "streak", "intensity", "depth" (m, NaN where
-        there is none).
-        """
+        """Return pictures of a frame by name: "streak", "intensity", "depth" (m, NaN if none)."""
         return {}
 
     def waveform(
         self, number: int, pixel: tuple[int, int], time: float, layer: int = 1
     ) -> FloatArray | None:
-        """Return times of flight, s, about `time` and the counts of a pixel (row, column) in frame
-        `number`, (2, n); None where they are not known.
-        """
+        """Return times, s, about `time` and a pixel's counts, (2, n); None if not known."""
         return None
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
         """Let go of files and instruments."""
 
 
-def make_cloud(xyz: NDArray[Any], known: Mapping[str, NDArray[Any]] | None = None) -> PointCloud:
-    """Make a cloud of positions (n, 3), m; columns that are not known follow from them, or are 0.
-    ``"brightness"`` counts as intensity.
-    """
+def make_cloud(xyz: AnyArray, known: Mapping[str, AnyArray] | None = None) -> PointCloud:
+    """Make a cloud of positions (n, 3), m; what is not known follows from them, or is 0."""
     known, distance = known or {}, np.linalg.norm(xyz, axis=1)
     nothing = np.zeros(len(distance), np.float32)
     columns: dict[str, Any] = {
@@ -281,5 +275,5 @@ class LayeredSource(Source):
         return min(max(number, source.inflow.oldest), len(source) - 1)
 
 
-def _fill(values: NDArray[Any] | None, shape: tuple[int, ...], by: Any) -> NDArray[Any]:
+def _fill(values: AnyArray | None, shape: tuple[int, ...], by: Any) -> AnyArray:
     return np.full(shape, by) if values is None else values

@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.viewer.shots import LiveShots, Shots, make_view
 from apps.viewer.source import Choice, Inflow, Picture, Setting, Source, View, make_cloud
-from tofclip.arrays import FloatArray
+from tofclip.arrays import Float32Array, FloatArray
 from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.camera.noise import MeasurementNoise, find_dazzled
 from tofclip.errors import FileFormatError
@@ -69,9 +68,7 @@ class CloudSource(Source):
 
 
 def read_cloud(path: Path) -> PointCloud:
-    """Read a cloud or a picture of ranges of this program, or another's table of points with at
-    least x, y and z in metres.
-    """
+    """Read a cloud or a picture of ranges, or another's table of x, y and z in metres."""
     try:
         content = load(path)
     except FileFormatError:  # a table of another program may have fewer columns
@@ -417,7 +414,7 @@ class TransientSource(RecoveredSource):
         return Measured(Measurement(whole.values, known | (dazzled & alive)), noise)
 
     @cached_property
-    def _predictions(self) -> NDArray[np.float32]:
+    def _predictions(self) -> Float32Array:
         """What the camera would read; neighbouring frames of one shear share an operator."""
         frames, shears = self.frames, self.frames.shears
         measurements = np.empty((frames.camera.slit_width_px, frames.times.size), np.float32)

@@ -143,9 +143,7 @@ FEW_POINTS, MANY_POINTS = 20_000, 200_000
 
 
 class SceneFigure:
-    """A figure around a rendered scene: box, colours, words. Pictures of a film share one. `first`:
-    says from where one looks.
-    """
+    """A figure around a rendered scene, which pictures of a film share."""
 
     def __init__(
         self,
@@ -251,9 +249,7 @@ def choose_point_size(points: int) -> int:
 
 
 def save_picture(session: Session, renderer: Renderer, out: Path) -> int:
-    """Write a picture of what is shown, whole or not at all, in the format of its suffix; return its
-    number of points.
-    """
+    """Write a picture of what is shown, whole or not at all; return its number of points."""
     shown = session.frame_at(0.0)
     figure = SceneFigure(session.title, shown, renderer, session.viewpoint)
     save_figure(figure.draw(shown), out)
@@ -275,9 +271,7 @@ def choose_frames(session: Session) -> list[int]:
 def save_film(
     session: Session, renderer: Renderer, out: Path, advance: Callable[[int], None]
 ) -> int:
-    """Write a film, whole or not at all. `out`: ends in ``.mp4``; `advance`: called with 1 after
-    every picture. Returns the largest number of points in a picture.
-    """
+    """Write an ``.mp4``, whole or not at all; return the largest number of points in a picture."""
     whole = session.frame_at(0.0)  # a transient begins at its end: with all of its points
     figure, most = SceneFigure(session.title, whole, renderer, session.viewpoint), 0
     frames = choose_frames(session)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, Float32Array, FloatArray
 
 FIELD_OF_VIEW_RAD = math.radians(35.0)
 # A cloud that fills more than this is looked at from further back than from where it was taken
@@ -50,9 +50,7 @@ class Viewpoint:
     def project(
         self, xyz: NDArray[np.floating], shape: tuple[int, int]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return row, column and depth (m) of points in a picture of `shape` pixels; NaN behind the
-        eye.
-        """
+        """Return row, column and depth (m) of points in a picture; NaN behind the eye."""
         right, down, depth = self.axes @ (np.asarray(xyz, dtype=np.float64) - self.eye).T
         depth = np.where(depth > 0, depth, np.nan)
         focal = shape[0] / 2 / np.tan(self.field_of_view / 2)
@@ -76,7 +74,7 @@ class Box:
     high: FloatArray  # (3,), opposite corners, m
 
     @classmethod
-    def around(cls, xyz: NDArray[np.float32]) -> Box:
+    def around(cls, xyz: Float32Array) -> Box:
         """Return the box of points (n, 3), m, without the outermost half per cent on each side."""
         low, high = np.percentile(xyz, (0.5, 99.5), axis=0).astype(np.float64)
         return cls(low, high)
@@ -99,9 +97,7 @@ class Box:
         return edges
 
     def scale_bar(self, eye: FloatArray) -> FloatArray:
-        """Ends of a bar of a round length, (2, 3) in m: below the floor, near the side that an eye is at,
-        across its line of sight.
-        """
+        """Ends of a bar of a round length, m, below the floor on the eye's side."""
         right = Viewpoint(eye, self.middle).axes[0]
         ahead, sides = np.cross(right, DOWN), self.high - self.low
         width, depth = float(np.abs(right) @ sides), float(np.abs(ahead) @ sides)
@@ -112,9 +108,7 @@ class Box:
 
     @property
     def length_marks(self) -> FloatArray:
-        """Where the lengths of the sides along x, y and z are written, (3, 3) in m: at edges of the
-        far side, which is always in the picture, and of the floor close to it.
-        """
+        """Where the lengths of x, y and z are written, (3, 3) in m: at edges that are in sight."""
         (left, ceiling, front), (right, floor, back) = self.low, self.high
         y = self.middle[1]
         x = (1 - X_MARK) * left + X_MARK * right  # over the middle it would hide what stands there
@@ -125,10 +119,8 @@ class Box:
 MAX_NEIGHBOUR_POINTS = 20_000  # points among which neighbours are looked for
 
 
-def measure_point_spacing(xyz: NDArray[np.float32]) -> float:
-    """Return the median distance, m, of the points (n, 3) of surfaces from their neighbours; two
-    points at least.
-    """
+def measure_point_spacing(xyz: Float32Array) -> float:
+    """Return the median distance, m, of two or more points of surfaces from their neighbours."""
     from scipy.spatial import cKDTree
 
     thinned = xyz[:: max(1, len(xyz) // MAX_NEIGHBOUR_POINTS)]
@@ -143,7 +135,7 @@ def round_length_down(length: float) -> float:
     return float(max(nice * power for nice in (1, 2, 5) if nice * power <= length * (1 + 1e-9)))
 
 
-def make_presets(xyz: NDArray[np.float32], aspect: float = 1.5) -> dict[str, Viewpoint]:
+def make_presets(xyz: Float32Array, aspect: float = 1.5) -> dict[str, Viewpoint]:
     """Return places to look at a cloud (n, 3), m, from, by name: ``"start"`` is `place_viewpoint`'s;
     ``"front"``, ``"top"`` and ``"side"`` see the whole cloud; ``"camera"`` is where it was taken
     from. `aspect`: width of the picture over its height.
@@ -165,10 +157,8 @@ def make_presets(xyz: NDArray[np.float32], aspect: float = 1.5) -> dict[str, Vie
     return views
 
 
-def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
-    """Return a viewpoint close to the camera's own, the origin, from which a cloud (n, 3), m, is seen
-    whole. `aspect`: width of the picture over its height.
-    """
+def place_viewpoint(xyz: Float32Array, aspect: float = 1.5) -> Viewpoint:
+    """Return a viewpoint close to the origin from which a cloud is seen whole."""
     if len(xyz) == 0:
         return Viewpoint(np.array([0.0, 0.0, -1.0]), np.zeros(3))
     box = Box.around(xyz)
@@ -193,10 +183,8 @@ def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
     return Viewpoint(far.eye, middle, wide)
 
 
-def _fit_field_of_view(viewpoint: Viewpoint, xyz: NDArray[Any], box: Box, aspect: float) -> float:
-    """Return the field of view that holds nearly all points, and the scale bar of the box around
-    them, which may lie lower than any.
-    """
+def _fit_field_of_view(viewpoint: Viewpoint, xyz: AnyArray, box: Box, aspect: float) -> float:
+    """Return the field of view that holds nearly all points and the scale bar below them."""
     fields = []
     for points in (xyz, box.scale_bar(viewpoint.eye)):
         right, down, depth = np.abs(viewpoint.axes @ (points - viewpoint.eye).T)

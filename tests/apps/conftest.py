@@ -9,22 +9,17 @@ import numpy as np
 import pytest
 import tifffile
 from small_instrument import (
-    ANGLES,
-    BACKGROUND,
-    BIN_WIDTH,
-    CENTRES_PX,
     HIDDEN_SCENE,
-    IMAGE_SHAPE,
-    ROWS,
-    SLIT_WIDTH_PX,
-    SQUARE_ROWS,
     Shell,
+    draw_squares,
     focus_pictures,
+    make_camera,
+    take_shot,
     wall_shot,
 )
 
 from apps.verbs import nlos_imaging
-from tofclip.camera import Camera, SkewSweep
+from tofclip.camera import Camera
 from tofclip.shots import Streak
 
 
@@ -38,31 +33,13 @@ def shell(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.fixture(scope="session")
 def camera() -> Camera:
     """Camera without skew, whose numbers made the small streak image."""
-    at_rest = SkewSweep(CENTRES_PX, np.zeros(7), np.zeros(7))
-    return Camera(
-        CENTRES_PX, ANGLES, IMAGE_SHAPE, SLIT_WIDTH_PX, sweep=at_rest, focal_length_px=140.0
-    )
+    return make_camera()
 
 
 @pytest.fixture(scope="session")
-def scene() -> np.ndarray:
-    """Frames (time, y, x): a square at the upper left, later one at the lower right, each as long
-    as a pulse.
-    """
-    frames = np.zeros((ROWS, *IMAGE_SHAPE), np.float32)
-    sigma_bins = 60e-12 / BIN_WIDTH / 2.355
-    for row, place in zip(SQUARE_ROWS, (np.s_[8:14, 9:15], np.s_[18:25, 17:24]), strict=True):
-        pulse = np.exp(-(((np.arange(ROWS) - row) / sigma_bins) ** 2) / 2)
-        frames[:, place[0], place[1]] += 100 * pulse[:, np.newaxis, np.newaxis].astype(np.float32)
-    return frames
-
-
-@pytest.fixture(scope="session")
-def streak(camera: Camera, scene: np.ndarray) -> Streak:
-    """The shot of the scene, with Poisson noise."""
-    expected = camera.operator()(np.moveaxis(scene, 0, -1)).T + BACKGROUND
-    counts = np.random.default_rng(3).poisson(expected).astype(np.float32)
-    return Streak(counts, camera=camera).with_bin_width(BIN_WIDTH)
+def streak(camera: Camera) -> Streak:
+    """The shot of two squares, with Poisson noise."""
+    return take_shot(camera, draw_squares())
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from apps.cli import main
+from tofclip.camera import Camera, SkewSweep
 from tofclip.io.light_fields import write_light_field
 from tofclip.lidar import compute_ray_directions
 from tofclip.lidar.photons import make_pinhole
@@ -34,9 +35,50 @@ IMAGE_SHAPE = (32, 32)
 ROWS = 96
 BIN_WIDTH = 20e-12
 SQUARE_ROWS = (30, 62)  # instants at which the two squares send their light back
+SQUARES = (np.s_[8:14, 9:15], np.s_[18:25, 17:24])  # at the upper left, and at the lower right
 BACKGROUND = 20.0
 HIDDEN_POINT = (0.1, -0.05, 0.6)
 HIDDEN_SCENE = "--points 0.1,-0.05,0.6 --wall-width-m 0.8 --bin-width-ps 16 --jitter-ps 15"
+
+
+DEEP_CENTRES_PX = 40.0 + 60 * np.arange(5)
+DEEP_CAMERA = Camera(
+    DEEP_CENTRES_PX,
+    np.arctan([0.5, -0.8, 0.9, -0.4, 0.1]),
+    (32, 32),
+    320,
+    sweep=SkewSweep(DEEP_CENTRES_PX, np.zeros(5), np.zeros(5)),
+    time_zero=-2e-9,
+    pulse_fwhm=300e-12,
+    focal_length_px=100.0,
+    lenslet_pitch=10e-3,
+    focus_distance=1.3,
+)
+"""Its views move apart with range, which they are known to."""
+
+
+def make_camera(time_zero: float = 0.0) -> Camera:
+    """Camera without skew, for which light of range 0 arrives at a time, s."""
+    at_rest, known = SkewSweep(CENTRES_PX, np.zeros(7), np.zeros(7)), {"time_zero": time_zero}
+    shapes = IMAGE_SHAPE, SLIT_WIDTH_PX
+    return Camera(CENTRES_PX, ANGLES, *shapes, sweep=at_rest, focal_length_px=140.0, **known)
+
+
+def draw_squares() -> np.ndarray:
+    """Frames (time, y, x) of both squares, each as long as a pulse."""
+    frames = np.zeros((ROWS, *IMAGE_SHAPE), np.float32)
+    sigma_bins = 60e-12 / BIN_WIDTH / 2.355
+    for row, place in zip(SQUARE_ROWS, SQUARES, strict=True):
+        pulse = np.exp(-(((np.arange(ROWS) - row) / sigma_bins) ** 2) / 2)
+        frames[:, place[0], place[1]] += 100 * pulse[:, np.newaxis, np.newaxis].astype(np.float32)
+    return frames
+
+
+def take_shot(camera: Camera, frames: np.ndarray, seed: int = 3) -> Streak:
+    """The shot of frames, with Poisson noise."""
+    expected = camera.operator()(np.moveaxis(frames, 0, -1)).T + BACKGROUND
+    counts = np.random.default_rng(seed).poisson(expected).astype(np.float32)
+    return Streak(counts, camera=camera).with_bin_width(BIN_WIDTH)
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from nlos import Volume
-from tofclip import Frames, PointCloud, Streak, arrays, recover
-from tofclip.recovery import DepthLockedFocus, SharpestFocus
+from tofclip import Frames, PointCloud, arrays, recover
 
 torch = pytest.importorskip("torch", reason="PyTorch is optional")
 torch.set_num_threads(1)  # waking others up takes longer than what there is to do
@@ -67,19 +66,6 @@ def test_frames_of_a_file_to_a_cloud(shell, streak):
     np.testing.assert_allclose(there["range_m"], here["range_m"], atol=1e-5)
 
 
-@pytest.mark.parametrize("focus", [DepthLockedFocus(), SharpestFocus(-0.2, 0.2, 2)], ids=str)
-@pytest.mark.parametrize("method", ["l1", "linear"])
-def test_pieces_of_their_own_shear(streak, focus, method):
-    camera = streak.camera.replace(lenslet_pitch=1e-3)
-    shot = Streak(streak.counts, camera=camera).with_bin_width(20e-12)
-    here, there = (
-        recover(shot, method=method, focus=focus, device=device) for device in DEVICES.values()
-    )
-    assert len(set(here.shears)) > 1
-    np.testing.assert_array_equal(there.shears, here.shears)
-    assert difference(there, here) < AGREEMENT
-
-
 def test_a_folder_belongs_to_one_device(shell, files):
     Path("shots").mkdir()
     shutil.copy(files / "streak.h5", "shots")
@@ -90,25 +76,6 @@ def test_a_folder_belongs_to_one_device(shell, files):
     for clouds, device in DEVICES.items():
         found = shell.figures(f"cloud frames --out {clouds} --device {device}")
         assert (found["results"], found["device"]) == (1, device)
-
-
-@pytest.mark.parametrize(
-    ("wall", "method"), [("confocal", "rsd"), ("curved", "hybrid"), ("curved", "backprojection")]
-)
-@pytest.mark.nightly
-def test_hidden_scenes_are_the_same_elsewhere(shell, wall, method):
-    line = f"nlos reconstruct {{{wall}}} --voxel-mm 40 --method {method}"
-    here, there = (
-        shell.figures(f"{line} --out {name}.h5 --device {device}")
-        for name, device in DEVICES.items()
-    )
-    assert (here["device"], there["device"]) == ("cpu", "torch:cpu")
-    assert here["peak_m"] == there["peak_m"]
-    found = Volume.load("torch.h5")
-    assert found.provenance["settings"]["device"] == "torch:cpu"
-    assert difference(found, Volume.load("cpu.h5")) < AGREEMENT
-    # Where it was computed is none of the settings that make the volume.
-    assert Path("cpu.toml").read_text() == Path("torch.toml").read_text()
 
 
 def test_what_has_compiled_loops_only_says_so(shell):

@@ -65,14 +65,6 @@ def test_trying_out(shell):
     assert "bytes per second" in shell(f"devices test '{SIM}' --seconds 0.1").out
 
 
-def test_faults_are_counted(shell):
-    faulty = f"{SIM}&transfer_kib=4&faults=unplug@5:1,corrupt@9:4,timeout@12"
-    found = shell.figures(f"devices test '{faulty}' --seconds 0.5")
-    assert found["reconnects"] == 1
-    assert found["malformed"] >= 4
-    assert found["timeouts"] >= 1
-
-
 def test_recording_and_verifying(shell):
     done = shell.figures(f"record '{SIM}' --out run.h5 --seconds 0.3")
     found = shell.figures("devices verify run.h5")

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from small_instrument import DEEP_CAMERA as CAMERA
 from small_instrument import Shell, write_views
 from verb_pages import collect_verbs
 
 from apps.benchmarks import harness
 from apps.benchmarks.harness import find_cases
 from apps.viewer.page import Page
-from tofclip.camera import Camera, SkewSweep
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_checkerboard
 
@@ -66,19 +66,6 @@ def list_keys(value: Any, path: str = "") -> Iterator[str]:
             yield from list_keys(entry, f"{path.removesuffix('.')}[].")
 
 
-CENTRES = 40.0 + 60 * np.arange(5)
-CAMERA = Camera(
-    CENTRES,
-    np.arctan([0.5, -0.8, 0.9, -0.4, 0.1]),
-    (32, 32),
-    320,
-    sweep=SkewSweep(CENTRES, np.zeros(5), np.zeros(5)),
-    time_zero=-2e-9,
-    pulse_fwhm=300e-12,
-    focal_length_px=100.0,
-    lenslet_pitch=10e-3,
-    focus_distance=1.3,
-)
 PLATES = [
     make_plate((place, place, distance), (0.09, 0.09), make_checkerboard(3, 0.1, 0.9))
     for distance, place in ((0.8, -0.07), (1.3, 0.0), (2.0, 0.18))

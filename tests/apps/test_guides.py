@@ -122,12 +122,6 @@ class TestPictures:
         with Image.open(tmp_path / "pictures" / "small" / "noise.png") as image:
             assert (image.mode, image.size) == ("P", (320, 320))
 
-    def test_a_step_that_fails_is_named(self, tmp_path, inputs):
-        guide = tmp_path / "faulty.md"
-        guide.write_text("```sh\ntofclip info absent.h5\n```\n")
-        with pytest.raises(SystemExit, match=r"tofclip info absent\.h5: exit status 2"):
-            make_pictures(guide, inputs)
-
     def test_a_gallerys_pictures_are_found_in_the_folders_of_its_commands(
         self, tmp_path, monkeypatch
     ):
@@ -289,10 +283,3 @@ class TestReadme:
         script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
         assert promised[0] in script
         assert script.rstrip().endswith(promised[-1])  # last, so that its summary is the last line
-
-    @pytest.mark.skipif(
-        "PYTEST_XDIST_WORKER" not in os.environ, reason="one process has no workers"
-    )
-    def test_the_tests_of_a_file_stay_on_one_worker(self, request):
-        # what the scheduler of pytest-xdist goes by: not added with pytest 9.2
-        assert request.node.nodeid.endswith("@test_guides")

@@ -77,15 +77,6 @@ def test_alone_the_program_shows_a_map_of_all_verbs_on_eighty_columns(shell):
     assert shell("--version").out == f"{tofclip.__version__}\n"
 
 
-def test_prose_is_joined_and_examples_are_taken_out():
-    prose, examples = split_docstring(
-        "Do a\nthing.\n\n  a  table\n\nExample: tofclip do\n    it --now\n\nMore."
-    )
-    assert prose == ["Do a thing.", "  a  table", "More."]
-    assert examples == ["tofclip do it --now"]
-    assert split_docstring(None) == ([], [])
-
-
 def test_a_long_example_is_still_one_command_for_a_shell():
     command = "tofclip calibrate " + " ".join(
         f"--picture-number-{n} picture_{n}.tif" for n in range(6)
@@ -177,11 +168,6 @@ def test_a_page_for_each_verb(tmp_path):
     assert "tofclip --install-completion" in listed
 
 
-def test_pages_that_are_the_same_stay_untouched(tmp_path):
-    before = {path: path.stat().st_mtime_ns for path in write_pages(tmp_path)}
-    assert {path: path.stat().st_mtime_ns for path in write_pages(tmp_path)} == before
-
-
 def test_what_a_page_says():
     text = render_page("lidar scene", VERBS["lidar scene"])
     assert text.startswith("# tofclip lidar scene\n\nList a scene's objects")
@@ -189,15 +175,6 @@ def test_what_a_page_says():
     assert "`--reach-mm MM`\n: Points this close belong together. \\[default: 40.0\\]" in text
     assert "## Arguments\n\n`FRAMES" in text
     assert "## Arguments" not in render_page("devices list", VERBS["devices list"])
-
-
-def test_a_page_keeps_the_headings_of_the_help():
-    text = render_page("nlos info", VERBS["nlos info"])
-    headings = [line for line in text.splitlines() if line.startswith("## ")]
-    assert headings[:2] == ["## Arguments", "## Options"]
-    assert headings[2].startswith("## Settings")
-    places = [text.index(word) for word in ("## Options", "`--json`", "## Settings", "`--cycles")]
-    assert places == sorted(places)
 
 
 def test_the_help_has_the_headings_of_the_page(shell):

@@ -6,10 +6,9 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
+from small_instrument import DEEP_CAMERA as CAMERA
 
-from tofclip.camera import Camera, SkewSweep
 from tofclip.io.streaks import save_stack
 from tofclip.shots import Frames
 from tofclip.simulate import (
@@ -21,20 +20,6 @@ from tofclip.simulate import (
     simulate_shot,
 )
 from tofclip.simulate.patterns import make_checkerboard
-
-CENTRES = 40.0 + 60 * np.arange(5)
-CAMERA = Camera(
-    CENTRES,
-    np.arctan([0.5, -0.8, 0.9, -0.4, 0.1]),
-    (32, 32),
-    320,
-    sweep=SkewSweep(CENTRES, np.zeros(5), np.zeros(5)),
-    time_zero=-2e-9,
-    pulse_fwhm=300e-12,
-    focal_length_px=100.0,
-    lenslet_pitch=10e-3,
-    focus_distance=1.3,
-)
 
 
 def scene(*plates: tuple[float, float]) -> Scene:

@@ -8,7 +8,6 @@ import json
 import signal
 import threading
 from dataclasses import dataclass, fields
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -126,19 +125,6 @@ class TestProgress:
             assert stopped.is_set()
         assert signal.getsignal(signal.SIGINT) is before
 
-    def test_other_threads_may_use_it(self):
-        amounts = []
-
-        def work():
-            with show_progress("working", 1) as advance:
-                advance(1)
-                amounts.append(1)
-
-        worker = threading.Thread(target=work)
-        worker.start()
-        worker.join(timeout=10)
-        assert amounts == [1]
-
     def test_where_there_is_no_terminal_long_work_says_once_what_it_does(self, capsys, monkeypatch):
         monkeypatch.setattr("apps.progress.MAX_SILENCE_S", 0.01)
         said = ""
@@ -198,13 +184,6 @@ class TestMoments:
         # Half height of a Gaussian of 2.5 bins, smoothed by 1.5, is 3.4 bins away from its peak.
         assert [moment.last - moment.first for moment in found[:4]] == pytest.approx([7] * 4, abs=1)
 
-    def test_only_the_strongest_are_shown(self, camera):
-        energy = np.zeros(600)
-        energy[10::30] = np.arange(1, 21)
-        found = [moment.frame for moment in choose_moments(frames_with(camera, energy))]
-        assert found == list(range(250, 600, 30))
-        assert len(found) == MAX_MOMENTS
-
     def test_light_without_a_pause_is_cut_into_even_shares(self, camera):
         energy = bumps([150], 40)[:, 0]
         moments = choose_moments(frames_with(camera, energy, WALL))
@@ -212,13 +191,6 @@ class TestMoments:
         shares = [energy[moment.first : moment.last + 1].sum() / energy.sum() for moment in moments]
         # A twelfth each, up to the frame that a cut falls on (at most 1 % of the light).
         np.testing.assert_allclose(shares, 0.98 / MAX_MOMENTS, atol=0.011)
-
-    def test_overlapping_peaks_are_cut_into_even_shares(self, camera):
-        # the middle one stands on all of the others
-        peaks = bumps([90, 120, 150, 180, 210], 3).sum(axis=1)
-        moments = choose_moments(frames_with(camera, bumps([150], 60)[:, 0] + 0.2 * peaks))
-        assert all(earlier.last < later.first for earlier, later in pairwise(moments))
-        assert len(moments) == MAX_MOMENTS
 
     def test_brightness_is_compensated_only_where_time_tells_the_range(self, camera):
         """A far peak is below the limit as measured, and above it once the fall-off with range is
@@ -230,10 +202,6 @@ class TestMoments:
         for attachments, is_shown in (({}, True), (WALL, False)):
             found = choose_moments(frames_with(camera, energy, attachments))
             assert (980 in [moment.frame for moment in found]) == is_shown
-
-    def test_few_frames_are_shown_one_by_one(self, camera):
-        moments = choose_moments(frames_with(camera, np.ones(5)))
-        assert [(one.first, one.last) for one in moments] == [(n, n) for n in range(5)]
 
     @pytest.mark.parametrize("energy", [np.ones(1), np.zeros(5), np.zeros(50)])
     def test_the_picture_can_always_be_drawn(self, camera, tmp_path, energy):

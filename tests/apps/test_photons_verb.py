@@ -101,12 +101,6 @@ def test_a_hot_pixel_is_counted_and_changes_nothing(shell, ball, surface):
         assert np.mean(np.abs(found - surface)[seen] < 5) > 0.95
 
 
-def test_info_says_what_a_file_of_photons_holds(shell):
-    found = shell.figures("info {ball}")
-    assert (found["kind"], found["layout"]) == ("photons", "cube")
-    assert found["arrays"] == {"array": "40 x 56 x 200 uint8"}
-
-
 def assert_gates_show_the_scene(bound_m: float) -> None:
     """Median error of a gated array of 32 x 32 where a pixel sees one distance."""
     delays = render_array_delays().reshape(32, 16, 32, 16)

@@ -91,13 +91,6 @@ def test_a_streaming_camera_becomes_clouds(shell):
     assert 1.6 < np.median(cloud.range) < 3.3  # where the simulated scene stands
 
 
-def test_a_stream_by_a_prior_says_so_and_its_rate(shell):
-    figures = shell.figures(f"stream {STREAK_CAMERA} --shots 3 --method l1")
-    assert (figures["method"], figures["clouds"]) == ("l1", 3)
-    assert figures["clouds_per_second"] > 0
-    assert figures["points"] > 0
-
-
 def test_a_stream_by_surfaces_is_that_of_its_pipeline(shell):
     centres = 30.0 + 45 * np.arange(4)
     camera = Camera(
@@ -187,16 +180,6 @@ def test_shots_of_a_source_add_up_to_its_whole():
     np.testing.assert_allclose(total, whole.counts, rtol=1e-5, atol=1e-5)
     assert all(19000 < part.counts.sum() < 20001 for part in parts[:-1])
     assert parts[0].camera is not None
-
-
-def test_pictures_are_added_up_by_so_many():
-    address = "sim+remoteex://?seed=1&scene=small&frame_rate=100"
-    for number in (1, 5):
-        coming = read_transients(f"{address}&frames={number}")
-        picture = next(coming)
-        coming.close()
-        assert picture.counts.sum() > 0
-        assert picture.counts.shape == (576, picture.counts.shape[1])
 
 
 @pytest.mark.parametrize("kind", ["stack", "folder"])

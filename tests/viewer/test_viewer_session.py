@@ -19,7 +19,6 @@ from apps.viewer.look import (
     PALETTE_SIZE,
     QUANTITIES,
     Colouring,
-    Pick,
     Scale,
     choose_ticks,
     colour_points,
@@ -32,7 +31,7 @@ from apps.viewer.look import (
     render_pictures,
 )
 from apps.viewer.panels import bind_user_input, mark_times
-from apps.viewer.points import MIN_DRAWN_POINTS, DetailChooser, FramePacer
+from apps.viewer.points import MIN_DRAWN_POINTS, DetailChooser
 from apps.viewer.session import Filters, PlaybackClock, Section, Session
 from apps.viewer.source import View, make_cloud
 from apps.viewer.viewpoint import (
@@ -204,15 +203,6 @@ def test_the_point_in_front_is_meant_and_a_miss_means_none() -> None:
     assert find_point_on_ray(xyz[:0], (0, 0, 0), (0, 0, 1)) is None
 
 
-def test_what_is_known_about_a_pick() -> None:
-    sigma = {"range_sigma": np.array([0.002])}
-    point = make_cloud(np.array([[0.3, 0.4, 1.2]]), sigma)
-    lines = ["x 0.3000, y 0.4000, z 1.2000 m", "range 1.3000 m ± 2 mm"]
-    assert Pick(point, (3, 4)).description.splitlines()[:2] == lines
-    assert Pick(point, (3, 4)).description.endswith("pixel row 4, column 5")
-    assert "pixel" not in Pick(point).description
-
-
 @pytest.mark.parametrize(
     ("limits", "unit", "labels", "title"),
     [
@@ -254,16 +244,6 @@ def test_a_scale_bar_is_one_two_or_five(longest: float, bar: float) -> None:
         near = np.where(np.array(eye) > 0, 1 - SCALE_BAR_DEPTH, SCALE_BAR_DEPTH)
         middle = np.where(eye, near * width, width / 2)
         assert ends.mean(axis=0) == pytest.approx([middle[0], 1 + SCALE_BAR_DROP, middle[2]])
-
-
-@pytest.mark.parametrize("direction", [0, 1, 2])
-def test_lengths_of_the_box_are_written_apart_from_the_scale_bar(direction: int) -> None:
-    """Seen along any axis, no two words stand within a twentieth of the box."""
-    box = Box(np.array([-1.0, -0.5, 1.5]), np.array([1.0, 0.7, 4.0]))
-    places = np.vstack([box.length_marks, box.scale_bar(np.array([0.0, 0.1, -3.0])).mean(axis=0)])
-    seen = np.delete((places - box.low) / (box.high - box.low), direction, axis=1)
-    apart = np.linalg.norm(seen[:, np.newaxis] - seen, axis=-1)
-    assert apart[np.triu_indices(4, 1)].min() > 0.05
 
 
 def test_right_is_right_and_down_is_down() -> None:
@@ -347,15 +327,6 @@ def test_a_camera_with_few_pixels_leaves_no_seams_in_the_panes() -> None:
     assert (made["intensity"][np.isfinite(made["depth"])] == 1).all()
 
 
-def test_frames_of_the_last_two_seconds_count_and_large_clouds_are_sent_less_often() -> None:
-    pace = FramePacer()
-    pace.record_sent(1.0, 100)
-    assert (pace.can_send(1.02), pace.can_send(1.04)) == (False, True)
-    pace.record_sent(2.0, 1_000_000)
-    assert (pace.can_send(2.4), pace.can_send(2.5)) == (False, True)
-    assert [pace.per_second(now) for now in (2.5, 3.5, 4.5)] == [1.0, 0.5, 0.0]
-
-
 def test_the_slowest_browser_decides_how_many_points_are_drawn() -> None:
     detail = DetailChooser()
     assert detail.count(2_000_000, moving=False) == MIN_DRAWN_POINTS  # nothing is known yet
@@ -367,24 +338,6 @@ def test_the_slowest_browser_decides_how_many_points_are_drawn() -> None:
     assert detail.count(2_000_000, moving=True) == 80_000
     detail.points_per_s[2] = 100.0
     assert detail.count(2_000_000, moving=True) == MIN_DRAWN_POINTS
-
-
-@pytest.mark.parametrize(
-    ("drawn", "rate", "worthwhile"),
-    [
-        (15_000, 1e6, True),  # half a million could be
-        (500_000, 1e6, False),
-        (500_000, 1.2e6, False),
-        (500_000, 2e6, True),
-        (500_000, 0.4e6, True),
-        (1_800_000, 1e7, True),  # all of them could
-        (2_000_000, 1e7, False),
-    ],
-)
-def test_a_cloud_is_sent_again_for_clearly_more_or_fewer_points(
-    drawn: int, rate: float, worthwhile: bool
-) -> None:
-    assert DetailChooser({1: rate}).is_worthwhile(drawn, 2_000_000) == worthwhile
 
 
 def test_a_large_cloud_is_thinned_while_frames_pass() -> None:

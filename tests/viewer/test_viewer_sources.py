@@ -216,13 +216,6 @@ def test_clouds_follow_one_another(folder: Path) -> None:
     assert source.settings == ()  # there is nothing to refocus
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".csv", ".npz", ".h5"])
-def test_a_single_cloud_of_every_format(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"cloud{suffix}"
-    plane(30).save(path)
-    assert np.allclose(open_source(str(path)).view(0).cloud.xyz, plane(30).xyz)
-
-
 def test_a_cloud_of_another_program_needs_positions_only(tmp_path: Path) -> None:
     (tmp_path / "other.csv").write_text("x,y,z\n0.3,0.4,1.2\nnan,nan,nan\n")
     cloud = open_source(str(tmp_path / "other.csv")).view(0).cloud

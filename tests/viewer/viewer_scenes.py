@@ -3,45 +3,36 @@
 from __future__ import annotations
 
 import numpy as np
+from small_instrument import (
+    BIN_WIDTH,
+    ROWS,
+    SQUARE_ROWS,
+    SQUARES,
+    draw_squares,
+    make_camera,
+    take_shot,
+)
 
 from apps.viewer.source import Source, View, make_cloud
 from nlos import Grid, Volume
-from tofclip.camera import Camera, SkewSweep
+from tofclip.camera import Camera
 from tofclip.lidar import PointCloud
 from tofclip.shots import Frames, Streak
 from tofclip.units import SPEED_OF_LIGHT
 
-CENTRES_PX = np.array([30.4, 70.0, 110.7, 150.0, 190.2, 230.0, 269.6])
-ANGLES = np.deg2rad([-43.0, -26.0, -13.0, 0.5, 23.0, 37.0, 48.0])
-IMAGE_SHAPE = (32, 32)
-FRAMES = 96
-BIN_WIDTH = 20e-12
-NEAR_FRAME, FAR_FRAME = 30, 62
-NEAR, FAR = np.s_[8:14, 9:15], np.s_[18:25, 17:24]
+FRAMES = ROWS
+NEAR_FRAME, FAR_FRAME = SQUARE_ROWS
+NEAR, FAR = SQUARES
 
 
 def camera() -> Camera:
     """Seven views whose light of range 0 would arrive 10 ns before the first row."""
-    at_rest = SkewSweep(CENTRES_PX, np.zeros(7), np.zeros(7))
-    return Camera(
-        CENTRES_PX,
-        ANGLES,
-        IMAGE_SHAPE,
-        slit_width_px=300,
-        sweep=at_rest,
-        focal_length_px=140.0,
-        time_zero=-10e-9,
-    )
+    return make_camera(-10e-9)
 
 
 def frames() -> Frames:
     """A square at the upper left, later one at the lower right, each as long as a pulse of 60 ps."""
-    values = np.zeros((FRAMES, *IMAGE_SHAPE), np.float32)
-    sigma = 60e-12 / BIN_WIDTH / 2.355
-    for frame, place in ((NEAR_FRAME, NEAR), (FAR_FRAME, FAR)):
-        pulse = 100 * np.exp(-(((np.arange(FRAMES) - frame) / sigma) ** 2) / 2)
-        values[:, place[0], place[1]] += pulse[:, np.newaxis, np.newaxis].astype(np.float32)
-    return Frames(values, np.arange(FRAMES) * BIN_WIDTH + 10e-9, camera())
+    return Frames(draw_squares(), np.arange(FRAMES) * BIN_WIDTH + 10e-9, camera())
 
 
 def range_of(frame: int) -> float:
@@ -51,9 +42,7 @@ def range_of(frame: int) -> float:
 
 def streak(seed: int = 3) -> Streak:
     """The shot of these frames, with Poisson noise."""
-    expected = camera().operator()(np.moveaxis(frames().values, 0, -1)).T + 20.0
-    counts = np.random.default_rng(seed).poisson(expected).astype(np.float32)
-    return Streak(counts, camera=camera()).with_bin_width(BIN_WIDTH)
+    return take_shot(camera(), frames().values, seed)
 
 
 def plane(points: int, distance: float = 2.0, seed: int = 0) -> PointCloud:
