@@ -120,12 +120,6 @@ class TestCases:
         with pytest.raises(InputError, match="--data"):
             library.light_field("data:render_letters")
 
-    def test_recorded_light_fields_join_where_their_folder_is_given(self, shared_data):
-        known = Library(shared_data)
-        assert known.has_recording("lightfields/render_letters.npz")
-        assert not known.has_recording("lightfields/nothing.npz")
-        assert known.light_field("data:render_letters").pictures.shape == (64, 128, 128)
-
 
 class TestStudies:
     @pytest.mark.nightly
