@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.special import ndtr
-from scipy.stats import exponnorm
 
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -66,29 +65,15 @@ def make_rates(
     background: np.ndarray | float,
     bins: int = 512,
     fwhm: float = FWHM / BIN,
-    tail: tuple[float, float] = (0.0, 0.0),
+    lengths: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Expected photons, (rows, columns, bins): signal of each pixel, background of each bin; a share
-    of the light in an exponential tail of so many bins.
+    """Expected photons, (rows, columns, bins): signal of each pixel, background of each bin; `lengths`
+    of the bins of an uneven converter, of 1 in the mean.
     """
-    edges = np.arange(bins + 1) - 0.5 - surface[..., np.newaxis]
-    sigma = fwhm / np.sqrt(8 * np.log(2))
-    passed = ndtr(edges / sigma)
-    share, length = tail
-    if share:
-        passed = (1 - share) * passed + share * exponnorm.cdf(edges, length / sigma, scale=sigma)
-    return np.asarray(signal)[..., np.newaxis] * np.diff(passed, axis=-1) + background
-
-
-def make_uneven_rates(
-    surface: np.ndarray, signal: np.ndarray, background: float, lengths: np.ndarray
-) -> np.ndarray:
-    """Expected photons, (rows, columns, bins), of a converter whose bins have `lengths`, of 1 in the
-    mean; `background`: of an even bin.
-    """
+    lengths = np.ones(bins) if lengths is None else lengths
     edges = np.concatenate([[0], np.cumsum(lengths)]) - 0.5 - surface[..., np.newaxis]
-    passed = ndtr(edges / (FWHM / BIN / np.sqrt(8 * np.log(2))))
-    return signal[..., np.newaxis] * np.diff(passed, axis=-1) + background * lengths
+    passed = ndtr(edges / fwhm * np.sqrt(8 * np.log(2)))
+    return np.asarray(signal)[..., np.newaxis] * np.diff(passed, axis=-1) + background * lengths
 
 
 def count_first_photons(rates: np.ndarray, cycles: int, seed: int) -> np.ndarray:
@@ -97,20 +82,6 @@ def count_first_photons(rates: np.ndarray, cycles: int, seed: int) -> np.ndarray
     before = np.concatenate([np.ones_like(missed[..., :1]), missed[..., :-1]], axis=-1)
     share = np.concatenate([before - missed, missed[..., -1:]], axis=-1)
     return np.random.default_rng(seed).multinomial(cycles, share)[..., :-1]
-
-
-def count_with_dead_time(rates: np.ndarray, cycles: int, dead: int, seed: int) -> np.ndarray:
-    """Histograms of a detector that is blind for some bins after each count; ready in every cycle."""
-    noise, flat = np.random.default_rng(seed), rates.reshape(-1, rates.shape[-1])
-    chance, counts = -np.expm1(-flat / cycles), np.zeros(flat.shape, np.int64)
-    for _ in range(cycles):
-        ready = np.zeros(len(flat), np.int64)
-        arrived = noise.random(flat.shape) < chance
-        for number in np.flatnonzero(arrived.any(axis=0)):
-            seen = arrived[:, number] & (ready <= number)
-            ready[seen] = number + 1 + dead
-            counts[seen, number] += 1
-    return counts.reshape(rates.shape)
 
 
 def spoil_pixels(
@@ -132,8 +103,4 @@ def spoil_pixels(
         )[noise.integers(3)]
         spoilt[row] += level * spectrum
     spoilt[dead] = 0
-    return (
-        spoilt.reshape(rates.shape),
-        hot.reshape(rows, columns),
-        dead.reshape(rows, columns),
-    )
+    return spoilt.reshape(rates.shape), hot.reshape(rows, columns), dead.reshape(rows, columns)

@@ -178,7 +178,7 @@ def test_uneven_bins_of_a_converter_are_found_in_the_background(find):
     surface, signal = scenes.make_surface(), 20 * TILES + np.zeros((80, 80))
     lengths = np.random.default_rng(5).uniform(0.7, 1.3, BINS)
     lengths *= 1 + 0.2 * np.sin(2 * np.pi * np.arange(BINS) / 64)
-    rates = scenes.make_uneven_rates(surface, signal, 0.1, lengths / lengths.mean())
+    rates = scenes.make_rates(surface, signal, 0.1, lengths=lengths / lengths.mean())
     counts = np.random.default_rng(3).poisson(rates)
     found = find(PhotonImage.from_cube(counts, scenes.BIN))
     error = found.range - surface * scenes.BIN_M

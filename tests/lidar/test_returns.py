@@ -187,35 +187,6 @@ def test_intensity_undoes_the_falloff_with_range():
     np.testing.assert_allclose(returns.intensity, 500.0 * pulse_bins, rtol=4e-3)
 
 
-@pytest.mark.parametrize(("height", "background"), [(50.0, 1.0), (1000.0, 5.0)])
-def test_confidence_is_the_standard_deviation_of_the_range(height, background):
-    random = np.random.default_rng(3)
-    times = even_times(300)
-    arrivals = START + BIN * random.uniform(100, 200, 3000)
-    counts = random.poisson(gaussian(times, arrivals, height) + background)
-    returns = depth(frames_of(counts, times))
-    first = returns.image("range")[0]
-    errors = first - range_of(arrivals)
-    predicted = returns.image("confidence")[0]
-    assert np.isfinite(errors).all()
-    assert abs(errors.mean()) < 5 * errors.std() / np.sqrt(errors.size)
-    # 3000 trials know a standard deviation to 1.3 %; the rest is the quasi-Poisson model's
-    assert np.sqrt(np.mean(predicted**2)) == pytest.approx(errors.std(), rel=0.08)
-
-
-def test_range_precision_is_near_the_photon_limit():
-    random = np.random.default_rng(4)
-    times = even_times(300)
-    arrivals = START + BIN * random.uniform(100, 200, 3000)
-    signal = gaussian(times, arrivals, 200.0)
-    slope = signal * 8 * np.log(2) * (times[:, np.newaxis] - arrivals) / FWHM**2
-    bound = range_of(np.mean(1 / np.sqrt(np.sum(slope**2 / (signal + 1.0), axis=0))))
-    returns = depth(frames_of(random.poisson(signal + 1.0), times))
-    errors = returns.image("range")[0] - range_of(arrivals)
-    # counts are fitted with Poisson weights; the spread of 3000 errors is known to 1.3 %
-    assert errors.std() == pytest.approx(bound, rel=0.04)
-
-
 def test_another_pulse_shape_finds_its_own_arrivals():
     spacing = 1e-12
     late = np.arange(400) * spacing
@@ -241,19 +212,27 @@ def test_a_pulse_shorter_than_a_bin_still_gives_a_range():
 
 @pytest.mark.parametrize(("photons", "background"), [(20, 0.02), (200, 2.0)])
 def test_a_cube_of_counts_has_the_deviations_of_photons(photons: float, background: float) -> None:
-    """Those of least squares are four times too large; the bound is 3 sigma of 576 pixels' spread."""
-    width, times = 400e-12, 80e-12 * np.arange(200)
+    """Those of least squares are four times too large; the bound is 3 sigma of 576 pixels' spread. Times
+    are of flight, whatever the camera's time zero; strengths are those of photons from 1 m, and false
+    alarms those of a pixel in a hundred.
+    """
+    width, times = 400e-12, 2e-9 + 80e-12 * np.arange(200)
     y, x = np.mgrid[:24, :24]
     ranges = 1 + 0.01 * x + 0.003 * y
     off = times - 2 * ranges[..., np.newaxis] / SPEED_OF_LIGHT
     light = np.exp(-4 * np.log(2) * (off / width) ** 2)
     light *= photons / light.sum(axis=-1, keepdims=True)
     cube = np.random.default_rng(3).poisson(np.moveaxis(light + background, -1, 0))
-    found = depth(Frames(cube.astype(np.float32), times, Camera.pinhole((24, 24), 60.0, width)))
+    seen_by = Camera.pinhole((24, 24), 60.0, width).replace(time_zero=5e-9)
+    found = depth(Frames(cube.astype(np.float32), times, seen_by))
     strongest = found.select("strongest")
     assert len(strongest) > 0.98 * ranges.size
-    z = (strongest.range - ranges[strongest.y, strongest.x]) / strongest.range_sigma
+    true = ranges[strongest.y, strongest.x]
+    z = (strongest.range - true) / strongest.range_sigma
     assert np.median(np.abs(z)) / 0.6745 == pytest.approx(1, abs=0.15)
+    # 576 pixels know the mean of so many photons to a hundredth, and a background beside them
+    assert np.mean(strongest.intensity / true**2) == pytest.approx(photons, rel=0.03)
+    assert strongest.false_alarm == pytest.approx(0.01 * ranges.size / len(strongest), rel=0.01)
 
 
 def test_the_result_does_not_depend_on_the_number_of_threads(monkeypatch):

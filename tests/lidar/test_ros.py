@@ -2,6 +2,7 @@
 
 import sqlite3
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,6 +70,29 @@ def test_what_was_written_is_read_back(name, cloud, tmp_path):
             np.testing.assert_array_equal(column.values, kept.values)
     with pytest.raises(InputError, match=r"choose one topic .*: /lidar"):
         list(read_bag(tmp_path / name, "/other"))
+
+
+def test_messages_of_big_endian_machines_are_read(cloud, tmp_path):
+    rosbag2, typesys = (
+        pytest.importorskip("rosbags.rosbag2"),
+        pytest.importorskip("rosbags.typesys"),
+    )
+    types, kind = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE), "sensor_msgs/msg/PointCloud2"
+    write_bag([StampedCloud(cloud, 5)], tmp_path / "little")
+    with (
+        rosbag2.Reader(tmp_path / "little") as reader,
+        rosbag2.Writer(tmp_path / "big", version=8) as writer,
+    ):
+        ((_, _, data),) = reader.messages()
+        message = types.deserialize_cdr(data, kind)
+        layout = [(one.name, {7: "<f4", 2: "u1"}[one.datatype]) for one in message.fields]
+        swapped = message.data.view(layout).byteswap().view(np.uint8)
+        turned = replace(message, data=swapped, is_bigendian=True)
+        own = writer.add_connection("/points", kind, typestore=types)
+        writer.write(own, 5, types.serialize_cdr(turned, kind))
+    (found,) = read_bag(tmp_path / "big")
+    np.testing.assert_array_equal(found.cloud.xyz, cloud.xyz)
+    np.testing.assert_array_equal(found.cloud.time, cloud.time)
 
 
 def test_sqlite_and_the_standard_show_what_is_in_a_bag(cloud, tmp_path):

@@ -21,7 +21,6 @@ from tofclip.lidar.peak_kernels import (
 )
 from tofclip.lidar.pulse_tables import (
     MAX_OFFSET_BINS,
-    PHASES_PER_BIN,
     PhaseTable,
     TraceBins,
     list_windows,
@@ -88,17 +87,6 @@ def test_returns_that_overlap_are_fitted_as_exactly(apart):
 
 def add_dim(bright: Frames, dim: Frames) -> Frames:
     return replace(bright, values=bright.values + np.float32(0.3) * dim.values)
-
-
-def test_the_table_holds_the_sums_of_its_pulse():
-    table = PhaseTable.tabulate(Pulse.gaussian(FWHM), TIMES)
-    shape, slope = table.shapes.astype(float), table.slopes.astype(float)
-    np.testing.assert_allclose(table.sums[:, 0], (shape**2).sum(axis=1), rtol=1e-6)
-    np.testing.assert_allclose(table.sums[:, 2], (slope**2).sum(axis=1), rtol=1e-6)
-    # with a pulse in the middle of its bin, no change of height looks like a shift
-    middle = round(MAX_OFFSET_BINS * PHASES_PER_BIN)
-    assert abs(table.sums[middle, 1]) < 1e-9
-    assert shape[middle].argmax() == table.half
 
 
 def test_bins_whose_neighbours_are_not_held_are_left_to_the_exact_fit():
