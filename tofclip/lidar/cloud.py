@@ -6,6 +6,7 @@ back: programs that work on neighbours take these from the rows and columns.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -137,9 +138,8 @@ class PointCloud(Storable):
             raise InputError(
                 f"one point is cloud[{points}:{points + 1}]; cloud.xyz has its position"
             )
-        names = ("xyz", *PROPERTY_COLUMNS)
         try:
-            chosen = {name: getattr(self, name)[points] for name in names}
+            chosen = {name: getattr(self, name)[points] for name in ("xyz", *PROPERTY_COLUMNS)}
         except (IndexError, TypeError) as fault:
             raise InputError(
                 f"points are selected by a slice, a mask or numbers: {fault}"
@@ -155,20 +155,15 @@ class PointCloud(Storable):
         return f"PointCloud({len(self)} points, range {self.range.min():.3g} to {self.range.max():.3g} m)"
 
     def _repr_html_(self) -> str:
-        rows = {"points": str(len(self))}
+        rows, light = {"points": str(len(self))}, None
         if len(self):
-            for axis, column in zip("xyz", self.xyz.T, strict=True):
+            x, y, z = self.xyz.T
+            for axis, column in {"x": x, "y": y, "z": z, "range": self.range}.items():
                 rows[axis] = f"{column.min():.3f} to {column.max():.3f} m"
-            rows["range"] = f"{self.range.min():.3f} to {self.range.max():.3f} m"
-        return render_html("PointCloud", rows, self._render_front())
-
-    def _render_front(self) -> FloatArray | None:
-        """Light of the points as the camera sees them, (rows, columns); None without points."""
-        if len(self) == 0:
-            return None
-        x, y, _ = self.xyz.T
-        light: FloatArray = np.histogram2d(y, x, bins=FRONT_PIXELS, weights=self.intensity)[0]
-        return np.sqrt(np.maximum(light, 0))
+            # of the points, as the camera sees them
+            light = np.histogram2d(y, x, bins=FRONT_PIXELS, weights=self.intensity)[0]
+            light = np.sqrt(np.maximum(light, 0))
+        return render_html("PointCloud", rows, light)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the points as the camera sees them, coloured by range.
@@ -328,10 +323,9 @@ class PointCloud(Storable):
     def to_record(self) -> Record:
         """Return what is known of the points for storage."""
         record = super().to_record()
-        known = {column.name for column in self.columns} | {"xyz"}
-        return replace(
-            record, fields={name: one for name, one in record.fields.items() if name in known}
-        )
+        known = {"xyz", *(column.name for column in self.columns)}
+        fields = {name: one for name, one in record.fields.items() if name in known}
+        return replace(record, fields=fields)
 
     @property
     def columns(self) -> list[Column]:
@@ -415,9 +409,9 @@ def save_organised(returns: Returns, path: str | Path) -> int:
         raise InputError("an organised cloud has one point for a pixel: first, strongest or last")
     columns, cloud = [], point_cloud(returns)
     for column in cloud.columns:
-        whole = column.values.dtype.kind == "u"
-        values = np.full(shape[0] * shape[1], 0 if whole else np.nan, column.values.dtype)
+        kind = column.values.dtype
+        values = np.full(math.prod(shape), 0 if kind.kind == "u" else np.nan, kind)
         values[pixel] = column.values
-        columns.append(Column(column.name, column.unit, values))
+        columns.append(replace(column, values=values))
     export.write_table(path, columns, shape, cloud.provenance)
     return len(returns)

@@ -73,15 +73,12 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
 
     first = np.full(number.size, 255, np.uint8)
     np.minimum.at(first, group, cloud.return_number)
-    columns: dict[str, Any] = {
-        name: mean(getattr(cloud, name))
-        for name in PROPERTY_COLUMNS
-        if name not in ("range_sigma", "return_number")
-    }
+    columns: dict[str, Any] = {name: mean(getattr(cloud, name)) for name in PROPERTY_COLUMNS}
     # the error of a mean of n independent points is the root of their mean variance over n
     columns["range_sigma"] = np.sqrt(mean(cloud.range_sigma.astype(np.float64) ** 2) / number)
-    positions = np.stack([mean(axis) for axis in cloud.xyz.T], axis=-1).astype(np.float32)
-    return replace(cloud, xyz=positions, return_number=first, **columns)
+    columns["return_number"] = first
+    columns["xyz"] = np.stack([mean(axis) for axis in cloud.xyz.T], axis=-1)
+    return replace(cloud, **columns)
 
 
 def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0) -> PointCloud:
@@ -200,20 +197,13 @@ def find_objects(cloud: PointCloud, reach: float, min_points: int = 40) -> list[
     objects = []
     for group in np.flatnonzero(np.bincount(label, minlength=groups) >= min_points):
         points = np.flatnonzero(label == group)
-        xyz, distance = cloud.xyz[points], cloud.range[points]
-        low, high = np.percentile(xyz, SIZE_PERCENTILES, axis=0)
-        middle = float(np.median(distance))
-        x, y, z = (float(axis) for axis in np.median(xyz, axis=0))
-        objects.append(
-            DetectedObject(
-                points=points,
-                range=middle,
-                range_sigma=float(np.median(cloud.range_sigma[points])),
-                scatter=MAD_TO_SIGMA * float(np.median(np.abs(distance - middle))),
-                centre=(x, y, z),
-                width=float(high[0] - low[0]),
-                height=float(high[1] - low[1]),
-                intensity=float(np.median(cloud.intensity[points])),
-            )
+        own = cloud[points]
+        width, height, _ = np.ptp(np.percentile(own.xyz, SIZE_PERCENTILES, axis=0), axis=0)
+        middle, sigma, bright = (
+            float(np.median(one)) for one in (own.range, own.range_sigma, own.intensity)
         )
+        scatter = MAD_TO_SIGMA * float(np.median(np.abs(own.range - middle)))
+        x, y, z = (float(axis) for axis in np.median(own.xyz, axis=0))
+        sizes = (x, y, z), float(width), float(height)
+        objects.append(DetectedObject(points, middle, sigma, scatter, *sizes, bright))
     return sorted(objects, key=lambda seen: seen.range)

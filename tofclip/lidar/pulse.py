@@ -47,12 +47,8 @@ class Pulse:
 
     def __post_init__(self) -> None:
         samples = np.array(self.samples, dtype=np.float64)
-        if (
-            samples.ndim != 1
-            or samples.size < 3
-            or not np.all(np.isfinite(samples))
-            or samples.max() <= 0
-        ):
+        usable = samples.ndim == 1 and samples.size >= 3 and np.all(np.isfinite(samples))
+        if not (usable and samples.max() > 0):
             raise InputError("a pulse needs at least three finite samples, one of them positive")
         if not (np.isfinite(self.spacing) and self.spacing > 0):
             raise InputError(
@@ -132,19 +128,16 @@ class Pulse:
             raise InputError(
                 f"a bin of {bin_width:g} s does not go with a pulse of {self.fwhm:g} s; check their units"
             )
-        before = int(np.ceil((self.origin * self.spacing + bin_width / 2) / spacing))
-        after = int(
-            np.ceil(
-                ((self.samples.size - 1 - self.origin) * self.spacing + bin_width / 2) / spacing
-            )
+        before, after = (
+            int(np.ceil((samples * self.spacing + bin_width / 2) / spacing))
+            for samples in (self.origin, self.samples.size - 1 - self.origin)
         )
         time = np.arange(-before, after + 1) * spacing
         # Integral up to each sample, by trapezoids; the light of a bin is the difference at its
         # edges.
         arrived = np.concatenate([[0.0], np.cumsum((self.samples[1:] + self.samples[:-1]) / 2)])
-        position = (
-            time[:, np.newaxis] + np.array([-0.5, 0.5]) * bin_width
-        ) / self.spacing + self.origin
+        edges = time[:, np.newaxis] + np.array([-0.5, 0.5]) * bin_width
+        position = edges / self.spacing + self.origin
         start, end = np.interp(position, np.arange(self.samples.size), arrived).T
         return Pulse(end - start, spacing, float(before))
 
@@ -154,13 +147,15 @@ class Pulse:
 
     def __call__(self, time: ArrayLike) -> NDArray[np.float64]:
         """Brightness at `time`, s, after the arrival; the peak is 1."""
-        position = np.asarray(time, dtype=np.float64) / self.spacing + self.origin
-        return np.interp(position, np.arange(self.samples.size), self.samples, left=0.0, right=0.0)
+        return self._interpolate(time, self.samples)
 
     def slope_at(self, time: ArrayLike) -> NDArray[np.float64]:
         """Change of brightness per second at `time`, s, after the arrival."""
+        return self._interpolate(time, self.slope)
+
+    def _interpolate(self, time: ArrayLike, values: NDArray[np.float64]) -> NDArray[np.float64]:
         position = np.asarray(time, dtype=np.float64) / self.spacing + self.origin
-        return np.interp(position, np.arange(self.samples.size), self.slope, left=0.0, right=0.0)
+        return np.interp(position, np.arange(values.size), values, left=0.0, right=0.0)
 
     @property
     def area(self) -> float:
@@ -184,20 +179,11 @@ class Pulse:
         return self.extent(SUPPORT_THRESHOLD)
 
     def kernel_table(self, level: float = SUPPORT_THRESHOLD) -> Table:
-        """Return what the compiled loops take.
-
-        Returns
-        -------
-        curve : (n, 2) array
-            Samples and their slopes, per second.
-        scale : tuple
-            Samples per second, origin, and `extent` of `level`.
+        """Return what the compiled loops take: (n, 2) samples and their slopes, per second; and samples
+        per second, origin, and the `extent` of `level`.
         """
-        return np.stack([self.samples, self.slope], axis=1), (
-            1 / self.spacing,
-            self.origin,
-            *self.extent(level),
-        )
+        curve = np.stack([self.samples, self.slope], axis=1)
+        return curve, (1 / self.spacing, self.origin, *self.extent(level))
 
     def extent(self, level: float) -> tuple[float, float]:
         """Return when the curve first rises through `level` of its peak and last falls through it,

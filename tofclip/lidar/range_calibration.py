@@ -363,9 +363,8 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
         reference_signal=reference,
         signal_range=10**span,
     )
-    jitter, spread = np.nan, np.nan
+    jitter, spread = np.sqrt(effects.variances[1:]) if repeated else (np.nan, np.nan)
     if repeated:
-        jitter, spread = (float(np.sqrt(value)) for value in effects.variances[1:])
         sigma = np.sqrt(effects.pixel_variance)
         calibration = replace(
             calibration,
@@ -378,8 +377,8 @@ def fit_range_calibration(shots: Sequence[TargetShot], walk: bool | None = None)
     once = "one shot does not tell the pixels' own from noise: give two or more"
     return RangeFit(
         base.replace(time_zero=late, range_calibration=calibration),
-        jitter * 2 / SPEED_OF_LIGHT,
-        spread,
+        float(jitter) * 2 / SPEED_OF_LIGHT,
+        float(spread),
         sample.signal[effects.inliers],
         excess[effects.inliers] - effects.fixed[0],
         min(shares),
@@ -488,13 +487,12 @@ def _find_cluster(excess: FloatArray, width: float, name: str) -> NDArray[np.boo
 
     middle = float(np.median(find_fullest(excess)))
     target: NDArray[np.bool_] = np.abs(excess - middle) <= width
-    if not target.all():
-        rival = find_fullest(excess[~target])
-        if rival.size > MAX_RIVAL_FRACTION * target.sum():
-            raise CalibrationError(
-                f"{name}: two surfaces as large as each other, {abs(rival[0] - middle):.3g} m apart: "
-                "which is the target? Cut the picture to it (`region`)"
-            )
+    rival = excess[~target]
+    if rival.size and (rival := find_fullest(rival)).size > MAX_RIVAL_FRACTION * target.sum():
+        raise CalibrationError(
+            f"{name}: two surfaces as large as each other, {abs(rival[0] - middle):.3g} m apart: "
+            "which is the target? Cut the picture to it (`region`)"
+        )
     return target
 
 
@@ -515,7 +513,6 @@ def _explain_missing_walk(shots: int, span: FloatArray, asked: bool | None) -> s
     """Say why no walk can be fitted, if so; refuse where one is asked for."""
     if asked is False:
         return "not asked for"
-    note = ""
     if shots < MIN_WALK_SHOTS:
         note = f"a range walk needs {MIN_WALK_SHOTS} shots of different brightness, got {shots}"
     elif np.ptp(span) < MIN_WALK_SPAN_DECADES:
@@ -523,7 +520,9 @@ def _explain_missing_walk(shots: int, span: FloatArray, asked: bool | None) -> s
             f"the returns' intensities span a factor of {10 ** np.ptp(span):.2g}, a range walk needs "
             f"{10**MIN_WALK_SPAN_DECADES:.2g}: take shots through a grey filter or at other distances"
         )
-    if note and asked:
+    else:
+        return ""
+    if asked:
         raise CalibrationError(note)
     return note
 
@@ -570,6 +569,5 @@ def _add_brightness(
 
 def _to_picture(values: FloatArray, shape: tuple[int, int], missing: float = 0.0) -> FloatArray:
     """Lay the values of pixels out as a picture; those behind the last one were never seen."""
-    picture = np.full(shape[0] * shape[1], missing)
-    picture[: values.size] = values
-    return picture.reshape(shape)
+    behind = shape[0] * shape[1] - values.size
+    return np.pad(values, (0, behind), constant_values=missing).reshape(shape)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import empty_aligned
@@ -172,18 +173,15 @@ class SignalRowFinder:
         # each operator with its instants, a multiple of `LANES`
         self._owners: list[tuple[BrightFrameFinder, slice]] = []
         finders: dict[InverseTraces, BrightFrameFinder] = {}
-        first = 0
+        last = 0
         for place in places:
-            instants = np.arange(place.rows.start, place.rows.stop, self._step)
-            last = first + -(-instants.size // LANES) * LANES
+            instants, first = np.arange(place.rows.start, place.rows.stop, self._step), last
+            last += -(-instants.size // LANES) * LANES
             middles.append(np.pad(instants, (0, last - first - instants.size), constant_values=-1))
-            if place.inverse not in finders:
-                (measurements,) = place.inverse.inverse.operator.shape_out
-                finders[place.inverse] = BrightFrameFinder(
-                    place.inverse.tiles, measurements, GROUP_PIXELS
-                )
-            self._owners.append((finders[place.inverse], slice(first, last)))
-            first = last
+            if (inverse := place.inverse) not in finders:
+                (measurements,) = inverse.inverse.operator.shape_out
+                finders[inverse] = BrightFrameFinder(inverse.tiles, measurements, GROUP_PIXELS)
+            self._owners.append((finders[inverse], slice(first, last)))
         self._middles = np.concatenate(middles)
         self._taken = self._middles >= 0
         self._row_sums: RowSums | None = None
@@ -260,11 +258,9 @@ class SignalRowFinder:
 
     def _mark_rows_near(self, lit: Mask, distance: int) -> Mask:
         """Rows within `distance` of the middle of a lit instant."""
-        middles = self._middles[lit]
-        steps = np.zeros(self.rows + 1, np.int64)
-        np.add.at(steps, np.maximum(middles - distance, 0), 1)
-        np.add.at(steps, np.minimum(middles + distance + 1, self.rows), -1)
-        return np.asarray(np.cumsum(steps[:-1]) > 0)
+        near = np.zeros(self.rows, bool)
+        near[self._middles[lit]] = True
+        return np.asarray(scipy.ndimage.maximum_filter1d(near, 2 * distance + 1, mode="constant"))
 
 
 def _divide_into_lanes(instants: int) -> int:

@@ -437,6 +437,7 @@ class PhotonDetector:
         from tofclip.lidar.photons.kernels import fit_histograms
 
         found = np.full((*peaks.shape, 3), np.nan)
+        pulse = self.relative_background, *self._kernel_pulse, self.times
 
         def work(piece: slice) -> None:
             some = counts[piece]
@@ -447,8 +448,7 @@ class PhotonDetector:
                 most = 1 - 0.5 / np.maximum(ready * cycles, 1)
                 arrived = -cycles * np.log1p(-np.minimum(some / (ready * cycles), most))
             seen = some, arrived, ready, float(cycles), peaks[piece], numbers[piece]
-            pulse = *self._kernel_pulse, self.times
-            fit_histograms(*seen, self.relative_background, *pulse, found[piece])
+            fit_histograms(*seen, *pulse, found[piece])
 
         run_blocks(work, counts.shape[0], HISTOGRAMS_PER_BLOCK)
         arrival, photons, deviation = np.moveaxis(found, -1, 0)

@@ -136,8 +136,7 @@ def measure_accuracy(
     )
     # In batches: the memory does not depend on the number of trials.
     batch = max(1, BINS_PER_BATCH // detector.bins)
-    detections = false_alarms = 0
-    squared_error = 0.0
+    sums = np.zeros(3)  # squared errors, detections, false alarms
     for begin in range(0, trials, batch):
         count = min(batch, trials - begin)
         fractions = present.uniform(detector.bins / 4, 3 * detector.bins / 4, count)
@@ -147,11 +146,10 @@ def measure_accuracy(
         found = detector.locate(present.poisson(expected), int(chance.integers(1 << 62)))
         dark = absent.poisson(background, (count, detector.bins))
         false = detector.locate(dark, int(chance.integers(1 << 62)))
-        detected = found.detected[:, 0]
-        error = (found.range[:, 0] - SPEED_OF_LIGHT * arrival / 2)[detected]
-        squared_error += float(np.sum(error**2))
-        detections += int(np.count_nonzero(detected))
-        false_alarms += int(np.count_nonzero(false.detected[:, 0]))
+        error = found.range[:, 0] - SPEED_OF_LIGHT * arrival / 2
+        alarms = found.detected[:, 0].sum(), false.detected[:, 0].sum()
+        sums += np.nansum(error**2), *alarms
         progress(count)
-    rms = float(np.sqrt(squared_error / detections)) if detections else float("nan")
+    squares, detections, false_alarms = sums.tolist()
+    rms = float(np.sqrt(squares / detections)) if detections else float("nan")
     return Accuracy(rms, bound, rms / bound, detections / trials, false_alarms / trials)
