@@ -2,7 +2,6 @@
 the dark ones out does to the returns.
 """
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,11 +10,10 @@ import scipy.sparse
 
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
-from tofclip.lidar import Detection, depth
 from tofclip.lidar.pulse_tables import TraceBins
 from tofclip.lidar.signal_rows import BrightFrameFinder, RowBlock, SignalRowFinder
 from tofclip.operators.sparse import Tiles
-from tofclip.recovery import DepthLockedFocus, FixedFocus, recover
+from tofclip.recovery import DepthLockedFocus, FixedFocus
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_checkerboard
@@ -164,13 +162,6 @@ def test_returns_are_those_of_all_rows(focus, monkeypatch):
         # pulse
         np.testing.assert_allclose(np.median(np.abs(some.range - everything.range)), 0, atol=1e-6)
         np.testing.assert_allclose(some.intensity, everything.intensity, rtol=0.05)
-
-
-def test_frames_that_are_there_are_searched_everywhere():
-    every = replace(Detection(), signal_to_noise=0.0)
-    shot, pipeline, measurements = see_plates(1, detection=every)
-    alone = depth(recover(shot, camera(), method="linear"), detection=every)
-    assert abs(len(pipeline.find_returns(measurements)) - len(alone)) <= 2
 
 
 NARROW = (21, 37)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, Float32Array, FloatArray
 from tofclip.errors import FileFormatError, InputError, ShapeError, require_type
 from tofclip.files import import_open3d, require_suffix
 from tofclip.io.archive import ArchiveEntry
@@ -99,17 +99,17 @@ class PointCloud(Storable):
 
     RECORD_KIND = "cloud"
 
-    xyz: NDArray[np.float32] = field(metadata=stored_array("m", "point", "xyz", dtype=np.float32))
-    intensity: NDArray[np.float32] = field(metadata=_column("intensity"))
-    range_sigma: NDArray[np.float32] = field(metadata=_column("range_sigma"))
-    range: NDArray[np.float32] = field(metadata=_column("range"))
+    xyz: Float32Array = field(metadata=stored_array("m", "point", "xyz", dtype=np.float32))
+    intensity: Float32Array = field(metadata=_column("intensity"))
+    range_sigma: Float32Array = field(metadata=_column("range_sigma"))
+    range: Float32Array = field(metadata=_column("range"))
     return_number: NDArray[np.uint8] = field(metadata=_column("return_number", np.uint8))
-    time: NDArray[np.float32] = field(metadata=_column("time"))
+    time: Float32Array = field(metadata=_column("time"))
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
-    false_alarm: NDArray[np.float32] = field(
+    false_alarm: Float32Array = field(
         default_factory=lambda: np.empty(0, np.float32), metadata=_column("false_alarm")
     )
-    reflectance: NDArray[np.float32] = field(
+    reflectance: Float32Array = field(
         default_factory=lambda: np.empty(0, np.float32), metadata=_column("reflectance")
     )
 
@@ -146,7 +146,7 @@ class PointCloud(Storable):
             ) from fault
         return replace(self, **chosen)
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> AnyArray:
         return np.asarray(self.xyz, dtype=dtype)
 
     def __repr__(self) -> str:
@@ -338,7 +338,7 @@ class PointCloud(Storable):
         ]
 
 
-def complete_cloud(xyz: FloatArray, known: Mapping[str, NDArray[Any]]) -> PointCloud:
+def complete_cloud(xyz: FloatArray, known: Mapping[str, AnyArray]) -> PointCloud:
     """Make a cloud of another program's positions (n, 3), m, and columns. What is missing is made up
     where it follows from the positions, is otherwise NaN.
     """

@@ -28,6 +28,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from tofclip.arrays import AnyArray
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import (
     BoundedFile,
@@ -76,7 +77,7 @@ class Column:
 
     name: str
     unit: str
-    values: NDArray[Any]
+    values: AnyArray
 
     @property
     def label(self) -> str:
@@ -119,7 +120,7 @@ def list_columns(path: str | Path) -> Entries:
     return entries
 
 
-def read_table(path: str | Path) -> dict[str, NDArray[Any]]:
+def read_table(path: str | Path) -> dict[str, AnyArray]:
     """Read a table that `write_table` wrote: its columns by their names, without units."""
     return {name: entry.load() for name, entry in list_columns(path).items()}
 
@@ -128,7 +129,7 @@ def _defer(points: int, types: Mapping[str, DTypeLike], read: Callable[[], Any])
     """Entries of columns that are read together, when the first of them is loaded."""
     read_all = functools.cache(read)
 
-    def load(name: str) -> NDArray[Any]:
+    def load(name: str) -> AnyArray:
         return np.array(read_all()[name], types[name])
 
     return {
@@ -137,7 +138,7 @@ def _defer(points: int, types: Mapping[str, DTypeLike], read: Callable[[], Any])
     }
 
 
-def paint_brightness(brightness: NDArray[Any]) -> NDArray[np.uint8]:
+def paint_brightness(brightness: AnyArray) -> NDArray[np.uint8]:
     """Colours (n, 3) of points; the root, or all but the brightest would be of one colour."""
     light = np.nan_to_num(np.maximum(brightness, 0))
     white = np.quantile(light, WHITE_QUANTILE) if light.size else 1.0
@@ -207,7 +208,7 @@ def _write_pcd(path: Path, columns: Columns, shape: Any, provenance: Mapping[str
     _write_binary(path, lines, columns)
 
 
-def make_rows(columns: Columns) -> NDArray[Any]:
+def make_rows(columns: Columns) -> AnyArray:
     """Return columns as packed rows, little endian."""
     layout = np.dtype([(one.name, one.values.dtype.newbyteorder("<")) for one in columns])
     return np.rec.fromarrays([one.values for one in columns], dtype=layout)
@@ -434,7 +435,7 @@ def _write_vector(lib: Any, image: Any, columns: Columns, attach: Callable[[Any]
 
 def _list_e57(path: Path) -> Entries:
     def read() -> Mapping[str, Any]:
-        found: dict[str, NDArray[Any]] = {}
+        found: dict[str, AnyArray] = {}
         with _open_e57(path) as (lib, image, tables):
             for table, elements in tables:
                 points, buffers = table.childCount(), lib.VectorSourceDestBuffer()

@@ -21,9 +21,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import Float32Array, FloatArray, IntArray
 from tofclip.compiling import compile_as_part, compile_loop, inlined
 from tofclip.threads import run_blocks
 from tofclip.units import MAD_TO_SIGMA
@@ -61,7 +60,7 @@ def add_recovery_error(
     sigma: FloatArray,
     distance: FloatArray,
     along_axis: FloatArray,
-    pixel: NDArray[np.int64],
+    pixel: IntArray,
     image_shape: tuple[int, int],
     gate: float,
 ) -> FloatArray:
@@ -81,7 +80,7 @@ def add_recovery_error(
     layers = layer_returns(nearness, pixel, starts, image_shape)
     scatter = np.full(pixel.size, np.nan)
 
-    def fit_surfaces(chosen: NDArray[np.int64]) -> None:
+    def fit_surfaces(chosen: IntArray) -> None:
         def fit(piece: slice) -> None:
             returns = nearness, metres, pixel
             window = allocate_window()
@@ -108,10 +107,10 @@ def add_recovery_error(
 
 def layer_returns(
     nearness: FloatArray,
-    pixel: NDArray[np.int64],
-    starts: NDArray[np.int64],
+    pixel: IntArray,
+    starts: IntArray,
     image_shape: tuple[int, int],
-) -> NDArray[np.float32]:
+) -> Float32Array:
     """Lay out the returns so that those at the neighbours' distance lie side by side: (most returns of a
     pixel, 4, rows, columns) of `nearness` of each pixel's first, second, ... returns, `FAR` where there is
     none; of pixels of even rows and columns, even rows and odd columns, and so on, within a margin.
@@ -127,7 +126,7 @@ def layer_returns(
     return layers.reshape(shape)
 
 
-def allocate_window() -> tuple[NDArray[np.float32], FloatArray]:
+def allocate_window() -> tuple[Float32Array, FloatArray]:
     """Return the memory of `scatter_about_surfaces`: a window, of whose rows the first three change, and
     room for the equations, (`TERMS`, `TERMS` + 1).
     """

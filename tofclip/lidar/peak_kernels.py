@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from tofclip.compiling import ONE, SUMS_IN_ANY_ORDER, compile_as_part, compile_loop, inlined
 from tofclip.vectors import (
     LENGTH,
@@ -37,8 +37,6 @@ from tofclip.vectors import (
     store_vector,
     sum_vector,
 )
-
-Float32 = NDArray[np.float32]
 
 # Of the share of the strongest return that a candidate needs before the fit, which does not make up
 # for more than the rest.
@@ -62,16 +60,16 @@ class Axis(NamedTuple):
 
     times: FloatArray  # (bins,), s, increasing
     # (bins,), for how many bins each one stands where background and noise are concerned
-    bin_weights: Float32
-    sharp: Float32  # (width, bins), weight of bin ``j + w - width // 2`` for a return at bin j
-    runs: NDArray[np.int64]  # first bins of the vectors in which it is applied, an even number
-    edges: NDArray[np.int64]  # single bins in which it is applied
-    words: NDArray[np.int64]  # first bins of the words in which maxima are sought
-    matched: Float32  # (bins, width), filters of unit energy, nowhere negative
-    starts: NDArray[np.int64]  # (bins,), first bin that each of them takes
+    bin_weights: Float32Array
+    sharp: Float32Array  # (width, bins), weight of bin ``j + w - width // 2`` for a return at bin j
+    runs: IntArray  # first bins of the vectors in which it is applied, an even number
+    edges: IntArray  # single bins in which it is applied
+    words: IntArray  # first bins of the words in which maxima are sought
+    matched: Float32Array  # (bins, width), filters of unit energy, nowhere negative
+    starts: IntArray  # (bins,), first bin that each of them takes
     sums: FloatArray  # (bins,), over each of them
     windows: NDArray[np.int32]  # (bins, 4), `tofclip.lidar.pulse_tables.list_windows`
-    even: NDArray[np.bool_]  # (bins,), `tofclip.lidar.pulse_tables.PhaseTable.find_even_bins`
+    even: BoolArray  # (bins,), `tofclip.lidar.pulse_tables.PhaseTable.find_even_bins`
 
 
 class Limits(NamedTuple):
@@ -85,26 +83,26 @@ class Limits(NamedTuple):
     matched_gain: float
     background_gain: float  # that of the sharp filters, or 0 where nothing is known of interest
     lowest_response: float  # of interest
-    of_interest: Float32  # (bins + WORD_BINS,), by how much scores exceed that of the background
+    # (bins + WORD_BINS,), by how much scores exceed that of the background
+    of_interest: Float32Array
     # (bins,), response that a return must exceed; weaker peaks are kept only where one overlaps them
-    least: Float32
+    least: Float32Array
 
 
 class Room(NamedTuple):
     """What a thread's search overwrites, for some pixels of which each has at most `returns`."""
 
-    score: (
-        Float32  # (1 + bins + WORD_BINS + 1,), zero where no sharp filter is applied; one bin late
-    )
+    # (1 + bins + WORD_BINS + 1,), zero where no sharp filter is applied; one bin late
+    score: Float32Array
     places: NDArray[np.int32]  # (4, bins), of `list_maxima`; zeros become 1 where a peak is taken
-    responses: Float32  # (bins,), of the matched filter at these maxima
-    free: Float32  # (bins,), as `bin_weights`, before and afterwards
+    responses: Float32Array  # (bins,), of the matched filter at these maxima
+    free: Float32Array  # (bins,), as `bin_weights`, before and afterwards
     peaks: FloatArray  # (returns, 2), bin, and response less that to the background
     moments: FloatArray  # (pixels, 2), background and noise
     candidates: FloatArray  # (pixels * returns, CANDIDATE_COLUMNS), a trace's side by side, in time
     # (pixels * returns, width), trace less background around each peak; zero where that fills up
-    rests: Float32
-    fitted: NDArray[np.int64]  # (pixels * returns,), candidates that the table fits
+    rests: Float32Array
+    fitted: IntArray  # (pixels * returns,), candidates that the table fits
     estimates: FloatArray  # (returns, 5), of the exact fit
     level: FloatArray  # (bins,), background of the exact fit
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, BoolArray, FloatArray, IndexArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.files import import_open3d
 from tofclip.lidar.cloud import PROPERTY_COLUMNS, PointCloud
@@ -29,7 +29,7 @@ class Plane:
 
     normal: FloatArray  # (3,), unit vector, towards the camera
     offset: float  # its distance from the origin along the normal, m; not positive
-    inliers: NDArray[np.bool_]  # (n,), points of the cloud that lie on it
+    inliers: BoolArray  # (n,), points of the cloud that lie on it
     rms: float  # root mean square distance of these from it, m
 
 
@@ -68,7 +68,7 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     _, group, number = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     group = group.ravel()
 
-    def mean(values: NDArray[Any]) -> FloatArray:
+    def mean(values: AnyArray) -> FloatArray:
         return np.asarray(np.bincount(group, values.astype(np.float64), number.size) / number)
 
     first = np.full(number.size, 255, np.uint8)
@@ -86,9 +86,7 @@ def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float =
     return cloud[~find_outliers(cloud, neighbours, deviations)]
 
 
-def find_outliers(
-    cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0
-) -> NDArray[np.bool_]:
+def find_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0) -> BoolArray:
     """Say which points lie further from their neighbours than those do from theirs.
 
     A surface at twice the range has its points twice as far apart, and one mean distance for all
@@ -170,7 +168,7 @@ def align_clouds(
 class DetectedObject:
     """One object."""
 
-    points: NDArray[np.intp]  # (n,), numbers of its points in the cloud
+    points: IndexArray  # (n,), numbers of its points in the cloud
     range: float  # median distance from the camera, m
     range_sigma: float  # median of its points' expected standard deviations of range, m
     scatter: float  # robust standard deviation of its points' ranges, m: noise and its own depth

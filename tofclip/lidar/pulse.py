@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.units import FWHM_PER_SIGMA
 
@@ -18,7 +19,7 @@ MAX_SAMPLES = 1 << 23
 """Of a pulse: 10,000 times as long as a bin and as long as its tail may be."""
 SUPPORT_THRESHOLD = 0.01  # below this fraction of its peak a pulse says nothing about where it is
 
-Table = tuple[NDArray[np.float64], tuple[float, float, float, float]]
+Table = tuple[FloatArray, tuple[float, float, float, float]]
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Pulse:
         outside.
     """
 
-    samples: NDArray[np.float64]
+    samples: FloatArray
     spacing: float
     origin: float
 
@@ -145,15 +146,15 @@ class Pulse:
         """Return the same shape, `factor` times shorter."""
         return Pulse(self.samples, self.spacing / factor, self.origin)
 
-    def __call__(self, time: ArrayLike) -> NDArray[np.float64]:
+    def __call__(self, time: ArrayLike) -> FloatArray:
         """Brightness at `time`, s, after the arrival; the peak is 1."""
         return self._interpolate(time, self.samples)
 
-    def slope_at(self, time: ArrayLike) -> NDArray[np.float64]:
+    def slope_at(self, time: ArrayLike) -> FloatArray:
         """Change of brightness per second at `time`, s, after the arrival."""
         return self._interpolate(time, self.slope)
 
-    def _interpolate(self, time: ArrayLike, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _interpolate(self, time: ArrayLike, values: FloatArray) -> FloatArray:
         position = np.asarray(time, dtype=np.float64) / self.spacing + self.origin
         return np.interp(position, np.arange(values.size), values, left=0.0, right=0.0)
 
@@ -163,7 +164,7 @@ class Pulse:
         return float(np.sum(self.samples[1:] + self.samples[:-1]) / 2 * self.spacing)
 
     @property
-    def slope(self) -> NDArray[np.float64]:
+    def slope(self) -> FloatArray:
         """Change of brightness per second at each sample."""
         return np.gradient(self.samples, self.spacing)
 

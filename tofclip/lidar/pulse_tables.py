@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from tofclip.lidar.pulse import Pulse, Table
 
 
@@ -18,12 +17,12 @@ from tofclip.lidar.pulse import Pulse, Table
 class TraceBins:
     """Which bins of a time axis traces hold."""
 
-    numbers: NDArray[np.int64]  # (n,), increasing
+    numbers: IntArray  # (n,), increasing
     # (n,), whether a return may lie there. Wherever one may, all bins that its search and its fit
     # look at are held
-    search_mask: NDArray[np.bool_]
+    search_mask: BoolArray
     # (n,), for how many bins of the axis each one stands where background and noise are concerned
-    bin_weights: NDArray[np.float32]
+    bin_weights: Float32Array
 
     @classmethod
     def all_bins(cls, bins: int) -> TraceBins:
@@ -34,7 +33,7 @@ class TraceBins:
 class Traces(Protocol):
     """Anything that hands out pixels' traces."""
 
-    pixels: NDArray[np.int64]
+    pixels: IntArray
     """Numbers of the pixels, counted in raster order, in the order in which their traces are
     cheapest to have.
     """
@@ -42,7 +41,7 @@ class Traces(Protocol):
     bins: TraceBins
     """The bins that they hold."""
 
-    def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
+    def fill(self, piece: slice, traces: Float32Array) -> None:
         """Write the traces of ``pixels[piece]`` into (n, bins) contiguous memory."""
         ...
 
@@ -50,11 +49,11 @@ class Traces(Protocol):
 class PictureTraces:
     """Traces of pictures, (bins, rows, columns), that are there already."""
 
-    def __init__(self, pictures: NDArray[np.float32], bins: TraceBins) -> None:
+    def __init__(self, pictures: Float32Array, bins: TraceBins) -> None:
         self.pictures = pictures.reshape(len(pictures), -1).astype(np.float32, copy=False)
         self.pixels, self.bins = np.arange(self.pictures.shape[1]), bins
 
-    def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
+    def fill(self, piece: slice, traces: Float32Array) -> None:
         """Write traces of neighbours in raster order."""
         from tofclip.solvers.kernels import copy_lanes_to_frames
 
@@ -64,7 +63,7 @@ class PictureTraces:
 
 def list_windows(
     times: FloatArray, scale: tuple[float, float, float, float], distance: float
-) -> NDArray[np.int64]:
+) -> IntArray:
     """List the bins that a return at each bin reaches, and those too near for another return:
     (bins, 4) first bin reached and the one after the last; first bin nearer than `distance`, s, and
     the one after the last. `scale`: of the pulse, `tofclip.lidar.Pulse.kernel_table`. Bins are
@@ -93,10 +92,10 @@ class PhaseTable(NamedTuple):
 
     # (phases, width), pulse, and its change from bin to bin; zero where the pulse does not matter and
     # in the bins that fill up a whole vector. Bin w lies ``w - half`` bins after the peak's
-    shapes: NDArray[np.float32]
-    slopes: NDArray[np.float32]
+    shapes: Float32Array
+    slopes: Float32Array
     # (phases, 4 * half + width), pulse, wherever it ends. Bin w lies ``w - 3 * half`` bins after it
-    tails: NDArray[np.float32]
+    tails: Float32Array
     # (phases, 7), over the bins: of squared pulse, pulse times slope, and squared slope; of the
     # pulse; of the pulse as far as the fit leaves it, and of the pulse times the square of the
     # slope across it (`tofclip.lidar.fit_kernels.estimate_deviation`); number of bins
@@ -134,7 +133,7 @@ class PhaseTable(NamedTuple):
         single = (one.astype(np.float32) for one in (shape, slope, tails))
         return cls._make([*single, sums, half, width])
 
-    def find_even_bins(self, bins: TraceBins) -> NDArray[np.bool_]:
+    def find_even_bins(self, bins: TraceBins) -> BoolArray:
         """Say around which of the bins, (n,), all those of the table are held."""
         even = np.zeros(bins.numbers.size, bool)
         if self.half > 0:
@@ -153,8 +152,8 @@ class PulseFilters:
 
     # (width, bins), filter that shows candidates, and the one that judges them. Entry w is the weight
     # of bin ``j + w - width // 2`` for a return at bin j
-    sharp: NDArray[np.float32]
-    matched: NDArray[np.float32]
+    sharp: Float32Array
+    matched: Float32Array
     sums: FloatArray  # (bins,), of the matched filters
     gains: tuple[float, float]  # (2,), largest sums of either
     table: PhaseTable
@@ -178,7 +177,7 @@ class PulseFilters:
         )
 
 
-def _build_filter(pulse: Pulse, times: FloatArray) -> NDArray[np.float32]:
+def _build_filter(pulse: Pulse, times: FloatArray) -> Float32Array:
     """Unit-energy filter for a return at each bin, (width, bins); the time axis may be uneven. What
     a measured pulse has below zero is noise and left out. Where the axis cuts off most of the pulse
     the energy stays below one: little would be known of such a return.

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from tofclip.camera import Camera, RangeCalibration
 from tofclip.errors import CalibrationError, InputError
 from tofclip.lidar.geometry import compute_ray_directions
@@ -72,12 +72,12 @@ class Measurements(NamedTuple):
     value: FloatArray
     sigma: FloatArray  # one standard deviation, right up to a factor
     design: FloatArray  # (n, effects), fixed effects
-    shot: NDArray[np.int64]  # numbers from 0
-    pixel: NDArray[np.int64]  # numbers from 0
-    y: NDArray[np.int64]  # row and column of the pixel
-    x: NDArray[np.int64]
+    shot: IntArray  # numbers from 0
+    pixel: IntArray  # numbers from 0
+    y: IntArray  # row and column of the pixel
+    x: IntArray
 
-    def keep(self, chosen: NDArray[np.bool_]) -> Measurements:
+    def keep(self, chosen: BoolArray) -> Measurements:
         return Measurements._make(part[chosen] for part in self)
 
 
@@ -93,7 +93,7 @@ class Effects(NamedTuple):
     fitted_variance: FloatArray  # of what is fitted to each measurement
     # factor of the measurements' own variances, variances of the shots' and of the pixels' effects
     variances: FloatArray
-    inliers: NDArray[np.bool_]  # measurements that were used
+    inliers: BoolArray  # measurements that were used
 
 
 def fit_effects(data: Measurements, with_shots: bool, with_pixels: bool) -> Effects:
@@ -145,7 +145,7 @@ def measure_correlation(standardised: FloatArray, data: Measurements) -> float:
 
 
 def _estimate_variances(
-    data: Measurements, sizes: tuple[int, int], present: NDArray[np.bool_], rounds: int
+    data: Measurements, sizes: tuple[int, int], present: BoolArray, rounds: int
 ) -> FloatArray:
     """Estimate what varies, from the scatter of the means over shots and over pixels. `sizes`:
     numbers of shots and of pixels; `present`: that there is noise, and whether these have effects of
@@ -276,7 +276,7 @@ class TargetShot:
         if not (np.isnan(percent) or 0 < percent <= 1000):
             raise InputError(f"a reflectance must be a positive percentage, got {percent}")
 
-    def cut(self, inside: NDArray[np.bool_]) -> TargetShot:
+    def cut(self, inside: BoolArray) -> TargetShot:
         """Return the shot with a part of its returns, and what is known of the others."""
         return replace(self, returns=self.returns[inside], brightest=self.measure_brightest())
 
@@ -311,10 +311,10 @@ class RangeFit:
 class _Sample(NamedTuple):
     """The target's returns of one shot or of all, side by side."""
 
-    shot: NDArray[np.int64]
-    pixel: NDArray[np.int64]
-    y: NDArray[np.int64]
-    x: NDArray[np.int64]
+    shot: IntArray
+    pixel: IntArray
+    y: IntArray
+    x: IntArray
     excess: FloatArray
     sigma: FloatArray
     signal: FloatArray
@@ -445,9 +445,9 @@ def _select_target(
 def _require_plate(
     excess: FloatArray,
     sigma: FloatArray,
-    target: NDArray[np.bool_],
+    target: BoolArray,
     width: float,
-    place: tuple[NDArray[Any], NDArray[Any]],
+    place: tuple[AnyArray, AnyArray],
     name: str,
 ) -> None:
     """Refuse returns that agree by chance, or as those of a slanted or uneven surface do."""
@@ -475,7 +475,7 @@ def _require_plate(
     )
 
 
-def _find_cluster(excess: FloatArray, width: float, name: str) -> NDArray[np.bool_]:
+def _find_cluster(excess: FloatArray, width: float, name: str) -> BoolArray:
     """Say which returns lie in the window that holds most of them, and refuse a rival to it."""
 
     def find_fullest(values: FloatArray) -> FloatArray:
@@ -486,7 +486,7 @@ def _find_cluster(excess: FloatArray, width: float, name: str) -> NDArray[np.boo
         return order[first : first + inside[first]]
 
     middle = float(np.median(find_fullest(excess)))
-    target: NDArray[np.bool_] = np.abs(excess - middle) <= width
+    target: BoolArray = np.abs(excess - middle) <= width
     rival = excess[~target]
     if rival.size and (rival := find_fullest(rival)).size > MAX_RIVAL_FRACTION * target.sum():
         raise CalibrationError(

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray, to_numpy
+from tofclip.arrays import Float32Array, FloatArray, IntArray, to_numpy
 from tofclip.camera import Camera
 from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError, ShapeError, require_type
@@ -163,9 +163,7 @@ class ReturnSearch:
     def _filters(self) -> PulseFilters:
         return PulseFilters.build(self.pulse, self.times)
 
-    def _find_candidates(
-        self, traces: Traces, judged: bool
-    ) -> tuple[NDArray[np.int64], FloatArray]:
+    def _find_candidates(self, traces: Traces, judged: bool) -> tuple[IntArray, FloatArray]:
         """Pixel number of every candidate, and (3, n) instants, counts and deviations, in raster
         and time order. Unless all candidates are `judged`, those that are too weak beside what a
         sample of the pixels shows are not fitted.
@@ -190,8 +188,8 @@ class ReturnSearch:
         return loops.list_found()
 
     def _compute_least_responses(
-        self, pixel: NDArray[np.int64], values: FloatArray, at: FloatArray, traces: Traces
-    ) -> NDArray[np.float32]:
+        self, pixel: IntArray, values: FloatArray, at: FloatArray, traces: Traces
+    ) -> Float32Array:
         """Response of the matched filter, (bins,), below which no candidate can become a return.
         `pixel, values`: what was found in some of the pixels. Those of all pixels are brighter or
         as bright, so that nothing is lost.
@@ -206,7 +204,7 @@ class ReturnSearch:
         tiny = np.finfo(np.float32).tiny
         sums = np.maximum(self._filters.sums[traces.bins.numbers], tiny)
         squares = np.maximum(_square_distance(at), tiny)
-        least: NDArray[np.float32] = SAMPLE_THRESHOLD_FACTOR * needed / (squares * sums)
+        least: Float32Array = SAMPLE_THRESHOLD_FACTOR * needed / (squares * sums)
         return least.astype(np.float32)
 
 
@@ -297,7 +295,7 @@ def depth(
     return search.find_returns(traces, frames.provenance, judge)
 
 
-def number_returns(pixel: NDArray[np.int64]) -> NDArray[np.uint8]:
+def number_returns(pixel: IntArray) -> NDArray[np.uint8]:
     """Return the number of each return in its pixel, from 1; `pixel` (n,) does not decrease."""
     first = np.flatnonzero(np.diff(pixel, prepend=-1))
     rank = np.arange(pixel.size) - np.repeat(first, np.diff(first, append=pixel.size))

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from tofclip.arrays import empty_aligned
+from tofclip.arrays import BoolArray, Float32Array, FloatArray, IntArray, empty_aligned
 from tofclip.camera import Rectifier
 from tofclip.camera.rectifier import RowSums
 from tofclip.errors import InputError
@@ -42,9 +41,6 @@ MAX_ROW_FRACTION = 0.75  # of all rows: what needs more of them is as well searc
 GAP_INSTANTS = LANES + 16
 """Places beyond a column's sums: whole vectors need no end of their own, and columns are an odd number
 of cache lines apart, so that neighbours share no place of the cache."""
-
-Mask = NDArray[np.bool_]
-FloatImage = NDArray[np.float32]
 
 
 class BrightFrameFinder:
@@ -90,7 +86,7 @@ class BrightFrameFinder:
         highest = share.reshape(-1, group_pixels).max(axis=1, initial=0)
         self._groups = starts, windows, (highest * (1 + ROUNDING_MARGIN)).astype(np.float32)
 
-    def find(self, readings: FloatImage, span: slice, limit: float) -> Mask:
+    def find(self, readings: Float32Array, span: slice, limit: float) -> BoolArray:
         """Say in which frames of a span a pixel stands out: in which the response ``a'f / |a|``
         reaches the limit, a being its column of the operator. `readings` (measurements, frames) are
         in units of their noise. Whole blocks of `LANES` frames from the first of the span on lie
@@ -112,9 +108,7 @@ class BrightFrameFinder:
         return bright
 
 
-def _list_pairs(
-    row: NDArray[np.int64], tiles: Tiles
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+def _list_pairs(row: IntArray, tiles: Tiles) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
     """List each row's entries two by two, as far as they are neighbours: row, first column, sum of
     both, and what the second one has of it. `row`: of each entry.
     """
@@ -169,7 +163,7 @@ class SignalRowFinder:
         self._reach, self._threshold = reach, THRESHOLD_FACTOR * limit
         self._step = max(1, round(pulse_rows))
         self._length = min(self.rows, max(1, round(BOX_LENGTH_WIDTHS * pulse_rows)))
-        middles: list[NDArray[np.int64]] = []
+        middles: list[IntArray] = []
         # each operator with its instants, a multiple of `LANES`
         self._owners: list[tuple[BrightFrameFinder, slice]] = []
         finders: dict[InverseTraces, BrightFrameFinder] = {}
@@ -187,7 +181,7 @@ class SignalRowFinder:
         self._row_sums: RowSums | None = None
         self._starts = np.clip(self._middles - self._length // 2, 0, self.rows - self._length)
 
-    def sum_measurements(self, measurements: FloatImage) -> FloatImage:
+    def sum_measurements(self, measurements: Float32Array) -> Float32Array:
         """Add up rectified measurements, (columns, rows), as `bins` needs them."""
         from tofclip.camera.kernels import sum_boxes
 
@@ -200,7 +194,7 @@ class SignalRowFinder:
         run_blocks(work, self._starts.size, _divide_into_lanes(self._starts.size))
         return sums
 
-    def sum_streak(self, counts: FloatImage, rectifier: Rectifier) -> tuple[FloatImage, float]:
+    def sum_streak(self, counts: Float32Array, rectifier: Rectifier) -> tuple[Float32Array, float]:
         """Add up the measurements of a raw streak image, (rows, columns), and return its dark level,
         counts, as well. The camera is that of the first shot, and so is its `rectifier`.
         """
@@ -209,14 +203,14 @@ class SignalRowFinder:
         sums = self._allocate_sums(counts.shape[1])
         return sums, self._row_sums.add_up(counts, sums)
 
-    def _allocate_sums(self, columns: int) -> FloatImage:
+    def _allocate_sums(self, columns: int) -> Float32Array:
         """As weights have it: whole cache lines, and a gap between columns, of zeros."""
         instants = self._starts.size
-        sums: FloatImage = empty_aligned((columns, instants + GAP_INSTANTS), np.float32)
+        sums: Float32Array = empty_aligned((columns, instants + GAP_INSTANTS), np.float32)
         sums[:, instants:] = 0
         return sums
 
-    def bins(self, sums: FloatImage) -> TraceBins:
+    def bins(self, sums: Float32Array) -> TraceBins:
         """Return the rows worth recovering, and a sample of the dark ones that stands for the rest.
         All rows, if a quarter of the shot is not nearly as dark as the darkest twentieth, or if not
         much would be left out. `sums` of `sum_measurements` or `sum_streak` are overwritten.
@@ -234,7 +228,7 @@ class SignalRowFinder:
         numbers = np.flatnonzero(bin_weights)
         return TraceBins(numbers, searched[numbers], bin_weights[numbers])
 
-    def _find_signal_bins(self, sums: FloatImage) -> Mask:
+    def _find_signal_bins(self, sums: Float32Array) -> BoolArray:
         from tofclip.lidar.signal_row_kernels import compute_energies, standardise_columns
 
         room = np.empty((2, self._starts.size), np.float32)
@@ -256,7 +250,7 @@ class SignalRowFinder:
         lit = [finder.find(sums, own, self._threshold) for finder, own in self._owners]
         return np.asarray(self._taken & np.concatenate(lit))
 
-    def _mark_rows_near(self, lit: Mask, distance: int) -> Mask:
+    def _mark_rows_near(self, lit: BoolArray, distance: int) -> BoolArray:
         """Rows within `distance` of the middle of a lit instant."""
         near = np.zeros(self.rows, bool)
         near[self._middles[lit]] = True

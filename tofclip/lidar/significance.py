@@ -30,7 +30,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray, to_numpy
+from tofclip.arrays import BoolArray, FloatArray, IntArray, to_numpy
 from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar.pulse import Pulse
@@ -87,8 +87,8 @@ class Detection:
             raise InputError(f"a pixel can have 1 to 255 returns, got {self.max_returns}")
 
     def find_significant(
-        self, pixel: NDArray[np.int64], time: FloatArray, intensity: FloatArray, pulse_width: float
-    ) -> NDArray[np.bool_]:
+        self, pixel: IntArray, time: FloatArray, intensity: FloatArray, pulse_width: float
+    ) -> BoolArray:
         """Say which candidates are strong enough, (n,). `pixel, time, intensity` (n,): number of each
         one's pixel, instant, s, and brightness with the fall-off with range undone; instants that differ
         by less than `pulse_width`, s, are the same.
@@ -101,7 +101,7 @@ class Detection:
 
     def compute_least_intensity(
         self,
-        pixel: NDArray[np.int64],
+        pixel: IntArray,
         time: FloatArray,
         intensity: FloatArray,
         pulse_width: float,
@@ -113,7 +113,7 @@ class Detection:
         """
         start, end = min(time.min(), at.min()), max(time.max(), at.max())
 
-        def find_slot(instants: FloatArray) -> NDArray[np.int64]:
+        def find_slot(instants: FloatArray) -> IntArray:
             slots = (instants - start) * (SLOTS_PER_WIDTH / pulse_width) + 0.5
             return np.asarray(slots, dtype=np.int64)
 
@@ -126,7 +126,7 @@ class Detection:
         return np.asarray(needed[find_slot(at)])
 
 
-def find_strongest(pixel: NDArray[np.int64], intensity: FloatArray) -> FloatArray:
+def find_strongest(pixel: IntArray, intensity: FloatArray) -> FloatArray:
     """Return the largest intensity of each pixel, 0 where there is no candidate."""
     strongest = np.zeros(int(pixel.max()) + 1)
     np.maximum.at(strongest, pixel, intensity)
@@ -186,7 +186,7 @@ class EvidenceJudge:
                 f"the probability of a false alarm lies between 0 and 1, got {self.max_false_alarm}"
             )
 
-    def judge(self, pixel: NDArray[np.int64], time: FloatArray, signal: FloatArray) -> FloatArray:
+    def judge(self, pixel: IntArray, time: FloatArray, signal: FloatArray) -> FloatArray:
         """Return the probability that each candidate is false. `pixel` (n,) does not decrease; `signal`
         (n,): counts, summed over the bins.
         """
@@ -264,7 +264,7 @@ def weigh_candidates(
     frames: Frames,
     noise: MeasurementNoise,
     pulse: Pulse,
-    pixel: NDArray[np.int64],
+    pixel: IntArray,
     time: FloatArray,
     signal: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -317,8 +317,8 @@ def weigh_candidates(
 
 
 def join_candidates(
-    frames: Frames, pulse: Pulse, pixel: NDArray[np.int64], found: FloatArray
-) -> tuple[NDArray[np.int64], FloatArray]:
+    frames: Frames, pulse: Pulse, pixel: IntArray, found: FloatArray
+) -> tuple[IntArray, FloatArray]:
     """Make one candidate of those of a pixel that are ripples of one surface's light, which the recovery
     spread over time. `pixel` (n,) and `found` (3, n), times (s), signals and deviations (s), in the order
     of pixels and times; return the same of the surfaces. Of such a surface the light says how far off its

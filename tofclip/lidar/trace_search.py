@@ -6,9 +6,8 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray
 from tofclip.lidar.fit_kernels import list_returns, search_traces
 from tofclip.lidar.peak_kernels import (
     CANDIDATE_COLUMNS,
@@ -27,9 +26,9 @@ NEIGHBOUR_FRACTION = 0.5  # of what is of interest: weaker peaks do not move a r
 class Memory(NamedTuple):
     """What a thread's search overwrites, for some pixels."""
 
-    handed: NDArray[np.float32]  # (pixels, bins), as traces are handed out
+    handed: Float32Array  # (pixels, bins), as traces are handed out
     # (pixels, whole vectors of bins); the same memory where that is a whole number of vectors
-    traces: NDArray[np.float32]
+    traces: Float32Array
     room: Room
 
 
@@ -94,7 +93,7 @@ class TraceSearch:
         )
         self.set_least(np.zeros(number, np.float32))
 
-    def set_least(self, least: NDArray[np.float32]) -> None:
+    def set_least(self, least: Float32Array) -> None:
         """Say which response of the matched filter, (bins,), a return must exceed to be of interest;
         0 where nothing is known.
         """
@@ -119,7 +118,7 @@ class TraceSearch:
             self._search_piece(piece, memory)
         self._spare.append(memory)
 
-    def list_found(self) -> tuple[NDArray[np.int64], FloatArray]:
+    def list_found(self) -> tuple[IntArray, FloatArray]:
         """List all that was found so far, in raster and time order: numbers of the pixels, and (3, n)
         instants, s, sums of the fitted pulses over the bins, standard deviations of the instants, s.
         """
@@ -169,9 +168,7 @@ class TraceSearch:
         )
 
 
-def _place_vectors(
-    sharp: NDArray[np.float32], searched: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def _place_vectors(sharp: Float32Array, searched: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
     """Where the sharp filter is applied, in vectors, an even number of them, and in single bins at the
     ends, and where maxima are sought.
     """
@@ -184,7 +181,7 @@ def _place_vectors(
     at_ends = near.copy()
     at_ends[first : last + LENGTH] = False
 
-    def is_marked(marked: NDArray[np.bool_], starts: NDArray[np.int64], step: int) -> Any:
+    def is_marked(marked: BoolArray, starts: IntArray, step: int) -> Any:
         before = np.concatenate([[0], np.cumsum(marked)])
         return before[np.minimum(starts + step, marked.size)] > before[starts]
 
@@ -193,9 +190,7 @@ def _place_vectors(
     return np.append(runs, runs[-1:]) if runs.size % 2 else runs, np.flatnonzero(at_ends), words
 
 
-def _align(
-    matched: NDArray[np.float32], length: int, width: int
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def _align(matched: Float32Array, length: int, width: int) -> tuple[Float32Array, IntArray]:
     """The matched filters of all bins, (bins, width), each from a bin on that leaves room for its
     vectors, and these bins.
     """
@@ -216,7 +211,7 @@ def _fill_up(number: int, step: int) -> int:
     return -(-number // step) * step
 
 
-def _pad(values: NDArray[Any], length: int) -> NDArray[Any]:
+def _pad(values: AnyArray, length: int) -> AnyArray:
     """Fill the last axis up with zeros."""
     padded = np.zeros((*values.shape[:-1], length), values.dtype)
     padded[..., : values.shape[-1]] = values

@@ -11,7 +11,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import BoolArray, FloatArray, IntArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, add_errors
 from tofclip.lidar.photons.scene import (
@@ -48,7 +48,7 @@ SAMPLED_PIXELS = 8192  # that say what the pixels' background has in common
 
 def correct_pile_up(
     counts: NDArray[np.integer] | NDArray[np.floating], cycles: int, dead_bins: int | None = None
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Turn a histogram of a detector with dead time into the photons that arrived (Coates 1968).
 
     A bin counts only in the cycles in which no photon shortly before has blinded the detector. The
@@ -129,7 +129,7 @@ class Arrivals:
     confidence: FloatArray
 
     @property
-    def detected(self) -> NDArray[np.bool_]:
+    def detected(self) -> BoolArray:
         """Whether there is a return, (n, returns)."""
         return ~np.isnan(self.range)
 
@@ -146,7 +146,7 @@ class LogMatchedFilter:
     background: tuple[float, ...]  # of each bin, relative to the mean
 
     @cached_property
-    def shades(self) -> tuple[FloatArray, NDArray[np.int64]]:
+    def shades(self) -> tuple[FloatArray, IntArray]:
         """Backgrounds for which there are weights, and which of them each bin has."""
         return group_shades(np.array(self.background))
 
@@ -267,7 +267,7 @@ class PhotonDetector:
         return self.shape.kernel_table(PULSE_CUTOFF)
 
     @cached_property
-    def _offsets(self) -> NDArray[np.int64]:
+    def _offsets(self) -> IntArray:
         """Bins of a pulse, relative to its arrival."""
         first, last = np.array(self.shape.extent(PULSE_CUTOFF)) / self.bin_width
         return np.arange(int(np.ceil(first)), int(np.floor(last)) + 1)
@@ -398,9 +398,7 @@ class PhotonDetector:
             own, ramp = replace(self, background=detector.relative_background / ready), detector
         return own._refine(counts, *ramp._detect(counts, dither), live, cycles)
 
-    def _detect(
-        self, counts: FloatArray, dither: FloatArray
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _detect(self, counts: FloatArray, dither: FloatArray) -> tuple[IntArray, IntArray]:
         """Bins of the returns, (n, most returns), and how many there are."""
         from tofclip.lidar.photons.kernels import extract_strongest_returns
 
@@ -426,8 +424,8 @@ class PhotonDetector:
     def _refine(
         self,
         counts: FloatArray,
-        peaks: NDArray[np.int64],
-        numbers: NDArray[np.int64],
+        peaks: IntArray,
+        numbers: IntArray,
         live: FloatArray | None = None,
         cycles: float = NO_PILE_UP,
     ) -> Arrivals:
@@ -480,7 +478,7 @@ class PhotonDetector:
         return np.asarray(np.sqrt(4 / 3 * (weight @ error) / weight.sum(axis=1)))
 
 
-def _quantise_photons(photons: FloatArray) -> NDArray[np.int64]:
+def _quantise_photons(photons: FloatArray) -> IntArray:
     """Numbers of photons that have filters of their own, nearest to those found."""
     many = np.maximum(photons, MAX_EXACT_PHOTONS) / MAX_EXACT_PHOTONS
     steps = np.rint(np.log(many) / np.log(PHOTON_LEVEL_RATIO))

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import AnyArray
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import (
     BoundedFile,
@@ -263,7 +263,7 @@ def _read_layout(
     return PhotonImage.from_events(pixel, number, (rows, columns), bin_width)
 
 
-def recognise_axes(cube: NDArray[Any], path: Path) -> tuple[str, float]:
+def recognise_axes(cube: AnyArray, path: Path) -> tuple[str, float]:
     """Say which axis of a cube is time: light is concentrated along it, and it is long. Returns
     ``tyx``, ``ytx`` or ``yxt``, and by what factor it is ahead of the next axis.
     """
@@ -287,7 +287,7 @@ def recognise_axes(cube: NDArray[Any], path: Path) -> tuple[str, float]:
     return order[int(first)], certainty
 
 
-def _compare_concentration(cube: NDArray[Any], time: int) -> float:
+def _compare_concentration(cube: AnyArray, time: int) -> float:
     """Unevenness of light along an axis over that along the other two, were it the time axis: hot
     pixels, which rule every sum, then weigh no more than bright ones.
     """
@@ -375,11 +375,11 @@ def _iterate_datasets(group: Any, visited: set[int], prefix: str = "") -> Iterat
             yield from _iterate_datasets(item, visited, f"{prefix}{name}/")
 
 
-def _load_dataset(path: Path, name: str, matlab: bool) -> NDArray[Any]:
+def _load_dataset(path: Path, name: str, matlab: bool) -> AnyArray:
     import h5py
 
     with h5py.File(path, "r") as file:
-        values: NDArray[Any] = file[name][()]
+        values: AnyArray = file[name][()]
         if values.dtype.kind == "O":
             total, cells = 0, np.empty(values.shape, dtype=object)
             for place in np.ndindex(values.shape):
@@ -406,7 +406,7 @@ def _open_tiff(path: Path) -> _PhotonFile:
         require_bounded_size(path, "pictures", size, packed, series.keyframe.compression != 1)
         shape, dtype = tuple(series.shape), series.dtype
 
-    def load() -> NDArray[Any]:
+    def load() -> AnyArray:
         with BoundedFile(path) as reopened, tifffile.TiffFile(reopened) as again:
             return np.asarray(again.series[0].asarray())
 
@@ -432,12 +432,12 @@ def _open_ptu(path: Path) -> _PhotonFile:
         # Where the end was cut off, what is there counts.
         count = max(0, min(int(file.number_records), (path.stat().st_size - start) // 4))
 
-    def load() -> NDArray[Any]:
+    def load() -> AnyArray:
         # Mapped by NumPy: ptufile's own ways of it differ between its versions.
         words = np.memmap(path, "<u4", "r", start, (count,)) if count else np.empty(0, "<u4")
         with BoundedFile(path) as reopened, ptufile.PtuFile(reopened) as again:
             cube = again.decode_image(records=words, frame=-1, channel=-1, dtype=np.uint32)
-        summed: NDArray[Any] = np.asarray(cube).sum(axis=(0, 3), dtype=np.uint32)
+        summed: AnyArray = np.asarray(cube).sum(axis=(0, 3), dtype=np.uint32)
         return summed
 
     return _PhotonFile({"image": ArchiveEntry(shape, np.dtype(np.uint32), load)}, width, "yxt")

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray
 from tofclip.camera import Camera
 from tofclip.errors import CalibrationError, InputError, ShapeError
 from tofclip.lidar.pulse import Pulse
@@ -40,7 +40,7 @@ class Shading:
     bins: int
     mean: float
 
-    def at(self, pixel: NDArray[np.int64], instant: ArrayLike) -> NDArray[np.float32]:
+    def at(self, pixel: IntArray, instant: ArrayLike) -> Float32Array:
         """Return the level at each `instant`, in bins, of each `pixel`, a raster number."""
         sides = *self.image_shape, self.bins
         place = (*np.divmod(pixel, self.image_shape[1]), np.asarray(instant))
@@ -94,9 +94,9 @@ class PhotonImage:
         Arrays that do not belong together, a bin width that is not positive, or no photon at all.
     """
 
-    offsets: NDArray[np.int64]
-    bin: NDArray[np.float32]
-    count: NDArray[np.float32]
+    offsets: IntArray
+    bin: Float32Array
+    count: Float32Array
     image_shape: tuple[int, int]
     bins: int
     bin_width: float
@@ -150,8 +150,8 @@ class PhotonImage:
     @classmethod
     def from_events(
         cls,
-        pixel: NDArray[Any],
-        bin_number: NDArray[Any],
+        pixel: AnyArray,
+        bin_number: AnyArray,
         image_shape: tuple[int, int],
         bin_width: float,
         bins: int | None = None,
@@ -193,7 +193,7 @@ class PhotonImage:
         return self.offsets.size - 1
 
     @cached_property
-    def pixel(self) -> NDArray[np.int64]:
+    def pixel(self) -> IntArray:
         """Raster number of the pixel of each event."""
         return np.repeat(np.arange(self.pixels), np.diff(self.offsets))
 
@@ -201,19 +201,19 @@ class PhotonImage:
         """Return by how many bins each event comes after its pixel's surface, (rows, columns)."""
         return np.asarray(self.bin - surface.ravel()[self.pixel])
 
-    def sum_by_pixel(self, weights: NDArray[Any]) -> FloatArray:
+    def sum_by_pixel(self, weights: AnyArray) -> FloatArray:
         """Return the sums over each pixel's events of their `weights`, (rows, columns)."""
         total = np.bincount(self.pixel, weights, self.pixels)
         return total.reshape(self.image_shape).astype(np.float64)
 
     @cached_property
-    def relative(self) -> NDArray[np.float32]:
+    def relative(self) -> Float32Array:
         """Background at each event over its mean, (events,)."""
         if self.shading is None:
             return np.ones(self.bin.size, np.float32)
         return np.asarray(self.shading.at(self.pixel, self.bin))
 
-    def relative_at(self, surface: FloatArray) -> NDArray[np.float32]:
+    def relative_at(self, surface: FloatArray) -> Float32Array:
         """Return the background at each pixel's surface over its mean, (rows, columns)."""
         if self.shading is None:
             return np.ones(surface.shape, np.float32)
@@ -248,7 +248,7 @@ class PhotonImage:
         counts = np.bincount(self.pixel * number + part, self.count, self.pixels * number)
         return np.asarray(counts.reshape(self.pixels, number), np.float64)
 
-    def select(self, count: NDArray[np.float32]) -> PhotonImage:
+    def select(self, count: Float32Array) -> PhotonImage:
         """Return the events with other counts, (events,); those with none are left out."""
         kept = count > 0
         offsets = np.concatenate([[0], np.cumsum(kept)])[self.offsets]
@@ -366,8 +366,8 @@ class PhotonCube:
         Not a cube, a time axis of another length, or one that is not even or not credible.
     """
 
-    counts: NDArray[Any]
-    times: NDArray[np.float64]
+    counts: AnyArray
+    times: FloatArray
     camera: Camera | None = None
     pulse: Pulse | None = None
     sampled: bool = False
@@ -396,7 +396,7 @@ class PhotonCube:
         return rows, columns
 
     @property
-    def histograms(self) -> NDArray[np.float32]:
+    def histograms(self) -> Float32Array:
         """Photons (pixels, bins), pixels in raster order."""
         flat = self.counts.reshape(self.times.size, -1).T
         return np.ascontiguousarray(flat, dtype=np.float32)
@@ -427,7 +427,7 @@ NEIGHBOUR_BINS = 2  # by which the same surface may lie earlier or later in the 
 STRETCHES, FAULT_RATIO, FAULT_SIGMAS, NEIGHBOUR_RANK = 16, 3.0, 6.0, 2
 
 
-def find_hot_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
+def find_hot_pixels(photons: PhotonImage) -> BoolArray:
     """Say which pixels, (rows, columns), count what no light makes: far more than their neighbours
     at all times, or in one bin. Pairs of photons grow with the square of their number: one such pixel
     would say more about the pulse than all others together. They are found before anything is learnt.
@@ -440,7 +440,7 @@ def find_hot_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
     return np.asarray(throughout | _find_peaked_pixels(photons))
 
 
-def find_dim_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
+def find_dim_pixels(photons: PhotonImage) -> BoolArray:
     """Say which pixels, (rows, columns), count far less than their neighbours, dead ones among them."""
     light = photons.photons_per_pixel
     around = _rank_neighbours(light, NEIGHBOUR_RANK)
@@ -459,7 +459,7 @@ def _rank_neighbours(values: FloatArray, rank: int) -> FloatArray:
     return np.asarray(scipy.ndimage.rank_filter(values, rank, footprint=footprint, mode="mirror"))
 
 
-def _find_peaked_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
+def _find_peaked_pixels(photons: PhotonImage) -> BoolArray:
     rows, columns = photons.image_shape
     hot, table = np.zeros((rows, columns), np.bool_), photons.table
     total = photons.photons_per_pixel.ravel()
@@ -485,7 +485,7 @@ def _find_peaked_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
     return hot
 
 
-def leave_out_pixels(photons: PhotonImage, pixels: NDArray[np.bool_]) -> PhotonImage:
+def leave_out_pixels(photons: PhotonImage, pixels: BoolArray) -> PhotonImage:
     """Return the photons of all but some pixels, (rows, columns)."""
     if not pixels.any():
         return photons
@@ -527,7 +527,7 @@ class SurfaceImage:
     pulse: Pulse
     settings: dict[str, float | str]
     further: tuple[SurfaceImage, ...] = ()
-    hot_pixels: NDArray[np.bool_] | None = None
+    hot_pixels: BoolArray | None = None
 
     @classmethod
     def from_layers(
@@ -535,7 +535,7 @@ class SurfaceImage:
         layers: FloatArray,
         pulse: Pulse,
         settings: dict[str, float | str],
-        hot: NDArray[np.bool_],
+        hot: BoolArray,
     ) -> SurfaceImage:
         """Make one of range, deviation, photons and outlier probability of each pixel's returns, the
         strongest first, `layers` (layers, rows, columns, 4); `pulse` and `settings` are those that found

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from tofclip.lidar.photons.image import PhotonImage
 from tofclip.lidar.photons.scene import MIN_SIGNAL_PHOTONS, Scene, group_shades
 from tofclip.threads import run_blocks
@@ -46,10 +45,10 @@ class LabelAxis:
     """The instants on which a surface is looked for."""
 
     coarse: int  # bins of a coarse one
-    numbers: NDArray[np.int64]  # (labels,), coarse bins that are labels
+    numbers: IntArray  # (labels,), coarse bins that are labels
     coarse_bins: int  # coarse bins of the whole axis
 
-    def number_events(self, photons: PhotonImage) -> NDArray[np.int64]:
+    def number_events(self, photons: PhotonImage) -> IntArray:
         """Return the coarse bin of each event."""
         return ((photons.bin + 0.5) / self.coarse).astype(np.int64)
 
@@ -72,7 +71,7 @@ def choose_label_axis(photons: PhotonImage, scene: Scene) -> LabelAxis:
 
 def _find_occupied_bins(
     photons: PhotonImage, scene: Scene, axis: LabelAxis, tiles: int
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Coarse bins, and those around, at which some tile of the picture is above the background."""
     y, x = np.divmod(photons.pixel, photons.image_shape[1])
     tile = (y // TILE_PX) * -(-photons.image_shape[1] // TILE_PX) + x // TILE_PX
@@ -90,7 +89,7 @@ def _find_occupied_bins(
     return np.asarray(scipy.ndimage.binary_dilation(occupied, iterations=2 * LABELS_PER_WIDTH))
 
 
-def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArray[np.float32]:
+def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> Float32Array:
     """Log-likelihood ratio of a surface at each label against none, (pixels, labels)."""
     from tofclip.lidar.photons import kernels
 
@@ -113,12 +112,12 @@ def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArr
 
 
 def match_labels(
-    score: NDArray[np.float32],
+    score: Float32Array,
     axis: LabelAxis,
     image_shape: tuple[int, int],
     slope_cost: float,
     jump_cost: float,
-) -> tuple[FloatArray, NDArray[np.float32]]:
+) -> tuple[FloatArray, Float32Array]:
     """Find the most likely piecewise smooth surface, instants (rows, columns) in bins, and by how much
     the label of each beats the next best that is not beside it. The costs are of a change by one
     label, and by more.

@@ -29,7 +29,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import BoolArray, FloatArray, IntArray
 from tofclip.errors import InputError
 from tofclip.lidar.photons.image import PhotonImage, Shading, find_hot_pixels, leave_out_pixels
 from tofclip.lidar.pulse import Pulse
@@ -156,7 +156,7 @@ class Scene:
 
 def prepare_photons(
     photons: PhotonImage, pulse: Pulse | None, join: bool = True
-) -> tuple[PhotonImage, Pulse, NDArray[np.bool_]]:
+) -> tuple[PhotonImage, Pulse, BoolArray]:
     """Return the photons of all but hot pixels, in bins that the counter tells apart if they are to
     be joined; the pulse, or the one as wide as pairs of photons say; and the hot pixels.
     """
@@ -246,7 +246,7 @@ def measure_pulse_width(photons: PhotonImage) -> float:
     )
 
 
-def group_shades(relative: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.int64]]:
+def group_shades(relative: NDArray[np.floating]) -> tuple[FloatArray, IntArray]:
     """Return backgrounds over their mean that stand for the given ones, and which of them each has."""
     step = np.rint(np.log(relative) / np.log(SHADE_RATIO)).astype(np.int64)
     first = int(step.min())
@@ -494,7 +494,7 @@ def segment_counts(counts: FloatArray) -> FloatArray:
     return level
 
 
-def find_clumps(counts: FloatArray) -> NDArray[np.bool_]:
+def find_clumps(counts: FloatArray) -> BoolArray:
     """Say in which windows photons of pixels, (n, windows), vary more than a Poisson law allows."""
     whole = counts.sum(axis=1, keepdims=True)
     share = counts.sum(axis=0) / max(float(whole.sum()), 1.0)

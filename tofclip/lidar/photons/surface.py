@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tofclip.arrays import FloatArray
+from tofclip.arrays import BoolArray, Float32Array, FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.photons.detector import Arrivals, PhotonDetector
 from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, find_dim_pixels
@@ -308,8 +308,8 @@ def calibrate_outliers(
     train: PhotonImage,
     scene: Scene,
     fitted: FloatArray,
-    margin: NDArray[np.float32],
-) -> Callable[[NDArray[np.float32]], FloatArray]:
+    margin: Float32Array,
+) -> Callable[[Float32Array], FloatArray]:
     """Learn how to turn margins of labels into probabilities of an outlier.
 
     A margin is what the paths make of the log odds: the probability is a logistic function of it,
@@ -332,7 +332,7 @@ def calibrate_outliers(
     some = slice(None, None, -(-margin.size // MAX_JUDGED_PIXELS))
     for_surface = np.exp(np.clip(evidence[some], -30, 30))
 
-    def doubt(value: NDArray[np.float32], weight: float, rivals: float) -> FloatArray:
+    def doubt(value: Float32Array, weight: float, rivals: float) -> FloatArray:
         odds = np.log(rivals) - weight * np.maximum(value, 0).astype(np.float64)
         return np.asarray(scipy.special.expit(odds))
 
@@ -393,7 +393,7 @@ def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> F
     expected = scene.background * (2 * reach + 1) * photons.relative_at(surface).astype(np.float64)
     pooled = np.rint(scipy.ndimage.uniform_filter(seen, 3, mode="nearest") * 9)
 
-    def is_rare(seen: FloatArray, expected: FloatArray, most: float) -> NDArray[np.bool_]:
+    def is_rare(seen: FloatArray, expected: FloatArray, most: float) -> BoolArray:
         # chance of that many photons or more by Poisson's law; scipy.stats loads for a second
         chance = scipy.special.gammainc(np.maximum(seen, 1), expected)
         return np.asarray((seen > 0) & (chance < most))
