@@ -277,7 +277,7 @@ def _describe_bins(
     resolution: float, channels: int, period: float, path: Path, **shape: int
 ) -> Record:
     """Return the calibration of photons in bins of `resolution`, s."""
-    if not (np.isfinite(resolution) and resolution > 0):
+    if not 0 < resolution < np.inf:
         raise FileFormatError(path, f"says that its bins last {resolution} s")
     found: dict[str, Scalar] = {"resolution_s": resolution, "channels": channels, **shape}
     if period:

@@ -16,7 +16,7 @@ from devices.linospad2 import CLOCK_PERIOD_S, PIXELS, BoardCalibration
 from devices.source import Records
 from devices.timetag_codec import DELTA
 from tofclip.arrays import AnyArray, FloatArray, IntArray
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_positive
 from tofclip.shots import Streak
 from tofclip.threads import run_blocks, thread_count
 
@@ -41,19 +41,11 @@ class BinAxis:
     period: float | None = None
 
     def __post_init__(self) -> None:
-        if not (
-            math.isfinite(self.bin_width)
-            and self.bin_width > 0
-            and math.isfinite(self.start)
-            and self.bins >= 1
-        ):
+        if not (0 < self.bin_width < math.inf and math.isfinite(self.start) and self.bins >= 1):
             raise InputError(f"bins need a positive width, a number and a start, got {self}")
         if self.period is None:
             return
-        if not (math.isfinite(self.period) and self.period > 0):
-            raise InputError(
-                f"the laser's period must be a positive number of seconds, got {self.period}"
-            )
+        require_positive("the laser's period", self.period, "number of seconds")
         # A relative tolerance, because a width is often computed as period / bins.
         if self.bins * self.bin_width > self.period * (1 + 1e-9):
             raise InputError(
@@ -184,8 +176,7 @@ class TagHistogram(Histogram):
             raise InputError(
                 f"sync and pixels need channels of their own within 0..7, got {channels}"
             )
-        if not (np.isfinite(tick) and tick > 0):
-            raise InputError(f"a tick must be a positive number of seconds, got {tick}")
+        require_positive("a tick", tick, "number of seconds")
         self._sync = 1 << sync_channel
         self._pixel_of = np.full(max(channels) + 1, -1, np.int64)
         self._pixel_of[list(pixel_channels)] = np.arange(len(pixel_channels))
@@ -219,8 +210,7 @@ class BinHistogram(Histogram):
 
     def __init__(self, pixels: int, axis: BinAxis, resolution: float) -> None:
         super().__init__(pixels, axis)
-        if not (np.isfinite(resolution) and resolution > 0):
-            raise InputError(f"a resolution must be a positive number of seconds, got {resolution}")
+        require_positive("a resolution", resolution, "number of seconds")
         self._resolution = resolution
 
     def add(self, records: Records, after_gap: bool = False) -> None:

@@ -402,11 +402,8 @@ class Closing(abc.ABC):
 
 
 class Source(Closing):
-    """A stream of records: a context manager and an iterator over batches.
-
-    A subclass gives `read`, `close`, `info` and `stats`, and where they differ from the defaults
-    the rest. Opening is done by the constructor (or the function in `devices.registry`); leaving
-    the context closes.
+    """A stream of records: a context manager and an iterator over batches. A subclass gives `read`,
+    `close`, `info` and `stats`, and where they differ from the defaults the rest.
 
     Attributes
     ----------
@@ -432,36 +429,20 @@ class Source(Closing):
 
     @abc.abstractmethod
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
-        """Return the next batch, or None at the end of the stream.
-
-        Parameters
-        ----------
-        timeout : float
-            Seconds to wait at most.
-
-        Raises
-        ------
-        DeviceTimeoutError
-            Nothing came in that time; reading on is fine.
-        DeviceError
-            The instrument failed in another way; what arrived before has been read by now.
+        """Return the next batch, or None at the end of the stream. `DeviceTimeoutError`: nothing came within
+        `timeout` s, and reading on is fine; another `DeviceError`: the instrument failed, and what
+        arrived before has been read by now.
         """
 
     def seek(self, record: int) -> None:
-        """Go to record number ``record``, so that the next batch begins with it.
-
-        Raises
-        ------
-        InputError
-            The source cannot go back, or has no such record.
+        """Go to record number ``record``, so that the next batch begins with it; `InputError` where the
+        source cannot go back, or has no such record.
         """
         raise InputError("a live source cannot seek; record it and open the recording")
 
     def stop(self) -> None:
         """Let the instrument register nothing more; what arrived can still be read, up to the None
-        at the end.
-
-        Where nothing waits to be read this is the same as `close`.
+        at the end. Where nothing waits to be read this is the same as `close`.
         """
         self.close()
 

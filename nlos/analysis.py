@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.linalg import norm
 from numpy.typing import NDArray
 
 from nlos.band import VirtualPulse
@@ -79,9 +80,8 @@ def find_first_bounce(capture: Capture) -> FirstBounce | None:
     A record that begins after its arrival may begin with its tail, which falls from the first bin on.
     """
     late, level = _compute_profile(capture)
-    extent = float(np.ptp(capture.points, axis=0).max())
-    own = np.abs(late) <= FIRST_BOUNCE_WALL_FRACTION * extent
-    recorded = late[:1].min(initial=np.inf) <= FIRST_BOUNCE_WALL_FRACTION * extent
+    reach = FIRST_BOUNCE_WALL_FRACTION * capture.extent
+    own, recorded = np.abs(late) <= reach, late[:1].min(initial=np.inf) <= reach
     if late.size < 4 or own.all() or (recorded and not own.any()):
         return None
     peak = int(np.argmax(np.where(own, level, -np.inf))) if recorded else 0
@@ -194,16 +194,16 @@ def find_lit_end(capture: Capture) -> bool:
 def require_plausible(capture: Capture) -> None:
     """Refuse what no picture can come of, before any work is done."""
     low, high = capture.points.min(axis=0), capture.points.max(axis=0)
-    extent = float((high - low).max())
+    extent = capture.extent
     if len(capture.points) > 1 and extent == 0 and capture.laser.ndim == 1:
         raise InputError("all wall points stand in one place: a capture needs several places")
     beyond = np.maximum(np.maximum(low - capture.lasers, capture.lasers - high), 0)
-    away = float(np.linalg.norm(beyond, axis=1).max())
+    away = float(norm(beyond, axis=1).max())
     if extent > 0 and away > MAX_LASER_WALL_WIDTHS * extent:
         raise InputError(
             f"the laser spot lies {away:.3g} m from the wall, which is {extent:.3g} m wide: give the spot on the wall"
         )
-    outside = np.linalg.norm(beyond[:, :2], axis=1)
+    outside = norm(beyond[:, :2], axis=1)
     off = beyond[:, 2] - MAX_LASER_OFF_WALL_M - LASER_OFF_WALL_SLOPE * outside
     if extent > 0 and off.max() > 0:
         worst = int(np.argmax(off))
@@ -232,13 +232,12 @@ def require_plausible(capture: Capture) -> None:
 
 def require_usable_wavelength(capture: Capture, wavelength: float, cycles: float) -> None:
     """Refuse a given wavelength that shows nothing."""
-    extent = float(np.ptp(capture.points, axis=0).max())
     record = float(np.ptp(capture.axis.paths))
-    longest = min(limit for limit in (extent, record / cycles) if limit > 0)
+    longest = min(limit for limit in (capture.extent, record / cycles) if limit > 0)
     if wavelength > longest * (1 + 1e-6):
         raise InputError(
-            f"a wavelength of {wavelength:.3g} m shows nothing of this capture, with a wall {extent:.3g} m wide and a "
-            f"record of {record:.3g} m: use at most {longest / 2:.2g} m"
+            f"a wavelength of {wavelength:.3g} m shows nothing of this capture, with a wall {capture.extent:.3g} m "
+            f"wide and a record of {record:.3g} m: use at most {longest / 2:.2g} m"
         )
 
 
@@ -310,8 +309,7 @@ def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
 
 def find_longest_wavelength(capture: Capture) -> float:
     """Carrier above which a point's image at a wall's width is wider than half the wall, m."""
-    extent = float(np.ptp(capture.points[:, :2], axis=0).max())
-    return extent / 2
+    return float(np.ptp(capture.points[:, :2], axis=0).max()) / 2
 
 
 def find_sampling_step(capture: Capture) -> float:
@@ -332,7 +330,7 @@ def _sampling_limit(capture: Capture, sine: float = 1.0) -> float:
 
 def _steepest_angle(capture: Capture) -> float:
     """Sine of the angle at which what is brightest is seen from the far end of the wall."""
-    extent = float(np.ptp(capture.points[:, :2], axis=0).max())
+    extent = 2 * find_longest_wavelength(capture)
     late, level = _compute_profile(capture)
     depth = max(float(late[np.argmax(level)]) / 2, 0.0)
     return extent / math.hypot(extent, depth) if extent > 0 else 1.0
@@ -341,8 +339,7 @@ def _steepest_angle(capture: Capture) -> float:
 def _compute_profile(capture: Capture) -> tuple[FloatArray, FloatArray]:
     """Mean signal by path beyond that of the wall's own light: paths, m, and levels."""
     traces, direct = _select_traces(capture)
-    extent = float(np.ptp(capture.points, axis=0).max())
-    step = max(capture.axis.spacing, extent / PROFILE_STEPS_PER_WALL)
+    step = max(capture.axis.spacing, capture.extent / PROFILE_STEPS_PER_WALL)
     number = np.floor((capture.axis.paths - direct[:, np.newaxis]) / step).astype(np.intp)
     first = int(number.min())
     count = np.bincount((number - first).ravel())
@@ -359,6 +356,6 @@ def _select_traces(capture: Capture) -> tuple[FloatArray, FloatArray]:
     some = some[:: len(some) // MAX_ANALYSED_POINTS + 1]
     flat = to_numpy(capture.signal).reshape(capture.axis.bins, -1)
     traces = flat[:, np.flatnonzero(capture.valid)[some]].T.astype(np.float64)
-    lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[some]
-    direct: FloatArray = np.linalg.norm(capture.points[some] - lasers, axis=1)
+    lasers = capture.select_lasers(some)
+    direct: FloatArray = norm(capture.points[some] - lasers, axis=1)
     return traces, direct

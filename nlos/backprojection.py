@@ -57,7 +57,7 @@ class Weighting:
     obliquity: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.falloff) and np.isfinite(self.obliquity) and self.obliquity >= 0):
+        if not (np.isfinite(self.falloff) and 0 <= self.obliquity < np.inf):
             raise InputError(
                 f"weights need finite powers, that of the obliquity not negative, got {self}"
             )
@@ -162,7 +162,7 @@ def backproject_signals(
         progress(len(waveforms[0]) * brick.size)
 
     for points in split_blocks(len(capture.points), max(1, TABLE_BYTES // (8 * samples))):
-        lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[points]
+        lasers = capture.select_lasers(points)
         spots = (some.astype(np.float32) for some in (capture.points[points], lasers))
         signals = apply_filter(capture.traces(points))
         start, spacing = np.float32(signals.start), np.float32(signals.spacing)
@@ -199,7 +199,7 @@ def backproject_on_device(
         waveforms = xp.reshape(transform.of(get_traces(capture, points)) @ carriers, (-1,))
         count = points.stop - points.start
         first, wall = library.put(samples * np.arange(count)), library.put(capture.points[points].T)
-        lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[points]
+        lasers = capture.select_lasers(points)
         laser = library.put(lasers.T)
         for some in split_blocks(rows, max(1, pairs // (grid.x.size * count))):
             ahead, across = z[some, ...] - wall[2, :], y[some, ...] - wall[1, :]

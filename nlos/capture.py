@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.linalg import norm
 
 from nlos.kernels import shift_signals
 from tofclip.arrays import (
@@ -145,12 +146,12 @@ class Capture:
         require_credible_bin_width(self.bin_width)
         if not np.any(self.valid):
             raise InputError("every wall point is NaN: nothing is left to image with")
-        low, high = self.points.min(axis=0), self.points.max(axis=0)
-        extent = float((high - low).max())
-        if extent > MAX_WALL_EXTENT_M:
-            raise InputError(f"a wall of {extent:g} m is not credible; give its points in metres")
-        behind = float(low[2] - self.lasers[:, 2].min())
-        if len(self.points) > 1 and behind > extent / 2:
+        if self.extent > MAX_WALL_EXTENT_M:
+            raise InputError(
+                f"a wall of {self.extent:g} m is not credible; give its points in metres"
+            )
+        behind = float(self.points[:, 2].min() - self.lasers[:, 2].min())
+        if len(self.points) > 1 and behind > self.extent / 2:
             raise InputError(
                 f"the laser spot lies {behind:.3g} m behind the hindmost wall point: give the spot on the wall, not "
                 "the device, and z growing from the wall into the hidden scene"
@@ -204,11 +205,6 @@ class Capture:
         bin_width, start, provenance
             As of `Capture`.
 
-        Raises
-        ------
-        ShapeError
-            Wall or laser points have not three coordinates.
-
         Examples
         --------
         >>> import numpy as np
@@ -256,6 +252,15 @@ class Capture:
     def lasers(self) -> FloatArray:
         """Laser spots, m: (1, 3) if it stands still, else (points, 3) as `points`."""
         return self.laser[np.newaxis] if self.laser.shape == (3,) else self.laser[self.valid]
+
+    def select_lasers(self, some: slice | AnyArray) -> FloatArray:
+        """Laser spots of some of the `points`: the one, or theirs."""
+        return self.lasers if len(self.lasers) == 1 else self.lasers[some]
+
+    @cached_property
+    def extent(self) -> float:
+        """The longest side of a box about the wall's points, m."""
+        return float(np.ptp(self.points, axis=0).max())
 
     @cached_property
     def spacing(self) -> float:
@@ -411,7 +416,7 @@ def unwarp_signal(
     camera, laser = (_require_position(*one) for one in (("camera", camera), ("laser", laser)))
     if signal.shape[1:] != wall.shape[:-1] or wall.shape[-1:] != (3,):
         raise ShapeError("wall", (*signal.shape[1:], 3), wall.shape)
-    leg = np.linalg.norm(wall - camera, axis=-1) - np.linalg.norm(laser - camera)
+    leg = norm(wall - camera, axis=-1) - norm(laser - camera)
     return _shift_earlier(signal, leg / (SPEED_OF_LIGHT * bin_width))
 
 
@@ -422,8 +427,8 @@ def remove_device_legs(capture: Capture, source: Any, camera: Any) -> Capture:
     """
     source, camera = (_require_position(*one) for one in (("source", source), ("camera", camera)))
     require_numpy("unwarping", capture.signal)
-    outward = np.linalg.norm(capture.laser - source, axis=-1)
-    legs = outward + np.linalg.norm(capture.wall - camera, axis=-1)
+    outward = norm(capture.laser - source, axis=-1)
+    legs = outward + norm(capture.wall - camera, axis=-1)
     # shifts from the shortest leg on cut off as little of the record as possible
     common = float(legs[capture.valid].min())
     signal = _shift_earlier(np.nan_to_num(capture.signal), (legs - common) / capture.axis.spacing)

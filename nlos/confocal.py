@@ -167,7 +167,7 @@ def _shift_to_distance_zero(capture: Capture, bins: int) -> Float32Array:
 
 
 def _require_falloff(falloff: float) -> None:
-    if not (np.isfinite(falloff) and falloff >= 0):
+    if not 0 <= falloff < np.inf:
         raise InputError(f"falloff must be a power of 0 or more, got {falloff}")
 
 

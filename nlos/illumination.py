@@ -39,9 +39,8 @@ def is_confocal(capture: Capture) -> bool:
     """Whether every wall point is its own laser spot, but for rounding."""
     if len(capture.lasers) != len(capture.points) or len(capture.points) == 1:
         return False
-    extent = float(np.ptp(capture.points, axis=0).max())
     apart = float(np.abs(capture.lasers - capture.points).max())
-    return apart <= SAME_SPOT_FRACTION * extent
+    return apart <= SAME_SPOT_FRACTION * capture.extent
 
 
 def swap_roles(capture: Capture) -> Capture:

@@ -195,8 +195,7 @@ def _complete_voxels(gated: Capture, found: Wanted) -> Wanted:
     if by_lattice:
         voxel = (found.bins_together or 1) * spacing * VOXEL_BIN_FRACTION
         reason = "a third of the path of a bin"
-    extent = float(np.ptp(gated.points, axis=0).max())
-    found = found.with_found("voxel", max(voxel, extent / MAX_VOXELS_PER_SIDE), reason)
+    found = found.with_found("voxel", max(voxel, gated.extent / MAX_VOXELS_PER_SIDE), reason)
     return _complete_box(gated, found.with_found("sigma", wavelength / SIGMAS_PER_WAVELENGTH))
 
 

@@ -72,17 +72,8 @@ class PlannedGeometry:
 
 
 class Plan(ABC):
-    """A method made ready for captures of one geometry on one grid.
-
-    Parameters
-    ----------
-    capture : Capture
-        One of them; wall, laser, time axis and device are what counts.
-    grid : Grid
-
-    Attributes
-    ----------
-    grid : Grid
+    """A method made ready for captures of one geometry on one ``grid``: wall, laser, time axis and device
+    of a capture are what counts.
     """
 
     images = 1  # how many are made and added up
@@ -109,7 +100,7 @@ class Plan(ABC):
         Parameters
         ----------
         capture : Capture
-            Of the geometry that was planned for.
+            Of the geometry that was planned for, or `InputError`.
         progress : callable, optional
             Called with a part of `cost` whenever so much is done.
 
@@ -117,11 +108,6 @@ class Plan(ABC):
         -------
         Volume
             Brightness, real and not negative, float32.
-
-        Raises
-        ------
-        InputError
-            Wall, laser, time axis or device differ from those that were planned for.
         """
         self.geometry.require_same(capture)
         return self._image(capture, progress)
@@ -153,18 +139,8 @@ class Method(ABC):
 
     @abstractmethod
     def plan(self, capture: Capture, grid: Grid) -> Plan:
-        """Make the method ready for captures like `capture` on `grid`.
-
-        Parameters
-        ----------
-        capture : Capture
-            Wall, laser, time axis and device are what counts.
-        grid : Grid
-
-        Raises
-        ------
-        InputError
-            The method cannot image such a capture on the grid; the message says why.
+        """Make the method ready for captures like `capture` on `grid`: wall, laser, time axis and device
+        are what counts. `InputError` says why it cannot image them.
         """
 
     def reconstruct(

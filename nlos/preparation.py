@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.linalg import norm
 
 from nlos.capture import Capture
 from nlos.illumination import is_confocal
@@ -64,9 +65,9 @@ def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> C
     `ramp` m, as a raised cosine; a sharp edge would show as a plane at half the margin.
     """
     for name, value in (("margin after the first bounce", margin), ("ramp after it", ramp)):
-        if not (np.isfinite(value) and value >= 0):
+        if not 0 <= value < np.inf:
             raise InputError(f"the {name} must be 0 m or more, got {value}")
-    direct = np.linalg.norm(capture.wall - capture.laser, axis=-1)
+    direct = norm(capture.wall - capture.laser, axis=-1)
     paths = capture.axis.paths.reshape(-1, *[1] * direct.ndim)
     late = paths - (direct + margin)
     early = capture.device.put(late <= 0)
@@ -90,7 +91,7 @@ def fade_record_end(capture: Capture, length: float) -> Capture:
     """Let signals fade out over a path of `length`, m, by a raised cosine: where light still comes
     at the record's end, that would show as a plane.
     """
-    if not (np.isfinite(length) and length > 0):
+    if not 0 < length < np.inf:
         raise InputError(f"the record's end must fade over more than 0 m, got {length}")
     paths = capture.axis.paths
     weight = (1 - np.cos(np.pi * np.clip((paths[-1] - paths) / length, 0, 1))) / 2
@@ -135,27 +136,65 @@ class MidpointJoin:
     def __init__(self, capture: Capture) -> None:
         self._geometry = PlannedGeometry(capture)
         self._middle: FloatArray | None = None
-        self._moveout: _Moveout | None = None
+        self._blocks: list[slice] = []  # of pairs whose signals are read at other paths
+        self._kept: list[Readings] = []
         if capture.laser.ndim == 1 or is_confocal(capture) or len(capture.points) == 1:
             return
-        extent = float(np.ptp(capture.points, axis=0).max())
+        extent = capture.extent
         apart = float(np.linalg.norm(capture.lasers - capture.points, axis=1).max())
         near = min(NEAR_LASER_M, MAX_NEAR_LASER_FRACTION * extent)
         middle = (capture.wall + capture.laser) / 2
         if apart <= max(NEAR_LASER_FRACTION * extent, near):
             self._middle = middle
-        elif apart <= MAX_OFFSET_FRACTION * extent and is_numpy(capture.signal):
-            spacing = replace(capture, wall=middle, laser=middle).spacing
-            if _find_path_error(capture) <= MAX_PATH_ERROR_FRACTION * spacing:
-                self._middle, self._moveout = middle, _Moveout(capture)
+            return
+        if apart > MAX_OFFSET_FRACTION * extent or not is_numpy(capture.signal):
+            return
+        spacing = replace(capture, wall=middle, laser=middle).spacing
+        if _find_path_error(capture) > MAX_PATH_ERROR_FRACTION * spacing:
+            return
+        self._middle, self._places = middle, np.flatnonzero(capture.valid)
+        _, self._squared, self._along = _find_offsets(capture, slice(None))
+        self._blocks = list(split_blocks(len(self._places), PAIRS_PER_BLOCK))
+        if len(self._places) * capture.axis.bins * BYTES_PER_READING <= MAX_KEPT_BYTES:
+            self._kept = [self._find_bins(some) for some in self._blocks]
 
     def join(self, capture: Capture) -> Capture:
         """Return a capture with its pairs at their midpoints, or itself; see `join_near_lasers`."""
         self._geometry.require_same(capture)
         if self._middle is None:
             return capture
-        signal = capture.signal if self._moveout is None else self._moveout.read(capture.signal)
+        signal = self._read(capture.signal) if self._blocks else capture.signal
         return replace(capture, wall=self._middle, laser=self._middle, signal=signal)
+
+    def _read(self, signal: AnyArray) -> Float32Array:
+        """Return signals (t, ...) read at their pairs' paths, linear between bins; 0 outside."""
+        read = np.zeros(signal.shape, np.float32)
+        flat, recorded = (one.reshape(len(signal), -1) for one in (read, signal))
+        for number, some in enumerate(self._blocks):
+            before, weight = self._kept[number] if self._kept else self._find_bins(some)
+            own = self._places[some]
+            # Two bins of silence for what lies outside.
+            block = np.concatenate([recorded[:, own], np.zeros((2, own.size), recorded.dtype)])
+            first, second = block.take(before), block.take(before + own.size)
+            flat[:, own] = first + weight * (second - first)
+        return read
+
+    def _find_bins(self, some: slice) -> Readings:
+        """Find the bin before each reading, as a place in (t, n) signals, and the weight of the
+        next.
+        """
+        axis = self._geometry.axis
+        confocal = np.maximum(axis.paths, 0)[:, np.newaxis]
+        paths = _path_of(confocal, self._squared[some], self._along[some])
+        bins = (paths - axis.start) / axis.spacing
+        before = np.clip(bins.astype(np.intp), 0, axis.bins - 2)
+        weight = (bins - before).astype(np.float32)
+        # What was not recorded is read from a row of zeros behind the last bin.
+        before[(bins < 0) | (bins > axis.bins - 1)] = axis.bins
+        return before * before.shape[1] + np.arange(before.shape[1]), weight
+
+
+Readings = tuple[IndexArray, Float32Array]
 
 
 class MidpointImaging(PhasorMethod):
@@ -208,7 +247,7 @@ def _find_offsets(capture: Capture, some: slice) -> tuple[FloatArray, FloatArray
     places = _sample_space(capture.points)
     for place in places:
         direction = place - middle
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        direction /= norm(direction, axis=1, keepdims=True)
         along += np.sum(half * direction, axis=1) ** 2 / len(places)
     return middle, np.sum(half**2, axis=1), along
 
@@ -221,7 +260,7 @@ def _find_path_error(capture: Capture) -> float:
     errors = []
     for place in _sample_space(capture.points):
         outward, back, middle_leg = (
-            np.linalg.norm(place - spots, axis=1)
+            norm(place - spots, axis=1)
             for spots in (capture.lasers[some], capture.points[some], middle)
         )
         errors.append(_path_of(2 * middle_leg, squared, along) - outward - back)
@@ -233,42 +272,3 @@ def _path_of(confocal: FloatArray, squared: Any, along: Any) -> FloatArray:
     total = 4 * squared + confocal**2
     root = np.sqrt(np.maximum(total**2 - 16 * along * confocal**2, 0))
     return np.sqrt((total + root) / 2)
-
-
-class _Moveout:
-    """Where between the bins every valid signal is read: at the path of its pair."""
-
-    def __init__(self, capture: Capture) -> None:
-        self._axis, self._places = capture.axis, np.flatnonzero(capture.valid)
-        _, self._squared, self._along = _find_offsets(capture, slice(None))
-        self._blocks = list(split_blocks(len(self._places), PAIRS_PER_BLOCK))
-        self._kept = None
-        if len(self._places) * capture.axis.bins * BYTES_PER_READING <= MAX_KEPT_BYTES:
-            self._kept = [self._find_bins(some) for some in self._blocks]
-
-    def read(self, signal: AnyArray) -> Float32Array:
-        """Return signals (t, ...) read at their pairs' paths, linear between bins; 0 outside."""
-        read = np.zeros(signal.shape, np.float32)
-        flat, recorded = (one.reshape(self._axis.bins, -1) for one in (read, signal))
-        for number, some in enumerate(self._blocks):
-            before, weight = self._kept[number] if self._kept else self._find_bins(some)
-            own = self._places[some]
-            # Two bins of silence for what lies outside.
-            block = np.concatenate([recorded[:, own], np.zeros((2, own.size), recorded.dtype)])
-            first, second = block.take(before), block.take(before + own.size)
-            flat[:, own] = first + weight * (second - first)
-        return read
-
-    def _find_bins(self, some: slice) -> tuple[IndexArray, Float32Array]:
-        """Find the bin before each reading, as a place in (t, n) signals, and the weight of the
-        next.
-        """
-        axis = self._axis
-        confocal = np.maximum(axis.paths, 0)[:, np.newaxis]
-        paths = _path_of(confocal, self._squared[some], self._along[some])
-        bins = (paths - axis.start) / axis.spacing
-        before = np.clip(bins.astype(np.intp), 0, axis.bins - 2)
-        weight = (bins - before).astype(np.float32)
-        # What was not recorded is read from a row of zeros behind the last bin.
-        before[(bins < 0) | (bins > axis.bins - 1)] = axis.bins
-        return before * before.shape[1] + np.arange(before.shape[1]), weight

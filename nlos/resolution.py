@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.linalg import norm
 
 from nlos.band import VirtualPulse
 from nlos.capture import Capture
@@ -86,14 +87,14 @@ def _compute_ideal_width(
     # every n-th point spans the same aperture
     some = slice(None, None, max(1, len(capture.points) // MAX_WALL_POINTS))
     wall = capture.points[some]
-    lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[some]
-    distance = float(np.linalg.norm(wall - point, axis=1).mean())
+    lasers = capture.select_lasers(some)
+    distance = float(norm(wall - point, axis=1).mean())
     extent = float(np.ptp(wall, axis=0).max())
     # the order of the diffraction limit, wavelength * distance / aperture
     narrow = pulse.wavelength * max(1.0, distance / max(extent, 1e-9))
     places = np.linspace(-PROFILE_EXTENT_WIDTHS, PROFILE_EXTENT_WIDTHS, PROFILE_SAMPLES) * narrow
     start = _compute_path_lengths(wall, lasers, point)
-    weights = np.linalg.norm(wall - point, axis=1) ** -3.0
+    weights = norm(wall - point, axis=1) ** -3.0
     field = np.empty(PROFILE_SAMPLES, np.complex128)
     for i, place in enumerate(places):
         moved = point.copy()
@@ -105,5 +106,5 @@ def _compute_ideal_width(
 
 
 def _compute_path_lengths(wall: FloatArray, lasers: FloatArray, point: FloatArray) -> FloatArray:
-    legs = (np.linalg.norm(ends - point, axis=1) for ends in (lasers, wall))
+    legs = (norm(ends - point, axis=1) for ends in (lasers, wall))
     return sum(legs)

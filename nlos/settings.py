@@ -163,14 +163,8 @@ class Settings:
         """Mirror coordinates, blank the wall's own light and put time bins together, as settings say.
 
         Of laser spots and wall points the fewer come as laser spots: a wave is imaged for each,
-        and seen from a lone detector all of its surroundings would be bright.
-
-        Parameters
-        ----------
-        capture : Capture
-        join : callable, optional
-            Brings pairs to their midpoints; `nlos.preparation.MidpointJoin.join` for many captures of
-            one geometry.
+        and seen from a lone detector all of its surroundings would be bright. `join` brings pairs to
+        their midpoints: `nlos.preparation.MidpointJoin.join` for many captures of one geometry.
         """
         from nlos import preparation
         from nlos.illumination import choose_roles
@@ -212,24 +206,8 @@ class Settings:
         return made
 
     def plan_quickest(self, capture: Capture, grid: Grid) -> tuple[str, Plan]:
-        """Return the first method that takes the capture and does not take longer than the last
-        one, and its plan.
-
-        Parameters
-        ----------
-        capture : Capture
-            As `prepare` returns it.
-        grid : Grid
-
-        Returns
-        -------
-        name : str
-        plan : Plan
-
-        Raises
-        ------
-        InputError
-            None of them can image the capture; the reason is that of the last.
+        """Return the first method that takes a prepared capture and does not take longer than the last
+        one, and its plan. `InputError`: none of them can image it, for the reason of the last.
         """
         *quicker, last = METHODS_BY_SPEED
         for name in quicker:

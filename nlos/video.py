@@ -194,7 +194,7 @@ class TransientImaging:
         Returns
         -------
         TransientVideo
-            (t, z, y, x).
+            (t, z, y, x) float32.
 
         Raises
         ------
@@ -215,24 +215,8 @@ class TransientImaging:
     def front_views(
         self, capture: Capture, grid: Grid, times: ArrayLike, progress: Progress = ignore_progress
     ) -> TransientVideo:
-        """Image the scene at every instant and keep the brightest of every line of sight in z, (t,
-        y, x).
-
-        Memory for no more than that; parameters and errors as of `video`.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        times : (t,) array_like
-            Seconds after the flash.
-        progress : callable
-            As for `video`.
-
-        Returns
-        -------
-        TransientVideo
-            (t, y, x) float32.
+        """As `video`, but keep the brightest of every line of sight in z, (t, y, x), and memory for no
+        more than that.
         """
         from threading import Lock
 
@@ -256,30 +240,11 @@ class TransientImaging:
         closes: float,
         progress: Progress = ignore_progress,
     ) -> Volume:
-        """Image what lights up while a gate is open.
+        """Image what lights up while a gate is open, between two times in s since the flash left its spot:
+        ``sqrt(int |u|^2 c dt / (sqrt(pi) * sigma))``, sigma that of the pulse, float32.
 
         A lone point whose flash passes within the gate is as bright as in the image of the method;
-        one that lights up at another time is dark.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        opens, closes : float
-            Seconds since the flash left its spot on the wall.
-        progress : callable, optional
-            Called with the number of voxels just done.
-
-        Returns
-        -------
-        Volume
-            ``sqrt(int |u|^2 c dt / (sqrt(pi) * sigma))``, sigma that of the pulse, float32.
-
-        Raises
-        ------
-        InputError
-            The method cannot image such a capture on the grid, or the gate does not open before it
-            closes.
+        one that lights up at another time is dark. Other arguments and errors as of `video`.
         """
         if not (np.isfinite(opens) and np.isfinite(closes) and opens < closes):
             raise InputError(f"a gate must open before it closes, got {opens} and {closes} s")

@@ -81,12 +81,7 @@ class Grid:
         voxel : float or (float, float, float)
             Distance of neighbouring centres, m, for all axes or for x, y and z. It is met exactly:
             where a side is not a multiple of it, the voxels are centred in the box and the outer ones
-            lie inside.
-
-        Raises
-        ------
-        InputError
-            The voxel size is not positive, or so small that a side has more than a million voxels.
+            lie inside. `InputError` if a side has more than a million.
 
         Examples
         --------
@@ -108,17 +103,13 @@ class Grid:
         Parameters
         ----------
         capture : Capture
+            `InputError` if its record ends before anything hidden could be seen.
         voxel : float
             Distance of neighbouring voxel centres, m.
         near, far : float, optional
             First and last z, m. They default to one voxel in front of the middle of the wall's
             relief, and to the depth that light reaches and returns from within the record, at most
             two wall widths.
-
-        Raises
-        ------
-        InputError
-            The record ends before anything hidden could be seen.
         """
         if not hasattr(capture, "points"):
             raise InputError(f"a grid lies before a Capture's wall, not a {type(capture).__name__}")
@@ -140,23 +131,17 @@ class Grid:
     @classmethod
     def around(cls, volume: Volume, voxel: float, fraction: float = 0.15) -> Grid:
         """Fill the smallest box that holds everything bright in a coarse volume, with one of its
-        voxels to spare.
-
-        Imaging coarsely first and then here finely costs a small part of imaging everything finely.
+        voxels to spare: imaging coarsely first and then here finely costs a small part of imaging
+        everything finely.
 
         Parameters
         ----------
         volume : Volume
-            At least one voxel per half wavelength, or small objects may slip through.
+            At least one voxel per half wavelength, or small objects may slip through; not dark.
         voxel : float
             Distance of neighbouring voxel centres, m.
         fraction : float
             What counts as bright, relative to the brightest voxel.
-
-        Raises
-        ------
-        InputError
-            The volume is dark everywhere.
         """
         indices = np.nonzero(volume.threshold(fraction).magnitude)
         if indices[0].size == 0:
@@ -333,7 +318,7 @@ class Volume:
 
     def export(self, path: str | Path, fraction: float = 0.3) -> None:
         """Write the magnitude for other programs, in the format that the suffix names, whole or not
-        at all.
+        at all; `InputError` for another suffix, or voxels that the format cannot hold.
 
         Parameters
         ----------
@@ -344,11 +329,6 @@ class Volume:
             * ``.ply``, ``.pcd``, ``.csv``: bright voxels as points.
         fraction : float
             Which voxels become points: those with at least this fraction of the brightest.
-
-        Raises
-        ------
-        InputError
-            Another suffix, or voxels that the format cannot hold.
         """
         from nlos.export import export_volume
 
@@ -361,16 +341,8 @@ class Volume:
         save_picture(self, path)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the brightest voxel along every line of sight, as seen from the wall.
-
-        Parameters
-        ----------
-        ax : matplotlib Axes, optional
-            Where to draw; by default the current figure's.
-
-        Returns
-        -------
-        matplotlib Axes
+        """Draw the brightest voxel along every line of sight, as seen from the wall, to matplotlib Axes `ax`,
+        by default the current figure's, and return these.
         """
         picture, sides = self.maximum_projection().brightness, (self.grid.x, self.grid.y)
         return plot_picture(picture, "seen from the wall", ax, unit="brightness", sides=sides)

@@ -34,7 +34,7 @@ def rotate_to_scene(capture: Capture, towards_scene: FloatArray) -> Capture:
     +z: by half a turn around y if it is -z; else the old z, upright in most programs, becomes -y.
     """
     length = float(np.linalg.norm(towards_scene))
-    if not (np.isfinite(length) and length > 0):
+    if not 0 < length < np.inf:
         raise InputError(f"the direction towards the scene must not be 0, got {towards_scene}")
     forward = np.asarray(towards_scene, dtype=np.float64) / length
     if abs(forward[2]) > MIN_Z_COSINE:

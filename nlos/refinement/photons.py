@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -62,13 +62,14 @@ class TimeOfFlight:
 
     def compute_light(self, albedo: AnyArray, voxels: AnyArray, points: AnyArray) -> AnyArray:
         """Return the light (m, bins) of voxels (n,), flat indices, at points (m,)."""
-        light = np.empty((len(points), self._bins), np.float32)
+        bins = self.capture.axis.bins
+        light = np.empty((len(points), bins), np.float32)
         places, albedo = np.take(self._places, voxels, axis=1), np.asarray(albedo, np.float32)
 
         def process_block(some: slice) -> None:
-            changes = np.zeros((some.stop - some.start, self._bins + 2))
+            changes = np.zeros((some.stop - some.start, bins + 2))
             add_expected_light(*self._pairs(points[some]), *self._scale, places, albedo, changes)
-            light[some] = np.cumsum(changes[:, : self._bins], axis=1)
+            light[some] = np.cumsum(changes[:, :bins], axis=1)
 
         run_blocks(process_block, len(points), POINTS_PER_BLOCK)
         return self.spread(light, self.response)
@@ -81,9 +82,10 @@ class TimeOfFlight:
         """
         # Running sums from the end on: a box of light is the difference of two, see the kernel. The
         # response is turned around, as the adjoint of a convolution asks for.
-        sums = np.zeros((len(points), self._bins + 2), np.float32)
+        bins = self.capture.axis.bins
+        sums = np.zeros((len(points), bins + 2), np.float32)
         spread = self.spread(values, self.response[::-1])
-        np.cumsum(spread[:, ::-1], axis=1, out=sums[:, self._bins - 1 :: -1])
+        np.cumsum(spread[:, ::-1], axis=1, out=sums[:, bins - 1 :: -1])
         places, pairs = np.take(self._places, voxels, axis=1), self._pairs(points)
         total = np.zeros(len(voxels), np.float32)
 
@@ -94,10 +96,6 @@ class TimeOfFlight:
         size = max(VOXELS_PER_RUN, -(-len(voxels) // (4 * thread_count())))
         run_blocks(process_block, max(len(voxels), 1), size)
         return total
-
-    @property
-    def _bins(self) -> int:
-        return self.capture.axis.bins
 
     @cached_property
     def _places(self) -> Float32Array:
@@ -115,9 +113,8 @@ class TimeOfFlight:
         return np.array(cell, np.float32), start, np.float32(1 / axis.spacing), self.obliquity
 
     def _pairs(self, points: AnyArray) -> tuple[AnyArray, AnyArray]:
-        lasers = self.capture.lasers
-        lasers = lasers if len(lasers) == 1 else lasers[points]
-        return self.capture.points[points].astype(np.float32), lasers.astype(np.float32)
+        pairs = self.capture.points[points], self.capture.select_lasers(points)
+        return pairs[0].astype(np.float32), pairs[1].astype(np.float32)
 
     def spread(self, values: AnyArray, response: FloatArray) -> AnyArray:
         """Convolve values (m, bins) with a response (n,) in time, whose middle is no delay."""
@@ -475,11 +472,7 @@ class PhotonPlan(Plan):
         kept, held = photons.hold_out(HELD_OUT_FRACTION, HELD_OUT_SEED)
         linear = self.linear.image(photons.capture, progress)
         start = self.linear.image(kept.capture, progress).magnitude.astype(np.float32) ** 2
-        passes = iter([self.linear.cost] * (COARSE_PASSES + self.method.iterations))
-
-        def report_pass() -> None:
-            progress(next(passes))
-
+        report_pass = partial(progress, self.linear.cost)
         fit, linear_light = self._look_over(kept, start, report_pass)
         last = min(FINAL_PASSES, self.method.iterations - 1)
         stopped = fit.run(self.method.iterations - last, report_pass)
@@ -493,7 +486,8 @@ class PhotonPlan(Plan):
             values = show_with_beam(fit, values)
         else:
             stopped = LINEAR_SHOWN
-        progress(sum(passes))  # those that were not needed
+        # those that were not needed
+        progress(self.linear.cost * (self.method.iterations - fit.passes))
         settings = {
             "method": "photon refinement",
             "linear": type(self.linear).__name__,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.linalg import norm
 
 from nlos.capture import Capture, TimeAxis
 from nlos.simulate.kernels import add_facet_light
@@ -25,12 +26,11 @@ from tofclip.units import SPEED_OF_LIGHT
 def add_poisson_noise(
     capture: Capture, peak_counts: float, background: float = 0.0, seed: int = 0
 ) -> Capture:
-    """Draw Poisson counts.
+    """Draw Poisson counts of an expected signal, which is nowhere negative.
 
     Parameters
     ----------
     capture : Capture
-        Expected signal, not negative; its largest measurement maps to `peak_counts`.
     peak_counts : float
         Expected counts in the brightest bin, without background.
     background : float
@@ -38,19 +38,12 @@ def add_poisson_noise(
     seed : int
         Of the random numbers; recorded in the provenance.
 
-    Returns
-    -------
-    Capture
-        Counts.
-
     Raises
     ------
     InputError
         The peak is not positive, the background negative, or the signal negative or dark.
     """
-    if not (
-        np.isfinite(peak_counts) and peak_counts > 0 and np.isfinite(background) and background >= 0
-    ):
+    if not (0 < peak_counts < np.inf and 0 <= background < np.inf):
         raise InputError(
             f"counts need a positive peak and a background of 0 or more, got {peak_counts}, {background}"
         )
@@ -107,13 +100,8 @@ class PointScene:
             Laser spot, m, or one per wall point.
         axis : TimeAxis
         jitter : float
-            Standard deviation of the instrument's Gaussian response, s; its integral over every
-            time bin is exact.
-
-        Raises
-        ------
-        InputError
-            The jitter is not positive.
+            Standard deviation of the instrument's Gaussian response, s, more than 0; its integral over
+            every time bin is exact.
         """
         from scipy.special import ndtr
 
@@ -123,8 +111,8 @@ class PointScene:
         edges = axis.start + axis.spacing * (np.arange(axis.bins + 1) - 0.5)
         edges = edges.reshape(-1, *[1] * (signal.ndim - 1))
         for position, albedo in zip(self.positions, np.asarray(self.albedo), strict=True):
-            outward = np.linalg.norm(dark.laser - position, axis=-1)
-            back = np.linalg.norm(dark.wall - position, axis=-1)
+            outward = norm(dark.laser - position, axis=-1)
+            back = norm(dark.wall - position, axis=-1)
             below = ndtr((edges - (outward + back)) / (SPEED_OF_LIGHT * jitter))
             signal += albedo / (outward * back) ** 2 * np.diff(below, axis=0)
         return replace(dark, signal=np.nan_to_num(signal))
@@ -164,27 +152,15 @@ class Material:
 
 
 class Lambert(Material):
-    """Scatters evenly: paper, plaster, cloth.
-
-    Parameters
-    ----------
-    albedo : float
-        Fraction of light that comes back, 0 to 1.
-    """
+    """Scatters evenly: paper, plaster, cloth; of the light a fraction `albedo` comes back."""
 
     def __init__(self, albedo: float = 1.0) -> None:
         super().__init__(albedo)
 
 
 class Retroreflector(Material):
-    """Sends light back to where it came from: traffic signs, safety vests.
-
-    Parameters
-    ----------
-    albedo : float
-        Fraction of light that comes back, 0 to 1.
-    spread : float
-        Standard deviation about the way back, rad.
+    """Sends light back to where it came from: traffic signs, safety vests; a fraction `albedo`, with a
+    standard deviation `spread` about the way back, rad.
     """
 
     def __init__(self, albedo: float = 1.0, spread: float = 0.1) -> None:
@@ -226,22 +202,19 @@ class Surface:
         Parameters
         ----------
         vertices : (v, 3) array
-            m.
+            m; finite.
         faces : (m, 3) int array
             Corners of each triangle, counter-clockwise as seen from the side that scatters.
         spacing : float
             Largest distance of neighbouring facets, m: a quarter of what the capture resolves is
             enough.
         material : Material, optional
-            Defaults to white Lambert.
+            White Lambert by default.
 
         Raises
         ------
-        ShapeError
-            Vertices are not (v, 3), or faces not (m, 3).
-        InputError
-            A face names a vertex that does not exist, a vertex is not finite, or the spacing is not
-            positive.
+        ShapeError, InputError
+            Arrays of other shapes, faces that name no vertex, or a spacing that is not positive.
         """
         vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
         shapes = vertices.shape, faces.shape
@@ -250,29 +223,17 @@ class Surface:
         known = faces.dtype.kind in "ui" and np.all((faces >= 0) & (faces < len(vertices)))
         if not (known and faces.size):
             raise InputError("faces must name vertices by their index, and there must be one")
-        if not (np.isfinite(spacing) and spacing > 0 and np.all(np.isfinite(vertices))):
+        if not (0 < spacing < np.inf and np.all(np.isfinite(vertices))):
             raise InputError(f"a mesh needs finite vertices and a positive spacing, got {spacing}")
         triangles = vertices[faces]
         positions, crosses, areas = _subdivide_triangles(triangles, spacing)
-        normals = crosses / np.linalg.norm(crosses, axis=1, keepdims=True)
+        normals = crosses / norm(crosses, axis=1, keepdims=True)
         return cls(positions, normals, areas, material or Lambert(), triangles)
 
     @classmethod
     def load(cls, path: str | Path, spacing: float, material: Material | None = None) -> Surface:
         """Read a mesh in m (PLY, OBJ, STL, VTP) by PyVista and cut it into facets; arguments as of
-        `mesh`.
-
-        Parameters
-        ----------
-        path : str or Path
-        spacing : float
-            Side of the facets, m.
-        material : Material, optional
-
-        Raises
-        ------
-        FileFormatError
-            The file is not a triangle mesh, or holds no triangle.
+        `mesh`, `FileFormatError` where it is no triangle mesh.
         """
         import pyvista
 
@@ -296,17 +257,8 @@ class Surface:
         spacing: float,
         material: Material | None = None,
     ) -> Surface:
-        """Build a rectangle that faces the wall, (width, height) in m about its centre (x, y, z).
-
-        Parameters
-        ----------
-        centre : (3,) array_like
-            Metres.
-        size : (float, float)
-            Width and height, m.
-        spacing : float
-            Side of the facets, m.
-        material : Material, optional
+        """Build a rectangle that faces the wall, (width, height) in m about its centre (x, y, z); other
+        arguments as of `mesh`.
         """
         x, y = size[0] / 2, size[1] / 2
         # Counter-clockwise from the wall, which looks along +z with y down.
@@ -325,12 +277,10 @@ class Surface:
             Read from the wall, looking along +z.
         centre : (3,) array
             Middle of the text, m.
-        height : float
-            Height of a capital, m.
-        spacing : float
-            Side of a facet, m.
+        height, spacing : float
+            Of a capital, and the side of a facet, m.
         material : Material, optional
-            Defaults to white Lambert.
+            White Lambert by default.
 
         Raises
         ------
@@ -358,7 +308,7 @@ def _subdivide_triangles(
     finished: list[FloatArray] = []
     count, pending = 0, triangles
     while len(pending):
-        sides = np.linalg.norm(np.roll(pending, -1, axis=1) - pending, axis=2)
+        sides = norm(np.roll(pending, -1, axis=1) - pending, axis=2)
         longest = sides.argmax(axis=1)
         small = sides.max(axis=1) <= spacing
         finished.append(pending[small])
@@ -375,7 +325,7 @@ def _subdivide_triangles(
         pending = np.concatenate(halves)
     facets = np.concatenate(finished)
     crosses = np.cross(facets[:, 1] - facets[:, 0], facets[:, 2] - facets[:, 0])
-    areas = np.linalg.norm(crosses, axis=1) / 2
+    areas = norm(crosses, axis=1) / 2
     # Facets without area, of meshes with repeated corners, have no normal.
     flat = areas > 0
     return facets[flat].mean(axis=1), crosses[flat], areas[flat]
@@ -440,24 +390,9 @@ class HiddenScene:
             raise InputError("a hidden scene needs a surface")
 
     def simulate_capture(self, wall: Any, laser: Any, axis: TimeAxis, jitter: float) -> Capture:
-        """Simulate a capture without noise.
-
-        Parameters
-        ----------
-        wall : (..., 3) array
-            Wall points, m; NaN ones stay dark. Normals follow from a wall given in rows and
-            columns; else they are +z.
-        laser : (3,) or (..., 3) array
-            Laser spot, m, or one per wall point. A lone spot gets the normal of the nearest wall
-            point.
-        axis : TimeAxis
-        jitter : float
-            Standard deviation of the instrument's Gaussian response, s.
-
-        Raises
-        ------
-        InputError
-            The jitter is not positive.
+        """Simulate a capture without noise; arguments as of `PointScene.simulate_capture`. Normals follow
+        from a wall given in rows and columns; else they are +z. A lone laser spot gets the normal of
+        the nearest wall point.
         """
         from scipy.ndimage import gaussian_filter1d
 
@@ -466,7 +401,7 @@ class HiddenScene:
         laser_normals = normals
         if len(dark.lasers) == 1:
             # the laser spot lies on the wall: it has the normal of the wall point next to it
-            nearest = int(np.argmin(np.linalg.norm(dark.points - dark.laser, axis=1)))
+            nearest = int(np.argmin(norm(dark.points - dark.laser, axis=1)))
             laser_normals = normals[nearest : nearest + 1]
         sigma = SPEED_OF_LIGHT * jitter
         fine = axis.spacing / BIN_OVERSAMPLING

@@ -52,7 +52,7 @@ def build_relay_wall(name: str, points: int = 64, width: float = 2.0) -> FloatAr
     """
     if name not in WALLS:
         raise InputError(f"no wall is called '{name}'; choose one of {', '.join(WALLS)}")
-    if points < MIN_POINTS or not (np.isfinite(width) and width > 0):
+    if points < MIN_POINTS or not 0 < width < np.inf:
         raise InputError(
             f"a wall needs at least 2 x 2 points and a positive width, got {points} and {width} m"
         )

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from instruments import finish, take
+from numpy.testing import assert_allclose, assert_array_equal
 
 import devices
 from devices.aravis import UNNUMBERED, find_cameras, load_aravis
@@ -230,8 +231,8 @@ def test_a_streak_picture_has_its_rows_in_time(stand_in):
     stand_in(shot.counts.astype(np.uint16)[np.newaxis], list(range(1, 4)))
     row_ps = (light.row_times[1] - light.row_times[0]) * 1e12
     streak = read_transient(f"aravis://?row_ps={row_ps}")
-    np.testing.assert_array_equal(streak.counts, shot.counts)
-    np.testing.assert_allclose(np.diff(streak.times), np.diff(shot.times), rtol=1e-9)
+    assert_array_equal(streak.counts, shot.counts)
+    assert_allclose(np.diff(streak.times), np.diff(shot.times), rtol=1e-9)
 
 
 def test_each_streak_picture_of_the_emulated_camera_becomes_a_cloud(aravis):
@@ -248,7 +249,7 @@ def test_each_streak_picture_of_the_emulated_camera_becomes_a_cloud(aravis):
     for cloud in clouds:
         assert len(cloud) > 100
         assert 1.6 < np.median(cloud.range) < 3.3
-    np.testing.assert_allclose(first.times, light.row_times)
+    assert_allclose(first.times, light.row_times)
     assert any(np.array_equal(first.counts, light.draw_frame(n)) for n in range(65400, 65420))
 
 
@@ -258,8 +259,8 @@ def test_gated_frames_become_photons_in_time(stand_in):
     stand_in(pictures[[0, 1, 3, 0, 1, 2, 3]], [1, 2, 4, 5, 6, 7, 8])
     gate = "mode=gated&gate_steps=4&gate_step_ps=1000&gate_width_ns=2&gate_offset_ps=500"
     counted = read_photons(f"aravis://?{gate}")
-    np.testing.assert_array_equal(counted.counts, pictures)
-    np.testing.assert_allclose(counted.times, 1e-9 * (0.5 + np.arange(4)))
+    assert_array_equal(counted.counts, pictures)
+    assert_allclose(counted.times, 1e-9 * (0.5 + np.arange(4)))
 
 
 def test_a_camera_that_goes_away(stand_in):

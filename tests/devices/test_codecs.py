@@ -4,6 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given
+from numpy.testing import assert_array_equal
 
 from devices.frames import FrameCodec
 from devices.linospad2 import FIRMWARES, MAX_TIMESTAMPS, LinoSpad2Codec
@@ -93,7 +94,7 @@ def test_a_stream_comes_back_wherever_it_is_cut(name, data):
     cut = codec.count_complete_bytes(stream[: data.draw(st.integers(0, len(stream)))])
     first = codec.decode(stream[:cut], codec.start)
     second = codec.decode(stream[cut:], first.state)
-    np.testing.assert_array_equal(np.concatenate([first.records, second.records]), records)
+    assert_array_equal(np.concatenate([first.records, second.records]), records)
     assert (first.malformed, second.malformed) == (0, 0)
     assert first.records.dtype == codec.dtype
     again = build_codec(name, codec.settings)
@@ -289,7 +290,7 @@ def test_threads_change_nothing(monkeypatch):
         monkeypatch.setenv(THREADS_VARIABLE, threads)
         found.append(codec.decode(as_bytes(stream.tobytes()), 0))
     alone, together = found
-    np.testing.assert_array_equal(together.records, alone.records)
+    assert_array_equal(together.records, alone.records)
     assert together.malformed == alone.malformed == np.count_nonzero(stream[:, 64 * 20 :] >> 31)
     assert len(alone.records) == np.count_nonzero(stream[:, : 64 * 20] >> 31)
 

@@ -16,6 +16,7 @@ import pytest
 import tcspc_files
 import tifffile
 from itex_files import encode_itex
+from numpy.testing import assert_allclose, assert_array_equal
 from tcspc_files import PERIOD, RESOLUTION, T2_TICK, make_decays
 
 import devices
@@ -64,22 +65,22 @@ def test_photons_of_a_ptu(write):
     assert records.dtype == PHOTON_DTYPE
     for channel, decay in enumerate(DECAYS):
         counts = np.bincount(records["bin"][records["channel"] == channel], minlength=200)
-        np.testing.assert_array_equal(counts, decay)
+        assert_array_equal(counts, decay)
     assert known.attribute("resolution_s") == pytest.approx(RESOLUTION)
     assert known.attribute("laser_period_s") == pytest.approx(PERIOD, rel=1e-6)
     streak = read_transient(f"file://{write('ptu')}?bins=200&start_ps=16", bin_width=RESOLUTION)
     # Bins of the file's own width, the first one in the middle of its first: every photon stays in
     # its bin.
-    np.testing.assert_allclose(streak.counts, DECAYS.T, atol=1e-3)
-    np.testing.assert_allclose(streak.times[:2], [16e-12, 48e-12], rtol=1e-9)
+    assert_allclose(streak.counts, DECAYS.T, atol=1e-3)
+    assert_allclose(streak.times[:2], [16e-12, 48e-12], rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["phu", "sdt"])
 def test_histograms_become_a_streak_image(write, kind):
     path = write(kind)
     streak = read_transient(f"file://{path}")
-    np.testing.assert_array_equal(streak.counts, DECAYS.T)
-    np.testing.assert_allclose(np.diff(streak.times), RESOLUTION, rtol=1e-6)
+    assert_array_equal(streak.counts, DECAYS.T)
+    assert_allclose(np.diff(streak.times), RESOLUTION, rtol=1e-6)
     assert read_transient(f"file://{path}", bin_width=1e-12).times[1] == pytest.approx(1e-12)
 
 
@@ -90,12 +91,12 @@ def test_a_picture_is_one_frame(write):
         info = source.info.as_dict()
     assert (info["camera"], info["serial"], info["date"]) == ("C1", "S/N: 5", "1/2/2023")
     records, known = read_all(path)
-    np.testing.assert_array_equal(records["counts"], [counts])
+    assert_array_equal(records["counts"], [counts])
     times = known.array("row_times", float, 1, "s")
-    np.testing.assert_allclose(times, np.arange(6) ** 1.5 * 1e-9, rtol=1e-6)
+    assert_allclose(times, np.arange(6) ** 1.5 * 1e-9, rtol=1e-6)
     streak = read_transient(f"file://{path}")
-    np.testing.assert_array_equal(streak.counts, counts)
-    np.testing.assert_array_equal(streak.times, times)
+    assert_array_equal(streak.counts, counts)
+    assert_array_equal(streak.times, times)
 
 
 def test_pictures_without_a_time_axis(tmp_path):
@@ -165,11 +166,11 @@ def test_a_ptu_is_the_same_in_pieces(write, pieces, monkeypatch):
     path = write("ptu")
     whole, _ = read_all(path)
     monkeypatch.setattr("tofclip.io.tcspc.CHUNK_EVENTS", -(-len(whole) // pieces))
-    np.testing.assert_array_equal(read_all(path)[0], whole)
+    assert_array_equal(read_all(path)[0], whole)
     with devices.open(f"file://{path}") as source:
         source.seek(len(whole) // 2)
         batch = next(source)
-    np.testing.assert_array_equal(batch.records, whole[len(whole) // 2 :][: len(batch)])
+    assert_array_equal(batch.records, whole[len(whole) // 2 :][: len(batch)])
     assert batch.first == len(whole) // 2
 
 
@@ -189,7 +190,7 @@ def test_photons_of_a_file_in_t2_mode(tmp_path, chunk, monkeypatch):
     records, known = read_all(path)
     order = np.argsort(events[:, 0], kind="stable")
     for name, values in (("bin", delay), ("sync", own), ("channel", channel)):
-        np.testing.assert_array_equal(records[name], values[order])
+        assert_array_equal(records[name], values[order])
     assert known.attribute("laser_period_s") == pytest.approx(400e-9)
     assert known.attribute("resolution_s") == T2_TICK
     with pytest.raises(FileFormatError, match="name their channel: sync="):
@@ -261,15 +262,15 @@ def test_photons_of_a_ttbin(ttbin, chunk, monkeypatch):
         known, stats = source.calibration, source.stats
         source.seek(700)
         batch = next(source)
-        np.testing.assert_array_equal(batch.records, records[700 : 700 + len(batch)])
+        assert_array_equal(batch.records, records[700 : 700 + len(batch)])
         assert source.info.details["inputs"] == "-3,1"
     for name, values in (("sync", own), ("bin", delay), ("channel", channel == 1)):
-        np.testing.assert_array_equal(records[name], values)
+        assert_array_equal(records[name], values)
     assert (stats.delivered, stats.lost_device, stats.is_balanced) == (1500, 17, True)
     assert known is not None
     assert known.attribute("laser_period_s") == pytest.approx(12.5e-9)
     streak = read_transient(f"file://{path}?sync=2")
-    np.testing.assert_allclose(streak.counts.sum(axis=0), [sum(channel == -3), sum(channel == 1)])
+    assert_allclose(streak.counts.sum(axis=0), [sum(channel == -3), sum(channel == 1)])
 
 
 def test_a_ttbin_that_cannot_be_read(ttbin, monkeypatch):
@@ -302,10 +303,10 @@ def test_pictures_of_an_sdt_keep_their_shape(tmp_path, channels):
     assert found.image_shape == (4, 6)
     assert found.bin_width == pytest.approx(RESOLUTION)
     per_pixel = np.bincount(found.pixel, found.count, 24).reshape(4, 6)
-    np.testing.assert_array_equal(per_pixel, cube.sum(axis=(0, 3)))
+    assert_array_equal(per_pixel, cube.sum(axis=(0, 3)))
     records, known = read_all(path)
     assert (known.attributes["rows"], known.attributes["columns"]) == (4, 6)
-    np.testing.assert_array_equal(records["histogram"].reshape(cube.shape), cube)
+    assert_array_equal(records["histogram"].reshape(cube.shape), cube)
 
 
 def pack_sdt(path, data, compression=zipfile.ZIP_DEFLATED):
@@ -325,7 +326,7 @@ def pack_sdt(path, data, compression=zipfile.ZIP_DEFLATED):
 def test_packed_blocks_are_read_and_take_no_more_than_they_hold(tmp_path):
     path, counts = tmp_path / "run.sdt", np.arange(50, dtype="<u2")
     pack_sdt(path, counts.tobytes())
-    np.testing.assert_array_equal(read_transient(f"file://{path}").counts[:, 0], counts)
+    assert_array_equal(read_transient(f"file://{path}").counts[:, 0], counts)
     whole = path.read_bytes()
     size = struct.pack("<I", len(whole))  # where the block ends: three gigabytes later
     far = whole.replace(size, struct.pack("<I", 3_400_000_000))
@@ -350,7 +351,7 @@ def test_a_picture_in_t3_mode(tmp_path):
     assert found.image_shape == (3, 4)
     assert found.count.sum() == cube.sum()
     per_pixel = np.bincount(found.pixel, found.count, 12).reshape(3, 4)
-    np.testing.assert_array_equal(per_pixel, cube.sum(axis=(0, 3, 4)))
+    assert_array_equal(per_pixel, cube.sum(axis=(0, 3, 4)))
 
 
 ROWS, COLUMNS, FRAMES = 5, 7, 3
@@ -398,7 +399,7 @@ class Scan:
         expected = np.zeros((ROWS, COLUMNS), int)
         np.add.at(expected, (self.y, x), 1)
         counts = np.bincount(found.pixel, minlength=ROWS * COLUMNS).reshape(ROWS, COLUMNS)
-        np.testing.assert_array_equal(counts, expected)
+        assert_array_equal(counts, expected)
 
 
 @pytest.fixture
@@ -418,7 +419,7 @@ def test_markers_make_a_picture_of_a_file_in_t2_mode(scan, dwell_ms, chunk, monk
     scan.require_pixels(found, scan.x)
     order = np.lexsort((scan.delay, scan.y * COLUMNS + scan.x))
     bins = found.bin[np.lexsort((found.bin, found.pixel))]
-    np.testing.assert_allclose(bins, scan.delay[order], atol=0.01)
+    assert_allclose(bins, scan.delay[order], atol=0.01)
     assert described["layout"] == "events"
     assert described["arrays"]["x"] == f"{len(scan.x)} uint16"
 
@@ -463,5 +464,5 @@ def test_events_beyond_2_gib(tmp_path):
     assert large.events == events
     last, _ = large.decode(large.pieces - 1, Checkpoint())
     assert expected.is_photon.sum() == 20
-    np.testing.assert_array_equal(last.delay[-len(photons) :], expected.delay)
-    np.testing.assert_array_equal(last.channel[-len(photons) :], expected.channel)
+    assert_array_equal(last.delay[-len(photons) :], expected.delay)
+    assert_array_equal(last.channel[-len(photons) :], expected.channel)

@@ -4,6 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given
+from numpy.testing import assert_allclose
 
 from devices.files import PHOTON_DTYPE
 from devices.histogram import BinAxis, BinHistogram, StampHistogram, TagHistogram
@@ -57,7 +58,7 @@ def test_times_are_shared_out_over_the_bins_they_cover(axis, seed, resolution):
     expected = np.stack([shares[pixels == pixel].sum(axis=0) for pixel in range(3)], axis=1)
     # Positions of 60 ns / 20 ps = 3000 bins in float64 and widths of a quarter bin, summed 40
     # times; see NOTHING.
-    np.testing.assert_allclose(histogram.counts, expected, atol=1e-6)
+    assert_allclose(histogram.counts, expected, atol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +99,8 @@ def test_stamps_are_shared_out_over_their_codes(board, period):
     np.add.at(expected.T, pixels, shares)
     # float32 tables: 700 bins to 6e-8 of their value, divided by codes as narrow as a hundredth of
     # a bin.
-    np.testing.assert_allclose(histogram.counts, expected, atol=5e-3)
-    np.testing.assert_allclose(histogram.counts.sum(), expected.sum(), rtol=1e-5)
+    assert_allclose(histogram.counts, expected, atol=5e-3)
+    assert_allclose(histogram.counts.sum(), expected.sum(), rtol=1e-5)
 
 
 def test_even_light_gives_even_bins_whatever_the_codes(board):
@@ -139,7 +140,7 @@ def test_stamps_with_a_counter_and_in_pieces(board, monkeypatch):
     pieces.add(counted[:150_000])
     pieces.add(counted[150_000:])
     # The order of additions in float64.
-    np.testing.assert_allclose(pieces.counts, whole.counts, atol=1e-6)
+    assert_allclose(pieces.counts, whole.counts, atol=1e-6)
 
 
 def tags(rows):
@@ -162,7 +163,7 @@ def test_tags_count_from_the_last_pulse():
     expected = np.zeros((10, 2))
     expected[[2, 5, 0], 0] = 1
     expected[5, 1] = 1
-    np.testing.assert_allclose(histogram.counts, expected, atol=1e-9)
+    assert_allclose(histogram.counts, expected, atol=1e-9)
 
 
 def test_tags_after_a_gap_wait_for_the_next_pulse():
@@ -188,7 +189,7 @@ def test_tags_on_threads_know_the_pulse_before_their_piece(monkeypatch):
         histogram = TagHistogram(axis, 0, (1, 2), 1e-9)
         histogram.add(records)
         found.append(histogram.counts)
-    np.testing.assert_allclose(found[1], found[0], atol=1e-6)
+    assert_allclose(found[1], found[0], atol=1e-6)
     # An interval at either end may stick out.
     assert found[0].sum() == pytest.approx(300_000 - 5, abs=1)
 
@@ -198,7 +199,7 @@ def test_the_sum_is_a_streak_image_that_does_not_trust_hot_pixels(board):
     pixels = np.arange(256)
     histogram.add(stamps_at(np.full(256, 27e-9), pixels, board))
     streak = histogram.to_streak()
-    np.testing.assert_allclose(streak.times, 1e-9 + np.arange(100) * 20 * PS, rtol=1e-12)
+    assert_allclose(streak.times, 1e-9 + np.arange(100) * 20 * PS, rtol=1e-12)
     assert streak.saturated is not None
     assert np.flatnonzero(streak.saturated.any(axis=0)).tolist() == [17, 200]
     # All at 2 ns after a pulse: row 50, and no code is longer than three rows.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from instruments import finish, take
+from numpy.testing import assert_array_equal
 
 import devices
 from devices.emulation.histogram_kits import (
@@ -53,7 +54,7 @@ def test_three_bytes_of_every_bin_come_together(zones):
     for number, seed in enumerate((1, 2, 3)):
         counts = draw_counts(zones, seed)
         (frame,) = parse(parser, format_tmf8828(counts, number, 5000))
-        np.testing.assert_array_equal(frame.counts, counts)
+        assert_array_equal(frame.counts, counts)
         assert (frame.missing, frame.stamp) == (0, pytest.approx(1e-3))
 
 
@@ -72,7 +73,7 @@ def test_halves_that_are_both_numbered_from_0():
             words[2] = b"%d" % (int(words[2]) % 30)
         lines.append(b",".join(words))
     (frame,) = parse(make_tmf_parser(), lines)
-    np.testing.assert_array_equal(frame.counts, counts)
+    assert_array_equal(frame.counts, counts)
     assert frame.stamp is None
 
 
@@ -103,10 +104,10 @@ def test_compact_histograms_of_each_zone():
     counts = draw_counts(16, 5, 24) % 100_000
     lines = [b"Zone 3: No target\r\n", *format_vl53l8(counts), *format_vl53l8(counts)[:9]]
     (frame,) = parse(parser, lines)
-    np.testing.assert_array_equal(frame.counts, counts)
+    assert_array_equal(frame.counts, counts)
     # The next one is cut and begins anew: it is whole, and what was cut is not counted twice.
     (again,) = parse(parser, format_vl53l8(counts))
-    np.testing.assert_array_equal(again.counts, counts)
+    assert_array_equal(again.counts, counts)
     torn = format_vl53l8(counts)
     torn[5] = torn[5][:-9] + b"\r\n"
     assert parse(parser, torn)[0].counts is None

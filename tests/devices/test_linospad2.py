@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import devices
 from devices import linospad2
@@ -54,7 +55,7 @@ def test_times_follow_the_formula(uneven):
     ]
     # float64 resolves 5 ms to 1e-18 s; the table's own digits were multiplied by 1e12 and back.
     known = np.array(expected) * 1e-12
-    np.testing.assert_allclose(uneven.times(records), known, atol=1e-16, rtol=1e-14)
+    assert_allclose(uneven.times(records), known, atol=1e-16, rtol=1e-14)
 
 
 @pytest.mark.parametrize(("board", "hot"), [("NL11_#33_2212b", 66), ("B7d_#28_2212s", 37)])
@@ -67,12 +68,12 @@ def test_recorded_boards(shared_data, light, board, hot):
     name, firmware = board.rsplit("_", 1)
     code_table, offset_table = folder / f"TDC_{board}.csv", folder / f"Offset_{board}.npy"
     tables = load_calibration(code_table, offset_table, folder / f"mask_{name}.txt")
-    np.testing.assert_allclose(tables.code_ends[:, -1].max(), 2500e-12, rtol=1e-12)
+    assert_allclose(tables.code_ends[:, -1].max(), 2500e-12, rtol=1e-12)
     assert hot in tables.hot_pixels
     raw = np.loadtxt(code_table, delimiter=",", skiprows=1)
     records = np.array([(0, 140 * 7 + 93, 100)], LinoSpad2Codec().dtype)
     expected = 7 * 2500 + raw[100, 94] + np.load(offset_table)[100]
-    np.testing.assert_allclose(tables.times(records) * 1e12, [expected], rtol=1e-12)
+    assert_allclose(tables.times(records) * 1e12, [expected], rtol=1e-12)
     codec = LinoSpad2Codec(firmware)
     simulated, errors = SimulatedBoard(light, tables, codec, 8000, 1), []
     for known in (tables, BoardCalibration.ideal()):
@@ -96,7 +97,7 @@ def test_a_calibration_survives_storage(uneven, tmp_path):
         board.to_record().save(tmp_path / "board.h5")
         found = BoardCalibration.from_record(type(board.to_record()).load(tmp_path / "board.h5"))
         for name in ("code_ends", "offsets", "hot_pixels"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(board, name))
+            assert_array_equal(getattr(found, name), getattr(board, name))
 
 
 @pytest.mark.parametrize(
@@ -127,15 +128,13 @@ def test_sidecars_say_all_or_the_least(recording, uneven):
     recording.with_suffix(".toml").write_text(SIDECAR + tables + rest)
     found = read_sidecar(recording)
     assert found.codec == CODEC
-    np.testing.assert_allclose(
-        found.calibration.code_ends, uneven.code_ends, rtol=1e-15, atol=1e-24
-    )
+    assert_allclose(found.calibration.code_ends, uneven.code_ends, rtol=1e-15, atol=1e-24)
     assert found.calibration.hot_pixels.tolist() == [15, 231]
     assert (found.board, found.camera) == ("B7d", "camera.h5")
     assert found.laser_period == pytest.approx(25e-9, rel=1e-12)
     recording.with_suffix(".toml").write_text(SIDECAR)
     found, ideal = read_sidecar(recording), BoardCalibration.ideal()
-    np.testing.assert_array_equal(found.calibration.code_ends, ideal.code_ends)
+    assert_array_equal(found.calibration.code_ends, ideal.code_ends)
     assert (found.laser_period, found.camera) == (None, "")
 
 
@@ -202,7 +201,7 @@ def records_of(source):
 def test_a_recording_gives_every_stamp(stamps, scheme):
     expected = CODEC.decode(np.frombuffer(stamps.read_bytes(), np.uint8), 0).records
     with devices.open(f"{scheme}://{stamps}") as source:
-        np.testing.assert_array_equal(records_of(source), expected)
+        assert_array_equal(records_of(source), expected)
         assert "not public" in str(source.info.details["limits"])
         known = source.calibration
     assert source.stats.delivered == len(expected)
@@ -217,7 +216,7 @@ def test_a_recording_that_was_cut_off(stamps):
     stamps.write_bytes(stamps.read_bytes()[:-10])
     with devices.open(f"linospad2://{stamps}") as source:
         found = records_of(source)
-    np.testing.assert_array_equal(found, whole[whole["cycle"] < 19])
+    assert_array_equal(found, whole[whole["cycle"] < 19])
     assert (source.stats.malformed, source.stats.is_balanced, source.stats.unread) == (1, True, 0)
     stamps.write_bytes(b"short")
     with pytest.raises(FileFormatError, match="one cycle takes"):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from instruments import joined
+from numpy.testing import assert_array_equal
 from test_faults import draw_tagger_script
 
 import devices
@@ -153,10 +154,8 @@ def test_everything_about_the_instrument_is_kept(path):
     with devices.open(f"file://{path}") as source:
         assert source.info == INFO
         assert source.calibration is not None
-        np.testing.assert_array_equal(
-            source.calibration.array("table", float, 1, "s"), np.arange(5)
-        )
-        np.testing.assert_array_equal(joined(list(source)), np.concatenate(records))
+        assert_array_equal(source.calibration.array("table", float, 1, "s"), np.arange(5))
+        assert_array_equal(joined(list(source)), np.concatenate(records))
         assert source.stats == Stats(600, 600)
     with Recording(path) as recording:
         assert recording.head.provenance == {"verb": "test"}
@@ -393,7 +392,7 @@ def test_damage_is_found_and_the_rest_is_saved(tmp_path_factory, data):
     repair(path, out)
     saved = replayed(out)
     kept = [records for number, records in enumerate(pieces, 1) if number != victim]
-    np.testing.assert_array_equal(joined(saved), np.concatenate(kept))
+    assert_array_equal(joined(saved), np.concatenate(kept))
     gaps = [number for number, batch in enumerate(saved) if batch.after_gap]
     assert gaps == ([victim - 1] if victim < PIECES else [])
     assert (verify(out).is_sound, verify(out).complete) == (True, False)
@@ -408,7 +407,7 @@ def test_a_file_without_its_front_and_end_is_rebuilt(path, out):
     path.write_bytes(bytes(2000) + path.read_bytes()[2000:-20])
     # one head, and the piece that was cut off
     assert verify(path).damaged_blocks == repair(path, out).damaged_blocks == 2
-    np.testing.assert_array_equal(joined(replayed(out)), np.concatenate(pieces[:-1]))
+    assert_array_equal(joined(replayed(out)), np.concatenate(pieces[:-1]))
     with ReplaySource(out) as source:
         assert source.calibration is not None
         assert source.info.serial == "7"

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from instruments import finish, read_gaps, take
+from numpy.testing import assert_allclose, assert_array_equal
 
 import devices
 from devices.emulation.harness import HOST, Fault, LoopbackServer
@@ -105,7 +106,7 @@ def opened(server, **values):
 def require_pictures(frames):
     """Require the streak camera's pictures, bit for bit, by their numbers."""
     for frame in frames:
-        np.testing.assert_array_equal(frame["counts"], LIGHT.draw_frame(int(frame["number"])))
+        assert_array_equal(frame["counts"], LIGHT.draw_frame(int(frame["number"])))
 
 
 # What drivers of both have in common
@@ -336,7 +337,7 @@ def test_pictures_come_in_order_and_bit_for_bit(camera):
     assert (info["rows"], info["columns"]) == (12, 20)
     assert known is not None
     # float32 numbers in ns, as the camera sends them.
-    np.testing.assert_allclose(known.array("row_times", float, 1, "s"), LIGHT.row_times, rtol=1e-7)
+    assert_allclose(known.array("row_times", float, 1, "s"), LIGHT.row_times, rtol=1e-7)
 
 
 def test_pictures_that_fell_out_of_the_ring_are_accounted_for(camera):
@@ -396,13 +397,11 @@ def test_a_synchroscan_unit_counts_its_time_in_ps(camera):
     with opened(camera(time_range="3")) as source:
         assert source.calibration is not None
         times = source.calibration.fields["row_times"].values
-        np.testing.assert_allclose(times, LIGHT.row_times, rtol=1e-6)
+        assert_allclose(times, LIGHT.row_times, rtol=1e-6)
     server = camera(time_range="2", has_scaling_table=False)
     with opened(server, time_ranges_ps="165,480,1200") as source:
         assert source.calibration is not None
-        np.testing.assert_allclose(
-            np.diff(source.calibration.fields["row_times"].values), 480e-12 / 12
-        )
+        assert_allclose(np.diff(source.calibration.fields["row_times"].values), 480e-12 / 12)
 
 
 def test_an_emulated_camera_sees_a_scene():
@@ -497,7 +496,7 @@ def test_single_bits_lie_as_the_other_depths_do(array):
     corner = np.zeros((ROWS, ROWS))
     corner[:100, :50] = 1e9
     with opened(array(light=corner), bits=1, width=512) as source:
-        np.testing.assert_array_equal(take(source, 1)[0]["counts"] > 0, corner > 0)
+        assert_array_equal(take(source, 1)[0]["counts"] > 0, corner > 0)
         finish(source)
 
 
@@ -517,7 +516,7 @@ def test_pixels_that_spell_the_end_are_pixels():
 
     with LoopbackServer(serve) as server, opened(server, width=4) as source:
         for frame in take(source, 3):
-            np.testing.assert_array_equal(frame["counts"].ravel(), pixels)
+            assert_array_equal(frame["counts"].ravel(), pixels)
 
 
 def test_a_picture_that_was_cut_is_malformed(array):

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from instruments import TAGS, finish, joined, make_tagger, read_until_dark, true_records
+from numpy.testing import assert_allclose, assert_array_equal
 
 import devices
 from devices.emulation.harness import Fault
@@ -95,7 +96,7 @@ def test_photons_are_poisson():
     assert abs(gaps.mean() - 10) < 0.11
     assert abs(gaps.std() - np.sqrt(90)) < 0.2
     shares = np.bincount(records["channels"], minlength=9)[[1, 2, 4, 8]] / len(records)
-    np.testing.assert_allclose(shares, 0.25, atol=0.005)  # four standard deviations
+    assert_allclose(shares, 0.25, atol=0.005)  # four standard deviations
 
 
 def test_wraps_are_in_the_stream_and_cuts_are_not():
@@ -107,11 +108,11 @@ def test_wraps_are_in_the_stream_and_cuts_are_not():
         for number in range(500)
     ]
     cut = np.concatenate(pieces)
-    np.testing.assert_array_equal(cut, whole[: len(cut)])
+    assert_array_equal(cut, whole[: len(cut)])
     found = TAGS.decode(as_bytes(whole), TAGS.start)
     assert found.malformed == 0
     marks = found.records[found.records["flags"] == WRAP]["time_ticks"]
-    np.testing.assert_array_equal(marks, COUNTER_RANGE * np.arange(1, len(marks) + 1))
+    assert_array_equal(marks, COUNTER_RANGE * np.arange(1, len(marks) + 1))
     assert len(marks) == found.records["time_ticks"][-1] // COUNTER_RANGE > 5
 
 
@@ -219,7 +220,7 @@ def test_a_loose_plug_is_followed():
 )
 def test_every_record_of_this_session_and_no_other(unkind, packet):
     instrument = make_tagger(transfer_kib=4, packet_bytes=packet, records=RECORDS, **unkind)
-    np.testing.assert_array_equal(read_all(instrument), true_records(1, RECORDS))
+    assert_array_equal(read_all(instrument), true_records(1, RECORDS))
 
 
 @pytest.mark.parametrize("rate", [20.0, 1000.0, 6000.0])
@@ -297,7 +298,7 @@ def test_records_of_the_last_session_are_thrown_away_though_they_come_slowly(sil
 
     instrument = make_tagger(Slow, transfer_kib=4, records=RECORDS, **OLD)
     ticks = read_all(instrument)["time_ticks"]
-    np.testing.assert_array_equal(ticks, true_records(1, RECORDS)["time_ticks"])
+    assert_array_equal(ticks, true_records(1, RECORDS)["time_ticks"])
 
 
 @pytest.mark.parametrize("number", range(12))
@@ -354,7 +355,7 @@ def test_cuts_do_not_change_the_stream(light):
     pieces = [scene.next_words(*limit) for limit in limits]
     assert len(pieces[2]) == 0
     pieces.append(scene.next_words(40_000 - sum(map(len, pieces)) // 6, MAX_TICK))
-    np.testing.assert_array_equal(TAGS.decode(np.concatenate(pieces), TAGS.start).records, whole)
+    assert_array_equal(TAGS.decode(np.concatenate(pieces), TAGS.start).records, whole)
     assert len(scene.next_words(0, MAX_TICK)) == 0
 
 
@@ -381,4 +382,4 @@ def test_it_becomes_a_streak_image_of_three_columns(light):
     mean = SCENE_SCALE * (light.row_times[:, np.newaxis] * columns).sum(0) / columns.sum(0)
     measured = (streak.times[:, np.newaxis] * streak.counts).sum(0) / streak.counts.sum(0)
     # Within a tick: a record says only in which one a photon came.
-    np.testing.assert_allclose(measured, mean, atol=1 / CLOCK_HZ)
+    assert_allclose(measured, mean, atol=1 / CLOCK_HZ)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from devices import transients
 from devices.address import Options, option
@@ -59,8 +60,8 @@ def test_tags_of_two_channels(canned):
     expected[3, 0] = expected[2, 1] = (
         1  # the photon at 9 came after a gap, and no pulse before it is known
     )
-    np.testing.assert_allclose(streak.counts, expected, atol=1e-6)
-    np.testing.assert_allclose(streak.times, 0.5e-9 + np.arange(5) * 1e-9, rtol=1e-12)
+    assert_allclose(streak.counts, expected, atol=1e-6)
+    assert_allclose(streak.times, 0.5e-9 + np.arange(5) * 1e-9, rtol=1e-12)
 
 
 def frames(*numbers):
@@ -78,8 +79,8 @@ def test_frames_are_added_up(canned):
     streak = read_transient("canned://?frames=3")
     expected = np.full((3, 4), 8.0)
     expected[2, 3] += 65534
-    np.testing.assert_array_equal(streak.counts, expected)
-    np.testing.assert_array_equal(streak.times, times)
+    assert_array_equal(streak.counts, expected)
+    assert_array_equal(streak.times, times)
     assert streak.saturated is not None
     assert np.argwhere(streak.saturated).tolist() == [[2, 3]]
     canned([Batch(frames(1))])

@@ -1,6 +1,7 @@
 """Frames of a camera that looks at a relay wall."""
 
 import numpy as np
+from numpy.linalg import norm
 
 from tofclip.camera import Camera
 from tofclip.shots import Frames
@@ -39,8 +40,8 @@ def see_by_camera(wall, bins=800):
     camera, drawn without any shifting; the record begins `DELAY_BINS` bins after light of path 0
     would have arrived by way of the laser spot.
     """
-    late = np.linalg.norm(wall - CAMERA, axis=-1) - np.linalg.norm(LASER - CAMERA)
-    path = np.linalg.norm(LASER - HIDDEN) + np.linalg.norm(wall - HIDDEN, axis=-1) + late
+    late = norm(wall - CAMERA, axis=-1) - norm(LASER - CAMERA)
+    path = norm(LASER - HIDDEN) + norm(wall - HIDDEN, axis=-1) + late
     arrival_bins = path / (SPEED_OF_LIGHT * BIN_WIDTH) - DELAY_BINS
     rows, columns = wall.shape[:2]
     values = np.zeros((bins, rows + 5, columns + 6))

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.linalg import norm
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
@@ -46,7 +47,7 @@ def test_phasors_are_the_weighted_fourier_sum_of_their_definition():
     single = band.compute_phasors(signal.astype(np.float32))
     assert single.dtype == np.complex64
     # float32 sums of 300 terms.
-    assert np.linalg.norm(single - expected) < 1e-5 * np.linalg.norm(expected)
+    assert norm(single - expected) < 1e-5 * norm(expected)
 
 
 @pytest.mark.parametrize(
@@ -72,4 +73,4 @@ def test_tails_too_small_for_normal_numbers_change_nothing():
     # faint signals are no tails
     faint = band.compute_phasors(np.float32(1e-25) * signal)
     expected = 1e-25 * band.compute_phasors(signal).astype(np.complex128)
-    assert np.linalg.norm(faint - expected) < 1e-5 * np.linalg.norm(expected)
+    assert norm(faint - expected) < 1e-5 * norm(expected)

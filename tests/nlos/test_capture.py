@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes
+from numpy.linalg import norm
 from relay_frames import (
     BIN_WIDTH,
     CAMERA,
@@ -207,7 +208,7 @@ def test_frames_become_a_capture_that_shows_the_hidden_point_where_it_is():
     grid = Grid.box((-0.2, 0.2), (-0.2, 0.2), (0.2, 0.4), 0.02)  # holds the point itself
     brightest = Backprojection(0.06).reconstruct(capture, grid).find_brightest()
     assert brightest == pytest.approx(HIDDEN, abs=1e-9)
-    path = np.linalg.norm(LASER - brightest) + np.linalg.norm(wall - brightest, axis=-1)
+    path = norm(LASER - brightest) + norm(wall - brightest, axis=-1)
     centroid = np.tensordot(capture.axis.paths, capture.signal, 1) / capture.signal.sum(axis=0)
     # Linear interpolation keeps the centroid; float32 sums of 800 bins leave 1e-4 of a bin.
     assert np.max(np.abs(centroid - path)) < 1e-3 * capture.axis.spacing
@@ -235,8 +236,8 @@ def test_both_legs_to_the_device_are_taken_off(moving):
     wall = wall_of(9, 11)
     laser = wall[:, ::-1] if moving else LASER
     source, start = np.array([0.4, -0.2, 1.3]), 2.0
-    legs = np.linalg.norm(laser - source, axis=-1) + np.linalg.norm(wall - CAMERA, axis=-1)
-    path = np.linalg.norm(laser - HIDDEN, axis=-1) + np.linalg.norm(wall - HIDDEN, axis=-1)
+    legs = norm(laser - source, axis=-1) + norm(wall - CAMERA, axis=-1)
+    path = norm(laser - HIDDEN, axis=-1) + norm(wall - HIDDEN, axis=-1)
     arrival = (path + legs - start) / SPACING
     signal = np.exp(-0.5 * ((np.arange(1500)[:, None, None] - arrival) / 5) ** 2)
     wall[0, 0] = np.nan  # must not decide what is common to all

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from scenes import around, distance_to_nearest, find_refusal, relative_error, scaled_error, see
 
 from nlos import Capture, FKMigration, Grid, LightCone
@@ -193,8 +194,8 @@ def test_the_filter_is_wiener_s():
     spectrum = np.ones((4, 4, 4), np.complex64)
     apply_wiener_filter(spectrum, quarter.astype(np.complex64), 0.5)
     expected = quarter.conj() / (np.abs(quarter) ** 2 + 2)
-    np.testing.assert_allclose(spectrum[:3, :3], expected, rtol=1e-5)
-    np.testing.assert_allclose(spectrum[3, 3], expected[1, 1], rtol=1e-5)
+    assert_allclose(spectrum[:3, :3], expected, rtol=1e-5)
+    assert_allclose(spectrum[3, 3], expected[1, 1], rtol=1e-5)
 
 
 def test_migration_keeps_the_sign_of_signals_below_the_background():

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from scenes import planar_wall, voxels_of
 
 from nlos import Grid, PlanarRSD, Volume
@@ -47,7 +48,7 @@ def test_a_tilted_square_has_its_depth_and_direction(turn, confocal):
     # a bin, or a quarter of the wavelength
     assert np.median(np.abs(z[inner] - plane)) < (0.005 if confocal else 0.03)
     normals = found.normals[found.seen][inner]
-    assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert np.allclose(norm(normals, axis=1), 1, atol=1e-5)
     true = [np.sin(angle), 0, -np.cos(angle)]
     errors = np.degrees(np.arccos(np.clip(normals @ true, -1, 1)))
     assert np.median(errors) < 12
@@ -89,13 +90,13 @@ def test_a_sphere_has_its_normals():
     """A bright shell about a centre: brightness changes most towards it."""
     centre, radius = CENTRE + np.array([0, 0, 0.15]), 0.3
     away = voxels_of(GRID) - centre
-    shell = np.exp(-(((np.linalg.norm(away, axis=-1) - radius) / 0.03) ** 2))
+    shell = np.exp(-(((norm(away, axis=-1) - radius) / 0.03) ** 2))
     # Only its front half is seen.
     found = find_front_surface(Volume(shell * (away[..., 2] < 0), GRID), 0.5)
     outward = found.points - centre
-    inner = np.linalg.norm(outward[:, :2], axis=1) < 0.2
+    inner = norm(outward[:, :2], axis=1) < 0.2
     assert inner.sum() > 200
-    distance = np.linalg.norm(outward, axis=1)
+    distance = norm(outward, axis=1)
     # A tenth of a voxel, where the shell is steep it is brightest a little behind.
     assert np.median(np.abs(distance[inner] - radius)) < 0.005
     cosines = np.sum(found.normals[found.seen] * outward / distance[:, None], axis=1)[inner]

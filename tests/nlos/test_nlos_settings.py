@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from scenes import planar_wall, reorder, see
 
 from nlos import Capture, Grid, Settings, Volume, reconstruct, settings_for
@@ -27,7 +28,7 @@ def clean(confocal=True):
 
 def with_glare(capture, peak, fades=0.05):
     """Add the wall's own light, which fades by e over so much path."""
-    direct = np.linalg.norm(capture.wall - capture.laser, axis=-1)
+    direct = norm(capture.wall - capture.laser, axis=-1)
     late = capture.axis.paths[:, None, None] - direct
     glare = np.where(late >= 0, np.exp(-np.maximum(late, 0) / fades), 0)
     return replace(capture, signal=capture.signal + peak * capture.signal.max() * glare)
@@ -49,7 +50,7 @@ def test_the_walls_own_light_is_recognised_and_gated(confocal, peak):
 def lit_late(hidden, confocal, peak=0.0, fades=1.0):
     """Every wall point sees light of brightness 1 that much path (m) after the wall's own."""
     axis, laser = TimeAxis(1700, 3e-12), WALL if confocal else np.zeros(3)
-    late = axis.paths[:, None, None] - np.linalg.norm(WALL - laser, axis=-1)
+    late = axis.paths[:, None, None] - norm(WALL - laser, axis=-1)
     glare = np.where(late >= 0, peak * np.exp(-np.maximum(late, 0) / fades), 0)
     signal = glare + np.exp(-(((late - hidden) / 0.05) ** 2) / 2)
     return Capture(signal, WALL, laser, axis.bin_width)
@@ -117,7 +118,7 @@ def test_a_record_that_begins_amid_the_walls_own_light_is_gated_alike():
 def test_what_comes_before_the_walls_own_light_can_is_noise():
     """Recovered frames are not dark before: their noise is no light of the wall's."""
     capture = clean(confocal=False)
-    early = capture.axis.paths[:, None, None] < np.linalg.norm(WALL, axis=-1) - 0.15
+    early = capture.axis.paths[:, None, None] < norm(WALL, axis=-1) - 0.15
     noise = 0.2 * capture.signal.max() * early
     assert find_first_bounce(replace(capture, signal=capture.signal + noise)) is None
 

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from scenes import distance_to_nearest, energy_fraction, planar_wall, see
 
 from nlos import Capture, Grid, Hybrid
@@ -174,7 +175,7 @@ def test_brightness_of_known_light_is_found():
     truth = light * (20 * 64**2 / light.sum(dtype=float)) + BACKGROUND
     # Of many photons, Poisson's noise leaves a percent.
     assert found.sum() == pytest.approx(photons.counts.sum(), rel=0.01)
-    assert np.linalg.norm(found - truth) < 0.03 * np.linalg.norm(truth)
+    assert norm(found - truth) < 0.03 * norm(truth)
     gain, noise = compare_likelihoods(photons.counts, truth, np.ones_like(truth), photons.observed)
     assert gain > 10 * noise > 0
 
@@ -182,7 +183,7 @@ def test_brightness_of_known_light_is_found():
 def test_the_walls_own_light_is_left_out_of_account():
     """Glare in the first 0.2 m after the direct path changes nothing but what it blanks."""
     capture = count("planar", "points", 20, 16, seed=2)
-    direct = np.linalg.norm(capture.wall - capture.laser, axis=-1)
+    direct = norm(capture.wall - capture.laser, axis=-1)
     glare = 1000 * (np.abs(AXIS.paths[:, None, None] - direct - 0.1) < 0.05)
     method = PhotonRefinement(LINEAR, iterations=2, blank=0.2)
     bright = Capture(capture.signal + glare, capture.wall, capture.laser, AXIS.bin_width)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from array_places import DEVICE_NAMES, find_device
+from numpy.testing import assert_allclose
 from scenes import (
     HIDDEN,
     JITTER,
@@ -221,7 +222,7 @@ def test_a_capture_is_checked_stored_and_prepared_where_it_lives(library, tmp_pa
         found, expected = prepare(moved), prepare(capture)
         assert found.device == device
         assert found.axis == expected.axis
-        np.testing.assert_allclose(to_numpy(found.signal), expected.signal, rtol=1e-6, atol=1e-6)
+        assert_allclose(to_numpy(found.signal), expected.signal, rtol=1e-6, atol=1e-6)
 
 
 PREPARATIONS = (
@@ -392,7 +393,7 @@ def test_preparation_stays_on_its_device(elsewhere):
     capture = mask(see_planar(), (2, 3))
     for prepare in PREPARATIONS:
         found = elsewhere.fetch(prepare(capture.on(elsewhere.device)).signal)
-        np.testing.assert_allclose(found, prepare(capture).signal, rtol=1e-6, atol=1e-7)
+        assert_allclose(found, prepare(capture).signal, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("method", [RSD, HYBRID, BACKPROJECTION])

@@ -2,10 +2,13 @@
 such files can fail.
 """
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
 import scipy.io
+from numpy.linalg import norm
 from relay_frames import BIN_WIDTH, DELAY_BINS, frames_of, relay_wall, see_by_camera, wall_of
 from scenes import HIDDEN, around, planar_wall, see
 
@@ -27,10 +30,10 @@ def simulated(laser=SPOT, wall=WALL, axis=AXIS):
     return see([HIDDEN], wall, laser, axis)
 
 
-def with_legs(capture, start):
+def with_legs(capture, start=3.6):
     """The same light as a device records it, drawn without any shifting."""
-    path = sum(np.linalg.norm(capture.laser - end, axis=-1) for end in (SOURCE, HIDDEN))
-    path = path + sum(np.linalg.norm(capture.wall - end, axis=-1) for end in (EYE, HIDDEN))
+    path = sum(norm(capture.laser - end, axis=-1) for end in (SOURCE, HIDDEN))
+    path = path + sum(norm(capture.wall - end, axis=-1) for end in (EYE, HIDDEN))
     paths = start + AXIS.spacing * np.arange(400)
     return np.exp(-0.5 * ((paths.reshape(-1, *[1] * path.ndim) - path) / 0.012) ** 2), start
 
@@ -53,11 +56,11 @@ def refused(path, problem, error=FileFormatError):
         read_capture(path)
 
 
-# --- our own
+# --- our own, and NumPy archives
 
 
 def test_our_own_captures_keep_their_history(tmp_path):
-    capture = Capture(simulated().signal, WALL, SPOT, AXIS.bin_width, AXIS.start, {"shot": 7})
+    capture = replace(simulated(), provenance={"shot": 7})
     capture.save(tmp_path / "wall.h5")
     found = read_capture(tmp_path / "wall.h5")
     same(found, capture)
@@ -72,23 +75,46 @@ def test_frames_with_a_wall_become_a_capture(tmp_path):
     assert found.start == pytest.approx(DELAY_BINS * BIN_WIDTH * SPEED_OF_LIGHT)
 
 
-# --- NumPy archives
-
-
 @pytest.mark.parametrize("laser", [SPOT, WALL], ids=["single", "confocal"])
-def test_a_numpy_archive(laser, tmp_path):
-    expected = simulated(laser)
-    arrays = {
-        "H": expected.signal,
-        "wall_xyz": WALL.astype(np.float32),
-        "laser_xyz": laser.astype(np.float32),
-    }
-    np.savez(
-        tmp_path / "a.npz", **arrays, delta_t_s=AXIS.bin_width, t_start_m=AXIS.start, confocal=1
-    )
+@pytest.mark.parametrize("unit", ["s", "m"])
+def test_a_numpy_archive(laser, unit, tmp_path):
+    expected, width = simulated(laser), AXIS.bin_width if unit == "s" else AXIS.spacing
+    geometry = {"wall_xyz": WALL.astype(np.float32), "laser_xyz": laser.astype(np.float32)}
+    times = {f"delta_t_{unit}": width, "t_start_m": AXIS.start}
+    np.savez(tmp_path / "a.npz", H=expected.signal, **geometry, **times, confocal=1)
     found = read_capture(tmp_path / "a.npz")
     same(found, expected)
     assert found.provenance["inputs"][0]["name"] == "a.npz"
+    lasers = np.array([SPOT, np.add(SPOT, [0.1, 0, 0])])
+    several = np.stack([expected.signal, 2 * expected.signal], axis=1)
+    np.savez(tmp_path / "b.npz", H=several, wall_xyz=WALL, laser_xyz=lasers, **times)
+    assert read_capture(tmp_path / "b.npz").signal.shape == several.shape
+
+
+@pytest.mark.parametrize("name", ["t_s", "t_m"])
+def test_time_bins_that_are_named_one_by_one(name, tmp_path):
+    unit = SPEED_OF_LIGHT if name == "t_s" else 1.0
+    file, fields = tmp_path / "a.npz", {"wall_xyz": WALL, "laser_xyz": SPOT}
+    np.savez(file, H=simulated().signal, **fields, **{name: AXIS.paths / unit})
+    same(read_capture(file), simulated())
+    # The same light in bins that are by turns wider and narrower, by up to 45 %.
+    number = np.arange(400)
+    uneven = 0.5 + AXIS.spacing * (number + 3 * np.sin(0.15 * number))
+    direct = norm(SPOT - HIDDEN) + norm(WALL - HIDDEN, axis=-1)
+    light = np.exp(-0.5 * ((uneven.reshape(-1, 1, 1) - direct) / 0.02) ** 2)
+    light *= np.gradient(uneven).reshape(-1, 1, 1) / AXIS.spacing
+    np.savez(file, H=light, **fields, **{name: uneven / unit}, delta_t_s=1.0)
+    found = read_capture(file)
+    assert found.signal.sum(axis=0) == pytest.approx(light.sum(axis=0), rel=1e-5)
+    arrival = np.tensordot(found.axis.paths, found.signal, (0, 0)) / found.signal.sum(axis=0)
+    # A fiftieth of a bin; as they came the middles err by up to three bins.
+    assert np.abs(arrival - direct).max() < 0.02 * AXIS.spacing
+    for times, problem in (
+        (uneven[::-1], "do not grow from bin to bin"),
+        (np.append(uneven[:-1], uneven[-1] + 1e3), "so uneven"),
+    ):
+        np.savez(file, H=light, **fields, **{name: times / unit})
+        refused(file, problem)
 
 
 def test_the_recorded_archives(shared_data):
@@ -100,44 +126,38 @@ def test_the_recorded_archives(shared_data):
     assert letter.bin_width == pytest.approx(4.6e-12)
 
 
-# --- y-tal
+# --- y-tal and Zaragoza
 
 
 def write_tal(path, capture, laser, signal=None, **more):
     with h5py.File(path, "w") as file:
         file["H"] = capture.signal if signal is None else signal
-        file["H_format"] = np.array([1], "i4")
+        file["H_format"], file["scene_info"] = np.array([1], "i4"), "a: 1"
         file["sensor_grid_xyz"], file["laser_grid_xyz"] = WALL, laser
         file["delta_t"], file["t_start"] = capture.axis.spacing, capture.start
-        file["scene_info"] = "a: 1"
         file["laser_grid_normals"] = h5py.Empty(float)
         for name, value in {"t_accounts_first_and_last_bounces": False, **more}.items():
             file[name] = value
 
 
-def test_tal_single_confocal_and_exhaustive(tmp_path):
-    write_tal(tmp_path / "single.hdf5", simulated(), SPOT.reshape(1, 1, 3))
-    same(read_capture(tmp_path / "single.hdf5"), simulated())
-    write_tal(tmp_path / "confocal.hdf5", simulated(WALL), WALL)
-    same(read_capture(tmp_path / "confocal.hdf5"), simulated(WALL))
+def test_tal_of_one_spot_of_confocal_ones_of_a_grid_and_with_legs(tmp_path):
     lasers = WALL[::4, ::5] + [0.01, 0, 0]
     each = np.stack([simulated(spot).signal for spot in lasers.reshape(-1, 3)], axis=1)
     signal = each.reshape(AXIS.bins, *lasers.shape[:2], *WALL.shape[:2])
-    write_tal(tmp_path / "all.hdf5", simulated(), lasers, signal)
-    found = read_capture(tmp_path / "all.hdf5")
-    same(found, Capture.exhaustive(signal, WALL, lasers, AXIS.bin_width, AXIS.start))
-    shows_the_point(found)
-
-
-def test_tal_with_the_ways_to_the_devices(tmp_path):
-    signal, start = with_legs(simulated(), 3.6)
+    every = Capture.exhaustive(signal, WALL, lasers, AXIS.bin_width, AXIS.start)
+    for laser, expected, stored in (
+        (SPOT.reshape(1, 1, 3), simulated(), None),
+        (WALL, simulated(WALL), None),
+        (lasers, every, signal),
+    ):
+        write_tal(tmp_path / "tal.hdf5", expected, laser, stored)
+        same(read_capture(tmp_path / "tal.hdf5"), expected)
+    raw, start = with_legs(simulated())
     positions = {"laser_xyz": SOURCE, "sensor_xyz": EYE, "t_accounts_first_and_last_bounces": True}
-    raw = Capture(signal, WALL, SPOT, AXIS.bin_width, start)
-    write_tal(tmp_path / "legs.hdf5", raw, SPOT.reshape(1, 3), **positions)
+    legs = Capture(raw, WALL, SPOT, AXIS.bin_width, start)
+    write_tal(tmp_path / "legs.hdf5", legs, SPOT.reshape(1, 3), **positions)
     shows_the_point(read_capture(tmp_path / "legs.hdf5"))
 
-
-# --- Zaragoza
 
 # In that data set the wall is upright in x and z, and the scene lies at smaller y.
 TO_ZARAGOZA = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
@@ -190,7 +210,7 @@ def test_zaragoza(kind, columns_first, tmp_path):
 def test_turning_makes_a_direction_z_and_keeps_distances(
     direction,
 ):
-    towards = np.array(direction) / np.linalg.norm(direction)
+    towards = np.array(direction) / norm(direction)
     # The scene stays in front: a hidden point at 0.5 along the direction has z = 0.5 afterwards.
     turned = rotate_to_scene(
         Capture(np.ones((3, 2)), [0.5 * towards, [0, 0, 0]], 0.5 * towards, 1e-11), towards
@@ -225,47 +245,56 @@ def write_matlab(path, version, **variables):
 versions = pytest.mark.parametrize("version", ["5", "7.3"])
 
 
-@versions
-def test_light_cone_data(version, tmp_path):
+def plane_wall(x, y):
+    x, y = np.meshgrid(x, y)
+    return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+
+def light_cone():
     # x falls along the first axis, as the authors' own script shows it.
-    x, y = np.meshgrid(np.linspace(0.5, -0.5, 11), np.linspace(-0.5, 0.5, 11), indexing="ij")
-    wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    wall = np.swapaxes(plane_wall(np.linspace(0.5, -0.5, 11), np.linspace(-0.5, 0.5, 11)), 0, 1)
     expected = simulated(wall, wall, TimeAxis(1800, 4e-12))
-    rect_data = np.moveaxis(expected.signal, 0, 2)
-    write_matlab(tmp_path / "data_s.mat", version, rect_data=rect_data, width=0.5)
-    same(read_capture(tmp_path / "data_s.mat"), expected)
-    shows_the_point(read_capture(tmp_path / "data_s.mat"))
+    return {"rect_data": np.moveaxis(expected.signal, 0, 2), "width": 0.5}, expected
+
+
+def rectified(column=7):
+    wall = plane_wall((np.arange(12) - 6) * 0.1, (np.arange(10) - 5) * 0.1)
+    expected = simulated(wall[4, 7], wall, TimeAxis(300, 16e-12))
+    counts = {"rect_data": np.moveaxis(expected.signal, 0, 2), "SPAD_index": [column, 4]}
+    return {**counts, "ts": 16e-12, "sampling_spacing": 0.1}, expected
+
+
+def surface_optimisation():
+    points = WALL.reshape(-1, 3)
+    expected = simulated(points, points, TimeAxis(1500, 1.2e-3 / SPEED_OF_LIGHT))
+    return {"transient": expected.signal.T, "lighting": points}, expected
+
+
+@versions
+@pytest.mark.parametrize("make", [light_cone, rectified, surface_optimisation])
+def test_matlab_files_that_hold_everything(make, version, tmp_path):
+    variables, expected = make()
+    write_matlab(tmp_path / "a.mat", version, **variables)
+    same(read_capture(tmp_path / "a.mat"), expected)
 
 
 @versions
 @pytest.mark.parametrize("beside", [True, False])
 def test_migration_data(version, beside, tmp_path):
-    x, y = np.meshgrid(np.linspace(-1, 1, 14), np.linspace(-1, 1, 13))
-    wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    wall = plane_wall(np.linspace(-1, 1, 14), np.linspace(-1, 1, 13))
     expected = simulated(wall, wall, TimeAxis(300, 32e-12))
     delay_bins = np.random.default_rng(1).integers(3, 20, wall.shape[:2])
     meas = np.zeros((13, 14, 330), np.float32)
     for i, j in np.ndindex(13, 14):
         meas[i, j, delay_bins[i, j] : delay_bins[i, j] + 300] = expected.signal[:, i, j]
-    tofgrid = delay_bins * 32.0
+    path, tofgrid = tmp_path / "meas_10min.mat", {"tofgrid": delay_bins * 32.0}
+    write_matlab(path, version, meas=meas, **({} if beside else tofgrid))
     if beside:
-        write_matlab(tmp_path / "meas_10min.mat", version, meas=meas)
-        write_matlab(tmp_path / "tof.mat", version, tofgrid=tofgrid)
-    else:
-        write_matlab(tmp_path / "meas_10min.mat", version, meas=meas, tofgrid=tofgrid)
-    found = read_capture(tmp_path / "meas_10min.mat")
+        write_matlab(tmp_path / "tof.mat", version, **tofgrid)
+    found = read_capture(path)
     assert found.signal[:300] == pytest.approx(expected.signal, rel=1e-4, abs=1e-6)
+    assert found.wall == pytest.approx(wall)
     assert np.array_equal(found.laser, found.wall)
-    shows_the_point(found)
-
-
-def test_surface_optimisation_data(tmp_path):
-    points = WALL.reshape(-1, 3)
-    expected = simulated(points, points, TimeAxis(1500, 1.2e-3 / SPEED_OF_LIGHT))
-    write_matlab(tmp_path / "a.mat", "5", transient=expected.signal.T, lighting=points)
-    found = read_capture(tmp_path / "a.mat")
-    same(found, expected)
-    shows_the_point(found)
 
 
 def test_pairs_with_their_points_beside(tmp_path):
@@ -335,52 +364,13 @@ def test_general_pairs(tmp_path):
     assert read_capture(tmp_path / "data_one.mat").bin_width == pytest.approx(8.33e-12)
 
 
-@pytest.mark.parametrize("name", ["t_s", "t_m"])
-def test_time_bins_that_are_named_one_by_one(name, tmp_path):
-    unit = SPEED_OF_LIGHT if name == "t_s" else 1.0
-    file, fields = tmp_path / "a.npz", {"wall_xyz": WALL, "laser_xyz": SPOT}
-    expected = simulated()
-    np.savez(file, H=expected.signal, **fields, **{name: AXIS.paths / unit})
-    same(read_capture(file), expected)
-    # The same light in bins that are by turns wider and narrower, by up to 45 %.
-    number = np.arange(400)
-    uneven = 0.5 + AXIS.spacing * (number + 3 * np.sin(0.15 * number))
-    direct = np.linalg.norm(SPOT - HIDDEN) + np.linalg.norm(WALL - HIDDEN, axis=-1)
-    light = np.exp(-0.5 * ((uneven.reshape(-1, 1, 1) - direct) / 0.02) ** 2)
-    light *= np.gradient(uneven).reshape(-1, 1, 1) / AXIS.spacing
-    np.savez(file, H=light, **fields, **{name: uneven / unit}, delta_t_s=1.0)
-    found = read_capture(file)
-    assert found.signal.sum(axis=0) == pytest.approx(light.sum(axis=0), rel=1e-5)
-    arrival = np.tensordot(found.axis.paths, found.signal, (0, 0)) / found.signal.sum(axis=0)
-    # A fiftieth of a bin; as they came the middles err by up to three bins.
-    assert np.abs(arrival - direct).max() < 0.02 * AXIS.spacing
-    shows_the_point(found)
-    np.savez(file, H=light, **fields, **{name: uneven[::-1] / unit})
-    refused(file, "do not grow from bin to bin")
-    np.savez(file, H=light, **fields, **{name: np.append(uneven[:-1], uneven[-1] + 1e3) / unit})
-    refused(file, "so uneven")
-
-
-def test_archives_with_paths_and_several_lasers(tmp_path):
-    expected = simulated()
-    fields = {"H": expected.signal, "wall_xyz": WALL, "laser_xyz": SPOT}
-    np.savez(tmp_path / "a.npz", **fields, delta_t_m=AXIS.spacing, t_start_m=AXIS.start)
-    same(read_capture(tmp_path / "a.npz"), expected)
-    lasers = np.array([SPOT, np.add(SPOT, [0.1, 0, 0])])
-    several = np.stack([expected.signal, 2 * expected.signal], axis=1)
-    np.savez(
-        tmp_path / "b.npz", H=several, wall_xyz=WALL, laser_xyz=lasers, delta_t_s=AXIS.bin_width
-    )
-    assert read_capture(tmp_path / "b.npz").signal.shape == several.shape
-
-
 @versions
 def test_phasor_field_data(version, tmp_path):
     points = WALL.reshape(-1, 3)
     listed = simulated(SPOT, points)
     # Their laser scans our wall points; our laser spot is where their camera looks.
-    legs = np.linalg.norm(SPOT - SOURCE) + np.linalg.norm(points - EYE, axis=-1)
-    path = np.linalg.norm(SPOT - HIDDEN) + np.linalg.norm(points - HIDDEN, axis=-1) + legs
+    legs = norm(SPOT - SOURCE) + norm(points - EYE, axis=-1)
+    path = norm(SPOT - HIDDEN) + norm(points - HIDDEN, axis=-1) + legs
     signal = np.exp(-0.5 * ((3.6 + AXIS.spacing * np.arange(400) - path[:, None]) / 0.012) ** 2)
     dataset = {
         "data": signal[:, None, :],
@@ -401,22 +391,6 @@ def test_phasor_field_data(version, tmp_path):
     dataset["t"] = 399
     write_matlab(tmp_path / "cut.mat", version, dataset=dataset)
     refused(tmp_path / "cut.mat", "must end with 399 bins")
-
-
-@versions
-def test_rectified_data(version, tmp_path):
-    x, y = np.meshgrid((np.arange(12) - 6) * 0.1, (np.arange(10) - 5) * 0.1)
-    wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
-    expected = simulated(wall[4, 7], wall, TimeAxis(300, 16e-12))
-    arrays = {
-        "rect_data": np.moveaxis(expected.signal, 0, 2),
-        "ts": 16e-12,
-        "sampling_spacing": 0.1,
-    }
-    write_matlab(tmp_path / "four.mat", version, **arrays, SPAD_index=[7, 4])
-    same(read_capture(tmp_path / "four.mat"), expected)
-    write_matlab(tmp_path / "off.mat", version, **arrays, SPAD_index=[12, 4])
-    refused(tmp_path / "off.mat", "SPAD_index")
 
 
 # --- EXR
@@ -542,6 +516,7 @@ DISAGREEING = lambda path: write_tal(path, simulated(), WALL[:2])  # noqa: E731
             "begins with time; put time last: perm",
         ),
         ("rectified.mat", RECTIFIED, "begins with time; put time last: permute"),
+        ("off.mat", rectified(12)[0], "SPAD_index"),
         ("meas_10min.mat", {"meas": np.ones((3, 4, 5))}, r"no tof\.mat beside it"),
     ],
 )

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from scenes import distance_to_nearest, energy_fraction, planar_wall, see
 from scipy.optimize import brentq
 
@@ -55,12 +56,12 @@ def test_the_limit_is_the_width_of_the_sum_that_defines_it():
     wall, middle = np.stack([x, y, np.zeros_like(x)], axis=-1), np.array([0.0, 0.0, 0.4])
     capture = see([middle], wall, [0.0, 0.0, 0.0], TimeAxis(200, 60e-12), 60e-12)
     points, pulse = wall.reshape(-1, 3), METHOD.pulse
-    distance = np.linalg.norm(points - middle, axis=1)
+    distance = norm(points - middle, axis=1)
     offsets, field = np.linspace(-0.08, 0.08, 321), []
     for offset in offsets:
         moved = middle + np.array([offset, 0, 0])
-        detour = np.linalg.norm(points - moved, axis=1) - distance
-        detour += np.linalg.norm(moved) - np.linalg.norm(middle)
+        detour = norm(points - moved, axis=1) - distance
+        detour += norm(moved) - norm(middle)
         waves = np.exp(1j * pulse.wavenumber * detour - detour**2 / (2 * pulse.sigma**2))
         field.append(abs(np.sum(distance**-3.0 * waves)))
     expected = full_width_at_half_maximum(offsets, np.array(field))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 
 from nlos import Capture
 from nlos.capture import TimeAxis
@@ -85,7 +86,7 @@ FINE = TimeAxis(bins=300, bin_width=10e-12, start=0.3)
 @pytest.mark.parametrize("laser", [np.array([0.1, 0.0, 0.0]), THREE])
 def test_light_arrives_after_its_path_with_inverse_squares(laser):
     capture = PointScene([POINT], [2.0]).simulate_capture(THREE, laser, FINE, 15e-12)
-    outward, back = (np.linalg.norm(end - POINT, axis=-1) for end in (laser, THREE))
+    outward, back = (norm(end - POINT, axis=-1) for end in (laser, THREE))
     total, centroid, spread = measure(capture)
     # float32 signals.
     assert total == pytest.approx(2.0 / (outward * back) ** 2, rel=1e-5)
@@ -122,7 +123,7 @@ def look(*surfaces, laser=SPOT, axis=AXIS, wall=WALL):
 
 
 def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / norm(vectors, axis=-1, keepdims=True)
 
 
 @pytest.mark.parametrize("shape", ["planar", "cylinder"])
@@ -133,7 +134,7 @@ def test_brightness_arrival_and_width_of_one_facet(shape, confocal):
     normals = compute_wall_normals(wall)
     laser, at_laser = (wall, normals) if confocal else (wall[3, 4], normals[3, 4])
     out, back = CENTRE - laser, wall - CENTRE
-    lengths = np.linalg.norm(out, axis=-1), np.linalg.norm(back, axis=-1)
+    lengths = norm(out, axis=-1), norm(back, axis=-1)
     at_facet = unit(out)[..., 2] * -unit(back)[..., 2]
     cosines = (
         np.sum(at_laser * unit(out), axis=-1) * at_facet * np.sum(normals * -unit(back), axis=-1)
@@ -200,7 +201,7 @@ def test_a_mesh_keeps_its_area_and_its_facets_are_small():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0.7, 0.2], [0, 0, 0]])
     surface = Surface.mesh(vertices, [[0, 1, 2], [0, 3, 1]], 0.1)  # the second has no area
     across = np.cross(vertices[1], vertices[2])
-    whole = np.linalg.norm(across) / 2
+    whole = norm(across) / 2
     assert surface.areas.sum() == pytest.approx(whole)
     assert surface.areas.max() <= 0.1**2 / 2
     assert surface.normals == pytest.approx(np.tile(unit(across), (len(surface.areas), 1)))
@@ -219,7 +220,7 @@ def test_letters_read_from_left_to_right_and_from_top_to_bottom():
     assert np.sum((x > 0.05) & (y < 0)) > 10
     assert not np.any((x > 0.05) & (y > 0.1))
     hole = Surface.letters("O", [0, 0, 0.5], 0.4, 0.01)
-    assert not np.any(np.linalg.norm(hole.positions[:, :2], axis=1) < 0.05)
+    assert not np.any(norm(hole.positions[:, :2], axis=1) < 0.05)
 
 
 def test_meshes_are_read_from_files(tmp_path):

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
 from PIL import Image
 from scenes import curved_wall, planar_wall, see
 
@@ -15,7 +16,7 @@ from tofclip.units import SPEED_OF_LIGHT
 
 LASER = np.array([0.12, 0.05, 0.0])
 POINTS = np.array([[0.15, -0.2, 0.6], [-0.2, 0.15, 0.95]])
-ARRIVALS = np.linalg.norm(POINTS - LASER, axis=1) / SPEED_OF_LIGHT
+ARRIVALS = norm(POINTS - LASER, axis=1) / SPEED_OF_LIGHT
 AXIS = TimeAxis(300, 24e-12, 0.4)
 GRID = Grid(np.linspace(-0.4, 0.4, 17), np.linspace(-0.4, 0.4, 17), [0.5, 0.6, 0.7, 0.8, 0.95, 1.1])
 METHODS = {"rsd": PlanarRSD(0.15, 4), "hybrid": Hybrid(0.15, 4)}
@@ -55,7 +56,7 @@ def test_every_voxel_at_its_own_time_is_the_image_of_the_method(method):
     imaging, capture = TransientImaging(METHODS[method]), seen(method)
     voxels = [(1, 4, 11), (4, 11, 4), (3, 8, 8), (0, 0, 16)]
     places = np.array([[GRID.x[x], GRID.y[y], GRID.z[z]] for z, y, x in voxels])
-    times = np.linalg.norm(places - LASER, axis=1) / SPEED_OF_LIGHT
+    times = norm(places - LASER, axis=1) / SPEED_OF_LIGHT
     values = imaging.video(capture, GRID, times).values
     image = METHODS[method].reconstruct(capture, GRID).values
     for i, voxel in enumerate(voxels):
@@ -198,7 +199,7 @@ def test_far_things_stand_out_and_near_ones_leave_no_trail():
         field = plan.field(Capture(noisy, capture.wall, capture.laser, FAR_AXIS.bin_width))
         averaged = average.add(field).values
     single, far = np.abs(field.values), slice(9, None)
-    errors = [np.linalg.norm(one[far] - clean[far]) for one in (averaged, single)]
+    errors = [norm(one[far] - clean[far]) for one in (averaged, single)]
     # Noise falls with the root of 7 to 9 captures; the near point's waves, which change, stay.
     assert errors[0] < 0.55 * errors[1]
     row = DEEP.find_nearest((places[-1], 0.1, 0.4))
