@@ -12,7 +12,7 @@ from numpy.linalg import norm
 from numpy.typing import NDArray
 
 from nlos.band import VirtualPulse
-from nlos.capture import Capture
+from nlos.capture import Capture, measure_extent, select_lasers
 from nlos.illumination import is_confocal
 from tofclip.arrays import BoolArray, FloatArray, to_numpy
 from tofclip.errors import InputError
@@ -80,7 +80,7 @@ def find_first_bounce(capture: Capture) -> FirstBounce | None:
     A record that begins after its arrival may begin with its tail, which falls from the first bin on.
     """
     late, level = _compute_profile(capture)
-    reach = FIRST_BOUNCE_WALL_FRACTION * capture.extent
+    reach = FIRST_BOUNCE_WALL_FRACTION * measure_extent(capture)
     own, recorded = np.abs(late) <= reach, late[:1].min(initial=np.inf) <= reach
     if late.size < 4 or own.all() or (recorded and not own.any()):
         return None
@@ -194,7 +194,7 @@ def find_lit_end(capture: Capture) -> bool:
 def require_plausible(capture: Capture) -> None:
     """Refuse what no picture can come of, before any work is done."""
     low, high = capture.points.min(axis=0), capture.points.max(axis=0)
-    extent = capture.extent
+    extent = measure_extent(capture)
     if len(capture.points) > 1 and extent == 0 and capture.laser.ndim == 1:
         raise InputError("all wall points stand in one place: a capture needs several places")
     beyond = np.maximum(np.maximum(low - capture.lasers, capture.lasers - high), 0)
@@ -233,10 +233,11 @@ def require_plausible(capture: Capture) -> None:
 def require_usable_wavelength(capture: Capture, wavelength: float, cycles: float) -> None:
     """Refuse a given wavelength that shows nothing."""
     record = float(np.ptp(capture.axis.paths))
-    longest = min(limit for limit in (capture.extent, record / cycles) if limit > 0)
+    extent = measure_extent(capture)
+    longest = min(limit for limit in (extent, record / cycles) if limit > 0)
     if wavelength > longest * (1 + 1e-6):
         raise InputError(
-            f"a wavelength of {wavelength:.3g} m shows nothing of this capture, with a wall {capture.extent:.3g} m "
+            f"a wavelength of {wavelength:.3g} m shows nothing of this capture, with a wall {extent:.3g} m "
             f"wide and a record of {record:.3g} m: use at most {longest / 2:.2g} m"
         )
 
@@ -339,7 +340,7 @@ def _steepest_angle(capture: Capture) -> float:
 def _compute_profile(capture: Capture) -> tuple[FloatArray, FloatArray]:
     """Mean signal by path beyond that of the wall's own light: paths, m, and levels."""
     traces, direct = _select_traces(capture)
-    step = max(capture.axis.spacing, capture.extent / PROFILE_STEPS_PER_WALL)
+    step = max(capture.axis.spacing, measure_extent(capture) / PROFILE_STEPS_PER_WALL)
     number = np.floor((capture.axis.paths - direct[:, np.newaxis]) / step).astype(np.intp)
     first = int(number.min())
     count = np.bincount((number - first).ravel())
@@ -356,6 +357,6 @@ def _select_traces(capture: Capture) -> tuple[FloatArray, FloatArray]:
     some = some[:: len(some) // MAX_ANALYSED_POINTS + 1]
     flat = to_numpy(capture.signal).reshape(capture.axis.bins, -1)
     traces = flat[:, np.flatnonzero(capture.valid)[some]].T.astype(np.float64)
-    lasers = capture.select_lasers(some)
+    lasers = select_lasers(capture, some)
     direct: FloatArray = norm(capture.points[some] - lasers, axis=1)
     return traces, direct

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from nlos.band import Band, VirtualPulse, Waveforms
-from nlos.capture import Capture
+from nlos.capture import Capture, select_lasers
 from nlos.illumination import warn_of_aliasing
 from nlos.kernels import MIN_DISTANCE_M, add_backprojection
 from nlos.method import (
@@ -162,7 +162,7 @@ def backproject_signals(
         progress(len(waveforms[0]) * brick.size)
 
     for points in split_blocks(len(capture.points), max(1, TABLE_BYTES // (8 * samples))):
-        lasers = capture.select_lasers(points)
+        lasers = select_lasers(capture, points)
         spots = (some.astype(np.float32) for some in (capture.points[points], lasers))
         signals = apply_filter(capture.traces(points))
         start, spacing = np.float32(signals.start), np.float32(signals.spacing)
@@ -199,7 +199,7 @@ def backproject_on_device(
         waveforms = xp.reshape(transform.of(get_traces(capture, points)) @ carriers, (-1,))
         count = points.stop - points.start
         first, wall = library.put(samples * np.arange(count)), library.put(capture.points[points].T)
-        lasers = capture.select_lasers(points)
+        lasers = select_lasers(capture, points)
         laser = library.put(lasers.T)
         for some in split_blocks(rows, max(1, pairs // (grid.x.size * count))):
             ahead, across = z[some, ...] - wall[2, :], y[some, ...] - wall[1, :]

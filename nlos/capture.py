@@ -146,12 +146,11 @@ class Capture:
         require_credible_bin_width(self.bin_width)
         if not np.any(self.valid):
             raise InputError("every wall point is NaN: nothing is left to image with")
-        if self.extent > MAX_WALL_EXTENT_M:
-            raise InputError(
-                f"a wall of {self.extent:g} m is not credible; give its points in metres"
-            )
+        extent = measure_extent(self)
+        if extent > MAX_WALL_EXTENT_M:
+            raise InputError(f"a wall of {extent:g} m is not credible; give its points in metres")
         behind = float(self.points[:, 2].min() - self.lasers[:, 2].min())
-        if len(self.points) > 1 and behind > self.extent / 2:
+        if len(self.points) > 1 and behind > extent / 2:
             raise InputError(
                 f"the laser spot lies {behind:.3g} m behind the hindmost wall point: give the spot on the wall, not "
                 "the device, and z growing from the wall into the hidden scene"
@@ -252,15 +251,6 @@ class Capture:
     def lasers(self) -> FloatArray:
         """Laser spots, m: (1, 3) if it stands still, else (points, 3) as `points`."""
         return self.laser[np.newaxis] if self.laser.shape == (3,) else self.laser[self.valid]
-
-    def select_lasers(self, some: slice | AnyArray) -> FloatArray:
-        """Laser spots of some of the `points`: the one, or theirs."""
-        return self.lasers if len(self.lasers) == 1 else self.lasers[some]
-
-    @cached_property
-    def extent(self) -> float:
-        """The longest side of a box about the wall's points, m."""
-        return float(np.ptp(self.points, axis=0).max())
 
     @cached_property
     def spacing(self) -> float:
@@ -369,6 +359,16 @@ class Capture:
     def load(cls, path: str | Path) -> Capture:
         """Read the capture that `save` wrote to ``path``."""
         return cls.from_record(Record.load(path, "capture"))
+
+
+def measure_extent(capture: Capture) -> float:
+    """Return the longest side of a box about a wall's points, m."""
+    return float(np.ptp(capture.points, axis=0).max())
+
+
+def select_lasers(capture: Capture, some: slice | AnyArray) -> FloatArray:
+    """Return the laser spots of some of the `points`: the one, or theirs."""
+    return capture.lasers if len(capture.lasers) == 1 else capture.lasers[some]
 
 
 def _to_float_signal(values: Any) -> Array:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nlos.band import Band, VirtualPulse
-from nlos.capture import Capture, TimeAxis
+from nlos.capture import Capture, TimeAxis, measure_extent
 from nlos.phasor.to_depths_compiled import LaserSource
 from nlos.phasor.transfer import SphericalWaves
 from nlos.volume import Grid
@@ -40,7 +40,7 @@ def is_confocal(capture: Capture) -> bool:
     if len(capture.lasers) != len(capture.points) or len(capture.points) == 1:
         return False
     apart = float(np.abs(capture.lasers - capture.points).max())
-    return apart <= SAME_SPOT_FRACTION * capture.extent
+    return apart <= SAME_SPOT_FRACTION * measure_extent(capture)
 
 
 def swap_roles(capture: Capture) -> Capture:

@@ -18,7 +18,7 @@ import numpy as np
 
 from nlos import analysis
 from nlos.band import VirtualPulse
-from nlos.capture import Capture
+from nlos.capture import Capture, measure_extent
 from nlos.illumination import AliasingWarning, choose_roles
 from nlos.method import Plan
 from nlos.plane import WallLattice
@@ -195,7 +195,9 @@ def _complete_voxels(gated: Capture, found: Wanted) -> Wanted:
     if by_lattice:
         voxel = (found.bins_together or 1) * spacing * VOXEL_BIN_FRACTION
         reason = "a third of the path of a bin"
-    found = found.with_found("voxel", max(voxel, gated.extent / MAX_VOXELS_PER_SIDE), reason)
+    found = found.with_found(
+        "voxel", max(voxel, measure_extent(gated) / MAX_VOXELS_PER_SIDE), reason
+    )
     return _complete_box(gated, found.with_found("sigma", wavelength / SIGMAS_PER_WAVELENGTH))
 
 

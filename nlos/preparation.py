@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.linalg import norm
 
-from nlos.capture import Capture
+from nlos.capture import Capture, measure_extent
 from nlos.illumination import is_confocal
 from nlos.method import PhasorMethod, PhasorPlan, PlannedGeometry, Progress
 from nlos.volume import Grid, Volume
@@ -140,7 +140,7 @@ class MidpointJoin:
         self._kept: list[Readings] = []
         if capture.laser.ndim == 1 or is_confocal(capture) or len(capture.points) == 1:
             return
-        extent = capture.extent
+        extent = measure_extent(capture)
         apart = float(np.linalg.norm(capture.lasers - capture.points, axis=1).max())
         near = min(NEAR_LASER_M, MAX_NEAR_LASER_FRACTION * extent)
         middle = (capture.wall + capture.laser) / 2

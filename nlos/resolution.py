@@ -9,7 +9,7 @@ import numpy as np
 from numpy.linalg import norm
 
 from nlos.band import VirtualPulse
-from nlos.capture import Capture
+from nlos.capture import Capture, select_lasers
 from nlos.volume import Volume
 from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import InputError
@@ -87,7 +87,7 @@ def _compute_ideal_width(
     # every n-th point spans the same aperture
     some = slice(None, None, max(1, len(capture.points) // MAX_WALL_POINTS))
     wall = capture.points[some]
-    lasers = capture.select_lasers(some)
+    lasers = select_lasers(capture, some)
     distance = float(norm(wall - point, axis=1).mean())
     extent = float(np.ptp(wall, axis=0).max())
     # the order of the diffraction limit, wavelength * distance / aperture

@@ -160,10 +160,11 @@ class Settings:
     def prepare(
         self, capture: Capture, join: Callable[[Capture], Capture] | None = None
     ) -> Capture:
-        """Mirror coordinates, blank the wall's own light and put time bins together, as settings say.
+        """Mirror a ``capture``'s coordinates, blank the wall's own light and put time bins together, as settings
+        say.
 
         Of laser spots and wall points the fewer come as laser spots: a wave is imaged for each,
-        and seen from a lone detector all of its surroundings would be bright. `join` brings pairs to
+        and seen from a lone detector all of its surroundings would be bright. ``join`` brings pairs to
         their midpoints: `nlos.preparation.MidpointJoin.join` for many captures of one geometry.
         """
         from nlos import preparation
@@ -206,8 +207,9 @@ class Settings:
         return made
 
     def plan_quickest(self, capture: Capture, grid: Grid) -> tuple[str, Plan]:
-        """Return the first method that takes a prepared capture and does not take longer than the last
-        one, and its plan. `InputError`: none of them can image it, for the reason of the last.
+        """Return the first method that takes a ``capture``, as `prepare` returns it, and a ``grid``, and does not
+        take longer than the last one, and its plan. `InputError`: none of them can image it, for the
+        reason of the last.
         """
         *quicker, last = METHODS_BY_SPEED
         for name in quicker:

@@ -240,11 +240,18 @@ class TransientImaging:
         closes: float,
         progress: Progress = ignore_progress,
     ) -> Volume:
-        """Image what lights up while a gate is open, between two times in s since the flash left its spot:
-        ``sqrt(int |u|^2 c dt / (sqrt(pi) * sigma))``, sigma that of the pulse, float32.
+        """Image what lights up while a gate is open: ``sqrt(int |u|^2 c dt / (sqrt(pi) * sigma))``, sigma that
+        of the pulse, float32.
 
         A lone point whose flash passes within the gate is as bright as in the image of the method;
-        one that lights up at another time is dark. Other arguments and errors as of `video`.
+        one that lights up at another time is dark.
+
+        Parameters
+        ----------
+        capture, grid, progress
+            As of `video`.
+        opens, closes : float
+            Seconds since the flash left its spot on the wall; `InputError` unless it opens first.
         """
         if not (np.isfinite(opens) and np.isfinite(closes) and opens < closes):
             raise InputError(f"a gate must open before it closes, got {opens} and {closes} s")

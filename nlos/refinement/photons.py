@@ -13,7 +13,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from nlos.capture import Capture
+from nlos.capture import Capture, select_lasers
 from nlos.method import (
     FEWER_VOXELS,
     Method,
@@ -113,7 +113,7 @@ class TimeOfFlight:
         return np.array(cell, np.float32), start, np.float32(1 / axis.spacing), self.obliquity
 
     def _pairs(self, points: AnyArray) -> tuple[AnyArray, AnyArray]:
-        pairs = self.capture.points[points], self.capture.select_lasers(points)
+        pairs = self.capture.points[points], select_lasers(self.capture, points)
         return pairs[0].astype(np.float32), pairs[1].astype(np.float32)
 
     def spread(self, values: AnyArray, response: FloatArray) -> AnyArray:

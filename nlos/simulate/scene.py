@@ -232,8 +232,8 @@ class Surface:
 
     @classmethod
     def load(cls, path: str | Path, spacing: float, material: Material | None = None) -> Surface:
-        """Read a mesh in m (PLY, OBJ, STL, VTP) by PyVista and cut it into facets; arguments as of
-        `mesh`, `FileFormatError` where it is no triangle mesh.
+        """Read a mesh in m (PLY, OBJ, STL, VTP) from ``path`` by PyVista and cut it into facets; ``spacing``
+        and ``material`` as of `mesh`. `FileFormatError`: it is no triangle mesh, or holds no triangle.
         """
         import pyvista
 
@@ -257,8 +257,8 @@ class Surface:
         spacing: float,
         material: Material | None = None,
     ) -> Surface:
-        """Build a rectangle that faces the wall, (width, height) in m about its centre (x, y, z); other
-        arguments as of `mesh`.
+        """Build a rectangle that faces the wall, of a ``size`` (width, height) in m about its ``centre``
+        (x, y, z); ``spacing`` and ``material`` as of `mesh`.
         """
         x, y = size[0] / 2, size[1] / 2
         # Counter-clockwise from the wall, which looks along +z with y down.
@@ -390,9 +390,9 @@ class HiddenScene:
             raise InputError("a hidden scene needs a surface")
 
     def simulate_capture(self, wall: Any, laser: Any, axis: TimeAxis, jitter: float) -> Capture:
-        """Simulate a capture without noise; arguments as of `PointScene.simulate_capture`. Normals follow
-        from a wall given in rows and columns; else they are +z. A lone laser spot gets the normal of
-        the nearest wall point.
+        """Simulate a capture without noise; ``wall``, ``laser``, ``axis`` and ``jitter`` as of
+        `PointScene.simulate_capture`. Normals follow from a wall given in rows and columns; else they
+        are +z. A lone laser spot gets the normal of the nearest wall point.
         """
         from scipy.ndimage import gaussian_filter1d
 
