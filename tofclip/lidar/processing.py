@@ -69,7 +69,7 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     group = group.ravel()
 
     def mean(values: AnyArray) -> FloatArray:
-        return np.asarray(np.bincount(group, values.astype(np.float64), number.size) / number)
+        return np.bincount(group, values.astype(np.float64), number.size) / number
 
     first = np.full(number.size, 255, np.uint8)
     np.minimum.at(first, group, cloud.return_number)
@@ -112,7 +112,7 @@ def find_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4
     middle = float(np.median(ratio))
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(ratio - middle)))
     limit = max(middle + deviations * sigma, np.log(MIN_SPACING_RATIO))
-    return np.asarray(ratio > limit)
+    return ratio > limit
 
 
 def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:

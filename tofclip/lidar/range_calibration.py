@@ -254,7 +254,7 @@ def correct_ranges(
 
 def count_signal(returns: Returns) -> FloatArray:
     """Counts of returns, which list what they would have at 1 m."""
-    return np.asarray(returns.intensity / np.maximum(returns.range**2, np.finfo(np.float64).tiny))
+    return returns.intensity / np.maximum(returns.range**2, np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)

@@ -248,13 +248,13 @@ class SignalRowFinder:
 
         run_blocks(work, len(sums), -(-len(sums) // count_block_threads()))
         lit = [finder.find(sums, own, self._threshold) for finder, own in self._owners]
-        return np.asarray(self._taken & np.concatenate(lit))
+        return self._taken & np.concatenate(lit)
 
     def _mark_rows_near(self, lit: BoolArray, distance: int) -> BoolArray:
         """Rows within `distance` of the middle of a lit instant."""
         near = np.zeros(self.rows, bool)
         near[self._middles[lit]] = True
-        return np.asarray(scipy.ndimage.maximum_filter1d(near, 2 * distance + 1, mode="constant"))
+        return scipy.ndimage.maximum_filter1d(near, 2 * distance + 1, mode="constant")
 
 
 def _divide_into_lanes(instants: int) -> int:

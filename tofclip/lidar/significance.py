@@ -123,7 +123,7 @@ class Detection:
         strongest = find_strongest(pixel, intensity)
         scene = find_quantile_value(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
         needed = np.maximum(self.min_scene_fraction * scene, self.min_time_bin_fraction * around)
-        return np.asarray(needed[find_slot(at)])
+        return needed[find_slot(at)]
 
 
 def find_strongest(pixel: IntArray, intensity: FloatArray) -> FloatArray:
@@ -234,7 +234,7 @@ class EvidenceJudge:
         no_noise = scipy.special.expit(NOISE[:-1] @ against_noise + NOISE[-1])
         spread = scipy.special.expit(-SPREAD[:-1] @ [*brightness, excess] - SPREAD[-1])
         seen = most**2 / (most**2 + HALF_SEEN**2)
-        return np.asarray(1 - no_noise * (1 - seen * spread))
+        return 1 - no_noise * (1 - seen * spread)
 
 
 def find_brightness(values: FloatArray) -> float:
@@ -257,7 +257,7 @@ def find_brightness_at_instant(time: FloatArray, values: FloatArray, width: floa
         first, last = edges[max(number - 1, 0)], edges[min(number + 2, edges.size - 1)]
         if first < last:
             usual[number] = find_brightness(values[order[first:last]])
-    return np.asarray(usual[slot])
+    return usual[slot]
 
 
 def weigh_candidates(

@@ -154,7 +154,7 @@ class LogMatchedFilter:
         """Weights of each shade, (shades, width), where a histogram has so many photons."""
         level = max(photons, 1) / len(self.background) * self.shades[0]
         odds = self.min_photons * np.array(self.share) / level[:, np.newaxis]
-        return np.asarray(np.log1p(odds))
+        return np.log1p(odds)
 
 
 @lru_cache(maxsize=MAX_THRESHOLDS)
@@ -251,7 +251,7 @@ class PhotonDetector:
     @property
     def times(self) -> FloatArray:
         """Instant of each bin's middle, s; the first is 0."""
-        return np.asarray(np.arange(self.bins) * np.float64(self.bin_width))
+        return np.arange(self.bins) * np.float64(self.bin_width)
 
     @cached_property
     def relative_background(self) -> FloatArray:
@@ -260,7 +260,7 @@ class PhotonDetector:
             return np.ones(self.bins)
         shape = np.asarray(self.background, dtype=np.float64)
         relative = np.maximum(shape / shape.mean(), MIN_RELATIVE_BACKGROUND)
-        return np.asarray(relative / relative.mean())
+        return relative / relative.mean()
 
     @cached_property
     def _kernel_pulse(self) -> Table:
@@ -475,7 +475,7 @@ class PhotonDetector:
         weight = np.exp(-((apart / STEP_BLUR) ** 2) / 2)
         error = (found - SPEED_OF_LIGHT / 2 * truth) ** 2
         # two thirds of what is spread evenly lie within 2 / sqrt(3) of its root mean square
-        return np.asarray(np.sqrt(4 / 3 * (weight @ error) / weight.sum(axis=1)))
+        return np.sqrt(4 / 3 * (weight @ error) / weight.sum(axis=1))
 
 
 def _quantise_photons(photons: FloatArray) -> IntArray:

@@ -408,7 +408,7 @@ def _open_tiff(path: Path) -> _PhotonFile:
 
     def load() -> AnyArray:
         with BoundedFile(path) as reopened, tifffile.TiffFile(reopened) as again:
-            return np.asarray(again.series[0].asarray())
+            return again.series[0].asarray()
 
     return _PhotonFile({"pages": ArchiveEntry(shape, dtype, load)}, axes="tyx")
 

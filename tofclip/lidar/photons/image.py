@@ -48,8 +48,7 @@ class Shading:
             (axis + 0.5) * (number / side) - 0.5
             for axis, number, side in zip(place, self.level.shape, sides, strict=True)
         ]
-        found = scipy.ndimage.map_coordinates(self.level, cells, np.float32, 1, mode="nearest")
-        return np.asarray(found)
+        return scipy.ndimage.map_coordinates(self.level, cells, np.float32, 1, mode="nearest")
 
     def average(self) -> Shading:
         """Return the same of all times."""
@@ -199,7 +198,7 @@ class PhotonImage:
 
     def times_after(self, surface: FloatArray) -> FloatArray:
         """Return by how many bins each event comes after its pixel's surface, (rows, columns)."""
-        return np.asarray(self.bin - surface.ravel()[self.pixel])
+        return self.bin - surface.ravel()[self.pixel]
 
     def sum_by_pixel(self, weights: AnyArray) -> FloatArray:
         """Return the sums over each pixel's events of their `weights`, (rows, columns)."""
@@ -211,14 +210,14 @@ class PhotonImage:
         """Background at each event over its mean, (events,)."""
         if self.shading is None:
             return np.ones(self.bin.size, np.float32)
-        return np.asarray(self.shading.at(self.pixel, self.bin))
+        return self.shading.at(self.pixel, self.bin)
 
     def relative_at(self, surface: FloatArray) -> Float32Array:
         """Return the background at each pixel's surface over its mean, (rows, columns)."""
         if self.shading is None:
             return np.ones(surface.shape, np.float32)
         found = self.shading.at(np.arange(surface.size), surface.ravel())
-        return np.asarray(found.reshape(surface.shape))
+        return found.reshape(surface.shape)
 
     @cached_property
     def table(self) -> csr_array:
@@ -437,14 +436,14 @@ def find_hot_pixels(photons: PhotonImage) -> BoolArray:
     quiet = quiet.reshape(photons.image_shape)
     around = _rank_neighbours(quiet, -1 - NEIGHBOUR_RANK)
     throughout = quiet > FAULT_RATIO * around + FAULT_SIGMAS * np.sqrt(around + 4)
-    return np.asarray(throughout | _find_peaked_pixels(photons))
+    return throughout | _find_peaked_pixels(photons)
 
 
 def find_dim_pixels(photons: PhotonImage) -> BoolArray:
     """Say which pixels, (rows, columns), count far less than their neighbours, dead ones among them."""
     light = photons.photons_per_pixel
     around = _rank_neighbours(light, NEIGHBOUR_RANK)
-    return np.asarray(FAULT_RATIO * light + FAULT_SIGMAS * np.sqrt(light + 4) < around)
+    return FAULT_RATIO * light + FAULT_SIGMAS * np.sqrt(light + 4) < around
 
 
 def _rank_neighbours(values: FloatArray, rank: int) -> FloatArray:
@@ -456,7 +455,7 @@ def _rank_neighbours(values: FloatArray, rank: int) -> FloatArray:
     line = np.where(np.array(values.shape) > 1, 9, 1)
     footprint = np.ones((3, 3) if min(values.shape) > 1 else line)
     footprint[footprint.shape[0] // 2, footprint.shape[1] // 2] = 0
-    return np.asarray(scipy.ndimage.rank_filter(values, rank, footprint=footprint, mode="mirror"))
+    return scipy.ndimage.rank_filter(values, rank, footprint=footprint, mode="mirror")
 
 
 def _find_peaked_pixels(photons: PhotonImage) -> BoolArray:

@@ -86,7 +86,7 @@ def _find_occupied_bins(
     expected = length * np.where(level > 0, level, dark)
     limit = expected + MIN_TILE_SIGNIFICANCE * np.sqrt(expected) + 2
     occupied = np.any(pooled > limit[:, np.newaxis], axis=0)
-    return np.asarray(scipy.ndimage.binary_dilation(occupied, iterations=2 * LABELS_PER_WIDTH))
+    return scipy.ndimage.binary_dilation(occupied, iterations=2 * LABELS_PER_WIDTH)
 
 
 def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> Float32Array:
@@ -200,4 +200,4 @@ def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int, width: flo
     excess = np.zeros(apart.shape)
     excess[known] = apart[known] - CHANCE_SHARE * (narrow[known] - wide[known])
     usual = scipy.ndimage.median_filter(excess, 2 * reach + 1, mode="nearest")
-    return np.asarray(NESTED_BIAS_RATIO**2 * np.maximum(usual, 0))
+    return NESTED_BIAS_RATIO**2 * np.maximum(usual, 0)

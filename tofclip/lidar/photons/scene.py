@@ -97,7 +97,7 @@ class BinnedResponse:
     def density(self) -> FloatArray:
         """Probability density of a photon's time at each sample, per bin."""
         samples = np.maximum(self.pulse.samples, DENSITY_FLOOR)
-        return np.asarray(samples / (samples.sum() * self.step))
+        return samples / (samples.sum() * self.step)
 
     @cached_property
     def log_slope(self) -> FloatArray:
@@ -105,7 +105,7 @@ class BinnedResponse:
         faint, chance in what was learnt is not taken for a slope.
         """
         faint = self.slope_floor * self.density.max()
-        return np.asarray(-np.gradient(np.log(self.density + faint), self.step))
+        return -np.gradient(np.log(self.density + faint), self.step)
 
     def coarse_shares(self, coarse: int) -> tuple[FloatArray, int]:
         """Share of the photons in each of the coarse bins, of so many bins, around the one that holds
@@ -466,7 +466,7 @@ def learn_background(histograms: FloatArray, width: float) -> FloatArray | None:
     sharp = np.abs(relative - 1) > np.maximum(MIN_UNEVENNESS, 5 / np.sqrt(np.maximum(total, 1)))
     if np.all(unevenness < np.maximum(MIN_UNEVENNESS, 5 * noise)) and not sharp.any():
         return None
-    return np.asarray(relative)
+    return relative
 
 
 def segment_counts(counts: FloatArray) -> FloatArray:
@@ -504,7 +504,7 @@ def find_clumps(counts: FloatArray) -> BoolArray:
     spread = ((counts - expected) ** 2).sum(axis=0) / np.maximum(variance, 1e-9)
     mean = np.maximum(expected.mean(axis=0), 1e-9)
     limit = 1 + CLUMP_SIGNIFICANCE * np.sqrt((2 + 1 / mean) / counts.shape[0])
-    return np.asarray(spread > limit)
+    return spread > limit
 
 
 def find_lower_mean(counts: FloatArray) -> float:

@@ -334,7 +334,7 @@ def calibrate_outliers(
 
     def doubt(value: Float32Array, weight: float, rivals: float) -> FloatArray:
         odds = np.log(rivals) - weight * np.maximum(value, 0).astype(np.float64)
-        return np.asarray(scipy.special.expit(odds))
+        return scipy.special.expit(odds)
 
     def weigh(choice: tuple[float, float]) -> float:
         wrong = doubt(margin.ravel()[some], *choice)
@@ -396,7 +396,7 @@ def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> F
     def is_rare(seen: FloatArray, expected: FloatArray, most: float) -> BoolArray:
         # chance of that many photons or more by Poisson's law; scipy.stats loads for a second
         chance = scipy.special.gammainc(np.maximum(seen, 1), expected)
-        return np.asarray((seen > 0) & (chance < most))
+        return (seen > 0) & (chance < most)
 
     kept = is_rare(seen, expected, MAX_OWN_CHANCE) & is_rare(
         pooled, 9 * expected, MAX_POOLED_CHANCE
