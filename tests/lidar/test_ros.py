@@ -118,23 +118,3 @@ def test_recordings_that_cannot_be_are_refused(cloud, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(MissingDependencyError, match=r"tofclip\[exchange\]"):
         write_bag([StampedCloud(cloud, 5)], tmp_path / "absent.mcap")
-
-
-def test_kiss_icp_follows_a_moving_camera(tmp_path, monkeypatch):
-    """Its own reader of ROS 2 bags and its own pipeline, as they are."""
-    loading = pytest.importorskip("kiss_icp.datasets.rosbag")
-    pipeline = pytest.importorskip("kiss_icp.pipeline")
-    random = np.random.default_rng(2)
-    # A corner of a room, seen from a camera that goes forward.
-    walls = [random.uniform(-6, 6, (3000, 3)) for _ in range(3)]
-    for axis, wall in enumerate(walls):
-        wall[:, axis] = (6, 2, 14)[axis]
-    room = np.concatenate(walls) + np.array([0, 0, 2.0])
-    step = np.array([0.05, 0.0, 0.2])
-    seen = [room - number * step + random.normal(0, 0.01, room.shape) for number in range(6)]
-    clouds = [StampedCloud(make_cloud(xyz), number * 10**8) for number, xyz in enumerate(seen)]
-    write_bag(clouds, tmp_path / "drive")
-    odometry = pipeline.OdometryPipeline(loading.RosbagDataset(tmp_path / "drive", ""))
-    monkeypatch.chdir(tmp_path)  # it writes its results beside where it runs
-    odometry.run()
-    np.testing.assert_allclose(odometry.poses[:, :3, 3], np.arange(6)[:, None] * step, atol=0.05)

@@ -38,7 +38,7 @@ from tofclip.lidar.peak_kernels import (
     search_step,
 )
 from tofclip.lidar.pulse_tables import MAX_OFFSET_BINS, PHASES_PER_BIN
-from tofclip.vectors import STEP, choose, fill_vector, load_vector, store_vector, sum_vector
+from tofclip.vectors import STEP, fill_vector, load_vector, store_vector, sum_vector
 
 MAX_FIT_ROUNDS = (
     8  # from near the top it has converged after two; more are for returns that overlap
@@ -182,7 +182,7 @@ def measure_returns_by_table(room, listed, least, pixels, times, table, found, c
     (traces,): of the traces; `counts` (all pixels,) goes up by one for each return, and is
     `NEEDS_EXACT_FIT` where one of the pixel does.
     """
-    zero, candidates = fill_vector(np.float32(0)), room.candidates
+    candidates = room.candidates
     for k in range(listed):
         own, rest = candidates[k], room.rests[k]
         height, noise, offset = own[HEIGHT], own[NOISE], own[OFFSET]
@@ -197,14 +197,13 @@ def measure_returns_by_table(room, listed, least, pixels, times, table, found, c
         known = table.sums[phase]
         if height <= 0 or height * math.sqrt(known[0]) <= least * noise:
             continue
-        later = fill_vector(np.float32(offset - (phase / PHASES_PER_BIN - MAX_OFFSET_BINS)))
-        high, misfits = fill_vector(np.float32(height)), zero
-        for w in range(np.uintp(0), np.uintp(rest.size), STEP):
-            shape = load_vector(table.shapes[phase], w)
-            moved = shape - later * load_vector(table.slopes[phase], w)
-            off = load_vector(rest, w) - high * moved
-            misfits += choose(shape > zero, off * off, zero)
-        misfit = sum_vector(misfits) - noise * noise * (known[6] - 2)
+        later = np.float32(offset - (phase / PHASES_PER_BIN - MAX_OFFSET_BINS))
+        high, misfit = np.float32(height), np.float32(0)
+        for w in range(np.uintp(rest.size)):
+            shape = table.shapes[phase, w]
+            off = rest[w] - high * (shape - later * table.slopes[phase, w])
+            misfit += off * off if shape > 0 else np.float32(0)
+        misfit -= noise * noise * (known[6] - 2)
         energy = known[2] - known[1] * known[1] / known[0]
         width = times[j + ONE] - times[j]
         deviation = estimate_deviation(height, noise, misfit, energy, known[3], known[4], known[5])

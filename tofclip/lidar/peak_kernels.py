@@ -33,7 +33,6 @@ from tofclip.vectors import (
     find_highest_lane,
     list_set_lanes,
     load_vector,
-    number_lanes,
     store_vector,
     sum_vector,
 )
@@ -298,9 +297,8 @@ def take_strongest_peaks(trace, axis, limits, about, listed, room):
             room.peaks[number, 0] = best
             room.peaks[number, 1] = above if above > 0 else 0.0
             number += 1
-            for i in range(np.uintp(windows[best, 0]), np.uintp(windows[best, 1]), STEP):
-                start = min(i, np.uintp(trace.size) - STEP)
-                store_vector(room.free, start, load_vector(axis.bin_weights, start))
+            for i in range(np.uintp(windows[best, 0]), np.uintp(windows[best, 1])):
+                room.free[i] = axis.bin_weights[i]
     return background, math.sqrt(variance), number
 
 
@@ -337,22 +335,14 @@ def claim_bins(trace, centre, free, first, after):
     """Take the bins from `first` to before `after`, as far as they are free; return sums over them of
     what is above `centre`, of its square, and their number.
     """
-    total = square = number = zero = fill_vector(np.float32(0))
-    last = np.uintp(trace.size) - STEP
-    for begin in range(first, after, STEP):
-        start = begin if begin < last else last
-        numbers = number_lanes() + fill_vector(np.int32(start))
-        inside = (numbers >= fill_vector(np.int32(begin))) & (
-            fill_vector(np.int32(after)) > numbers
-        )
-        still_free = load_vector(free, start)
-        taken = choose(inside, still_free, zero)
-        store_vector(free, start, still_free - taken)
-        above = load_vector(trace, start) - fill_vector(centre)
+    total = square = number = np.float32(0)
+    for i in range(first, after):
+        above, taken = trace[i] - centre, free[i]
         total += taken * above
         square += taken * above * above
         number += taken
-    return sum_vector(total), sum_vector(square), sum_vector(number)
+        free[i] = 0
+    return total, square, number
 
 
 @inlined
@@ -429,15 +419,9 @@ def cut_out(trace, background, start, held, rest):
     """Cut `held` bins from `start` on out of a trace, less its background, and fill up with zeros. The
     trace has memory behind its last bin.
     """
-    zero, level, lanes = (
-        fill_vector(np.float32(0)),
-        fill_vector(np.float32(background)),
-        number_lanes(),
-    )
-    for w in range(np.uintp(0), np.uintp(rest.size), STEP):
-        inside = fill_vector(np.int32(held - np.int64(w))) > lanes
-        above = load_vector(trace, np.uintp(start) + w) - level
-        store_vector(rest, w, choose(inside, above, zero))
+    level, first = np.float32(background), np.uintp(start)
+    for w in range(np.uintp(rest.size)):
+        rest[w] = trace[first + w] - level if w < np.uintp(held) else np.float32(0)
 
 
 @compile_loop()
