@@ -147,7 +147,13 @@ def require_known(what: str, name: str, known: Collection[str]) -> None:
 def require_shape(what: str, expected: tuple[object, ...], got: tuple[int, ...]) -> None:
     """Refuse an array of another shape than the one that is needed."""
     if got != expected:
-        raise ShapeError(what, expected, tuple(got))
+        raise ShapeError(what, tuple(expected), tuple(got))
+
+
+def require_axes(what: str, axes: str, shape: tuple[int, ...]) -> None:
+    """Refuse an array that has not these axes, such as ``"rows, columns"``."""
+    if len(shape) != axes.count(",") + 1:
+        raise ShapeError(what, f"({axes})", tuple(shape))
 
 
 def require_type(value: object, wanted: type | tuple[type, ...], use: str) -> None:

@@ -114,8 +114,8 @@ class Streak(Storable):
             f"{self.source}: {bad} pixels are NaN or infinite; replace them or mark them as saturated",
         )
         require(np.any(counts), f"{self.source}: every pixel is zero; was the shutter closed?")
-        if self.saturated is not None and self.saturated.shape != counts.shape:
-            raise ShapeError("saturated", counts.shape, self.saturated.shape)
+        if self.saturated is not None:
+            require_shape("saturated", counts.shape, self.saturated.shape)
         if self.row_times is not None:
             times = np.asarray(self.row_times, dtype=np.float64)
             require_shape(f"{self.source}: the time axis", counts.shape[:1], times.shape)
@@ -396,8 +396,8 @@ class Frames(Storable):
         if self.shears.shape != times.shape or not np.all(np.isfinite(self.shears)):
             raise ShapeError("the frames' shears", f"{times.shape}, finite", self.shears.shape)
         slit = self.camera.slit_width_px, times.size
-        if self.measured.size and self.measured.shape != slit:
-            raise ShapeError("the frames' measurements", slit, self.measured.shape)
+        if self.measured.size:
+            require_shape("the frames' measurements", slit, self.measured.shape)
         xp = namespace(self.values)
         require(xp.all(xp.isfinite(self.values)), "frames must not hold NaN or infinity")
 

@@ -19,9 +19,8 @@ NANOSECOND: Final = 1e-9
 MILLIMETRE: Final = 1e-3
 
 FWHM_PER_SIGMA: Final = 2.354820045030949  # of a Gaussian: 2 sqrt(2 ln 2)
-MAD_TO_SIGMA: Final = (
-    1.4826  # of Gaussian numbers: standard deviation over median absolute deviation
-)
+# of Gaussian numbers: standard deviation over median absolute deviation
+MAD_TO_SIGMA: Final = 1.4826
 
 MIN_BIN_WIDTH_S = 1e-15
 MAX_BIN_WIDTH_S = 1e-7

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from tofclip.arrays import FloatArray, IndexArray, IntArray
 from tofclip.camera.model import Camera
 from tofclip.errors import CalibrationError, InputError, ShapeError
+from tofclip.units import MAD_TO_SIGMA
 
 DOT_HALF_WIDTH_PX = 14  # the core of a dot; aberrated tails beyond it would pull the centre
 SLIT_HALF_HEIGHT_PX = 6
@@ -135,7 +136,7 @@ def _find_dots(dots: FloatArray, views: int) -> tuple[int, IndexArray]:
     clean = median_filter(dots, 3)  # single hot pixels survive no 3 x 3 median
     slit_row = int(gaussian_filter1d(clean.sum(axis=1), 2).argmax())
     profile = gaussian_filter1d(_crop_slit_band(clean, slit_row).sum(axis=0), 4)
-    noise = 1.4826 * float(np.median(np.abs(profile - np.median(profile))))
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(profile - np.median(profile))))
     distance = max(1, dots.shape[1] // (2 * views + 1))
     height = np.median(profile) + MIN_DOT_SNR * noise
     peaks, _ = find_peaks(profile, height=height, distance=distance)

@@ -21,7 +21,13 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from tofclip.arrays import BoolArray, FloatArray
 from tofclip.camera.range_calibration import RangeCalibration, empty_array
-from tofclip.errors import CalibrationError, FileFormatError, ShapeError, require_consistent
+from tofclip.errors import (
+    CalibrationError,
+    FileFormatError,
+    ShapeError,
+    require_consistent,
+    require_shape,
+)
 from tofclip.notebook import render_html
 from tofclip.operators import LineProjection
 from tofclip.storage import Record, Storable, stored_array, stored_child, stored_value
@@ -102,8 +108,9 @@ class PolynomialSweep(Sweep):
         super().__post_init__()
         for item in fields(self):
             expected = (6,) if item.name.endswith("coefficients") else (2,)
-            if (shape := getattr(self, item.name).shape) != expected:
-                raise ShapeError(f"polynomial sweep's {item.name}", expected, shape)
+            require_shape(
+                f"polynomial sweep's {item.name}", expected, getattr(self, item.name).shape
+            )
         if not (np.all(self.rectified_scale) and np.all(self.raw_scale)):
             raise CalibrationError("a polynomial sweep's scales must not be zero")
 
@@ -131,8 +138,7 @@ class ProjectiveSweep(Sweep):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.matrix.shape != (3, 3):
-            raise ShapeError("projective sweep matrix", (3, 3), self.matrix.shape)
+        require_shape("projective sweep matrix", (3, 3), self.matrix.shape)
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
         raw_column, raw_row, weight = (h[0] * column + h[1] * row + h[2] for h in self.matrix)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import BoolArray, Float32Array, IndexArray, IntArray
 from tofclip.camera.model import Camera
-from tofclip.errors import CalibrationError, InputError, ShapeError
+from tofclip.errors import CalibrationError, InputError, require_shape
 from tofclip.threads import LANES, count_block_threads, run_blocks, split_blocks
 
 DARK_ROW_FRACTION = 0.05
@@ -238,8 +238,7 @@ class Rectifier:
     def _prepare(self, counts: Float32Array) -> Float32Array:
         """Return a streak image that fits as compiled loops take it."""
         require_width(counts, self.camera)
-        if counts.shape != self._raw_row.shape:
-            raise ShapeError("a streak image of this camera", self._raw_row.shape, counts.shape)
+        require_shape("a streak image of this camera", self._raw_row.shape, counts.shape)
         return np.ascontiguousarray(counts, np.float32)
 
 

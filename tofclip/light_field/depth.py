@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofclip.arrays import AnyArray, FloatArray, IntArray
-from tofclip.errors import ShapeError, require, require_shape
+from tofclip.errors import ShapeError, require, require_axes, require_shape
 from tofclip.light_field.views import LightField
 
 Array = AnyArray
@@ -36,8 +36,7 @@ def find_smooth_labels(
     ShapeError, InputError
         The costs have not three dimensions, one is not finite, or the smoothness is negative.
     """
-    if costs.ndim != 3:
-        raise ShapeError("costs", "(labels, rows, columns)", costs.shape)
+    require_axes("costs", "labels, rows, columns", costs.shape)
     require(
         np.all(np.isfinite(costs)) and smoothness >= 0,
         "costs must be finite and the smoothness zero or more",

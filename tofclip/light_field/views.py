@@ -17,7 +17,14 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from tofclip.arrays import AnyArray, FloatArray, IntArray
-from tofclip.errors import ShapeError, require, require_known, require_positive, require_shape
+from tofclip.errors import (
+    ShapeError,
+    require,
+    require_axes,
+    require_known,
+    require_positive,
+    require_shape,
+)
 from tofclip.operators import LinearShear
 from tofclip.operators.cameras import CAMERAS, EvenAngleLineCamera, LightFieldCamera
 from tofclip.operators.shear import View
@@ -44,10 +51,8 @@ class LightField(Storable):
     views: FloatArray = field(metadata=stored_array("", "view", "vu"))
 
     def __post_init__(self) -> None:
-        shape, expected = self.pictures.shape, (len(self.pictures), 2)
-        if len(shape) != 3:
-            raise ShapeError("the pictures of a light field", "(views, rows, columns)", shape)
-        require_shape("the views of a light field", expected, self.views.shape)
+        require_axes("the pictures of a light field", "views, rows, columns", self.pictures.shape)
+        require_shape("the views of a light field", (len(self.pictures), 2), self.views.shape)
         require(np.all(np.isfinite(self.pictures)), "a light field must not hold NaN or infinity")
         require(
             np.ptp(self.pictures) != 0,

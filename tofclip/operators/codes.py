@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from tofclip.arrays import Array, FloatArray, IndexArray
-from tofclip.errors import ShapeError, require
+from tofclip.errors import require, require_axes
 from tofclip.operators.base import (
     Adjoint,
     Composition,
@@ -93,8 +93,7 @@ class MaskedSensor(_Sensor):
 
     def __init__(self, live: ArrayLike, dtype: DTypeLike = np.float32) -> None:
         mask = np.asarray(live, dtype=bool)
-        if mask.ndim != 2:
-            raise ShapeError("the mask of live pixels", "(rows, columns)", mask.shape)
+        require_axes("the mask of live pixels", "rows, columns", mask.shape)
         super().__init__((mask.shape[0], mask.shape[1]), np.flatnonzero(mask), dtype)
 
 
@@ -175,8 +174,7 @@ class WeightedViews(LinearOperator):
         self, image_shape: tuple[int, int], weights: ArrayLike, dtype: DTypeLike = np.float32
     ) -> None:
         self.weights = np.asarray(weights, dtype=dtype)
-        if self.weights.ndim != 2:
-            raise ShapeError("mask weights", "(exposures, views)", self.weights.shape)
+        require_axes("mask weights", "exposures, views", self.weights.shape)
         require(np.all(np.isfinite(self.weights)), "mask weights must be finite")
         exposures, views = self.weights.shape
         super().__init__(
@@ -202,8 +200,7 @@ class MaskedViews(Composition):
 
     def __init__(self, codes: ArrayLike, dtype: DTypeLike = np.float32) -> None:
         masks = np.asarray(codes, dtype=dtype)
-        if masks.ndim != 3:
-            raise ShapeError("mask codes", "(views, rows, columns)", masks.shape)
+        require_axes("mask codes", "views, rows, columns", masks.shape)
         plane = Integration([Diagonal(mask, dtype) for mask in masks])
         super().__init__(DenseSensor(masks.shape[1:], dtype), plane)
 

@@ -22,6 +22,7 @@ from tofclip.camera.noise import MeasurementNoise, find_dazzle_limit
 from tofclip.shots import Streak
 from tofclip.solvers import ClippedSquares, DataTermMaker, LeastSquares
 from tofclip.storage import Scalar
+from tofclip.units import MAD_TO_SIGMA
 
 DEFECTS_KEY, CLIPPED_KEY = "defective_readings", "clipped_readings"
 # Full widths of the shortest pulse that is distinguished from a single row; and of the longest, as
@@ -134,7 +135,7 @@ def estimate_noise(counts: Float32Array) -> tuple[float, float, float]:
     changes = np.abs(rough)
     if not np.median(changes):  # a detector that counts hardly anything, or cuts off the dark
         changes = changes[changes > 0] if changes.any() else changes
-    noise = 1.4826 * float(np.median(changes))
+    noise = MAD_TO_SIGMA * float(np.median(changes))
     level = (counts[:-2] + counts[1:-1] + counts[2:]) / 3 - dark
     lit = level > max(LIT_DEVIATIONS * noise, float(np.finfo(np.float32).tiny))
     if np.count_nonzero(lit) < MIN_LIT_MEASUREMENTS:

@@ -11,7 +11,7 @@ import numpy as np
 
 from tofclip.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from tofclip.camera import Camera
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError, require_shape
 from tofclip.lidar.photons import PhotonCube, PhotonDetector, SurfaceImage
 from tofclip.lidar.photons.scene import prepare_photons
 from tofclip.lidar.pulse import Pulse
@@ -135,8 +135,7 @@ class PhotonPipeline:
                 photons, Pulse.gaussian(known.pulse_fwhm), join=False
             )
         seen_by = known or Camera.pinhole(shot.image_shape, pulse_fwhm=pulse.fwhm)
-        if seen_by.image_shape != shot.image_shape:
-            raise ShapeError("the camera's picture", shot.image_shape, seen_by.image_shape)
+        require_shape("the camera's picture", shot.image_shape, seen_by.image_shape)
         if time_zero is not None:
             seen_by = seen_by.replace(time_zero=time_zero)
         detector = PhotonDetector(pulse, photons.bin_width, photons.bins)
@@ -144,9 +143,8 @@ class PhotonPipeline:
 
     def rectify(self, shot: PhotonCube) -> Float32Array:
         """Put the bins of a pixel side by side, (pixels, bins)."""
-        if shot.counts.shape != (self.times.size, *self.camera.image_shape):
-            expected = self.times.size, *self.camera.image_shape
-            raise ShapeError("histograms", expected, shot.counts.shape)
+        expected = self.times.size, *self.camera.image_shape
+        require_shape("histograms", expected, shot.counts.shape)
         return shot.histograms
 
     def recover_shot(self, shot: PhotonCube, rectified: Float32Array) -> BoolArray:

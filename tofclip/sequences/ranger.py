@@ -21,7 +21,7 @@ import numpy as np
 
 from tofclip.arrays import BoolArray, Float32Array, FloatArray
 from tofclip.camera import Camera, Rectifier
-from tofclip.errors import ShapeError
+from tofclip.errors import require_shape
 from tofclip.lidar import PointCloud, point_cloud
 from tofclip.lidar.pulse_tables import PictureTraces, TraceBins, Traces
 from tofclip.lidar.search import ReturnSearch, keep_probable
@@ -319,8 +319,7 @@ class RangingPipeline:
         recovered, a few at a time, as they are asked for.
         """
         expected = self.camera.slit_width_px, self.times.size
-        if measurements.shape != expected:
-            raise ShapeError("measurements", expected, measurements.shape)
+        require_shape("measurements", expected, measurements.shape)
         bins = self._lit.bins(self._lit.sum_measurements(measurements))
         # by rows, which is how measurements lie in memory
         return self._recover_bins(np.take(measurements.T, bins.numbers, axis=0).T, bins)

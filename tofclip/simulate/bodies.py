@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from tofclip.arrays import AnyArray, IndexArray
-from tofclip.errors import ShapeError, require
+from tofclip.errors import require, require_axes
 
 Array = AnyArray
 Vector = tuple[float, float, float]
@@ -143,8 +143,7 @@ class Lambertian:
 
     def __post_init__(self) -> None:
         known = self.pattern[np.isfinite(self.pattern)]
-        if self.pattern.ndim != 2:
-            raise ShapeError("a pattern of reflectances", "(rows, columns)", self.pattern.shape)
+        require_axes("a pattern of reflectances", "rows, columns", self.pattern.shape)
         require(
             known.size != 0 and known.min() >= 0 and known.max() <= 1,
             "a pattern's reflectances must lie within 0..1 where they are not NaN, and some must be",

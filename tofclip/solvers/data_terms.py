@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, scalar_like
-from tofclip.errors import ShapeError, require, require_positive
+from tofclip.errors import require, require_positive, require_shape
+from tofclip.units import MAD_TO_SIGMA
 
 Mask = Array | None
 
@@ -35,9 +36,8 @@ class DataTerm(ABC):
     """
 
     def __init__(self, measurements: Array, valid: Mask = None) -> None:
-        if valid is not None and valid.shape != measurements.shape:
-            shapes = tuple(measurements.shape), tuple(valid.shape)
-            raise ShapeError("the mask of valid measurements", *shapes)
+        if valid is not None:
+            require_shape("the mask of valid measurements", measurements.shape, valid.shape)
         xp = namespace(measurements)
         all_good = valid is None or xp.all(valid)
         self.measurements = measurements
@@ -205,8 +205,7 @@ class Poisson(DataTerm):
 
 def estimate_robust_deviation(residual: Array) -> float:
     """Return the standard deviation that Gaussian errors with the median size of `residual` have."""
-    # the median size of Gaussian numbers is 1 / 1.4826 of their standard deviation
-    deviation = 1.4826 * float(np.median(np.abs(residual)))
+    deviation = MAD_TO_SIGMA * float(np.median(np.abs(residual)))
     require(
         deviation > 0, "most measurements are met exactly; there is nothing to be robust against"
     )

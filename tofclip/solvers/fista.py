@@ -27,7 +27,7 @@ from tofclip.arrays import (
     to_numpy,
     zeros,
 )
-from tofclip.errors import ShapeError, require
+from tofclip.errors import require, require_shape
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm, DataTermMaker, LeastSquares, Mask
 from tofclip.solvers.methods import (
@@ -272,9 +272,9 @@ class ProximalMethod(Method):
         pictures to begin at, (frames, rows, columns), such as those of the shot before: dark ones
         by default.
         """
-        expected = (measurements.shape[1], *operator.shape_in)
-        if start is not None and start.shape != expected:
-            raise ShapeError("pictures to begin at", expected, start.shape)
+        if start is not None:
+            pictures = measurements.shape[1], *operator.shape_in
+            require_shape("pictures to begin at", pictures, start.shape)
         if not self.portable:
             require_numpy(f"recovery with the prior {type(self).__name__}", measurements)
         measurements = validate_measurements(operator, measurements, valid)

@@ -26,7 +26,7 @@ from tofclip.arrays import (
     to_numpy,
     zeros,
 )
-from tofclip.errors import ShapeError, require
+from tofclip.errors import ShapeError, require, require_shape
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTermMaker, Mask
 from tofclip.threads import LANES, run_blocks, split_blocks
@@ -320,9 +320,8 @@ def validate_measurements(operator: LinearOperator, measurements: Array, valid: 
     if measurements.ndim != 2 or measurements.shape[:1] != operator.shape_out:
         expected = f"({operator.shape_out[0]}, frames)"
         raise ShapeError("measurements", expected, tuple(measurements.shape))
-    if valid is not None and valid.shape != measurements.shape:
-        shapes = tuple(measurements.shape), tuple(valid.shape)
-        raise ShapeError("the mask of valid measurements", *shapes)
+    if valid is not None:
+        require_shape("the mask of valid measurements", measurements.shape, valid.shape)
     require(
         xp.all(xp.isfinite(measurements)),
         "measurements must not hold NaN or infinity; mark bad ones in `valid`",
