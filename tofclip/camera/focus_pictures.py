@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from tofclip.arrays import FloatArray, IndexArray, IntArray
 from tofclip.camera.model import Camera
-from tofclip.errors import CalibrationError, InputError, ShapeError
+from tofclip.errors import CalibrationError, ShapeError, require
 from tofclip.units import MAD_TO_SIGMA
 
 DOT_HALF_WIDTH_PX = 14  # the core of a dot; aberrated tails beyond it would pull the centre
@@ -122,8 +122,10 @@ def _subtract_background(picture: ArrayLike, background: ArrayLike) -> FloatArra
     a, b = np.asarray(picture, dtype=np.float64), np.asarray(background, dtype=np.float64)
     if a.ndim != 2 or a.shape != b.shape:
         raise ShapeError("a background picture", a.shape, b.shape)
-    if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
-        raise InputError("calibration pictures must not hold NaN or infinity")
+    require(
+        np.all(np.isfinite(a)) and np.all(np.isfinite(b)),
+        "calibration pictures must not hold NaN or infinity",
+    )
     difference: FloatArray = a - b
     return difference
 

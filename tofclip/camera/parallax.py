@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from tofclip.arrays import Float32Array, FloatArray
 from tofclip.camera.model import Camera
 from tofclip.camera.rectifier import Measurement
-from tofclip.errors import CalibrationError, InputError, ShapeError
+from tofclip.errors import CalibrationError, ShapeError, require
 from tofclip.solvers import Progress, Sparse, ignore_progress, relative_residual
 
 # How a gate is recovered to see whether its views agree.
@@ -161,8 +161,10 @@ def find_sharpest_shears(
         There are fewer than two finite shears.
     """
     tried = np.asarray(shears, dtype=np.float64)
-    if tried.ndim != 1 or tried.size < 2 or not np.all(np.isfinite(tried)):
-        raise InputError("at least two finite shears have to be tried")
+    require(
+        tried.ndim == 1 and tried.size >= 2 and np.all(np.isfinite(tried)),
+        "at least two finite shears have to be tried",
+    )
     table = np.zeros((len(gates), tried.size))
     for column, shear in enumerate(tried):
         operator = camera.operator(float(shear))

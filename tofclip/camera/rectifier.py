@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import BoolArray, Float32Array, IndexArray, IntArray
 from tofclip.camera.model import Camera
-from tofclip.errors import CalibrationError, InputError, require_shape
+from tofclip.errors import CalibrationError, require, require_shape
 from tofclip.threads import LANES, count_block_threads, run_blocks, split_blocks
 
 DARK_ROW_FRACTION = 0.05
@@ -135,14 +135,13 @@ class Rectifier:
         self._prepare(counts)
         bad = np.zeros(counts.shape, bool) if saturated is None else saturated
         valid = self._find_valid(bad, delay)
-        if not valid.any():
-            raise InputError(
-                "no measurement can be trusted: every pixel is saturated, dead or outside the sweep"
-            )
+        require(
+            valid.any(),
+            "no measurement can be trusted: every pixel is saturated, dead or outside the sweep",
+        )
         measurements = self.rectify(counts, dark, delay)
         # Light that only saturated pixels show would let a recovery run on nothing.
-        if not np.any((measurements > 0) & valid):
-            raise InputError(NO_LIGHT_MESSAGE)
+        require(np.any((measurements > 0) & valid), NO_LIGHT_MESSAGE)
         return Measurement(measurements, valid)
 
     def rectify(
@@ -156,8 +155,7 @@ class Rectifier:
         measurements = self._sample(counts, level, delay)
         # Some rows at a time: noise about the dark level is above it in the first ones already.
         pieces = split_blocks(len(measurements), ROWS_PER_BLOCK)
-        if not any(measurements[piece].max() > 0 for piece in pieces):
-            raise InputError(NO_LIGHT_MESSAGE)
+        require(any(measurements[piece].max() > 0 for piece in pieces), NO_LIGHT_MESSAGE)
         return measurements.T
 
     def rectify_rows(self, counts: Float32Array, dark: float, numbers: IntArray) -> Float32Array:
@@ -269,8 +267,7 @@ class RowSums:
             subtract_dark_level(measured[piece], np.float32(dark), sums[piece], lit[piece])
 
         run_blocks(work, lit.size, -(-lit.size // count_block_threads()))
-        if not lit.any():
-            raise InputError(NO_LIGHT_MESSAGE)
+        require(lit.any(), NO_LIGHT_MESSAGE)
         return dark
 
     def _add_rows(self, counts: Float32Array, sums: Float32Array) -> Float32Array:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from math import inf
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from tofclip.camera.parallax import (
     fit_parallax_to_shears,
 )
 from tofclip.camera.registration import count_registration_iterations
-from tofclip.errors import CalibrationError, InputError
+from tofclip.errors import CalibrationError, InputError, require, require_positive
 from tofclip.recovery.shot import Shot
 from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
@@ -92,8 +93,7 @@ class FixedFocus(Focus):
     shear: float = 0.0
 
     def __post_init__(self) -> None:
-        if not np.isfinite(self.shear):
-            raise InputError(f"a shear must be finite, got {self.shear}")
+        require(np.isfinite(self.shear), f"a shear must be finite, got {self.shear}")
 
     def __str__(self) -> str:
         return f"fixed:{self.shear:g}"
@@ -119,10 +119,7 @@ class DepthLockedFocus(Focus):
     tolerance_px: float = 0.25
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.tolerance_px) and self.tolerance_px > 0):
-            raise InputError(
-                f"the tolerance must be a positive number of pixels, got {self.tolerance_px}"
-            )
+        require_positive("the tolerance", self.tolerance_px, "number of pixels")
 
     def __str__(self) -> str:
         return "depth-locked"
@@ -163,10 +160,10 @@ class SharpestFocus(Focus):
     number: int
 
     def __post_init__(self) -> None:
-        if not (np.all(np.isfinite([self.first, self.last])) and self.first < self.last) or (
-            self.number < 2
-        ):
-            raise InputError(f"a focus stack needs two or more rising shears, got {self}")
+        require(
+            -inf < self.first < self.last < inf and self.number >= 2,
+            f"a focus stack needs two or more rising shears, got {self}",
+        )
 
     def __str__(self) -> str:
         return f"stack:{self.first:g}:{self.last:g}:{self.number}"
@@ -257,8 +254,7 @@ def fit_parallax_to_shot(
     InputError
         Fewer than three gates.
     """
-    if gates < MIN_GATES:
-        raise InputError(f"a parallax needs {MIN_GATES} gates or more, got {gates}")
+    require(gates >= MIN_GATES, f"a parallax needs {MIN_GATES} gates or more, got {gates}")
     shot = shot.fit_camera(progress)
     camera, times = shot.camera, shot.times
     measurement = measure(shot.streak.counts, shot.streak.saturated, camera)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.errors import FileFormatError, InputError, StorageError, require
 from tofclip.io import read_streak
 from tofclip.io.streaks import StreakStack
 from tofclip.sequences.jobs import SETTINGS_NAME
@@ -117,8 +117,7 @@ def list_files(
     files = sorted(
         path.absolute() for path in found if path.is_file() and not path.name.startswith(".")
     )
-    if not files:
-        raise InputError(f"{source}: there is no file")
+    require(files, f"{source}: there is no file")
     common = Path(os.path.commonpath([path.parent for path in files]))
     named: dict[str, Path] = {}
     for path in files:

@@ -14,7 +14,7 @@ import numpy as np
 
 from tofclip.arrays import Float32Array, FloatArray
 from tofclip.camera import Camera
-from tofclip.errors import InputError
+from tofclip.errors import require
 from tofclip.files import compute_sha256, require_apart
 from tofclip.lidar import PointCloud
 from tofclip.recovery import SharpestFocus, open_shot, parse_focus
@@ -70,10 +70,11 @@ class RangingSettings:
     steady: bool = True
 
     def __post_init__(self) -> None:
-        if isinstance(parse_focus(self.focus), SharpestFocus):
-            raise InputError("a sequence has one focus for all shots: depth-locked or fixed:S")
-        if self.average < 1:
-            raise InputError("a sequence needs at least one shot to average")
+        require(
+            not isinstance(parse_focus(self.focus), SharpestFocus),
+            "a sequence has one focus for all shots: depth-locked or fixed:S",
+        )
+        require(self.average >= 1, "a sequence needs at least one shot to average")
 
     def jobs(self, shots: Mapping[str, Shot], folder: Path, suffix: str) -> list[Job]:
         """Return one job for each cloud, which writes it into `folder` in the format of `suffix`.
@@ -191,8 +192,7 @@ def make_average_cloud(
     """Make one cloud of successive shots, each read when it is called, and say by how many rows each
     was late; without `jitter` they are taken as they come.
     """
-    if not shots:
-        raise InputError("a cloud needs at least one shot")
+    require(shots, "a cloud needs at least one shot")
     late = np.zeros(len(shots))
 
     def measurements(place: int) -> Float32Array:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tofclip.arrays import CPU, parse_device
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require
 from tofclip.files import compute_sha256
 from tofclip.lidar import PointCloud, Returns, depth, point_cloud
 from tofclip.lidar.cloud import save_organised
@@ -197,17 +197,19 @@ class CloudSettings:
     false_alarm: float | None = None
 
     def __post_init__(self) -> None:
-        if self.returns not in RETURN_CHOICES:
-            raise InputError(
-                f"no return is called '{self.returns}'; choose one of {', '.join(RETURN_CHOICES)}"
-            )
-        if self.organised and self.returns == "all":
-            raise InputError(
-                "an organised cloud has one point for a pixel: choose the first, strongest or last "
-                "return"
-            )
-        if self.organised and self.voxel is not None:
-            raise InputError("an organised cloud keeps its pixels: leave the side of voxels out")
+        require(
+            self.returns in RETURN_CHOICES,
+            f"no return is called '{self.returns}'; choose one of {', '.join(RETURN_CHOICES)}",
+        )
+        require(
+            not self.organised or self.returns != "all",
+            "an organised cloud has one point for a pixel: choose the first, strongest or last "
+            "return",
+        )
+        require(
+            not self.organised or self.voxel is None,
+            "an organised cloud keeps its pixels: leave the side of voxels out",
+        )
 
     def make_cloud(self, frames: Frames, origin: str) -> tuple[PointCloud, Returns]:
         """Find each pixel's returns, where the frames carry none, and place them in space;

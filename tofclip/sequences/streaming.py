@@ -21,7 +21,7 @@ from time import perf_counter
 from typing import Any, Literal, NamedTuple, Protocol
 
 from tofclip.camera import Camera
-from tofclip.errors import InputError, TofclipError
+from tofclip.errors import InputError, TofclipError, require
 from tofclip.lidar import PointCloud, point_cloud
 from tofclip.lidar.photons import PhotonCube
 from tofclip.plugins import METHODS
@@ -90,19 +90,20 @@ def make_pipeline(
     InputError
         No such method or focus, a method for histograms, or a streak image without a camera.
     """
-    if average < 1:
-        raise InputError(f"a stream averages 1 shot or more, not {average}")
-    if isinstance(focus, SharpestFocus):
-        raise InputError("a stream has one focus for all shots: depth-locked or fixed:S")
+    require(average >= 1, f"a stream averages 1 shot or more, not {average}")
+    require(
+        not isinstance(focus, SharpestFocus),
+        "a stream has one focus for all shots: depth-locked or fixed:S",
+    )
     if isinstance(shot, PhotonCube):
-        if average != 1:
-            raise InputError(
-                "photons of histograms are summed wherever nothing moves: leave out the average"
-            )
-        if method is not None:
-            raise InputError(
-                "histograms of a picture are ranged by their photons alone: leave out the method"
-            )
+        require(
+            average == 1,
+            "photons of histograms are summed wherever nothing moves: leave out the average",
+        )
+        require(
+            method is None,
+            "histograms of a picture are ranged by their photons alone: leave out the method",
+        )
         return PhotonPipeline.for_shot(shot, camera, time_zero)
     wanted = "l1" if method is None else method
     chosen = METHODS.make(wanted, {}) if isinstance(wanted, str) else wanted
@@ -175,10 +176,10 @@ def run_in_order(
     default the error ends the stream.
     """
     for what, number in (("works on", at_once), ("holds", queue_size)):
-        if number < 1:
-            raise InputError(f"a stream {what} one entry or more, not {number}")
-    if policy not in POLICIES:
-        raise InputError(f"a stream's policy is one of {', '.join(POLICIES)}, not '{policy}'")
+        require(number >= 1, f"a stream {what} one entry or more, not {number}")
+    require(
+        policy in POLICIES, f"a stream's policy is one of {', '.join(POLICIES)}, not '{policy}'"
+    )
     drops = policy == "drop_oldest"
 
     def submit(value: Any) -> Future[Any]:
