@@ -6,7 +6,7 @@ import numpy as np
 
 from tofclip.camera import Camera, SkewSweep
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState
-from tofclip.recovery.surfaces.patches import SmoothBasis
+from tofclip.recovery.surfaces.shapes import SmoothBasis
 from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate
 from tofclip.simulate.patterns import make_checkerboard, make_plain_pattern

@@ -19,7 +19,7 @@ from tofclip.recovery.surfaces.fit import (
     straighten_surfaces,
 )
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, weigh_measurements
-from tofclip.recovery.surfaces.patches import SmoothBasis, evaluate_monomials, find_patches
+from tofclip.recovery.surfaces.patches import find_patches
 from tofclip.recovery.surfaces.pulse import make_pulse
 from tofclip.recovery.surfaces.ranges import (
     CLUSTER_COLUMNS,
@@ -33,6 +33,7 @@ from tofclip.recovery.surfaces.ranges import (
     refine_state,
 )
 from tofclip.recovery.surfaces.returns import estimate_displacement, list_returns
+from tofclip.recovery.surfaces.shapes import QuadricBasis, SmoothBasis, evaluate_monomials
 from tofclip.shots import Frames
 from tofclip.simulate import simulate_shot
 
@@ -58,19 +59,49 @@ def test_patches_are_planes_to_rounding_and_halves_of_one_are_joined():
     np.testing.assert_allclose(fitted, plane.ravel(), atol=1e-4)
 
 
-def test_a_ball_that_no_quadratic_follows_gets_splines():
+def test_what_no_quadratic_follows_gets_splines():
     y, x = np.indices((64, 64))
     ray_length = np.sqrt(1 + ((x - 32) / 300) ** 2 + ((y - 32) / 300) ** 2)
-    square = 1 - ((x - 32) ** 2 + (y - 32) ** 2) / 27.0**2
-    ball = np.where(square > 0.1, 1.5 - 0.12 * np.sqrt(np.maximum(square, 0)), np.nan)
-    distance = ball + 3e-4 * np.random.default_rng(0).standard_normal(ball.shape)
+    waves = 1.5 + 0.01 * np.sin(x / 8) * np.cos(y / 9)
+    distance = waves + 3e-4 * np.random.default_rng(0).standard_normal(waves.shape)
     (patch,) = find_patches_in(distance, ray_length)
-    assert not patch.basis.is_quadratic
-    fitted = ray_length.ravel()[patch.pixels] / (
-        patch.basis.evaluate(patch.pixels) @ patch.coefficients
-    )
-    # noise of a tenth of a bin; the quadratic leaves 0.38 bins
-    assert np.median(np.abs(fitted - ball.ravel()[patch.pixels])) < 0.15 * BIN_M
+    # noise of a tenth of a bin; waves of three
+    assert np.median(np.abs(patch.compute_ranges(patch.pixels) - waves.ravel())) < 0.15 * BIN_M
+
+
+@pytest.mark.parametrize("axes", [(1, 1, 1), (1, 0, 1)])
+def test_a_ball_and_a_rod_are_followed_up_to_their_limbs(axes):
+    """Frames' returns at a limb are far too near, all of them, and no polynomial is as steep."""
+    y, x = np.indices((64, 64))
+    rays = np.stack([(x - 32) / 300, (y - 32) / 300, np.ones(x.shape)], axis=-1)
+    ray_length = np.linalg.norm(rays, axis=-1)
+    middle, radius, across = np.array([0.03, -0.02, 1.5]), 0.12, np.array(axes)
+    a, b = np.sum(across * rays**2, axis=-1), rays @ (across * middle)
+    inside = b**2 - a * (np.sum(across * middle**2) - radius**2)
+    with np.errstate(invalid="ignore"):
+        truth = ray_length * (b - np.sqrt(inside)) / a
+    limb = inside / inside.max() < 0.15
+    random = np.random.default_rng(0)
+    distance = truth + 3e-4 * random.standard_normal(truth.shape)
+    distance[limb] -= random.uniform(0, 0.01, truth.shape)[limb]
+    patch = max(find_patches_in(distance, ray_length), key=lambda one: one.pixels.size)
+    # what a pixel at the limb sees is a mean of what is there
+    seen = np.flatnonzero(inside > 0.05 * inside.max())
+    error = patch.compute_ranges(seen) - truth.ravel()[seen]
+    assert np.median(np.abs(error)) < 0.1 * BIN_M
+    assert np.quantile(np.abs(error), 0.95) < BIN_M  # splines: 5 bins at the limb
+
+
+def test_derivatives_of_a_round_surface_are_those_of_differences():
+    basis = QuadricBasis((40, 50), (5, 8, 35, 42), unit=0.02)
+    coefficients = np.array([0.3, 0.01, 0.02, 0.1, 0.01, 0.005, -0.1, 0.008, -0.12])
+    functions = basis.evaluate(np.arange(40 * 50))  # within, at the limb, and beyond
+    found = basis.differentiate(functions, coefficients)
+    for number, step in enumerate(1e-6 * np.eye(coefficients.size)):
+        ahead, behind = (
+            basis.compute_inverse(functions, coefficients + sign * step) for sign in (1, -1)
+        )
+        np.testing.assert_allclose(found[:, number], (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-6)
 
 
 def test_splines_are_a_quadratic_and_what_bends():

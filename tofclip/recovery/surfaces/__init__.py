@@ -2,7 +2,7 @@
 
 A frame is a thin slice through surfaces, often a ring or a sliver, which no prior on pictures fits.
 Here the prior is on the surfaces. Surface k has a range r_k(p), its inverse depth a smooth function
-over the picture, and an amplitude a_k(p) >= 0; the raw streak image is
+over the picture (`shapes`), and an amplitude a_k(p) >= 0; the raw streak image is
 
     y = sum_k sum_p a_k(p) g_v s_v(p, r_k(p)) h(t - 2 r_k(p) / c),
 

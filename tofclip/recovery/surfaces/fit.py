@@ -18,14 +18,10 @@ from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.lidar import Detection, compute_ray_directions, depth
 from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver, Tick
-from tofclip.recovery.surfaces.patches import (
-    COEFFICIENTS,
-    Pixels,
-    find_dimmer_patches,
-    rank_within_pixels,
-)
+from tofclip.recovery.surfaces.patches import find_dimmer_patches, rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
 from tofclip.recovery.surfaces.ranges import Refinement, refine_state
+from tofclip.recovery.surfaces.shapes import COEFFICIENTS, ROUND_COEFFICIENTS, Pixels
 from tofclip.recovery.surfaces.start import (
     CHANGED_RATIO,
     MAX_UNEXPLAINED,
@@ -50,8 +46,9 @@ LAST_STEP_SIGMAS = 0.3
 FOLLOWING_ITERATIONS, FOLLOWING_MARGIN_PX = 10, 4
 CHANGED_EXCESS = 0.02  # beyond `CHANGED_RATIO` of what surfaces left unexplained
 
-# Of the greatest need for splines of all surfaces: those that need them more have them.
-CERTAINLY_BENT = 3.0
+# Of the greatest need to be bent of all surfaces, or of a need that leaves no doubt: those that need it
+# more are bent.
+CERTAINLY_BENT, NO_DOUBT = 3.0, 100.0
 
 # Bins in range, and pixels, within which frames' returns and surfaces are the same.
 NEAR_BINS, NEAR_PX = 7.0, 1.5
@@ -180,7 +177,9 @@ def follow_surfaces(
         )
         model, limit = solver.model, MAX_UNEXPLAINED
         remainder = np.zeros(len(patches))
-        begun = replace(begun, explained=np.zeros((COEFFICIENTS, model.surface.size), np.float32))
+        begun = replace(
+            begun, explained=np.zeros((ROUND_COEFFICIENTS, model.surface.size), np.float32)
+        )
     solver.run(FOLLOWING_ITERATIONS)
     # what explains the last shot best without the prior has that shot's noise
     refinement = refine_state(model, solver.amplitude, begun, True)
@@ -212,8 +211,8 @@ def _keep_lit(solver: AmplitudeSolver) -> AmplitudeSolver:
 def straighten_surfaces(
     solver: AmplitudeSolver,
 ) -> tuple[AmplitudeSolver, Refinement | None]:
-    """Replace splines by quadratics where these explain the shot as well, after a step; return what
-    that step knew as well, if there was one. Splines follow the returns of frames, also where these
+    """Replace splines and quadrics by quadratics where these explain the shot as well, after a step;
+    return what that step knew as well, if there was one. Splines follow the returns of frames, also where these
     are displaced, as behind gauze; the shot itself says whether the surface is bent.
     """
     model = solver.model
@@ -243,7 +242,7 @@ def straighten_surfaces(
         if max(needed) <= 1:
             return AmplitudeSolver(trial, after.amplitude, solver.weight, solver), after
         # one that is bent for certain takes light from others: these are tried again without it
-        least = max(1.0, max(needed) / CERTAINLY_BENT)
+        least = max(1.0, min(max(needed), NO_DOUBT) / CERTAINLY_BENT)
         straight = [one for one, need in zip(straight, needed, strict=True) if need <= least]
     return solver, replace(before, free=None)
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, estimate_dark_level
 from tofclip.lidar import compute_ray_directions
-from tofclip.recovery.surfaces.patches import MIN_BEHIND_FRACTION, KnownBasis, SmoothBasis
+from tofclip.recovery.surfaces.patches import MIN_BEHIND_FRACTION
 from tofclip.recovery.surfaces.pulse import (
     EXTENT_SIGMAS,
     FWHM_PER_SIGMA,
@@ -37,6 +37,7 @@ from tofclip.recovery.surfaces.pulse import (
     ShotPulse,
     make_pulse,
 )
+from tofclip.recovery.surfaces.shapes import KnownBasis, SmoothBasis
 from tofclip.shots import Streak
 from tofclip.threads import map_parallel, split_blocks, thread_count
 from tofclip.units import SPEED_OF_LIGHT
@@ -253,7 +254,7 @@ class SurfaceModel:
         self.pixel = self.row * masks.shape[2] + self.column
         ends = np.searchsorted(self.surface, np.arange(len(masks) + 1))
         self.parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
-        self.monomials = self._evaluate(self.pixel)
+        self.functions = self._evaluate(self.pixel)
         self._directions = compute_ray_directions(self.camera, self.row, self.column)
         axis_row, axis_column = self.camera.optical_axis_px
         self._x, self._y = self.column - axis_column, self.row - axis_row
@@ -295,8 +296,10 @@ class SurfaceModel:
     def place(self, state: SurfaceState) -> None:
         """Move the surfaces to where `state` has them."""
         self.state = state
-        shapes = zip(self.monomials, state.coefficients, strict=True)
-        inverse = np.concatenate([m @ c for m, c in shapes])
+        shapes = list(zip(self.bases, self.functions, state.coefficients, strict=True))
+        inverse = np.concatenate([basis.compute_inverse(f, c) for basis, f, c in shapes])
+        # of each surface, (points, coefficients), of the inverse depths
+        self.derivatives = [basis.differentiate(f, c) for basis, f, c in shapes]
         self.distance = np.asarray(self.ray_length / np.maximum(inverse, MIN_INVERSE_DEPTH))
         self.places = Places.split(
             self.distance, self.compute_slopes(), self.pulse.sigma, self.row_m
@@ -438,7 +441,7 @@ class SurfaceModel:
         where they are lit.
         """
         other, state = copy.copy(self), self.state.copy()
-        other.bases, other.monomials = list(self.bases), list(self.monomials)
+        other.bases, other.functions = list(self.bases), list(self.functions)
         for surface in surfaces:
             part = self.parts[surface]
             basis = SmoothBasis(self.bases[surface].image_shape)
@@ -446,13 +449,13 @@ class SurfaceModel:
             inverse = self.ray_length[part] / self.distance[part]
             nearest, *_ = np.linalg.lstsq(design[lit], inverse[lit])
             state.coefficients[surface] = nearest.astype(np.float64)
-            other.bases[surface], other.monomials[surface] = basis, design
+            other.bases[surface], other.functions[surface] = basis, design
         other.place(state)
         return other
 
     def estimate_deviation(self, covariances: Sequence[FloatArray]) -> FloatArray:
         """Standard deviations of all ranges, (points,), by covariances of surfaces' coefficients."""
-        known = zip(self.monomials, covariances, strict=True)
+        known = zip(self.derivatives, covariances, strict=True)
         variance = np.concatenate([np.einsum("pi,ij,pj->p", m, c, m) for m, c in known])
         # range = length / inverse depth
         return np.asarray(self.distance**2 / self.ray_length * np.sqrt(variance))

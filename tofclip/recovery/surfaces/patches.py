@@ -1,15 +1,16 @@
 """Smooth surfaces in the returns of frames: connected patches, and a robust smooth fit to each.
 
 A surface's inverse depth 1/z is a quadratic of the picture's coordinates, which a plane's is exactly,
-or a spline where a quadratic does not follow its returns. Range is ``length / (1/z)``, with the length
-of the ray ``(X/f, Y/f, 1)``. A patch is the surface's first estimate: where it is seen, and its inverse
-depth over a `SmoothBasis`. Pixels are raster numbers, ranges metres, `ray_length` is (rows, columns).
+or where a quadratic does not follow its returns one of the others in `shapes`. Range is ``length /
+(1/z)``, with the length of the ray ``(X/f, Y/f, 1)``. A patch is the surface's first estimate: where it
+is seen, and its inverse depth over a `SmoothBasis`. Pixels are raster numbers, ranges metres,
+`ray_length` is (rows, columns).
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,15 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.lidar.search import number_returns
+from tofclip.recovery.surfaces.shapes import (
+    SPLINE_DEGREE,
+    TINY,
+    Pixels,
+    SmoothBasis,
+    fit_quadric,
+)
 from tofclip.shots import Returns
 
-Pixels = NDArray[np.intp]
-
-COEFFICIENTS = 6  # of a quadratic
-SPLINE_DEGREE = 3
 MARGIN_PX = 10  # how far a surface may reach beyond the returns that showed it
 NEIGHBOUR_BINS = 1.6  # neighbouring pixels whose ranges differ by less lie on one surface
 # Of that: by how much they may differ where the surface is turned as far on either side.
@@ -51,79 +55,10 @@ KNOT_SPACING_PX, MAX_PIECES = 12, 8
 RETURNS_PER_UNKNOWN = 3.0  # of splines: they share their errors
 BEND_BINS = 0.3  # misfit of a quadratic from which on splines are tried
 BENT_FRACTION = 0.6  # of a quadratic's misfit: splines are worth their freedom below
+MIN_ROUND_PX = 100  # of a surface of second order in space: any few returns lie on one
 EVIDENCE_ROUNDS = 2
 SPLINE_START_PENALTY, SPLINE_FLOOR = 1e-5, 1e-9  # per return, before the bending is known
 CORRELATED_PX = 30  # returns of a frame recovery that share their errors, about
-TINY = float(np.finfo(np.float32).eps)
-
-
-@dataclass(frozen=True)
-class SmoothBasis:
-    """Smooth functions over the picture, of which a surface's inverse depth is a sum."""
-
-    image_shape: tuple[int, int]
-    # first row and column, and those after the last, over which splines run
-    box: tuple[int, int, int, int] = (0, 0, 0, 0)
-    # of the splines along rows and columns; without any it is the six monomials of a quadratic
-    pieces: tuple[int, int] = (0, 0)
-    # (n, n), half of ``c' bending c`` is added to the objective: what is known of coefficients c
-    # without the shot. By default nothing is
-    bending: FloatArray = field(default_factory=lambda: np.zeros((COEFFICIENTS, COEFFICIENTS)))
-
-    @property
-    def is_quadratic(self) -> bool:
-        """Whether the functions are the monomials of a quadratic, and not splines."""
-        return self.pieces == (0, 0)
-
-    def evaluate(self, pixels: Pixels) -> FloatArray:
-        """Return the functions' values, (pixels, n): monomials, or uniform cubic B-splines, which
-        are beyond their box as at its ends.
-        """
-        if self.is_quadratic:
-            return evaluate_monomials(pixels, self.image_shape)
-        from scipy.interpolate import BSpline
-
-        along = []
-        ends = zip(self.box[:2], self.box[2:], strict=True)
-        places = zip(np.divmod(pixels, self.image_shape[1]), ends, self.pieces, strict=True)
-        for place, (first, last), pieces in places:
-            knots = np.arange(-SPLINE_DEGREE, pieces + SPLINE_DEGREE + 1) / pieces
-            inside = np.clip((place - first + 0.5) / (last - first), 0.0, 1 - 1e-9)
-            along.append(BSpline.design_matrix(inside, knots, SPLINE_DEGREE).toarray())
-        return np.asarray(np.einsum("pi,pj->pij", *along).reshape(pixels.size, -1))
-
-    def split_quadratic(self) -> tuple[FloatArray, FloatArray]:
-        """Return the coefficients of the six monomials over this basis, (n, 6), and what of each
-        function is such a quadratic, (6, n), both as least squares over the splines' box.
-        """
-        if self.is_quadratic:
-            return np.eye(COEFFICIENTS), np.eye(COEFFICIENTS)
-        inside = np.zeros(self.image_shape, bool)
-        inside[max(self.box[0], 0) : self.box[2], max(self.box[1], 0) : self.box[3]] = True
-        pixels = np.flatnonzero(inside)
-        functions, monomials = self.evaluate(pixels), evaluate_monomials(pixels, self.image_shape)
-        coefficients, *_ = np.linalg.lstsq(functions, monomials)
-        quadratic, *_ = np.linalg.lstsq(monomials, functions)
-        return coefficients.astype(np.float64), quadratic.astype(np.float64)
-
-
-def evaluate_monomials(pixels: Pixels, image_shape: tuple[int, int]) -> FloatArray:
-    """Return 1, x, y, x^2, xy and y^2 of pixels, (n, 6), in halves of the picture from its middle."""
-    y, x = np.divmod(pixels, image_shape[1])
-    down, right = 2 * y / image_shape[0] - 1, 2 * x / image_shape[1] - 1
-    return np.stack([np.ones_like(x), right, down, right**2, right * down, down**2], axis=-1)
-
-
-@dataclass(frozen=True)
-class KnownBasis(SmoothBasis):
-    """One function: inverse depths that are known point by point, 1/m, (rows, columns)."""
-
-    inverse: FloatArray = field(default_factory=lambda: np.ones((0, 0)))
-    bending: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
-
-    def evaluate(self, pixels: Pixels) -> FloatArray:
-        """Return the inverse depths at some pixels, (pixels, 1)."""
-        return self.inverse.ravel()[pixels, np.newaxis]
 
 
 @dataclass(frozen=True)
@@ -139,7 +74,7 @@ class Patch:
 
     def compute_ranges(self, pixels: Pixels) -> FloatArray:
         """Return the ranges of the surface at some pixels, (n,)."""
-        inverse = self.basis.evaluate(pixels) @ self.coefficients
+        inverse = self.basis.compute_inverse(self.basis.evaluate(pixels), self.coefficients)
         found: FloatArray = self.ray_length.ravel()[pixels] / inverse
         return found
 
@@ -219,10 +154,11 @@ def _stands_apart(part: Patch, whole: Patch, bin_m: float) -> bool:
     followed = part.compute_error(whole)
     if followed <= MERGE_BINS * bin_m:
         return False
-    # six numbers that say as much as all splines; what is round takes its own
+    # six numbers that say as much as all of the whole's; what is round takes splines of its own, as any
+    # rim of a ball is one of second order
     return (
         part.compute_error() < followed
-        or _bend_where_needed(part, bin_m).compute_error() < BENT_FRACTION * followed
+        or _give_splines(part).compute_error() < BENT_FRACTION * followed
     )
 
 
@@ -320,10 +256,22 @@ def _merge(large: Patch, small: Patch, bin_m: float) -> Patch | None:
 
 
 def _bend_where_needed(patch: Patch, bin_m: float) -> Patch:
-    """Give a patch splines where a quadratic does not follow its returns and they do."""
+    """Make a patch a surface of second order in space, or give it splines, whichever follows its
+    returns better, where a quadratic does not follow them.
+    """
     plain = patch.compute_error()
     if plain < BEND_BINS * bin_m:
         return patch
+    bent = _give_splines(patch)
+    if patch.pixels.size >= MIN_ROUND_PX:
+        inverse = patch.ray_length.ravel()[patch.pixels] / patch.distance
+        basis, coefficients = fit_quadric(patch.pixels, inverse, patch.basis.image_shape)
+        quadric = replace(patch, basis=basis, coefficients=coefficients)
+        bent = min(quadric, bent, key=Patch.compute_error)
+    return bent if bent.compute_error() < BENT_FRACTION * plain else patch
+
+
+def _give_splines(patch: Patch) -> Patch:
     corners = np.stack(np.divmod(patch.pixels, patch.ray_length.shape[1]))
     start, end = corners.min(axis=1) - MARGIN_PX, corners.max(axis=1) + 1 + MARGIN_PX
     free = int(patch.pixels.size / RETURNS_PER_UNKNOWN)
@@ -350,8 +298,7 @@ def _bend_where_needed(patch: Patch, bin_m: float) -> Patch:
         # the bending that the fit itself shows is what is known about it (empirical Bayes)
         usual = float(np.mean((differences @ coefficients) ** 2)) + TINY
         penalty = scale**2 * CORRELATED_PX * bending / usual + floor
-    bent = replace(patch, basis=replace(basis, bending=bending / usual), coefficients=coefficients)
-    return bent if bent.compute_error() < BENT_FRACTION * plain else patch
+    return replace(patch, basis=replace(basis, bending=bending / usual), coefficients=coefficients)
 
 
 def find_dimmer_patches(

@@ -23,8 +23,8 @@ from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.recovery.surfaces.amplitudes import TINY, explain_by_amplitude, scale_amplitude
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, Window
-from tofclip.recovery.surfaces.patches import COEFFICIENTS
 from tofclip.recovery.surfaces.pulse import Image, differentiate_pulse
+from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS
 from tofclip.threads import map_parallel
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -168,12 +168,12 @@ def _differentiate_sweep(model: SurfaceModel, amplitude: Image, view: int) -> li
 def _differentiate_surface(
     model: SurfaceModel, amplitude: Image, surface: int
 ) -> list[Derivatives]:
-    part, monomials = model.parts[surface], model.monomials[surface]
+    part, derivatives = model.parts[surface], model.derivatives[surface]
     there = 2 * model.distance[part] / SPEED_OF_LIGHT + model.camera.time_zero
     rows_per_metre = 2 / SPEED_OF_LIGHT / np.interp(there, model.times, np.gradient(model.times))
     # range = length / inverse depth
     by_inverse = -(model.distance[part] ** 2) / model.ray_length[part] * rows_per_metre
-    in_range = (amplitude[part] * by_inverse)[:, np.newaxis] * monomials
+    in_range = (amplitude[part] * by_inverse)[:, np.newaxis] * derivatives
     lights = np.ascontiguousarray(in_range.T, np.float32)
     windows = []
     for view, place in enumerate(model.footprints):
@@ -290,7 +290,8 @@ class Refinement:
     # of each surface's coefficients; everything else that was solved for is unknown
     covariances: list[FloatArray]
     amplitude: Image  # after the step
-    # (6, points), changes of amplitude that look like a change of each coefficient of a quadratic
+    # (9, points), changes of amplitude that look like a change of each coefficient of a quadratic, of
+    # which there are six, or of a surface of second order in space
     explained: Image
     steps: int  # taken, with this one
     # after the step: the misfit that amplitudes cannot explain, (rows, columns)
@@ -454,14 +455,15 @@ def _eliminate_amplitude(
     surfaces, which hardly share measurements, the derivatives of one number are treated at once.
     Splines bend less than amplitudes could follow, but what of them is a quadratic does not.
 
-    Returns `changes` (6, points): x for each coefficient of a quadratic; and derivatives by the first
-    of these changes of each surface's amplitude, ("patterns", surface, 0): what amplitudes can explain
-    of views that are all late is an unknown of its own. Taken for what only late views explain, it
-    would make steps too short and ranges surer than they are.
+    Returns `changes` (9, points): x for each coefficient of a quadratic, or of a surface of second
+    order in space; and derivatives by the first of these changes of each surface's amplitude,
+    ("patterns", surface, 0): what amplitudes can explain of views that are all late is an unknown of
+    its own. Taken for what only late views explain, it would make steps too short and ranges surer
+    than they are.
     """
     own = [group for group in groups if group.names[0][0] == "coefficients"]
     shares = [basis.split_quadratic() for basis in model.bases]
-    changes = np.zeros((COEFFICIENTS, model.surface.size), np.float32)
+    changes = np.zeros((ROUND_COEFFICIENTS, model.surface.size), np.float32)
     iterations = ELIMINATION_ITERATIONS
     if start is not None:
         changes[:, scale > 0] = start[:, scale > 0]
@@ -470,22 +472,24 @@ def _eliminate_amplitude(
         image = np.zeros_like(model.image)
         for group in own:
             functions, _ = shares[group.names[0][1]]
-            image[group.area] += np.tensordot(
-                functions[:, number].astype(np.float32), group.images, 1
-            )
+            if number < functions.shape[1]:
+                image[group.area] += np.tensordot(
+                    functions[:, number].astype(np.float32), group.images, 1
+                )
         if start is not None:
             image -= model.render(change)
         change += explain_by_amplitude(model, image, scale, iterations)
 
     def explain(surface: int) -> list[Derivatives]:
         part = model.parts[surface]
+        own = changes[: len(shares[surface][1]), part]
         windows = [
-            [model.receive(view, change[part], gain * kernel, part) for change in changes]
+            [model.receive(view, change, gain * kernel, part) for change in own]
             for view, (kernel, gain) in enumerate(
                 zip(model.kernels, model.state.gains.astype(np.float32), strict=True)
             )
         ]
-        names = [("explained", surface, number) for number in range(COEFFICIENTS)]
+        names = [("explained", surface, number) for number in range(len(own))]
         return [*_join_windows(model, names, windows)]
 
     patterns = []
@@ -566,7 +570,7 @@ def _move(
         _, quadratic = model.bases[surface].split_quadratic()
         along = -quadratic @ change[own]
         along[0] += change[names.index(("patterns", surface, 0))]
-        ahead[part] += along.astype(np.float32) @ changes[:, part]
+        ahead[part] += along.astype(np.float32) @ changes[: along.size, part]
     # the mean gain is the amplitudes' unit, and so is the mean brightness behind a surface
     brighter, shading = moved.gains.mean() / state.gains.mean(), moved.shading.mean(axis=1)
     moved.gains /= brighter

@@ -13,8 +13,9 @@ from tofclip.camera import Camera
 from tofclip.lidar import Detection
 from tofclip.lidar.range_calibration import correct_returns
 from tofclip.recovery.surfaces.fit import SURE_SIGMAS, SurfaceFit, find_candidates, find_near
-from tofclip.recovery.surfaces.patches import Pixels, rank_within_pixels
+from tofclip.recovery.surfaces.patches import rank_within_pixels
 from tofclip.recovery.surfaces.ranges import measure_local_shifts
+from tofclip.recovery.surfaces.shapes import Pixels
 from tofclip.shots import Returns
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT

@@ -1,0 +1,206 @@
+"""Functions that a surface's inverse depth may be: quadratics and splines over the picture, and surfaces
+of second order in space. Pixels are raster numbers.
+
+A ball, a rod, a cone, any surface of second order, has
+
+    1/z = l(x, y) +- sqrt(q(x, y))
+
+over the picture, with l linear and q quadratic, exactly. Where q becomes negative it ends, and its
+range is steeper there than any polynomial or spline.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from tofclip.arrays import FloatArray
+
+Pixels = NDArray[np.intp]
+
+COEFFICIENTS = 6  # of a quadratic
+LINEAR = 3  # of these
+ROUND_COEFFICIENTS = LINEAR + COEFFICIENTS  # of a surface of second order in space
+SPLINE_DEGREE = 3
+TINY = float(np.finfo(np.float32).eps)
+# Of the change of q over a pixel: the mean of sqrt(q) over what a pixel at the limb sees of a surface
+# is sqrt(q) at the pixel's middle, of which as much is rounded off.
+LIMB = 0.44
+LIMB_LEVELS = np.array([1.0, 1.5, 2.0, 3.0, 5.0])
+FIT_ROUNDS, FIT_STEPS = 8, 30
+
+
+@dataclass(frozen=True)
+class SmoothBasis:
+    """Smooth functions over the picture, of which a surface's inverse depth is a sum."""
+
+    image_shape: tuple[int, int]
+    # first row and column, and those after the last, over which splines run
+    box: tuple[int, int, int, int] = (0, 0, 0, 0)
+    # of the splines along rows and columns; without any it is the six monomials of a quadratic
+    pieces: tuple[int, int] = (0, 0)
+    # (n, n), half of ``c' bending c`` is added to the objective: what is known of coefficients c
+    # without the shot. By default nothing is
+    bending: FloatArray = field(default_factory=lambda: np.zeros((COEFFICIENTS, COEFFICIENTS)))
+
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether the functions are the monomials of a quadratic, and not splines."""
+        return self.pieces == (0, 0)
+
+    def evaluate(self, pixels: Pixels) -> FloatArray:
+        """Return the functions' values, (pixels, n): monomials, or uniform cubic B-splines, which
+        are beyond their box as at its ends.
+        """
+        if self.is_quadratic:
+            return evaluate_monomials(pixels, self.image_shape)
+        from scipy.interpolate import BSpline
+
+        along = []
+        ends = zip(self.box[:2], self.box[2:], strict=True)
+        places = zip(np.divmod(pixels, self.image_shape[1]), ends, self.pieces, strict=True)
+        for place, (first, last), pieces in places:
+            knots = np.arange(-SPLINE_DEGREE, pieces + SPLINE_DEGREE + 1) / pieces
+            inside = np.clip((place - first + 0.5) / (last - first), 0.0, 1 - 1e-9)
+            along.append(BSpline.design_matrix(inside, knots, SPLINE_DEGREE).toarray())
+        return np.asarray(np.einsum("pi,pj->pij", *along).reshape(pixels.size, -1))
+
+    def compute_inverse(self, functions: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """Return inverse depths, (pixels,), from the functions' values."""
+        return np.asarray(functions @ coefficients)
+
+    def differentiate(self, functions: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """Return the derivatives of inverse depths by the coefficients, (pixels, n)."""
+        return functions
+
+    def split_quadratic(self) -> tuple[FloatArray, FloatArray]:
+        """Return the coefficients of the six monomials over this basis, (n, 6), and what of each
+        function is such a quadratic, (6, n), both as least squares over the splines' box.
+        """
+        if self.is_quadratic:
+            return np.eye(COEFFICIENTS), np.eye(COEFFICIENTS)
+        inside = np.zeros(self.image_shape, bool)
+        inside[max(self.box[0], 0) : self.box[2], max(self.box[1], 0) : self.box[3]] = True
+        pixels = np.flatnonzero(inside)
+        functions, monomials = self.evaluate(pixels), evaluate_monomials(pixels, self.image_shape)
+        coefficients, *_ = np.linalg.lstsq(functions, monomials)
+        quadratic, *_ = np.linalg.lstsq(monomials, functions)
+        return coefficients.astype(np.float64), quadratic.astype(np.float64)
+
+
+def evaluate_monomials(pixels: Pixels, image_shape: tuple[int, int]) -> FloatArray:
+    """Return 1, x, y, x^2, xy and y^2 of pixels, (n, 6), in halves of the picture from its middle."""
+    y, x = np.divmod(pixels, image_shape[1])
+    down, right = 2 * y / image_shape[0] - 1, 2 * x / image_shape[1] - 1
+    return np.stack([np.ones_like(x), right, down, right**2, right * down, down**2], axis=-1)
+
+
+@dataclass(frozen=True)
+class QuadricBasis(SmoothBasis):
+    """Inverse depths ``l + sign sqrt(2 unit q)``: coefficients are the 3 of l and the 6 of q, over
+    monomials in halves of the box from its middle.
+    """
+
+    sign: float = 1.0
+    unit: float = 1.0  # 1/m; where the root is as large, inverse depths change as much by q as by l
+    bending: FloatArray = field(
+        default_factory=lambda: np.zeros((ROUND_COEFFICIENTS, ROUND_COEFFICIENTS))
+    )
+
+    @property
+    def is_quadratic(self) -> bool:
+        return False
+
+    def evaluate(self, pixels: Pixels) -> FloatArray:
+        """Return the monomials at some pixels, (pixels, 6)."""
+        row, column = np.divmod(pixels, self.image_shape[1])
+        (top, left), (high, wide) = self.box[:2], self._measure_box()
+        y, x = 2 * (row - top + 0.5) / high - 1, 2 * (column - left + 0.5) / wide - 1
+        return np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=-1)
+
+    def split_quadratic(self) -> tuple[FloatArray, FloatArray]:
+        """No quadratic follows a limb: all functions count on their own, (9, 9)."""
+        return np.eye(ROUND_COEFFICIENTS), np.eye(ROUND_COEFFICIENTS)
+
+    def _measure_box(self) -> tuple[int, int]:
+        return self.box[2] - self.box[0], self.box[3] - self.box[1]
+
+    def compute_inverse(self, functions: FloatArray, coefficients: FloatArray) -> FloatArray:
+        root, _ = self._take_root(functions, coefficients)
+        return np.asarray(functions[:, :LINEAR] @ coefficients[:LINEAR] + self.sign * root)
+
+    def differentiate(self, functions: FloatArray, coefficients: FloatArray) -> FloatArray:
+        _, by_q = self._take_root(functions, coefficients)
+        return np.concatenate([functions[:, :LINEAR], self.sign * by_q], axis=1)
+
+    def _take_root(
+        self, functions: FloatArray, coefficients: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The root of q, (pixels,), and its derivative by q's coefficients, (pixels, 6)."""
+        own = coefficients[LINEAR:]
+        functions = 2 * self.unit * functions
+        q = functions @ own
+        one, x, y = functions[:, :LINEAR].T
+        none, (high, wide) = np.zeros_like(x), self._measure_box()
+        right = np.stack([none, one, none, 2 * x, y, none], axis=-1) * (2 / wide)
+        down = np.stack([none, none, one, none, x, 2 * y], axis=-1) * (2 / high)
+        slopes = right @ own, down @ own
+        change = np.hypot(*slopes) + np.finfo(np.float64).tiny
+        limb = LIMB * change
+        size = np.hypot(q, limb)
+        # twice what is left of q, without the difference of large numbers beyond the limb
+        inside = np.where(q > 0, q + size, limb**2 / (size + np.abs(q)))
+        root = np.sqrt(inside / 2)
+        by_limb = LIMB * (slopes[0][:, None] * right + slopes[1][:, None] * down) / change[:, None]
+        by_q = (inside / size)[:, None] * functions + (limb / size)[:, None] * by_limb
+        return root, by_q / (4 * root)[:, None]
+
+
+@dataclass(frozen=True)
+class KnownBasis(SmoothBasis):
+    """One function: inverse depths that are known point by point, 1/m, (rows, columns)."""
+
+    inverse: FloatArray = field(default_factory=lambda: np.ones((0, 0)))
+    bending: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
+
+    def evaluate(self, pixels: Pixels) -> FloatArray:
+        """Return the inverse depths at some pixels, (pixels, 1)."""
+        return self.inverse.ravel()[pixels, np.newaxis]
+
+
+def fit_quadric(
+    pixels: Pixels, inverse: FloatArray, image_shape: tuple[int, int]
+) -> tuple[QuadricBasis, FloatArray]:
+    """Fit the inverse depths of returns robustly; return the basis and its coefficients."""
+    corners = np.stack(np.divmod(pixels, image_shape[1]))
+    ends = corners.min(axis=1), corners.max(axis=1) + 1
+    middle, unit = float(np.median(inverse)), float(np.std(inverse)) + TINY
+    basis = QuadricBasis(image_shape, tuple(np.concatenate(ends).tolist()), unit=unit)
+    functions = basis.evaluate(pixels)
+    plain, *_ = np.linalg.lstsq(functions, inverse)
+    # what bulges towards the camera has its greatest inverse depth in the middle
+    basis = replace(basis, sign=1.0 if plain[3] + plain[5] < 0 else -1.0)
+
+    def measure(coefficients: FloatArray) -> FloatArray:
+        return np.asarray((basis.compute_inverse(functions, coefficients) - inverse) / unit)
+
+    def differentiate(coefficients: FloatArray) -> FloatArray:
+        return np.asarray(basis.differentiate(functions, coefficients) / unit)
+
+    # With a constant l, q is a quadratic fit to squares: of some constants, the best is the start.
+    starts = []
+    for limb in middle - basis.sign * unit * LIMB_LEVELS:
+        height = np.maximum(basis.sign * (inverse - limb), unit / 10)
+        sure = 1 / height
+        q, *_ = np.linalg.lstsq(2 * unit * sure[:, np.newaxis] * functions, height)
+        starts.append(np.concatenate([[limb, 0, 0], q]))
+    found = min(starts, key=lambda one: float(np.median(np.abs(measure(one)))))
+    # frames' returns at a limb are far too near, all of them: what the others do not share hardly counts
+    for _ in range(FIT_ROUNDS):
+        scale = float(np.median(np.abs(measure(found)))) + TINY
+        settings = {"loss": "arctan", "f_scale": scale, "x_scale": "jac", "max_nfev": FIT_STEPS}
+        found = scipy.optimize.least_squares(measure, found, differentiate, **settings).x
+    return basis, found
