@@ -31,10 +31,15 @@ def estimate(rates: np.ndarray, seed: int = 0, *pulse: Pulse | bool) -> SurfaceI
     return estimate_surface(PhotonImage.from_cube(counts, scenes.BIN), *pulse)
 
 
-def compute_z(found: SurfaceImage, surface: np.ndarray) -> float:
-    """Robust: borders are told by the probability of an outlier."""
-    ratio = (found.range / scenes.BIN_M - surface) / (found.range_sigma / scenes.BIN_M)
-    return float(1.4826 * np.median(np.abs(ratio)))
+def find_wrong(found: SurfaceImage, surface: np.ndarray) -> np.ndarray:
+    """Pixels more than three bins off."""
+    return np.abs(found.range / scenes.BIN_M - surface) > 3
+
+
+def require_true_deviations(found: SurfaceImage, surface: np.ndarray, most=1.3) -> None:
+    """Robust: borders are told by the probability of an outlier. `surface`: in bins."""
+    ratio = (found.range - surface * scenes.BIN_M) / found.range_sigma
+    assert 0.7 < 1.4826 * np.nanmedian(np.abs(ratio)) < most
 
 
 @pytest.mark.parametrize(
@@ -50,9 +55,9 @@ def test_deviations_and_outliers_are_as_stated(signal, background, least):
     """
     surface = scenes.make_surface()
     found = estimate(scenes.make_rates(surface, signal * TILES + 0 * surface, background / BINS))
-    wrong = np.abs(found.range / scenes.BIN_M - surface) > 3
+    wrong = find_wrong(found, surface)
     assert 1 - wrong.mean() >= least
-    assert 0.7 < compute_z(found, surface) < 1.3
+    require_true_deviations(found, surface)
     said = float(found.outlier_probability.mean())
     # a share of a hundredth, which either may be off, is as good as none
     assert (wrong.mean() - 0.005) / 2 < said < 2 * wrong.mean() + 0.005
@@ -72,7 +77,7 @@ def test_many_photons_place_the_surface_far_below_a_bin(shape, pulse):
     assert np.median(found.intensity) == pytest.approx(60, rel=0.05)
     error = found.range / scenes.BIN_M - surface
     assert 1.4826 * np.median(np.abs(error)) < 0.18
-    assert 0.7 < compute_z(found, surface) < 1.3
+    require_true_deviations(found, surface)
 
 
 def test_a_wrong_width_gives_way_to_what_the_photons_show():
@@ -81,7 +86,7 @@ def test_a_wrong_width_gives_way_to_what_the_photons_show():
     found = estimate(rates, 2, Pulse.gaussian(4 * scenes.FWHM))
     assert found.settings["response"] == "learnt"
     assert found.pulse.fwhm == pytest.approx(scenes.FWHM, rel=0.2)
-    assert np.mean(np.abs(found.range / scenes.BIN_M - surface) <= 3) > 0.97
+    assert find_wrong(found, surface).mean() < 0.03
 
 
 @pytest.mark.parametrize(
@@ -96,10 +101,10 @@ def test_steep_edges_stay_where_they_are(seed, pulse):
     found = estimate(rates, seed, *pulse)
     assert found.settings["response"] == ("given" if pulse else "learnt")
     assert found.pulse.fwhm == pytest.approx(scenes.FWHM, rel=0.2)
-    close = np.abs(found.range / scenes.BIN_M - surface) <= 3
+    close = ~find_wrong(found, surface)
     assert close.mean() >= 0.96
     assert close[scenes.find_edges(surface)].mean() >= 0.85
-    assert 0.7 < compute_z(found, surface) < 1.3
+    require_true_deviations(found, surface)
     reported = found.outlier_probability
     doubtful = (reported > 0.05) & (reported < 0.2)
     assert doubtful.sum() > 100
@@ -117,7 +122,7 @@ def test_pixels_that_are_hot_at_all_times_and_dead_ones_are_found(level):
     np.testing.assert_array_equal(found.hot_pixels, hot)
     # in the darkest columns chance leaves no photon either
     assert 0.9 * dead.sum() <= found.settings["dim_pixels"] <= dead.sum() + 5
-    assert np.mean(np.abs(found.range / scenes.BIN_M - surface) <= 3) >= 0.98
+    assert find_wrong(found, surface).mean() <= 0.02
 
 
 @pytest.mark.parametrize(
@@ -138,7 +143,7 @@ def test_first_photons_of_a_cycle_are_not_taken_for_all(photons, unaware):
         assert abs(np.median(error)) < 0.6e-3  # three seeds, both kinds: up to 0.4 mm
         for columns in (TILES > 1.3, TILES < 0.7):
             assert abs(np.median(error[:, columns])) < 0.8e-3
-        assert 0.7 < compute_z(found, surface) < 1.4
+        require_true_deviations(found, surface, 1.4)
         assert found.settings["pile_up"] == 0
 
 
@@ -164,9 +169,9 @@ def test_a_background_that_changes_over_picture_and_time_is_no_surface(decay, le
     level = 90 / BINS * course / course.mean() * (1 + 0.5 * np.sin(7 * x + 5 * y))
     found = estimate(scenes.make_rates(surface, 4 * TILES + 0 * surface, level))
     assert 0.25e-9 < found.pulse.fwhm < 0.36e-9
-    wrong = np.abs(found.range / scenes.BIN_M - surface) > 3
+    wrong = find_wrong(found, surface)
     assert 1 - wrong.mean() >= least
-    assert 0.7 < compute_z(found, surface) < 1.3
+    require_true_deviations(found, surface)
     assert abs(found.outlier_probability.mean() - wrong.mean()) < 0.02
 
 
@@ -210,8 +215,7 @@ def test_a_pulse_shorter_than_a_bin_is_known_to_a_part_of_it(pulse, seed):
     rates = scenes.make_rates(surface, 20 * TILES + 0 * surface, 0.08, 128, 60 / 400)
     counts = np.random.default_rng(seed).poisson(rates)
     found = estimate_surface(PhotonImage.from_cube(counts, bin_width), pulse)
-    ratio = (found.range - surface * 4 * scenes.BIN_M) / found.range_sigma
-    assert 0.7 < 1.4826 * np.median(np.abs(ratio)) < 1.3
+    require_true_deviations(found, 4 * surface)
 
 
 @pytest.mark.parametrize("find", [estimate_surface, estimate_pixels])
@@ -229,5 +233,4 @@ def test_where_in_a_step_of_a_gate_a_return_lies_is_in_the_deviation(width, step
     counts = np.random.default_rng(0).poisson(40 * seen + 0.5)
     cube = PhotonCube(counts, np.arange(steps) * step, pulse=pulse, sampled=True)
     found = find(cube.to_image(), pulse)
-    ratio = (found.range - surface * step / scenes.BIN * scenes.BIN_M) / found.range_sigma
-    assert 0.7 < 1.4826 * np.nanmedian(np.abs(ratio)) < 1.3
+    require_true_deviations(found, surface * step / scenes.BIN)

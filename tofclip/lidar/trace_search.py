@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,15 +23,6 @@ from tofclip.vectors import LENGTH
 NEIGHBOUR_FRACTION = 0.5  # of what is of interest: weaker peaks do not move a return beside them
 
 
-class Memory(NamedTuple):
-    """What a thread's search overwrites, for some pixels."""
-
-    handed: Float32Array  # (pixels, bins), as traces are handed out
-    # (pixels, whole vectors of bins); the same memory where that is a whole number of vectors
-    traces: Float32Array
-    room: Room
-
-
 class TraceSearch:
     """The search in some traces, at most `pixels` of them together, and what it has found so far.
 
@@ -49,7 +40,11 @@ class TraceSearch:
         pixels: int,
     ) -> None:
         bins, self._most = source.bins, detection.max_returns
-        self._source, self._pixels, self._spare = source, pixels, list[Memory]()
+        self._source, self._pixels, self._spare = (
+            source,
+            pixels,
+            list[tuple[Float32Array, Float32Array, Room]](),
+        )
         self._found = np.empty((source.pixels.size, self._most, 3))
         self._counts = np.zeros(source.pixels.size, np.int64)
         self._pulse, self._table = filters.kernel, filters.table
@@ -114,8 +109,14 @@ class TraceSearch:
     def find_returns(self, pieces: Iterable[slice]) -> None:
         """Find the returns of some of the source's pixels, those of each piece together."""
         memory = self._spare.pop() if self._spare else self._allocate_memory()
+        everywhere = self._axis, self._limits, self._table, self._pulse
         for piece in pieces:
-            self._search_piece(piece, memory)
+            pixels = self._source.pixels[piece]
+            handed, traces = (one[: pixels.size] for one in memory[:2])
+            self._source.fill(piece, handed)
+            if traces.shape != handed.shape:
+                traces[:, : self._number] = handed
+            search_traces(traces, pixels, *everywhere, memory[2], self._found, self._counts)
         self._spare.append(memory)
 
     def list_found(self) -> tuple[IntArray, FloatArray]:
@@ -127,7 +128,10 @@ class TraceSearch:
         list_returns(self._found, self._counts, pixel, values)
         return pixel, values
 
-    def _allocate_memory(self) -> Memory:
+    def _allocate_memory(self) -> tuple[Float32Array, Float32Array, Room]:
+        """What a thread's search overwrites: (pixels, bins) traces as they are handed out, the same in
+        whole vectors of bins, which is the same memory where those are whole, and all else.
+        """
         length, most, pixels = self._length, self._most, self._pixels
         listed, width = pixels * most, self._table.shapes.shape[1]
         # Vectors that begin in the last trace may end behind it.
@@ -147,25 +151,7 @@ class TraceSearch:
             level=np.empty(self._number),
         )
         handed = traces if whole else np.empty((pixels, self._number), np.float32)
-        return Memory(handed, traces, room)
-
-    def _search_piece(self, piece: slice, memory: Memory) -> None:
-        pixels = self._source.pixels[piece]
-        handed, traces = memory.handed[: pixels.size], memory.traces[: pixels.size]
-        self._source.fill(piece, handed)
-        if traces.shape != handed.shape:
-            traces[:, : self._number] = handed
-        results = self._found, self._counts
-        search_traces(
-            traces,
-            pixels,
-            self._axis,
-            self._limits,
-            self._table,
-            self._pulse,
-            memory.room,
-            *results,
-        )
+        return handed, traces, room
 
 
 def _place_vectors(sharp: Float32Array, searched: BoolArray) -> tuple[IntArray, IntArray, IntArray]:

@@ -168,23 +168,24 @@ def _find_layout(
     opened: _PhotonFile, path: Path, axes: str | None = None
 ) -> tuple[str, list[ArchiveEntry]]:
     """Choose the arrays that hold the photons."""
-    arrays = opened.arrays
-    numbers = {name: one for name, one in arrays.items() if not _is_cell(one)}
-    sides = len(axes) if axes else 3
-    small = {name: one for name, one in numbers.items() if len(one.shape) == sides}
-    thick = {name: sum(length != 1 for length in one.shape) for name, one in arrays.items()}
-    cubes = {name: one for name, one in numbers.items() if thick[name] == sides}
-    if axes or opened.axes:  # known: there may be one row, or one pixel
-        cubes = cubes or small
-    named = [one for n, one in cubes.items() if n.rpartition("/")[2].lower() in CUBE_NAMES]
+    arrays, sides = opened.arrays, len(axes) if axes else 3
     cells = [one for one in arrays.values() if _is_cell(one) and len(one.shape) == 2]
-    if len(named) == 1 or len(cubes) == 1:
-        return "cube", named if len(named) == 1 else list(cubes.values())
-    if not cubes and len(cells) == 1:
-        return "cells", cells
-    flat = {name.lower(): one for name, one in numbers.items() if thick[name] == 1}
-    times = [flat[name] for name in TIME_NAMES if name in flat]
+    numbers = {name: one for name, one in arrays.items() if not _is_cell(one)}
+    thick = {name: sum(length != 1 for length in one.shape) for name, one in numbers.items()}
+    cubes = {name: one for name, one in numbers.items() if thick[name] == sides}
+    if not cubes and (axes or opened.axes):  # known: there may be one row, or one pixel
+        cubes = {name: one for name, one in numbers.items() if len(one.shape) == sides}
+    named = {n: one for n, one in cubes.items() if n.rpartition("/")[2].lower() in CUBE_NAMES}
+    for layout, found in (
+        ("cube", [*named.values()]),
+        ("cube", [*cubes.values()]),
+        ("cells", cells),
+    ):
+        if len(found) == 1 and (layout == "cube" or not cubes):
+            return layout, found
     if not cubes and not cells:
+        flat = {name.lower(): one for name, one in numbers.items() if thick[name] == 1}
+        times = [flat[name] for name in TIME_NAMES if name in flat]
         if times and "x" in flat and "y" in flat:
             return "events", [flat["y"], flat["x"], times[0]]
         # three rows may be a line of three pixels: that they are x, y and t has to be said
@@ -199,13 +200,11 @@ def _find_layout(
                 return "times", [alone]
     held = ", ".join(f"{name} {one.shape}" for name, one in [*arrays.items()][:6]) or "no arrays"
     problem = "several cubes of photons" if len(cubes) > 1 else "no photons"
-    remedy = SUITABLE
-    if not cubes and len(numbers) == 1:
-        fitting = {1: "t of one histogram", 2: "xt of a line", 3: "yxt of a picture of one row"}
-        shape = next(iter(numbers.values())).shape
-        if len(shape) == 2 and shape[0] == 3:
-            fitting[2] = "xyt of events"
-        remedy = f"give `axes`, e.g. {fitting[len(shape)]}" if len(shape) in fitting else SUITABLE
+    remedy, shapes = SUITABLE, [one.shape for one in numbers.values()]
+    if not cubes and len(shapes) == 1 and 1 <= len(shapes[0]) <= 3:
+        line = "xyt of events" if shapes[0][0] == 3 else "xt of a line"
+        fitting = "t of one histogram", line, "yxt of a picture of one row"
+        remedy = f"give `axes`, e.g. {fitting[len(shapes[0]) - 1]}"
     raise FileFormatError(path, f"holds {problem} ({held}); {remedy}")
 
 
@@ -222,11 +221,11 @@ def _read_layout(
         if cube.dtype.kind not in "uifb":
             raise FileFormatError(path, f"its cube holds {cube.dtype}, not counts; {SUITABLE}")
         order, how = axes or opened.axes, ""
-        missing = "" if not order else "".join(axis for axis in "yx" if axis not in order)
-        cube, order = cube.reshape((1,) * len(missing) + cube.shape), missing + order
         if not order:
             order, certainty = recognise_axes(cube, path)
             how = f"{order}, ahead of the next axis by a factor of {certainty:.2g}"
+        missing = "".join(axis for axis in "yx" if axis not in order)
+        cube, order = cube.reshape((1,) * len(missing) + cube.shape), missing + order
         ordered = np.transpose(cube, [order.index(axis) for axis in "yxt"])
         return replace(PhotonImage.from_cube(ordered, bin_width), axes=how)
     if layout == "cells":
@@ -241,10 +240,8 @@ def _read_layout(
     else:
         if layout == "table":
             table = np.asarray(arrays[0].load())
-            columns_of = dict(
-                zip(axes or "xyt", table.T if table.shape[1] == 3 else table, strict=True)
-            )
-            y, x, times = (columns_of[axis] for axis in "yxt")
+            lines = table.T if table.shape[1] == 3 else table
+            y, x, times = (lines[(axes or "xyt").index(axis)] for axis in "yxt")
         else:
             y, x, times = (np.squeeze(entry.load()) for entry in arrays)
         if not y.shape == x.shape == times.shape or min(y.min(initial=0), x.min(initial=0)) < 0:
