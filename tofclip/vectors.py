@@ -91,16 +91,6 @@ def fill_vector(typing, value):
 
 
 @intrinsic
-def number_lanes(typing):
-    """Return 0, 1, ... 15 as int32."""
-
-    def build(context, builder, called, args):
-        return ir.Constant(context.get_value_type(INTEGERS), list(range(LENGTH)))
-
-    return INTEGERS(), build
-
-
-@intrinsic
 def choose(typing, mask, lanes, others):
     """Return `lanes` where the mask is set, and `others` elsewhere."""
 

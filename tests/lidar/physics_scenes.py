@@ -36,6 +36,7 @@ PITCH_M, FOCUS_M = 2.1e-3, 2.4
 ANGLES = np.radians([-44.5, -27.0, -12.0, 1.5, 21.0, 36.0, 46.5])
 GAINS = np.array([0.95, 1.06, 1.0, 0.91, 1.03, 0.97, 1.08])
 STEPS = np.arange(7) - 3.0  # of the lenslets from the reference
+RAYS = 4  # across a pixel
 FINE = 4  # parts of a row in which light is gathered before the pulse spreads it
 RIM_PX, NEAR_M = 10, 0.03  # of the score: what lies nearer the rim is left out; what is one return
 MIN_FILL = 0.3  # of a pixel that a surface fills to count as a return that may be missed
@@ -360,12 +361,11 @@ class Shot:
             "median_mm": 1e3 * float(np.median(off[found])),
             "counted": counted,
             "is_false": is_false,
-            **{key: {} for key in ("misses", "medians_mm", "z")},
+            "medians_mm": {},
+            "z": {},
         }
         for name in dict.fromkeys(self.names):
-            own, its = found & (name_of == name), may_be_missed & (of_surface == name)
-            if its.any():
-                result["misses"][name] = float(missed[its].mean())
+            own = found & (name_of == name)
             if own.sum() >= 20:
                 result["medians_mm"][name] = 1e3 * float(np.median(off[own]))
                 if sigma is not None:
@@ -389,7 +389,6 @@ def make_shot(
     background: float = 2.0,
     afterglow: float = 0.0,
     haze: float = 0.0,
-    rays_per_side: int = 4,
     bend: float = 0.0,
 ) -> Shot:
     """Simulate a shot whose brightest streak pixel expects `photons`. `scene`: one of `SCENES`, or
@@ -413,9 +412,9 @@ def make_shot(
     gathered = np.zeros((ROWS * FINE, width))
     for view in range(7):
         origin = np.array([PITCH_M * STEPS[view], 0.0, 0.0])
-        grid = (np.arange(size * rays_per_side)) / rays_per_side - size // 2 - 0.5
+        grid = np.arange(size * RAYS) / RAYS - size // 2 - 0.5
         x, y = np.meshgrid(grid, grid)
-        x, y = (axis + random.uniform(0, 1 / rays_per_side, x.shape) for axis in (x, y))
+        x, y = (axis + random.uniform(0, 1 / RAYS, x.shape) for axis in (x, y))
         shift = focal * origin[0] / FOCUS_M  # all views' pictures coincide at this depth
         seen = look(surfaces, origin, x, y, focal, shift)
         lit = seen.surface >= 0
