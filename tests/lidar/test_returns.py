@@ -196,9 +196,8 @@ def test_another_pulse_shape_finds_its_own_arrivals():
     arrival = START + 80.37 * BIN
     returns = depth(frames_of(50 * pulse(times - arrival)[:, np.newaxis], times), pulse=pulse)
     assert len(returns) == 1
-    assert returns.time[0] == pytest.approx(
-        arrival, abs=0.05 * BIN
-    )  # the kink at its start is 1 ps wide
+    # the kink at its start is 1 ps wide
+    assert returns.time[0] == pytest.approx(arrival, abs=0.05 * BIN)
 
 
 def test_a_pulse_shorter_than_a_bin_still_gives_a_range():

@@ -23,7 +23,6 @@ from tofclip.lidar.pulse_tables import (
     MAX_OFFSET_BINS,
     PhaseTable,
     TraceBins,
-    list_windows,
 )
 from tofclip.shots import Frames
 
@@ -132,11 +131,3 @@ def test_a_return_is_followed_when_it_moves_away_from_its_peak(peak, there):
         assert candidates[0, HEIGHT] == pytest.approx(100, rel=1e-3)
     else:
         assert np.isnan(candidates[0, HEIGHT])
-
-
-def test_bins_just_as_far_apart_as_the_distance_are_not_too_near():
-    """Of bins 1 s apart those 3 s away are; half a bin more makes them so."""
-    times, scale = np.arange(20.0), (1.0, 0.0, -2.5, 2.5)
-    assert list_windows(times, scale, 3.0)[10].tolist() == [8, 13, 8, 13]
-    assert list_windows(times, scale, 3.5)[10].tolist() == [8, 13, 7, 14]
-    assert list_windows(times, scale, 3.0)[[0, 19], 2:].tolist() == [[0, 3], [17, 20]]

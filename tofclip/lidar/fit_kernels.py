@@ -40,9 +40,8 @@ from tofclip.lidar.peak_kernels import (
 from tofclip.lidar.pulse_tables import MAX_OFFSET_BINS, PHASES_PER_BIN
 from tofclip.vectors import STEP, fill_vector, load_vector, store_vector, sum_vector
 
-MAX_FIT_ROUNDS = (
-    8  # from near the top it has converged after two; more are for returns that overlap
-)
+# from near the top a fit has converged after two; more are for returns that overlap
+MAX_FIT_ROUNDS = 8
 CONVERGENCE_STEP_BINS = 5e-3  # a return that moved by less is done: its next step is smaller by far
 
 # Without counts of the arrays' owners, which cost a lock for every array that is handed on; nothing
@@ -305,10 +304,8 @@ def check_overlap(estimate, k, curve, scale):
     """Whether another return reaches return k (has light in bins that count for it), and the most bins
     that one of them moved.
     """
-    before, after = (
-        scale[1] / scale[0] + scale[3],
-        (curve.shape[0] - 1 - scale[1]) / scale[0] - scale[2],
-    )
+    before = scale[1] / scale[0] + scale[3]
+    after = (curve.shape[0] - 1 - scale[1]) / scale[0] - scale[2]
     crowded, moving = False, estimate[k, 4]
     for other in range(estimate.shape[0]):
         later = estimate[other, 0] - estimate[k, 0]
@@ -362,9 +359,8 @@ def take_gauss_newton_step(times, sums, own):
         own[1] = 0.0
         return
     bin_width = (times[last - 1] - times[first]) / (last - 1 - first)
-    step = -(pp * dr - pd * pr) / (
-        determinant * height
-    )  # model: height * p(t - arrival), whose slope is -height * d
+    # model: height * p(t - arrival), whose slope is -height * d
+    step = -(pp * dr - pd * pr) / (determinant * height)
     if math.fabs(step) > bin_width:
         step = math.copysign(bin_width, step)
     own[0] += step

@@ -115,10 +115,9 @@ def fit_effects(data: Measurements, with_shots: bool, with_pixels: bool) -> Effe
     # Errors that neighbours share do not average out: as many measurements as are independent.
     shared = measure_correlation(found.residual / (used.sigma * np.sqrt(variances[0])), used)
     effects = data.design.shape[1]
-    covariance, without = (
-        _solve(used, variances * [shared, with_them, 1], sizes).covariance[:effects, :effects]
-        for with_them in (1, 0)
-    )
+    fewer = variances * [shared, 1, 1]
+    covariance = _solve(used, fewer, sizes).covariance[:effects, :effects]
+    without = _solve(used, fewer * [1, 0, 1], sizes).covariance[:effects, :effects]
     # What a handful of shots say of their own spread is uncertain itself: Student's t.
     freedom = max(sizes[0] - effects, 1)
     widened = float(scipy.special.stdtrit(freedom, scipy.special.ndtr(1.0))) ** 2

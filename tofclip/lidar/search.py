@@ -124,13 +124,10 @@ class ReturnSearch:
             self.camera.image_shape,
             SPEED_OF_LIGHT / 2 * self.pulse.fwhm,
         )
+        shear = np.full(time.size, self.shears[0])
         # looking up every instant takes longer than placing it in space
-        moves = np.ptp(self.shears) > 0
-        shear = (
-            np.interp(time, self.times, self.shears)
-            if moves
-            else np.full(time.size, self.shears[0])
-        )
+        if np.ptp(self.shears) > 0:
+            shear = np.interp(time, self.times, self.shears)
         return correct_returns(
             Returns(
                 y=y,

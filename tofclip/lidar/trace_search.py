@@ -40,11 +40,8 @@ class TraceSearch:
         pixels: int,
     ) -> None:
         bins, self._most = source.bins, detection.max_returns
-        self._source, self._pixels, self._spare = (
-            source,
-            pixels,
-            list[tuple[Float32Array, Float32Array, Room]](),
-        )
+        self._source, self._pixels = source, pixels
+        self._spare: list[tuple[Float32Array, Float32Array, Room]] = []
         self._found = np.empty((source.pixels.size, self._most, 3))
         self._counts = np.zeros(source.pixels.size, np.int64)
         self._pulse, self._table = filters.kernel, filters.table

@@ -131,9 +131,8 @@ def measure_accuracy(
     if trials < 1:
         raise InputError(f"at least one trial is needed, got {trials}")
     bound = compute_range_bound(detector.pulse, detector.bin_width, photons, background)
-    present, absent, chance = (
-        np.random.default_rng(one) for one in np.random.SeedSequence(seed).spawn(3)
-    )
+    seeds = np.random.SeedSequence(seed).spawn(3)
+    present, absent, chance = (np.random.default_rng(one) for one in seeds)
     # In batches: the memory does not depend on the number of trials.
     batch = max(1, BINS_PER_BATCH // detector.bins)
     sums = np.zeros(3)  # squared errors, detections, false alarms
